@@ -1,0 +1,36 @@
+# Everything a newcomer types. `make` alone lists the targets.
+PYTHON ?= python3
+BIN := .venv/bin
+STAMP := .venv/installed
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test check format bench test-socketcan results clean
+
+help:            ## list the targets
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 18
+
+$(STAMP): pyproject.toml constraints.txt
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[sim,dev]'
+	@touch $(STAMP)
+
+setup: $(STAMP)  ## make .venv with the exact versions of constraints.txt
+
+demo: $(STAMP)   ## one minute with a muscle-driven arm that loses a sensor and a muscle
+	$(BIN)/gemuco demo
+
+test: $(STAMP)   ## all tests
+	$(BIN)/python -m pytest
+
+check: $(STAMP)  ## formatting, lint, types, import contracts
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+format: $(STAMP) ## apply formatting and the safe lint fixes
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+clean:           ## remove what make setup and the demo made
+	rm -rf .venv runs build *.egg-info

@@ -1,0 +1,1 @@
+"""The hardware: buses, devices, limits and time. Knows nothing of learning or of the network."""

@@ -1,0 +1,66 @@
+"""Time as an argument: the machine's clock, and one that a test moves by hand."""
+
+import threading
+import time
+from typing import Protocol
+
+
+class Clock(Protocol):
+    """A monotonic clock for deadlines and ages, and the wall clock for stamps."""
+
+    def monotonic(self) -> float:
+        """Seconds from an arbitrary start; never goes back."""
+        ...
+
+    def now_ns(self) -> int:
+        """Wall-clock time [ns since 1970]; for stamps only, never for deadlines."""
+        ...
+
+    def sleep_until(self, deadline: float) -> None:
+        """Sleep until `monotonic()` reaches the deadline; return at once when it has passed."""
+        ...
+
+
+class SystemClock:
+    """The machine's own clocks."""
+
+    def monotonic(self) -> float:
+        """See `Clock.monotonic`."""
+        return time.monotonic()
+
+    def now_ns(self) -> int:
+        """See `Clock.now_ns`."""
+        return time.time_ns()
+
+    def sleep_until(self, deadline: float) -> None:
+        """See `Clock.sleep_until`."""
+        remaining = deadline - time.monotonic()
+        if remaining > 0:
+            time.sleep(remaining)
+
+
+class ManualClock:
+    """A clock that only moves when told to, so that a test of time needs no time."""
+
+    def __init__(self, start: float = 1000.0) -> None:
+        self._now = start
+        self._moved = threading.Condition()
+
+    def monotonic(self) -> float:
+        """See `Clock.monotonic`."""
+        return self._now
+
+    def now_ns(self) -> int:
+        """See `Clock.now_ns`."""
+        return round(self._now * 1e9)
+
+    def advance(self, duration: float) -> None:
+        """Move time forward by `duration` [s] and wake whoever sleeps."""
+        with self._moved:
+            self._now += duration
+            self._moved.notify_all()
+
+    def sleep_until(self, deadline: float) -> None:
+        """Block until another thread has advanced the clock to the deadline."""
+        with self._moved:
+            self._moved.wait_for(lambda: self._now >= deadline)

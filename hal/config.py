@@ -1,0 +1,238 @@
+"""robots/*.yaml -> typed models. An unknown key is an error that lists the known ones."""
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from hal.errors import ConfigError
+
+
+class Section(BaseModel):
+    """A part of the robot file: frozen, and without room for a misspelt key."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class SignalConfig(Section):
+    """A named vector of sensor or control values."""
+
+    unit: str
+    elements: tuple[str, ...] = Field(min_length=1)
+    stale_after: Positive = 0.02
+    """Age [s] beyond which an element is not valid any more."""
+
+    @property
+    def size(self) -> int:
+        """How many elements the signal has."""
+        return len(self.elements)
+
+
+class BusConfig(Section):
+    """One CAN bus, as python-can names it."""
+
+    interface: str = "socketcan"
+    channel: str
+    bitrate: int = 1_000_000
+    max_load: Annotated[float, Field(gt=0, le=0.8)] = 0.6
+    """Share of the bit rate that the cyclic frames may take; more is refused at start."""
+    options: dict[str, Any] = {}
+    """Passed to python-can as they are."""
+
+
+class KindConfig(Section):
+    """What several devices share: the driver's name and its settings."""
+
+    driver: str
+    settings: dict[str, Any] = {}
+
+
+class DeviceConfig(Section):
+    """One device on a bus: where it is, and which element of which signal it measures or moves."""
+
+    kind: str
+    bus: str
+    node: Annotated[int, Field(ge=1, le=127)]
+    element: str
+    """`signal.element`, as in `muscle_length.biceps`."""
+    settings: dict[str, Any] = {}
+    """Added to the kind's settings; a key given in both takes the device's value."""
+
+
+class LimitConfig(Section):
+    """Bounds of one signal, per element or one for all. For a command: what may be applied."""
+
+    low: Finite | tuple[Finite, ...] | None = None
+    high: Finite | tuple[Finite, ...] | None = None
+    rate: Positive | None = None
+    """Largest change of a command [unit/s]."""
+    soft_high: Positive | None = None
+    """Measured value above which the command is relaxed (muscle tension)."""
+    trip_high: Positive | None = None
+    """Measured value above which the robot stops and disables."""
+
+
+class CommandConfig(Section):
+    """Which signal is commanded, how long a command lives, and what happens when none comes."""
+
+    signal: str
+    time_to_live: Positive = 0.1
+    """Age [s] of a command beyond which it is not followed any more."""
+    hold: Annotated[float, Field(ge=0)] = 1.0
+    """How long [s] the last applied command is held before the drives are disabled."""
+
+
+class RatesConfig(Section):
+    """Loop rates [Hz]."""
+
+    hal: Positive = 200.0
+    estimation: Positive = 200.0
+    control: Positive = 50.0
+    anomaly: Positive = 100.0
+    update: Positive = 10.0
+
+
+class RobotConfig(Section):
+    """A whole robot file."""
+
+    robot: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
+    description: str = ""
+    signals: dict[str, SignalConfig] = Field(min_length=1)
+    command: CommandConfig
+    limits: dict[str, LimitConfig] = {}
+    rates: RatesConfig = RatesConfig()
+    buses: dict[str, BusConfig] = {}
+    kinds: dict[str, KindConfig] = {}
+    devices: dict[str, DeviceConfig] = {}
+    simulator: str | None = None
+    """`module:name` of what stands in for the hardware."""
+    model: dict[str, Any] = {}
+    """What the body schema service reads; it checks this section itself."""
+    collect: dict[str, Any] = {}
+    """How random safe motion is made; the collector checks this section itself."""
+    folder: Path = Path()
+    """Where the robot file lies; paths inside it are relative to this folder."""
+
+    @model_validator(mode="after")
+    def _names_fit(self) -> "RobotConfig":
+        signals = ", ".join(self.signals)
+        if self.command.signal not in self.signals:
+            raise ValueError(f"command.signal '{self.command.signal}' is not a signal. Known: {signals}.")
+        for name, limit in self.limits.items():
+            if name not in self.signals:
+                raise ValueError(f"limits.{name} is not a signal. Known: {signals}.")
+            self._limits_fit(name, limit)
+        addresses: dict[tuple[str, int], str] = {}
+        elements: dict[str, str] = {}
+        for name, device in self.devices.items():
+            self._device_fits(name, device)
+            taken = addresses.setdefault((device.bus, device.node), name)
+            if taken != name:
+                raise ValueError(f"devices '{taken}' and '{name}' both claim node {device.node} on bus '{device.bus}'.")
+            taken = elements.setdefault(device.element, name)
+            if taken != name:
+                raise ValueError(f"devices '{taken}' and '{name}' both claim element '{device.element}'.")
+        if self.devices:
+            missing = [e for e in self.element_names() if e not in elements]
+            if missing:
+                raise ValueError(f"no device measures {', '.join(missing)}. Add one, or drop the element.")
+        return self
+
+    def _limits_fit(self, name: str, limit: LimitConfig) -> None:
+        low, high = self.bounds(name)
+        if np.any(low >= high):
+            raise ValueError(f"limits.{name}: low must be below high in every element.")
+        if limit.soft_high and limit.trip_high and limit.soft_high >= limit.trip_high:
+            raise ValueError(f"limits.{name}: soft_high must be below trip_high.")
+
+    def _device_fits(self, name: str, device: DeviceConfig) -> None:
+        if device.kind not in self.kinds:
+            raise ValueError(f"device '{name}' is of kind '{device.kind}'. Known kinds: {', '.join(self.kinds)}.")
+        if device.bus not in self.buses:
+            raise ValueError(f"device '{name}' is on bus '{device.bus}'. Known buses: {', '.join(self.buses)}.")
+        if device.element not in self.element_names():
+            raise ValueError(
+                f"device '{name}' serves '{device.element}', which no signal has. "
+                f"Known elements: {', '.join(self.element_names())}."
+            )
+
+    def element_names(self) -> list[str]:
+        """`signal.element` of every value of the robot, in order."""
+        return [f"{name}.{element}" for name, signal in self.signals.items() for element in signal.elements]
+
+    def bounds(self, signal: str) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest value of a signal [its unit], each of shape (n,); infinite where not stated."""
+        size = self.signals[signal].size
+        limit = self.limits.get(signal, LimitConfig())
+        bounds = []
+        for label, value, default in (("low", limit.low, -np.inf), ("high", limit.high, np.inf)):
+            array = np.asarray(default if value is None else value, float)
+            if array.ndim and array.shape != (size,):
+                raise ValueError(f"limits.{signal}.{label} has {array.size} values, the signal has {size}.")
+            bounds.append(np.broadcast_to(array, (size,)).copy())
+        return bounds[0], bounds[1]
+
+    def settings_of(self, device: str) -> dict[str, Any]:
+        """The kind's settings with the device's own on top."""
+        entry = self.devices[device]
+        return {**self.kinds[entry.kind].settings, **entry.settings}
+
+
+def load_robot(path: str | Path) -> RobotConfig:
+    """Read a robot file.
+
+    Raises:
+        ConfigError: The file is missing, is not YAML, or does not describe a robot.
+    """
+    path = Path(path)
+    try:
+        raw = yaml.safe_load(path.read_text())
+    except FileNotFoundError:
+        raise ConfigError(f"There is no robot file '{path}'. {_beside(path)}") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"Robot file '{path}' cannot be read: {error}.") from None
+    except yaml.YAMLError as error:
+        raise ConfigError(f"Robot file '{path}' is not YAML: {' '.join(str(error).split())}") from None
+    if not isinstance(raw, dict):
+        raise ConfigError(f"Robot file '{path}' is empty or not a mapping. Compare it with robots/*.yaml.")
+    try:
+        return RobotConfig.model_validate({**raw, "folder": path.resolve().parent})
+    except ValidationError as error:
+        raise ConfigError(f"Robot file '{path}': {explain(error, RobotConfig)}") from None
+
+
+def explain(error: ValidationError, model: type[BaseModel]) -> str:
+    """The first problem in one sentence; for an unknown key, with the keys that are known there."""
+    first = error.errors()[0]
+    where = ".".join(str(part) for part in first["loc"])
+    if first["type"] == "extra_forbidden":
+        known = ", ".join(_model_at(model, first["loc"][:-1]).model_fields)
+        return f"unknown key '{where}'. Known keys there: {known}."
+    message = first["msg"].removeprefix("Value error, ")
+    more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
+    return f"{where}: {message}{more}" if where else f"{message}{more}"
+
+
+def _model_at(model: type[BaseModel], location: tuple[int | str, ...]) -> type[BaseModel]:
+    for part in location:
+        field = model.model_fields.get(str(part))
+        if field is None:
+            continue  # a name inside a mapping, such as the device's
+        inner = [field.annotation, *getattr(field.annotation, "__args__", ())]
+        models = [kind for kind in inner if isinstance(kind, type) and issubclass(kind, BaseModel)]
+        model = models[0] if models else model
+    return model
+
+
+def _beside(path: Path) -> str:
+    found = sorted(str(other) for other in path.parent.glob("*.yaml")) if path.parent.is_dir() else []
+    return f"Robot files there: {', '.join(found)}." if found else f"Is '{path.parent}' the right folder?"
+
+
+Backend = Literal["bus", "direct"]

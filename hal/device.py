@@ -1,0 +1,99 @@
+"""The contract of a device: open, enable, read, apply, stop, close.
+
+A device serves one or more elements of the robot's signals (`muscle_length.biceps`), in SI units. A driver holds no
+safety code: limits, command age and watchdogs wrap every device alike (see `hal.robot`).
+"""
+
+import abc
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+
+
+class DeviceState(StrEnum):
+    """Where a device stands."""
+
+    CLOSED = "closed"
+    OPENING = "opening"
+    READY = "ready"
+    """Answers and measures, does not move."""
+    ENABLED = "enabled"
+    """Follows what is applied."""
+    FAULT = "fault"
+    """Reports a fault of its own; leaves it only by `reset`."""
+    SILENT = "silent"
+    """Was heard, and is not heard any more."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """What a device last measured.
+
+    Attributes:
+        values: One value per element of `Device.measures` [the signal's unit], shape (n,); NaN if never measured.
+        received: Monotonic time [s] at which each value arrived, shape (n,); -inf if never.
+    """
+
+    values: np.ndarray
+    received: np.ndarray
+
+
+@dataclass(slots=True)
+class DeviceHealth:
+    """What a device says of itself; for status messages, not for control."""
+
+    state: DeviceState = DeviceState.CLOSED
+    text: str = ""
+    """One sentence a person can act on; empty when all is well."""
+    counters: dict[str, int] = field(default_factory=dict)
+    """Malformed frames, missed cycles, emergencies, reboots and the like, since opened."""
+
+
+class Device(abc.ABC):
+    """One thing on the robot that measures or moves.
+
+    No method but `open` and `close` may block longer than it takes to put a frame on the bus: the rest is called from
+    the cycle. `enable`, `disable` and `reset` ask; `health` tells when it has happened.
+    """
+
+    name: str
+    measures: tuple[str, ...] = ()
+    """Elements that `read` returns, in order."""
+    commands: tuple[str, ...] = ()
+    """Elements that `apply` takes, in order; empty for a sensor."""
+
+    @abc.abstractmethod
+    def open(self) -> None:
+        """Check that the right device answers, and configure it. May block for seconds.
+
+        Raises:
+            DeviceSilent: Nothing answers.
+            WrongDevice: Something else answers.
+            DeviceRefused: It refuses its configuration.
+        """
+
+    @abc.abstractmethod
+    def read(self) -> Reading:
+        """The newest values and when they arrived; never blocks, never makes a value look newer than it is."""
+
+    @abc.abstractmethod
+    def health(self) -> DeviceHealth:
+        """State, a sentence and counters."""
+
+    @abc.abstractmethod
+    def close(self) -> None:
+        """Disable and let go. Safe to call twice, and when the bus is gone."""
+
+    def enable(self) -> None:
+        """Ask to follow commands, starting from where the device is."""
+
+    def disable(self) -> None:
+        """Ask to stop following and to be safe without power."""
+
+    def reset(self) -> None:
+        """Ask to leave a fault; never enables."""
+
+    def apply(self, values: np.ndarray) -> None:
+        """Send set-points [the signal's unit], shape (len(commands),), already limited by `Robot`."""
+        raise NotImplementedError(f"{self.name} takes no commands")

@@ -1,0 +1,1 @@
+"""One device per file: a protocol, a bus, and the conversion to SI units."""

@@ -1,0 +1,1 @@
+"""Bytes to frozen dataclasses and back, one standard per file, no input or output."""

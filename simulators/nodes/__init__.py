@@ -1,0 +1,1 @@
+"""Simulated CAN nodes, each with its own object dictionary."""

@@ -1,0 +1,1 @@
+"""What each simulated robot is made of."""

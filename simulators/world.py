@@ -1,0 +1,41 @@
+"""The contract of a physics: what simulated nodes and the direct backend read, drive and break."""
+
+from collections.abc import Mapping
+from typing import Protocol
+
+import numpy as np
+
+
+class World(Protocol):
+    """A robot that does not exist, with its own time.
+
+    Signals and elements are those of the robot file; arrays are float64 in SI units and in the order of the elements.
+    One thread steps a world; `measure` returns arrays that no later step changes.
+    """
+
+    time: float
+    """Simulated time [s]."""
+
+    def step(self, duration: float) -> None:
+        """Move the world forward by `duration` [s], with as many substeps as its physics needs."""
+        ...
+
+    def measure(self) -> Mapping[str, np.ndarray]:
+        """What ideal electronics would read from the sensors now: noise included, transmission not. Shapes (n,)."""
+        ...
+
+    def truth(self) -> Mapping[str, np.ndarray]:
+        """What is, without noise: every signal, shapes (n,)."""
+        ...
+
+    def drive(self, element: str, target: float, enabled: bool) -> None:
+        """Set-point of one servo [its signal's unit]; a servo that is not enabled holds by its brake."""
+        ...
+
+    def break_part(self, part: str) -> None:
+        """Break a part of the body (`muscle_cut:biceps`); an unknown part is an error that lists the known ones."""
+        ...
+
+    def close(self) -> None:
+        """Let go of the physics engine. Safe to call twice."""
+        ...
