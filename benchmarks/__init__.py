@@ -1,0 +1,1 @@
+"""Every speed and accuracy figure of the documentation, one command each."""
