@@ -1,0 +1,122 @@
+"""What hangs on a bus: a simulated node's address, what it measures or moves, and its own electrical constants.
+
+The constants are those of the device, not of the robot file: a robot file whose settings disagree with its hardware
+must read wrong values here as it would on a bench.
+"""
+
+import math
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+EDS_FOLDER = Path(__file__).resolve().parents[2] / "robots" / "eds"
+
+
+@dataclass(frozen=True, slots=True)
+class DriveConstants:
+    """A CiA 402 servo drive that winds a wire on a spool, or turns a joint.
+
+    position [m or rad] = zero + direction * counts / (counts_per_turn * gear) * turn, where a turn is
+    2 pi spool_radius [m], or 2 pi [rad] without a spool.
+
+    Attributes:
+        counts_per_turn: Encoder counts per motor turn.
+        gear: Motor turns per turn of the output.
+        spool_radius: Radius of the spool [m]; None for a joint, whose position is in rad.
+        direction: +1 if counts grow with the position, else -1.
+        zero: Position at zero counts [m or rad].
+        rated_torque: Motor rated torque [N m], a multiple of 1e-3 as object 6076h has it.
+        load: `signal.element` of the wire's tension [N] or the joint's torque [N m] that the motor carries; None: no
+            load is reported by 6077h.
+    """
+
+    counts_per_turn: int = 4096
+    gear: float = 29.0
+    spool_radius: float | None = 0.008
+    direction: int = 1
+    zero: float = 0.0
+    rated_torque: float = 0.1
+    load: str | None = None
+
+    @property
+    def counts_per_unit(self) -> float:
+        """Counts per metre of wire, or per radian of the joint; negative if they grow the other way."""
+        turn = 2.0 * math.pi * (self.spool_radius or 1.0)
+        return self.direction * self.counts_per_turn * self.gear / turn
+
+
+@dataclass(frozen=True, slots=True)
+class CellConstants:
+    """A load cell with a CiA 404 measuring amplifier.
+
+    Attributes:
+        capacity: Force [N] beyond which the status tells overload.
+        counts_per_newton: Of the analogue-digital converter.
+        unbalance: What the unloaded cell reads before a tare [N].
+        decimal_digits: Of the integer process value: 2 means 0.01 N.
+    """
+
+    capacity: float = 500.0
+    counts_per_newton: float = 4000.0
+    unbalance: float = 0.0
+    decimal_digits: int = 2
+
+
+@dataclass(frozen=True, slots=True)
+class EncoderConstants:
+    """A CiA 406 absolute encoder: angle [rad] = zero + direction * counts / counts_per_turn * 2 pi.
+
+    Attributes:
+        counts_per_turn: Physical resolution; the position value wraps after `turns` turns.
+        turns: Turns that the encoder tells apart.
+        direction: +1 if counts grow with the angle, else -1.
+        zero: Angle at zero counts [rad]; half a turn away from the middle of the joint's range avoids the wrap.
+    """
+
+    counts_per_turn: int = 262144
+    turns: int = 1
+    direction: int = 1
+    zero: float = -math.pi
+
+
+Constants = DriveConstants | CellConstants | EncoderConstants
+
+_KINDS: dict[type, str] = {
+    DriveConstants: "servo_drive",
+    CellConstants: "load_cell",
+    EncoderConstants: "joint_encoder",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class NodeSpec:
+    """One simulated node.
+
+    Attributes:
+        name: As a person calls it in a fault: `shoulder_roll_encoder`.
+        bus: Key of the bus in the robot file.
+        node: CANopen node id, 1 to 127.
+        element: `signal.element` of the world that it measures or moves.
+        constants: Its electrical constants; their type says what kind of node it is.
+    """
+
+    name: str
+    bus: str
+    node: int
+    element: str
+    constants: Constants
+
+    @property
+    def kind(self) -> str:
+        """`servo_drive`, `load_cell` or `joint_encoder`."""
+        return _KINDS[type(self.constants)]
+
+    @property
+    def eds(self) -> Path:
+        """The electronic data sheet of this kind of node."""
+        return EDS_FOLDER / f"{self.kind}.eds"
+
+    @property
+    def serial(self) -> int:
+        """Serial number (1018h:4), made of the name so that it is the same in every run."""
+        return zlib.crc32(self.name.encode())
