@@ -11,11 +11,17 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType, TracebackType
+from typing import Any
 
 _PR_SET_PDEATHSIG = 1
 _LIBC = ctypes.CDLL(None, use_errno=True)
 LAST_LINES = 5
 POLL = 0.05
+
+
+def gemuco_command(*arguments: str) -> list[str]:
+    """The command line of one of our own verbs."""
+    return [sys.executable, "-m", "services.cli", *arguments]
 
 
 class ChildDied(Exception):
@@ -57,20 +63,26 @@ class Supervisor:
         self.folder = folder
         self.grace = grace
         self.children: dict[str, Child] = {}
+        self._handlers: dict[int, Any] = {}
 
     def __enter__(self) -> "Supervisor":
         """Turn SIGTERM and SIGHUP into `SystemExit`, so that leaving the block stops the children."""
         self.folder.mkdir(parents=True, exist_ok=True)
         for number in (signal.SIGTERM, signal.SIGHUP):
-            signal.signal(number, _leave)
+            self._handlers[number] = signal.signal(number, _leave)
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self.stop_all()
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            self.stop_all()
+        finally:
+            for number, handler in self._handlers.items():
+                signal.signal(number, handler)
 
-    def start(self, name: str, arguments: Sequence[str]) -> Child:
-        """Start `python -m services.cli <arguments>`; call from the main thread, whose death ends the child."""
-        command = (sys.executable, "-m", "services.cli", *arguments)
+    def start(self, name: str, command: Sequence[str]) -> Child:
+        """Start a process; call from the main thread, whose death ends the child."""
         log = self.folder / f"{name}.log"
         with log.open("wb") as sink:
             process = subprocess.Popen(
@@ -82,7 +94,7 @@ class Supervisor:
                 preexec_fn=_die_with(os.getpid()),
                 env={**os.environ, "PYTHONUNBUFFERED": "1", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
             )
-        child = Child(name, command, log, process)
+        child = Child(name, tuple(command), log, process)
         self.children[name] = child
         return child
 
