@@ -1,0 +1,171 @@
+"""A CAN bus between processes over a Unix socket: a python-can interface and the server that it talks to.
+
+`can.Bus(interface="hub", channel="musashi_arm_can0")` joins the bus that a `HubServer` of that name serves. No frame
+is lost between programs that read; a program that does not read is cut off rather than fed with gaps. A packet on the
+socket holds one or more records of one frame each, which is what makes a burst of answers cheap.
+"""
+
+import contextlib
+import select
+import socket
+import time
+from collections import deque
+from collections.abc import Iterable
+from typing import Any
+
+import can
+
+from simulators.hub_server import HubServer
+from simulators.hub_socket import PACKET, RECORD, channels, socket_path
+from simulators.wire_time import ERROR, EXTENDED, REMOTE
+
+__all__ = ["HubBus", "HubServer"]
+
+_SEND_PATIENCE = 1.0
+"""How long [s] a sender waits for a server that does not take frames, unless told otherwise."""
+
+
+class HubBus(can.BusABC):
+    """One program's place on a bus that a `HubServer` serves.
+
+    Classic frames only. One thread may receive while others send. There is no `fileno`: frames wait in the object as
+    well as in the socket.
+    """
+
+    def __init__(
+        self,
+        channel: str,
+        can_filters: can.typechecking.CanFilters | None = None,
+        receive_own_messages: bool = False,
+        **kwargs: Any,
+    ) -> None:
+        """Join a bus.
+
+        Args:
+            channel: Name of the channel, or the absolute path of its socket.
+            can_filters: As for every python-can bus.
+            receive_own_messages: Also receive what this object sends, at once.
+            **kwargs: `bitrate` and the like, which are the server's business.
+
+        Raises:
+            can.CanInitializationError: Nobody serves the channel.
+        """
+        path = socket_path(str(channel))
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        try:
+            self._socket.connect(str(path))
+        except OSError as error:
+            self._socket.close()
+            raise can.CanInitializationError(
+                f"Nobody serves the hub channel '{channel}' ({path}: {error.strerror}). Is the simulator running?"
+            ) from None
+        self._socket.setblocking(False)
+        self._readable = select.poll()
+        self._readable.register(self._socket, select.POLLIN)
+        self._writable = select.poll()
+        self._writable.register(self._socket, select.POLLOUT)
+        self._waiting: deque[can.Message] = deque()
+        self._own = receive_own_messages
+        self._channel = str(channel)
+        self.channel_info = f"hub channel {channel}"
+        super().__init__(channel=channel, can_filters=can_filters, **kwargs)
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        """Send one frame; waits up to `timeout` [s] (1 s if not given) while the bus takes none.
+
+        Raises:
+            can.CanOperationError: The server is gone or takes no frames, or the frame is not a classic one.
+        """
+        identifier = msg.arbitration_id
+        if msg.is_fd or msg.dlc > 8 or len(msg.data) > 8:
+            raise can.CanOperationError("The hub carries classic CAN frames of at most 8 bytes.")
+        if not 0 <= identifier <= (0x1FFFFFFF if msg.is_extended_id else 0x7FF):
+            raise can.CanOperationError(f"Identifier 0x{identifier:X} is out of range.")
+        if msg.is_extended_id:
+            identifier |= EXTENDED
+        if msg.is_remote_frame:
+            identifier |= REMOTE
+        if msg.is_error_frame:
+            identifier |= ERROR
+        self._put(RECORD.pack(identifier, msg.dlc, time.time(), bytes(msg.data)), timeout)
+        if self._own:
+            self._waiting.append(msg)
+
+    def send_frames(self, frames: Iterable[tuple[int, bytes]], timeout: float | None = None) -> None:
+        """Send several data frames (identifier with flags, data) in few packets; otherwise as `send`."""
+        now = time.time()
+        records = b"".join([RECORD.pack(identifier, len(data), now, data) for identifier, data in frames])
+        for start in range(0, len(records), PACKET):
+            self._put(records[start : start + PACKET], timeout)
+
+    def _put(self, packet: bytes, timeout: float | None) -> None:
+        deadline = None
+        while True:
+            try:
+                self._socket.send(packet, socket.MSG_NOSIGNAL)
+                return
+            except BlockingIOError:
+                now = time.monotonic()
+                deadline = deadline or now + (_SEND_PATIENCE if timeout is None else timeout)
+                if now >= deadline:
+                    raise can.CanOperationError(
+                        f"{self.channel_info} takes no frames: is the bus overloaded?"
+                    ) from None
+                self._writable.poll((deadline - now) * 1e3)
+            except OSError:
+                raise self._gone() from None
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        if not self._waiting:
+            self._fetch(timeout)
+        return (self._waiting.popleft() if self._waiting else None), False
+
+    def _fetch(self, timeout: float | None) -> None:
+        try:
+            packet = self._socket.recv(PACKET)
+        except BlockingIOError:
+            if timeout == 0 or not self._readable.poll(None if timeout is None else timeout * 1e3):
+                return
+            try:
+                packet = self._socket.recv(PACKET)
+            except BlockingIOError:
+                return
+            except OSError:
+                raise self._gone() from None
+        except OSError:
+            raise self._gone() from None
+        if not packet:
+            raise self._gone()
+        for identifier, length, stamp, data in RECORD.iter_unpack(packet):
+            self._waiting.append(_message(identifier, length, stamp, data, self._channel))
+
+    def _gone(self) -> can.CanOperationError:
+        if self._is_shutdown:
+            return can.CanOperationError(f"{self.channel_info} is closed.")
+        return can.CanOperationError(
+            f"The server of {self.channel_info} is gone, or cut this program off because it did not read."
+        )
+
+    def shutdown(self) -> None:
+        """Leave the bus; a thread that waits in `recv` gets a CanOperationError."""
+        super().shutdown()
+        with contextlib.suppress(OSError):
+            self._socket.shutdown(socket.SHUT_RDWR)
+        self._socket.close()
+
+    @staticmethod
+    def _detect_available_configs() -> list[can.typechecking.AutoDetectedConfig]:
+        return [{"interface": "hub", "channel": channel} for channel in channels()]
+
+
+def _message(identifier: int, length: int, stamp: float, data: bytes, channel: str) -> can.Message:
+    return can.Message(
+        timestamp=stamp,
+        arbitration_id=identifier & 0x1FFFFFFF,
+        is_extended_id=bool(identifier & EXTENDED),
+        is_remote_frame=bool(identifier & REMOTE),
+        is_error_frame=bool(identifier & ERROR),
+        channel=channel,
+        dlc=length,
+        data=None if identifier & REMOTE else data[:length],
+    )

@@ -1,0 +1,215 @@
+"""The server of a hub channel: hands every frame to everybody else, at once or at the pace of a real bus."""
+
+import contextlib
+import fcntl
+import logging
+import os
+import select
+import socket
+import threading
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Self
+
+import can
+
+from simulators.hub_socket import PACKET, RECORD, socket_path
+from simulators.wire_time import ERROR, Wire
+
+_log = logging.getLogger(__name__)
+
+_BACKLOG = 100_000 * RECORD.size
+"""Bytes kept for one program that does not read; more, and it is cut off. Ten seconds of a full 1 Mbit/s bus."""
+_QUEUE = 256
+"""Frames that may wait for a timed bus before the server takes no more from the senders."""
+
+
+@dataclass(eq=False, slots=True)
+class _Client:
+    socket: socket.socket
+    outbox: bytearray = field(default_factory=bytearray)
+
+
+class HubServer:
+    """Serves one channel from a thread of its own.
+
+    Without a bit rate a frame reaches the others as soon as it comes. With one, frames wait for arbitration, the
+    lowest identifier first, and arrive when their last bit would have, stamped with that time.
+    """
+
+    def __init__(self, channel: str, bitrate: int | None = None) -> None:
+        """Prepare a server.
+
+        Args:
+            channel: Name of the channel, or the absolute path of its socket.
+            bitrate: Bit rate to keep [bit/s]; None for no delay.
+        """
+        self.channel = channel
+        self._path = socket_path(channel)
+        self._bitrate = bitrate
+        self._wire = Wire(bitrate) if bitrate else None
+        self._clients: list[_Client] = []
+        self._thread: threading.Thread | None = None
+        self._counters = {"frames": 0, "joined": 0, "cut_off": 0, "malformed": 0}
+
+    def start(self) -> None:
+        """Open the channel; from now on programs can join.
+
+        Raises:
+            can.CanInitializationError: Another server has the channel, or its folder is not ours.
+        """
+        self._lock = _claim(self._path, self.channel)
+        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._path.unlink(missing_ok=True)
+        self._listener.bind(str(self._path))
+        self._listener.listen(64)
+        self._listener.setblocking(False)
+        self._waker, self._wake = socket.socketpair()
+        self._thread = threading.Thread(target=self._serve, name=f"hub {self.channel}", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Close the channel; whoever is on it gets a CanOperationError. Safe to call twice."""
+        if self._thread is None:
+            return
+        self._waker.send(b"x")
+        self._thread.join()
+        self._thread = None
+        for part in (self._listener, self._waker, self._wake, *(client.socket for client in self._clients)):
+            part.close()
+        self._clients.clear()
+        self._path.unlink(missing_ok=True)
+        _lock_path(self._path).unlink(missing_ok=True)
+        os.close(self._lock)
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def stats(self) -> dict[str, float]:
+        """Counters since the start: frames, joined, cut_off, malformed; clients now; busy [s] of a timed bus."""
+        busy = {"busy": self._wire.busy} if self._wire is not None else {}
+        return {**self._counters, "clients": len(self._clients), **busy}
+
+    def _serve(self) -> None:
+        while True:
+            full = self._wire is not None and len(self._wire) >= _QUEUE
+            senders = {} if full else {client.socket: client for client in self._clients}
+            readers = [client.socket for client in self._clients if client.outbox]
+            ready, _, _ = select.select([self._wake, self._listener, *senders], readers, [], self._pause())
+            if self._wake in ready:
+                return
+            for part in ready:
+                if part is self._listener:
+                    self._admit()
+                else:
+                    self._take(senders[part])
+            if self._wire is not None:
+                for sender, record, end in self._wire.advance(time.monotonic()):
+                    self._share(sender, self._restamp(record, end))
+            for client in list(self._clients):
+                self._flush(client)
+
+    def _pause(self) -> float | None:
+        due = self._wire.due() if self._wire is not None else None
+        return None if due is None else max(due - time.monotonic(), 0.0)
+
+    def _admit(self) -> None:
+        with contextlib.suppress(BlockingIOError, ConnectionError):
+            peer, _ = self._listener.accept()
+            peer.setblocking(False)
+            self._clients.append(_Client(peer))
+            self._counters["joined"] += 1
+
+    def _take(self, client: _Client) -> None:
+        for _ in range(64):  # then the others have their turn
+            try:
+                packet = client.socket.recv(PACKET)
+            except BlockingIOError:
+                return
+            except OSError:
+                packet = b""
+            if not packet:
+                self._drop(client)
+                return
+            if len(packet) % RECORD.size:
+                self._counters["malformed"] += 1
+                _log.warning("hub %s: a client that does not speak the hub's language is cut off", self.channel)
+                self._drop(client)
+                return
+            self._counters["frames"] += len(packet) // RECORD.size
+            if self._wire is None:
+                self._share(client, packet)
+            else:
+                self._queue(self._wire, client, packet)
+
+    def _queue(self, wire: Wire, client: _Client, packet: bytes) -> None:
+        now = time.monotonic()
+        for start in range(0, len(packet), RECORD.size):
+            record = packet[start : start + RECORD.size]
+            identifier, length, _, data = RECORD.unpack(record)
+            if identifier & ERROR:
+                self._share(client, record)
+            else:
+                wire.push(now, client, identifier, data[:length], min(length, 8), record)
+
+    @staticmethod
+    def _restamp(record: bytes, end: float) -> bytes:
+        identifier, length, _, data = RECORD.unpack(record)
+        return RECORD.pack(identifier, length, time.time() - time.monotonic() + end, data)
+
+    def _share(self, sender: object, records: bytes) -> None:
+        for client in self._clients:
+            if client is not sender:
+                client.outbox += records
+
+    def _flush(self, client: _Client) -> None:
+        while client.outbox:
+            try:
+                sent = client.socket.send(client.outbox[:PACKET], socket.MSG_NOSIGNAL)
+            except BlockingIOError:
+                break
+            except OSError:
+                self._drop(client)
+                return
+            del client.outbox[:sent]
+        if len(client.outbox) > _BACKLOG:
+            self._counters["cut_off"] += 1
+            _log.warning("hub %s: a client that does not read is cut off", self.channel)
+            self._drop(client)
+
+    def _drop(self, client: _Client) -> None:
+        if client in self._clients:
+            self._clients.remove(client)
+        client.socket.close()
+
+
+def _lock_path(path: Path) -> Path:
+    return path.with_name(path.name + ".lock")
+
+
+def _claim(path: Path, channel: str) -> int:
+    """Lock a channel for this process; the lock goes with the process, however it ends."""
+    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    while True:
+        try:
+            lock = os.open(_lock_path(path), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        except OSError as error:
+            raise can.CanInitializationError(
+                f"Hub channel '{channel}' cannot be served from '{path.parent}': {error.strerror}. Is the folder yours?"
+            ) from None
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(lock)
+            raise can.CanInitializationError(
+                f"Hub channel '{channel}' is already served ({path}). Is another simulator running?"
+            ) from None
+        with contextlib.suppress(FileNotFoundError):
+            if os.fstat(lock).st_ino == _lock_path(path).stat().st_ino:
+                return lock
+        os.close(lock)  # the owner before removed the file while we opened it

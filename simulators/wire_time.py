@@ -1,0 +1,137 @@
+"""How long a frame takes on a real CAN bus, and which one goes first (ISO 11898-1, classic frames)."""
+
+import heapq
+from dataclasses import dataclass
+
+EXTENDED, REMOTE, ERROR = 1 << 31, 1 << 30, 1 << 29
+"""Flags above the identifier, as SocketCAN has them."""
+
+_TAIL_BITS = 13
+"""CRC delimiter, acknowledge slot and delimiter, end of frame, and the 3 bits between two frames; never stuffed."""
+
+
+def _crc_table() -> tuple[int, ...]:
+    table = []
+    for byte in range(256):
+        crc = byte << 7
+        for _ in range(8):
+            crc = (crc << 1) ^ (0x4599 if crc & 0x4000 else 0)
+        table.append(crc & 0x7FFF)
+    return tuple(table)
+
+
+def _stuff(state: int, bits: int, count: int) -> tuple[int, int]:
+    """Send `count` bits from a state (last bit * 8 + run length); return the state after and the stuff bits added."""
+    last, run = state >> 3, state & 7
+    stuffed = 0
+    for position in reversed(range(count)):
+        bit = bits >> position & 1
+        run = run + 1 if bit == last else 1
+        last = bit
+        if run == 5:
+            stuffed += 1
+            last, run = 1 - last, 1
+    return last << 3 | run, stuffed
+
+
+_CRC = _crc_table()
+_STUFF = tuple(tuple(_stuff(state, byte, 8) for byte in range(256)) for state in range(16))
+_IDLE = 1 << 3
+"""The bus before a frame is recessive; the run length 0 makes the start bit the first of its run."""
+
+
+def frame_bits(identifier: int, data: bytes, length: int | None = None) -> int:
+    """Bits that a frame takes, stuff bits and the gap after it included.
+
+    Args:
+        identifier: With the flags EXTENDED and REMOTE.
+        data: Up to 8 bytes; empty for a remote frame.
+        length: The length code, if it is not the number of bytes (a remote frame's).
+    """
+    code = len(data) if length is None else length
+    remote = 1 if identifier & REMOTE else 0
+    if identifier & EXTENDED:
+        base, rest = identifier >> 18 & 0x7FF, identifier & 0x3FFFF
+        head = (base << 2 | 3) << 25 | rest << 7 | remote << 6 | code
+        head_bits = 39
+    else:
+        head = (identifier & 0x7FF) << 7 | remote << 6 | code
+        head_bits = 19
+    payload = b"" if remote else data
+    stream = head << 8 * len(payload) | int.from_bytes(payload, "big")
+    stream_bits = head_bits + 8 * len(payload)
+
+    crc = 0
+    for byte in stream.to_bytes((stream_bits + 7) // 8, "big"):  # leading zeros leave a CRC of zero as it is
+        crc = (crc << 8 & 0x7FFF) ^ _CRC[crc >> 7 ^ byte]
+    stream = stream << 15 | crc
+    stream_bits += 15
+
+    first = stream_bits % 8
+    state, stuffed = _stuff(_IDLE, stream >> stream_bits - first, first)
+    rest_bytes = stream_bits // 8
+    for byte in (stream & (1 << 8 * rest_bytes) - 1).to_bytes(rest_bytes, "big"):
+        state, more = _STUFF[state][byte]
+        stuffed += more
+    return stream_bits + stuffed + _TAIL_BITS
+
+
+def arbitration(identifier: int) -> int:
+    """What is compared on the wire: the lower number wins."""
+    remote = 1 if identifier & REMOTE else 0
+    if identifier & EXTENDED:
+        return (identifier >> 18 & 0x7FF) << 21 | 3 << 19 | (identifier & 0x3FFFF) << 1 | remote
+    return (identifier & 0x7FF) << 21 | remote << 20
+
+
+@dataclass(frozen=True, slots=True)
+class _Waiting:
+    sender: object
+    frame: bytes
+    arrived: float
+    duration: float
+
+
+class Wire:
+    """One bus: of all frames that wait the one with the lowest identifier is sent, and takes its time.
+
+    A frame in flight is not interrupted. Times [s] are those of one monotonic clock.
+    """
+
+    def __init__(self, bitrate: int) -> None:
+        self._bit = 1.0 / bitrate
+        self._waiting: list[tuple[int, int, _Waiting]] = []
+        self._count = 0
+        self._flying: _Waiting | None = None
+        self._free_at = 0.0
+        self.busy = 0.0
+        """Seconds during which the bus carried a frame."""
+
+    def __len__(self) -> int:
+        return len(self._waiting)
+
+    def push(self, now: float, sender: object, identifier: int, data: bytes, length: int, frame: bytes) -> None:
+        """Hand a frame to the bus."""
+        entry = _Waiting(sender, frame, now, frame_bits(identifier, data, length) * self._bit)
+        self._count += 1
+        heapq.heappush(self._waiting, (arbitration(identifier), self._count, entry))
+
+    def advance(self, now: float) -> list[tuple[object, bytes, float]]:
+        """Frames whose last bit has passed by now: sender, frame, and when it ended."""
+        done: list[tuple[object, bytes, float]] = []
+        while True:
+            if self._flying is None:
+                if not self._waiting:
+                    return done
+                self._flying = heapq.heappop(self._waiting)[2]
+                start = max(self._free_at, self._flying.arrived)
+                self._free_at = start + self._flying.duration
+                self.busy += self._flying.duration
+            if self._free_at > now:
+                return done
+            done.append((self._flying.sender, self._flying.frame, self._free_at))
+            self._flying = None
+
+    def due(self) -> float | None:
+        """When the frame in flight ends; None on an idle bus."""
+        return self._free_at if self._flying is not None else None
