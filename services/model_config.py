@@ -15,7 +15,7 @@ class NetworkConfig(Section):
 
     hidden: tuple[Count, ...] = (200, 30)
     latent: Count = 15
-    activation: Literal["tanh", "relu"] = "tanh"
+    activation: Literal["tanh"] = "tanh"
 
 
 class StructureConfig(Section):

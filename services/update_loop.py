@@ -1,0 +1,152 @@
+"""The update loop: W learns online from a bounded window, and every model it accepts is swapped in whole."""
+
+import math
+import threading
+from collections import deque
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
+
+import numpy as np
+
+from gemuco.errors import NotEnoughData
+from gemuco.schema import BodySchema
+from hal.clock import Clock
+from services.estimation import Freshness
+from services.living_model import LivingModel
+from services.messages import Update
+from services.model_config import UpdateConfig
+
+SPREAD = 0.1
+"""A sample joins the window when some element has moved this far since the last [standard deviations]: a robot that rests
+would fill it with one posture."""
+ENOUGH = 60
+"""Samples from which the normal may be learned."""
+
+
+class Learner(Protocol):
+    """An updater of W with a window of its own (`gemuco.adapt.Updater`)."""
+
+    schema: BodySchema
+
+    def add(self, values: Mapping[str, np.ndarray]) -> Any:
+        """Take one complete sample [unit]."""
+        ...
+
+    def step(self) -> Any:
+        """Learn a little; the result has `loss`, `window` and `dropped`."""
+        ...
+
+
+class OnlineUpdate:
+    """Gathers samples while the robot moves; while active, learns from them and swaps the model.
+
+    Samples since the model last changed are kept apart: what is normal is learned from those, because the errors a
+    model makes on what it was fitted to say nothing of its errors elsewhere.
+    """
+
+    def __init__(
+        self,
+        freshness: Freshness,
+        living: LivingModel,
+        config: UpdateConfig,
+        learner: Callable[[BodySchema], Learner],
+        publish: Callable[[Update], None],
+        clock: Clock,
+    ) -> None:
+        """`learner` makes an updater that starts from a schema, with an empty window."""
+        self._freshness, self._living, self._config = freshness, living, config
+        self._make_learner, self._publish, self._clock = learner, publish, clock
+        self._lock = threading.Lock()
+        self._learner: Learner | None = None
+        self._since_change: deque[dict[str, np.ndarray]] = deque(maxlen=config.window)
+        self._last: np.ndarray | None = None
+        self._added_at = -math.inf
+        self._told = Update(active=False, model_version=0, window=0, dropped=0, loss=math.nan)
+
+    @property
+    def is_active(self) -> bool:
+        """Whether W is being updated."""
+        return self._learner is not None
+
+    def adapt(self, active: bool) -> None:
+        """Start from the model in use, or stop; the model stays as it is then."""
+        with self._lock:
+            if active and self._learner is None:
+                self._living.keep()
+                self._learner = self._make_learner(self._living.schema)
+            elif not active:
+                self._learner = None
+                self._since_change.clear()
+
+    def rollback(self) -> int:
+        """Stop, and go back to the model before adaption began; returns the model's version."""
+        with self._lock:
+            self._learner = None
+            self._since_change.clear()
+            return self._living.rollback()
+
+    def learn_normal(self, fit: Callable[[np.ndarray], Any]) -> int:
+        """Learn what errors are normal from the samples since the model last changed; returns how many.
+
+        Raises:
+            NotEnoughData: The robot moved too little since.
+        """
+        with self._lock:
+            samples = list(self._since_change)
+            schema = self._living.schema
+            if len(samples) < ENOUGH:
+                raise NotEnoughData(
+                    f"Only {len(samples)} samples of the moving robot since the model last changed; {ENOUGH} are needed "
+                    "to learn what is normal. Let it move, with the update stopped."
+                )
+            rows = {name: np.stack([sample[name] for sample in samples]) for name in samples[0]}
+            self._living.swap(schema.with_normal(fit(schema.predict_error(rows))))
+            return len(samples)
+
+    def tick(self) -> None:
+        """Take the newest sample into the window if it is worth it, and learn if active."""
+        with self._lock:
+            sample = self._worthy()
+            if sample is not None:
+                self._since_change.append(sample)
+            if self._learner is None:
+                told = Update(
+                    active=False,
+                    model_version=self._living.version,
+                    window=len(self._since_change),
+                    dropped=0,
+                    loss=self._told.loss,
+                )
+            else:
+                told = self._learn(self._learner, sample)
+            self._told = told
+        self._publish(told)
+
+    def _worthy(self) -> dict[str, np.ndarray] | None:
+        """The newest sample, if it is whole, late enough after the last and far enough from it."""
+        fresh, values = self._freshness.take()
+        now = self._clock.monotonic()
+        if fresh is None or not fresh.sample.complete or now - self._added_at < 0.9 * self._config.interval:
+            return None
+        row = self._living.schema.normalise(values)
+        if not np.isfinite(row).all():
+            return None
+        if self._last is not None and float(np.abs(row - self._last).max()) < SPREAD:
+            return None
+        self._last, self._added_at = row, now
+        return values
+
+    def _learn(self, learner: Learner, sample: dict[str, np.ndarray] | None) -> Update:
+        if sample is not None:
+            learner.add(sample)
+        result = learner.step()
+        if learner.schema is not self._living.schema and result.window:
+            self._living.swap(learner.schema)
+            self._since_change.clear()
+        return Update(
+            active=True,
+            model_version=self._living.version,
+            window=int(result.window),
+            dropped=int(result.dropped),
+            loss=float(result.loss),
+        )
