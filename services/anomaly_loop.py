@@ -34,7 +34,7 @@ class AnomalyWatch:
         self.latest: Anomaly | None = None
 
     def tick(self) -> None:
-        """Score the newest sample; without a fresh one, or without normal data, the score is NaN and nothing is blamed."""
+        """Score the newest sample; NaN, and nobody is blamed, without a fresh one or without normal data."""
         fresh, values = self._freshness.take()
         schema = self._schema()
         cycle = -1 if fresh is None else fresh.sample.cycle

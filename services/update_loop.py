@@ -8,6 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from gemuco.anomaly import Normal
 from gemuco.errors import NotEnoughData
 from gemuco.schema import BodySchema
 from hal.clock import Clock
@@ -17,10 +18,8 @@ from services.messages import Update
 from services.model_config import UpdateConfig
 
 SPREAD = 0.1
-"""A sample joins the window when some element has moved this far since the last [standard deviations]: a robot that rests
-would fill it with one posture."""
-ENOUGH = 60
-"""Samples from which the normal may be learned."""
+"""A sample joins the window when some element has moved this far since the last [standard deviations]: a robot that
+rests would fill it with one posture."""
 
 
 class Learner(Protocol):
@@ -55,6 +54,7 @@ class OnlineUpdate:
     ) -> None:
         """`learner` makes an updater that starts from a schema, with an empty window."""
         self._freshness, self._living, self._config = freshness, living, config
+        self._sizes = [(signal.name, signal.size) for signal in living.schema.layout.signals]
         self._make_learner, self._publish, self._clock = learner, publish, clock
         self._lock = threading.Lock()
         self._learner: Learner | None = None
@@ -85,7 +85,7 @@ class OnlineUpdate:
             self._since_change.clear()
             return self._living.rollback()
 
-    def learn_normal(self, fit: Callable[[np.ndarray], Any]) -> int:
+    def learn_normal(self) -> int:
         """Learn what errors are normal from the samples since the model last changed; returns how many.
 
         Raises:
@@ -94,13 +94,14 @@ class OnlineUpdate:
         with self._lock:
             samples = list(self._since_change)
             schema = self._living.schema
-            if len(samples) < ENOUGH:
-                raise NotEnoughData(
-                    f"Only {len(samples)} samples of the moving robot since the model last changed; {ENOUGH} are needed "
-                    "to learn what is normal. Let it move, with the update stopped."
-                )
-            rows = {name: np.stack([sample[name] for sample in samples]) for name in samples[0]}
-            self._living.swap(schema.with_normal(fit(schema.predict_error(rows))))
+            rows = {
+                name: np.array([sample[name] for sample in samples]).reshape(-1, size) for name, size in self._sizes
+            }
+            try:
+                normal = Normal.fit(schema.predict_error(rows), schema.scaler.std[schema.out_index])
+            except NotEnoughData as error:
+                raise NotEnoughData(f"{error} Let the robot move for a while with the update stopped.") from None
+            self._living.swap(schema.with_normal(normal))
             return len(samples)
 
     def tick(self) -> None:
