@@ -1,0 +1,82 @@
+"""PyBullet as the carrier of rigid bodies: torques in, joint positions and velocities out.
+
+The only file that knows pybullet. Every call names its physics client, so that worlds do not see each other.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pybullet
+
+from simulators.chain import GRAVITY
+
+
+class BulletBody:
+    """A fixed-base body from a URDF, headless, whose joints are driven by torques only.
+
+    Attributes:
+        position: Joint positions [rad], shape (n,); updated in place by every step.
+        velocity: Joint velocities [rad/s], shape (n,); likewise.
+    """
+
+    def __init__(self, urdf: Path, joints: Sequence[str], position: np.ndarray) -> None:
+        """Load `urdf` and put its `joints`, in this order, at `position` [rad], at rest."""
+        self._client = pybullet.connect(pybullet.DIRECT)
+        client = {"physicsClientId": self._client}
+        pybullet.setPhysicsEngineParameter(enableFileCaching=0, **client)  # a file changed on disk must be read again
+        pybullet.setGravity(0.0, 0.0, -GRAVITY, **client)
+        flags = pybullet.URDF_USE_INERTIA_FROM_FILE
+        self._body = pybullet.loadURDF(str(urdf), useFixedBase=True, flags=flags, **client)
+        count = pybullet.getNumJoints(self._body, **client)
+        indices = {pybullet.getJointInfo(self._body, i, **client)[1].decode(): i for i in range(count)}
+        self._joints = [indices[name] for name in joints]
+        for index in range(-1, count):
+            pybullet.changeDynamics(
+                self._body, index, linearDamping=0.0, angularDamping=0.0, jointDamping=0.0, **client
+            )
+        zero = [0.0] * len(self._joints)
+        pybullet.setJointMotorControlArray(self._body, self._joints, pybullet.VELOCITY_CONTROL, forces=zero, **client)
+        for index, angle in zip(self._joints, position, strict=True):
+            pybullet.resetJointState(self._body, index, float(angle), 0.0, **client)
+        self.position = np.array(position, float)
+        self.velocity = np.zeros(len(self._joints))
+        self._step_size = 0.0
+
+    def step(self, torque: np.ndarray, duration: float) -> None:
+        """One physics step of `duration` [s] under joint torques [N m], shape (n,)."""
+        client = self._client
+        if duration != self._step_size:
+            pybullet.setTimeStep(duration, physicsClientId=client)
+            self._step_size = duration
+        pybullet.setJointMotorControlArray(
+            self._body, self._joints, pybullet.TORQUE_CONTROL, forces=torque.tolist(), physicsClientId=client
+        )
+        pybullet.stepSimulation(physicsClientId=client)
+        states = pybullet.getJointStates(self._body, self._joints, physicsClientId=client)
+        self.position[:] = [state[0] for state in states]
+        self.velocity[:] = [state[1] for state in states]
+
+    def add_mass(self, joint: str, mass: float, radius: float) -> None:
+        """Put a ball of `mass` [kg] and `radius` [m] at the centre of mass of the link behind `joint`."""
+        index = self._joints[self._names().index(joint)]
+        link_mass, _, inertia, *_ = pybullet.getDynamicsInfo(self._body, index, physicsClientId=self._client)
+        added = 0.4 * mass * radius**2
+        pybullet.changeDynamics(
+            self._body,
+            index,
+            mass=link_mass + mass,
+            localInertiaDiagonal=[value + added for value in inertia],
+            physicsClientId=self._client,
+        )
+
+    def close(self) -> None:
+        """Let go of the physics client. Safe to call twice."""
+        if self._client >= 0:
+            pybullet.disconnect(physicsClientId=self._client)
+            self._client = -1
+
+    def _names(self) -> list[str]:
+        return [
+            pybullet.getJointInfo(self._body, index, physicsClientId=self._client)[1].decode() for index in self._joints
+        ]

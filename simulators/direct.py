@@ -1,0 +1,90 @@
+"""A World as a hal device without a bus, and the clock it moves: faster than real time, for data collection."""
+
+import time
+from collections.abc import Mapping
+
+import numpy as np
+
+from hal.config import RobotConfig
+from hal.device import Device, DeviceHealth, DeviceState, Reading
+from simulators.world import World
+
+
+class WorldClock:
+    """A clock whose sleep is the world's motion, so that a cycle takes no longer than its computation."""
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+        self._now = 0.0
+        self._start_ns = time.time_ns()
+
+    def monotonic(self) -> float:
+        """Simulated time [s]."""
+        return self._now
+
+    def now_ns(self) -> int:
+        """Simulated time after the wall-clock time at which this clock was made [ns since 1970]."""
+        return self._start_ns + round(self._now * 1e9)
+
+    def sleep_until(self, deadline: float) -> None:
+        """Step the world until the deadline; return at once when it has passed."""
+        duration = deadline - self._now
+        if duration > 0.0:
+            self._world.step(duration)
+            self._now = deadline
+
+
+class DirectDevice(Device):
+    """Every sensor and servo of a world in one device; it can neither fall silent nor fault."""
+
+    def __init__(self, config: RobotConfig, world: World, clock: WorldClock, name: str = "direct") -> None:
+        self.name = name
+        self.measures = tuple(config.element_names())
+        signal = config.command.signal
+        self.commands = tuple(f"{signal}.{element}" for element in config.signals[signal].elements)
+        self._signals = tuple(config.signals)
+        self._commanded = signal
+        self._world = world
+        self._clock = clock
+        self._state = DeviceState.CLOSED
+
+    def open(self) -> None:
+        """See `Device.open`."""
+        self._state = DeviceState.READY
+
+    def read(self) -> Reading:
+        """See `Device.read`; the world is measured now."""
+        measured: Mapping[str, np.ndarray] = self._world.measure()
+        values = np.concatenate([measured[signal] for signal in self._signals])
+        return Reading(values, np.full(len(values), self._clock.monotonic()))
+
+    def health(self) -> DeviceHealth:
+        """See `Device.health`."""
+        return DeviceHealth(self._state)
+
+    def enable(self) -> None:
+        """See `Device.enable`; holds the lengths that are."""
+        self._drive(self._world.truth()[self._commanded], True)
+        self._state = DeviceState.ENABLED
+
+    def disable(self) -> None:
+        """See `Device.disable`; the brakes hold."""
+        if self._state is DeviceState.ENABLED:
+            self._drive(self._world.truth()[self._commanded], False)
+            self._state = DeviceState.READY
+
+    def apply(self, values: np.ndarray) -> None:
+        """See `Device.apply`; not enabled, it does nothing."""
+        if self._state is DeviceState.ENABLED:
+            self._drive(values, True)
+
+    def close(self) -> None:
+        """See `Device.close`; the world goes with it."""
+        if self._state is not DeviceState.CLOSED:
+            self.disable()
+            self._state = DeviceState.CLOSED
+            self._world.close()
+
+    def _drive(self, targets: np.ndarray, enabled: bool) -> None:
+        for element, target in zip(self.commands, targets.tolist(), strict=True):
+            self._world.drive(element, target, enabled)

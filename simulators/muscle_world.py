@@ -1,0 +1,213 @@
+"""A muscle-driven body as a World: rigid links in PyBullet, wires, elastic elements, spool servos and sensors in numpy.
+
+A wire's length is what its spool has paid out; the path is longer by what the elastic element gives. Tensions are
+brought to the joints by the moment arms, tau = -G^T f, once per physics step.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from simulators.bullet import BulletBody
+from simulators.faults import MUSCLE_CUT, check_part
+from simulators.muscles import Elastic, Paths
+
+
+@dataclass(frozen=True, slots=True)
+class Friction:
+    """Dry friction with a presliding range, so that it holds at rest: force = limit * (slid / presliding).
+
+    Attributes:
+        joint_torque: Coulomb torque of each joint [N m], shape (n,).
+        joint_presliding: Joint travel until it slips [rad].
+        wire: Share of the tension that is lost along a wire, shape (m,).
+        wire_presliding: Path travel until it slips [m].
+    """
+
+    joint_torque: np.ndarray
+    joint_presliding: float
+    wire: np.ndarray
+    wire_presliding: float
+
+
+@dataclass(frozen=True, slots=True)
+class Servo:
+    """What every spool can do.
+
+    Attributes:
+        speed: Highest speed of the wire [m/s].
+        lag: Time constant of the position loop [s].
+        force: Tension at which the spool gives way while driven [N].
+        brake: Tension at which the brake gives way [N].
+    """
+
+    speed: float = 0.2
+    lag: float = 0.008
+    force: float = 350.0
+    brake: float = 450.0
+
+
+@dataclass(frozen=True, slots=True)
+class Body:
+    """All that makes one variant of a muscle-driven robot.
+
+    Attributes:
+        urdf: Its rigid links.
+        paths: Its wires.
+        elastic: Their elastic elements.
+        slack: Wire length that counts as zero: path length minus what is reported [m], shape (m,).
+        joint_damping: Viscous torque of each joint [N m s/rad], shape (n,).
+        loss_time: Of the elastic elements: f = elastic(x) * (1 + loss_time * rate * dx/dt) [s].
+        friction: Dry friction, or None.
+        noise: Standard deviation of what is measured, per signal [its unit].
+        rest: Joint positions at the start [rad], shape (n,).
+        rest_tension: Tensions at the start [N], shape (m,).
+        object_mass: Of the heavy object [kg].
+        object_radius: Of the heavy object [m].
+    """
+
+    urdf: Path
+    paths: Paths
+    elastic: Elastic
+    slack: np.ndarray
+    joint_damping: np.ndarray
+    loss_time: float
+    friction: Friction | None
+    noise: Mapping[str, float]
+    rest: np.ndarray
+    rest_tension: np.ndarray
+    object_mass: float = 0.7
+    object_radius: float = 0.05
+
+
+class MuscleWorld:
+    """See `simulators.world.World`. Signals: joint_position, muscle_tension, muscle_length."""
+
+    _LONGEST_STEP = 0.00125
+    """[s]; the stiffest mode (full tension, elbow yaw) then turns by 0.2 rad per step."""
+    _STEPS_PER_REFRESH = 4
+    """Moment arms are solved anew every so many steps; in between paths are linear in the joint positions."""
+
+    def __init__(self, body: Body, seed: int, servo: Servo | None = None) -> None:
+        self.time = 0.0
+        self._body = body
+        self._servo = servo or Servo()
+        joints, muscles = body.paths.chain.joints, body.paths.names
+        self._bullet = BulletBody(body.urdf, joints, body.rest)
+        self._random = np.random.default_rng(seed)
+        self._muscles = {f"muscle_length.{name}": index for index, name in enumerate(muscles)}
+        self._noise = {
+            "joint_position": (body.noise.get("joint_position", 0.0), len(joints)),
+            "muscle_tension": (body.noise.get("muscle_tension", 0.0), len(muscles)),
+            "muscle_length": (body.noise.get("muscle_length", 0.0), len(muscles)),
+        }
+        self._refresh()
+        self._spool = self._lengths - body.elastic.elongation(body.rest_tension)
+        self._target = self._spool.copy()
+        self._follows = np.zeros(len(muscles))
+        self._grip = np.empty(len(muscles))
+        self._hold_or_drive()
+        self._whole = np.ones(len(muscles))
+        self._tension = body.rest_tension.copy()
+        self._slid_joint = np.zeros(len(joints))
+        self._slid_wire = np.zeros(len(muscles))
+
+    def step(self, duration: float) -> None:
+        """See `World.step`."""
+        count = max(1, math.ceil(duration / self._LONGEST_STEP - 1e-6))
+        size = duration / count
+        for index in range(count):
+            if index % self._STEPS_PER_REFRESH == 0:
+                self._refresh()
+            self._substep(size)
+        self.time += duration
+
+    def measure(self) -> Mapping[str, np.ndarray]:
+        """See `World.measure`."""
+        values = self.truth()
+        for name, (deviation, size) in self._noise.items():
+            if deviation:
+                values[name] += deviation * self._random.standard_normal(size)
+        return values
+
+    def truth(self) -> dict[str, np.ndarray]:
+        """See `World.truth`."""
+        return {
+            "joint_position": self._bullet.position.copy(),
+            "muscle_tension": self._tension.copy(),
+            "muscle_length": self._spool - self._body.slack,
+        }
+
+    def drive(self, element: str, target: float, enabled: bool) -> None:
+        """See `World.drive`; the element of a servo is its muscle's length."""
+        index = self._muscles.get(element)
+        if index is None:
+            raise KeyError(f"No servo moves '{element}'. Known servos: {', '.join(self._muscles)}.")
+        if not math.isfinite(target):
+            raise ValueError(f"The set-point of '{element}' is {target}; it must be a length in metres.")
+        self._target[index] = target + self._body.slack[index]
+        if self._follows[index] != enabled:
+            self._follows[index] = enabled
+            self._hold_or_drive()
+
+    def break_part(self, part: str) -> None:
+        """See `World.break_part`: `muscle_cut:<muscle>` or `heavy_object`."""
+        kind, muscle = check_part(part, self._body.paths.names)
+        if kind == MUSCLE_CUT:
+            self._whole[self._body.paths.names.index(muscle)] = 0.0
+        else:
+            hand = self._body.paths.chain.joints[-1]
+            self._bullet.add_mass(hand, self._body.object_mass, self._body.object_radius)
+
+    def close(self) -> None:
+        """See `World.close`."""
+        self._bullet.close()
+
+    def _refresh(self) -> None:
+        """Solve the paths at the present posture."""
+        self._solved_at = self._bullet.position.copy()
+        self._lengths, self._arms = self._body.paths.solve(self._solved_at)
+
+    def _hold_or_drive(self) -> None:
+        """The longest a wire's elastic element can get before its motor, or its brake, gives way [m]."""
+        force = np.where(self._follows > 0, self._servo.force, self._servo.brake)
+        self._grip = self._body.elastic.elongation(force)
+
+    def _substep(self, duration: float) -> None:
+        body, servo, bullet = self._body, self._servo, self._bullet
+        path = self._lengths + self._arms @ (bullet.position - self._solved_at)
+        path_rate = self._arms @ bullet.velocity
+
+        reach = servo.speed * duration
+        move = (self._target - self._spool) * (duration / (duration + servo.lag))
+        move = np.minimum(np.maximum(move, -reach), reach) * self._follows
+        self._spool += move
+        np.maximum(self._spool, path - self._grip, out=self._spool)
+
+        stretch_rate = path_rate - move / duration
+        loss = 1.0 + body.loss_time * body.elastic.rate * stretch_rate
+        loss = np.minimum(np.maximum(loss, 0.0), 1.5)
+        self._tension = body.elastic.tension(path - self._spool) * loss * self._whole
+
+        pull = self._tension
+        torque = -body.joint_damping * bullet.velocity
+        if body.friction is not None:
+            pull = pull * (1.0 + self._wire_friction(body.friction, path_rate * duration))
+            torque -= self._joint_friction(body.friction, bullet.velocity * duration)
+        torque -= pull @ self._arms
+        bullet.step(torque, duration)
+
+    def _wire_friction(self, friction: Friction, travel: np.ndarray) -> np.ndarray:
+        """Share of the tension by which a wire pulls harder where it is dragged out, shape (m,)."""
+        limit = friction.wire_presliding
+        self._slid_wire = np.minimum(np.maximum(self._slid_wire + travel, -limit), limit)
+        return friction.wire * self._slid_wire / limit
+
+    def _joint_friction(self, friction: Friction, travel: np.ndarray) -> np.ndarray:
+        """Torque [N m] against the motion, shape (n,)."""
+        limit = friction.joint_presliding
+        self._slid_joint = np.minimum(np.maximum(self._slid_joint + travel, -limit), limit)
+        return friction.joint_torque * self._slid_joint / limit

@@ -1,0 +1,48 @@
+"""A Musashi-like arm: five joints, ten muscles of which one spans both (paper, section III-B)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from simulators.robots.musashi_arm.body import VARIANTS, body, gravity_torque
+from simulators.robots.musashi_arm.hardware import hardware
+from simulators.robots.musashi_arm.motion import random_motion
+
+if TYPE_CHECKING:
+    from hal.config import RobotConfig
+    from hal.robot import Robot
+    from simulators.muscle_world import MuscleWorld
+    from simulators.rig import Rig
+
+__all__ = ["MusashiArm", "gravity_torque", "hardware", "random_motion", "simulator"]
+
+
+class MusashiArm:
+    """What stands in for the arm. PyBullet is imported when the first world is made."""
+
+    variants = VARIANTS
+
+    def world(self, variant: str, seed: int) -> MuscleWorld:
+        """The physics of one variant; the seed chooses among actual arms, and their noise."""
+        from simulators.muscle_world import MuscleWorld
+
+        return MuscleWorld(body(variant, seed), seed)
+
+    def rig(self, config: RobotConfig, variant: str, seed: int) -> Rig:
+        """The world behind simulated nodes on the robot file's buses."""
+        from simulators.rig import Rig
+
+        return Rig(config, self.world(variant, seed), hardware())
+
+    def direct(self, config: RobotConfig, variant: str, seed: int) -> Robot:
+        """The world behind no bus at all, as fast as it computes."""
+        from hal.robot import Robot
+        from simulators.direct import DirectDevice, WorldClock
+
+        world = self.world(variant, seed)
+        clock = WorldClock(world)
+        device = DirectDevice(config, world, clock)
+        return Robot(config, devices=[device], buses=(), clock=clock, source="simulated")
+
+
+simulator = MusashiArm()

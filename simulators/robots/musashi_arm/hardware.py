@@ -1,0 +1,46 @@
+"""What hangs on the arm's two buses: every node with its own electrical constants.
+
+Kept apart from the robot file on purpose: a robot file that disagrees with the hardware must read wrong values here as
+it would on a bench. tests/simulators/test_musashi_hardware.py checks that ours agrees.
+"""
+
+import math
+
+from simulators.nodes.spec import CellConstants, DriveConstants, EncoderConstants, NodeSpec
+
+MUSCLES: dict[str, tuple[str, int, float]] = {
+    "deltoid_front": ("can0", 1, 0.17),
+    "deltoid_side": ("can0", -1, 0.20),
+    "deltoid_back": ("can0", 1, 0.17),
+    "pectoral": ("can0", -1, 0.14),
+    "latissimus": ("can0", 1, 0.14),
+    "infraspinatus": ("can1", -1, 0.14),
+    "biceps": ("can1", 1, 0.43),
+    "brachialis": ("can1", -1, 0.18),
+    "triceps": ("can1", 1, 0.19),
+    "pronator": ("can1", -1, 0.17),
+}
+"""Bus, direction of the drive, and wire length [m] at zero counts: the drives were zeroed at about the rest posture."""
+
+JOINTS: dict[str, tuple[str, int]] = {
+    "shoulder_roll": ("can0", 1),
+    "shoulder_pitch": ("can0", -1),
+    "shoulder_yaw": ("can0", 1),
+    "elbow_pitch": ("can1", -1),
+    "elbow_yaw": ("can1", 1),
+}
+"""Bus and direction of the encoder."""
+
+
+def hardware() -> list[NodeSpec]:
+    """Ten drives (nodes 1 to 10), ten load cells (11 to 20), five encoders (21 to 25)."""
+    nodes = []
+    for index, (name, (bus, direction, zero)) in enumerate(MUSCLES.items()):
+        drive = DriveConstants(direction=direction, zero=zero, load=f"muscle_tension.{name}")
+        nodes.append(NodeSpec(f"{name}_drive", bus, 1 + index, f"muscle_length.{name}", drive))
+    for index, (name, (bus, _, _)) in enumerate(MUSCLES.items()):
+        nodes.append(NodeSpec(f"{name}_cell", bus, 11 + index, f"muscle_tension.{name}", CellConstants()))
+    for index, (name, (bus, direction)) in enumerate(JOINTS.items()):
+        encoder = EncoderConstants(direction=direction, zero=-direction * math.pi)
+        nodes.append(NodeSpec(f"{name}_encoder", bus, 21 + index, f"joint_position.{name}", encoder))
+    return nodes
