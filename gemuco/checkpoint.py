@@ -1,0 +1,160 @@
+"""A body schema on disk: model.safetensors for the arrays, manifest.json for everything a person may want to read."""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from safetensors import SafetensorError
+from safetensors.numpy import load as load_tensors
+from safetensors.numpy import save as save_tensors
+
+from gemuco.anomaly import Normal
+from gemuco.errors import CheckpointError, SchemaError
+from gemuco.kernels import Chain, Layer, Weights
+from gemuco.masks import label
+from gemuco.scaler import Scaler
+from gemuco.signals import Layout, Signal
+
+if TYPE_CHECKING:
+    from gemuco.schema import BodySchema
+
+FORMAT = "gemuco.body_schema"
+VERSION = 1
+TENSORS = "model.safetensors"
+MANIFEST = "manifest.json"
+
+
+def save(schema: "BodySchema", folder: Path) -> None:
+    """Write both files; the manifest comes last and names the arrays' hash, so a torn write is noticed."""
+    folder.mkdir(parents=True, exist_ok=True)
+    data = save_tensors({name: np.ascontiguousarray(array) for name, array in _tensors(schema).items()})
+    head = {
+        "format": FORMAT,
+        "version": VERSION,
+        "signals": [
+            {"name": s.name, "size": s.size, "unit": s.unit, "elements": list(s.elements)}
+            for s in schema.layout.signals
+        ],
+        "x_in": list(schema.x_in),
+        "x_out": list(schema.x_out),
+        "masks": [label(mask, schema.layout.names) for mask in schema.masks],
+        "network": {
+            "encoder": [layer.curved for layer in schema.weights.encoder],
+            "decoder": [layer.curved for layer in schema.weights.decoder],
+        },
+        "errors": [[method, label(mask, schema.layout.names)] for method, mask in schema.errors],
+        "conditions": list(schema.biases),
+        "normal": None
+        if schema.normal is None
+        else {"threshold": schema.normal.threshold, "false_alarm": schema.normal.false_alarm},
+        "facts": dict(schema.manifest),
+        "tensors": {"file": TENSORS, "sha256": hashlib.sha256(data).hexdigest()},
+    }
+    _replace(folder / TENSORS, data)
+    _replace(folder / MANIFEST, json.dumps(head, indent=2).encode())
+
+
+def _replace(path: Path, data: bytes) -> None:
+    draft = path.with_name(path.name + ".draft")
+    draft.write_bytes(data)
+    draft.replace(path)
+
+
+def _tensors(schema: "BodySchema") -> dict[str, np.ndarray]:
+    tensors: dict[str, np.ndarray] = {}
+    for part, chain in (("encoder", schema.weights.encoder), ("decoder", schema.weights.decoder)):
+        for index, layer in enumerate(chain):
+            tensors[f"{part}.{index}.matrix"] = layer.matrix
+            tensors[f"{part}.{index}.offset"] = layer.offset
+    for name in ("mean", "std", "low", "high"):
+        tensors[f"scaler.{name}"] = getattr(schema.scaler, name)
+    for index, array in enumerate(schema.errors.values()):
+        tensors[f"errors.{index}"] = array
+    for index, array in enumerate(schema.biases.values()):
+        tensors[f"biases.{index}"] = array
+    tensors["bias"] = schema.bias
+    tensors["anchors"] = schema.anchors
+    if schema.normal is not None:
+        tensors["normal.mean"] = schema.normal.mean
+        tensors["normal.covariance"] = schema.normal.covariance
+    return tensors
+
+
+def load(folder: Path) -> "BodySchema":
+    """Read what `save` wrote; see `BodySchema.load`."""
+    head = _manifest(folder)
+    try:
+        data = (folder / TENSORS).read_bytes()
+    except OSError:
+        raise CheckpointError(f"The model in '{folder}' has no {TENSORS}; train it again.") from None
+    try:
+        if hashlib.sha256(data).hexdigest() != head["tensors"]["sha256"]:
+            raise CheckpointError(f"{TENSORS} in '{folder}' is not the one its manifest describes; train it again.")
+        return _schema(head, load_tensors(data))
+    except CheckpointError:
+        raise
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError, SafetensorError, SchemaError) as error:
+        reason = str(error).strip("'\"").rstrip(".")
+        raise CheckpointError(
+            f"The model in '{folder}' is damaged ({type(error).__name__}: {reason}); train it again."
+        ) from None
+
+
+def _manifest(folder: Path) -> dict[str, Any]:
+    path = folder / MANIFEST
+    try:
+        head = json.loads(path.read_bytes())
+    except OSError:
+        raise CheckpointError(f"There is no model in '{folder}': {MANIFEST} is missing. Run `gemuco train`.") from None
+    except ValueError:
+        raise CheckpointError(f"'{path}' is damaged: it is not JSON; train the model again.") from None
+    if not isinstance(head, dict) or head.get("format") != FORMAT:
+        found = head.get("format") if isinstance(head, dict) else type(head).__name__
+        raise CheckpointError(f"'{path}' does not describe a body schema but {found!r}.")
+    version = head.get("version")
+    if version != VERSION:
+        newer = isinstance(version, int) and version > VERSION
+        advice = "use a newer gemuco" if newer else "train it again"
+        raise CheckpointError(
+            f"The model in '{folder}' has version {version!r}; this gemuco reads {VERSION}: {advice}."
+        )
+    return head
+
+
+def _schema(head: Mapping[str, Any], tensors: Mapping[str, np.ndarray]) -> "BodySchema":
+    from gemuco.schema import BodySchema
+
+    layout = Layout(tuple(Signal(s["name"], s["size"], s["unit"], tuple(s["elements"])) for s in head["signals"]))
+    for name, array in tensors.items():
+        if name != "normal.mean" and not name.startswith("errors.") and not np.isfinite(array).all():
+            raise ValueError(f"array {name} holds NaN or infinity")
+    normal = None
+    if head["normal"] is not None:
+        normal = Normal(tensors["normal.mean"], tensors["normal.covariance"], **head["normal"])
+    return BodySchema(
+        layout=layout,
+        x_in=tuple(head["x_in"]),
+        x_out=tuple(head["x_out"]),
+        masks=tuple(frozenset(text.split("+")) for text in head["masks"]),
+        scaler=Scaler(*(tensors[f"scaler.{name}"] for name in ("mean", "std", "low", "high"))),
+        weights=Weights(_chain(head, tensors, "encoder"), _chain(head, tensors, "decoder")),
+        errors={
+            (method, frozenset(text.split("+")) if text else frozenset()): tensors[f"errors.{index}"]
+            for index, (method, text) in enumerate(head["errors"])
+        },
+        anchors=tensors["anchors"],
+        normal=normal,
+        bias=tensors["bias"],
+        biases={condition: tensors[f"biases.{index}"] for index, condition in enumerate(head["conditions"])},
+        manifest=head["facts"],
+    )
+
+
+def _chain(head: Mapping[str, Any], tensors: Mapping[str, np.ndarray], part: str) -> Chain:
+    return tuple(
+        Layer(tensors[f"{part}.{index}.matrix"], tensors[f"{part}.{index}.offset"], bool(curved))
+        for index, curved in enumerate(head["network"][part])
+    )

@@ -1,0 +1,33 @@
+"""What can be wrong with values, data or a stored model."""
+
+
+class SchemaError(Exception):
+    """Base of every exception that `gemuco` raises on purpose."""
+
+
+class UnknownSignal(SchemaError):
+    """A signal or element is not part of the layout."""
+
+
+class WrongSize(SchemaError):
+    """An array does not have as many elements as its signal."""
+
+
+class NotFinite(SchemaError):
+    """A value that must be a number is NaN or infinite."""
+
+
+class NotObservable(SchemaError):
+    """What was asked for cannot be inferred from what is available."""
+
+
+class NotEnoughData(SchemaError):
+    """Too few samples for what was asked."""
+
+
+class DatasetError(SchemaError):
+    """A data file is damaged, or is not a data file."""
+
+
+class CheckpointError(SchemaError):
+    """A stored model is missing, damaged, or of another version."""

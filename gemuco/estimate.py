@@ -1,0 +1,184 @@
+"""State estimation (paper, II-G): what is missing, by a feasible mask, by descent on z, or by descent on x_in."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from gemuco.descent import DescentConfig, descend
+from gemuco.kernels import Layer, pull, run, trace
+from gemuco.masks import Mask, best, covered_by
+
+if TYPE_CHECKING:
+    from gemuco.schema import BodySchema
+
+SEARCH = DescentConfig(gamma_max=1.0, candidates=12, iterations=30)
+STARTS = 64
+"""How many anchors of the training data a descent chooses its start from."""
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """A signal as well as it can be known.
+
+    Attributes:
+        value: Measured values, with estimates in place of missing elements [unit], shape (n,); NaN if impossible.
+        std: Expected error (1 sigma, from held-out data) [unit], shape (n,); 0 where measured, NaN where unknown.
+        estimated: Which elements were estimated, shape (n,).
+        method: `measured`, `mask` (usages a and b), `latent` (e), `input` (f) or `none`.
+        mask: The signals it was estimated from; empty where measured.
+        residual: How badly the model explains what it was given (root mean square, standard deviations of the
+            training data); 0 where measured, NaN if impossible.
+    """
+
+    value: np.ndarray
+    std: np.ndarray
+    estimated: np.ndarray
+    method: str
+    mask: Mask
+    residual: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Guess:
+    """A vector with every element filled in: values and std in units of the layout, shape (size,)."""
+
+    value: np.ndarray
+    std: np.ndarray
+    method: str
+    mask: Mask
+    residual: float
+
+
+def estimate(schema: "BodySchema", values: Mapping[str, np.ndarray]) -> dict[str, Estimate]:
+    """Every signal of the layout; see `BodySchema.estimate`."""
+    joined = schema.layout.join(values)
+    finite = np.isfinite(joined)
+    whole = schema.layout.whole(finite)
+    guesses: dict[tuple[str, Mask], _Guess] = {}
+    found: dict[str, Estimate] = {}
+    normalised: np.ndarray | None = None
+    for signal in schema.layout.signals:
+        span = schema.layout.slice(signal.name)
+        if signal.name in whole:
+            zeros = np.zeros(signal.size)
+            found[signal.name] = Estimate(joined[span], zeros, zeros > 0, "measured", frozenset(), 0.0)
+            continue
+        if normalised is None:
+            normalised = np.where(finite, schema.scaler.normalise(joined), np.nan)
+        method, mask = _route(schema, signal.name, whole, finite)
+        guess = guesses.get((method, mask))
+        if guess is None:
+            guess = guesses[method, mask] = _guess(schema, method, mask, normalised)
+        missing = ~finite[span]
+        found[signal.name] = Estimate(
+            np.where(missing, guess.value[span], joined[span]),
+            np.where(missing, guess.std[span], 0.0),
+            missing if method != "none" else np.zeros(signal.size, bool),
+            method,
+            mask,
+            guess.residual,
+        )
+    return found
+
+
+def mask_error(schema: "BodySchema", mask: Mask, name: str) -> float:
+    """Mean squared held-out error of a signal under a mask [standard deviations]; 1 where it was never measured."""
+    known = schema.errors.get(("mask", mask))
+    if known is None:
+        return 1.0
+    scaled = known / schema.scaler.std[schema.out_index]
+    return float(np.mean(scaled[schema.out_layout.slice(name)] ** 2))
+
+
+def _route(schema: "BodySchema", name: str, whole: Mask, finite: np.ndarray) -> tuple[str, Mask]:
+    """How to estimate a signal, and from which signals."""
+    if name in schema.x_out:
+        mask = best(schema.masks, whole, lambda m: mask_error(schema, m, name))
+        if mask is not None:
+            return "mask", mask
+        return ("latent", whole & set(schema.x_out)) if finite[schema.out_index].any() else ("none", frozenset())
+    if name in schema.x_in and finite[schema.out_index].any() and covered_by(schema.masks, whole | {name}):
+        return "input", whole
+    return "none", frozenset()
+
+
+def _guess(schema: "BodySchema", method: str, mask: Mask, x: np.ndarray) -> _Guess:
+    full = np.full(schema.layout.size, np.nan)
+    if method == "mask":
+        full[schema.out_index] = schema.infer(x, mask)
+    elif method == "latent":
+        full[schema.out_index] = latent_search(schema, x)
+    elif method == "input":
+        full = input_search(schema, x, mask)
+    given = np.isfinite(x) & np.isfinite(full)
+    residual = float(np.sqrt(np.mean((full[given] - x[given]) ** 2))) if given.any() else float("nan")
+    std = np.full(schema.layout.size, np.nan)
+    known = schema.errors.get((method, mask))
+    if known is not None:
+        std[schema.out_index] = known
+    return _Guess(schema.scaler.restore(full), std, method, mask, residual)
+
+
+def _distance(chain: tuple[Layer, ...], points: np.ndarray, data: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Norm of the difference to the given outputs (paper, eq. state-loss), and its gradient with respect to points."""
+    given = np.isfinite(data)
+    values = trace(chain, points)
+    difference = np.where(given, values[-1] - data, 0.0).astype(points.dtype)
+    norm = np.sqrt(np.einsum("ij,ij->i", difference, difference))
+    return norm, pull(chain, values, difference / np.maximum(norm, 1e-9)[:, None])
+
+
+def latent_search(schema: "BodySchema", x: np.ndarray) -> np.ndarray:
+    """Usage (e): the x_out that fits the given ones best, shape (out_size,) [standard deviations].
+
+    Args:
+        schema: The body schema.
+        x: Every signal [standard deviations], shape (size,), NaN where nothing was measured.
+    """
+    decoder = schema.weights.decoder
+    anchors = schema.anchors[:STARTS]
+    if len(anchors):
+        starts = run(schema.weights.encoder, schema.network_input(anchors, schema.masks[0]))
+    else:
+        starts = np.zeros((1, decoder[0].matrix.shape[0]), np.float32)
+    data = x[schema.out_index]
+    return run(decoder, descend(lambda z: _distance(decoder, z, data), starts, SEARCH).point)
+
+
+def input_search(schema: "BodySchema", x: np.ndarray, available: Mask) -> np.ndarray:
+    """Usage (f): missing x_in that make the network's output fit what is given, shape (size,) [standard deviations].
+
+    Args:
+        schema: The body schema.
+        x: Every signal [standard deviations], shape (size,), NaN where nothing was measured.
+        available: Signals of which every element was measured.
+
+    Returns:
+        x_out as predicted and the missing x_in as found; NaN elsewhere.
+    """
+    missing = set(schema.x_in) - set(schema.x_out) - available
+    mask = max(covered_by(schema.masks, available | missing), key=lambda m: (len(m & missing), len(m)))
+    full = np.where(np.isfinite(x), x, 0.0)
+    base = schema.network_input(full, mask)
+    through, _ = schema.gate(mask)
+    sought = schema.layout.indices(mask - available)
+    columns = np.flatnonzero(np.isin(schema.in_index, sought) & (through > 0))
+    data = x[schema.out_index]
+
+    def objective(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        inputs = np.repeat(base[None], len(points), axis=0)
+        inputs[:, columns] = points
+        norm, gradient = _distance(schema.weights.whole, inputs, data)
+        return norm, gradient[:, columns]
+
+    anchors = schema.anchors[:STARTS]
+    starts = anchors[:, sought] if len(anchors) else np.zeros((1, len(sought)))
+    found = descend(objective, starts.astype(np.float32), SEARCH).point
+    result = np.full(schema.layout.size, np.nan)
+    base[columns] = found
+    result[schema.out_index] = run(schema.weights.whole, base)
+    hidden = sought[~np.isin(sought, schema.out_index)]
+    result[hidden] = found[np.isin(sought, hidden)]
+    return result

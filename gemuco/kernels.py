@@ -1,0 +1,151 @@
+"""Forward and backward passes of the network on plain numpy arrays; no torch, no state.
+
+A chain of layers is y = W_n(... a(x W_1 + b_1) ...) + b_n, with a = tanh where a layer is curved. The latent state and
+the output are linear, so encoder, decoder and both together are all chains, and one set of functions serves them all.
+Rows are samples. Derivatives carry the names of their direction: `pull` brings a gradient from the output to the input
+(reverse mode), `push` brings a change of the input to the output (forward mode).
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+
+class Layer(NamedTuple):
+    """One affine map and whether tanh follows: matrix (n_in, n_out), offset (n_out,)."""
+
+    matrix: np.ndarray
+    offset: np.ndarray
+    curved: bool
+
+
+Chain = tuple[Layer, ...]
+Trace = list[np.ndarray]
+"""Input and the value after every layer, shapes (samples, n)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Weights:
+    """The network's W: z = encoder(x_in, m, p), x_out = decoder(z)."""
+
+    encoder: Chain
+    decoder: Chain
+
+    @property
+    def whole(self) -> Chain:
+        """Encoder and decoder as one chain."""
+        return self.encoder + self.decoder
+
+    def arrays(self) -> list[np.ndarray]:
+        """Every matrix and offset, in the order of the layers."""
+        return [array for layer in self.whole for array in (layer.matrix, layer.offset)]
+
+    def replaced(self, arrays: list[np.ndarray]) -> "Weights":
+        """The same network with other numbers, given in the order of `arrays`."""
+        layers = tuple(Layer(arrays[2 * i], arrays[2 * i + 1], layer.curved) for i, layer in enumerate(self.whole))
+        return Weights(layers[: len(self.encoder)], layers[len(self.encoder) :])
+
+    def astype(self, dtype: type) -> "Weights":
+        """A copy in another precision (float64 for finite differences)."""
+        return self.replaced([array.astype(dtype) for array in self.arrays()])
+
+
+def run(chain: Chain, x: np.ndarray) -> np.ndarray:
+    """Forward pass, shape (n_in,) or (samples, n_in) -> (n_out,) or (samples, n_out)."""
+    for matrix, offset, curved in chain:
+        x = x @ matrix
+        x += offset
+        if curved:
+            np.tanh(x, out=x)
+    return x
+
+
+def trace(chain: Chain, x: np.ndarray) -> Trace:
+    """Forward pass that keeps what the other passes need."""
+    values = [x]
+    for matrix, offset, curved in chain:
+        x = x @ matrix
+        x += offset
+        if curved:
+            np.tanh(x, out=x)
+        values.append(x)
+    return values
+
+
+def pull(chain: Chain, values: Trace, gradient: np.ndarray) -> np.ndarray:
+    """Gradient of a scalar with respect to the output -> with respect to the input, shapes (samples, n)."""
+    for (matrix, _, curved), value in zip(reversed(chain), reversed(values), strict=False):
+        if curved:
+            gradient = gradient * (1.0 - value * value)
+        gradient = gradient @ matrix.T
+    return gradient
+
+
+def pull_weights(chain: Chain, values: Trace, gradient: np.ndarray) -> list[np.ndarray]:
+    """Gradient with respect to the output -> with respect to every matrix and offset, summed over the samples."""
+    found: list[np.ndarray] = []
+    for index in range(len(chain) - 1, -1, -1):
+        matrix, _, curved = chain[index]
+        if curved:
+            gradient = gradient * (1.0 - values[index + 1] ** 2)
+        found.append(gradient.sum(axis=0))
+        found.append(values[index].T @ gradient)
+        if index:
+            gradient = gradient @ matrix.T
+    return found[::-1]
+
+
+def push(chain: Chain, values: Trace, tangent: np.ndarray) -> np.ndarray:
+    """Change of the input -> change of the output to first order, shapes (samples, n)."""
+    for (matrix, _, curved), value in zip(chain, values[1:], strict=True):
+        tangent = tangent @ matrix
+        if curved:
+            tangent *= 1.0 - value * value
+    return tangent
+
+
+class Curvature:
+    """First and mixed second derivatives of s = w . y(x): its gradient g = dy/dx^T w, then d(u . g)/dx for a fixed u.
+
+    Forward over reverse: the tangent u is pushed forward through the net, and w . (dy/dx u) is pulled back again. The
+    chain of gradients that the second pull needs is the one that gave g, so it is kept.
+    """
+
+    __slots__ = ("_chain", "_gradients", "_slopes", "_values", "gradient")
+
+    def __init__(self, chain: Chain, x: np.ndarray, w: np.ndarray) -> None:
+        """Run forward at x, shape (samples, n_in), and pull w, shape (samples, n_out), back to `gradient`."""
+        self._chain = chain
+        self._values = trace(chain, x)
+        self._slopes: list[np.ndarray | None] = []
+        self._gradients: list[np.ndarray] = []
+        gradient = w
+        for (matrix, _, curved), value in zip(reversed(chain), reversed(self._values), strict=False):
+            slope = 1.0 - value * value if curved else None
+            self._slopes.append(slope)
+            self._gradients.append(gradient)
+            gradient = (gradient if slope is None else gradient * slope) @ matrix.T
+        self._slopes.reverse()
+        self._gradients.reverse()
+        self.gradient = gradient
+
+    def mixed(self, tangent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """What happens to u . g: (dy/dx u, shape (samples, n_out)) and (d(u . g)/dx, shape (samples, n_in))."""
+        tangents: list[np.ndarray] = []
+        for (matrix, _, _), slope in zip(self._chain, self._slopes, strict=True):
+            tangent = tangent @ matrix
+            tangents.append(tangent)
+            if slope is not None:
+                tangent = tangent * slope
+        second: np.ndarray | None = None
+        for index in range(len(self._chain) - 1, -1, -1):
+            slope = self._slopes[index]
+            if slope is not None:
+                # d/da of (1 - tanh(a)^2) is -2 tanh(a) (1 - tanh(a)^2).
+                bend = -2.0 * self._values[index + 1] * slope * tangents[index] * self._gradients[index]
+                second = bend if second is None else second * slope + bend
+            if second is not None:
+                second = second @ self._chain[index].matrix.T
+        assert second is not None or not any(layer.curved for layer in self._chain)
+        return tangent, np.zeros_like(self.gradient) if second is None else second

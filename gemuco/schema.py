@@ -1,0 +1,172 @@
+"""The body schema: what a body has learned about itself, as one immutable value.
+
+Nothing here changes in place. What is learned later is another schema (`with_weights`, `with_normal`), so a loop that
+holds one can go on with it while another thread makes the next.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gemuco import anomaly, checkpoint
+from gemuco.anomaly import AnomalyScore, Normal
+from gemuco.errors import UnknownSignal, WrongSize
+from gemuco.estimate import Estimate, estimate
+from gemuco.kernels import Weights, run
+from gemuco.masks import Mask, bits, label
+from gemuco.scaler import CLIP, Scaler
+from gemuco.signals import Layout
+
+ErrorTable = Mapping[tuple[str, Mask], np.ndarray]
+"""(method, signals it was inferred from) -> expected error of every x_out element [unit], shape (out_size,)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BodySchema:
+    """Layout, masks, scaler and network weights together, and the verbs they allow.
+
+    Attributes:
+        layout: Every signal of the body.
+        x_in: Signals the network is given, in the order of the layout.
+        x_out: Signals the network infers, in the order of the layout.
+        masks: The feasible masks: what is enough to infer x_out.
+        scaler: Units outside, standard deviations inside.
+        weights: The network's W.
+        errors: How well every mask did on held-out data (1 sigma).
+        anchors: Some rows of the training data [standard deviations], shape (n, layout.size): where a descent starts.
+        normal: What prediction errors are like on a healthy body; None if never learned.
+        bias: The parametric bias p of the present condition, shape (bias_size,).
+        biases: Condition -> its p.
+        manifest: Facts that whoever made the schema wants kept with it (JSON values).
+    """
+
+    layout: Layout
+    x_in: tuple[str, ...]
+    x_out: tuple[str, ...]
+    masks: tuple[Mask, ...]
+    scaler: Scaler
+    weights: Weights
+    errors: ErrorTable = field(default_factory=dict)
+    anchors: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    normal: Normal | None = None
+    bias: np.ndarray = field(default_factory=lambda: np.zeros(0, np.float32))
+    biases: Mapping[str, np.ndarray] = field(default_factory=dict)
+    manifest: Mapping[str, Any] = field(default_factory=dict)
+    out_layout: Layout = field(init=False, repr=False)
+    in_index: np.ndarray = field(init=False, repr=False)
+    out_index: np.ndarray = field(init=False, repr=False)
+    _gates: dict[Mask, tuple[np.ndarray, np.ndarray]] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        set_field = object.__setattr__
+        set_field(self, "out_layout", self.layout.subset(self.x_out))
+        set_field(self, "in_index", self.layout.indices(self.x_in))
+        set_field(self, "out_index", self.layout.indices(self.x_out))
+        inputs = len(self.in_index) + len(self.x_in) + len(self.bias)
+        shape = (self.weights.encoder[0].matrix.shape[0], self.weights.decoder[-1].matrix.shape[1])
+        if shape != (inputs, len(self.out_index)):
+            raise WrongSize(
+                f"The network is {shape[0]} -> {shape[1]}; the layout asks for {inputs} -> {len(self.out_index)}."
+            )
+        set_field(self, "_gates", {})
+        for array in (*self.weights.arrays(), self.anchors, self.bias):
+            array.setflags(write=False)
+
+    def gate(self, mask: Mask) -> tuple[np.ndarray, np.ndarray]:
+        """What lets a mask's signals through: (0 or 1 per x_in element, the input's tail of m and p), float32."""
+        found = self._gates.get(mask)
+        if found is None:
+            for name in sorted(mask - set(self.x_in)):
+                raise UnknownSignal(f"Signal '{name}' is not an input of the network. Inputs: {', '.join(self.x_in)}.")
+            m = bits(mask, self.x_in)
+            sizes = [self.layout.signal(name).size for name in self.x_in]
+            found = np.repeat(m, sizes), np.concatenate([m, self.bias]).astype(np.float32)
+            self._gates[mask] = found
+        return found
+
+    def network_input(self, normalised: np.ndarray, mask: Mask) -> np.ndarray:
+        """x_in masked and clipped, with m and p behind it.
+
+        Args:
+            normalised: Every signal [standard deviations], shape (size,) or (samples, size); NaN where masked is fine.
+            mask: Which signals to let through.
+        """
+        through, tail = self.gate(mask)
+        x = np.empty((*normalised.shape[:-1], len(through) + len(tail)), np.float32)
+        values = np.where(through, normalised[..., self.in_index], 0.0)
+        np.clip(values, -CLIP, CLIP, out=x[..., : len(through)])
+        x[..., len(through) :] = tail
+        return x
+
+    def infer(self, normalised: np.ndarray, mask: Mask) -> np.ndarray:
+        """Usage (a) and (b): every x_out from the signals of a mask [standard deviations], shape (..., out_size)."""
+        return run(self.weights.whole, self.network_input(normalised, mask))
+
+    def normalise(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Named arrays [unit] -> one vector [standard deviations]; NaN where a value is absent or infinite."""
+        joined = self.layout.join(values)
+        joined[~np.isfinite(joined)] = np.nan
+        return self.scaler.normalise(joined)
+
+    def estimate(self, values: Mapping[str, np.ndarray]) -> dict[str, Estimate]:
+        """Every signal: measured where it can be, estimated where it cannot (paper, II-G).
+
+        Args:
+            values: Signal -> array [its unit], shape (n,). NaN elements and absent signals are what is missing.
+
+        Raises:
+            UnknownSignal: A name is not in the layout.
+            WrongSize: An array does not have its signal's size.
+        """
+        return estimate(self, values)
+
+    def predict_error(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Measured minus predicted of every x_out element [unit], shape (out_size,) or (samples, out_size).
+
+        Each signal is predicted from the others where a feasible mask allows; NaN where something is missing.
+        """
+        return anomaly.prediction_error(self, values)
+
+    def score(self, values: Mapping[str, np.ndarray]) -> AnomalyScore:
+        """How unlike normal a sample is (paper, II-K)."""
+        return anomaly.score(self, values)
+
+    def error_rows(self) -> list[tuple[str, str, str, float]]:
+        """For a table: (mask, signal, unit, root mean square error over its elements) on held-out data."""
+        rows: list[tuple[str, str, str, float]] = []
+        for mask in self.masks:
+            known = self.errors.get(("mask", mask))
+            if known is None:
+                continue
+            for name, part in self.out_layout.split(known).items():
+                rms = float(np.sqrt(np.mean(part**2)))
+                rows.append((label(mask, self.layout.names), name, self.layout.signal(name).unit, rms))
+        return rows
+
+    def with_weights(self, weights: Weights, errors: ErrorTable | None = None) -> "BodySchema":
+        """The same body with another W, and with the errors it was found to make if they are known."""
+        return replace(self, weights=weights, errors=self.errors if errors is None else errors)
+
+    def with_normal(self, normal: Normal | None) -> "BodySchema":
+        """The same body with other statistics of the normal."""
+        return replace(self, normal=normal)
+
+    def with_manifest(self, **facts: Any) -> "BodySchema":
+        """The same body with more facts kept beside it."""
+        return replace(self, manifest={**self.manifest, **facts})
+
+    def save(self, folder: str | Path) -> None:
+        """Write model.safetensors and manifest.json into a folder."""
+        checkpoint.save(self, Path(folder))
+
+    @classmethod
+    def load(cls, folder: str | Path) -> "BodySchema":
+        """Read what `save` wrote.
+
+        Raises:
+            CheckpointError: Nothing there, damaged, not a body schema, or of another version.
+        """
+        return checkpoint.load(Path(folder))

@@ -1,0 +1,136 @@
+"""Named vectors and the one long vector they are parts of."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from gemuco.errors import UnknownSignal, WrongSize
+
+
+@dataclass(frozen=True, slots=True)
+class Signal:
+    """A named vector of sensor or control values (the paper's x_i).
+
+    Attributes:
+        name: Such as `joint_position`.
+        size: How many elements.
+        unit: SI unit of every element.
+        elements: Names of the elements; numbered if not given.
+    """
+
+    name: str
+    size: int
+    unit: str
+    elements: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.size < 1:
+            raise WrongSize(f"Signal '{self.name}' has {self.size} elements; it needs at least one.")
+        if not self.elements:
+            object.__setattr__(self, "elements", tuple(str(i) for i in range(self.size)))
+        if len(self.elements) != self.size:
+            raise WrongSize(f"Signal '{self.name}' has {self.size} elements but {len(self.elements)} element names.")
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """Several signals in a fixed order: where each lies in the vector of all of them."""
+
+    signals: tuple[Signal, ...]
+    names: tuple[str, ...] = field(init=False, compare=False, repr=False)
+    size: int = field(init=False, compare=False, repr=False)
+    _slices: dict[str, slice] = field(init=False, compare=False, repr=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "signals", tuple(self.signals))
+        slices: dict[str, slice] = {}
+        start = 0
+        for signal in self.signals:
+            if signal.name in slices:
+                raise UnknownSignal(f"Signal '{signal.name}' is in the layout twice; names must differ.")
+            slices[signal.name] = slice(start, start + signal.size)
+            start += signal.size
+        object.__setattr__(self, "names", tuple(slices))
+        object.__setattr__(self, "size", start)
+        object.__setattr__(self, "_slices", slices)
+
+    def slice(self, name: str) -> slice:
+        """Where a signal lies in the vector.
+
+        Raises:
+            UnknownSignal: No signal has this name.
+        """
+        try:
+            return self._slices[name]
+        except KeyError:
+            known = ", ".join(self.names)
+            raise UnknownSignal(f"Signal '{name}' is not in the schema. Known signals: {known}.") from None
+
+    def signal(self, name: str) -> Signal:
+        """The signal of a name."""
+        self.slice(name)
+        return self.signals[self.names.index(name)]
+
+    def subset(self, names: Iterable[str]) -> "Layout":
+        """The layout of some of the signals, in the order of this one."""
+        wanted = set(names)
+        for name in wanted:
+            self.slice(name)
+        return Layout(tuple(signal for signal in self.signals if signal.name in wanted))
+
+    def indices(self, names: Iterable[str]) -> np.ndarray:
+        """Positions of the elements of some signals in the vector, in the order of the layout, shape (n,)."""
+        subset = self.subset(names)
+        parts = [np.arange(self._slices[name].start, self._slices[name].stop) for name in subset.names]
+        return np.concatenate(parts) if parts else np.zeros(0, int)
+
+    def element(self, index: int) -> str:
+        """`signal.element` at a position of the vector."""
+        for signal in self.signals:
+            span = self._slices[signal.name]
+            if span.start <= index < span.stop:
+                return f"{signal.name}.{signal.elements[index - span.start]}"
+        raise UnknownSignal(f"Element {index} is outside of the layout of {self.size} elements.")
+
+    def join(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Named arrays -> one vector.
+
+        Args:
+            values: Signal -> array [its unit], shape (n,) or (samples, n). Absent signals become NaN.
+
+        Returns:
+            Shape (size,) or (samples, size), float64.
+
+        Raises:
+            UnknownSignal: A name is not of this layout.
+            WrongSize: An array does not have its signal's size, or another number of samples than the rest.
+        """
+        arrays: dict[str, np.ndarray] = {}
+        leading: tuple[int, ...] | None = None
+        for name, value in values.items():
+            span = self.slice(name)
+            array = np.asarray(value, float)
+            size = span.stop - span.start
+            if array.ndim not in (1, 2) or array.shape[-1] != size:
+                raise WrongSize(f"Signal '{name}' has {size} elements, but the array has shape {array.shape}.")
+            if leading is not None and array.shape[:-1] != leading:
+                raise WrongSize(
+                    f"Signal '{name}' has shape {array.shape}; the signals before it have {leading} samples."
+                )
+            leading = array.shape[:-1]
+            arrays[name] = array
+        joined = np.full((*(leading or ()), self.size), np.nan)
+        for name, array in arrays.items():
+            joined[..., self._slices[name]] = array
+        return joined
+
+    def split(self, vector: np.ndarray) -> dict[str, np.ndarray]:
+        """One vector, shape (..., size) -> signal -> array, shape (..., n). The arrays are views."""
+        if vector.shape[-1] != self.size:
+            raise WrongSize(f"The layout has {self.size} elements, but the array has shape {vector.shape}.")
+        return {name: vector[..., span] for name, span in self._slices.items()}
+
+    def whole(self, finite: np.ndarray) -> frozenset[str]:
+        """Signals of which every element is there; `finite` is a truth value per element, shape (size,)."""
+        return frozenset(name for name, span in self._slices.items() if finite[span].all())
