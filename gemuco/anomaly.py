@@ -30,7 +30,7 @@ class AnomalyScore:
     Attributes:
         score: Mahalanobis distance; NaN without normal data or without any error to judge.
         threshold: Score above which it counts as an anomaly.
-        contribution: Signal of x_out -> by how much score^2 drops if an element is left out, shape (n,); NaN if unknown.
+        contribution: Signal of x_out -> by how much score^2 drops without an element, shape (n,); NaN if unknown.
         blamed: `signal.element` of the largest contribution; empty if the score is NaN.
     """
 

@@ -1,6 +1,7 @@
 """z = h_enc(x_in, m, p), x_out = h_dec(z); nothing else lives here."""
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import torch
 from torch import nn
@@ -10,7 +11,7 @@ from gemuco.kernels import Layer, Weights
 
 def _chain(sizes: Sequence[int]) -> nn.Sequential:
     layers: list[nn.Module] = []
-    for index, (wide, narrow) in enumerate(zip(sizes[:-1], sizes[1:], strict=True)):
+    for index, (wide, narrow) in enumerate(pairwise(sizes)):
         if index:
             layers.append(nn.Tanh())
         layers.append(nn.Linear(wide, narrow))

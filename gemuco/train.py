@@ -189,7 +189,7 @@ class _Trainer:
             for rows, chosen in self.batches():
                 optimiser.zero_grad(set_to_none=True)
                 loss = self.loss(self.material, rows, chosen)
-                loss.backward()  # type: ignore[no-untyped-call]
+                loss.backward()
                 optimiser.step()
                 schedule.step()
                 losses.append(loss.detach())
