@@ -38,6 +38,10 @@ class SystemClock:
         if remaining > 0:
             time.sleep(remaining)
 
+    def wait(self, event: threading.Event, deadline: float) -> bool:
+        """Sleep until the event is set, at most until `monotonic()` reaches the deadline; whether it was set."""
+        return event.wait(max(deadline - time.monotonic(), 0.0))
+
 
 class ManualClock:
     """A clock that only moves when told to, so that a test of time needs no time."""
@@ -64,3 +68,7 @@ class ManualClock:
         """Block until another thread has advanced the clock to the deadline."""
         with self._moved:
             self._moved.wait_for(lambda: self._now >= deadline)
+
+    def wait(self, event: threading.Event, deadline: float) -> bool:
+        """Give those who may set the event 20 ms of real time, whatever the deadline; whether it was set."""
+        return event.wait(0.02)

@@ -97,3 +97,6 @@ class Device(abc.ABC):
     def apply(self, values: np.ndarray) -> None:
         """Send set-points [the signal's unit], shape (len(commands),), already limited by `Robot`."""
         raise NotImplementedError(f"{self.name} takes no commands")
+
+    def idle(self) -> None:
+        """Called instead of `apply` in every cycle that has no set-point; may keep a state machine going."""

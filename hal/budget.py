@@ -1,0 +1,85 @@
+"""Whether the frames of a cycle fit on the bus, before anything is sent.
+
+Source: CiA 301 frames on classic CAN with 11-bit identifiers (ISO 11898-1): 44 bits beside the data, of which 34 and
+the data may be stuffed once in four after the first, and 3 bits of space between frames.
+"""
+
+from dataclasses import dataclass
+
+from hal import registry
+from hal.config import RobotConfig
+from hal.errors import ConfigError
+
+HEARTBEAT_RATE = 10.0
+"""Of every node [Hz]."""
+OWN_HEARTBEAT_RATE = 20.0
+"""Of the HAL [Hz]."""
+
+
+def frame_bits(size: int) -> int:
+    """Longest a classic frame with `size` data bytes can be on the wire [bit], stuffing and space included."""
+    return 47 + 8 * size + (34 + 8 * size - 1) // 4
+
+
+@dataclass(frozen=True, slots=True)
+class BusBudget:
+    """What the cyclic frames take of one bus.
+
+    Attributes:
+        bus: Name in the robot file.
+        frames: Frames per cycle, the SYNC included.
+        bits: Their longest length together [bit].
+        heartbeats: What heartbeats add [bit/s].
+        rate: Cycles per second [Hz].
+        bitrate: Of the bus [bit/s].
+    """
+
+    bus: str
+    frames: int
+    bits: int
+    heartbeats: float
+    rate: float
+    bitrate: int
+
+    @property
+    def load(self) -> float:
+        """Share of the bit rate, 0 to 1 and beyond."""
+        return (self.bits * self.rate + self.heartbeats) / self.bitrate
+
+    def __str__(self) -> str:
+        return (
+            f"{self.frames} frames of together {self.bits} bits at {self.rate:g} Hz and {self.heartbeats / 1e3:.1f} "
+            f"kbit/s of heartbeats are {self.load:.0%} of {self.bitrate / 1e6:g} Mbit/s"
+        )
+
+
+def budgets(config: RobotConfig) -> list[BusBudget]:
+    """The budget of every bus of a robot."""
+    found = []
+    for name, bus in config.buses.items():
+        sizes = [0]
+        nodes = 0
+        for device in config.devices.values():
+            if device.bus == name:
+                nodes += 1
+                sizes += registry.driver(config.kinds[device.kind].driver).FRAMES
+        beats = (nodes * HEARTBEAT_RATE + OWN_HEARTBEAT_RATE) * frame_bits(1)
+        bits = sum(frame_bits(size) for size in sizes)
+        found.append(BusBudget(name, len(sizes), bits, beats, config.rates.hal, bus.bitrate))
+    return found
+
+
+def check(config: RobotConfig) -> None:
+    """Refuse a robot whose frames do not fit.
+
+    Raises:
+        ConfigError: A bus would carry more than its `max_load`; the message has the arithmetic.
+    """
+    for budget in budgets(config):
+        allowed = config.buses[budget.bus].max_load
+        if budget.load > allowed:
+            fits = (allowed * budget.bitrate - budget.heartbeats) / budget.bits
+            raise ConfigError(
+                f"Bus '{budget.bus}' would carry too much: {budget}, and buses.{budget.bus}.max_load is {allowed:.0%}. "
+                f"Lower rates.hal to {max(fits, 0):.0f} Hz, or move devices to another bus."
+            )

@@ -1,0 +1,72 @@
+"""Opens devices, and opens them again when they come back; enables nothing."""
+
+import threading
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+
+from hal.device import Device, DeviceState
+from hal.errors import HalError
+
+PASS_PERIOD = 0.05
+"""How often [s] the devices are looked at."""
+BACK_OFF = (0.2, 0.4, 0.8)
+"""Pauses [s] between tries to open the same device; the last is repeated."""
+NEED_OPENING = (DeviceState.CLOSED, DeviceState.OPENING, DeviceState.SILENT)
+
+
+class Caretaker:
+    """Tries all devices at once, each in its own thread; one that does not answer delays no other."""
+
+    def __init__(self, devices: Sequence[Device]) -> None:
+        self._devices = tuple(devices)
+        self._tries = dict.fromkeys(self._devices, 0)
+        self._not_before = dict.fromkeys(self._devices, 0)
+        self._running: dict[Device, Future[None]] = {}
+        self._passes = 0
+        self._stopping = threading.Event()
+        self._pool: ThreadPoolExecutor | None = None
+        self._thread: threading.Thread | None = None
+
+    def start(self) -> None:
+        """Try every device once, then go on looking after them in a thread of its own."""
+        self._stopping.clear()
+        self._pool = ThreadPoolExecutor(max(len(self._devices), 1), "commission")
+        self._look()
+        for future in list(self._running.values()):
+            future.result()
+        self._thread = threading.Thread(target=self._run, name="caretaker", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End the thread; waits for tries that are under way."""
+        self._stopping.set()
+        if self._thread:
+            self._thread.join()
+        if self._pool:
+            self._pool.shutdown()
+        self._thread = self._pool = None
+
+    def _run(self) -> None:
+        while not self._stopping.wait(PASS_PERIOD):
+            self._look()
+
+    def _look(self) -> None:
+        self._passes += 1
+        for device in self._devices:
+            running = self._running.get(device)
+            if running is not None and not running.done():
+                continue
+            if device.health().state not in NEED_OPENING:
+                self._tries[device] = 0
+            elif self._passes >= self._not_before[device] and self._pool:
+                pause = BACK_OFF[min(self._tries[device], len(BACK_OFF) - 1)]
+                self._tries[device] += 1
+                self._not_before[device] = self._passes + round(pause / PASS_PERIOD)
+                self._running[device] = self._pool.submit(self._open, device)
+
+    @staticmethod
+    def _open(device: Device) -> None:
+        try:
+            device.open()
+        except HalError:
+            return  # the device's health says what is wrong, and the next try comes

@@ -1,0 +1,56 @@
+"""A load cell: the force [N] in a wire."""
+
+import math
+
+from hal.commissioning import Plan
+from hal.config import Finite
+from hal.device import DeviceState
+from hal.drivers.canopen_node import CanopenNode, NodeSettings, Place
+from hal.errors import DeviceRefused
+from hal.protocols import cia404
+
+
+class CellSettings(NodeSettings):
+    """Settings of a load cell; unit and decimal digits are read from the device."""
+
+    zero: Finite = 0.0
+    """Added to what the cell reads [N]."""
+
+
+class Cia404Cell(CanopenNode):
+    """One load cell. A value whose status is not good, or during an emergency, is NaN."""
+
+    FRAMES = (cia404.VALUE_LAYOUT.size,)
+    Settings = CellSettings
+
+    def __init__(self, place: Place, settings: CellSettings) -> None:
+        super().__init__(place, settings)
+        self._zero = settings.zero
+        self._scale = math.nan
+        self._status = 0
+
+    def _plan(self) -> Plan:
+        return Plan(cia404.PROFILE, (), cia404.VALUE)
+
+    def _calibrate(self) -> None:
+        unit = self._sdo.read(cia404.UNIT.index, cia404.UNIT.subindex)
+        digits = self._sdo.read(cia404.DIGITS.index, cia404.DIGITS.subindex)
+        scale = cia404.newtons_per_digit(unit, digits)
+        if scale is None:
+            raise DeviceRefused(f"{self._place} measures in unit {unit:08X}h (6131h), which is no force.")
+        self._scale = scale
+
+    def _on_tpdo(self, data: bytearray, received: float) -> None:
+        if len(data) != 5:
+            self._counters["malformed"] += 1
+            return
+        if not self.is_commissioned:
+            return
+        digits, self._status = cia404.VALUE_LAYOUT.unpack(data)
+        good = not self._status and not self._emergency
+        self._answered(self._zero + self._scale * digits if good else math.nan, received)
+
+    def _running(self) -> tuple[DeviceState, str]:
+        if self._status:
+            return DeviceState.READY, f"{self._place}: {cia404.describe_status(self._status)}."
+        return DeviceState.READY, ""

@@ -1,0 +1,45 @@
+"""Names in a robot file -> what they stand for, imported when asked for."""
+
+import importlib
+from typing import Any
+
+from hal.errors import ConfigError
+
+DRIVERS = {
+    "cia402": "hal.drivers.cia402:Cia402Drive",
+    "cia404": "hal.drivers.cia404:Cia404Cell",
+    "cia406": "hal.drivers.cia406:Cia406Encoder",
+}
+
+
+def load(name: str) -> Any:
+    """The object that `module:name` stands for.
+
+    Raises:
+        ConfigError: The name is malformed, or there is no such module or no such object in it.
+    """
+    module_name, colon, attribute = name.partition(":")
+    if not (colon and module_name and attribute):
+        raise ConfigError(f"'{name}' is not of the form 'module:name'.")
+    try:
+        module = importlib.import_module(module_name)
+    except ImportError as error:
+        raise ConfigError(f"'{name}' cannot be loaded: {error}. Is the package that has it installed?") from error
+    try:
+        return getattr(module, attribute)
+    except AttributeError:
+        known = sorted(key for key, value in vars(module).items() if not key.startswith("_") and callable(value))
+        raise ConfigError(f"Module '{module_name}' has no '{attribute}'. It has: {', '.join(known)}.") from None
+
+
+def driver(name: str) -> Any:
+    """The driver class behind a kind's `driver`: a known name, or `module:name` for one of your own.
+
+    Raises:
+        ConfigError: Unknown.
+    """
+    if ":" in name:
+        return load(name)
+    if name not in DRIVERS:
+        raise ConfigError(f"There is no driver '{name}'. Known: {', '.join(DRIVERS)}, or 'module:name' of your own.")
+    return load(DRIVERS[name])
