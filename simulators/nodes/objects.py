@@ -1,0 +1,207 @@
+"""A node's object dictionary: what the EDS file says, and the values that are there now."""
+
+import functools
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from enum import IntEnum
+from pathlib import Path
+
+import canopen
+from canopen.objectdictionary import ODVariable
+
+Key = tuple[int, int]
+"""Index and sub-index."""
+Value = int | float | str
+
+_FORMATS = {2: "b", 3: "h", 4: "i", 5: "B", 6: "H", 7: "I", 8: "f"}
+_STRING = 9
+STRING_LIMIT = 64
+"""Bytes that a writable string holds."""
+
+
+class Abort(IntEnum):
+    """SDO abort codes (CiA 301, table 22) that our nodes send."""
+
+    TOGGLE = 0x0503_0000
+    COMMAND = 0x0504_0001
+    MEMORY = 0x0504_0005
+    WRITE_ONLY = 0x0601_0001
+    READ_ONLY = 0x0601_0002
+    NO_OBJECT = 0x0602_0000
+    NOT_MAPPABLE = 0x0604_0041
+    MAPPING_LENGTH = 0x0604_0042
+    INCOMPATIBLE = 0x0604_0043
+    LENGTH = 0x0607_0010
+    TOO_LONG = 0x0607_0012
+    TOO_SHORT = 0x0607_0013
+    NO_SUBINDEX = 0x0609_0011
+    VALUE = 0x0609_0030
+    TOO_HIGH = 0x0609_0031
+    TOO_LOW = 0x0609_0032
+    DEVICE_STATE = 0x0800_0022
+
+
+class Refused(Exception):
+    """An access that the node answers with an abort code."""
+
+    def __init__(self, code: Abort) -> None:
+        super().__init__(f"0x{code:08X} {code.name}")
+        self.code = code
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """What the EDS says of one value."""
+
+    format: str
+    """As in `struct`; empty for a string."""
+    access: str
+    default: Value
+    low: int | None
+    high: int | None
+    mappable: bool
+
+    @property
+    def size(self) -> int:
+        """Bytes; 0 for a string."""
+        return struct.calcsize("<" + self.format)
+
+    def encode(self, value: Value) -> bytes:
+        """Value as it goes over the bus."""
+        return value.encode() if isinstance(value, str) else struct.pack("<" + self.format, value)
+
+    def decode(self, data: bytes) -> Value:
+        """Value from bytes of the right number.
+
+        Raises:
+            Refused: The length does not fit.
+        """
+        if not self.format:
+            if len(data) > STRING_LIMIT:
+                raise Refused(Abort.MEMORY)
+            return data.decode("ascii", "replace").rstrip("\0")
+        if len(data) != self.size:
+            raise Refused(Abort.TOO_LONG if len(data) > self.size else Abort.TOO_SHORT)
+        value: Value = struct.unpack("<" + self.format, data)[0]
+        return value
+
+    def check(self, value: Value) -> None:
+        """Refuse a number beyond the limits."""
+        if isinstance(value, str):
+            return
+        if self.high is not None and value > self.high:
+            raise Refused(Abort.TOO_HIGH)
+        if self.low is not None and value < self.low:
+            raise Refused(Abort.TOO_LOW)
+
+
+def read_eds(path: Path, node: int) -> dict[Key, Entry]:
+    """Every value of an EDS file, with the defaults that this node id gives."""
+    entries = {}
+    for key, (entry, is_relative) in _sheet(path).items():
+        entries[key] = replace(entry, default=entry.default + node) if is_relative else entry  # type: ignore[operator]
+    return entries
+
+
+@functools.cache
+def _sheet(path: Path) -> dict[Key, tuple[Entry, bool]]:
+    """The values of an EDS file for node 0, and whether the node id is added to their defaults."""
+    dictionary = canopen.import_od(str(path), node_id=0)
+    return {(v.index, v.subindex): (_entry(v), v.relative) for v in _variables(dictionary)}
+
+
+def _variables(dictionary: canopen.ObjectDictionary) -> Iterator[ODVariable]:
+    for item in dictionary.values():
+        if isinstance(item, ODVariable):
+            yield item
+        else:
+            yield from item.subindices.values()
+
+
+def _entry(variable: ODVariable) -> Entry:
+    kind = variable.data_type
+    if kind != _STRING and kind not in _FORMATS:
+        raise ValueError(f"Object {variable.index:04X}:{variable.subindex} has a data type {kind} that no node uses.")
+    empty: Value = "" if kind == _STRING else 0
+    default = empty if variable.default is None else variable.default
+    return Entry(
+        format=_FORMATS.get(kind, ""),
+        access=variable.access_type,
+        default=default,
+        low=variable.min,
+        high=variable.max,
+        mappable=variable.pdo_mappable,
+    )
+
+
+class ObjectDictionary:
+    """The values of one node, and what happens when a master writes them.
+
+    The node itself uses `values` directly; `read` and `write` are the master's way and keep the rules.
+    """
+
+    def __init__(self, entries: dict[Key, Entry]) -> None:
+        self.entries = entries
+        self.values: dict[Key, Value] = {}
+        self.power_on: dict[Key, Value] = {}
+        """What differs from the EDS in this very device: its serial number, its constants."""
+        self.on_write: dict[int, Callable[[int, Value, Value], None]] = {}
+        """By index: called with sub-index, old and new value before the new one is kept; may raise `Refused`."""
+        self.after_write: dict[int, Callable[[int], None]] = {}
+        """By index: called with the sub-index after the new value is kept."""
+        self.restore()
+
+    def restore(self, first: int = 0, last: int = 0xFFFF) -> None:
+        """Set the values of some indices as they are after power-on."""
+        for key, entry in self.entries.items():
+            if first <= key[0] <= last:
+                self.values[key] = self.power_on.get(key, entry.default)
+
+    def entry(self, key: Key) -> Entry:
+        """The description of a value.
+
+        Raises:
+            Refused: There is no such object or sub-index.
+        """
+        try:
+            return self.entries[key]
+        except KeyError:
+            known = any(index == key[0] for index, _ in self.entries)
+            raise Refused(Abort.NO_SUBINDEX if known else Abort.NO_OBJECT) from None
+
+    def read(self, key: Key) -> bytes:
+        """A value as a master reads it.
+
+        Raises:
+            Refused: It does not exist or cannot be read.
+        """
+        entry = self.entry(key)
+        if entry.access == "wo":
+            raise Refused(Abort.WRITE_ONLY)
+        return entry.encode(self.values[key])
+
+    def write(self, key: Key, data: bytes) -> None:
+        """Write a value as a master does.
+
+        Raises:
+            Refused: It does not exist, cannot be written, has another length, or the node does not take it now.
+        """
+        entry = self.entry(key)
+        if entry.access in ("ro", "const"):
+            raise Refused(Abort.READ_ONLY)
+        self.assign(key, entry.decode(data))
+
+    def assign(self, key: Key, value: Value) -> None:
+        """Keep a value that a master has sent, by SDO or PDO, with its consequences.
+
+        Raises:
+            Refused: It is out of range, or the node does not take it now.
+        """
+        self.entries[key].check(value)
+        index, sub = key
+        if index in self.on_write:
+            self.on_write[index](sub, self.values[key], value)
+        self.values[key] = value
+        if index in self.after_write:
+            self.after_write[index](sub)

@@ -1,0 +1,38 @@
+"""What the nodes of a robot see of the world: the newest measurement, swapped whole."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """One measurement of the world.
+
+    Attributes:
+        time: Simulated time [s].
+        values: By signal, as `World.measure` gives them; shapes (n,).
+    """
+
+    time: float
+    values: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+
+@dataclass(slots=True)
+class Plant:
+    """The newest snapshot, written by the physics and read by every node."""
+
+    places: Mapping[str, tuple[str, int]]
+    """`signal.element` -> signal and position in it."""
+    snapshot: Snapshot
+
+    def read(self, element: str) -> float:
+        """The newest value of an element [its signal's unit]."""
+        signal, index = self.places[element]
+        return float(self.snapshot.values[signal][index])
+
+    @property
+    def time(self) -> float:
+        """Simulated time [s] of the snapshot."""
+        return self.snapshot.time

@@ -1,0 +1,155 @@
+"""One CAN bus with all the simulated nodes on it, behind a single python-can bus object."""
+
+import contextlib
+import logging
+import threading
+from collections.abc import Callable, Sequence
+
+import can
+
+from simulators.hub import HubBus
+from simulators.nodes.canopen_node import CanopenNode, Frame, Handler
+from simulators.nodes.drive import ServoDrive
+from simulators.nodes.encoder import JointEncoder
+from simulators.nodes.load_cell import LoadCell
+from simulators.nodes.plant import Plant
+from simulators.nodes.spec import NodeSpec
+
+_log = logging.getLogger(__name__)
+
+SYNC = 0x080
+TICK = 0.005
+"""How often nodes look at the time [s]."""
+_REOPEN = 0.2
+"""Pause [s] before a bus that failed is opened again."""
+
+_KINDS: dict[str, type[CanopenNode]] = {"servo_drive": ServoDrive, "load_cell": LoadCell, "joint_encoder": JointEncoder}
+
+
+class Segment:
+    """The nodes of one bus; frames that they send in one go leave in one go."""
+
+    def __init__(self, name: str, specs: Sequence[NodeSpec], plant: Plant, open_bus: Callable[[], can.BusABC]) -> None:
+        """Make the nodes; nothing is on the bus yet.
+
+        Args:
+            name: Of the bus, in the robot file.
+            specs: The nodes on it.
+            plant: What they measure.
+            open_bus: Joins the bus; called again after the bus failed.
+        """
+        self.name = name
+        self.lock = threading.Lock()
+        """Held by whoever uses the nodes."""
+        self._outbox: list[Frame] = []
+        self.nodes = {spec.name: _KINDS[spec.kind](spec, plant, self._outbox) for spec in specs}
+        self._listeners = list(self.nodes.values())
+        self._open_bus = open_bus
+        self._bus: can.BusABC | None = None
+        self._routes: dict[int, list[Handler]] = {}
+        self._is_routed = False
+        self.counters = {"received": 0, "sent": 0, "lost": 0, "reopened": 0}
+        for node in self._listeners:
+            node.routes_changed = self._forget_routes
+
+    def open(self, now: float) -> None:
+        """Join the bus and switch the nodes on."""
+        self._bus = self._open_bus()
+        with self.lock:
+            for node in self._listeners:
+                node.power_up(now)
+            self._flush()
+
+    def close(self) -> None:
+        """Leave the bus. Safe to call twice."""
+        if self._bus is not None:
+            self._bus.shutdown()
+            self._bus = None
+
+    def answer(self, now: float) -> None:
+        """Take every frame that waits, and answer."""
+        with self.lock:
+            while (message := self._receive(0.0)) is not None:
+                self._handle(message, now)
+            self._flush()
+
+    def tick(self, now: float) -> None:
+        """Let time pass for every node."""
+        with self.lock:
+            for node in self._listeners:
+                node.tick(now)
+            self._flush()
+
+    def serve(self, monotonic: Callable[[], float], is_running: Callable[[], bool]) -> None:
+        """Answer and tick in real time, and open a failed bus again, until told to stop."""
+        due = monotonic()
+        while is_running():
+            try:
+                message = self._receive(max(due - monotonic(), 0.0))
+                if message is not None:
+                    with self.lock:
+                        self._handle(message, monotonic())
+                self.answer(monotonic())
+                if monotonic() >= due:  # heartbeats that waited have been heard by now
+                    self.tick(monotonic())
+                    due = max(due + TICK, monotonic())
+            except (can.CanError, OSError) as error:
+                self._reopen(error, is_running)
+
+    def _receive(self, timeout: float) -> can.Message | None:
+        assert self._bus is not None, "the segment is not open"
+        return self._bus.recv(timeout)
+
+    def _handle(self, message: can.Message, now: float) -> None:
+        if message.is_error_frame or message.is_remote_frame or message.is_extended_id:
+            return
+        self.counters["received"] += 1
+        identifier = message.arbitration_id
+        if identifier == SYNC:
+            for node in self._listeners:
+                node.sync(now)
+            self._flush()
+            return
+        if not self._is_routed:
+            self._route()
+        for handler in self._routes.get(identifier, ()):
+            handler(bytes(message.data), now)
+
+    def _forget_routes(self) -> None:
+        self._is_routed = False
+
+    def _route(self) -> None:
+        self._routes = {}
+        for node in self._listeners:
+            for identifier, handler in node.routes().items():
+                self._routes.setdefault(identifier, []).append(handler)
+        self._is_routed = True
+
+    def _flush(self) -> None:
+        if not self._outbox:
+            return
+        frames = self._outbox.copy()
+        self._outbox.clear()
+        if isinstance(self._bus, HubBus):
+            self._bus.send_frames(frames)
+        elif self._bus is not None:
+            for identifier, data in frames:
+                self._send(self._bus, can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
+        self.counters["sent"] += len(frames)
+
+    def _send(self, bus: can.BusABC, message: can.Message) -> None:
+        try:
+            bus.send(message, timeout=0.01)
+        except can.CanOperationError:  # a full transmit queue loses a frame, as it would in a device
+            self.counters["lost"] += 1
+
+    def _reopen(self, error: Exception, is_running: Callable[[], bool]) -> None:
+        _log.warning("bus %s: %s Opening it again.", self.name, error)
+        pause = threading.Event()
+        while is_running():
+            with contextlib.suppress(can.CanError, OSError):
+                self.close()
+                self._bus = self._open_bus()
+                self.counters["reopened"] += 1
+                return
+            pause.wait(_REOPEN)

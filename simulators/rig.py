@@ -1,0 +1,248 @@
+"""A simulated robot on its buses: a world, the nodes that measure and move it, and the time they share."""
+
+import logging
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+
+import can
+import numpy as np
+
+from hal.config import BusConfig, RobotConfig
+from simulators.hub import HubServer
+from simulators.nodes.canopen_node import CanopenNode
+from simulators.nodes.drive import ServoDrive
+from simulators.nodes.plant import Plant, Snapshot
+from simulators.nodes.segment import Segment
+from simulators.nodes.spec import NodeSpec
+from simulators.world import World
+
+_log = logging.getLogger(__name__)
+
+PERIOD = 0.005
+"""Step of the physics thread [s]."""
+_SWITCH_INTERVAL = 5e-4
+"""Longest time [s] that one Python thread keeps the others waiting; the default delays answers to SYNC by 5 ms."""
+
+
+class UnknownFault(ValueError):
+    """No such fault, or no such node; the message lists what is known."""
+
+
+class Rig:
+    """Simulated hardware of one robot.
+
+    `start` runs it in real time: a hub server for every bus of interface `hub`, one thread per bus that answers, and
+    one that moves the world. `step` moves it by hand instead, for tests on interface `virtual`.
+    """
+
+    def __init__(self, config: RobotConfig, world: World, hardware: Sequence[NodeSpec]) -> None:
+        """Wire up a robot; nothing runs and no bus is open yet.
+
+        Args:
+            config: Only buses, signals and their elements are read; what the hardware is comes from `hardware`.
+            world: The physics.
+            hardware: What hangs on the buses.
+
+        Raises:
+            ValueError: A node is on a bus, or measures an element, that the robot file does not have.
+        """
+        _check(config, hardware)
+        self._world = world
+        self._world_lock = threading.Lock()
+        places = {
+            f"{signal}.{element}": (signal, index)
+            for signal, section in config.signals.items()
+            for index, element in enumerate(section.elements)
+        }
+        self._plant = Plant(places, Snapshot(world.time, world.measure()))
+        self._servers: dict[str, HubServer] = {}
+        self._segments: dict[str, Segment] = {}
+        for name, bus in config.buses.items():
+            if bus.interface == "hub":
+                self._servers[name] = HubServer(bus.channel, bus.bitrate if bus.options.get("bit_timing") else None)
+            specs = [spec for spec in hardware if spec.bus == name]
+            self._segments[name] = Segment(name, specs, self._plant, _opener(bus))
+        self._drives = [node for node in self._nodes().values() if isinstance(node, ServoDrive)]
+        self._threads: list[threading.Thread] = []
+        self._running = threading.Event()
+        self._is_open = False
+        self._now = 0.0
+        self._ticks = {"steps": 0, "skipped": 0}
+        self.failure = ""
+        """Why the rig stopped by itself; empty while all is well."""
+
+    def start(self) -> None:
+        """Run in real time until `stop`.
+
+        Raises:
+            can.CanInitializationError: A bus cannot be opened.
+        """
+        self._open(time.monotonic())
+        self._interval = sys.getswitchinterval()
+        sys.setswitchinterval(_SWITCH_INTERVAL)
+        self._running.set()
+        jobs: dict[str, Callable[[], None]] = {"physics": self._run_physics}
+        for name, segment in self._segments.items():
+            jobs[f"nodes {name}"] = lambda segment=segment: segment.serve(time.monotonic, self._running.is_set)  # type: ignore[misc]
+        for name, job in jobs.items():
+            thread = threading.Thread(target=self._guard, args=(name, job), name=name, daemon=True)
+            self._threads.append(thread)
+            thread.start()
+
+    def stop(self) -> None:
+        """Stop, leave the buses and close the world. Safe to call twice."""
+        if self._running.is_set() or self._threads:
+            self._running.clear()
+            for thread in self._threads:
+                thread.join()
+            self._threads.clear()
+            sys.setswitchinterval(self._interval)
+        for segment in self._segments.values():
+            segment.close()
+        for server in self._servers.values():
+            server.close()
+        self._is_open = False
+        self._world.close()
+
+    def step(self, duration: float) -> None:
+        """Answer what waits on the buses, then move world and nodes by `duration` [s]; 0 only answers.
+
+        The buses are opened, and the nodes boot, at the first call.
+        """
+        self._open(self._now)
+        for segment in self._segments.values():
+            segment.answer(self._now)
+        if duration > 0:
+            self._move(duration)
+            self._now += duration
+            for segment in self._segments.values():
+                segment.tick(self._now)
+
+    def fault(self, text: str) -> str:
+        """Break something, or mend a node; the sentence tells what was done.
+
+        `sensor_silent NODE`, `node_silent NODE`, `node_back NODE`, `node_reboot NODE`, `emcy NODE`; anything else is a
+        part of the world, as in `muscle_cut biceps`.
+
+        Raises:
+            UnknownFault: There is no such fault, or no such node.
+        """
+        words = text.split()
+        if words and words[0] in _NODE_FAULTS:
+            return self._fault_node(words)
+        try:
+            with self._world_lock:
+                self._world.break_part(":".join(words))
+        except ValueError as error:
+            known = ", ".join(f"{fault} NODE" for fault in _NODE_FAULTS)
+            raise UnknownFault(f"{error} Faults of nodes: {known}.") from None
+        return f"Broke {' '.join(words)}."
+
+    def truth(self) -> Mapping[str, np.ndarray]:
+        """What is, without noise: every signal, shapes (n,)."""
+        with self._world_lock:
+            return self._world.truth()
+
+    def stats(self) -> dict[str, object]:
+        """Counters of the physics, the buses and the hub, and the state of every node."""
+        buses = {
+            name: {**segment.counters, **({"hub": self._servers[name].stats()} if name in self._servers else {})}
+            for name, segment in self._segments.items()
+        }
+        nodes = {name: node.nmt.name.lower() if node.is_powered else "off" for name, node in self._nodes().items()}
+        return {"physics": dict(self._ticks), "buses": buses, "nodes": nodes, "failure": self.failure}
+
+    def node(self, name: str) -> CanopenNode:
+        """One node by its name.
+
+        Raises:
+            UnknownFault: There is no such node.
+        """
+        nodes = self._nodes()
+        if name not in nodes:
+            raise UnknownFault(f"There is no node '{name}'. Known nodes: {', '.join(nodes)}.")
+        return nodes[name]
+
+    def _nodes(self) -> dict[str, CanopenNode]:
+        return {name: node for segment in self._segments.values() for name, node in segment.nodes.items()}
+
+    def _open(self, now: float) -> None:
+        if self._is_open:
+            return
+        for server in self._servers.values():
+            server.start()
+        for segment in self._segments.values():
+            segment.open(now)
+        self._is_open = True
+
+    def _fault_node(self, words: list[str]) -> str:
+        if len(words) != 2:
+            raise UnknownFault(f"'{words[0]}' takes the name of one node. Known nodes: {', '.join(self._nodes())}.")
+        node = self.node(words[1])
+        act, sentence = _NODE_FAULTS[words[0]]
+        with self._segments[node.spec.bus].lock:
+            act(node, time.monotonic() if self._running.is_set() else self._now)
+        return f"{node.spec.name} (node {node.spec.node} on {node.spec.bus}) {sentence}."
+
+    def _move(self, duration: float) -> None:
+        with self._world_lock:
+            for drive in self._drives:
+                target, enabled = drive.servo
+                self._world.drive(drive.spec.element, target, enabled)
+            self._world.step(duration)
+            self._plant.snapshot = Snapshot(self._world.time, self._world.measure())
+        self._ticks["steps"] += 1
+
+    def _run_physics(self) -> None:
+        due = time.monotonic()
+        while self._running.is_set():
+            self._move(PERIOD)
+            due += PERIOD
+            late = time.monotonic() - due
+            if late > 0:
+                missed = int(late / PERIOD)
+                self._ticks["skipped"] += missed
+                due += missed * PERIOD
+            else:
+                time.sleep(-late)
+
+    def _guard(self, name: str, job: Callable[[], None]) -> None:
+        """A rig whose physics or bus failed falls silent: nodes must not go on with a world that stands still."""
+        try:
+            job()
+        except Exception as error:
+            _log.exception("the rig's thread '%s' failed", name)
+            self.failure = f"{name}: {error}"
+            self._running.clear()
+
+
+def _opener(bus: BusConfig) -> Callable[[], can.BusABC]:
+    def open_bus() -> can.BusABC:
+        return can.Bus(interface=bus.interface, channel=bus.channel, bitrate=bus.bitrate, **bus.options)
+
+    return open_bus
+
+
+def _check(config: RobotConfig, hardware: Sequence[NodeSpec]) -> None:
+    elements = config.element_names()
+    for spec in hardware:
+        if spec.bus not in config.buses:
+            raise ValueError(f"Node '{spec.name}' is on bus '{spec.bus}'. Known buses: {', '.join(config.buses)}.")
+        for element in (spec.element, getattr(spec.constants, "load", None)):
+            if element is not None and element not in elements:
+                raise ValueError(f"Node '{spec.name}' measures '{element}'. Known elements: {', '.join(elements)}.")
+
+
+def _mute(node: CanopenNode, now: float) -> None:
+    node.is_muted = True
+
+
+_NODE_FAULTS: dict[str, tuple[Callable[[CanopenNode, float], None], str]] = {
+    "sensor_silent": (_mute, "sends no measurements any more; its heartbeat goes on"),
+    "node_silent": (lambda node, now: node.power_down(), "has no power any more"),
+    "node_back": (lambda node, now: node.power_up(now), "is back, as after power-on"),
+    "node_reboot": (lambda node, now: node.power_up(now), "rebooted"),
+    "emcy": (lambda node, now: node.break_down(), "reports a hardware fault"),
+}
