@@ -5,19 +5,23 @@ of numbers is a msgpack binary of little-endian float64; an array of truth value
 """
 
 import dataclasses
+import functools
 import types
 import typing
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, TypeVar
 
 import msgpack
 import numpy as np
 
+from services.errors import ServiceError
+
 VERSION = 1
 MAX_BYTES = 1 << 20
 
 
-class MessageError(ValueError):
+class MessageError(ServiceError, ValueError):
     """Bytes that are not the message they should be; the text says what is wrong."""
 
 
@@ -210,13 +214,17 @@ RECORDS: dict[str, type[Message]] = {
     record.TYPE: record for record in (Sample, Command, Applied, Estimates, Anomaly, Update, Target, Status)
 }
 M = TypeVar("M", bound=Message)
+_fields: Callable[[Any], tuple[dataclasses.Field[Any], ...]] = functools.cache(dataclasses.fields)
+_hints: Callable[[Any], dict[str, Any]] = functools.cache(typing.get_type_hints)
+"""Resolving the annotations anew would cost more than all the rest of `decode`."""
 
 
-def encode(message: Message) -> bytes:
-    """The wire form of a message."""
+def encode(message: Message, **header: int) -> bytes:
+    """The wire form of a message; `header` replaces `seq` and `boot`, which the publisher knows."""
     body: dict[str, Any] = {"type": message.TYPE, "v": VERSION}
-    for item in dataclasses.fields(message):
+    for item in _fields(type(message)):
         body[item.name] = _pack(getattr(message, item.name))
+    body.update(header)
     return msgpack.packb(body)
 
 
@@ -225,7 +233,9 @@ def _pack(value: Any) -> Any:
         return value.astype("?" if value.dtype == bool else "<f8", copy=False).tobytes()
     if isinstance(value, dict):
         return {key: _pack(item) for key, item in value.items()}
-    return value
+    if isinstance(value, list | tuple):
+        return [_pack(item) for item in value]
+    return value.item() if isinstance(value, np.generic) else value
 
 
 def decode(data: bytes, expected: type[M]) -> M:
@@ -249,9 +259,9 @@ def decode(data: bytes, expected: type[M]) -> M:
 
 
 def _record(expected: type[M], body: dict[str, Any]) -> M:
-    hints = typing.get_type_hints(expected)
+    hints = _hints(expected)
     fields: dict[str, Any] = {}
-    for item in dataclasses.fields(expected):
+    for item in _fields(expected):
         if item.name in body:
             fields[item.name] = _unpack(body[item.name], hints[item.name], f"{expected.TYPE}.{item.name}")
         elif item.default is dataclasses.MISSING and item.default_factory is dataclasses.MISSING:

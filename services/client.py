@@ -1,0 +1,198 @@
+"""A remote client in ten lines: read the newest of everything, ask for what a robot can do."""
+
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from types import TracebackType
+from typing import Any, Self, TypeVar
+
+import numpy as np
+import zenoh
+
+from services import keys, query
+from services.errors import ServiceUnavailable
+from services.messages import Anomaly, Applied, Command, Estimates, Message, Sample, Status, Target, Update
+from services.session import CLIENT, close_session, new_boot, open_session
+from services.streams import Newest, Publisher
+
+M = TypeVar("M", bound=Message)
+
+FRESH = 0.25
+"""Age [s], on this machine's clock, up to which a message is handed out; an older one is None."""
+FRESH_STATUS = 2.5
+TIMEOUT = 2.0
+"""Deadline [s] of a verb."""
+SLOW_TIMEOUT = 10.0
+"""Deadline [s] of a verb that computes."""
+
+
+class Client:
+    """Reads a robot and asks it, from any process.
+
+        with Client("musashi_arm") as arm:
+            print(arm.estimate(timeout=2.0))
+
+    The readers return None rather than something old, and subscribe when first used. Every verb raises what the
+    service raised, or `ServiceUnavailable` when nobody answers in time.
+
+    Args:
+        robot: The robot's name.
+        connect: More zenoh endpoints, such as a router's, for a robot on another machine.
+    """
+
+    session: zenoh.Session
+
+    def __init__(self, robot: str, connect: Iterable[str] = ()) -> None:
+        self.robot = robot
+        self.boot = new_boot()
+        self._connect = tuple(connect)
+        self._readers: dict[str, Newest[Any]] = {}
+        self._publishers: dict[str, Publisher[Any]] = {}
+
+    def __enter__(self) -> Self:
+        self.session = open_session(self.robot, CLIENT, self._connect)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        close_session(self.session)
+
+    def sample(self, max_age: float = FRESH, timeout: float = 0.0) -> Sample | None:
+        """The newest measurement; None if none arrived in the last `max_age` [s], nor while waiting `timeout` [s]."""
+        return self._fresh(keys.sample(self.robot), Sample, max_age, timeout)
+
+    def applied(self, max_age: float = FRESH, timeout: float = 0.0) -> Applied | None:
+        """What was last sent to the drives, or None; see `sample`."""
+        return self._fresh(keys.applied(self.robot), Applied, max_age, timeout)
+
+    def estimate(self, max_age: float = FRESH, timeout: float = 0.0) -> Estimates | None:
+        """The newest estimate of every signal, or None; see `sample`."""
+        return self._fresh(keys.estimate(self.robot), Estimates, max_age, timeout)
+
+    def anomaly(self, max_age: float = FRESH, timeout: float = 0.0) -> Anomaly | None:
+        """The newest anomaly score, or None; see `sample`."""
+        return self._fresh(keys.anomaly(self.robot), Anomaly, max_age, timeout)
+
+    def update(self, max_age: float = 4 * FRESH, timeout: float = 0.0) -> Update | None:
+        """What the online update does, or None; see `sample`."""
+        return self._fresh(keys.update(self.robot), Update, max_age, timeout)
+
+    def truth(self, max_age: float = FRESH, timeout: float = 0.0) -> Sample | None:
+        """What a simulator knows to be true, or None; see `sample`."""
+        return self._fresh(keys.truth(self.robot), Sample, max_age, timeout)
+
+    def status(self, service: str, max_age: float = FRESH_STATUS, timeout: float = 0.0) -> Status | None:
+        """The newest status of a service, or None; see `sample`."""
+        return self._fresh(keys.status(self.robot, service), Status, max_age, timeout)
+
+    def next_sample(self, timeout: float = TIMEOUT) -> Sample | None:
+        """Wait for the next measurement; None if none arrives within `timeout` [s]."""
+        return self.reader(keys.sample(self.robot), Sample).wait(timeout)
+
+    def command(self, signal: str, values: np.ndarray, answers: Sample) -> None:
+        """Send desired values to the drives; the HAL follows while they are younger than the time to live.
+
+        Args:
+            signal: The commanded signal.
+            values: Desired values [its unit], shape (n,).
+            answers: The sample that the command was made from; its age is the command's age.
+        """
+        message = Command(
+            stamp_ns=time.time_ns(), signal=signal, values=np.asarray(values, float), cycle=answers.cycle,
+            hal_boot=answers.boot,
+        )  # fmt: skip
+        self._publisher(keys.command(self.robot), Command).put(message)
+
+    def target(self, signal: str, values: Sequence[float] | np.ndarray, timeout: float = TIMEOUT) -> None:
+        """Tell the controller where to bring the body; it moves only while engaged.
+
+        Args:
+            signal: Signal to reach, such as `joint_position`.
+            values: Reference [its unit], shape (n,).
+            timeout: How long [s] to wait for a model service that listens.
+
+        Raises:
+            ServiceUnavailable: None listens.
+        """
+        publisher = self._publisher(keys.target(self.robot), Target)
+        deadline = time.monotonic() + timeout
+        while not publisher.has_listener:
+            if time.monotonic() > deadline:
+                raise ServiceUnavailable(
+                    f"No 'model' service of robot '{self.robot}' takes targets. Is `gemuco serve` running?"
+                )
+            time.sleep(query.RETRY_AFTER)
+        publisher.put(Target(stamp_ns=time.time_ns(), signal=signal, values=np.asarray(values, float)))
+
+    def enable(self) -> dict[str, Any]:
+        """Ask the drives to follow commands; the answer tells the mode, which soon is `hold` or `fault`."""
+        return self.ask("hal", "enable")
+
+    def disable(self) -> dict[str, Any]:
+        """Ask the drives to let go at once."""
+        return self.ask("hal", "disable")
+
+    def stop(self) -> dict[str, Any]:
+        """Hold where the robot is, then disable."""
+        return self.ask("hal", "stop")
+
+    def reset(self) -> dict[str, Any]:
+        """Leave a fault; never enables."""
+        return self.ask("hal", "reset")
+
+    def engage(self) -> dict[str, Any]:
+        """Let the controller command the drives."""
+        return self.ask("model", "engage")
+
+    def disengage(self) -> dict[str, Any]:
+        """Let the controller command no more."""
+        return self.ask("model", "disengage")
+
+    def adapt(self, active: bool) -> dict[str, Any]:
+        """Start or stop the online update of the model."""
+        return self.ask("model", "adapt", {"active": active}, SLOW_TIMEOUT)
+
+    def rollback(self) -> dict[str, Any]:
+        """Go back to the model before the online update."""
+        return self.ask("model", "rollback", timeout=SLOW_TIMEOUT)
+
+    def infer(
+        self, signal: str, values: Mapping[str, Sequence[float]] | None = None, hide: Iterable[str] = ()
+    ) -> dict[str, Any]:
+        """Ask the model for a signal, from given values or from the newest sample with some signals hidden."""
+        arguments = {"signal": signal, "hide": list(hide)} | ({} if values is None else {"values": dict(values)})
+        return self.ask("model", "estimate", arguments, SLOW_TIMEOUT)
+
+    def fault(self, text: str) -> dict[str, Any]:
+        """Break something in the simulator (`sensor_silent elbow_pitch_encoder`, `muscle_cut biceps`)."""
+        return self.ask("simulator", "fault", {"text": text})
+
+    def describe(self, service: str = "hal") -> dict[str, Any]:
+        """Who a service is and what it serves."""
+        return self.ask(service, "describe")
+
+    def alive(self) -> set[str]:
+        """Names of the robot's services that run now, as far as this client is connected."""
+        return query.alive(self.session, self.robot)
+
+    def ask(
+        self, service: str, verb: str, arguments: Mapping[str, Any] | None = None, timeout: float = TIMEOUT
+    ) -> dict[str, Any]:
+        """Ask any verb of any service; see `query.ask`."""
+        return query.ask(self.session, keys.verb(self.robot, service, verb), arguments, timeout)
+
+    def reader(self, key: str, record: type[M]) -> Newest[M]:
+        """The reader of a key, made when first asked for."""
+        if key not in self._readers:
+            self._readers[key] = Newest(self.session, key, record)
+        return self._readers[key]
+
+    def _publisher(self, key: str, record: type[M]) -> Publisher[M]:
+        if key not in self._publishers:
+            self._publishers[key] = Publisher(self.session, key, record, self.boot)
+        return self._publishers[key]
+
+    def _fresh(self, key: str, record: type[M], max_age: float, timeout: float) -> M | None:
+        reader = self.reader(key, record)
+        message = reader.get(max_age)
+        return reader.wait(timeout) if message is None and timeout > 0 else message
