@@ -57,6 +57,15 @@ class BulletBody:
         self.position[:] = [state[0] for state in states]
         self.velocity[:] = [state[1] for state in states]
 
+    def energy(self) -> float:
+        """Kinetic and potential energy of the links [J]."""
+        joints = range(pybullet.getNumJoints(self._body, physicsClientId=self._client))
+        mass = pybullet.calculateMassMatrix(self._body, self.position.tolist(), physicsClientId=self._client)
+        states = pybullet.getLinkStates(self._body, joints, computeForwardKinematics=1, physicsClientId=self._client)
+        masses = [pybullet.getDynamicsInfo(self._body, index, physicsClientId=self._client)[0] for index in joints]
+        height = sum(weight * state[0][2] for weight, state in zip(masses, states, strict=True))
+        return float(0.5 * self.velocity @ np.array(mass) @ self.velocity + GRAVITY * height)
+
     def add_mass(self, joint: str, mass: float, radius: float) -> None:
         """Put a ball of `mass` [kg] and `radius` [m] at the centre of mass of the link behind `joint`."""
         index = self._joints[self._names().index(joint)]

@@ -2,6 +2,7 @@
 
 import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Self
 
@@ -20,8 +21,8 @@ class Pose:
     Attributes:
         rotations: Frame orientations, shape (n + 1, 3, 3).
         origins: Frame origins [m], shape (n + 1, 3).
-        screws: Joint screws: column j times a wrench (force [N], moment about the base origin [N m]) is the torque [N m]
-            of the wrench about joint j. Shape (6, n).
+        screws: Joint screws, shape (6, n): a wrench (force [N], moment about the base origin [N m]) times column j is
+            its torque about joint j [N m].
     """
 
     rotations: np.ndarray
@@ -70,7 +71,7 @@ class Chain:
         root = ElementTree.parse(path).getroot()
         joints = root.findall("joint")
         links = {link.get("name"): link for link in root.findall("link")}
-        for before, joint in zip(joints, joints[1:], strict=False):
+        for before, joint in pairwise(joints):
             if _child(joint, "parent").get("link") != _child(before, "child").get("link"):
                 raise ValueError(f"{path.name}: joint '{joint.get('name')}' does not follow '{before.get('name')}'.")
         for joint in joints:

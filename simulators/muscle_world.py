@@ -184,13 +184,13 @@ class MuscleWorld:
         reach = servo.speed * duration
         move = (self._target - self._spool) * (duration / (duration + servo.lag))
         move = np.minimum(np.maximum(move, -reach), reach) * self._follows
-        self._spool += move
-        np.maximum(self._spool, path - self._grip, out=self._spool)
+        spool = np.maximum(self._spool + move, path - self._grip)
 
-        stretch_rate = path_rate - move / duration
+        stretch_rate = path_rate - (spool - self._spool) / duration
+        self._spool = spool
         loss = 1.0 + body.loss_time * body.elastic.rate * stretch_rate
         loss = np.minimum(np.maximum(loss, 0.0), 1.5)
-        self._tension = body.elastic.tension(path - self._spool) * loss * self._whole
+        self._tension = body.elastic.tension(path - spool) * loss * self._whole
 
         pull = self._tension
         torque = -body.joint_damping * bullet.velocity

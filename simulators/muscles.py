@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Self
 
 import numpy as np
@@ -39,9 +40,7 @@ class Paths:
         self.chain = chain
         self.names = tuple(routes)
         stretches = [
-            (muscle, start, end)
-            for muscle, route in enumerate(routes.values())
-            for start, end in zip(route, route[1:], strict=False)
+            (muscle, start, end) for muscle, route in enumerate(routes.values()) for start, end in pairwise(route)
         ]
         crossing = [part for part in stretches if part[1].frame != part[2].frame]
         self._fixed = np.zeros(len(routes))
@@ -66,8 +65,7 @@ class Paths:
         self._moves = chain.moves[self._frames].astype(float)
         self._belongs = np.zeros((len(routes), self._count))
         self._belongs[[muscle for muscle, _, _ in crossing], np.arange(self._count)] = 1.0
-        ends = np.tile(self._belongs, 2 + self._bends)
-        self._ends = ends
+        self._ends = np.tile(self._belongs, 2 + self._bends)
 
     def solve(self, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Path lengths [m], shape (m,), and moment arms dL/dq [m/rad], shape (m, n), at joint positions [rad] (n,)."""

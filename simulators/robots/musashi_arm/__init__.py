@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from simulators.robots.musashi_arm.body import VARIANTS, body, gravity_torque
+from simulators.robots.musashi_arm.body import VARIANTS, make_body
 from simulators.robots.musashi_arm.hardware import hardware
+from simulators.robots.musashi_arm.model import gravity_torque
 from simulators.robots.musashi_arm.motion import random_motion
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ class MusashiArm:
         """The physics of one variant; the seed chooses among actual arms, and their noise."""
         from simulators.muscle_world import MuscleWorld
 
-        return MuscleWorld(body(variant, seed), seed)
+        return MuscleWorld(make_body(variant, seed), seed)
 
     def rig(self, config: RobotConfig, variant: str, seed: int) -> Rig:
         """The world behind simulated nodes on the robot file's buses."""

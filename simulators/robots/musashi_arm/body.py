@@ -1,97 +1,41 @@
-"""What the arm is made of: the designer's `geometric` model, and `actual` robots drawn around it from a seed.
+"""The arm as it can be built: the designer's `geometric` variant, and `actual` ones drawn around it from a seed.
 
 simulators/assets/musashi_arm/README.md says where the numbers come from.
 """
 
 from dataclasses import replace
-from functools import cache
-from pathlib import Path
 
 import numpy as np
 
-from simulators.chain import Chain
 from simulators.muscle_world import Body, Friction
 from simulators.muscles import Elastic, Paths, Sphere, Via
+from simulators.robots.musashi_arm.model import (
+    ROUTES,
+    ULNA,
+    UPPER_ARM,
+    URDF,
+    balanced_tensions,
+    chain,
+    designed_elastic,
+    designed_paths,
+)
 
-URDF = Path(__file__).resolve().parents[2] / "assets" / "musashi_arm" / "musashi_arm.urdf"
 VARIANTS = ("geometric", "actual")
-
-TORSO, UPPER_ARM, ULNA, RADIUS = 0, 3, 4, 5
-"""Frames of the chain: the base, and the links behind shoulder_yaw, elbow_pitch and elbow_yaw."""
 
 REST = np.array([0.0, 0.0, 0.0, -0.6, 0.0])
 """Joint positions at which a robot starts and its wire lengths are calibrated [rad]."""
 REST_PRETENSION = 40.0
 """[N]"""
 
-ROUTES: dict[str, tuple[Via, ...]] = {
-    "deltoid_front": (Via(TORSO, 0.055, 0.01, 0.05), Via(UPPER_ARM, 0.03, -0.03, -0.12)),
-    "deltoid_side": (
-        Via(TORSO, 0.0, -0.01, 0.07),
-        Via(TORSO, 0.0, -0.05, 0.045),
-        Via(UPPER_ARM, 0.0, -0.04, -0.12),
-    ),
-    "deltoid_back": (Via(TORSO, -0.055, 0.01, 0.05), Via(UPPER_ARM, -0.03, -0.03, -0.12)),
-    "pectoral": (Via(TORSO, 0.06, 0.12, -0.04), Via(UPPER_ARM, 0.035, -0.01, -0.07)),
-    "latissimus": (Via(TORSO, -0.05, 0.10, -0.20), Via(UPPER_ARM, 0.0, 0.035, -0.08)),
-    "infraspinatus": (Via(TORSO, -0.08, 0.08, 0.0), Via(UPPER_ARM, -0.02, -0.04, -0.03)),
-    "biceps": (
-        Via(TORSO, 0.04, 0.0, 0.04),
-        Via(UPPER_ARM, 0.045, 0.01, -0.05),
-        Via(UPPER_ARM, 0.045, 0.01, -0.19),
-        Via(ULNA, 0.045, 0.03, -0.06),
-        Via(RADIUS, 0.03, -0.02, -0.09),
-    ),
-    "brachialis": (Via(UPPER_ARM, 0.035, -0.01, -0.14), Via(ULNA, 0.035, -0.01, -0.07)),
-    "triceps": (
-        Via(UPPER_ARM, -0.035, 0.0, -0.10),
-        Via(UPPER_ARM, -0.035, 0.0, -0.22),
-        Via(ULNA, -0.035, 0.0, -0.04),
-    ),
-    "pronator": (
-        Via(UPPER_ARM, 0.02, 0.035, -0.22),
-        Via(ULNA, 0.03, -0.035, -0.06),
-        Via(RADIUS, 0.03, 0.02, -0.09),
-    ),
-}
-
-JOINT_DAMPING = np.array([0.4, 0.4, 0.2, 0.2, 0.05])
+JOINT_DAMPING = np.array([0.8, 0.8, 0.3, 0.35, 0.08])
 """[N m s/rad]"""
-LOSS_TIME = 0.01
+LOSS_TIME = 0.025
 """Of the elastic elements [s]."""
 NOISE = {"joint_position": 0.001, "muscle_tension": 0.5, "muscle_length": 0.05e-3}
 """Of the actual robot's sensors [rad, N, m]."""
 
 
-@cache
-def chain() -> Chain:
-    """The links and joints, as the URDF has them."""
-    return Chain.from_urdf(URDF)
-
-
-@cache
-def designed_paths() -> Paths:
-    """The wires as straight lines between their via points."""
-    return Paths(chain(), ROUTES)
-
-
-@cache
-def designed_elastic() -> Elastic:
-    """The elastic elements as their data sheet would have them: 20 mm at 200 N."""
-    return Elastic.of(len(ROUTES), 20.0, 120.0)
-
-
-def gravity_torque(position: np.ndarray) -> np.ndarray:
-    """Joint torques [N m] that hold the arm's own weight at joint positions [rad]; shapes (5,)."""
-    return chain().gravity_torque(np.asarray(position, float))
-
-
-def wire_lengths(position: np.ndarray, tension: np.ndarray) -> np.ndarray:
-    """Wire lengths [m] that give joint positions [rad] and tensions [N] on the geometric model; shapes (5,), (10,)."""
-    return designed_paths().lengths(position) - designed_elastic().elongation(tension)
-
-
-def body(variant: str, seed: int) -> Body:
+def make_body(variant: str, seed: int) -> Body:
     """One variant of the arm; the seed chooses among the actual ones.
 
     Raises:
@@ -100,7 +44,6 @@ def body(variant: str, seed: int) -> Body:
     if variant not in VARIANTS:
         raise ValueError(f"The arm has no variant '{variant}'. Known variants: {', '.join(VARIANTS)}.")
     size = len(ROUTES)
-    tension = np.full(size, REST_PRETENSION)
     geometric = Body(
         urdf=URDF,
         paths=designed_paths(),
@@ -111,7 +54,7 @@ def body(variant: str, seed: int) -> Body:
         friction=None,
         noise={},
         rest=REST,
-        rest_tension=tension,
+        rest_tension=balanced_tensions(REST, np.full(size, REST_PRETENSION)),
     )
     return geometric if variant == "geometric" else _actual(geometric, np.random.default_rng([seed, 5]))
 
