@@ -220,7 +220,7 @@ class Bus:
             self._tried.set()
             self._closing.wait(pause)
             pause = min(2 * pause, BACK_OFF[1])
-        self._mark(BusState.GONE, "Closed.")
+        self.state, self.text = BusState.GONE, "Closed."
 
     def _new_interface(self) -> can.BusABC:
         config = self._config
