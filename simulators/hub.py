@@ -11,18 +11,19 @@ import socket
 import time
 from collections import deque
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 import can
 
 from simulators.hub_server import HubServer
-from simulators.hub_socket import PACKET, RECORD, channels, socket_path
+from simulators.hub_socket import HELLO, PACKET, RECORD, channels, socket_path
 from simulators.wire_time import ERROR, EXTENDED, REMOTE
 
 __all__ = ["HubBus", "HubServer"]
 
-_SEND_PATIENCE = 1.0
-"""How long [s] a sender waits for a server that does not take frames, unless told otherwise."""
+_PATIENCE = 1.0
+"""How long [s] a server may take to admit a program, and to take a frame unless the sender says otherwise."""
 
 
 class HubBus(can.BusABC):
@@ -51,14 +52,7 @@ class HubBus(can.BusABC):
             can.CanInitializationError: Nobody serves the channel.
         """
         path = socket_path(str(channel))
-        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        try:
-            self._socket.connect(str(path))
-        except OSError as error:
-            self._socket.close()
-            raise can.CanInitializationError(
-                f"Nobody serves the hub channel '{channel}' ({path}: {error.strerror}). Is the simulator running?"
-            ) from None
+        self._socket = _join(str(channel), path)
         self._socket.setblocking(False)
         self._readable = select.poll()
         self._readable.register(self._socket, select.POLLIN)
@@ -106,7 +100,7 @@ class HubBus(can.BusABC):
                 return
             except BlockingIOError:
                 now = time.monotonic()
-                deadline = deadline or now + (_SEND_PATIENCE if timeout is None else timeout)
+                deadline = deadline or now + (_PATIENCE if timeout is None else timeout)
                 if now >= deadline:
                     raise can.CanOperationError(
                         f"{self.channel_info} takes no frames: is the bus overloaded?"
@@ -156,6 +150,23 @@ class HubBus(can.BusABC):
     @staticmethod
     def _detect_available_configs() -> list[can.typechecking.AutoDetectedConfig]:
         return [{"interface": "hub", "channel": channel} for channel in channels()]
+
+
+def _join(channel: str, path: Path) -> socket.socket:
+    """A socket that the server has admitted."""
+    link = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    link.settimeout(_PATIENCE)
+    try:
+        link.connect(str(path))
+        if link.recv(PACKET) == HELLO:
+            return link
+        reason = "what answers is no hub"
+    except OSError as error:
+        reason = error.strerror or "no answer"
+    link.close()
+    raise can.CanInitializationError(
+        f"Nobody serves the hub channel '{channel}' ({path}: {reason}). Is the simulator running?"
+    )
 
 
 def _message(identifier: int, length: int, stamp: float, data: bytes, channel: str) -> can.Message:

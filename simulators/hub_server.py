@@ -14,7 +14,7 @@ from typing import Self
 
 import can
 
-from simulators.hub_socket import PACKET, RECORD, socket_path
+from simulators.hub_socket import HELLO, PACKET, RECORD, socket_path
 from simulators.wire_time import ERROR, Wire
 
 _log = logging.getLogger(__name__)
@@ -119,9 +119,10 @@ class HubServer:
         return None if due is None else max(due - time.monotonic(), 0.0)
 
     def _admit(self) -> None:
-        with contextlib.suppress(BlockingIOError, ConnectionError):
+        with contextlib.suppress(OSError):  # who knocked may have gone again
             peer, _ = self._listener.accept()
             peer.setblocking(False)
+            peer.send(HELLO, socket.MSG_NOSIGNAL)
             self._clients.append(_Client(peer))
             self._counters["joined"] += 1
 

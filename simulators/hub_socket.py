@@ -11,6 +11,8 @@ RECORD = struct.Struct("<IB3xd8s")
 """Identifier with flags, length, time stamp [s since 1970], data."""
 PACKET = 128 * RECORD.size
 """Most bytes in one packet."""
+HELLO = b"gemuco hub 1"
+"""First packet from the server: from here on the program misses no frame."""
 
 
 def socket_path(channel: str) -> Path:
