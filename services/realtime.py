@@ -39,8 +39,24 @@ def prepare_thread(priority: int) -> str:
     ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
     if not priority:
         return "other"
+    return "fifo" if _use_fifo(0, priority) else "other"
+
+
+def promote(prefix: str, priority: int) -> None:
+    """Try real-time scheduling for threads that others started.
+
+    Args:
+        prefix: What the names of the threads begin with.
+        priority: SCHED_FIFO priority.
+    """
+    for thread in threading.enumerate():
+        if thread.name.startswith(prefix) and thread.native_id is not None:
+            _use_fifo(thread.native_id, priority)
+
+
+def _use_fifo(thread: int, priority: int) -> bool:
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
+        os.sched_setscheduler(thread, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
     except OSError as error:
         if not _said.is_set():
             _said.set()
@@ -49,5 +65,5 @@ def prepare_thread(priority: int) -> str:
                 "To allow it, give the user an rtprio limit, or the container CAP_SYS_NICE.",
                 error.strerror,
             )
-        return "other"
-    return "fifo"
+        return False
+    return True

@@ -53,7 +53,7 @@ def settings(robot: str, role: str, connect: Iterable[str] = ()) -> dict[str, An
         "listen": {"endpoints": [] if role == CLIENT else [endpoint(robot, role)], "exit_on_failure": True},
         "connect": {
             "endpoints": [*(endpoint(robot, peer) for peer in peers), *connect],
-            "timeout_ms": 0,
+            "timeout_ms": -1,
             "exit_on_failure": False,
             "retry": {"period_init_ms": 50, "period_max_ms": 500, "period_increase_factor": 2},
         },

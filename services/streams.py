@@ -66,10 +66,9 @@ class Newest(Generic[M]):
             return None
         return slot[1]
 
-    def age(self) -> float:
-        """How long ago [s] the newest message arrived; inf if none did."""
-        slot = self._slot
-        return float("inf") if slot is None else self._clock.monotonic() - slot[0]
+    def last(self) -> tuple[float, M] | None:
+        """Monotonic time of arrival [s] and the newest message, however old it is; None if none arrived."""
+        return self._slot
 
     def wait(self, timeout: float) -> M | None:
         """Wait for the next message to arrive; None if none does within `timeout` [s]."""

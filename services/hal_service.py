@@ -1,0 +1,169 @@
+"""The process that owns a robot's hardware: cycles it, publishes what was measured and applied, takes commands.
+
+Safety lives in `hal.robot`; here is only what travels.
+"""
+
+import logging
+import threading
+import time
+from collections.abc import Iterable
+from typing import Any
+
+from hal.config import RobotConfig
+from hal.robot import Robot, open_robot
+from services import keys, messages, realtime
+from services.command_intake import CommandIntake
+from services.loop import Loop
+from services.messages import Status
+from services.service import Service, until_told
+
+log = logging.getLogger(__name__)
+
+CYCLE_PRIORITY = 50
+RECEIVE_PRIORITY = 51
+"""Above the cycle, which waits for what the receive threads bring."""
+POWERED = ("enabling", "hold", "follow", "stopping")
+
+
+class HalService:
+    """A robot between its buses and zenoh.
+
+    Args:
+        config: The robot file.
+        robot: Not opened yet.
+        service: The process's session.
+    """
+
+    def __init__(self, config: RobotConfig, robot: Robot, service: Service) -> None:
+        self._robot = robot
+        self._service = service
+        self._samples = service.publisher(keys.sample(config.robot), messages.Sample)
+        self._applied = service.publisher(keys.applied(config.robot), messages.Applied)
+        self._intake = CommandIntake(service.session, config, robot, service.boot)
+        self._loop = Loop("hal", config.rates.hal, self.tick, robot.clock, CYCLE_PRIORITY)
+        self._is_open = False
+        service.verb("enable", lambda _: self._do(robot.enable))
+        service.verb("disable", lambda _: self._do(robot.disable))
+        service.verb("stop", lambda _: self._do(lambda: robot.stop("A client asked to stop.")))
+        service.verb("reset", lambda _: self._do(robot.reset))
+
+    def run(self, stop: threading.Event) -> None:
+        """Cycle the robot until `stop` is set, then let the drives go; commissioning comes first."""
+        self._service.publish_status(self.status)
+        try:
+            self._robot.open()
+            self._is_open = True
+            realtime.promote("bus ", RECEIVE_PRIORITY)
+            realtime.freeze()
+            self._loop.start()
+            self._service.run(self.status, stop)
+        finally:
+            self._loop.stop()
+            self._robot.close()
+
+    def tick(self) -> None:
+        """Take the commands that came, turn the robot once, publish."""
+        self._intake.take()
+        try:
+            sample, applied = self._robot.cycle()
+        except Exception as error:
+            self._robot.stop(f"The cycle failed: {error}")
+            raise
+        self._samples.put(
+            messages.Sample(
+                stamp_ns=sample.stamp_ns,
+                cycle=sample.cycle,
+                source=sample.source,
+                complete=sample.complete,
+                values=sample.values,
+                age=sample.age,
+                valid=sample.valid,
+            )
+        )
+        self._applied.put(
+            messages.Applied(
+                stamp_ns=applied.stamp_ns,
+                cycle=applied.cycle,
+                mode=applied.mode,
+                signal=applied.signal,
+                desired=applied.desired,
+                values=applied.values,
+                limited_by=applied.limited_by,
+                sender=self._intake.sender if applied.mode == "follow" else 0,
+            )
+        )
+
+    def status(self) -> Status:
+        """Health of the robot and of the loop."""
+        health = self._robot.health()
+        problem = _problem(health) or self._loop.error
+        state = "starting" if not self._is_open else "degraded" if problem else "running"
+        if health["mode"] == "fault":
+            state = "fault"
+        # A receive thread is a new one after its bus was closed and opened again.
+        realtime.promote("bus ", RECEIVE_PRIORITY)
+        return Status(
+            stamp_ns=time.time_ns(),
+            service=self._service.name,
+            state=state,
+            text=problem or self._intake.news(),
+            loops={"hal": self._loop.statistics()},
+            facts={**health, "commands": self._intake.facts(), "scheduling": self._loop.scheduling},
+        )
+
+    def _do(self, act: Any) -> dict[str, str]:
+        """Ask the robot; the answer tells where it stands, which may be on the way."""
+        act()
+        return {"mode": self._robot.mode, "fault": self._robot.fault_text}
+
+
+def _problem(health: dict[str, Any]) -> str:
+    """The most important thing that is wrong, in one sentence; empty when nothing is."""
+    if health["fault"]:
+        return str(health["fault"])
+    for name, bus in health["buses"].items():
+        if bus["state"] != "ok":
+            return f"Bus '{name}' is {bus['state']}. {bus['text']}".strip()
+    ill = [(name, device) for name, device in health["devices"].items() if device["text"]]
+    if ill:
+        name, device = ill[0]
+        more = f" (and {len(ill) - 1} more devices)" if len(ill) > 1 else ""
+        return f"{name}: {device['text']}{more}"
+    return str(health["limits"])
+
+
+def _describe(config: RobotConfig) -> dict[str, Any]:
+    """What a client must know of the robot: signals with units and elements, command, rates."""
+    signals = {
+        name: {"unit": signal.unit, "elements": list(signal.elements)} for name, signal in config.signals.items()
+    }
+    return {
+        "description": config.description,
+        "signals": signals,
+        "command": config.command.model_dump(),
+        "rates": config.rates.model_dump(),
+    }
+
+
+def run_hal(config: RobotConfig, connect: Iterable[str] = (), stop: threading.Event | None = None) -> int:
+    """Run the hardware service of a robot until SIGTERM, SIGINT or `stop`.
+
+    Args:
+        config: The robot file.
+        connect: More zenoh endpoints, such as a router's.
+        stop: Ends the service in place of the signals.
+
+    Returns:
+        The process's exit code.
+
+    Raises:
+        ConfigError: The robot file names what is not there.
+        AlreadyRunning: The robot has this service already.
+        ServiceError: No session.
+    """
+    realtime.prepare_process()
+    robot = open_robot(config)
+    with until_told(stop) as told, Service(config.robot, "hal", connect, lambda: _describe(config)) as service:
+        log.info("HAL of robot '%s' runs (boot %d)", config.robot, service.boot)
+        HalService(config, robot, service).run(told)
+    return 0

@@ -1,0 +1,153 @@
+"""The process that pretends to be the robot: simulated nodes on the robot file's buses; faults in, truth out."""
+
+import logging
+import threading
+import time
+from collections.abc import Iterable, Mapping
+from typing import Any, Protocol
+
+import numpy as np
+
+from hal import registry
+from hal.config import RobotConfig
+from hal.errors import ConfigError
+from services import keys, messages, realtime
+from services.loop import Loop
+from services.messages import MessageError, Status
+from services.service import Service, until_told
+
+log = logging.getLogger(__name__)
+
+TRUTH_RATE = 100.0
+
+
+class Rig(Protocol):
+    """Simulated hardware that runs in real time (`simulators.rig.Rig`)."""
+
+    failure: str
+
+    def start(self) -> None:
+        """Run in real time until `stop`."""
+        ...
+
+    def stop(self) -> None:
+        """Stop and close the world."""
+        ...
+
+    def fault(self, text: str) -> str:
+        """Break something; the sentence tells what was done."""
+        ...
+
+    def truth(self) -> Mapping[str, np.ndarray]:
+        """Every signal as it is [its unit], shapes (n,)."""
+        ...
+
+    def stats(self) -> dict[str, Any]:
+        """Counters."""
+        ...
+
+
+class SimulatorService:
+    """A running rig on zenoh.
+
+    Args:
+        robot: The robot's name.
+        rig: Not started yet.
+        service: The process's session.
+        variant: Which variant of the robot it is; told in the status.
+    """
+
+    def __init__(self, robot: str, rig: Rig, service: Service, variant: str) -> None:
+        self._rig = rig
+        self._service = service
+        self._variant = variant
+        self._cycle = 0
+        self._truth = service.publisher(keys.truth(robot), messages.Sample)
+        self._loop = Loop("truth", TRUTH_RATE, self.tick)
+        service.verb("fault", self._fault)
+
+    def run(self, stop: threading.Event) -> int:
+        """Run the rig until `stop` is set or it fails; the exit code."""
+        self._rig.start()
+        try:
+            realtime.freeze()
+            self._loop.start()
+            self._service.run(lambda: self._status(stop), stop)
+        finally:
+            self._loop.stop()
+            self._rig.stop()
+        return 1 if self._rig.failure else 0
+
+    def tick(self) -> None:
+        """Publish what is true now."""
+        values = {name: np.asarray(value, float) for name, value in self._rig.truth().items()}
+        self._cycle += 1
+        self._truth.put(
+            messages.Sample(
+                stamp_ns=time.time_ns(),
+                cycle=self._cycle,
+                source="truth",
+                complete=True,
+                values=values,
+                age={name: np.zeros(value.shape) for name, value in values.items()},
+                valid={name: np.ones(value.shape, bool) for name, value in values.items()},
+            )
+        )
+
+    def _fault(self, arguments: dict[str, Any]) -> dict[str, str]:
+        text = arguments.get("text")
+        if not isinstance(text, str) or not text.strip():
+            raise MessageError("The verb 'fault' takes {text: what to break}, as in 'muscle_cut biceps'.")
+        done = self._rig.fault(text)
+        log.info("%s", done)
+        return {"text": done}
+
+    def _status(self, stop: threading.Event) -> Status:
+        failure = self._rig.failure
+        if failure:
+            log.error("The simulation failed: %s", failure)
+            stop.set()
+        return Status(
+            stamp_ns=time.time_ns(),
+            service=self._service.name,
+            state="fault" if failure else "running",
+            text=failure,
+            loops={"truth": self._loop.statistics()},
+            facts={"variant": self._variant, **self._rig.stats()},
+        )
+
+
+def run_simulator(
+    config: RobotConfig,
+    variant: str,
+    seed: int = 0,
+    connect: Iterable[str] = (),
+    stop: threading.Event | None = None,
+) -> int:
+    """Run what stands in for a robot's hardware until SIGTERM, SIGINT or `stop`.
+
+    Args:
+        config: The robot file.
+        variant: One of the simulator's variants.
+        seed: Chooses among the robots of a variant, and their noise.
+        connect: More zenoh endpoints, such as a router's.
+        stop: Ends the service in place of the signals.
+
+    Returns:
+        The process's exit code; 1 if the simulation failed.
+
+    Raises:
+        ConfigError: The robot file names no simulator, or one that is not there; an unknown variant.
+        AlreadyRunning: The robot is simulated already.
+        ServiceError: No session.
+    """
+    realtime.prepare_process()
+    if not config.simulator:
+        raise ConfigError(f"Robot '{config.robot}' has no 'simulator' in its robot file, so there is none to run.")
+    simulator = registry.load(config.simulator)
+    if variant not in simulator.variants:
+        known = ", ".join(simulator.variants)
+        raise ConfigError(f"The simulator of '{config.robot}' has no variant '{variant}'. Known variants: {known}.")
+    with until_told(stop) as told, Service(config.robot, "simulator", connect) as service:
+        log.info("Simulator of robot '%s' runs (%s, seed %d)", config.robot, variant, seed)
+        return SimulatorService(config.robot, simulator.rig(config, variant, seed), service, variant).run(told)
