@@ -151,6 +151,13 @@ class Bench:
                 wire.send(can.Message(arbitration_id=SENTINEL, is_extended_id=False))
                 assert self._passed[name].wait(2.0) or self.buses[name]._can is None, f"{name} does not receive"
 
+    def flush_errors(self, bus):
+        """Wait until an error frame was handled, without a data frame behind it that would end bus-off."""
+        deadline = time.monotonic() + 2.0
+        while not self.buses[bus].counters["error_frames"]:
+            assert time.monotonic() < deadline
+            time.sleep(0.001)
+
     def pass_time(self, duration=0.005):
         self.clock.advance(duration)
         if self.powered:
@@ -208,6 +215,9 @@ class Bench:
 
     def device(self, name):
         return self.robot.health()["devices"][name]
+
+    def states(self):
+        return {device["state"] for device in self.robot.health()["devices"].values()}
 
     def send(self, bus, cob_id, data, **more):
         """A frame from nowhere."""
