@@ -36,30 +36,16 @@ class AnomalyWatch:
     def tick(self) -> None:
         """Score the newest sample; NaN, and nobody is blamed, without a fresh one or without normal data."""
         fresh, values = self._freshness.take()
-        schema = self._schema()
-        cycle = -1 if fresh is None else fresh.sample.cycle
-        if fresh is None or schema.normal is None:
-            self._tell(
-                Anomaly(cycle=cycle, score=math.nan, threshold=math.nan, is_anomaly=False, blamed="", contribution={})
-            )
-            return
-        found = schema.score(values)
+        found = self._schema().score(values)
         now = self._clock.monotonic()
         self._above_since = min(self._above_since, now) if found.score > found.threshold else math.inf
-        contribution = {name: np.asarray(part, float) for name, part in found.contribution.items()}
-        self._tell(
-            Anomaly(
-                cycle=cycle,
-                score=float(found.score),
-                threshold=float(found.threshold),
-                is_anomaly=now - self._above_since >= self._after,
-                blamed=found.blamed,
-                contribution=contribution,
-            )
+        self.latest = Anomaly(
+            stamp_ns=self._clock.now_ns(),
+            cycle=-1 if fresh is None else fresh.sample.cycle,
+            score=float(found.score),
+            threshold=float(found.threshold),
+            is_anomaly=now - self._above_since >= self._after,
+            blamed=found.blamed,
+            contribution={name: np.asarray(part, float) for name, part in found.contribution.items()},
         )
-
-    def _tell(self, anomaly: Anomaly) -> None:
-        if not math.isfinite(anomaly.score):
-            self._above_since = math.inf
-        self.latest = anomaly
-        self._publish(anomaly)
+        self._publish(self.latest)

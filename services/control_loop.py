@@ -9,6 +9,7 @@ import numpy as np
 
 from hal.clock import Clock
 from hal.config import RobotConfig
+from services.errors import ServiceError
 from services.estimation import Estimation, Fresh, Newest
 from services.messages import Applied, Command, Target
 from services.model_config import ControlConfig
@@ -21,11 +22,11 @@ LIVE_MODES = ("hold", "follow")
 DEAD_MODES = ("off", "stopping", "fault")
 
 
-class TargetRefused(Exception):
+class TargetRefused(ServiceError):
     """A target was not accepted; the controller goes on with the one before."""
 
 
-class NotEngaged(Exception):
+class NotEngaged(ServiceError):
     """The controller could not take over; nothing moved because of it."""
 
 
@@ -72,11 +73,11 @@ class Control:
         newest: Newest,
         applied: Callable[[], Applied | None],
         estimation: Estimation,
-        solver: Callable[[], Solver],
+        solver: Solver,
         send: Callable[[Command], None],
         clock: Clock,
     ) -> None:
-        """`newest` and `applied` return what the HAL said last, `solver` the solver of the model in use."""
+        """`newest` and `applied` return what the HAL said last."""
         self._robot, self._config, self._clock = robot, config, clock
         self._newest, self._applied, self._estimation = newest, applied, estimation
         self._solver, self._send = solver, send
@@ -92,15 +93,22 @@ class Control:
         self.counters = {"sent": 0, "waited": 0, "refused_targets": 0}
 
     def set_target(self, target: Target) -> None:
-        """Where to go from now on. Raises `TargetRefused`; then nothing changes."""
+        """Where to go from now on.
+
+        Raises:
+            TargetRefused: It cannot be reached safely; the target before stays.
+        """
+        values = check_target(self._robot, self._config, target)
+        with self._lock:
+            self._target, self.text = values, ""
+
+    def try_target(self, target: Target) -> None:
+        """Take a target that came without anybody waiting for an answer; a refusal is counted and told in `facts`."""
         try:
-            values = check_target(self._robot, self._config, target)
+            self.set_target(target)
         except TargetRefused as refusal:
             self.counters["refused_targets"] += 1
             self.text = str(refusal)
-            raise
-        with self._lock:
-            self._target = values
 
     def engage(self, enable: Callable[[], Any]) -> None:
         """Take over from where the body is, and ask the HAL to enable.
@@ -188,7 +196,7 @@ class Control:
 
     def _command(self, reference: np.ndarray, now: Mapping[str, np.ndarray]) -> np.ndarray:
         """The solved command, led in from where the servos stand when the controller took over."""
-        solved = self._solver()({self._config.target: reference}, now)
+        solved = self._solver({self._config.target: reference}, now)
         measured = now[self._robot.command.signal]
         if self._bump is None:
             self._bump = np.where(np.isfinite(measured), measured - solved, 0.0)

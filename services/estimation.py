@@ -1,10 +1,11 @@
 """The estimation loop: stale is masked, estimated, and marked as estimated."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
+from gemuco.masks import label
 from gemuco.schema import BodySchema
 from hal.clock import Clock
 from hal.config import RobotConfig
@@ -43,14 +44,14 @@ class Freshness:
         if fresh is None:
             return None, {name: np.full(size, np.nan) for name, size in self._sizes.items()}
         waited = self._clock.monotonic() - fresh.received
+        sample = fresh.sample
         values: dict[str, np.ndarray] = {}
         for name, size in self._sizes.items():
-            value = fresh.sample.values.get(name)
-            if value is None or value.shape != (size,):
+            value, valid, age = sample.values.get(name), sample.valid.get(name), sample.age.get(name)
+            if value is None or valid is None or age is None or not value.shape == valid.shape == age.shape == (size,):
                 values[name] = np.full(size, np.nan)
                 continue
-            usable = fresh.sample.valid[name] & (fresh.sample.age[name] + waited <= self._stale_after[name])
-            values[name] = np.where(usable, value, np.nan)
+            values[name] = np.where(valid & (age + waited <= self._stale_after[name]), value, np.nan)
         if not any(np.isfinite(value).any() for value in values.values()):
             return None, values
         return fresh, values
@@ -60,31 +61,29 @@ class Estimation:
     """Makes one `Estimates` per tick from the newest sample."""
 
     def __init__(
-        self, freshness: Freshness, schema: Callable[[], BodySchema], publish: Callable[[Estimates], None]
+        self,
+        freshness: Freshness,
+        schema: Callable[[], BodySchema],
+        publish: Callable[[Estimates], None],
+        clock: Clock,
     ) -> None:
         """`schema` returns the body schema in use at the moment."""
-        self._freshness = freshness
-        self._schema = schema
-        self._publish = publish
+        self._freshness, self._schema, self._publish, self._clock = freshness, schema, publish, clock
         self.latest: Estimates | None = None
 
     def tick(self) -> None:
         """Publish what is measured, and estimates in place of what is not."""
         fresh, values = self._freshness.take()
-        self.latest = estimates(self._schema(), values, -1 if fresh is None else fresh.sample.cycle)
+        found = self._schema().estimate(values)
+        names = tuple(found)
+        self.latest = Estimates(
+            stamp_ns=self._clock.now_ns(),
+            cycle=-1 if fresh is None else fresh.sample.cycle,
+            values={name: found[name].value for name in names},
+            estimated={name: found[name].estimated for name in names},
+            std={name: found[name].std for name in names},
+            method={name: found[name].method for name in names},
+            mask={name: label(found[name].mask, names) for name in names},
+            residual={name: float(found[name].residual) for name in names},
+        )
         self._publish(self.latest)
-
-
-def estimates(schema: BodySchema, values: Mapping[str, np.ndarray], cycle: int) -> Estimates:
-    """Every signal of the schema, measured where `values` has a number and estimated where it has not."""
-    found = schema.estimate(values)
-    names = schema.layout.names
-    return Estimates(
-        cycle=cycle,
-        values={name: found[name].value for name in found},
-        estimated={name: found[name].estimated for name in found},
-        std={name: found[name].std for name in found},
-        method={name: found[name].method for name in found},
-        mask={name: "+".join(part for part in names if part in found[name].mask) for name in found},
-        residual={name: float(found[name].residual) for name in found},
-    )

@@ -54,7 +54,7 @@ class ControlConfig(Section):
 class UpdateConfig(Section):
     """The online update of W from a bounded window."""
 
-    window: Count = 300
+    window: Count = 3000
     """Samples kept; the oldest is dropped."""
     interval: Positive = 0.1
     """Least time [s] between two samples of the window, so that it spans some motion."""

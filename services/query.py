@@ -12,6 +12,7 @@ import msgpack
 import numpy as np
 import zenoh
 
+from gemuco.errors import SchemaError
 from hal.errors import HalError
 from services import keys
 from services.errors import RemoteError, ServiceError, ServiceUnavailable
@@ -50,7 +51,7 @@ def serve_verb(session: zenoh.Session, key: str, handler: Handler) -> zenoh.Quer
 def _answer(key: str, payload: zenoh.ZBytes | None, handler: Handler) -> bytes:
     try:
         return _pack({"ok": handler(_arguments(key, payload))})
-    except (HalError, ServiceError, ValueError, LookupError) as error:
+    except (HalError, SchemaError, ServiceError, ValueError, LookupError) as error:
         return _pack({"error": type(error).__name__, "text": str(error)})
     except Exception as error:
         log.exception("Verb %s failed", key)
@@ -83,7 +84,7 @@ def ask(
 
     Raises:
         ServiceUnavailable: No answer within the deadline.
-        ServiceError, HalError: What the service raised; `RemoteError` when the class is not known here.
+        ServiceError, HalError, SchemaError: What the service raised; `RemoteError` when the class is not known here.
     """
     deadline = time.monotonic() + timeout
     payload = _pack(dict(arguments or {}))
@@ -123,7 +124,7 @@ def _result(key: str, data: bytes) -> dict[str, Any]:
     reply = _unpack(data, f"The answer of {key}")
     if "error" in reply:
         name, text = str(reply["error"]), str(reply.get("text", ""))
-        known = {kind.__name__: kind for base in (HalError, ServiceError) for kind in _family(base)}
+        known = {kind.__name__: kind for base in (HalError, SchemaError, ServiceError) for kind in _family(base)}
         raise known[name](text) if name in known else RemoteError(f"{text} ({name} of {keys.parse(key)[1]})")
     value = reply.get("ok")
     if isinstance(value, dict):

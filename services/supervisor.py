@@ -13,6 +13,8 @@ from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any
 
+from services.errors import ServiceError
+
 _PR_SET_PDEATHSIG = 1
 _LIBC = ctypes.CDLL(None, use_errno=True)
 LAST_LINES = 5
@@ -24,11 +26,11 @@ def gemuco_command(*arguments: str) -> list[str]:
     return [sys.executable, "-m", "services.cli", *arguments]
 
 
-class ChildDied(Exception):
+class ChildDied(ServiceError):
     """A supervised process ended by itself; the text tells how, and what it said last."""
 
 
-class NotReady(Exception):
+class NotReady(ServiceError):
     """A supervised process did not become ready in time."""
 
 

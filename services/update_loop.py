@@ -112,6 +112,7 @@ class OnlineUpdate:
                 self._since_change.append(sample)
             if self._learner is None:
                 told = Update(
+                    stamp_ns=self._clock.now_ns(),
                     active=False,
                     model_version=self._living.version,
                     window=len(self._since_change),
@@ -145,6 +146,7 @@ class OnlineUpdate:
             self._living.swap(learner.schema)
             self._since_change.clear()
         return Update(
+            stamp_ns=self._clock.now_ns(),
             active=True,
             model_version=self._living.version,
             window=int(result.window),

@@ -1,0 +1,213 @@
+"""The body schema as a service: estimation, control, anomaly and update, four loops on the newest sample."""
+
+import math
+import threading
+import time
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gemuco import adapt
+from gemuco.control import Controller
+from gemuco.errors import SchemaError
+from gemuco.losses import Match, StaySmall, Term, TorqueBalance
+from gemuco.schema import BodySchema
+from hal import registry
+from hal.clock import SystemClock
+from hal.config import RobotConfig
+from services import keys, query
+from services.anomaly_loop import AnomalyWatch
+from services.control_loop import Control
+from services.estimation import Estimation, Fresh, Freshness
+from services.living_model import LivingModel, load_model
+from services.loop import Loop
+from services.messages import Anomaly, Applied, Command, Estimates, Sample, Status, Target, Update
+from services.model_config import ControlConfig, ModelConfig, model_config
+from services.model_verbs import ModelVerbs
+from services.realtime import freeze, prepare_process
+from services.service import Service, until_told
+from services.update_loop import OnlineUpdate
+
+PRIORITIES = {"estimation": 40, "control": 35, "anomaly": 30, "update": 10}
+"""SCHED_FIFO where the system allows it; the update is lowest but not without, or it would hold the interpreter up."""
+
+
+class ModelSolver:
+    """The controller of whichever model is in use."""
+
+    def __init__(self, living: LivingModel, config: ControlConfig, command: str) -> None:
+        """Prepare for the commanded signal.
+
+        Raises:
+            SchemaError: This model cannot control; the text says what it lacks.
+        """
+        terms: list[Term] = [Match(config.target)]
+        if config.effort is not None:
+            terms.append(StaySmall(config.effort, config.effort_weight))
+            if config.gravity is not None:
+                gravity = registry.load(config.gravity)
+                terms.append(TorqueBalance(gravity, config.torque_weight, config.target, config.effort, command))
+        self._living = living
+        self._controller = Controller(living.schema, terms, command)
+        middle = living.schema.layout.split(living.schema.scaler.mean)
+        self._controller.solve({config.target: middle[config.target]}, {})
+        self._controller.restart()
+
+    def __call__(self, target: Mapping[str, np.ndarray], now: Mapping[str, np.ndarray]) -> np.ndarray:
+        """The command [its unit], shape (n,), that brings about a target."""
+        if self._controller.schema is not self._living.schema:
+            self._controller.swap(self._living.schema)
+        return self._controller.solve(target, now).command
+
+
+class GemucoService:
+    """The four loops of one robot, bound to its session."""
+
+    def __init__(self, robot: RobotConfig, schema: BodySchema, service: Service) -> None:
+        """Subscribe, publish and prepare; nothing ticks yet."""
+        self.robot, self.config, self.service = robot, model_config(robot), service
+        self.clock = SystemClock()
+        self.living = LivingModel(schema)
+        self.verbs = ModelVerbs(self)
+        self._samples = service.newest(keys.sample(robot.robot), Sample)
+        self._applied = service.newest(keys.applied(robot.robot), Applied)
+        self._targets = service.newest(keys.target(robot.robot), Target)
+        self._target_seen: Target | None = None
+        self.freshness = Freshness(robot, self.newest_sample, self.clock)
+        self.estimation = Estimation(
+            self.freshness, self._schema, service.publisher(keys.estimate(robot.robot), Estimates).put, self.clock
+        )
+        self.anomaly = AnomalyWatch(
+            self.freshness,
+            self._schema,
+            self.config.anomaly.after,
+            service.publisher(keys.anomaly(robot.robot), Anomaly).put,
+            self.clock,
+        )
+        self.update = OnlineUpdate(
+            self.freshness,
+            self.living,
+            self.config.update,
+            self._learner,
+            service.publisher(keys.update(robot.robot), Update).put,
+            self.clock,
+        )
+        self.control, self.no_control = self._make_control(self.config)
+        rates = robot.rates
+        ticks = {
+            "estimation": (rates.estimation, self.estimation.tick),
+            "control": (rates.control, self._control_tick),
+            "anomaly": (rates.anomaly, self.anomaly.tick),
+            "update": (rates.update, self.update.tick),
+        }
+        self.loops = [Loop(name, rate, tick, self.clock, PRIORITIES[name]) for name, (rate, tick) in ticks.items()]
+
+    def newest_sample(self) -> Fresh | None:
+        """The last sample that arrived, however old."""
+        last = self._samples.last()
+        return None if last is None else Fresh(last[1], last[0])
+
+    def enable_hal(self) -> dict[str, Any]:
+        """Ask the HAL to enable the drives."""
+        return query.ask(self.service.session, keys.verb(self.robot.robot, "hal", "enable"))
+
+    def status(self) -> Status:
+        """State and counters of this second."""
+        fresh, values = self.freshness.take()
+        missing = [name for name, value in values.items() if not np.isfinite(value).all()]
+        failing = [f"{loop.name}: {loop.error}" for loop in self.loops if loop.error]
+        text = ""
+        if fresh is None:
+            text = "No fresh sample comes from the HAL. Is `gemuco hal` running?"
+        elif missing:
+            text = f"Estimating {', '.join(missing)}: not measured at the moment."
+        elif failing:
+            text = failing[0]
+        return Status(
+            stamp_ns=time.time_ns(),
+            service="model",
+            state="degraded" if text else "running",
+            text=text,
+            loops={loop.name: loop.statistics() for loop in self.loops},
+            facts={
+                "model_version": self.living.version,
+                "adapting": self.update.is_active,
+                "control": self.no_control if self.control is None else self.control.facts(),
+                "scheduling": {loop.name: loop.scheduling for loop in self.loops},
+                "rejected": self._samples.rejected + self._applied.rejected + self._targets.rejected,
+                "failing": failing,
+            },
+        )
+
+    def run(self, stop: threading.Event) -> None:
+        """Serve until told to stop."""
+        for name, handler in self.verbs.handlers().items():
+            self.service.verb(name, handler)
+        freeze()
+        for loop in self.loops:
+            loop.start()
+        try:
+            self.service.run(self.status, stop)
+        finally:
+            for loop in self.loops:
+                loop.stop()
+
+    def _schema(self) -> BodySchema:
+        return self.living.schema
+
+    def _learner(self, schema: BodySchema) -> adapt.Updater:
+        config = self.config.update
+        return adapt.Updater(schema, adapt.UpdateConfig(window=config.window, rate=config.rate))
+
+    def _make_control(self, config: ModelConfig) -> tuple[Control | None, str]:
+        """The controller, or why there is none."""
+        if config.control is None:
+            return None, f"The robot file of '{self.robot.robot}' has no model.control section."
+        try:
+            solver = ModelSolver(self.living, config.control, self.robot.command.signal)
+        except SchemaError as error:
+            return None, f"This model cannot control: {error}"
+        sender = self.service.publisher(keys.command(self.robot.robot), Command).put
+        return (
+            Control(
+                self.robot, config.control, self.newest_sample, self._newest_applied, self.estimation, solver, sender,
+                self.clock,
+            ),
+            "",
+        )  # fmt: skip
+
+    def _newest_applied(self) -> Applied | None:
+        return self._applied.get(self.robot.command.time_to_live)
+
+    def _control_tick(self) -> None:
+        if self.control is None:
+            return
+        target = self._targets.get(math.inf)
+        if target is not None and target is not self._target_seen:
+            self._target_seen = target
+            self.control.try_target(target)
+        self.control.tick()
+
+
+def serve(robot: RobotConfig, folder: Path, connect: Iterable[str] = (), stop: threading.Event | None = None) -> None:
+    """Run the model service of a robot until SIGTERM, SIGINT or `stop`.
+
+    Args:
+        robot: The robot file.
+        folder: Where the trained model lies.
+        connect: More zenoh endpoints, such as a router's.
+        stop: An event that ends it; signals are then left alone.
+
+    Raises:
+        CheckpointError: No model there, or one of another body.
+        AlreadyRunning: The robot already has a model service.
+    """
+    prepare_process()
+    schema = load_model(robot, folder)
+    made: list[GemucoService] = []
+    service = Service(robot.robot, "model", connect, lambda: made[0].verbs.describe() if made else {})
+    with until_told(stop) as told, service:
+        made.append(GemucoService(robot, schema, service))
+        made[0].run(told)
