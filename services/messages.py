@@ -244,21 +244,42 @@ def decode(data: bytes, expected: type[M]) -> M:
     Raises:
         MessageError: Too long, not msgpack, another type, another major version, a field missing or of a wrong kind.
     """
-    if len(data) > MAX_BYTES:
-        raise MessageError(f"A {expected.TYPE} message of {len(data)} bytes is over the limit of {MAX_BYTES}.")
-    try:
-        body = msgpack.unpackb(data)
-    except (ValueError, msgpack.UnpackException) as error:
-        raise MessageError(f"A {expected.TYPE} message is not msgpack: {error or type(error).__name__}.") from None
-    if not isinstance(body, dict) or body.get("type") != expected.TYPE:
-        found = body.get("type") if isinstance(body, dict) else type(body).__name__
-        raise MessageError(f"Expected a {expected.TYPE} message, got {found!r}.")
-    if body.get("v") != VERSION:
-        raise MessageError(f"A {expected.TYPE} message has version {body.get('v')!r}; this program reads {VERSION}.")
+    body = _body(data, expected.TYPE)
+    if body.get("type") != expected.TYPE:
+        raise MessageError(f"Expected a {expected.TYPE} message, got {body.get('type')!r:.80}.")
     return _record(expected, body)
 
 
+def decode_any(data: bytes) -> Message:
+    """Read a message of whatever type it says it is.
+
+    Raises:
+        MessageError: As `decode`, or the type is not known.
+    """
+    body = _body(data, "gemuco")
+    kind = body.get("type")
+    if not isinstance(kind, str) or kind not in RECORDS:
+        raise MessageError(f"There is no message type {kind!r:.80}. Known types: {', '.join(RECORDS)}.")
+    return _record(RECORDS[kind], body)
+
+
+def _body(data: bytes, what: str) -> dict[str, Any]:
+    if len(data) > MAX_BYTES:
+        raise MessageError(f"A {what} message of {len(data)} bytes is over the limit of {MAX_BYTES}.")
+    try:
+        body = msgpack.unpackb(data)
+    except (ValueError, msgpack.UnpackException) as error:
+        raise MessageError(f"A {what} message is not msgpack: {error or type(error).__name__}.") from None
+    if not isinstance(body, dict):
+        raise MessageError(f"Expected a {what} message, got {type(body).__name__}.")
+    return body
+
+
 def _record(expected: type[M], body: dict[str, Any]) -> M:
+    if body.get("v") != VERSION:
+        raise MessageError(
+            f"A {expected.TYPE} message has version {body.get('v')!r:.80}; this program reads {VERSION}."
+        )
     hints = _hints(expected)
     fields: dict[str, Any] = {}
     for item in _fields(expected):
