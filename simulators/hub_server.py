@@ -23,6 +23,8 @@ _BACKLOG = 100_000 * RECORD.size
 """Bytes kept for one program that does not read; more, and it is cut off. Ten seconds of a full 1 Mbit/s bus."""
 _QUEUE = 256
 """Frames that may wait for a timed bus before the server takes no more from the senders."""
+_GRAIN = 3e-4
+"""Shortest sleep [s] of a timed bus: two or three frames then leave together, at half the cost."""
 
 
 @dataclass(eq=False, slots=True)
@@ -116,7 +118,7 @@ class HubServer:
 
     def _pause(self) -> float | None:
         due = self._wire.due() if self._wire is not None else None
-        return None if due is None else max(due - time.monotonic(), 0.0)
+        return None if due is None else max(due - time.monotonic(), _GRAIN)
 
     def _admit(self) -> None:
         with contextlib.suppress(OSError):  # who knocked may have gone again
