@@ -41,9 +41,10 @@ class Recorder:
         session: An open session; it must outlive the recorder.
         robot: The robot's name.
         path: The file; an existing one is refused.
+        depth: How many messages may wait to be written; more are dropped and counted.
     """
 
-    def __init__(self, session: zenoh.Session, robot: str, path: Path) -> None:
+    def __init__(self, session: zenoh.Session, robot: str, path: Path, depth: int = QUEUE) -> None:
         self.path = path
         self.written = 0
         """Messages in the file."""
@@ -55,7 +56,7 @@ class Recorder:
         """Why writing ended early; empty while all is well."""
         self._session = session
         self._robot = robot
-        self._queue: queue.Queue[Item | None] = queue.Queue(QUEUE)
+        self._queue: queue.Queue[Item | None] = queue.Queue(depth)
         self._channels: dict[str, int] = {}
         self._last: dict[str, tuple[int, int]] = {}
         self._told: dict[str, str] = {}

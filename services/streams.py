@@ -2,7 +2,7 @@
 
 import logging
 import threading
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import zenoh
 
@@ -36,7 +36,8 @@ class Publisher(Generic[M]):
     @property
     def has_listener(self) -> bool:
         """Whether anybody subscribes to the key right now."""
-        return self._publisher.matching_status
+        status: Any = self._publisher.matching_status  # zenoh's stub says bool, which it is not: it is always true
+        return bool(status.matching)
 
 
 class Newest(Generic[M]):

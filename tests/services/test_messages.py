@@ -1,0 +1,140 @@
+import dataclasses
+
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from services import keys, messages
+from services.messages import (
+    MAX_BYTES,
+    Anomaly,
+    Applied,
+    Command,
+    Estimates,
+    Message,
+    MessageError,
+    Sample,
+    Status,
+    Target,
+    Update,
+)  # fmt: skip
+
+VALUES = {"joint_position": np.array([0.1, np.nan]), "muscle_tension": np.array([1.0])}
+TRUTH = {"joint_position": np.array([True, False]), "muscle_tension": np.array([True])}
+AGES = {"joint_position": np.array([0.001, np.inf]), "muscle_tension": np.array([0.0])}
+EXAMPLES: list[Message] = [
+    Sample(stamp_ns=5, seq=3, boot=2**53, cycle=7, source="can", complete=True, values=VALUES, age=AGES, valid=TRUTH),
+    Command(signal="muscle_length", values=np.arange(3.0), cycle=7, hal_boot=11),
+    Applied(
+        cycle=7, mode="follow", signal="muscle_length", desired=np.arange(3.0), values=np.full(3, np.nan),
+        limited_by=["rate"], sender=4,
+    ),
+    Estimates(
+        cycle=-1, values=VALUES, estimated=TRUTH, std=VALUES, method={"joint_position": "mask"},
+        mask={"joint_position": "muscle_length+muscle_tension"}, residual={"joint_position": 0.5},
+    ),
+    Anomaly(
+        cycle=1, score=float("nan"), threshold=3.0, is_anomaly=False, blamed="muscle_tension.biceps",
+        contribution=VALUES,
+    ),
+    Update(active=True, model_version=2, window=20, dropped=3, loss=0.25),
+    Target(signal="joint_position", values=np.zeros(5)),
+    Status(service="hal", state="running", loops={"hal": {"rate": 200.0}}, facts={"buses": {"can0": [1, "ok", None]}}),
+]  # fmt: skip
+
+
+def _same(left: object, right: object) -> bool:
+    if isinstance(left, dict) and isinstance(right, dict):
+        return left.keys() == right.keys() and all(_same(left[key], right[key]) for key in left)
+    if isinstance(left, np.ndarray | float) and isinstance(right, np.ndarray | float):
+        return np.array_equal(left, right, equal_nan=True)
+    return left == right
+
+
+@pytest.mark.parametrize("message", EXAMPLES, ids=lambda message: message.TYPE)
+def test_every_message_comes_back(message: Message) -> None:
+    for back in (
+        messages.decode(messages.encode(message), type(message)),
+        messages.decode_any(messages.encode(message)),
+    ):
+        assert type(back) is type(message)
+        for item in dataclasses.fields(message):
+            assert _same(getattr(message, item.name), getattr(back, item.name)), item.name
+
+
+def test_there_is_an_example_of_every_message() -> None:
+    assert {message.TYPE for message in EXAMPLES} == set(messages.RECORDS)
+
+
+def test_numpy_scalars_travel_as_numbers() -> None:
+    status = Status(
+        service="hal", state="running", facts={"n": np.int64(3), "x": [np.float32(0.5)], "ok": np.bool_(True)}
+    )
+    assert messages.decode(messages.encode(status), Status).facts == {"n": 3, "x": [0.5], "ok": True}
+
+
+def test_header_replaces_sequence_and_boot() -> None:
+    back = messages.decode(messages.encode(EXAMPLES[5], seq=9, boot=8), Update)
+    assert (back.seq, back.boot) == (9, 8)
+
+
+def _command(**change: object) -> bytes:
+    body = msgpack.unpackb(messages.encode(EXAMPLES[1]))
+    return msgpack.packb({name: value for name, value in (body | change).items() if value is not None})
+
+
+@pytest.mark.parametrize(
+    ("data", "says"),
+    [
+        (b"", "not msgpack"),
+        (b"\xc1", "not msgpack"),
+        (b"\x81\xa1a", "not msgpack"),
+        (b"\x91" * 5000, "not msgpack"),
+        (msgpack.packb({1: 2}), "not msgpack"),
+        (msgpack.packb([1, 2]), "got list"),
+        (msgpack.packb({}), "got None"),
+        (messages.encode(EXAMPLES[6]), "got 'target'"),
+        (_command(v=2), "has version 2; this program reads 1"),
+        (_command(v=None), "has version None"),
+        (_command(values=None), "lacks 'values'"),
+        (_command(values=[1.0, 2.0]), "not a binary"),
+        (_command(values=b"1234567"), "not a binary"),
+        (_command(signal=3), "command.signal is int, not str"),
+        (_command(cycle=True), "command.cycle is bool, not int"),
+        (_command(cycle=1.0), "command.cycle is float, not int"),
+        (b"\x00" * (MAX_BYTES + 1), "over the limit"),
+    ],
+)
+def test_what_is_no_command_says_why(data: bytes, says: str) -> None:
+    with pytest.raises(MessageError, match=says):
+        messages.decode(data, Command)
+
+
+def test_unknown_type_lists_the_known_ones() -> None:
+    with pytest.raises(MessageError, match=r"no message type 'wish'. Known types: sample, command"):
+        messages.decode_any(msgpack.packb({"type": "wish", "v": 1}))
+
+
+def test_unknown_fields_are_ignored() -> None:
+    assert messages.decode(_command(added_later=1), Command).cycle == 7
+
+
+@settings(max_examples=300)
+@given(st.integers(0, len(EXAMPLES) - 1), st.data())
+def test_damaged_bytes_never_raise_anything_else(which: int, data: st.DataObject) -> None:
+    wire = bytearray(messages.encode(EXAMPLES[which]))
+    for _ in range(data.draw(st.integers(1, 4))):
+        wire[data.draw(st.integers(0, len(wire) - 1))] = data.draw(st.integers(0, 255))
+    try:
+        messages.decode_any(bytes(wire))
+    except MessageError as error:
+        assert len(str(error)) < 400
+
+
+def test_a_key_comes_apart_again() -> None:
+    assert keys.parse(keys.verb("arm", "hal", "enable")) == ("arm", "hal", "do/enable")
+    for bad in ("", "gemuco", "gemuco/arm", "gemuco/arm/hal/", "other/arm/hal/sample", "gemuco//hal/sample"):
+        with pytest.raises(ValueError, match="not a gemuco key"):
+            keys.parse(bad)

@@ -1,0 +1,149 @@
+import threading
+import time
+
+import pytest
+import zenoh
+
+from hal.clock import ManualClock
+from services import keys, messages
+from services.client import Client
+from services.errors import AlreadyRunning, ServiceUnavailable
+from services.lock import ServiceLock
+from services.messages import Status, Target, Update
+from services.service import Service
+from services.session import close_session, open_session
+from services.streams import Newest, Publisher
+
+
+def _update(version: int) -> Update:
+    return Update(active=True, model_version=version, window=0, dropped=0, loss=0.0)
+
+
+def _read(newest: Newest[Update], version: int) -> Update:
+    deadline = time.monotonic() + 10.0
+    while time.monotonic() < deadline:
+        message = newest.get(float("inf"))
+        if message is not None and message.model_version == version:
+            return message
+        time.sleep(0.002)
+    raise AssertionError(f"update {version} did not arrive")
+
+
+def test_newest_is_handed_out_only_while_it_is_fresh(robot: str) -> None:
+    session, clock = open_session(robot, "client"), ManualClock()
+    newest = Newest(session, keys.update(robot), Update, clock)
+    publisher = Publisher(session, keys.update(robot), Update, boot=5)
+    assert newest.get(1e9) is None
+    assert newest.last() is None
+    for version in range(3):
+        publisher.put(_update(version))
+    message = _read(newest, 2)
+    assert (message.seq, message.boot) == (2, 5)
+    clock.advance(0.2)
+    assert newest.get(0.25) == message
+    clock.advance(0.1)
+    assert newest.get(0.25) is None
+    last = newest.last()
+    assert last is not None
+    assert clock.monotonic() - last[0] == pytest.approx(0.3)
+    close_session(session)
+
+
+def test_what_cannot_be_read_is_counted_and_does_not_replace_the_good(robot: str) -> None:
+    session = open_session(robot, "client")
+    newest = Newest(session, keys.update(robot), Update)
+    session.put(keys.update(robot), messages.encode(_update(1)))
+    good = _read(newest, 1)
+    session.put(keys.update(robot), b"\xc1")
+    while not newest.rejected:
+        time.sleep(0.002)
+    assert newest.get(10.0) == good
+    assert "not msgpack" in newest.rejected_text
+    close_session(session)
+
+
+def test_wait_returns_the_next_message_or_none(robot: str) -> None:
+    session = open_session(robot, "client")
+    newest = Newest(session, keys.update(robot), Update)
+    assert newest.wait(0.05) is None
+    timer = threading.Timer(0.05, lambda: session.put(keys.update(robot), messages.encode(_update(7))))
+    timer.start()
+    message = newest.wait(10.0)
+    assert message is not None
+    assert message.model_version == 7
+    assert newest.wait(0.05) is None
+    timer.join()
+    close_session(session)
+
+
+def test_reader_threads_end_with_the_session(robot: str) -> None:
+    session = open_session(robot, "client")
+    Newest(session, keys.update(robot), Update)
+    close_session(session)
+    deadline = time.monotonic() + 10.0
+    while any(thread.name == f"newest {keys.update(robot)}" for thread in threading.enumerate()):
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+def _status() -> Status:
+    return Status(service="model", state="running", facts={"n": 1})
+
+
+def test_client_reads_and_asks_a_service(robot: str) -> None:
+    engaged: list[dict[str, object]] = []
+    with Client(robot) as client, Service(robot, "model", describe=lambda: {"more": 1}) as service:
+        assert client.status("model") is None
+        service.verb("engage", lambda arguments: engaged.append(arguments))
+        assert client.engage() == {}
+        assert engaged == [{}]
+        stop = threading.Event()
+        thread = threading.Thread(target=service.run, args=(_status, stop))
+        thread.start()
+        status = client.status("model", timeout=10.0)
+        assert status is not None
+        assert status.boot == service.boot
+        stop.set()
+        thread.join()
+        who = client.describe("model")
+        assert (who["robot"], who["service"], who["boot"], who["more"]) == (robot, "model", service.boot, 1)
+        assert client.alive() == {"model"}
+
+
+def test_a_target_waits_for_the_one_who_takes_it(robot: str) -> None:
+    with Client(robot) as client:
+        with pytest.raises(ServiceUnavailable, match=r"takes targets\. Is `gemuco serve` running"):
+            client.target("joint_position", [0.0], timeout=0.1)
+        with Service(robot, "model") as service:
+            targets = service.newest(keys.target(robot), Target)
+            client.target("joint_position", [0.5, -0.5], timeout=10.0)
+            deadline = time.monotonic() + 10.0
+            while (last := targets.last()) is None:
+                assert time.monotonic() < deadline
+                time.sleep(0.005)
+            assert last[1].values.tolist() == [0.5, -0.5]
+
+
+def test_a_second_service_is_refused_with_the_holders_pid(robot: str) -> None:
+    with Service(robot, "hal") as service:
+        says = rf"Robot '{robot}' already has a 'hal' service: process {service.identity()['pid']} on this machine"
+        with pytest.raises(AlreadyRunning, match=says):
+            Service(robot, "hal").__enter__()
+        Service(f"{robot}_other", "hal").__enter__().__exit__(None, None, None)
+    Service(robot, "hal").__enter__().__exit__(None, None, None)
+
+
+def test_a_service_elsewhere_on_the_network_is_seen(robot: str) -> None:
+    """Another session stands for the other machine: it holds no lock here."""
+    with Service(robot, "hal") as service:
+        session: zenoh.Session = open_session(robot, "model")
+        lock = ServiceLock(robot, "hal")
+        deadline = time.monotonic() + 10.0
+        while True:
+            try:
+                lock.check_network(session)
+            except AlreadyRunning as error:
+                assert f"process {service.identity()['pid']} on {service.identity()['host']}" in str(error)
+                break
+            assert time.monotonic() < deadline
+        close_session(session)
