@@ -12,6 +12,7 @@ from hal import registry
 from hal.config import RobotConfig
 from hal.errors import ConfigError
 from hal.robot import Robot
+from services.client import Client
 from services.errors import ServiceError
 from services.living_model import layout_of
 from services.model_config import CollectConfig, collect_config
@@ -190,3 +191,64 @@ class Simulator(Protocol):
 
 def _with_samples(config: CollectConfig, samples: int | None) -> CollectConfig:
     return config if samples is None else config.model_copy(update={"samples": samples})
+
+
+class BusPlayground:
+    """A running robot; its time is the wall's."""
+
+    def __init__(self, robot: RobotConfig, client: Client, rate: float) -> None:
+        """Enable the robot; `rate` [Hz] is how often a sample is recorded.
+
+        Raises:
+            ServiceUnavailable: No HAL answers.
+            CommandRefused: It does not enable.
+            CollectionStopped: The drives do not come.
+        """
+        self._robot, self._client = robot, client
+        self._interval = 1.0 / rate
+        self._start = self._recorded = time.monotonic()
+        deadline = time.monotonic() + ENABLE_WITHIN
+        client.enable()
+        while self._mode() not in ("hold", "follow"):
+            if time.monotonic() > deadline:
+                raise CollectionStopped(f"The drives did not become enabled within {ENABLE_WITHIN:g} s.")
+            time.sleep(0.01)
+
+    def play(self, command: np.ndarray, duration: float) -> Iterator[Values]:
+        """See `Playground.play`."""
+        end = time.monotonic() + duration
+        while (now := time.monotonic()) < end:
+            sample = self._client.next_sample(self._robot.command.time_to_live)
+            if sample is None:
+                raise CollectionStopped("No sample comes from the HAL any more. Is `gemuco hal` running?")
+            if (mode := self._mode()) not in ("hold", "follow"):
+                raise CollectionStopped(f"The robot went to '{mode}'. `gemuco top {self._robot.robot}` may tell why.")
+            self._client.command(self._robot.command.signal, command, sample)
+            if now - self._recorded >= self._interval:
+                self._recorded = now
+                yield dict(sample.values)
+
+    def elapsed(self) -> float:
+        """See `Playground.elapsed`."""
+        return time.monotonic() - self._start
+
+    def _mode(self) -> str:
+        applied = self._client.applied(timeout=self._robot.command.time_to_live)
+        return "off" if applied is None else applied.mode
+
+
+def collect_bus(robot: RobotConfig, seed: int, samples: int | None, progress: Progress) -> Collected:
+    """Record from the robot that a HAL runs, as a client of it, and let it go at the end.
+
+    Raises:
+        ConfigError: The robot file names no motion.
+        ServiceUnavailable: No HAL answers.
+        CollectionStopped: The robot stopped by itself.
+    """
+    config = _with_samples(collect_config(robot), samples)
+    motion = registry.load(config.motion)(robot, seed)
+    with Client(robot.robot) as client:
+        try:
+            return gather(robot, BusPlayground(robot, client, config.rate), motion, config, "bus", progress)
+        finally:
+            client.disable()

@@ -25,13 +25,13 @@ class StructureConfig(Section):
     """A signal that the others explain better than this becomes an output."""
     threshold_in: Positive = 0.15
     """A mask that explains the outputs better than this is feasible."""
-    epochs: Count = 30
+    epochs: Count = 80
 
 
 class TrainingConfig(Section):
     """How the network is fitted once its structure is known."""
 
-    epochs: Count = 80
+    epochs: Count = 150
     batch: Count = 250
     rate: Positive = 3e-3
     """Peak learning rate of the one-cycle schedule."""

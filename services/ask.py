@@ -1,0 +1,113 @@
+"""`gemuco query`: one question to a running robot, answered as text."""
+
+import json
+import time
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+import typer
+
+from services import keys
+from services.client import Client
+from services.errors import ServiceError, ServiceUnavailable
+
+PLAIN = {
+    "enable": "hal",
+    "disable": "hal",
+    "stop": "hal",
+    "reset": "hal",
+    "engage": "model",
+    "disengage": "model",
+    "rollback": "model",
+    "normal": "model",
+}
+VERBS = ("estimate", "target", "adapt", "describe", "fault", *PLAIN)
+WATCH_EVERY = 1.0
+
+
+class BadQuestion(ServiceError):
+    """The command line asks something that cannot be asked."""
+
+
+def ask_robot(
+    robot: str, verb: str, words: Sequence[str], hide: Sequence[str], watch: bool, connect: Iterable[str]
+) -> int:
+    """Ask, print the answer, return the exit code.
+
+    Raises:
+        BadQuestion: An unknown verb, or words that the verb does not take.
+        ServiceUnavailable: Nobody answers.
+    """
+    if verb not in VERBS:
+        raise BadQuestion(f"'{verb}' is not something to ask. Known: {', '.join(VERBS)}.")
+    with Client(robot, connect) as client:
+        if verb == "estimate":
+            signal = _one(verb, words, "a signal, such as joint_position")
+            if watch:
+                return _watch(client, signal, hide)
+            typer.echo(line_of(client.infer(signal, hide=hide)))
+            return 0
+        for key, value in _answer(client, verb, words).items():
+            typer.echo(f"{key}: {value if isinstance(value, str) else json.dumps(value)}")
+    return 0
+
+
+def line_of(answer: dict[str, Any]) -> str:
+    """An estimate in one line: elements with values, and where they come from."""
+    unit, std = answer["unit"], np.asarray(answer["std"], float)
+    values = "  ".join(
+        f"{name} {value:+.3f}{'*' if guessed else ''}"
+        for name, value, guessed in zip(answer["elements"], answer["values"], answer["estimated"], strict=True)
+    )
+    if answer["method"] == "measured":
+        return f"{answer['signal']} [{unit}]  {values}  measured"
+    if answer["method"] == "none":
+        return f"{answer['signal']} [{unit}]  {values}  neither measured nor estimable"
+    spread = float(np.sqrt(np.mean(std[np.asarray(answer["estimated"], bool)] ** 2)))
+    source = answer["mask"].replace("+", ", ")
+    return f"{answer['signal']} [{unit}]  {values}  * estimated from {source}, expected error {spread:.3f} {unit}"
+
+
+def _watch(client: Client, signal: str, hide: Sequence[str]) -> int:
+    """Print an estimate each second, through whatever happens to the service, until Ctrl-C."""
+    while True:
+        try:
+            typer.echo(line_of(client.infer(signal, hide=hide)))
+        except ServiceUnavailable as error:
+            typer.echo(str(error))
+        time.sleep(WATCH_EVERY)
+
+
+def _answer(client: Client, verb: str, words: Sequence[str]) -> dict[str, Any]:
+    if verb == "target":
+        if len(words) < 2:
+            raise BadQuestion("'target' needs a signal and a value per element: target joint_position 0 0 0 -0.6 0")
+        try:
+            values = [float(word) for word in words[1:]]
+        except ValueError:
+            raise BadQuestion(f"'target' takes numbers after the signal, not '{' '.join(words[1:])}'.") from None
+        return client.ask("model", "target", {"signal": words[0], "values": values})
+    if verb == "adapt":
+        switch = _one(verb, words, "on or off")
+        if switch not in ("on", "off"):
+            raise BadQuestion(f"'adapt' takes on or off, not '{switch}'.")
+        return client.adapt(switch == "on")
+    if verb == "fault":
+        if not words:
+            raise BadQuestion("'fault' needs to be told what to break: fault muscle_cut biceps")
+        return client.fault(" ".join(words))
+    if verb == "describe":
+        service = words[0] if words else "hal"
+        if service not in keys.SERVICES:
+            raise BadQuestion(f"'{service}' is not a service. Known services: {', '.join(keys.SERVICES)}.")
+        return client.describe(service)
+    if words:
+        raise BadQuestion(f"'{verb}' takes nothing more, but got '{' '.join(words)}'.")
+    return client.ask(PLAIN[verb], verb)
+
+
+def _one(verb: str, words: Sequence[str], what: str) -> str:
+    if len(words) != 1:
+        raise BadQuestion(f"'{verb}' needs {what}, and nothing else; it got {len(words)} words.")
+    return words[0]

@@ -1,0 +1,261 @@
+"""The command line: every verb of gemuco, each ending in a sentence when something is wrong."""
+
+import os
+import sys
+from collections.abc import Callable
+from functools import wraps
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+app = typer.Typer(
+    name="gemuco",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    help="A body schema for robots, run as a real-time service.\n\n"
+    "A robot is a YAML file (robots/musashi_arm.yaml). Three processes run it: [bold]simulate[/] pretends to be the "
+    "hardware, [bold]hal[/] reads and moves the hardware, [bold]serve[/] thinks. [bold]collect[/] and [bold]train[/] "
+    "make the model that serve needs. [bold]demo[/] does all of it in a minute.",
+)
+
+RobotFile = Annotated[str, typer.Argument(metavar="ROBOT", help="A robot file, or the name of one in robots/.")]
+Connect = Annotated[
+    list[str] | None,
+    typer.Option("--connect", metavar="ENDPOINT", help="Another zenoh endpoint to connect to (tcp/192.168.0.5:7447)."),
+]
+Seed = Annotated[int, typer.Option(help="Seed of all that is random.")]
+VARIANT_HELP = "Which variant of the robot to simulate: the designer's model, or one built differently."
+
+
+def speaks_plainly(verb: Callable[..., Any]) -> Callable[..., Any]:
+    """Make what we raise on purpose one sentence on stderr: exit code 2 for a wrong robot file, 1 for the rest."""
+
+    @wraps(verb)
+    def plain(*arguments: Any, **options: Any) -> Any:
+        # numpy reads this when it is first imported: one thread is faster on layers this small.
+        for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+            os.environ.setdefault(name, "1")
+        from gemuco.errors import SchemaError
+        from hal.errors import ConfigError, HalError
+        from services.errors import ServiceError
+
+        try:
+            code = verb(*arguments, **options)
+        except ConfigError as error:
+            typer.echo(f"gemuco: {error}", err=True)
+            raise typer.Exit(2) from None
+        except (SchemaError, HalError, ServiceError) as error:
+            typer.echo(f"gemuco: {error}", err=True)
+            raise typer.Exit(1) from None
+        except KeyboardInterrupt:
+            raise typer.Exit(130) from None
+        raise typer.Exit(code or 0)
+
+    return plain
+
+
+@app.callback()
+def main(
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="Log what happens, not only what goes wrong.")
+    ] = False,
+) -> None:
+    """Begin logging on stderr; the verbs do the rest."""
+    import logging
+
+    level = logging.INFO if verbose else logging.WARNING
+    logging.basicConfig(level=level, stream=sys.stderr, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+
+
+@app.command()
+@speaks_plainly
+def simulate(
+    robot: RobotFile,
+    variant: Annotated[str, typer.Option(help=VARIANT_HELP)] = "geometric",
+    seed: Seed = 0,
+    connect: Connect = None,
+) -> int:
+    """Pretend to be the hardware: simulated CANopen nodes on the robot file's buses, until Ctrl-C.
+
+    Break things while it runs with `gemuco query ROBOT fault "muscle_cut biceps"`.
+    """
+    from services.simulator_service import run_simulator
+
+    return run_simulator(_load(robot), variant, seed, connect or ())
+
+
+@app.command()
+@speaks_plainly
+def hal(robot: RobotFile, connect: Connect = None) -> int:
+    """Read the hardware and move it: samples out, limited commands in, until Ctrl-C.
+
+    Starts with the motors off, and turns them on only when asked.
+    """
+    from services.hal_service import run_hal
+
+    return run_hal(_load(robot), connect or ())
+
+
+@app.command()
+@speaks_plainly
+def serve(
+    robot: RobotFile,
+    model: Annotated[Path | None, typer.Option(help="The trained model; runs/<robot>/model if not given.")] = None,
+    connect: Connect = None,
+) -> None:
+    """Run the model: estimation, control, anomaly detection and online update, until Ctrl-C."""
+    from services import artifacts
+    from services.gemuco_service import serve as run_model
+
+    config = _load(robot)
+    run_model(config, model or artifacts.model_folder(config.robot), connect or ())
+
+
+@app.command()
+@speaks_plainly
+def collect(
+    robot: RobotFile,
+    variant: Annotated[str, typer.Option(help=VARIANT_HELP)] = "geometric",
+    seed: Seed = 0,
+    samples: Annotated[
+        int | None, typer.Option(min=100, help="How many; the robot file's number if not given.")
+    ] = None,
+    bus: Annotated[
+        bool, typer.Option("--bus", help="Move the robot that `gemuco hal` runs, in its own time; else no bus at all.")
+    ] = False,
+    out: Annotated[Path | None, typer.Option(help="Where to write; runs/<robot>/data.npz if not given.")] = None,
+) -> None:
+    """Record random safe motion to train from."""
+    from services import artifacts, collector
+    from services.show import progress
+
+    config = _load(robot)
+    with progress("collecting") as tell:
+        if bus:
+            found = collector.collect_bus(config, seed, samples, tell)
+        else:
+            found = collector.collect_direct(config, variant, seed, samples, tell)
+    path = out or artifacts.data_path(config.robot)
+    found.dataset.save(path)
+    typer.echo(
+        f"{len(found.dataset)} samples in {path}: {found.robot_time:.0f} s of motion in {found.wall_time:.1f} s, "
+        f"{found.speed:.1f} times real time."
+    )
+
+
+@app.command()
+@speaks_plainly
+def train(
+    robot: RobotFile,
+    data: Annotated[Path | None, typer.Option(help="Recorded samples; runs/<robot>/data.npz if not given.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Where to write; runs/<robot>/model if not given.")] = None,
+    seed: Seed = 0,
+) -> None:
+    """Find out which signals explain which, train, and tell the errors in physical units."""
+    from rich.console import Console
+
+    from gemuco.dataset import Dataset
+    from services import artifacts, trainer
+    from services.show import progress
+
+    config = _load(robot)
+    dataset = Dataset.load(data or artifacts.data_path(config.robot))
+    with progress("training") as tell:
+        trained = trainer.train(config, dataset, seed, tell)
+    trainer.show(trained, Console())
+    folder = out or artifacts.model_folder(config.robot)
+    trained.schema.save(folder)
+    typer.echo(f"Saved in {folder}.")
+
+
+@app.command(context_settings={"ignore_unknown_options": True})  # a target may be negative
+@speaks_plainly
+def query(
+    robot: RobotFile,
+    verb: Annotated[str, typer.Argument(help="What to ask: estimate, engage, target, adapt, describe, fault, ...")],
+    words: Annotated[list[str] | None, typer.Argument(metavar="[WORDS]...", help="What the verb needs.")] = None,
+    hide: Annotated[list[str] | None, typer.Option(help="estimate: act as if this signal were not measured.")] = None,
+    watch: Annotated[bool, typer.Option("--watch", help="estimate: go on once a second until Ctrl-C.")] = False,
+    connect: Connect = None,
+) -> int:
+    """Ask a running robot, from any process.
+
+    [bold]estimate SIGNAL[/] measured or estimated values    [bold]target SIGNAL V1 V2 ...[/] where to go
+
+    [bold]engage[/], [bold]disengage[/] let the model move the robot or not    [bold]adapt on|off[/] online update
+
+    [bold]rollback[/] the model before the update    [bold]normal[/] learn anew what is normal
+
+    [bold]enable[/], [bold]disable[/], [bold]stop[/], [bold]reset[/] the HAL's motors    [bold]describe [SERVICE][/]
+
+    [bold]fault TEXT[/] break something in the simulator
+    """
+    from services.ask import ask_robot
+
+    return ask_robot(_name(robot), verb, tuple(words or ()), tuple(hide or ()), watch, connect or ())
+
+
+@app.command()
+@speaks_plainly
+def top(
+    robot: RobotFile,
+    once: Annotated[bool, typer.Option("--once", help="Print once and exit.")] = False,
+    connect: Connect = None,
+) -> int:
+    """Watch a running robot: rates, lateness, ages of signals, estimates, anomaly, mode of the motors."""
+    from services.top import watch
+
+    return watch(_name(robot), once, connect or ())
+
+
+@app.command()
+@speaks_plainly
+def record(
+    robot: RobotFile,
+    out: Annotated[Path, typer.Argument(metavar="FILE", help="The file to write, such as walk.mcap; must not exist.")],
+    connect: Connect = None,
+) -> int:
+    """Write down all that a robot's services publish, as MCAP, until Ctrl-C."""
+    from services.recorder import run_recorder
+
+    return run_recorder(_name(robot), out, connect or ())
+
+
+@app.command()
+@speaks_plainly
+def demo(
+    robot: RobotFile = "musashi_arm",
+    seed: Annotated[int, typer.Option(help="Which of the actual arms to simulate.")] = 1,
+    out: Annotated[Path, typer.Option(help="Where the plot, the recording and the logs go.")] = Path("runs/demo"),
+) -> int:
+    """One minute with an arm that loses a sensor, learns its own body, and loses a muscle.
+
+    Makes a model first if there is none; then starts simulated hardware, HAL and model as processes, and plays.
+    """
+    from services.demo import play
+
+    return play(_load(robot), _file(robot), seed, out)
+
+
+def _file(text: str) -> Path:
+    from services.artifacts import robot_file
+
+    return robot_file(text)
+
+
+def _load(text: str) -> Any:
+    from hal.config import load_robot
+
+    return load_robot(_file(text))
+
+
+def _name(text: str) -> str:
+    """The robot's name; a client needs no robot file."""
+    return str(_load(text).robot) if Path(text).suffix in (".yaml", ".yml") else text
+
+
+if __name__ == "__main__":
+    app()

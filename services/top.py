@@ -1,0 +1,135 @@
+"""`gemuco top`: a running robot at a glance."""
+
+import math
+import time
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from services import keys
+from services.client import FRESH_STATUS, Client
+from services.messages import Estimates, Sample, Status
+
+REFRESH = 0.25
+FIRST_WAIT = 2.0
+"""How long [s] to wait for the first messages when printing only once."""
+GOOD = {"running", "ready", "measured", "follow", "hold"}
+
+
+def watch(robot: str, once: bool, connect: Iterable[str], console: Console | None = None) -> int:
+    """Show the robot until Ctrl-C, or once; the exit code is 1 if none of its services is there.
+
+    Args:
+        robot: The robot's name.
+        once: Print once, without taking over the terminal.
+        connect: More zenoh endpoints.
+        console: Where to print.
+    """
+    console = console or Console()
+    with Client(robot, connect) as client:
+        view(client)  # subscribes
+        if once:
+            _first_statuses(client)
+            console.print(view(client))
+            return 0 if client.alive() else 1
+        with Live(view(client), console=console, screen=console.is_terminal, auto_refresh=False) as live:
+            while True:
+                live.update(view(client), refresh=True)
+                time.sleep(REFRESH)
+
+
+def view(client: Client) -> RenderableType:
+    """Everything at a glance, of this moment."""
+    statuses = {name: client.status(name) for name in keys.SERVICES}
+    sample, estimate = client.sample(), client.estimate()
+    return Group(
+        _services(client, statuses), _loops(statuses), _signals(sample, estimate), _anomaly(client), _update(client)
+    )
+
+
+def _first_statuses(client: Client) -> None:
+    """Wait until every service that is alive has told its status once."""
+    deadline = time.monotonic() + FIRST_WAIT
+    while time.monotonic() < deadline:
+        alive = client.alive()
+        if alive and all(client.status(name, FRESH_STATUS) for name in alive):
+            return
+        time.sleep(0.05)
+
+
+def _services(client: Client, statuses: Mapping[str, Status | None]) -> Table:
+    applied = client.applied()
+    table = Table(title=f"{client.robot}   motors: {applied.mode if applied else 'not heard of'}", title_justify="left")
+    for column in ("service", "state", ""):
+        table.add_column(column)
+    for name, status in statuses.items():
+        if status is None:
+            table.add_row(name, _word("absent"), "")
+        else:
+            table.add_row(name, _word(status.state), status.text)
+    return table
+
+
+def _loops(statuses: Mapping[str, Status | None]) -> Table:
+    table = Table(title="loops", title_justify="left")
+    table.add_column("loop")
+    for column in ("wanted Hz", "rate Hz", "late p50 ms", "p99 ms", "max ms", "skipped", "busy %"):
+        table.add_column(column, justify="right")
+    for status in statuses.values():
+        for name, loop in (status.loops if status else {}).items():
+            late = [f"{1e3 * loop.get(key, math.nan):.2f}" for key in ("late_p50", "late_p99", "late_max")]
+            rates = [f"{loop.get(key, math.nan):.1f}" for key in ("rate_wanted", "rate")]
+            busy = f"{100 * loop.get('busy', math.nan):.0f}"
+            table.add_row(name, *rates, *late, f"{loop.get('skipped', 0):.0f}", busy)
+    return table
+
+
+def _signals(sample: Sample | None, estimate: Estimates | None) -> Table:
+    table = Table(title="signals", title_justify="left")
+    table.add_column("signal")
+    table.add_column("valid", justify="right")
+    table.add_column("oldest ms", justify="right")
+    for column in ("estimate", "from", "values"):
+        table.add_column(column)
+    names = list(sample.values) if sample else list(estimate.values) if estimate else []
+    for name in names:
+        valid = age = method = source = values = "-"
+        if sample is not None:
+            valid = f"{int(sample.valid[name].sum())}/{sample.valid[name].size}"
+            age = f"{1e3 * float(sample.age[name].max()):.1f}"
+        if estimate is not None and name in estimate.values:
+            method, source = estimate.method[name], estimate.mask[name].replace("+", ", ")
+            values = _numbers(estimate.values[name], estimate.estimated[name])
+        table.add_row(name, valid, age, _word(method), source, values)
+    return table
+
+
+def _numbers(values: np.ndarray, estimated: np.ndarray) -> str:
+    digits = 1 if np.nanmax(np.abs(values), initial=0.0) >= 10 else 3
+    return " ".join(f"{v:.{digits}f}{'*' if e else ''}" for v, e in zip(values, estimated, strict=True))
+
+
+def _anomaly(client: Client) -> Text:
+    anomaly = client.anomaly()
+    if anomaly is None or not math.isfinite(anomaly.score):
+        return Text("anomaly: not judged")
+    text = f"anomaly: score {anomaly.score:.1f}, threshold {anomaly.threshold:.1f}"
+    if anomaly.is_anomaly:
+        return Text(f"{text}: ANOMALY, most of it in {anomaly.blamed}", style="bold red")
+    return Text(text, style="green")
+
+
+def _update(client: Client) -> Text:
+    update = client.update()
+    if update is None:
+        return Text("update: not heard of")
+    state = "learning" if update.active else "resting"
+    return Text(f"update: {state}, model {update.model_version}, window {update.window}, loss {update.loss:.4f}")
+
+
+def _word(word: str) -> Text:
+    return Text(word, style="green" if word in GOOD else "yellow" if word not in ("fault", "absent", "none") else "red")
