@@ -1,6 +1,7 @@
 # Everything a newcomer types. `make` alone lists the targets.
 PYTHON ?= python3
 BIN := .venv/bin
+VMCAN ?= ../shared/tools/vmcan.sh
 STAMP := .venv/installed
 
 .DEFAULT_GOAL := help
@@ -31,6 +32,14 @@ check: $(STAMP)  ## formatting, lint, types, import contracts
 format: $(STAMP) ## apply formatting and the safe lint fixes
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
+
+test-socketcan: $(STAMP)  ## the stack on vcan0 and vcan1 of a real Linux kernel, booted with $(VMCAN) if need be
+	@if [ -e /sys/class/net/vcan0 ]; then $(BIN)/python -m pytest tests/system/test_socketcan.py; \
+	elif [ -x "$(VMCAN)" ] && command -v insmod >/dev/null; then "$(VMCAN)" -t 280 "$(CURDIR)" $(BIN)/python -m pytest -p no:cacheprovider tests/system/test_socketcan.py; \
+	else echo "skipped: no vcan0 here (modprobe vcan; ip link add vcan0 type vcan), and no '$(VMCAN)' with insmod (package kmod) to boot a kernel that has one"; fi
+
+bench: $(STAMP)   ## the loops' punctuality beside bare timers, 10 minutes
+	$(BIN)/python -m benchmarks.loops
 
 clean:           ## remove what make setup and the demo made
 	rm -rf .venv runs build *.egg-info

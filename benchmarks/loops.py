@@ -1,0 +1,173 @@
+"""How the loops of HAL and service keep time, beside bare timer loops of the same rates at the same time.
+
+    python -m benchmarks.loops --minutes 10
+
+The whole stack runs as in life: simulated nodes on the hub, HAL, service; a client engages the controller, sends a new
+target every second and keeps the online update on. A process of its own ticks four times nothing, at the same rates and
+with the same scheduling, and says how punctual this machine was meanwhile.
+"""
+
+import argparse
+import json
+import multiprocessing
+import resource
+import threading
+import time
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from hal.config import RobotConfig, load_robot
+from services.client import Client
+from services.gemuco_service import PRIORITIES
+from services.lateness import Lateness
+from services.realtime import prepare_process, prepare_thread
+from services.supervisor import Supervisor, gemuco_command
+
+TARGET_EVERY = 1.0
+REACH = 0.6
+"""Share of the joint range that targets are drawn from."""
+
+
+def bare_loop(rate: float, priority: int, stop: threading.Event, into: dict[str, float]) -> None:
+    """Tick nothing at a rate [Hz] until told to stop; count as the services count."""
+    prepare_thread(priority)
+    lateness = Lateness(1)
+    period, start, index, ticks, skipped = 1.0 / rate, time.monotonic(), 0, 0, 0
+    while not stop.is_set():
+        index += 1
+        behind = int((time.monotonic() - start) / period) - index
+        if behind > 0:
+            skipped += behind
+            index += behind
+        deadline = start + index * period
+        pause = deadline - time.monotonic()
+        if pause > 0:
+            time.sleep(pause)
+        lateness.add(time.monotonic() - deadline)
+        ticks += 1
+    into.update(lateness.total() | {"ticks": ticks, "skipped": skipped, "rate": ticks / (time.monotonic() - start)})
+
+
+def bare_process(rates: dict[str, float], pipe: Connection) -> None:
+    """All bare loops, in threads of one process as in the service, until the pipe closes."""
+    prepare_process()
+    stop, found = threading.Event(), {name: {} for name in rates}
+    threads = [
+        threading.Thread(target=bare_loop, args=(rate, PRIORITIES.get(name, 40), stop, found[name]))
+        for name, rate in rates.items()
+    ]
+    for thread in threads:
+        thread.start()
+    pipe.recv()
+    stop.set()
+    for thread in threads:
+        thread.join()
+    pipe.send(found)
+
+
+def move(client: Client, robot: RobotConfig, duration: float) -> None:
+    """Send a random target every second for `duration` [s]."""
+    random = np.random.default_rng(0)
+    low, high = robot.bounds("joint_position")
+    middle, half = (low + high) / 2, (high - low) / 2
+    end = time.monotonic() + duration
+    while time.monotonic() < end:
+        applied = client.applied()
+        if applied is None or applied.mode not in ("follow", "hold", "enabling"):
+            print(f"not moving: {applied.mode if applied else 'no HAL'} {client.status('hal')}")
+            client.reset()
+            client.engage()
+        client.target("joint_position", middle + REACH * half * random.uniform(-1, 1, low.size))
+        time.sleep(TARGET_EVERY)
+
+
+def cpu_share(pid: int, since: tuple[float, float] | None = None) -> tuple[float, float]:
+    """CPU time [s] of a process and the time [s] it was read."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+    return (int(fields[11]) + int(fields[12])) / 100, time.monotonic()
+
+
+def run(robot_file: Path, minutes: float) -> dict[str, object]:
+    """The whole measurement; loop name -> statistics of ours and of the bare loop, process -> share of a core."""
+    robot = load_robot(robot_file)
+    rates = {"cycle": robot.rates.hal} | {name: getattr(robot.rates, name) for name in PRIORITIES}
+    context = multiprocessing.get_context("spawn")
+    pipe, other = context.Pipe()
+    bare = context.Process(target=bare_process, args=(rates, other), daemon=True)
+    with Supervisor(Path("runs/loops")) as supervisor, Client(robot.robot) as client:
+        children = {
+            "simulate": supervisor.start(
+                "simulate", gemuco_command("simulate", str(robot_file), "--variant", "actual", "--seed", "1")
+            ),
+            "hal": supervisor.start("hal", gemuco_command("hal", str(robot_file))),
+            "serve": supervisor.start("serve", gemuco_command("serve", str(robot_file))),
+        }
+        supervisor.wait_ready("serve", lambda: client.estimate() is not None, 60)
+        client.engage()
+        client.adapt(True)
+        time.sleep(3.0)
+        bare.start()
+        began = {name: cpu_share(child.process.pid) for name, child in children.items()}
+        before = {name: client.status(name, timeout=3.0) for name in ("hal", "model")}
+        move(client, robot, 60 * minutes)
+        supervisor.check()
+        pipe.send("stop")
+        baseline = pipe.recv()
+        after = {name: client.status(name, timeout=3.0) for name in ("hal", "model")}
+        shares = {}
+        for name, child in children.items():
+            used, now = cpu_share(child.process.pid)
+            shares[name] = (used - began[name][0]) / (now - began[name][1])
+        bare.join()
+    loops = {}
+    for service in ("hal", "model"):
+        for name, end in after[service].loops.items():
+            start = before[service].loops[name]
+            counted = {key: end[key] - start[key] for key in ("ticks", "skipped", "overruns", "failed")}
+            kept = {key: end[key] for key in ("rate_wanted", "total_p50", "total_p99", "total_max")}
+            rate = counted["ticks"] / (60 * minutes)
+            loops[name] = kept | counted | {"rate": rate, "bare": baseline.get(name, {})}
+    facts = {name: status.facts for name, status in after.items()}
+    return {"minutes": minutes, "loops": loops, "cores": shares, "facts": facts}
+
+
+def show(found: dict, console: Console) -> None:
+    """The table of docs/results.md."""
+    table = Table(
+        "loop",
+        "rate [Hz]",
+        "p50 [ms]",
+        "p99 [ms]",
+        "max [ms]",
+        "skipped",
+        "bare p50",
+        "bare p99",
+        "bare max",
+        "bare skipped",
+    )
+    for name, one in found["loops"].items():
+        bare = one["bare"]
+        row = [f"{one[key] * 1e3:.2f}" for key in ("total_p50", "total_p99", "total_max")]
+        skipped = f"{one['skipped']:.0f} of {one['ticks'] + one['skipped']:.0f}"
+        other = [f"{bare[key] * 1e3:.2f}" for key in ("total_p50", "total_p99", "total_max")] if bare else ["", "", ""]
+        table.add_row(name, f"{one['rate']:.2f}", *row, skipped, *other, f"{bare.get('skipped', 0):.0f}")
+    console.print(table)
+    console.print("share of a core: " + ", ".join(f"{name} {share:.0%}" for name, share in found["cores"].items()))
+    peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
+    console.print(f"largest process: {peak:.0f} MiB")
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--robot", type=Path, default=Path("robots/musashi_arm.yaml"))
+    parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--out", type=Path, default=Path("runs/loops.json"))
+    options = parser.parse_args()
+    result = run(options.robot, options.minutes)
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    options.out.write_text(json.dumps(result, indent=1, default=str))
+    show(result, Console(width=140))
