@@ -35,8 +35,10 @@ class BulletBody:
             pybullet.changeDynamics(
                 self._body, index, linearDamping=0.0, angularDamping=0.0, jointDamping=0.0, **client
             )
-        zero = [0.0] * len(self._joints)
-        pybullet.setJointMotorControlArray(self._body, self._joints, pybullet.VELOCITY_CONTROL, forces=zero, **client)
+        self._still = [0.0] * len(self._joints)
+        pybullet.setJointMotorControlArray(
+            self._body, self._joints, pybullet.VELOCITY_CONTROL, forces=self._still, **client
+        )
         for index, angle in zip(self._joints, position, strict=True):
             pybullet.resetJointState(self._body, index, float(angle), 0.0, **client)
         self.position = np.array(position, float)
@@ -57,14 +59,24 @@ class BulletBody:
         self.position[:] = [state[0] for state in states]
         self.velocity[:] = [state[1] for state in states]
 
+    def inertia(self) -> tuple[np.ndarray, np.ndarray]:
+        """Mass matrix [kg m^2], shape (n, n), and the torques [N m] of gravity and velocity, shape (n,).
+
+        The torques are those that it takes to keep the present velocity.
+        """
+        client, position, velocity = self._client, self.position.tolist(), self.velocity.tolist()
+        mass = pybullet.calculateMassMatrix(self._body, position, physicsClientId=client)
+        bias = pybullet.calculateInverseDynamics(self._body, position, velocity, self._still, physicsClientId=client)
+        return np.array(mass), np.array(bias)
+
     def energy(self) -> float:
         """Kinetic and potential energy of the links [J]."""
         joints = range(pybullet.getNumJoints(self._body, physicsClientId=self._client))
-        mass = pybullet.calculateMassMatrix(self._body, self.position.tolist(), physicsClientId=self._client)
+        mass, _ = self.inertia()
         states = pybullet.getLinkStates(self._body, joints, computeForwardKinematics=1, physicsClientId=self._client)
         masses = [pybullet.getDynamicsInfo(self._body, index, physicsClientId=self._client)[0] for index in joints]
         height = sum(weight * state[0][2] for weight, state in zip(masses, states, strict=True))
-        return float(0.5 * self.velocity @ np.array(mass) @ self.velocity + GRAVITY * height)
+        return float(0.5 * self.velocity @ mass @ self.velocity + GRAVITY * height)
 
     def add_mass(self, joint: str, mass: float, radius: float) -> None:
         """Put a ball of `mass` [kg] and `radius` [m] at the centre of mass of the link behind `joint`."""

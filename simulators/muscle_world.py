@@ -1,7 +1,8 @@
 """A muscle-driven body as a World: rigid links in PyBullet, wires, elastic elements, spool servos and sensors in numpy.
 
 A wire's length is what its spool has paid out; the path is longer by what the elastic element gives. Tensions are
-brought to the joints by the moment arms, tau = -G^T f, once per physics step.
+brought to the joints by the moment arms, tau = -G^T f, once per physics step. Wires are stiff and a forearm is light,
+so steps are linearly implicit: tensions are taken where the joints will be at the end of the step.
 """
 
 import math
@@ -86,10 +87,10 @@ class Body:
 class MuscleWorld:
     """See `simulators.world.World`. Signals: joint_position, muscle_tension, muscle_length."""
 
-    _LONGEST_STEP = 0.00125
-    """[s]; the stiffest mode (full tension, elbow yaw) then turns by 0.2 rad per step."""
-    _STEPS_PER_REFRESH = 4
-    """Moment arms are solved anew every so many steps; in between paths are linear in the joint positions."""
+    _LONGEST_STEP = 0.0025
+    """[s]"""
+    _STEPS_PER_REFRESH = 2
+    """Moment arms and inertia are solved anew every so many steps; in between paths are linear in joint positions."""
 
     def __init__(self, body: Body, seed: int, servo: Servo | None = None) -> None:
         self.time = 0.0
@@ -97,6 +98,7 @@ class MuscleWorld:
         self._servo = servo or Servo()
         joints, muscles = body.paths.chain.joints, body.paths.names
         self._bullet = BulletBody(body.urdf, joints, body.rest)
+        self._diagonal = np.diag_indices(len(joints))
         self._random = np.random.default_rng(seed)
         self._muscles = {f"muscle_length.{name}": index for index, name in enumerate(muscles)}
         self._noise = {
@@ -104,14 +106,14 @@ class MuscleWorld:
             "muscle_tension": (body.noise.get("muscle_tension", 0.0), len(muscles)),
             "muscle_length": (body.noise.get("muscle_length", 0.0), len(muscles)),
         }
-        self._refresh()
+        self._tension = body.rest_tension.copy()
+        self._refresh(self._LONGEST_STEP)
         self._spool = self._lengths - body.elastic.elongation(body.rest_tension)
         self._target = self._spool.copy()
         self._follows = np.zeros(len(muscles))
         self._grip = np.empty(len(muscles))
         self._hold_or_drive()
         self._whole = np.ones(len(muscles))
-        self._tension = body.rest_tension.copy()
         self._slid_joint = np.zeros(len(joints))
         self._slid_wire = np.zeros(len(muscles))
 
@@ -121,7 +123,7 @@ class MuscleWorld:
         size = duration / count
         for index in range(count):
             if index % self._STEPS_PER_REFRESH == 0:
-                self._refresh()
+                self._refresh(size)
             self._substep(size)
         self.time += duration
 
@@ -166,10 +168,23 @@ class MuscleWorld:
         """See `World.close`."""
         self._bullet.close()
 
-    def _refresh(self) -> None:
-        """Solve the paths at the present posture."""
+    def _refresh(self, duration: float) -> None:
+        """Solve the paths at the present posture, and what makes steps of `duration` [s] implicit.
+
+        With joint stiffness K and damping D at hand, (M + D dt + K dt^2) dv = (tau - bias) dt; PyBullet gets the torque
+        that makes M dv of it.
+        """
+        body = self._body
         self._solved_at = self._bullet.position.copy()
-        self._lengths, self._arms = self._body.paths.solve(self._solved_at)
+        self._lengths, self._arms = body.paths.solve(self._solved_at)
+        mass, self._bias = self._bullet.inertia()
+        elastic = body.elastic.stiffness(self._tension) * duration**2
+        viscous = body.loss_time * body.elastic.rate * self._tension * duration
+        held = (self._arms.T * (elastic + viscous)) @ self._arms
+        held[self._diagonal] += body.joint_damping * duration
+        if body.friction is not None:
+            held[self._diagonal] += body.friction.joint_torque / body.friction.joint_presliding * duration**2
+        self._implicit = np.linalg.solve(mass + held, mass).T
 
     def _hold_or_drive(self) -> None:
         """The longest a wire's elastic element can get before its motor, or its brake, gives way [m]."""
@@ -178,7 +193,8 @@ class MuscleWorld:
 
     def _substep(self, duration: float) -> None:
         body, servo, bullet = self._body, self._servo, self._bullet
-        path = self._lengths + self._arms @ (bullet.position - self._solved_at)
+        ahead = bullet.position - self._solved_at + duration * bullet.velocity
+        path = self._lengths + self._arms @ ahead
         path_rate = self._arms @ bullet.velocity
 
         reach = servo.speed * duration
@@ -198,7 +214,7 @@ class MuscleWorld:
             pull = pull * (1.0 + self._wire_friction(body.friction, path_rate * duration))
             torque -= self._joint_friction(body.friction, bullet.velocity * duration)
         torque -= pull @ self._arms
-        bullet.step(torque, duration)
+        bullet.step(self._bias + self._implicit @ (torque - self._bias), duration)
 
     def _wire_friction(self, friction: Friction, travel: np.ndarray) -> np.ndarray:
         """Share of the tension by which a wire pulls harder where it is dragged out, shape (m,)."""

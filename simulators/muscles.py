@@ -73,7 +73,7 @@ class Paths:
         points = pose.points(self._frames, self._points)
         start, end = points[: self._count], points[self._count : 2 * self._count]
         along = end - start
-        lengths = np.sqrt(np.einsum("ij,ij->i", along, along))
+        lengths = np.sqrt((along * along).sum(axis=1))
         along /= lengths[:, None]
         if self._bends:
             pulls = _bend(start, end, points[2 * self._count :], self._radius, lengths, along)
@@ -150,9 +150,9 @@ def _bend(
         dL/d(start, end, centre), shape (3 p, 3). A sphere is pushed by what its wire's ends are not pulled with.
     """
     a, b = start - center, end - center
-    from_a = np.maximum(np.sqrt(np.einsum("ij,ij->i", a, a)), 1.001 * radius)
-    from_b = np.maximum(np.sqrt(np.einsum("ij,ij->i", b, b)), 1.001 * radius)
-    cosine = np.clip(np.einsum("ij,ij->i", a, b) / (from_a * from_b), -0.999999, 0.999999)
+    from_a = np.maximum(np.sqrt((a * a).sum(axis=1)), 1.001 * radius)
+    from_b = np.maximum(np.sqrt((b * b).sum(axis=1)), 1.001 * radius)
+    cosine = np.minimum(np.maximum((a * b).sum(axis=1) / (from_a * from_b), -0.999999), 0.999999)
     arc = np.arccos(cosine) - np.arccos(radius / from_a) - np.arccos(radius / from_b)
     touches = (arc > 0.0) & (radius > 0.0)
     pull_a, pull_b = -along, along

@@ -29,6 +29,8 @@ REST_PRETENSION = 40.0
 
 JOINT_DAMPING = np.array([0.8, 0.8, 0.3, 0.35, 0.08])
 """[N m s/rad]"""
+ZERO_ERROR = 0.003
+"""Standard deviation of an actual robot's wire length calibration [m]."""
 LOSS_TIME = 0.025
 """Of the elastic elements [s]."""
 NOISE = {"joint_position": 0.001, "muscle_tension": 0.5, "muscle_length": 0.05e-3}
@@ -63,7 +65,7 @@ def _actual(geometric: Body, random: np.random.Generator) -> Body:
     """An arm as it was really built: every via point 5 to 10 mm off, bent wires, other elasticity, friction, noise."""
     size = len(ROUTES)
     routes = {name: tuple(_moved(via, random) for via in route) for name, route in ROUTES.items()}
-    radius = random.uniform(0.018, 0.024, 2)
+    radius = random.uniform(0.020, 0.028, 2)
     spheres = (
         Sphere(UPPER_ARM, (0.0, 0.0, 0.0), radius[0]),
         Sphere(ULNA, (0.0, 0.0, 0.0), radius[1]),
@@ -76,11 +78,11 @@ def _actual(geometric: Body, random: np.random.Generator) -> Body:
         wire=random.uniform(0.04, 0.10, size),
         wire_presliding=0.001,
     )
-    slack = paths.lengths(REST) - designed_paths().lengths(REST)
+    slack = paths.lengths(REST) - designed_paths().lengths(REST) + random.normal(0.0, ZERO_ERROR, size)
     return replace(geometric, paths=paths, elastic=elastic, slack=slack, friction=friction, noise=NOISE)
 
 
 def _moved(via: Via, random: np.random.Generator) -> Via:
     way = random.standard_normal(3)
-    x, y, z = way / np.linalg.norm(way) * random.uniform(0.005, 0.010)
+    x, y, z = way / np.linalg.norm(way) * random.uniform(0.007, 0.010)
     return Via(via.frame, via.x + x, via.y + y, via.z + z)

@@ -9,16 +9,16 @@ import math
 from simulators.nodes.spec import CellConstants, DriveConstants, EncoderConstants, NodeSpec
 
 MUSCLES: dict[str, tuple[str, int, float]] = {
-    "deltoid_front": ("can0", 1, 0.17),
-    "deltoid_side": ("can0", -1, 0.20),
-    "deltoid_back": ("can0", 1, 0.17),
-    "pectoral": ("can0", -1, 0.14),
-    "latissimus": ("can0", 1, 0.14),
-    "infraspinatus": ("can1", -1, 0.14),
-    "biceps": ("can1", 1, 0.43),
-    "brachialis": ("can1", -1, 0.18),
-    "triceps": ("can1", 1, 0.19),
-    "pronator": ("can1", -1, 0.17),
+    "deltoid_front": ("can0", 1, 0.152),
+    "deltoid_side": ("can0", -1, 0.253),
+    "deltoid_back": ("can0", 1, 0.119),
+    "pectoral": ("can0", -1, 0.129),
+    "latissimus": ("can0", 1, 0.203),
+    "infraspinatus": ("can1", -1, 0.099),
+    "biceps": ("can1", 1, 0.419),
+    "brachialis": ("can1", -1, 0.122),
+    "triceps": ("can1", 1, 0.256),
+    "pronator": ("can1", -1, 0.113),
 }
 """Bus, direction of the drive, and wire length [m] at zero counts: the drives were zeroed at about the rest posture."""
 

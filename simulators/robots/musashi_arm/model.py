@@ -20,33 +20,33 @@ LEAST_TENSION, MOST_TENSION = 10.0, 180.0
 """Tensions that are ever asked for [N]."""
 
 ROUTES: dict[str, tuple[Via, ...]] = {
-    "deltoid_front": (Via(TORSO, 0.02, 0.003, 0.065), Via(UPPER_ARM, 0.037, -0.008, -0.124)),
+    "deltoid_front": (Via(TORSO, 0.038, 0.005, 0.03), Via(UPPER_ARM, 0.029, -0.004, -0.129)),
     "deltoid_side": (
-        Via(TORSO, 0.001, 0.013, 0.087),
-        Via(TORSO, 0.019, -0.058, 0.01),
-        Via(UPPER_ARM, -0.027, -0.017, -0.132),
+        Via(TORSO, 0.027, 0.03, 0.069),
+        Via(TORSO, 0.018, -0.047, 0.002),
+        Via(UPPER_ARM, -0.0, 0.024, -0.14),
     ),
-    "deltoid_back": (Via(TORSO, -0.057, -0.004, 0.014), Via(UPPER_ARM, -0.026, 0.003, -0.115)),
-    "pectoral": (Via(TORSO, 0.07, 0.086, -0.058), Via(UPPER_ARM, 0.012, -0.037, -0.062)),
-    "latissimus": (Via(TORSO, -0.055, 0.064, -0.188), Via(UPPER_ARM, -0.01, 0.027, -0.054)),
-    "infraspinatus": (Via(TORSO, -0.091, 0.044, -0.011), Via(UPPER_ARM, -0.02, -0.047, -0.03)),
+    "deltoid_back": (Via(TORSO, -0.04, 0.002, 0.024), Via(UPPER_ARM, -0.034, 0.009, -0.105)),
+    "pectoral": (Via(TORSO, 0.101, 0.043, -0.033), Via(UPPER_ARM, -0.006, -0.044, -0.047)),
+    "latissimus": (Via(TORSO, -0.002, 0.096, -0.245), Via(UPPER_ARM, -0.002, 0.029, -0.044)),
+    "infraspinatus": (Via(TORSO, -0.095, 0.037, -0.042), Via(UPPER_ARM, -0.016, -0.034, -0.04)),
     "biceps": (
-        Via(TORSO, 0.009, -0.021, 0.032),
-        Via(UPPER_ARM, 0.022, 0.03, -0.06),
-        Via(UPPER_ARM, 0.032, 0.006, -0.208),
-        Via(ULNA, 0.035, 0.036, -0.039),
-        Via(RADIUS, 0.048, -0.023, -0.06),
+        Via(TORSO, 0.012, -0.023, 0.036),
+        Via(UPPER_ARM, 0.016, 0.045, -0.082),
+        Via(UPPER_ARM, 0.029, -0.021, -0.221),
+        Via(ULNA, 0.035, 0.034, -0.046),
+        Via(RADIUS, 0.042, -0.025, -0.054),
     ),
-    "brachialis": (Via(UPPER_ARM, 0.021, 0.021, -0.125), Via(ULNA, 0.038, -0.006, -0.046)),
+    "brachialis": (Via(UPPER_ARM, 0.023, 0.032, -0.147), Via(ULNA, 0.022, -0.003, -0.042)),
     "triceps": (
-        Via(UPPER_ARM, -0.043, -0.019, -0.077),
-        Via(UPPER_ARM, -0.047, -0.0, -0.247),
-        Via(ULNA, -0.05, -0.005, -0.014),
+        Via(UPPER_ARM, -0.029, -0.031, -0.097),
+        Via(UPPER_ARM, -0.047, 0.014, -0.256),
+        Via(ULNA, -0.044, -0.002, -0.076),
     ),
     "pronator": (
-        Via(UPPER_ARM, 0.01, 0.027, -0.252),
-        Via(ULNA, 0.045, -0.01, -0.068),
-        Via(RADIUS, 0.034, 0.037, -0.07),
+        Via(UPPER_ARM, 0.027, 0.015, -0.264),
+        Via(ULNA, 0.045, -0.022, -0.067),
+        Via(RADIUS, 0.029, 0.035, -0.069),
     ),
 }
 
