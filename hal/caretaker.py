@@ -1,11 +1,14 @@
 """Opens devices, and opens them again when they come back; enables nothing."""
 
+import logging
 import threading
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 
 from hal.device import Device, DeviceState
 from hal.errors import HalError
+
+log = logging.getLogger(__name__)
 
 PASS_PERIOD = 0.05
 """How often [s] the devices are looked at."""
@@ -38,11 +41,13 @@ class Caretaker:
         self._thread.start()
 
     def stop(self) -> None:
-        """End the thread; waits for tries that are under way."""
+        """End the thread, wait for tries that are under way, and close every device."""
         self._stopping.set()
         if self._thread:
             self._thread.join()
         if self._pool:
+            for closing in [self._pool.submit(device.close) for device in self._devices]:
+                closing.result()
             self._pool.shutdown()
         self._thread = self._pool = None
 
@@ -68,5 +73,7 @@ class Caretaker:
     def _open(device: Device) -> None:
         try:
             device.open()
-        except HalError:
-            return  # the device's health says what is wrong, and the next try comes
+        except HalError as error:
+            log.debug("%s: %s", device.name, error)  # the device's health says it, and the next try comes
+        except Exception:  # a driver's mistake must not look like a device that is still being opened
+            log.exception("'%s' cannot be opened", device.name)

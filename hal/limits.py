@@ -9,6 +9,9 @@ SOFT_BAND = 0.1
 """Part of `soft_high` below it within which shortening is slowed down, so that a muscle comes to rest at the limit
 instead of chattering about it."""
 
+MISPLACED = 0.1
+"""A position further out of range than this part of the range is not believed."""
+
 
 class Limiter:
     """Turns a desired set-point into one that may be applied.
@@ -87,6 +90,15 @@ class Limiter:
         raised = np.where(tense, np.maximum(mine, np.minimum(least, room)), mine)
         step[self._muscle] = raised
         return bool((raised != mine).any())
+
+    def misplaced(self, measured: np.ndarray) -> list[int]:
+        """Which measured elements of the commanded signal, shape (n,), are so far out of range that they must be wrong.
+
+        A drive that is pulled into range from there would pull for long, on the word of a calibration that is off.
+        """
+        margin = MISPLACED * (self._high - self._low)
+        wrong = (measured < self._low - margin) | (measured > self._high + margin)
+        return [int(index) for index in np.flatnonzero(wrong)]
 
     def trip(self, measured: Arrays) -> str | None:
         """A sentence if a measured value is over its `trip_high`, else None; invalid values trip nothing."""

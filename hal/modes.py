@@ -99,15 +99,13 @@ class ModeMachine:
             self.mode, self.fault_text = Mode.FAULT, text
 
     def reset(self) -> None:
-        """Leave the fault, and ask every drive to leave its own; enables nothing.
+        """Leave the fault; enables nothing.
 
         Raises:
             CommandRefused: The robot is enabled.
         """
         if self.mode not in (Mode.OFF, Mode.FAULT):
             raise CommandRefused(f"The robot is in mode '{self.mode}', there is no fault to reset.")
-        for device in self._actuators:
-            device.reset()
         self.mode, self.fault_text = Mode.OFF, ""
 
     def step(self, now: float, has_command: bool) -> None:

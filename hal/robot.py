@@ -63,6 +63,7 @@ class Robot:
         self._caretaker = Caretaker(devices) if self._buses else None
         size = config.signals[config.command.signal].size
         self._nothing = np.full(size, np.nan)
+        self._nothing.flags.writeable = False
         self._set_point = self._nothing
         self._desired: tuple[np.ndarray, float] | None = None
         self._measured = {name: np.full(signal.size, np.nan) for name, signal in config.signals.items()}
@@ -124,8 +125,9 @@ class Robot:
             self.cycle()
         if self._caretaker:
             self._caretaker.stop()
-        for device in self._devices:
-            device.close()
+        else:
+            for device in self._devices:
+                device.close()
         for bus in self._buses:
             bus.close()
 
@@ -136,17 +138,26 @@ class Robot:
             CommandRefused: In fault or stopping, a drive is not ready, or its position is not known.
         """
         with self._lock:
-            unknown = ~np.isfinite(self._measured[self.config.command.signal])
-            if unknown.any() and self._modes.mode is Mode.OFF:
-                names = np.array(self.config.signals[self.config.command.signal].elements)[unknown]
-                raise CommandRefused(
-                    f"No valid {self.config.command.signal} of {', '.join(names)}, so there is nothing to start from. "
-                    "Is the cycle running, does the drive answer?"
-                )
             if self._modes.mode is Mode.OFF:
+                self._check_start()
                 self._desired = None
                 self._set_point = self._measured[self.config.command.signal].copy()
             self._modes.enable(self._clock.monotonic())
+
+    def _check_start(self) -> None:
+        """Whether the robot is where it may be enabled."""
+        signal = self.config.command.signal
+        names, measured = self.config.signals[signal].elements, self._measured[signal]
+        unknown = [name for name, value in zip(names, measured, strict=True) if not np.isfinite(value)]
+        if unknown:
+            raise CommandRefused(
+                f"No valid {signal} of {', '.join(unknown)}, so there is nothing to start from. "
+                "Is the cycle running, does the drive answer?"
+            )
+        misplaced = self._limiter.misplaced(measured)
+        if misplaced:
+            told = ", ".join(f"{names[index]} {measured[index]:.4g}" for index in misplaced)
+            raise CommandRefused(f"Far outside limits.{signal}: {told}. Are zero and direction of these drives right?")
 
     def disable(self) -> None:
         """Let go at once."""
@@ -167,6 +178,8 @@ class Robot:
         """
         with self._lock:
             self._modes.reset()
+            for device in self._devices:
+                device.reset()
 
     def command(self, desired: np.ndarray, cycle: int) -> None:
         """Ask for set-points; the newest wins, and lives `command.time_to_live` from the cycle that it answers.

@@ -1,4 +1,4 @@
-"""A small robot for the tests of `hal`: two muscles and one joint on two buses, its nodes, and a clock moved by hand."""
+"""A small robot for the tests of `hal`: two muscles and a joint on two buses, its nodes, and a clock moved by hand."""
 
 import itertools
 import threading
@@ -120,11 +120,11 @@ class BenchClock(ManualClock):
 class Bench:
     """Robot and rig on `virtual` buses, moved in lockstep, so that a test of time needs no time."""
 
-    def __init__(self, config=None, powered=True):
+    def __init__(self, config=None, powered=True, nodes=None):
         self.config = config or RobotConfig.model_validate(description())
         self.clock = BenchClock()
         self.world = BenchWorld()
-        self.rig = Rig(self.config, self.world, hardware())
+        self.rig = Rig(self.config, self.world, nodes or hardware())
         self.robot: Robot = open_robot(self.config, self.clock)
         self.buses = {bus.name: bus for bus in self.robot._buses}
         self.wires = {

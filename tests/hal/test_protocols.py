@@ -25,7 +25,8 @@ def test_nmt_commands(command, frame):
 
 
 @pytest.mark.parametrize(
-    ("frame", "state"), [("00", 0x00), ("04", 0x04), ("05", 0x05), ("7F", 0x7F), ("85", 0x05), ("", None), ("05 00", None)]
+    ("frame", "state"),
+    [("00", 0x00), ("04", 0x04), ("05", 0x05), ("7F", 0x7F), ("85", 0x05), ("", None), ("05 00", None)],
 )
 def test_heartbeat(frame, state):
     assert cia301.nmt_state(bytes.fromhex(frame)) == state

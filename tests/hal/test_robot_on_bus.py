@@ -39,7 +39,7 @@ def test_enables_without_moving(bench):
 def test_follows_a_command_at_the_limited_rate(bench):
     bench.enable()
     start = bench.applied.values.copy()
-    goal = start + [0.01, -0.01]
+    goal = start + np.array([0.01, -0.01])
     bench.follow(goal)
     assert bench.robot.mode == "follow"
     assert bench.applied.limited_by == ["rate"]

@@ -1,0 +1,84 @@
+"""What the nodes are told before they are used, and what is said when they are not what they should be."""
+
+from dataclasses import replace
+
+import pytest
+from hal_bench import DRIVE, Bench, description, hardware
+
+from hal.config import RobotConfig
+from simulators.nodes.spec import EncoderConstants
+
+
+def test_nodes_are_configured_as_the_contract_says(bench):
+    drive, cell, encoder = (
+        bench.rig.node(f"{name}").objects.values for name in ("biceps_drive", "biceps_cell", "elbow_encoder")
+    )
+    assert [drive[0x1600, sub] for sub in range(3)] == [2, 0x60400010, 0x607A0020]
+    assert [drive[0x1A00, sub] for sub in range(4)] == [3, 0x60410010, 0x60640020, 0x60770010]
+    assert [cell[0x1A00, sub] for sub in range(3)] == [2, 0x91300120, 0x61500108]
+    assert [encoder[0x1A00, sub] for sub in range(3)] == [2, 0x60040020, 0x65030010]
+    assert drive[0x1400, 1] == 0x201
+    assert drive[0x1800, 1] & 0x800007FF == 0x181
+    assert drive[0x1800, 2] == cell[0x1800, 2] == encoder[0x1800, 2] == 1
+    assert drive[0x1017, 0] == cell[0x1017, 0] == encoder[0x1017, 0] == 100
+    assert drive[0x1016, 1] == 0x007F0096
+    assert cell[0x1016, 1] == 0
+    assert drive[0x6060, 0] == 8
+    assert drive[0x6007, 0] == 3
+    assert all(state == "operational" for state in bench.rig.stats()["nodes"].values())
+
+
+def opened(**how):
+    bench = Bench(**how)
+    bench.open()
+    bench.cycle(2)
+    return bench
+
+
+@pytest.fixture
+def close_after():
+    benches = []
+    yield lambda bench: benches.append(bench) or bench
+    for bench in benches:
+        bench.close()
+
+
+def swapped():
+    nodes = hardware()
+    nodes[2] = replace(nodes[2], element="joint_position.elbow", constants=EncoderConstants())
+    return nodes
+
+
+def test_another_device_at_the_address_is_told(close_after):
+    bench = close_after(opened(nodes=swapped()))
+    assert "has device profile 406, not 404. Are two node ids swapped?" in bench.device("biceps_cell")["text"]
+    assert bench.device("biceps_cell")["state"] == "opening"
+    assert bench.sample.valid["muscle_tension"].tolist() == [False, True]
+
+
+def test_another_makers_device_is_told(close_after, tmp_path):
+    text = (description()["folder"] / "eds" / "load_cell.eds").read_text()
+    other = tmp_path / "other.eds"
+    other.write_text(text.replace("DefaultValue=1195724117", "DefaultValue=7").replace("0x47454D55", "0x7"))
+    assert other.read_text() != text
+    body = description()
+    body["kinds"]["cell"]["settings"]["eds"] = str(other)
+    bench = close_after(opened(config=RobotConfig.model_validate(body)))
+    assert "its EDS file says 7h" in bench.device("biceps_cell")["text"]
+
+
+def test_a_setting_that_the_drive_refuses_is_told(close_after):
+    body = description()
+    body["kinds"]["encoder"]["settings"]["counts_per_turn"] = 262144
+    body["kinds"]["drive"]["settings"] = {**DRIVE, "max_torque": 1000}
+    bench = close_after(opened(config=RobotConfig.model_validate(body)))
+    assert bench.rig.node("biceps_drive").objects.values[0x6072, 0] == 1000
+    assert bench.states() == {"ready"}
+
+
+def test_the_cells_own_digits_are_used(close_after):
+    nodes = hardware()
+    nodes[2] = replace(nodes[2], constants=replace(nodes[2].constants, decimal_digits=0))
+    bench = close_after(opened(nodes=nodes))
+    assert bench.sample.values["muscle_tension"][0] == pytest.approx(20.0, abs=0.5)
+    assert bench.sample.values["muscle_tension"][1] == pytest.approx(30.0, abs=0.005)
