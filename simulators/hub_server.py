@@ -24,7 +24,7 @@ _BACKLOG = 100_000 * RECORD.size
 _QUEUE = 256
 """Frames that may wait for a timed bus before the server takes no more from the senders."""
 _GRAIN = 3e-4
-"""Shortest sleep [s] of a timed bus: two or three frames then leave together, at half the cost."""
+"""Shortest sleep [s] of a timed bus while more frames wait: two or three then leave together, at half the cost."""
 
 
 @dataclass(eq=False, slots=True)
@@ -117,8 +117,9 @@ class HubServer:
                 self._flush(client)
 
     def _pause(self) -> float | None:
-        due = self._wire.due() if self._wire is not None else None
-        return None if due is None else max(due - time.monotonic(), _GRAIN)
+        if self._wire is None or (due := self._wire.due()) is None:
+            return None
+        return max(due - time.monotonic(), _GRAIN if len(self._wire) else 0.0)
 
     def _admit(self) -> None:
         with contextlib.suppress(OSError):  # who knocked may have gone again
