@@ -1,0 +1,121 @@
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from bad_commands import bad_commands
+from small_arm import description
+
+from hal.clock import ManualClock
+from hal.config import RobotConfig
+from hal.device import Device, DeviceHealth, DeviceState, Reading
+from hal.robot import Robot
+from services import messages
+from services.command_intake import CommandIntake
+from services.messages import Command, Sample
+from services.session import close_session, open_session
+
+BOOT = 77
+
+
+class Wires(Device):
+    """All elements of the small arm in one device; each muscle is at once where it is asked to be."""
+
+    def __init__(self, config: RobotConfig, clock: ManualClock) -> None:
+        self.name = "wires"
+        self.measures = tuple(config.element_names())
+        self.commands = tuple(name for name in self.measures if name.startswith("muscle_length."))
+        self.values = np.zeros(len(self.measures))
+        self._clock = clock
+        self._state = DeviceState.READY
+
+    def open(self) -> None:
+        self._state = DeviceState.READY
+
+    def close(self) -> None:
+        self._state = DeviceState.CLOSED
+
+    def enable(self) -> None:
+        self._state = DeviceState.ENABLED
+
+    def disable(self) -> None:
+        self._state = DeviceState.READY
+
+    def health(self) -> DeviceHealth:
+        return DeviceHealth(self._state)
+
+    def read(self) -> Reading:
+        return Reading(self.values.copy(), np.full(self.values.shape, self._clock.monotonic()))
+
+    def apply(self, values: np.ndarray) -> None:
+        self.values[-len(values) :] = values
+
+
+class Taken:
+    """An intake before a robot that holds."""
+
+    def __init__(self, robot: str) -> None:
+        config = RobotConfig.model_validate(description(robot))
+        self.clock = ManualClock()
+        self.robot = Robot(config, [Wires(config, self.clock)], clock=self.clock)
+        self.session = open_session(robot, "client")
+        self.intake = CommandIntake(self.session, config, self.robot, BOOT)
+        self.robot.open()
+        self.cycle()
+        self.robot.enable()
+        self.sample = self.cycle()
+        while self.robot.mode != "hold":
+            self.sample = self.cycle()
+
+    def cycle(self) -> Sample:
+        self.clock.advance(self.robot.period)
+        sample, _ = self.robot.cycle()
+        return Sample(
+            boot=BOOT, cycle=sample.cycle, source="can", complete=True, values=sample.values, age=sample.age,
+            valid=sample.valid,
+        )  # fmt: skip
+
+
+@pytest.fixture
+def taken(robot: str) -> Iterator[Taken]:
+    setting = Taken(robot)
+    yield setting
+    setting.robot.close()
+    close_session(setting.session)
+
+
+_ANY = Sample(cycle=50, source="can", complete=True, values={}, age={}, valid={})
+
+
+@pytest.mark.parametrize("wrong", bad_commands(_ANY))
+def test_a_bad_command_is_counted_and_told(taken: Taken, wrong: str) -> None:
+    data, counter, says = bad_commands(taken.sample)[wrong]
+    if wrong == "an old cycle":
+        for _ in range(60):
+            taken.cycle()
+    taken.intake.offer(data)
+    taken.cycle()
+    facts = taken.intake.facts()
+    assert facts[counter] == 1
+    assert facts["accepted"] == 0
+    assert says in facts["text"]
+    assert taken.intake.news() == facts["text"]
+    assert taken.robot.mode == "hold"
+
+
+def test_a_good_command_is_followed_and_its_sender_known(taken: Taken) -> None:
+    good = Command(
+        boot=9, signal="muscle_length", values=np.array([0.001, 0.0]), cycle=taken.sample.cycle, hal_boot=BOOT
+    )
+    taken.intake.offer(messages.encode(good))
+    taken.cycle()
+    assert taken.robot.mode == "follow"
+    assert taken.intake.sender == 9
+    assert taken.intake.facts()["accepted"] == 1
+    assert taken.intake.news() == ""
+
+
+def test_bad_commands_are_logged_once_a_second(taken: Taken, caplog: pytest.LogCaptureFixture) -> None:
+    for _ in range(50):
+        taken.intake.offer(b"\xc1")
+    assert taken.intake.facts()["malformed"] == 50
+    assert len(caplog.records) == 1
