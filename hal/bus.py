@@ -161,7 +161,7 @@ class Bus:
         """Put a frame on the bus, waiting at most `SEND_TIMEOUT`; whether the interface took it. Never raises."""
         with self._send_lock:
             interface = self._can
-            if interface is None:
+            if interface is None or self._failed_sends >= FAILED_SENDS:  # about to be opened again
                 self.counters["send_failures"] += 1
                 return False
             try:

@@ -15,7 +15,9 @@ from hal.protocols import cia301, cia402
 from hal.protocols.cia402 import State
 
 RESET_CYCLES = 200
-"""For so many cycles a fault reset is tried, as an edge every fourth."""
+"""For so many cycles a fault reset is tried,"""
+RESET_PERIOD = 4
+"""as a rising edge in every fourth."""
 LARGEST_COUNT = 2**31 - 1
 
 
@@ -137,9 +139,9 @@ class Cia402Drive(CanopenNode):
         """See `Device.idle`; the drive is led to a state without power, and out of a fault if that was asked."""
         word = cia402.towards_disabled(self._state)
         if self._resetting:
-            self._resetting = self._resetting - 1 if self._state in (State.FAULT, State.FAULT_REACTION) else 0
-            if self._state is State.FAULT and self._resetting % 4 == 0:
+            if self._state is State.FAULT and self._resetting % RESET_PERIOD == 0:
                 word = cia402.FAULT_RESET
+            self._resetting = self._resetting - 1 if self._state in (State.FAULT, State.FAULT_REACTION) else 0
         self._command(word, self._counts)
 
     def _command(self, word: int, target: int) -> None:
