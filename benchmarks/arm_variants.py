@@ -20,7 +20,7 @@ ROBOT = Path(__file__).parents[1] / "robots" / "musashi_arm.yaml"
 
 
 def designed_posture(length: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """Joint positions [rad], shape (5,), at which the designer's model rests with wires of `length` [m], shape (10,)."""
+    """Joint positions [rad], shape (5,), at which the designer's model rests on wires of `length` [m] (10,)."""
     elastic, position = designed_elastic(), near
     for _ in range(40):
         path, arms = designed_paths().solve(position)
@@ -77,7 +77,7 @@ def main() -> None:
     arguments = parser.parse_args()
     config = load_robot(ROBOT)
     print(
-        "missed: between the posture that the designer's model commands and the one reached; soft: share of time above\n"
+        "missed: between the posture that the designer's model commands and the one reached; soft: share of time over\n"
         "soft_high; stops: how far a joint went into its mechanical stops\n"
         "variant    seed  postures  missed [rad]      p95  peak [N]  soft [%]  stops [rad]  x real time"
     )

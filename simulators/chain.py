@@ -21,13 +21,22 @@ class Pose:
     Attributes:
         rotations: Frame orientations, shape (n + 1, 3, 3).
         origins: Frame origins [m], shape (n + 1, 3).
-        screws: Joint screws, shape (6, n): a wrench (force [N], moment about the base origin [N m]) times column j is
-            its torque about joint j [N m].
+        axes: Joint axes, shape (n, 3).
     """
 
     rotations: np.ndarray
     origins: np.ndarray
-    screws: np.ndarray
+    axes: np.ndarray
+
+    def screws(self) -> np.ndarray:
+        """Joint screws, shape (6, n).
+
+        A wrench (force [N], moment about the base origin [N m]) times column j is its torque about joint j [N m].
+        """
+        screws = np.empty((6, len(self.axes)))
+        screws[:3] = cross(self.origins[1:], self.axes).T
+        screws[3:] = self.axes.T
+        return screws
 
     def points(self, frames: np.ndarray, local: np.ndarray) -> np.ndarray:
         """Points fixed in frames (p,), local coordinates [m] (p, 3), in base coordinates [m], shape (p, 3)."""
@@ -109,19 +118,16 @@ class Chain:
         axes = np.matmul(before, self.axes[:, :, None])[:, :, 0]
         origins = np.zeros((size + 1, 3))
         np.cumsum(np.matmul(before, self.offsets[:, :, None])[:, :, 0], axis=0, out=origins[1:])
-        screws = np.empty((6, size))
-        screws[:3] = cross(origins[1:], axes).T
-        screws[3:] = axes.T
-        return Pose(rotations, origins, screws)
+        return Pose(rotations, origins, axes)
 
     def gravity_torque(self, position: np.ndarray) -> np.ndarray:
         """Joint torques [N m] that hold the links against gravity at joint positions [rad]; both of shape (n,)."""
         pose = self.pose(position)
-        frames = np.arange(1, len(self.joints) + 1)
-        forces = np.zeros((len(self.joints), 3))
-        forces[:, 2] = self.masses * GRAVITY
-        wrenches = np.hstack([forces, cross(pose.points(frames, self.centers), forces)])
-        torque: np.ndarray = np.where(self.moves[1:], wrenches @ pose.screws, 0.0).sum(axis=0)
+        moments = np.matmul(pose.rotations[1:], self.centers[:, :, None])[:, :, 0] + pose.origins[1:]
+        moments *= self.masses[:, None]
+        carried = moments[::-1].cumsum(axis=0)[::-1]  # (n, 3): first mass moments of all that a joint moves
+        carried -= self.masses[::-1].cumsum()[::-1, None] * pose.origins[1:]
+        torque: np.ndarray = GRAVITY * (pose.axes[:, 0] * carried[:, 1] - pose.axes[:, 1] * carried[:, 0])
         return torque
 
 

@@ -7,81 +7,12 @@ so steps are linearly implicit: tensions are taken where the joints will be at t
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from simulators.bullet import BulletBody
 from simulators.faults import MUSCLE_CUT, check_part
-from simulators.muscles import Elastic, Paths
-
-
-@dataclass(frozen=True, slots=True)
-class Friction:
-    """Dry friction with a presliding range, so that it holds at rest: force = limit * (slid / presliding).
-
-    Attributes:
-        joint_torque: Coulomb torque of each joint [N m], shape (n,).
-        joint_presliding: Joint travel until it slips [rad].
-        wire: Share of the tension that is lost along a wire, shape (m,).
-        wire_presliding: Path travel until it slips [m].
-    """
-
-    joint_torque: np.ndarray
-    joint_presliding: float
-    wire: np.ndarray
-    wire_presliding: float
-
-
-@dataclass(frozen=True, slots=True)
-class Servo:
-    """What every spool can do.
-
-    Attributes:
-        speed: Highest speed of the wire [m/s].
-        lag: Time constant of the position loop [s].
-        force: Tension at which the spool gives way while driven [N].
-        brake: Tension at which the brake gives way [N].
-    """
-
-    speed: float = 0.2
-    lag: float = 0.008
-    force: float = 350.0
-    brake: float = 450.0
-
-
-@dataclass(frozen=True, slots=True)
-class Body:
-    """All that makes one variant of a muscle-driven robot.
-
-    Attributes:
-        urdf: Its rigid links.
-        paths: Its wires.
-        elastic: Their elastic elements.
-        slack: Wire length that counts as zero: path length minus what is reported [m], shape (m,).
-        joint_damping: Viscous torque of each joint [N m s/rad], shape (n,).
-        loss_time: Of the elastic elements: f = elastic(x) * (1 + loss_time * rate * dx/dt) [s].
-        friction: Dry friction, or None.
-        noise: Standard deviation of what is measured, per signal [its unit].
-        rest: Joint positions at the start [rad], shape (n,).
-        rest_tension: Tensions at the start [N], shape (m,).
-        object_mass: Of the heavy object [kg].
-        object_radius: Of the heavy object [m].
-    """
-
-    urdf: Path
-    paths: Paths
-    elastic: Elastic
-    slack: np.ndarray
-    joint_damping: np.ndarray
-    loss_time: float
-    friction: Friction | None
-    noise: Mapping[str, float]
-    rest: np.ndarray
-    rest_tension: np.ndarray
-    object_mass: float = 0.7
-    object_radius: float = 0.05
+from simulators.muscle_body import Body, Friction, Servo
 
 
 class MuscleWorld:

@@ -88,7 +88,7 @@ class Paths:
     def _arms(self, pose: Pose, points: np.ndarray, pulls: np.ndarray) -> np.ndarray:
         """dL/dq from dL/d(point): each point's pull is a wrench on the joints that move it."""
         wrenches = np.concatenate([pulls, cross(points, pulls)], axis=1)
-        arms: np.ndarray = self._ends @ (self._moves * (wrenches @ pose.screws))
+        arms: np.ndarray = self._ends @ (self._moves * (wrenches @ pose.screws()))
         return arms
 
 

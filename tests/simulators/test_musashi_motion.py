@@ -1,5 +1,7 @@
 """Random safe motion: smooth, within the robot file's limits, and it gets where it wants to."""
 
+import subprocess
+import sys
 from itertools import islice
 from pathlib import Path
 
@@ -31,6 +33,14 @@ def test_commands_stay_within_the_limits_and_the_rate():
     speed = np.abs(np.diff(lengths, axis=0)) / durations[1:, None]
     assert speed.max() < 0.8 * CONFIG.limits["muscle_length"].rate
     assert durations.sum() > 60.0
+
+
+def test_motion_and_gravity_need_no_physics_engine():
+    code = (
+        "import sys; from simulators.robots.musashi_arm import gravity_torque, random_motion; "
+        "gravity_torque([0.1, 0.2, 0.3, -0.4, 0.5]); sys.exit('pybullet' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 def test_the_seed_is_the_motion():

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from simulators.muscle_world import Body, Friction
+from simulators.muscle_body import Body, Friction
 from simulators.muscles import Elastic, Paths, Sphere, Via
 from simulators.robots.musashi_arm.model import (
     ROUTES,
