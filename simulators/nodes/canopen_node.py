@@ -58,8 +58,6 @@ class CanopenNode:
         self._watched: dict[int, tuple[float, float | None]] = {}
         self._now = 0.0
 
-    # What a subclass adds
-
     def sample(self) -> None:
         """Bring the process values in the object dictionary up to date."""
 
@@ -75,8 +73,6 @@ class CanopenNode:
     def break_down(self) -> None:
         """Report a fault of the device's own."""
         self.emergency(HARDWARE, GENERIC)
-
-    # Power
 
     def power_up(self, now: float) -> None:
         """Start anew with the values of power-on and report with a boot-up message."""
@@ -101,8 +97,6 @@ class CanopenNode:
         self._send(0x700 + self.spec.node, bytes([Nmt.BOOT]))
         self.nmt = Nmt.PRE_OPERATIONAL
         self._restart_heartbeat()
-
-    # Frames
 
     def routes(self) -> dict[int, Handler]:
         """Which identifiers this node listens to, SYNC aside, and what takes the data."""
@@ -209,8 +203,6 @@ class CanopenNode:
             except Refused:
                 continue  # a PDO has no answer: a value out of range is not taken
 
-    # Heartbeats
-
     def _restart_heartbeat(self) -> None:
         self._heartbeat_due = self._now
 
@@ -241,8 +233,6 @@ class CanopenNode:
             self.nmt = Nmt.STOPPED
         elif behaviour == 0 and self.nmt is Nmt.OPERATIONAL:
             self.nmt = Nmt.PRE_OPERATIONAL
-
-    # Errors
 
     def emergency(self, code: int, register: int, info: bytes = b"") -> None:
         """Send EMCY and remember the error (1001h, 1003h)."""

@@ -79,7 +79,7 @@ class JointEncoder(CanopenNode):
         """Make the position now read as the preset value (6003h)."""
         measured = self._measured()
         if measured is not None:
-            half = self._range() // 2
+            half = (self._range() + 1) // 2
             self.objects.values[0x6509, 0] = (int(new) - measured + half) % self._range() - half
 
     def _differentiate(self, position: int) -> None:

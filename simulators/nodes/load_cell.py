@@ -13,6 +13,9 @@ ZERO = int.from_bytes(b"zero", "little")
 NOT_VALID, POSITIVE_OVERLOAD, NEGATIVE_OVERLOAD = 1, 2, 4
 """Bits of the status 6150h."""
 
+_LARGEST = 1e9
+"""Process value [N] beyond which the scaling that a master has set makes no sense."""
+
 
 class LoadCell(CanopenNode):
     """One channel: field value (counts) times scaling factor plus offsets is the process value [N]."""
@@ -48,6 +51,9 @@ class LoadCell(CanopenNode):
         status = POSITIVE_OVERLOAD if force > capacity else NEGATIVE_OVERLOAD if force < -capacity else 0
         field_value = round(min(max(force, -capacity), capacity) * self._constants.counts_per_newton)
         process_value = field_value * float(values[0x6126, 1]) + float(values[0x6127, 1]) + float(values[0x6124, 1])
+        if not abs(process_value) < _LARGEST:
+            values[0x6150, 1] = NOT_VALID
+            return
         whole = round(process_value * 10 ** int(values[0x6132, 1]))
         values[0x9100, 1] = field_value
         values[0x6130, 1] = process_value
@@ -61,4 +67,6 @@ class LoadCell(CanopenNode):
                 raise Refused(Abort.VALUE)
             self.sample()
             values = self.objects.values
+            if values[0x6150, 1] == NOT_VALID:
+                raise Refused(Abort.DEVICE_STATE)
             values[0x6124, 1] = float(values[0x6124, 1]) - float(values[0x6130, 1])

@@ -4,6 +4,7 @@ import struct
 import pytest
 from bench import CELL, ENCODER, bench
 
+from simulators.nodes.objects import Abort
 from simulators.nodes.spec import CellConstants, EncoderConstants, NodeSpec
 
 ZERO = int.from_bytes(b"zero", "little")
@@ -79,6 +80,23 @@ def test_a_broken_cell_keeps_saying_so(b):
 def test_cell_that_is_switched_off_measures_nothing(b):
     b.write(CELL, 0x6112, 1, "B", 0)
     assert cell_at(b, 10.0)[1] == 1
+
+
+@pytest.mark.parametrize("factor", [1e30, math.inf, math.nan])
+def test_a_scaling_that_makes_no_sense_gives_no_measurement(b, factor):
+    assert b.write(CELL, 0x6126, 1, "f", factor) == 0
+    assert cell_at(b, 10.0)[1] == 1
+    assert b.write(CELL, 0x6125, 1, "I", ZERO) == Abort.DEVICE_STATE
+
+
+def test_the_widest_range_of_an_encoder_can_be_preset(b):
+    for index, value in ((0x6001, 2**32 - 1), (0x6002, 2**32 - 1)):
+        assert b.write(ENCODER, index, 0, "I", value) == 0
+    assert b.write(ENCODER, 0x6000, 0, "H", 4) == 0
+    for preset in (0, 2**31, 2**32 - 2):
+        assert b.write(ENCODER, 0x6003, 0, "I", preset) == 0
+        b.read(ENCODER, 0x6509, 0, "i")
+        assert encoder_at(b, b.world.angle)[0] == preset
 
 
 @pytest.mark.parametrize("angle", [-3.0, -0.5, 0.0, 1.0, 3.0])

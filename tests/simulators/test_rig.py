@@ -1,3 +1,5 @@
+import random
+import struct
 import threading
 import time
 
@@ -178,3 +180,33 @@ def test_a_bus_that_fails_is_opened_again(tmp_path):
         running.clear()
         thread.join()
     segment.close()
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_no_frame_however_malformed_brings_a_node_down(seed):
+    chance = random.Random(seed)
+    nodes = [spec.node for spec in SPECS]
+    with bench() as b:
+        objects = sorted(b.rig.node("wire_drive").objects.entries)
+        for _ in range(1500):
+            data = chance.randbytes(chance.randrange(9))
+            identifier = chance.randrange(2048)
+            if chance.random() < 0.6:  # a request for an object that exists, with any value
+                index, sub = chance.choice(objects)
+                head = struct.pack("<BHB", chance.choice((0x23, 0x27, 0x2B, 0x2F, 0x40, 0x21, 0x60)), index, sub)
+                identifier, data = 0x600 + chance.choice(nodes), head + chance.randbytes(4)
+            elif chance.random() < 0.5:
+                identifier = chance.choice((0x000, 0x080, 0x77F, *(0x200 + node for node in nodes)))
+            b.send(identifier, data)
+            b.step(0.005 * chance.randrange(2))
+        b.nmt(0x81)
+        b.nmt(1)
+        assert set(b.sync()) == {0x180 + node for node in nodes}
+
+
+def test_frames_of_other_kinds_are_passed_over():
+    with bench() as b:
+        b.nmt(1)
+        for flags in ({"is_remote_frame": True}, {"is_error_frame": True}, {"is_extended_id": True}):
+            b.bus.send(can.Message(arbitration_id=0x80, **{"is_extended_id": False, **flags}))
+        assert b.step(0.0) == []
