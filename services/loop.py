@@ -13,6 +13,8 @@ log = logging.getLogger(__name__)
 
 LOG_EVERY = 1.0
 """A tick that keeps failing is logged this often [s]."""
+ERROR_NEWS = 5.0
+"""How long [s] a failed tick is worth mentioning."""
 
 
 class Grid:
@@ -58,8 +60,6 @@ class Loop:
         """`fifo` when real-time scheduling was granted."""
         self.failed = 0
         """Ticks that raised."""
-        self.error = ""
-        """What the last tick that raised said."""
         self._tick = tick
         self._clock = clock or SystemClock()
         self._priority = priority
@@ -71,7 +71,13 @@ class Loop:
         self._busy = 0.0
         self._grid: Grid | None = None
         self._counted = (self._clock.monotonic(), 0, 0.0)
-        self._logged = -math.inf
+        self._error = ""
+        self._failed_at = self._logged = -math.inf
+
+    @property
+    def error(self) -> str:
+        """What the last tick that raised said; empty when that was long ago."""
+        return self._error if self._clock.monotonic() - self._failed_at < ERROR_NEWS else ""
 
     def start(self) -> None:
         """Begin ticking; the first tick is one period from now."""
@@ -136,8 +142,8 @@ class Loop:
             self._tick()
         except Exception as error:
             self.failed += 1
-            self.error = f"{type(error).__name__}: {error}"
-            now = self._clock.monotonic()
+            self._error = f"{type(error).__name__}: {error}"
+            self._failed_at = now = self._clock.monotonic()
             if now - self._logged >= LOG_EVERY:
                 self._logged = now
                 log.exception("A tick of loop '%s' failed (%d so far)", self.name, self.failed)
