@@ -31,7 +31,7 @@ OWN_HEARTBEAT_PERIOD = 0.05
 """[s]; the drives stop when it fails for their consumer heartbeat time."""
 SILENCE = 1.0
 """No frame for so long [s] means that the interface may be another one by now: it is opened again."""
-BACK_OFF = (0.05, 1.0)
+BACK_OFF = (0.05, 0.5)
 """First and longest pause [s] between tries to open."""
 RECEIVE_TIMEOUT = 0.1
 SEND_TIMEOUT = 0.002

@@ -12,7 +12,7 @@ log = logging.getLogger(__name__)
 
 PASS_PERIOD = 0.05
 """How often [s] the devices are looked at."""
-BACK_OFF = (0.2, 0.4, 0.8)
+BACK_OFF = (0.2, 0.4)
 """Pauses [s] between tries to open the same device; the last is repeated."""
 NEED_OPENING = (DeviceState.CLOSED, DeviceState.OPENING, DeviceState.SILENT)
 
@@ -24,6 +24,7 @@ class Caretaker:
         self._devices = tuple(devices)
         self._tries = dict.fromkeys(self._devices, 0)
         self._not_before = dict.fromkeys(self._devices, 0)
+        self._seen = dict.fromkeys(self._devices, DeviceState.CLOSED)
         self._running: dict[Device, Future[None]] = {}
         self._passes = 0
         self._stopping = threading.Event()
@@ -61,9 +62,10 @@ class Caretaker:
             running = self._running.get(device)
             if running is not None and not running.done():
                 continue
-            if device.health().state not in NEED_OPENING:
-                self._tries[device] = 0
-            elif self._passes >= self._not_before[device] and self._pool:
+            state = device.health().state
+            if state is not self._seen[device]:  # a silent node that boots need not wait for its next turn
+                self._seen[device], self._tries[device], self._not_before[device] = state, 0, 0
+            if state in NEED_OPENING and self._passes >= self._not_before[device] and self._pool:
                 pause = BACK_OFF[min(self._tries[device], len(BACK_OFF) - 1)]
                 self._tries[device] += 1
                 self._not_before[device] = self._passes + round(pause / PASS_PERIOD)

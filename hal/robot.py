@@ -23,6 +23,8 @@ __all__ = ["Applied", "Robot", "Sample", "open_robot"]
 
 ANSWER_SHARE = 0.6
 """Part of the period that the cycle waits for the answers to its SYNC."""
+START_MEMORY = 0.25
+"""A robot without power may be enabled where all its drives were seen not longer ago [s]: a lost frame is no obstacle."""
 CLOSING_CYCLES = 20
 """How many cycles `close` spends on letting the drives go."""
 
@@ -65,6 +67,8 @@ class Robot:
         self._nothing = np.full(size, np.nan)
         self._nothing.flags.writeable = False
         self._set_point = self._nothing
+        self._position = self._nothing
+        self._position_known = -np.inf
         self._desired: tuple[np.ndarray, float] | None = None
         self._measured = {name: np.full(signal.size, np.nan) for name, signal in config.signals.items()}
         self._number = 0
@@ -141,22 +145,24 @@ class Robot:
             if self._modes.mode is Mode.OFF:
                 self._check_start()
                 self._desired = None
-                self._set_point = self._measured[self.config.command.signal].copy()
+                self._set_point = self._position.copy()
             self._modes.enable(self._clock.monotonic())
 
     def _check_start(self) -> None:
         """Whether the robot is where it may be enabled."""
         signal = self.config.command.signal
-        names, measured = self.config.signals[signal].elements, self._measured[signal]
-        unknown = [name for name, value in zip(names, measured, strict=True) if not np.isfinite(value)]
-        if unknown:
+        names = self.config.signals[signal].elements
+        if self._clock.monotonic() - self._position_known > START_MEMORY:
+            unknown = [
+                name for name, value in zip(names, self._measured[signal], strict=True) if not np.isfinite(value)
+            ]
             raise CommandRefused(
-                f"No valid {signal} of {', '.join(unknown)}, so there is nothing to start from. "
+                f"No valid {signal} of {', '.join(unknown or names)}, so there is nothing to start from. "
                 "Is the cycle running, does the drive answer?"
             )
-        misplaced = self._limiter.misplaced(measured)
+        misplaced = self._limiter.misplaced(self._position)
         if misplaced:
-            told = ", ".join(f"{names[index]} {measured[index]:.4g}" for index in misplaced)
+            told = ", ".join(f"{names[index]} {self._position[index]:.4g}" for index in misplaced)
             raise CommandRefused(f"Far outside limits.{signal}: {told}. Are zero and direction of these drives right?")
 
     def disable(self) -> None:
@@ -223,6 +229,9 @@ class Robot:
             complete &= bus.wait(start + ANSWER_SHARE * self.period)
         values, age, valid = self._assembler.assemble(self._clock.monotonic())
         self._measured = values
+        position = values[self.config.command.signal]
+        if np.isfinite(position).all():
+            self._position, self._position_known = position, start
         self._incomplete += not complete
         return Sample(self._number, stamp, self.source, complete, values, age, valid), applied
 

@@ -7,7 +7,7 @@ from hal_bench import description
 from hal.clock import ManualClock
 from hal.config import RobotConfig
 from hal.device import Device, DeviceHealth, DeviceState, Reading
-from hal.errors import ConfigError, DeviceSilent
+from hal.errors import CommandRefused, ConfigError, DeviceSilent
 from hal.robot import Robot
 
 CONFIG = RobotConfig.model_validate(description(devices={}))
@@ -183,3 +183,18 @@ def test_devices_must_fit_the_robot_file(clock, measures, commands, told):
     device = Everything(clock, measures, commands or ("muscle_length.biceps", "muscle_length.triceps"))
     with pytest.raises(ConfigError, match=told):
         Robot(CONFIG, [device], clock=clock)
+
+
+def test_enabling_forgives_a_short_gap_and_not_a_long_one(robot, clock, device):
+    turn(robot, clock)
+    device.values["muscle_length.biceps"] = np.nan
+    turn(robot, clock, 2)
+    robot.enable()
+    _, applied = turn(robot, clock)
+    np.testing.assert_array_equal(applied.values, [0.3, 0.25])
+    robot.disable()
+    device.values["muscle_length.biceps"] = np.nan
+    turn(robot, clock, 60)
+    assert robot.mode == "off"
+    with pytest.raises(CommandRefused, match="No valid muscle_length of biceps,"):
+        robot.enable()
