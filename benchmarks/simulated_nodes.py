@@ -1,7 +1,7 @@
 """What the simulated arm costs at 200 Hz on the hub, and how long its answers take.
 
-`python benchmarks/simulated_nodes.py`; `--timed` keeps the timing of two 1 Mbit/s buses, `--period 0.0025` changes the step of
-the physics [s].
+`python benchmarks/simulated_nodes.py`; with `--timed` the hub keeps the timing of two 1 Mbit/s buses,
+`--period 0.0025` changes the step of the physics [s].
 """
 
 import argparse
