@@ -1,14 +1,19 @@
 """What everybody who drives a World may rely on, asked of both variants of the arm."""
 
+from itertools import islice
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from hal.config import load_robot
 from simulators.faults import UnknownPart
 from simulators.muscle_world import MuscleWorld
-from simulators.robots.musashi_arm import simulator
-from simulators.robots.musashi_arm.body import REST
+from simulators.robots.musashi_arm import random_motion, simulator
+from simulators.robots.musashi_arm.body import REST, make_body
 from simulators.robots.musashi_arm.model import ROUTES, URDF, chain
 
+CONFIG = load_robot(Path(__file__).parents[2] / "robots" / "musashi_arm.yaml")
 SIZES = {"joint_position": 5, "muscle_tension": 10, "muscle_length": 10}
 
 
@@ -130,6 +135,20 @@ def test_wrong_names_and_numbers_are_told(world):
         world.drive("muscle_length.gluteus", 0.1, True)
     with pytest.raises(ValueError, match=r"muscle_length\.biceps.* nan"):
         world.drive("muscle_length.biceps", float("nan"), True)
+
+
+def test_the_step_is_fine_enough():
+    bodies = [MuscleWorld(make_body("actual", 0), 0, longest_step=step) for step in (0.0025, 0.0005)]
+    histories: list[list[np.ndarray]] = [[], []]
+    for lengths, duration in islice(random_motion(CONFIG, 1), 150):
+        for world, history in zip(bodies, histories, strict=True):
+            drive(world, lengths)
+            run(world, duration)
+            history.append(world.truth()["joint_position"])
+    for world in bodies:
+        world.close()
+    difference = np.array(histories[0]) - np.array(histories[1])
+    assert np.sqrt(np.mean(difference**2)) < 0.003
 
 
 def test_worlds_do_not_see_each_other():
