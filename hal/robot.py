@@ -24,7 +24,7 @@ __all__ = ["Applied", "Robot", "Sample", "open_robot"]
 ANSWER_SHARE = 0.6
 """Part of the period that the cycle waits for the answers to its SYNC."""
 START_MEMORY = 0.25
-"""A robot without power may be enabled where all its drives were seen not longer ago [s]: a lost frame is no obstacle."""
+"""The robot may be enabled where all its drives were seen not longer ago [s]: a lost frame is no obstacle."""
 CLOSING_CYCLES = 20
 """How many cycles `close` spends on letting the drives go."""
 
