@@ -21,12 +21,12 @@ class UpdateConfig:
     Attributes:
         window: Samples kept; the oldest are dropped.
         minimum: Samples needed before the first step.
-        batch: Samples per gradient step, drawn from the window; each is used under every mask it allows.
+        batch: Samples per gradient step, drawn from window and replay; each is used under every mask it allows.
         steps: Gradient steps per `Updater.step`.
         rate: Learning rate.
         optimiser: `adam` or `sgd` (with momentum 0.9).
-        newest: Share of a batch that is the newest samples of the window, the rest is random.
-        replay: Rows of the training data in a batch, as a share of the batch, against forgetting.
+        replay: As how many samples of the window the training data counts. A young window then cannot pull W far
+            from what was known of postures it has not seen, and a full one outweighs what is known to be old.
         seed: For the draws.
     """
 
@@ -36,8 +36,7 @@ class UpdateConfig:
     steps: int = 3
     rate: float = 1e-3
     optimiser: str = "adam"
-    newest: float = 0.1
-    replay: float = 0.0
+    replay: int = 300
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -144,14 +143,12 @@ class Updater:
     def _batch(self) -> tuple[np.ndarray, np.ndarray]:
         """Inputs (rows, inputs) and wanted x_out (rows, out_size): each drawn sample once per mask it allows."""
         config = self.config
-        count = min(config.batch, self._count)
-        fresh = min(count, round(config.newest * count))
-        drawn = self._random.integers(0, self._count, count)
-        drawn[:fresh] = (self._next - 1 - np.arange(fresh)) % self._count
-        rows = self._rows[drawn]
         anchors = self.schema.anchors
-        if config.replay > 0 and len(anchors):
-            rows = np.concatenate([rows, anchors[self._random.integers(0, len(anchors), round(config.replay * count))]])
+        old = config.replay if len(anchors) else 0
+        drawn = self._random.random(config.batch) * (self._count + old)
+        lived = self._rows[drawn[drawn < self._count].astype(int)]
+        replayed = anchors[self._random.integers(0, max(1, len(anchors)), config.batch - len(lived))]
+        rows = np.concatenate([lived, replayed]) if len(replayed) else lived
         finite = np.isfinite(rows)
         inputs: list[np.ndarray] = []
         wanted: list[np.ndarray] = []

@@ -140,7 +140,7 @@ def prediction_error(schema: "BodySchema", values: Mapping[str, np.ndarray]) -> 
     x = schema.normalise(values)
     error = np.full((*x.shape[:-1], schema.out_layout.size), np.nan)
     predicted: dict[Mask, np.ndarray] = {}
-    for name, mask in judging_masks(schema).items():
+    for name, mask in schema.judges.items():
         if mask not in predicted:
             prediction = schema.infer(x, mask).astype(float)
             prediction[~np.isfinite(x[..., schema.layout.indices(mask)]).all(axis=-1)] = np.nan

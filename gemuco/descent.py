@@ -2,7 +2,8 @@
 
 It knows no loss and no robot. From the present point it takes the gradient, makes one candidate per step size in
 [0, gamma_max], evaluates all of them as a batch, and goes on from the best. Because the step size 0 is among them the
-loss never rises. A single candidate is plain descent with the constant step gamma_max.
+loss never rises; where it wins, every other step was too long, and the next ones are spread between 0 and the shortest
+of them. A single candidate is plain descent with the constant step gamma_max.
 """
 
 from collections.abc import Callable
@@ -77,5 +78,7 @@ def descend(
         if loss < best_loss:
             best_point, best_loss = points[chosen].copy(), loss
         if iteration < config.iterations:
+            if iteration and config.candidates > 1 and chosen == 0:
+                gammas = gammas / np.float32(config.candidates - 1)
             points = points[chosen] - gammas * gradients[chosen]
     return Descent(best_point, best_loss, tuple(history))

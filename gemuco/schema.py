@@ -41,6 +41,10 @@ class BodySchema:
         bias: The parametric bias p of the present condition, shape (bias_size,).
         biases: Condition -> its p.
         manifest: Facts that whoever made the schema wants kept with it (JSON values).
+        out_layout: The layout of x_out alone.
+        in_index: Where the elements of x_in lie in the layout, shape (in_size,).
+        out_index: Where the elements of x_out lie in the layout, shape (out_size,).
+        judges: Signal of x_out -> the mask that predicts it for the sake of anomaly detection.
     """
 
     layout: Layout
@@ -58,6 +62,7 @@ class BodySchema:
     out_layout: Layout = field(init=False, repr=False)
     in_index: np.ndarray = field(init=False, repr=False)
     out_index: np.ndarray = field(init=False, repr=False)
+    judges: Mapping[str, Mask] = field(init=False, repr=False)
     _gates: dict[Mask, tuple[np.ndarray, np.ndarray]] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -72,6 +77,9 @@ class BodySchema:
                 f"The network is {shape[0]} -> {shape[1]}; the layout asks for {inputs} -> {len(self.out_index)}."
             )
         set_field(self, "_gates", {})
+        for mask in self.masks:
+            self.gate(mask)
+        set_field(self, "judges", anomaly.judging_masks(self))
         for array in (*self.weights.arrays(), self.anchors, self.bias):
             array.setflags(write=False)
 

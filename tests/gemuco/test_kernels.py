@@ -1,0 +1,72 @@
+import numpy as np
+import pytest
+import torch
+
+from gemuco.kernels import Curvature, pull, pull_weights, push, run, trace
+from gemuco.network import Network
+
+INPUTS, OUTPUTS, SAMPLES = 9, 6, 4
+
+
+@pytest.fixture
+def network():
+    torch.manual_seed(3)
+    return Network(INPUTS, OUTPUTS, (20, 10), 5)
+
+
+@pytest.fixture
+def x():
+    return np.random.default_rng(1).standard_normal((SAMPLES, INPUTS)).astype(np.float32)
+
+
+@pytest.fixture
+def seed():
+    return np.random.default_rng(2).standard_normal((SAMPLES, OUTPUTS)).astype(np.float32)
+
+
+def test_forward_agrees_with_torch(network, x):
+    weights = network.weights()
+    wanted = network(torch.from_numpy(x)).detach().numpy()
+    np.testing.assert_allclose(run(weights.whole, x), wanted, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(run(weights.decoder, run(weights.encoder, x[0])), wanted[0], rtol=1e-5, atol=1e-6)
+
+
+def test_backward_agrees_with_torch(network, x, seed):
+    weights = network.weights()
+    given = torch.from_numpy(x).requires_grad_()
+    (network(given) * torch.from_numpy(seed)).sum().backward()
+    values = trace(weights.whole, x)
+    np.testing.assert_allclose(pull(weights.whole, values, seed), given.grad.numpy(), rtol=1e-5, atol=1e-6)
+    gradients = pull_weights(weights.whole, values, seed)
+    linear = [m for m in network.modules() if isinstance(m, torch.nn.Linear)]
+    wanted = [g for m in linear for g in (m.weight.grad.numpy().T, m.bias.grad.numpy())]
+    for found, expected in zip(gradients, wanted, strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5)
+
+
+def test_second_derivatives_agree_with_torch(network, x, seed):
+    weights = network.weights().astype(np.float64)
+    network, x, seed = network.double(), x.astype(np.float64), seed.astype(np.float64)
+    tangent = np.random.default_rng(5).standard_normal(x.shape)
+    curvature = Curvature(weights.whole, x, seed)
+    pushed, mixed = curvature.mixed(tangent)
+    given = torch.from_numpy(x).requires_grad_()
+    output = (network(given) * torch.from_numpy(seed)).sum()
+    (first,) = torch.autograd.grad(output, given, create_graph=True)
+    (second,) = torch.autograd.grad((first * torch.from_numpy(tangent)).sum(), given)
+    np.testing.assert_allclose(curvature.gradient, first.detach().numpy(), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(mixed, second.numpy(), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(pushed, push(weights.whole, trace(weights.whole, x), tangent), rtol=1e-9, atol=1e-12)
+
+
+def test_second_derivative_agrees_with_finite_differences(network, x, seed):
+    chain = network.weights().astype(np.float64).whole
+    x, seed = x.astype(np.float64), seed.astype(np.float64)
+    tangent = np.random.default_rng(5).standard_normal(x.shape)
+    _, mixed = Curvature(chain, x, seed).mixed(tangent)
+    step = 1e-6
+    for column in range(INPUTS):
+        moved = np.zeros_like(x)
+        moved[:, column] = step
+        rise = [np.sum(Curvature(chain, x + s * moved, seed).gradient * tangent, axis=1) for s in (1, -1)]
+        np.testing.assert_allclose(mixed[:, column], (rise[0] - rise[1]) / (2 * step), rtol=1e-5, atol=1e-8)

@@ -1,0 +1,108 @@
+import numpy as np
+import pytest
+import torch
+from muscle_arm import LAYOUT
+
+from gemuco.dataset import Dataset, Episode
+from gemuco.errors import NotEnoughData, SchemaError, UnknownSignal
+from gemuco.structure import Thresholds, determine
+from gemuco.train import TrainConfig, fit
+
+MASKS = [{"joint_position", "muscle_tension"}, {"muscle_tension", "muscle_length"}]
+TINY = TrainConfig(hidden=(20,), latent=5, epochs=3, batch=100)
+
+
+def test_the_same_seed_gives_the_same_model(data):
+    first, second = fit(data, TINY, MASKS)[0], fit(data, TINY, MASKS)[0]
+    for one, other in zip(first.weights.arrays(), second.weights.arrays(), strict=True):
+        np.testing.assert_array_equal(one, other)
+    third = fit(data, TrainConfig(hidden=(20,), latent=5, epochs=3, batch=100, seed=1), MASKS)[0]
+    assert not np.array_equal(first.weights.encoder[0].matrix, third.weights.encoder[0].matrix)
+
+
+def test_tells_its_progress_and_its_history(data):
+    told = []
+    _, history = fit(data, TINY, MASKS, lambda share, text: told.append((share, text)))
+    assert [share for share, _ in told] == pytest.approx([1 / 3, 2 / 3, 1.0])
+    assert "held-out loss" in told[-1][1]
+    assert len(history.train) == len(history.held_out) == 3
+    assert history.best_epoch == int(np.argmin(history.held_out))
+
+
+def test_stops_early(data):
+    config = TrainConfig(hidden=(20,), latent=5, epochs=50, batch=100, rate=0.0, patience=2)
+    assert len(fit(data, config, MASKS)[1].train) == 3
+
+
+def test_leaves_the_number_of_threads_alone(data):
+    before = torch.get_num_threads()
+    fit(data, TINY, MASKS)
+    assert torch.get_num_threads() == before
+
+
+def test_trains_on_rows_with_gaps(arm):
+    random = np.random.default_rng(0)
+    episodes = []
+    for seed in range(6):
+        values = arm.sample(200, seed)
+        values["joint_position"][random.random((200, 2)) < 0.3] = np.nan
+        episodes.append(Episode("new", values))
+    schema, history = fit(Dataset(LAYOUT, tuple(episodes)), TrainConfig(hidden=(40,), latent=7, epochs=40), MASKS)
+    assert history.held_out[history.best_epoch] < 0.5 * history.held_out[0]
+    assert all(np.isfinite(array).all() for array in schema.weights.arrays())
+
+
+def test_one_bias_per_condition(arm):
+    soft = type(arm)(softness=2.5)
+    episodes = tuple(
+        Episode(name, body.sample(200, seed)) for seed in range(4) for name, body in (("new", arm), ("worn", soft))
+    )
+    config = TrainConfig(hidden=(40, 20), latent=7, epochs=60, batch=100, bias_size=1)
+    schema, _ = fit(Dataset(LAYOUT, episodes), config, MASKS)
+    assert set(schema.biases) == {"new", "worn"}
+    assert abs(schema.biases["new"][0] - schema.biases["worn"][0]) > 0.1
+
+
+def test_finds_the_structure_of_a_muscle_driven_arm(structure):
+    assert {"joint_position", "muscle_length"} <= set(structure.x_out)
+    assert frozenset({"joint_position", "muscle_tension"}) in structure.masks
+    assert frozenset({"muscle_tension", "muscle_length"}) in structure.masks
+    assert frozenset({"muscle_tension"}) not in structure.masks
+    assert structure.L_i["muscle_tension"] > structure.L_i["joint_position"]
+    report = structure.report()
+    assert "muscle_tension+muscle_length" in report
+    assert "x_in  = joint_position, muscle_tension, muscle_length" in report
+
+
+def test_measure_and_outputs_are_options(data, structure):
+    options = Thresholds(out=10.0, into=10.0, measure="rmse", over="all")
+    config = TrainConfig(hidden=(60, 20), latent=7, epochs=30, batch=100)
+    wide = determine(data, config, options)
+    assert frozenset(LAYOUT.names) not in wide.L_m
+    assert len(wide.masks) == 6
+    for name, value in structure.L_i.items():
+        assert wide.L_i[name] == pytest.approx(np.sqrt(value), rel=1e-5)
+    assert "root mean square error" in wide.report()
+
+
+def test_says_what_is_wrong(data):
+    with pytest.raises(SchemaError, match="Known activations: tanh"):
+        TrainConfig(activation="relu")
+    with pytest.raises(SchemaError, match="Known: mse, rmse"):
+        Thresholds(measure="mae")
+    with pytest.raises(UnknownSignal, match="Mask names 'wire'"):
+        fit(data, TINY, [{"wire"}])
+    with pytest.raises(NotEnoughData, match="at least one mask"):
+        fit(data, TINY, [])
+    with pytest.raises(NotEnoughData, match="smallest L_i"):
+        determine(data, TINY, Thresholds(out=1e-9))
+    with pytest.raises(NotEnoughData, match="smallest L_m"):
+        determine(data, TINY, Thresholds(out=10.0, into=1e-9))
+
+
+def test_rows_that_fit_no_mask(arm):
+    values = arm.sample(200, 0)
+    values["muscle_tension"][0::2, 0] = np.nan
+    values["muscle_tension"][1::2, 1] = np.nan
+    with pytest.raises(NotEnoughData, match="No training sample has all signals of any mask"):
+        fit(Dataset(LAYOUT, (Episode("new", values),)), TINY, [{"muscle_tension"}])
