@@ -38,7 +38,8 @@ def on_hub(config: RobotConfig, folder: str) -> RobotConfig:
 
 def run(robot: Robot, cycles: int) -> None:
     """Follow a small motion for so many cycles and print what they cost."""
-    robot.cycle()
+    while not robot.cycle()[0].complete:
+        time.sleep(robot.period)
     robot.enable()
     turns, incomplete, middle = [], 0, None
     received = sum(bus["counters"]["received"] for bus in robot.health()["buses"].values())
