@@ -133,7 +133,7 @@ def _problem(health: dict[str, Any]) -> str:
 
 
 def _describe(config: RobotConfig) -> dict[str, Any]:
-    """What a client must know of the robot: signals with units and elements, command, rates."""
+    """What a client must know of the robot: signals with units and elements, command, limits, rates, devices."""
     signals = {
         name: {"unit": signal.unit, "elements": list(signal.elements)} for name, signal in config.signals.items()
     }
@@ -141,7 +141,9 @@ def _describe(config: RobotConfig) -> dict[str, Any]:
         "description": config.description,
         "signals": signals,
         "command": config.command.model_dump(),
+        "limits": {name: limit.model_dump(exclude_none=True) for name, limit in config.limits.items()},
         "rates": config.rates.model_dump(),
+        "devices": {name: {"kind": device.kind, "element": device.element} for name, device in config.devices.items()},
     }
 
 

@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterable
 from pathlib import Path
 from types import TracebackType
-from typing import BinaryIO, Self
+from typing import BinaryIO, Self, TypeGuard
 
 import mcap
 import msgpack
@@ -109,9 +109,9 @@ class Recorder:
     def _write(self) -> None:
         try:
             self._write_until_told()
-        except (OSError, ValueError) as error:
+        except Exception as error:  # whatever it was, what comes from now on counts as dropped, and is told
             self.failure = f"The recording '{self.path}' ended early: {error}."
-            log.error("%s", self.failure)
+            log.exception("%s", self.failure)
             while self._queue.get() is not None:
                 self.dropped += 1
 
@@ -153,10 +153,18 @@ def _header(payload: bytes, received_ns: int) -> tuple[int, int, int]:
     """Stamp [ns], sequence and boot of a message; of bytes that are none, the time of arrival and zeros."""
     try:
         body = msgpack.unpackb(payload)
-        stamp_ns, seq, boot = (int(body[name]) for name in ("stamp_ns", "seq", "boot"))
-    except (ValueError, TypeError, LookupError, msgpack.UnpackException):
+    except (ValueError, msgpack.UnpackException):
         return received_ns, 0, 0
-    return (stamp_ns, seq, boot) if stamp_ns >= 0 and seq >= 0 else (received_ns, 0, 0)
+    if not isinstance(body, dict):
+        return received_ns, 0, 0
+    stamp_ns, seq, boot = (body.get(name) for name in ("stamp_ns", "seq", "boot"))
+    if not (_counts(stamp_ns) and _counts(seq) and _counts(boot)):
+        return received_ns, 0, 0
+    return stamp_ns, seq, boot
+
+
+def _counts(value: object) -> TypeGuard[int]:
+    return isinstance(value, int) and 0 <= value < 1 << 63
 
 
 def run_recorder(robot: str, path: str | Path, connect: Iterable[str] = (), stop: threading.Event | None = None) -> int:

@@ -16,6 +16,7 @@ import zenoh
 
 from services import keys
 from services.errors import ServiceError
+from services.messages import MAX_BYTES
 
 FIRST_PORT = 20000
 PORT_GROUPS = 3000
@@ -23,7 +24,10 @@ PORT_GROUPS = 3000
 CLIENT = "client"
 LEASE_MS = 1000
 """How long a frozen or unreachable process counts as alive; one that dies is noticed within milliseconds."""
+MAX_RECEIVED = 4 * MAX_BYTES
+"""Longer ones are dropped before they arrive here; those in between are counted as malformed."""
 CLOSE_WITHIN = 2.0
+"""How long [s] to wait for a session to close."""
 
 
 def port(robot: str, service: str) -> int:
@@ -62,7 +66,7 @@ def settings(robot: str, role: str, connect: Iterable[str] = ()) -> dict[str, An
         "transport": {
             # Lost handshakes are repeated after open_timeout: 10 s by default.
             "unicast": {"open_timeout": 500, "accept_timeout": 1000},
-            "link": {"tx": {"lease": LEASE_MS}},
+            "link": {"tx": {"lease": LEASE_MS}, "rx": {"max_message_size": MAX_RECEIVED}},
             # A receiver that is descheduled for 100 ms loses queries that travel by shared memory.
             "shared_memory": {"enabled": False},
         },

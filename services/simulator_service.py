@@ -148,6 +148,7 @@ def run_simulator(
     if variant not in simulator.variants:
         known = ", ".join(simulator.variants)
         raise ConfigError(f"The simulator of '{config.robot}' has no variant '{variant}'. Known variants: {known}.")
-    with until_told(stop) as told, Service(config.robot, "simulator", connect) as service:
+    told_apart = {"variant": variant, "seed": seed, "variants": list(simulator.variants)}
+    with until_told(stop) as told, Service(config.robot, "simulator", connect, lambda: told_apart) as service:
         log.info("Simulator of robot '%s' runs (%s, seed %d)", config.robot, variant, seed)
         return SimulatorService(config.robot, simulator.rig(config, variant, seed), service, variant).run(told)

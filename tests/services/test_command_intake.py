@@ -11,7 +11,9 @@ from hal.device import Device, DeviceHealth, DeviceState, Reading
 from hal.robot import Robot
 from services import messages
 from services.command_intake import CommandIntake
+from services.hal_service import HalService
 from services.messages import Command, Sample
+from services.service import Service
 from services.session import close_session, open_session
 
 BOOT = 77
@@ -48,6 +50,17 @@ class Wires(Device):
 
     def apply(self, values: np.ndarray) -> None:
         self.values[-len(values) :] = values
+
+
+class BrokenWires(Wires):
+    """Wires whose driver has a bug."""
+
+    is_broken = False
+
+    def read(self) -> Reading:
+        if self.is_broken:
+            raise ZeroDivisionError("a bug in a driver")
+        return super().read()
 
 
 class Taken:
@@ -119,3 +132,28 @@ def test_bad_commands_are_logged_once_a_second(taken: Taken, caplog: pytest.LogC
         taken.intake.offer(b"\xc1")
     assert taken.intake.facts()["malformed"] == 50
     assert len(caplog.records) == 1
+
+
+def test_a_cycle_that_fails_stops_the_robot_and_the_service_goes_on(robot: str) -> None:
+    config = RobotConfig.model_validate(description(robot))
+    clock = ManualClock()
+    wires = BrokenWires(config, clock)
+    with Service(robot, "hal") as service:
+        body = Robot(config, [wires], clock=clock)
+        hal = HalService(config, body, service)
+        body.open()
+        hal.tick()
+        body.enable()
+        while body.mode != "hold":
+            clock.advance(body.period)
+            hal.tick()
+        wires.is_broken = True
+        clock.advance(body.period)
+        with pytest.raises(ZeroDivisionError):
+            hal.tick()
+        wires.is_broken = False
+        clock.advance(body.period)
+        hal.tick()
+        assert body.mode == "stopping"
+        assert hal.status().facts["stop_reason"] == "The cycle failed: a bug in a driver"
+        body.close()

@@ -60,9 +60,11 @@ class StalledDisk(Recorder):
 
     def __init__(self, *arguments: Any, **more: Any) -> None:
         super().__init__(*arguments, **more)
+        self.stands = threading.Event()
         self.goes_on = threading.Event()
 
     def _add(self, key: str, received_ns: int, payload: bytes) -> None:
+        self.stands.set()
         assert self.goes_on.wait(20.0)
         super()._add(key, received_ns, payload)
 
@@ -72,8 +74,7 @@ def test_losses_are_counted_and_written_into_the_file(robot: str, tmp_path: Path
     path = tmp_path / "run.mcap"
     with StalledDisk(session, robot, path, depth=4) as recorder:
         session.put(keys.update(robot), messages.encode(_update(0), seq=0, boot=3))
-        while recorder.counters()["waiting"]:
-            time.sleep(0.001)
+        assert recorder.stands.wait(10.0)
         for seq in (1, 5, 6, 7, 8, 9):
             session.put(keys.update(robot), messages.encode(_update(seq), seq=seq, boot=3))
         deadline = time.monotonic() + 10.0

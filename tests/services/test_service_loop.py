@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from hal.clock import ManualClock
 from services.lateness import GROWTH, RESOLUTION, Lateness
 from services.loop import Grid, Loop
+from services.realtime import prepare_thread, promote
 
 
 def test_grid_stays_on_multiples_of_the_period() -> None:
@@ -67,71 +68,73 @@ def test_lateness_before_the_first_tick_is_zero() -> None:
     assert set(Lateness(1).recent().values()) | set(Lateness(1).total().values()) == {0.0}
 
 
-class Turns:
-    """Counts ticks, and lets a test wait for them."""
+class DreamClock(ManualClock):
+    """Sleeping on it moves it on, and no real time goes by."""
 
-    def __init__(self, clock: ManualClock) -> None:
-        self.at: list[float] = []
-        self.longer = 0.0
-        self.raises = False
-        self._clock = clock
-        self._done = threading.Semaphore(0)
+    def sleep_until(self, deadline: float) -> None:
+        self.advance(max(0.0, deadline - self.monotonic()))
 
-    def __call__(self) -> None:
-        self.at.append(self._clock.monotonic())
-        self._clock.advance(self.longer)
-        self._done.release()
-        if self.raises:
+
+def _run(durations: list[float], broken: bool = False) -> tuple[Loop, DreamClock, list[float]]:
+    """A loop of 10 Hz that ended after ticks of these durations [s], and when they began."""
+    clock = DreamClock(0.0)
+    begun: list[float] = []
+
+    def tick() -> None:
+        begun.append(clock.monotonic())
+        clock.advance(durations[len(begun) - 1])
+        if len(begun) == len(durations):
+            loop.stop()
+        if broken:
             raise RuntimeError("broken on purpose")
 
-    def wait(self) -> None:
-        assert self._done.acquire(timeout=10.0)
-
-
-def _advance_until_tick(clock: ManualClock, turns: Turns) -> None:
-    clock.advance(0.1)
-    turns.wait()
-
-
-def test_loop_counts_late_and_skipped_ticks() -> None:
-    clock = ManualClock(0.0)
-    turns = Turns(clock)
-    loop = Loop("slow", 10.0, turns, clock)
+    loop = Loop("dream", 10.0, tick, clock)
     loop.start()
-    while loop._grid is None:
-        threading.Event().wait(0.001)
-    _advance_until_tick(clock, turns)
-    turns.longer = 0.35
-    _advance_until_tick(clock, turns)
-    turns.wait()  # the tick at 0.5, 0.05 late, after 0.3 and 0.4 were skipped
-    turns.longer = 0.0
-    turns.wait()
-    loop._stop.set()
-    clock.advance(0.1)
+    assert loop._thread is not None
+    loop._thread.join(10.0)
     loop.stop()
+    return loop, clock, begun
+
+
+def test_loop_counts_overruns_and_skips() -> None:
+    loop, _, begun = _run([0.0, 0.35, 0.0, 0.0])
+    assert begun == pytest.approx([0.1, 0.2, 0.55, 0.6])
     statistics = loop.statistics()
-    assert statistics["skipped"] >= 2
-    assert statistics["overruns"] >= 1
-    assert statistics["ticks"] == len(turns.at)
-    assert statistics["total_max"] >= 0.04
+    assert statistics["skipped"] == 2
+    assert statistics["overruns"] == 1
+    assert statistics["ticks"] == 4
+    assert statistics["total_max"] == statistics["late_max"] == pytest.approx(0.05)
+    assert statistics["late_p50"] == pytest.approx(0.0)
+    assert statistics["rate"] == pytest.approx(4 / 0.6)
+    assert statistics["busy"] == pytest.approx(0.35 / 0.6)
 
 
 def test_loop_survives_a_tick_that_raises(caplog: pytest.LogCaptureFixture) -> None:
-    clock = ManualClock(0.0)
-    turns = Turns(clock)
-    turns.raises = True
-    loop = Loop("broken", 10.0, turns, clock)
-    loop.start()
-    while loop._grid is None:
-        threading.Event().wait(0.001)
-    for _ in range(3):
-        _advance_until_tick(clock, turns)
-    loop._stop.set()
-    clock.advance(0.1)
-    loop.stop()
-    assert loop.failed == 3
+    loop, clock, _ = _run([0.0] * 5, broken=True)
+    assert loop.failed == loop.statistics()["ticks"] == 5
     assert loop.error == "RuntimeError: broken on purpose"
     assert len([record for record in caplog.records if "failed" in record.message]) == 1
+    clock.advance(60.0)
+    assert loop.error == ""
+
+
+def test_real_time_is_tried_and_a_refusal_is_no_error() -> None:
+    found: list[str] = []
+    ready, done = threading.Event(), threading.Event()
+
+    def prepare() -> None:
+        found.extend((prepare_thread(0), prepare_thread(1)))
+        ready.set()
+        done.wait(10.0)
+
+    thread = threading.Thread(target=prepare, name="prepared for the test")
+    thread.start()
+    assert ready.wait(10.0)
+    promote("prepared for", 2)
+    done.set()
+    thread.join()
+    assert found[0] == "other"
+    assert found[1] in ("fifo", "other")
 
 
 def test_loop_cannot_be_started_twice_and_stops_before_its_start() -> None:
