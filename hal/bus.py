@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import can
 import canopen
 
-from hal.budget import frame_bits
+from hal.budget import OWN_HEARTBEAT_RATE, frame_bits
 from hal.clock import Clock
 from hal.config import BusConfig
 from hal.errors import ConfigError
@@ -27,7 +27,7 @@ Handler = Callable[[bytearray, float], None]
 
 OWN_NODE = 127
 """Node id under which the HAL sends its own heartbeat."""
-OWN_HEARTBEAT_PERIOD = 0.05
+OWN_HEARTBEAT_PERIOD = 1.0 / OWN_HEARTBEAT_RATE
 """[s]; the drives stop when it fails for their consumer heartbeat time."""
 SILENCE = 1.0
 """No frame for so long [s] means that the interface may be another one by now: it is opened again."""
@@ -177,7 +177,7 @@ class Bus:
             return True
 
     def sync(self, now: float) -> None:
-        """Begin a cycle: the SYNC, and twenty times a second the HAL's own heartbeat."""
+        """Begin a cycle: the SYNC, and now and then the HAL's own heartbeat."""
         self._waiting = {n.node for n in self._nodes if n.is_commissioned and n.missed < MISSES_FORGIVEN}
         self._answered.clear()
         self.send(self._sync)

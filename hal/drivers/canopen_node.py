@@ -202,7 +202,8 @@ class CanopenNode(Device):
             self._counters["boots"] += 1
             self._lose(f"{self._place} rebooted and waits to be commissioned.")
         elif self.is_commissioned:
-            self._lose(f"{self._place} left the operational state by itself.")
+            why = f", after reporting {cia301.describe_emergency(self._emergency)}" if self._emergency else ""
+            self._lose(f"{self._place} left the operational state by itself{why}.")
 
     def _lose(self, text: str) -> None:
         """The node is not as we configured it any more."""
