@@ -4,6 +4,7 @@ Whatever was received more than a second ago survives kill -9. What was lost is 
 """
 
 import contextlib
+import itertools
 import logging
 import queue
 import threading
@@ -167,12 +168,19 @@ def _counts(value: object) -> TypeGuard[int]:
     return isinstance(value, int) and 0 <= value < 1 << 63
 
 
+def unused(path: Path) -> Path:
+    """The path itself, or the first of `name-2.mcap`, `name-3.mcap`... that does not exist."""
+    numbered = (path.with_name(f"{path.stem}-{number}{path.suffix}") for number in itertools.count(2))
+    return next(candidate for candidate in itertools.chain([path], numbered) if not candidate.exists())
+
+
 def run_recorder(robot: str, path: str | Path, connect: Iterable[str] = (), stop: threading.Event | None = None) -> int:
     """Record a robot until SIGTERM, SIGINT or `stop`.
 
     Args:
         robot: The robot's name.
-        path: The file to write.
+        path: The file to write; if it exists, a numbered one beside it is written, so that a recorder that was killed
+            can be started again as it was.
         connect: More zenoh endpoints, such as a router's.
         stop: Ends the recording in place of the signals.
 
@@ -180,17 +188,17 @@ def run_recorder(robot: str, path: str | Path, connect: Iterable[str] = (), stop
         The process's exit code; 1 if the recording ended early.
 
     Raises:
-        RecordingError: The file exists, or cannot be written.
+        RecordingError: The file cannot be written.
         AlreadyRunning: The robot is being recorded already.
         ServiceError: No session.
     """
     with (
         until_told(stop) as told,
         Service(robot, "recorder", connect) as service,
-        Recorder(service.session, robot, Path(path)) as recorder,
+        Recorder(service.session, robot, unused(Path(path))) as recorder,
     ):
         service.run(lambda: _status(recorder), told)
-    log.info("Recorded %d messages into %s", recorder.written, path)
+    log.info("Recorded %d messages into %s", recorder.written, recorder.path)
     return 1 if recorder.failure else 0
 
 

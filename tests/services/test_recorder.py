@@ -93,9 +93,22 @@ def test_losses_are_counted_and_written_into_the_file(robot: str, tmp_path: Path
 def test_a_recording_never_replaces_a_file(robot: str, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     path.write_text("precious")
+    session = open_session(robot, "client")
     with pytest.raises(RecordingError, match="never replaces"):
-        run_recorder(robot, path, stop=threading.Event())
+        Recorder(session, robot, path).__enter__()
+    close_session(session)
+    told = threading.Event()
+    told.set()
+    for name in ("run-2.mcap", "run-3.mcap"):
+        assert run_recorder(robot, path, stop=told) == 0
+        assert losses(tmp_path / name) == {"dropped": 0, "missed": 0}
     assert path.read_text() == "precious"
+
+
+def test_a_folder_that_cannot_be_written_is_told(robot: str, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RecordingError, match="cannot be written: "):
+        run_recorder(robot, tmp_path / "file" / "run.mcap", stop=threading.Event())
 
 
 def test_what_is_no_recording_says_so(tmp_path: Path) -> None:
