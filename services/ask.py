@@ -46,7 +46,7 @@ def ask_robot(
             signal = _one(verb, words, "a signal, such as joint_position")
             if watch:
                 return _watch(client, signal, hide)
-            typer.echo(line_of(client.infer(signal, hide=hide)))
+            typer.echo(line_of(_estimate(client, signal, hide)))
             return 0
         for key, value in _answer(client, verb, words).items():
             typer.echo(f"{key}: {value if isinstance(value, str) else json.dumps(value)}")
@@ -69,11 +69,15 @@ def line_of(answer: dict[str, Any]) -> str:
     return f"{answer['signal']} [{unit}]  {values}  * estimated from {source}, expected error {spread:.3f} {unit}"
 
 
+def _estimate(client: Client, signal: str, hide: Sequence[str]) -> dict[str, Any]:
+    return client.ask("model", "estimate", {"signal": signal, "hide": list(hide)})
+
+
 def _watch(client: Client, signal: str, hide: Sequence[str]) -> int:
     """Print an estimate each second, through whatever happens to the service, until Ctrl-C."""
     while True:
         try:
-            typer.echo(line_of(client.infer(signal, hide=hide)))
+            typer.echo(line_of(_estimate(client, signal, hide)))
         except ServiceUnavailable as error:
             typer.echo(str(error))
         time.sleep(WATCH_EVERY)

@@ -9,7 +9,7 @@ import numpy as np
 
 from hal.clock import Clock
 from hal.config import RobotConfig
-from services.errors import ServiceError
+from services.errors import NotEngaged, TargetRefused
 from services.estimation import Estimation, Fresh, Newest
 from services.messages import Applied, Command, Target
 from services.model_config import ControlConfig
@@ -20,14 +20,6 @@ LONGEST_STEP = 0.1
 """A tick that comes later than this [s] moves the reference no further than one that comes in time."""
 LIVE_MODES = ("hold", "follow")
 DEAD_MODES = ("off", "stopping", "fault")
-
-
-class TargetRefused(ServiceError):
-    """A target was not accepted; the controller goes on with the one before."""
-
-
-class NotEngaged(ServiceError):
-    """The controller could not take over; nothing moved because of it."""
 
 
 class Solver(Protocol):

@@ -19,3 +19,15 @@ class RemoteError(ServiceError):
 
 class RecordingError(ServiceError):
     """A recording cannot be written or read."""
+
+
+class TargetRefused(ServiceError):
+    """A target was not accepted; the controller goes on with the one before."""
+
+
+class NotEngaged(ServiceError):
+    """The controller could not take over; nothing moved because of it."""
+
+
+class BadArguments(ServiceError):
+    """A verb was asked with arguments it does not understand."""

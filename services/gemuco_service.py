@@ -11,6 +11,7 @@ import numpy as np
 
 from gemuco import adapt
 from gemuco.control import Controller
+from gemuco.descent import DescentConfig
 from gemuco.errors import SchemaError
 from gemuco.losses import Match, StaySmall, Term, TorqueBalance
 from gemuco.schema import BodySchema
@@ -30,6 +31,8 @@ from services.realtime import freeze, prepare_process
 from services.service import Service, until_told
 from services.update_loop import OnlineUpdate
 
+SEARCH = DescentConfig(gamma_max=0.1, candidates=10, iterations=20)
+"""Losses that are norms have gradients that do not fade; with larger steps the torque balance gets stuck."""
 PRIORITIES = {"estimation": 40, "control": 35, "anomaly": 30, "update": 10}
 """SCHED_FIFO where the system allows it; the update is lowest but not without, or it would hold the interpreter up."""
 
@@ -50,7 +53,7 @@ class ModelSolver:
                 gravity = registry.load(config.gravity)
                 terms.append(TorqueBalance(gravity, config.torque_weight, config.target, config.effort, command))
         self._living = living
-        self._controller = Controller(living.schema, terms, command)
+        self._controller = Controller(living.schema, terms, command, search=SEARCH)
         middle = living.schema.layout.split(living.schema.scaler.mean)
         self._controller.solve({config.target: middle[config.target]}, {})
         self._controller.restart()

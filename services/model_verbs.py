@@ -6,17 +6,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gemuco.masks import label
-from services.control_loop import Control, NotEngaged
-from services.errors import ServiceError
+from services.control_loop import Control
+from services.errors import BadArguments, NotEngaged
 from services.messages import Target
 from services.query import Handler
 
 if TYPE_CHECKING:
     from services.gemuco_service import GemucoService
-
-
-class BadArguments(ServiceError):
-    """A verb was asked with arguments it does not understand."""
 
 
 class ModelVerbs:
