@@ -194,5 +194,7 @@ class Client:
 
     def _fresh(self, key: str, record: type[M], max_age: float, timeout: float) -> M | None:
         reader = self.reader(key, record)
-        message = reader.get(max_age)
-        return reader.wait(timeout) if message is None and timeout > 0 else message
+        deadline = time.monotonic() + timeout
+        while (message := reader.get(max_age)) is None and (remaining := deadline - time.monotonic()) > 0:
+            reader.wait(remaining)
+        return message

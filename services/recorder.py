@@ -63,11 +63,11 @@ class Recorder:
         self._told: dict[str, str] = {}
 
     def __enter__(self) -> Self:
+        if self.path.exists():
+            raise RecordingError(f"There is a file '{self.path}' already; a recording never replaces one.")
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._file: BinaryIO = self.path.open("xb")
-        except FileExistsError:
-            raise RecordingError(f"There is a file '{self.path}' already; a recording never replaces one.") from None
         except OSError as error:
             raise RecordingError(f"The recording '{self.path}' cannot be written: {error.strerror}.") from None
         self._writer = Writer(self._file, compression=CompressionType.ZSTD)

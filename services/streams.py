@@ -1,6 +1,7 @@
 """Messages in and out: a publisher that numbers them, and a reader that keeps only the newest."""
 
 import logging
+import math
 import threading
 from typing import Any, Generic, TypeVar
 
@@ -40,6 +41,35 @@ class Publisher(Generic[M]):
         return bool(status.matching)
 
 
+class Transit:
+    """How much longer than usual a message was on its way.
+
+    A process or a link that stood still for a moment gets what piled up meanwhile, and its time of arrival alone would
+    make that look fresh. The difference of the two wall clocks is not known between machines, but its least value of
+    late stands for the shortest way; whatever a message has on top is delay. A wall clock that is set back makes all
+    look delayed for at most two windows.
+    """
+
+    WINDOW = 5.0
+
+    def __init__(self) -> None:
+        self._until = -math.inf
+        self._least = self._least_before = math.inf
+
+    def delay(self, stamp_ns: int, now_ns: int, now: float) -> float:
+        """Delay [s] of a message with this stamp that arrives now (wall clock [ns], monotonic [s])."""
+        if stamp_ns == 0:
+            return 0.0
+        if now >= self._until:
+            is_recent = now < self._until + self.WINDOW
+            self._least_before = self._least if is_recent else math.inf
+            self._least = math.inf
+            self._until = now + self.WINDOW
+        difference = (now_ns - stamp_ns) * 1e-9
+        self._least = min(self._least, difference)
+        return difference - min(self._least, self._least_before)
+
+
 class Newest(Generic[M]):
     """The newest message of a key, and when it arrived here.
 
@@ -61,14 +91,14 @@ class Newest(Generic[M]):
         threading.Thread(target=self._receive, name=f"newest {key}", daemon=True).start()
 
     def get(self, max_age: float) -> M | None:
-        """The newest message if it arrived at most `max_age` [s] ago, else None."""
+        """The newest message if it arrived, or would have without delay, at most `max_age` [s] ago, else None."""
         slot = self._slot
         if slot is None or self._clock.monotonic() - slot[0] > max_age:
             return None
         return slot[1]
 
     def last(self) -> tuple[float, M] | None:
-        """Monotonic time of arrival [s] and the newest message, however old it is; None if none arrived."""
+        """When the newest message arrived, or would have without delay [monotonic s], and the message; else None."""
         return self._slot
 
     def wait(self, timeout: float) -> M | None:
@@ -80,18 +110,20 @@ class Newest(Generic[M]):
             return self._slot[1] if self._slot else None
 
     def _receive(self) -> None:
+        transit = Transit()
         while True:
             try:
                 sample = self._subscriber.recv()
             except zenoh.ZError:
                 return  # the session was closed
-            received = self._clock.monotonic()
+            received, received_ns = self._clock.monotonic(), self._clock.now_ns()
             try:
                 message = messages.decode(sample.payload.to_bytes(), self._record)
             except MessageError as error:
                 self.rejected += 1
                 self.rejected_text = str(error)
                 continue
+            received -= transit.delay(message.stamp_ns, received_ns, received)
             with self._arrived:
                 self._slot = (received, message)
                 self._arrived.notify_all()

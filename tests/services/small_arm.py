@@ -28,6 +28,7 @@ EDS = ROOT / "robots" / "eds"
 MUSCLES = ("biceps", "triceps")
 TIME_TO_LIVE = 0.2
 HOLD = 0.5
+FRESH = 0.1
 
 
 def description(robot: str) -> dict[str, Any]:
@@ -185,22 +186,24 @@ class Processes:
         process = self._running.pop(service)
         process.kill()
         process.communicate()
+        time.sleep(FRESH)  # what it sent last is not to be taken for its successor's
 
     def terminate(self, service: str) -> tuple[int, str]:
         """As SIGTERM; exit code and what was written to stderr."""
         process = self._running.pop(service)
         process.terminate()
         said = process.communicate(timeout=20.0)[1]
+        time.sleep(FRESH)
         return process.returncode, said
 
     def all_valid(self) -> bool:
         """Whether a fresh sample has all its values."""
-        sample = self.client.sample(max_age=0.05)
+        sample = self.client.sample(max_age=FRESH)
         return sample is not None and all(valid.all() for valid in sample.valid.values())
 
     def mode(self) -> str:
         """The mode of the newest applied set-points; empty without fresh ones."""
-        applied = self.client.applied(max_age=0.1)
+        applied = self.client.applied(max_age=FRESH)
         return "" if applied is None else applied.mode
 
     def refused(self) -> dict[str, Any]:

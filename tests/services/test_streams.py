@@ -1,6 +1,7 @@
 import threading
 import time
 
+import numpy as np
 import pytest
 import zenoh
 
@@ -12,7 +13,7 @@ from services.lock import ServiceLock
 from services.messages import Status, Target, Update
 from services.service import Service
 from services.session import close_session, open_session
-from services.streams import Newest, Publisher
+from services.streams import Newest, Publisher, Transit
 
 
 def _update(version: int) -> Update:
@@ -47,6 +48,35 @@ def test_newest_is_handed_out_only_while_it_is_fresh(robot: str) -> None:
     assert last is not None
     assert clock.monotonic() - last[0] == pytest.approx(0.3)
     close_session(session)
+
+
+def test_a_message_that_was_held_up_is_as_old_as_it_is() -> None:
+    """The sender's clock is an hour ahead, and the way takes 1 ms, but once 0.4 s."""
+    transit, ahead = Transit(), 3600.0
+
+    def arrives(at: float, way: float) -> float:
+        return transit.delay(round((at - way + ahead) * 1e9), round(at * 1e9), at)
+
+    assert [arrives(at, 0.001) for at in (1.0, 1.1, 1.2)] == pytest.approx([0.0] * 3, abs=1e-6)
+    assert arrives(1.6, 0.401) == pytest.approx(0.4, abs=1e-6)
+    assert arrives(1.7, 0.001) == pytest.approx(0.0, abs=1e-6)
+    for tenth in range(20, 200):
+        assert arrives(tenth / 10, 0.001) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_wall_clock_that_was_set_back_is_believed_after_two_windows() -> None:
+    transit = Transit()
+    delays = [
+        transit.delay(round((at - (100.0 if at > 20.0 else 0.0)) * 1e9 + 1e9), round(at * 1e9), at)
+        for at in np.arange(1.0, 40.0, 0.1)
+    ]
+    late = np.count_nonzero(np.array(delays) > 1.0) * 0.1
+    assert 0 < late <= 2 * Transit.WINDOW + 0.2
+    assert delays[-1] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_message_without_a_stamp_counts_from_its_arrival() -> None:
+    assert Transit().delay(0, 10**18, 5.0) == 0.0
 
 
 def test_what_cannot_be_read_is_counted_and_does_not_replace_the_good(robot: str) -> None:
