@@ -23,6 +23,8 @@ log = logging.getLogger(__name__)
 Handler = Callable[[dict[str, Any]], Any]
 RETRY_AFTER = 0.02
 """Pause [s] before asking again when nobody was there: connections are made in the background."""
+APPEAR = 2.0
+"""How long [s] nobody may be there before the answer is that nobody is; a verb that computes may take longer."""
 STARTED_BY = {
     "simulator": "gemuco simulate",
     "hal": "gemuco hal",
@@ -86,7 +88,8 @@ def ask(
         ServiceUnavailable: No answer within the deadline.
         ServiceError, HalError, SchemaError: What the service raised; `RemoteError` when the class is not known here.
     """
-    deadline = time.monotonic() + timeout
+    begun = time.monotonic()
+    deadline, appear = begun + timeout, begun + min(timeout, APPEAR)
     payload = _pack(dict(arguments or {}))
     late = False
     while (remaining := deadline - time.monotonic()) > 0:
@@ -95,8 +98,10 @@ def ask(
                 return _result(key, reply.ok.payload.to_bytes())
             late = True
         # Without a queryable, zenoh returns at once: the service is absent, or its connection is being made.
+        if not late and time.monotonic() > appear:
+            break
         time.sleep(max(0.0, min(RETRY_AFTER, deadline - time.monotonic())))
-    raise _unavailable(session, key, timeout, late)
+    raise _unavailable(session, key, timeout if late else min(timeout, APPEAR), late)
 
 
 def alive(session: zenoh.Session, robot: str, timeout: float = 0.5) -> set[str]:
