@@ -6,6 +6,7 @@ from pathlib import Path
 
 from hal.config import RobotConfig
 from hal.errors import ConfigError
+from services.model_config import model_config
 
 RUNS = Path("runs")
 ROBOTS = Path("robots")
@@ -22,10 +23,11 @@ def model_folder(robot: str) -> Path:
 
 
 def fingerprint(robot: RobotConfig) -> str:
-    """Hash of what a model depends on: the signals and the `model` section of the robot file."""
+    """Hash of what a model depends on: the signals, and how the robot file wants it trained."""
+    model = model_config(robot)
     content = {
         "signals": {name: list(signal.elements) for name, signal in robot.signals.items()},
-        "model": {key: robot.model[key] for key in ("network", "structure", "training") if key in robot.model},
+        "model": [part.model_dump() for part in (model.network, model.structure, model.training)],
     }
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 

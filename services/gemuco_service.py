@@ -94,6 +94,7 @@ class GemucoService:
             self.living,
             self.config.update,
             self._learner,
+            lambda: self.control is not None and self.control.engaged,
             service.publisher(keys.update(robot.robot), Update).put,
             self.clock,
         )

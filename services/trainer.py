@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from gemuco.dataset import Dataset
-from gemuco.errors import DatasetError
+from gemuco.errors import CheckpointError, DatasetError
 from gemuco.masks import label
 from gemuco.schema import BodySchema
 from hal.config import RobotConfig
@@ -79,10 +79,11 @@ def train(robot: RobotConfig, dataset: Dataset, seed: int, progress: Progress) -
 
 
 def fits(robot: RobotConfig, folder: Path) -> bool:
-    """Whether a trained model lies there that was made for this robot file."""
-    if not folder.exists():
+    """Whether a sound model lies there that was made for this robot file."""
+    try:
+        return BodySchema.load(folder).manifest.get("fingerprint") == fingerprint(robot)
+    except CheckpointError:
         return False
-    return BodySchema.load(folder).manifest.get("fingerprint") == fingerprint(robot)
 
 
 def show(trained: Trained, console: Console) -> None:

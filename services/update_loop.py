@@ -18,8 +18,8 @@ from services.messages import Update
 from services.model_config import UpdateConfig
 
 SPREAD = 0.1
-"""A sample joins the window when some element has moved this far since the last [standard deviations]: a robot that
-rests would fill it with one posture."""
+"""A sample joins the learner's window when some element has moved this far since the last [standard deviations]: a robot
+that rests would fill it with one posture."""
 
 
 class Learner(Protocol):
@@ -49,18 +49,23 @@ class OnlineUpdate:
         living: LivingModel,
         config: UpdateConfig,
         learner: Callable[[BodySchema], Learner],
+        is_engaged: Callable[[], bool],
         publish: Callable[[Update], None],
         clock: Clock,
     ) -> None:
-        """`learner` makes an updater that starts from a schema, with an empty window."""
+        """`learner` makes an updater that starts from a schema, with an empty window.
+
+        `is_engaged` tells whether the robot is being moved; a robot at rest is of interest only then.
+        """
         self._freshness, self._living, self._config = freshness, living, config
+        self._is_engaged = is_engaged
         self._sizes = [(signal.name, signal.size) for signal in living.schema.layout.signals]
         self._make_learner, self._publish, self._clock = learner, publish, clock
         self._lock = threading.Lock()
         self._learner: Learner | None = None
         self._since_change: deque[dict[str, np.ndarray]] = deque(maxlen=config.window)
         self._last: np.ndarray | None = None
-        self._added_at = -math.inf
+        self._taken_at = -math.inf
         self._told = Update(active=False, model_version=0, window=0, dropped=0, loss=math.nan)
 
     @property
@@ -105,10 +110,10 @@ class OnlineUpdate:
             return len(samples)
 
     def tick(self) -> None:
-        """Take the newest sample into the window if it is worth it, and learn if active."""
+        """Take the newest sample if the robot moves or is engaged, and learn if active."""
         with self._lock:
-            sample = self._worthy()
-            if sample is not None:
+            sample, moved = self._newest()
+            if sample is not None and (moved or self._is_engaged()):
                 self._since_change.append(sample)
             if self._learner is None:
                 told = Update(
@@ -120,23 +125,24 @@ class OnlineUpdate:
                     loss=self._told.loss,
                 )
             else:
-                told = self._learn(self._learner, sample)
+                told = self._learn(self._learner, sample if moved else None)
             self._told = told
         self._publish(told)
 
-    def _worthy(self) -> dict[str, np.ndarray] | None:
-        """The newest sample, if it is whole, late enough after the last and far enough from it."""
+    def _newest(self) -> tuple[dict[str, np.ndarray] | None, bool]:
+        """The newest sample, if it is whole and late enough after the last, and whether it is far from the last."""
         fresh, values = self._freshness.take()
         now = self._clock.monotonic()
-        if fresh is None or not fresh.sample.complete or now - self._added_at < 0.9 * self._config.interval:
-            return None
+        if fresh is None or not fresh.sample.complete or now - self._taken_at < 0.9 * self._config.interval:
+            return None, False
         row = self._living.schema.normalise(values)
         if not np.isfinite(row).all():
-            return None
+            return None, False
+        self._taken_at = now
         if self._last is not None and float(np.abs(row - self._last).max()) < SPREAD:
-            return None
-        self._last, self._added_at = row, now
-        return values
+            return values, False
+        moved, self._last = self._last is not None, row
+        return values, moved
 
     def _learn(self, learner: Learner, sample: dict[str, np.ndarray] | None) -> Update:
         if sample is not None:

@@ -1,0 +1,160 @@
+"""`gemuco demo`: everything from nothing, one minute of story, and nothing left behind."""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from hal.config import RobotConfig
+from services import artifacts, collector, trainer
+from services.client import Client
+from services.show import progress
+from services.story import Marks, Story
+from services.supervisor import Supervisor, gemuco_command
+from services.timeline import Timeline
+
+READY_WITHIN = 30.0
+"""Time [s] that a process has to come up on a busy machine."""
+CLIENT = "remote client"
+LEAST_LINES = 20
+"""What the remote client must have printed for stage (e) to count."""
+
+
+def play(robot: RobotConfig, path: Path, seed: int, out: Path) -> int:
+    """Make a model if there is none, run the processes, play the story; the exit code is 0 if all was observed.
+
+    Args:
+        robot: The robot file's content.
+        path: The robot file.
+        seed: Which of the actual arms.
+        out: Folder for plot, recording and logs.
+    """
+    console = Console()
+    started = time.monotonic()
+    make_model(robot, console)
+    recording = out / "story.mcap"
+    recording.unlink(missing_ok=True)
+    with Supervisor(out) as supervisor:
+        remote = RemoteClient(out / "client.log", console)
+        with Client(robot.robot) as client:
+            start(robot, path, seed, recording, supervisor, client, console)
+
+            def idle() -> None:
+                supervisor.check()
+                remote.tell()
+
+            signal, command = "joint_position", robot.command.signal
+            sizes = robot.signals[signal].size, robot.signals[command].size
+            with Timeline(client, signal, *sizes) as timeline:
+                marks = Story(robot, client, timeline, seed, idle, console.print).play()
+        supervisor.stop("client", "recorder")
+        remote.tell()
+    from services.story_plot import plot
+
+    plot(robot, timeline, marks, out / "story.png")
+    ok = summary(marks, remote, out, console)
+    console.print(f"{time.monotonic() - started:.0f} s in all.")
+    return 0 if ok else 1
+
+
+def make_model(robot: RobotConfig, console: Console) -> None:
+    """Collect and train if there is no model that fits the robot file."""
+    folder = artifacts.model_folder(robot.robot)
+    if trainer.fits(robot, folder):
+        console.print(f"Using the model in {folder}.")
+        return
+    console.print(
+        "No model yet: the designer's geometric model moves at random, and the body schema is learned from it."
+    )
+    with progress("collecting") as tell:
+        found = collector.collect_direct(robot, "geometric", 0, None, tell)
+    console.print(f"{len(found.dataset)} samples, {found.speed:.0f} times faster than real time.")
+    with progress("training") as tell:
+        trained = trainer.train(robot, found.dataset, 0, tell)
+    trainer.show(trained, console)
+    trained.schema.save(folder)
+
+
+def start(
+    robot: RobotConfig,
+    path: Path,
+    seed: int,
+    recording: Path,
+    supervisor: Supervisor,
+    client: Client,
+    console: Console,
+) -> None:
+    """Start the processes one after another, each when the one before is ready.
+
+    Raises:
+        ChildDied: One of them ended.
+        NotReady: One of them did not come up in time.
+    """
+    commands = {
+        "simulator": ("simulate", str(path), "--variant", "actual", "--seed", str(seed)),
+        "hal": ("hal", str(path)),
+        "model": ("serve", str(path)),
+        "recorder": ("record", str(path), str(recording)),
+    }
+    for name, command in commands.items():
+        supervisor.start(name, gemuco_command(*command))
+        supervisor.wait_ready(name, _is_running(client, name), READY_WITHIN)
+    supervisor.start("client", gemuco_command("query", robot.robot, "estimate", "joint_position", "--watch"))
+    names = ", ".join(f"{child.name} {child.process.pid}" for child in supervisor.children.values())
+    console.print(f"[bold]Processes:[/] {names}")
+
+
+def _is_running(client: Client, name: str) -> Callable[[], bool]:
+    def is_running() -> bool:
+        status = client.status(name)
+        return status is not None and status.state == "running"
+
+    return is_running
+
+
+class RemoteClient:
+    """Shows what the remote client's process prints."""
+
+    def __init__(self, log: Path, console: Console) -> None:
+        self._log, self._console = log, console
+        self._read = 0
+        self.lines = 0
+        """Estimates that it printed."""
+        self.estimated = 0
+        """Of those, such that were not measured."""
+
+    def tell(self) -> None:
+        """Print the whole lines that are new."""
+        if not self._log.exists():
+            return
+        with self._log.open() as log:
+            log.seek(self._read)
+            text = log.read()
+        whole, newline, _ = text.rpartition("\n")
+        self._read += len((whole + newline).encode())
+        for line in whole.splitlines():
+            self.lines += "joint_position [rad]" in line
+            self.estimated += "estimated from" in line
+            self._console.print(f"    {CLIENT}: {line}", style="dim", highlight=False, markup=False)
+
+
+def summary(marks: Marks, remote: RemoteClient, out: Path, console: Console) -> bool:
+    """Print what happened as a table; whether every stage was really observed."""
+    table = Table(title="What happened", title_justify="left", show_lines=True)
+    table.add_column("stage")
+    table.add_column("measured")
+    table.add_column("observed", justify="center")
+    for stage in marks.stages:
+        table.add_row(stage.name, "\n".join(stage.figures), _yes(stage.observed))
+    heard = remote.lines >= LEAST_LINES and remote.estimated > 0
+    text = f"{remote.lines} estimates printed by a process of its own, {remote.estimated} of them not measured"
+    table.add_row(CLIENT, text, _yes(heard))
+    console.print(table)
+    console.print(f"Plot: {out / 'story.png'}   recording: {out / 'story.mcap'}   logs: {out}/*.log")
+    return heard and all(stage.observed for stage in marks.stages)
+
+
+def _yes(observed: bool) -> str:
+    return "[green]yes[/]" if observed else "[red]no[/]"

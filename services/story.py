@@ -1,0 +1,233 @@
+"""The story of the demo: an arm moves, loses a sensor, learns its body, loses a muscle."""
+
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from hal.config import RobotConfig
+from services.client import Client
+from services.errors import ServiceError
+from services.timeline import Timeline, hidden_error
+
+POSE_TIME = 2.5
+"""Time for one pose [s]."""
+POSES = 6
+"""Fresh poses at which the model is measured, before and after the update; none of them is learned from."""
+LEARNING_POSES = 8
+LEARNING_TIME = 2.0
+SILENT_POSES = 3
+CUT_POSES = 3
+INSIDE = 0.15
+"""Targets keep this share of the range away from the limits."""
+ENCODER, SILENT_ELEMENT = "shoulder_roll_encoder", "shoulder_roll"
+MUSCLE = "deltoid_side"
+NOTICED_WITHIN = 3.0
+"""Time [s] within which a fault must be told."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """One stage of the story.
+
+    Attributes:
+        name: What happened.
+        start: When it began [s of the timeline].
+        end: When it ended.
+        figures: What was measured, in physical units.
+        observed: Whether what the stage is about was really seen.
+    """
+
+    name: str
+    start: float
+    end: float
+    figures: tuple[str, ...]
+    observed: bool
+
+
+@dataclass(slots=True)
+class Marks:
+    """Moments and figures that the plot shows, on the timeline's clock."""
+
+    silent: tuple[float, float] = (0.0, 0.0)
+    learning: tuple[float, float] = (0.0, 0.0)
+    cut: float = 0.0
+    alarm: float = float("nan")
+    blamed: str = ""
+    error_before: float = float("nan")
+    error_after: float = float("nan")
+    stages: list[Stage] = field(default_factory=list)
+
+
+class Story:
+    """Plays the stages through a client, as any remote program could."""
+
+    def __init__(
+        self, robot: RobotConfig, client: Client, timeline: Timeline, seed: int, idle: Callable[[], None],
+        tell: Callable[[str], None],
+    ) -> None:  # fmt: skip
+        """`idle` is called all the time while waiting, `tell` with what happens."""
+        self._client, self._timeline, self._idle, self._tell = client, timeline, idle, tell
+        self._signal = "joint_position"
+        self._elements = robot.signals[self._signal].elements
+        self._low, self._high = robot.bounds(self._signal)
+        self._random = np.random.default_rng(seed)
+        self._poses = [self._pose() for _ in range(POSES)]
+        self.marks = Marks()
+
+    def play(self) -> Marks:
+        """All stages, about a minute."""
+        for stage in (self.move, self.lose_sensor, self.learn, self.lose_muscle):
+            done = stage()
+            self.marks.stages.append(done)
+            for figure in done.figures:
+                self._tell(f"    {figure}")
+            if not done.observed:
+                self._tell("    [red]That is not what should have been seen.[/]")
+        return self.marks
+
+    def move(self) -> Stage:
+        """(a) Targets are reached."""
+        self._tell("[bold](a)[/] The controller moves the arm to targets.")
+        start = self._timeline.now()
+        self._engage()
+        misses, errors = self._measure_poses()
+        self.marks.error_before = _mean_norm(errors)
+        reached = _mean_norm(misses)
+        figures = (
+            f"{POSES} targets, distance from the target {reached:.3f} rad (mean norm of 5 joints)",
+            f"with all encoders hidden, the model would be wrong by {self.marks.error_before:.3f} rad",
+        )
+        span = np.ptp(self._timeline.between("truth", start, self._timeline.now()), axis=0).max()
+        return Stage("moves to targets", start, self._timeline.now(), figures, reached < 0.5 and span > 0.3)
+
+    def lose_sensor(self) -> Stage:
+        """(b) An encoder falls silent; the arm goes on with an estimate."""
+        self._tell(f"[bold](b)[/] The node of {ENCODER} falls silent. The arm goes on with an estimate.")
+        index = self._elements.index(SILENT_ELEMENT)
+        start = self._timeline.now()
+        self._client.fault(f"sensor_silent {ENCODER}")
+        noticed = self._wait(lambda: self._is_estimated(index), NOTICED_WITHIN)
+        delay = self._timeline.now() - start
+        for _ in range(SILENT_POSES):
+            self._go(self._pose(), LEARNING_TIME)
+        estimate = self._client.estimate()
+        source = "" if estimate is None else f"{estimate.method[self._signal]} {estimate.mask[self._signal]}"
+        end = self._timeline.now()
+        self._client.fault(f"node_back {ENCODER}")
+        returned = self._wait(lambda: not self._is_estimated(index), NOTICED_WITHIN)
+        self.marks.silent = (start, end)
+        error = np.abs(self._silent_error(index, start + delay, end))
+        worst = float(np.nanmax(error)) if error.size else float("nan")
+        mean = float(np.nanmean(error)) if error.size else float("nan")
+        figures = (
+            f"marked as estimated after {1e3 * delay:.0f} ms, by {source.replace('+', ', ')}",
+            f"true error of {SILENT_ELEMENT} while silent: mean {mean:.3f} rad, worst {worst:.3f} rad",
+            "measured again when the node came back" if returned else "not measured again after the node came back",
+        )
+        return Stage("loses an encoder", start, self._timeline.now(), figures, noticed and returned and mean < 0.5)
+
+    def learn(self) -> Stage:
+        """(c) The model learns online while the arm moves, and is measured on fresh poses."""
+        self._tell("[bold](c)[/] The online update learns from the arm's own motion.")
+        start = self._timeline.now()
+        self._client.adapt(True)
+        for _ in range(LEARNING_POSES):
+            self._go(self._pose(), LEARNING_TIME)
+        update = self._client.update()
+        self._client.adapt(False)
+        self.marks.learning = (start, self._timeline.now())
+        misses, errors = self._measure_poses()
+        self.marks.error_after = _mean_norm(errors)
+        normal = self._client.ask("model", "normal")
+        before, after = self.marks.error_before, self.marks.error_after
+        window = 0 if update is None else update.window
+        figures = (
+            f"learned for {self.marks.learning[1] - start:.0f} s from {window} samples",
+            f"estimate on {POSES} fresh poses with all encoders hidden: {before:.3f} rad before, {after:.3f} rad after",
+            f"distance from the targets now {_mean_norm(misses):.3f} rad",
+            f"what is normal learned anew from {normal['samples']} samples",
+        )
+        return Stage("learns its own body", start, self._timeline.now(), figures, after < before)
+
+    def lose_muscle(self) -> Stage:
+        """(d) A muscle is cut, and the anomaly detector says which."""
+        self._tell(f"[bold](d)[/] The wire of {MUSCLE} is cut.")
+        start = self._timeline.now()
+        calm = self._timeline.between("is_anomaly", start - 2.0, start)
+        score = float(np.nanmedian(self._timeline.between("score", start - 2.0, start)))
+        self._client.fault(f"muscle_cut {MUSCLE}")
+        self.marks.cut = start
+        alarmed = self._wait(self._is_alarmed, NOTICED_WITHIN)
+        self.marks.alarm = self._timeline.now()
+        for _ in range(CUT_POSES):
+            self._go(self._pose(), LEARNING_TIME)
+        blamed = [element for at, element in self._timeline.blamed if start <= at < self.marks.alarm + 1.0]
+        self.marks.blamed = Counter(blamed).most_common(1)[0][0] if blamed else ""
+        end = self._timeline.now()
+        after = float(np.nanmedian(self._timeline.between("score", self.marks.alarm, end)))
+        limit = float(np.nanmedian(self._timeline.between("threshold", start, end)))
+        figures = (
+            f"anomaly score {score:.1f} before the cut, {after:.1f} after it, threshold {limit:.1f}",
+            f"told after {1e3 * (self.marks.alarm - start):.0f} ms, blaming {self.marks.blamed or 'nothing'}",
+        )
+        right = self.marks.blamed.endswith(f".{MUSCLE}")
+        self._client.disengage()
+        return Stage("loses a muscle", start, end, figures, alarmed and right and not calm.any())
+
+    def _engage(self) -> None:
+        self._client.engage()
+        if not self._wait(self._follows, NOTICED_WITHIN):
+            raise ServiceError("The arm did not begin to follow; see the logs beside the plot.")
+
+    def _measure_poses(self) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """At every fresh pose: target minus truth, and estimate with the encoders hidden minus truth [rad]."""
+        misses, errors = [], []
+        for pose in self._poses:
+            self._go(pose, POSE_TIME)
+            truth = self._client.truth(timeout=1.0)
+            if truth is None:
+                raise ServiceError("The simulator does not tell the truth any more; see the logs beside the plot.")
+            misses.append(pose - truth.values[self._signal])
+            errors.append(hidden_error(self._client, self._signal))
+        return misses, errors
+
+    def _go(self, pose: np.ndarray, duration: float) -> None:
+        self._client.ask("model", "target", {"signal": self._signal, "values": pose.tolist()})
+        self._wait(lambda: False, duration)
+
+    def _wait(self, condition: Callable[[], bool], duration: float) -> bool:
+        """Wait for so long [s] or until the condition holds; whether it did."""
+        deadline = time.monotonic() + duration
+        while not condition():
+            if time.monotonic() >= deadline:
+                return False
+            self._idle()
+            time.sleep(0.01)
+        return True
+
+    def _pose(self) -> np.ndarray:
+        margin = INSIDE * (self._high - self._low)
+        return self._random.uniform(self._low + margin, self._high - margin)
+
+    def _is_estimated(self, index: int) -> bool:
+        estimate = self._client.estimate()
+        return estimate is not None and bool(estimate.estimated[self._signal][index])
+
+    def _is_alarmed(self) -> bool:
+        anomaly = self._client.anomaly()
+        return anomaly is not None and anomaly.is_anomaly
+
+    def _follows(self) -> bool:
+        applied = self._client.applied()
+        return applied is not None and applied.mode == "follow"
+
+    def _silent_error(self, index: int, start: float, end: float) -> np.ndarray:
+        value, truth = (self._timeline.between(name, start, end) for name in ("value", "truth"))
+        return value[:, index] - truth[:, index] if len(value) else np.zeros(0)
+
+
+def _mean_norm(errors: list[np.ndarray]) -> float:
+    return float(np.mean([np.linalg.norm(error) for error in errors]))
