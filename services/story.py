@@ -113,17 +113,16 @@ class Story:
         delay = self._timeline.now() - start
         for _ in range(SILENT_POSES):
             self._go(self._pose(), LEARNING_TIME)
-        estimate = self._client.estimate()
-        source = "" if estimate is None else f"{estimate.method[self._signal]} {estimate.mask[self._signal]}"
         end = self._timeline.now()
         self._client.fault(f"node_back {ENCODER}")
         returned = self._wait(lambda: not self._is_estimated(index), NOTICED_WITHIN)
         self.marks.silent = (start, end)
         error = np.abs(self._silent_error(index, start + delay, end))
+        source = _most_common(self._timeline.between("source", start + delay, end).tolist())
         worst = float(np.nanmax(error)) if error.size else float("nan")
         mean = float(np.nanmean(error)) if error.size else float("nan")
         figures = (
-            f"marked as estimated after {1e3 * delay:.0f} ms, by {source.replace('+', ', ')}",
+            f"marked as estimated after {1e3 * delay:.0f} ms, method {source.replace(' ', ', from ').replace('+', ', ')}",
             f"true error of {SILENT_ELEMENT} while silent: mean {mean:.3f} rad, worst {worst:.3f} rad",
             "measured again when the node came back" if returned else "not measured again after the node came back",
         )
@@ -165,7 +164,7 @@ class Story:
         for _ in range(CUT_POSES):
             self._go(self._pose(), LEARNING_TIME)
         blamed = [element for at, element in self._timeline.blamed if start <= at < self.marks.alarm + 1.0]
-        self.marks.blamed = Counter(blamed).most_common(1)[0][0] if blamed else ""
+        self.marks.blamed = _most_common(blamed)
         end = self._timeline.now()
         after = float(np.nanmedian(self._timeline.between("score", self.marks.alarm, end)))
         limit = float(np.nanmedian(self._timeline.between("threshold", start, end)))
@@ -231,3 +230,7 @@ class Story:
 
 def _mean_norm(errors: list[np.ndarray]) -> float:
     return float(np.mean([np.linalg.norm(error) for error in errors]))
+
+
+def _most_common(words: list[str]) -> str:
+    return Counter(words).most_common(1)[0][0] if words else ""

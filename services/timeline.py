@@ -21,8 +21,8 @@ HIDDEN_EVERY = 4
 class Timeline:
     """Rows of a story in a thread of its own, as columns of arrays.
 
-    Columns are `time` [s since the start], `truth`, `value` and `estimated` of one signal, `applied` command, `score`,
-    `threshold` and `is_anomaly`; and on a time axis of their own `hidden_time` and `hidden_error`, the norm of what the
+    Columns are `time` [s since the start], `truth`, `value`, `estimated` and `source` (method and signals) of one signal,
+    `applied` command, `score`, `threshold` and `is_anomaly`; and on a time axis of their own `hidden_time` and `hidden_error`, the norm of what the
     model says of the hidden signal minus the truth [its unit]. What was not there is NaN.
     """
 
@@ -74,6 +74,7 @@ class Timeline:
             "truth": self._nothing if truth is None else truth.values[self._signal],
             "value": self._nothing if estimate is None else estimate.values[self._signal],
             "estimated": self._nothing if estimate is None else estimate.estimated[self._signal].astype(float),
+            "source": "" if estimate is None else f"{estimate.method[self._signal]} {estimate.mask[self._signal]}",
             "applied": self._no_command if applied is None else applied.values,
             "score": math.nan if anomaly is None else anomaly.score,
             "threshold": math.nan if anomaly is None else anomaly.threshold,

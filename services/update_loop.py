@@ -18,7 +18,7 @@ from services.messages import Update
 from services.model_config import UpdateConfig
 
 SPREAD = 0.1
-"""A sample joins the learner's window when some element has moved this far since the last [standard deviations]: a robot
+"""A sample joins the learner's window when some element moved this far since the last [standard deviations]: a robot
 that rests would fill it with one posture."""
 
 
@@ -130,10 +130,10 @@ class OnlineUpdate:
         self._publish(told)
 
     def _newest(self) -> tuple[dict[str, np.ndarray] | None, bool]:
-        """The newest sample, if it is whole and late enough after the last, and whether it is far from the last."""
+        """The newest sample, if it is whole (every value fresh) and late enough after the last, and whether it is far from the last."""
         fresh, values = self._freshness.take()
         now = self._clock.monotonic()
-        if fresh is None or not fresh.sample.complete or now - self._taken_at < 0.9 * self._config.interval:
+        if fresh is None or now - self._taken_at < 0.9 * self._config.interval:
             return None, False
         row = self._living.schema.normalise(values)
         if not np.isfinite(row).all():
