@@ -30,7 +30,7 @@ class UpdateConfig:
         seed: For the draws.
     """
 
-    window: int = 3000
+    window: int = 6000
     minimum: int = 50
     batch: int = 100
     steps: int = 3

@@ -22,6 +22,9 @@ FLOOR = 0.01
 HELD_OUT = 0.3
 """Share of the normal data, its end, that sets the threshold and is not used for mean and covariance."""
 
+SUSPECTS = 6
+"""How many of the largest contributors are repaired in turn to find the one to blame."""
+
 
 @dataclass(frozen=True, slots=True)
 class AnomalyScore:
@@ -31,7 +34,7 @@ class AnomalyScore:
         score: Mahalanobis distance; NaN without normal data or without any error to judge.
         threshold: Score above which it counts as an anomaly.
         contribution: Signal of x_out -> by how much score^2 drops without an element, shape (n,); NaN if unknown.
-        blamed: `signal.element` of the largest contribution; empty if the score is NaN.
+        blamed: `signal.element` whose repair would make the sample most normal; empty if the score is NaN.
     """
 
     score: float
@@ -88,32 +91,43 @@ class Normal:
         covariance = np.diag(spread**2)
         covariance[np.ix_(seen, seen)] = part
         draft = cls(mean, covariance, float("nan"), false_alarm)
-        scores = np.array([draft.distance(row)[0] for row in errors[np.isfinite(errors[:, seen]).all(axis=1)][count:]])
+        judged = np.full((len(rows) - count, len(seen)), np.nan)
+        judged[:, seen] = rows[count:]
+        scores = draft.distances(judged)
         return cls(mean, covariance, _tail(scores, false_alarm), false_alarm)
 
     def distance(self, error: np.ndarray) -> tuple[float, np.ndarray, int]:
-        """Distance of one error, shape (out_size,), judged by the elements that are there.
+        """Distance of one error [unit], shape (out_size,), judged by the elements that are there.
 
         Returns:
             The Mahalanobis distance, each element's contribution to its square (the drop of the square when that
             element alone is left out: (P e)_i^2 / P_ii), and how many elements were judged.
         """
-        there = np.isfinite(error) & np.isfinite(self.mean)
+        index, precision = self._precision(error)
         contribution = np.full(len(error), np.nan)
-        if not there.any():
+        if not len(index):
             return float("nan"), contribution, 0
-        index = np.flatnonzero(there)
-        precision = np.linalg.inv(self.covariance[np.ix_(index, index)])
         e = error[index] - self.mean[index]
         weighted = precision @ e
         contribution[index] = weighted**2 / np.diag(precision)
         return float(np.sqrt(max(0.0, float(e @ weighted)))), contribution, len(index)
 
+    def distances(self, errors: np.ndarray) -> np.ndarray:
+        """Distances of errors that lack the same elements, shape (samples, out_size) -> (samples,)."""
+        index, precision = self._precision(errors[0])
+        e = errors[:, index] - self.mean[index]
+        return np.sqrt(np.einsum("ij,jk,ik->i", e, precision, e).clip(min=0.0))
+
+    def _precision(self, error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Which elements of an error are there, and the inverse covariance of those."""
+        index = np.flatnonzero(np.isfinite(error) & np.isfinite(self.mean))
+        return index, np.linalg.inv(self.covariance[np.ix_(index, index)])
+
 
 def _tail(scores: np.ndarray, false_alarm: float) -> float:
     """The score that is exceeded with a small probability: observed where there is data, else by a log-normal tail."""
     logs = np.log(np.maximum(scores, 1e-9))
-    # Acklam-free: the normal quantile for a tail p below one half, Abramowitz and Stegun 26.2.23, |error| < 4.5e-4.
+    # Normal quantile of a small tail: Abramowitz and Stegun 26.2.23, error below 4.5e-4.
     t = np.sqrt(-2.0 * np.log(false_alarm))
     z = t - (2.515517 + 0.802853 * t + 0.010328 * t**2) / (1.0 + 1.432788 * t + 0.189269 * t**2 + 0.001308 * t**3)
     return max(float(np.quantile(scores, 1.0 - false_alarm)), float(np.exp(logs.mean() + z * logs.std())))
@@ -137,7 +151,11 @@ def prediction_error(schema: "BodySchema", values: Mapping[str, np.ndarray]) -> 
     An element's error is NaN when it was not measured or when the mask that judges its signal lacks a value: another
     mask would make errors of another size, which the statistics of the normal do not describe.
     """
-    x = schema.normalise(values)
+    return _error(schema, schema.normalise(values))
+
+
+def _error(schema: "BodySchema", x: np.ndarray) -> np.ndarray:
+    """The error [unit], shape (..., out_size), of samples [standard deviations], shape (..., size)."""
     error = np.full((*x.shape[:-1], schema.out_layout.size), np.nan)
     predicted: dict[Mask, np.ndarray] = {}
     for name, mask in schema.judges.items():
@@ -152,13 +170,38 @@ def prediction_error(schema: "BodySchema", values: Mapping[str, np.ndarray]) -> 
 
 def score(schema: "BodySchema", values: Mapping[str, np.ndarray]) -> AnomalyScore:
     """How unlike normal a sample is; see `BodySchema.score`."""
-    error = prediction_error(schema, values)
-    unknown = np.full(schema.out_layout.size, np.nan)
+    x = schema.normalise(values)
     if schema.normal is None:
+        unknown = np.full(schema.out_layout.size, np.nan)
         return AnomalyScore(float("nan"), float("nan"), schema.out_layout.split(unknown), "")
+    error = _error(schema, x)
     distance, contribution, judged = schema.normal.distance(error)
-    blamed = schema.out_layout.element(int(np.nanargmax(contribution))) if judged else ""
     # The square of the distance grows with the number of judged elements, so the threshold follows it.
     usual = int(np.isfinite(schema.normal.mean).sum())
     threshold = schema.normal.threshold * float(np.sqrt(judged / usual)) if judged else float("nan")
+    blamed = _blamed(schema, x, error, contribution) if judged else ""
     return AnomalyScore(distance, threshold, schema.out_layout.split(contribution), blamed)
+
+
+def _blamed(schema: "BodySchema", x: np.ndarray, error: np.ndarray, contribution: np.ndarray) -> str:
+    """The element whose repair makes the sample most normal.
+
+    One wrong element upsets every prediction that is made from it: a muscle that was cut makes the joints look wrong
+    too. So each of the largest contributors is replaced by its prediction in turn, and everything is judged anew.
+    Elements that nothing predicts but themselves cannot be repaired; without others the largest contributor is blamed.
+    """
+    normal = schema.normal
+    assert normal is not None
+    blind = np.concatenate(
+        [np.full(schema.layout.signal(name).size, name not in mask) for name, mask in schema.judges.items()]
+    )
+    known = np.where(blind & np.isfinite(contribution), contribution, -1.0)
+    suspects = np.argsort(known)[: -SUSPECTS - 1 : -1]
+    suspects = suspects[known[suspects] >= 0.0]
+    if not len(suspects):
+        return schema.out_layout.element(int(np.nanargmax(contribution)))
+    repaired = np.repeat(x[None], len(suspects), axis=0)
+    where = schema.out_index[suspects]
+    repaired[np.arange(len(suspects)), where] -= error[suspects] / schema.scaler.std[where]
+    distances = normal.distances(_error(schema, repaired))
+    return schema.out_layout.element(int(suspects[int(np.argmin(distances))]))

@@ -110,8 +110,11 @@ class Layout:
         leading: tuple[int, ...] | None = None
         for name, value in values.items():
             span = self.slice(name)
-            array = np.asarray(value, float)
             size = span.stop - span.start
+            try:
+                array = np.asarray(value, float)
+            except (TypeError, ValueError):
+                raise WrongSize(f"Signal '{name}' needs {size} numbers; what was given are none.") from None
             if array.ndim not in (1, 2) or array.shape[-1] != size:
                 raise WrongSize(f"Signal '{name}' has {size} elements, but the array has shape {array.shape}.")
             if leading is not None and array.shape[:-1] != leading:

@@ -47,7 +47,7 @@ class TrainConfig:
     bias_size: int = 0
     epochs: int = 150
     batch: int = 500
-    rate: float = 3e-3
+    rate: float = 1e-2
     bias_rate: float = 1e-2
     held_out: float = 0.2
     patience: int = 40

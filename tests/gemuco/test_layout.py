@@ -44,6 +44,11 @@ def test_names_elements_by_signal():
             WrongSize,
             "Signal 'joint_position' has 2 elements, but the array has shape (3,).",
         ),
+        (
+            {"joint_position": ["one", "two"]},
+            WrongSize,
+            "Signal 'joint_position' needs 2 numbers; what was given are none.",
+        ),
     ],
 )
 def test_says_what_is_wrong(values, kind, text):
