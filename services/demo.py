@@ -152,6 +152,8 @@ def summary(marks: Marks, remote: RemoteClient, out: Path, console: Console) -> 
     text = f"{remote.lines} estimates printed by a process of its own, {remote.estimated} of them not measured"
     table.add_row(CLIENT, text, _yes(heard))
     console.print(table)
+    if marks.stops:
+        console.print(f"The HAL stopped the arm {marks.stops} times by itself, see above.")
     console.print(f"Plot: {out / 'story.png'}   recording: {out / 'story.mcap'}   logs: {out}/*.log")
     return heard and all(stage.observed for stage in marks.stages)
 

@@ -56,6 +56,8 @@ class Marks:
     cut: float = 0.0
     alarm: float = float("nan")
     blamed: str = ""
+    stops: int = 0
+    """How often the HAL stopped the arm by itself."""
     error_before: float = float("nan")
     error_after: float = float("nan")
     stages: list[Stage] = field(default_factory=list)
@@ -119,10 +121,11 @@ class Story:
         self.marks.silent = (start, end)
         error = np.abs(self._silent_error(index, start + delay, end))
         source = _most_common(self._timeline.between("source", start + delay, end).tolist())
+        source = "method " + source.replace(" ", ", from ").replace("+", ", ")
         worst = float(np.nanmax(error)) if error.size else float("nan")
         mean = float(np.nanmean(error)) if error.size else float("nan")
         figures = (
-            f"marked as estimated after {1e3 * delay:.0f} ms, method {source.replace(' ', ', from ').replace('+', ', ')}",
+            f"marked as estimated after {1e3 * delay:.0f} ms, {source}",
             f"true error of {SILENT_ELEMENT} while silent: mean {mean:.3f} rad, worst {worst:.3f} rad",
             "measured again when the node came back" if returned else "not measured again after the node came back",
         )
@@ -181,6 +184,17 @@ class Story:
         if not self._wait(self._follows, NOTICED_WITHIN):
             raise ServiceError("The arm did not begin to follow; see the logs beside the plot.")
 
+    def _recover(self) -> None:
+        """Go on after the HAL stopped the arm, as a person would: read why, reset, engage again."""
+        status = self._client.status("hal", timeout=1.0)
+        why = "without a word" if status is None or not status.text else f"because: {status.text}"
+        self._tell(f"    [yellow]The HAL stopped the arm {why} It is reset and engaged again.[/]")
+        self.marks.stops += 1
+        self._client.reset()
+        if not self._wait(lambda: self._mode() == "off", NOTICED_WITHIN):
+            raise ServiceError(f"The HAL does not leave '{self._mode()}'. {why.capitalize()}")
+        self._engage()
+
     def _measure_poses(self) -> tuple[list[np.ndarray], list[np.ndarray]]:
         """At every fresh pose: target minus truth, and estimate with the encoders hidden minus truth [rad]."""
         misses, errors = [], []
@@ -194,6 +208,8 @@ class Story:
         return misses, errors
 
     def _go(self, pose: np.ndarray, duration: float) -> None:
+        if not self._follows():
+            self._recover()
         self._client.ask("model", "target", {"signal": self._signal, "values": pose.tolist()})
         self._wait(lambda: False, duration)
 
@@ -220,8 +236,11 @@ class Story:
         return anomaly is not None and anomaly.is_anomaly
 
     def _follows(self) -> bool:
-        applied = self._client.applied()
-        return applied is not None and applied.mode == "follow"
+        return self._mode() in ("hold", "follow")
+
+    def _mode(self) -> str:
+        applied = self._client.applied(timeout=0.5)
+        return "unheard" if applied is None else applied.mode
 
     def _silent_error(self, index: int, start: float, end: float) -> np.ndarray:
         value, truth = (self._timeline.between(name, start, end) for name in ("value", "truth"))

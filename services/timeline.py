@@ -21,9 +21,10 @@ HIDDEN_EVERY = 4
 class Timeline:
     """Rows of a story in a thread of its own, as columns of arrays.
 
-    Columns are `time` [s since the start], `truth`, `value`, `estimated` and `source` (method and signals) of one signal,
-    `applied` command, `score`, `threshold` and `is_anomaly`; and on a time axis of their own `hidden_time` and `hidden_error`, the norm of what the
-    model says of the hidden signal minus the truth [its unit]. What was not there is NaN.
+    Columns are `time` [s since the start], `truth`, `value`, `estimated` and `source` (method and signals) of one
+    signal, `applied` command, `score`, `threshold` and `is_anomaly`; and on a time axis of their own `hidden_time` and
+    `hidden_error`, the norm of what the model says of the hidden signal minus the truth [its unit]. What was not there
+    is NaN.
     """
 
     def __init__(self, client: Client, signal: str, size: int, commands: int) -> None:

@@ -130,7 +130,7 @@ class OnlineUpdate:
         self._publish(told)
 
     def _newest(self) -> tuple[dict[str, np.ndarray] | None, bool]:
-        """The newest sample, if it is whole (every value fresh) and late enough after the last, and whether it is far from the last."""
+        """The newest sample, if every value is fresh and it is late enough; and whether it is far from the last."""
         fresh, values = self._freshness.take()
         now = self._clock.monotonic()
         if fresh is None or now - self._taken_at < 0.9 * self._config.interval:
