@@ -1,0 +1,20 @@
+"""A sensor sample read with zenoh and msgpack and nothing of ours; any language that has both can do this.
+
+python examples/read_wire.py tcp/127.0.0.1:PORT [ROBOT]
+"""
+
+import json
+import sys
+
+import msgpack
+import numpy as np
+import zenoh
+
+endpoint, robot = sys.argv[1], sys.argv[2] if len(sys.argv) > 2 else "musashi_arm"
+config = zenoh.Config()
+config.insert_json5("connect/endpoints", json.dumps([endpoint]))
+config.insert_json5("scouting/multicast/enabled", "false")
+with zenoh.open(config) as session, session.declare_subscriber(f"gemuco/{robot}/hal/sample") as samples:
+    body = msgpack.unpackb(samples.recv().payload.to_bytes())
+for signal, binary in body["values"].items():
+    print(signal, np.frombuffer(binary, "<f8").round(4), np.frombuffer(body["valid"][signal], "?"))
