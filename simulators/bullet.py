@@ -4,9 +4,8 @@ The only file that knows pybullet. Every call names its physics client, so that 
 """
 
 import contextlib
-import ctypes
-import os
-from collections.abc import Iterator, Sequence
+import io
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,23 +13,7 @@ import numpy as np
 from simulators.chain import GRAVITY
 
 
-@contextlib.contextmanager
-def _without_greeting() -> Iterator[None]:
-    """Keep off standard output what a C library prints there, as pybullet does when it is imported."""
-    library = ctypes.CDLL(None)
-    library.fflush(None)
-    kept, sink = os.dup(1), os.open(os.devnull, os.O_WRONLY)
-    os.dup2(sink, 1)
-    try:
-        yield
-        library.fflush(None)
-    finally:
-        os.dup2(kept, 1)
-        os.close(kept)
-        os.close(sink)
-
-
-with _without_greeting():
+with contextlib.redirect_stderr(io.StringIO()):  # it tells its build time there
     import pybullet
 
 
