@@ -4,8 +4,8 @@ The only file that knows pybullet. Every call names its physics client, so that 
 """
 
 import contextlib
-import io
-from collections.abc import Sequence
+import os
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,20 @@ import numpy as np
 from simulators.chain import GRAVITY
 
 
-with contextlib.redirect_stderr(io.StringIO()):  # it tells its build time there
+@contextlib.contextmanager
+def _without_greeting() -> Iterator[None]:
+    """Keep off the file descriptor of standard error what C code prints there."""
+    kept, sink = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(sink, 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(sink)
+
+
+with _without_greeting():  # pybullet tells its build time when it is imported
     import pybullet
 
 
