@@ -22,6 +22,7 @@ log = logging.getLogger(__name__)
 CYCLE_PRIORITY = 50
 RECEIVE_PRIORITY = 51
 """Above the cycle, which waits for what the receive threads bring."""
+NETWORK_PRIORITY = 45
 POWERED = ("enabling", "hold", "follow", "stopping")
 
 
@@ -56,6 +57,7 @@ class HalService:
             realtime.promote("bus ", RECEIVE_PRIORITY)
             realtime.freeze()
             self._loop.start()
+            realtime.promote_rest(NETWORK_PRIORITY)
             self._service.run(self.status, stop)
         finally:
             self._loop.stop()

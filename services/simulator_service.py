@@ -19,6 +19,10 @@ from services.service import Service, until_told
 log = logging.getLogger(__name__)
 
 TRUTH_RATE = 100.0
+PRIORITY = 55
+"""Above the HAL's: hardware does not wait for the programs that use it, nor must what stands in for it."""
+NETWORK_PRIORITY = 20
+THREADS = ("physics", "nodes ", "hub ")
 
 
 class Rig(Protocol):
@@ -63,15 +67,18 @@ class SimulatorService:
         self._variant = variant
         self._cycle = 0
         self._truth = service.publisher(keys.truth(robot), messages.Sample)
-        self._loop = Loop("truth", TRUTH_RATE, self.tick)
+        self._loop = Loop("truth", TRUTH_RATE, self.tick, priority=PRIORITY)
         service.verb("fault", self._fault)
 
     def run(self, stop: threading.Event) -> int:
         """Run the rig until `stop` is set or it fails; the exit code."""
         self._rig.start()
         try:
+            for prefix in THREADS:
+                realtime.promote(prefix, PRIORITY)
             realtime.freeze()
             self._loop.start()
+            realtime.promote_rest(NETWORK_PRIORITY)
             self._service.run(lambda: self._status(stop), stop)
         finally:
             self._loop.stop()

@@ -24,6 +24,8 @@ INSIDE = 0.15
 """Targets keep this share of the range away from the limits."""
 ENCODER, SILENT_ELEMENT = "shoulder_roll_encoder", "shoulder_roll"
 MUSCLE = "deltoid_side"
+RECOVERED_WITHIN = 8.0
+"""Time [s] that nodes have to come back after a fault."""
 NOTICED_WITHIN = 3.0
 """Time [s] within which a fault must be told."""
 
@@ -138,7 +140,7 @@ class Story:
         self._client.adapt(True)
         for _ in range(LEARNING_POSES):
             self._go(self._pose(), LEARNING_TIME)
-        update = self._client.update()
+        update = self._client.update(timeout=1.0)
         self._client.adapt(False)
         self.marks.learning = (start, self._timeline.now())
         misses, errors = self._measure_poses()
@@ -186,13 +188,13 @@ class Story:
 
     def _recover(self) -> None:
         """Go on after the HAL stopped the arm, as a person would: read why, reset, engage again."""
-        status = self._client.status("hal", timeout=1.0)
-        why = "without a word" if status is None or not status.text else f"because: {status.text}"
+        mode, status = self._mode(), self._client.status("hal", timeout=1.0)
+        fault = status.facts.get("fault") if status else ""
+        why = f"({mode}). {fault or 'Commands came too late.'}"
         self._tell(f"    [yellow]The HAL stopped the arm {why} It is reset and engaged again.[/]")
         self.marks.stops += 1
         self._client.reset()
-        if not self._wait(lambda: self._mode() == "off", NOTICED_WITHIN):
-            raise ServiceError(f"The HAL does not leave '{self._mode()}'. {why.capitalize()}")
+        self._wait(lambda: self._mode() == "off" and self._is_healthy(), RECOVERED_WITHIN)
         self._engage()
 
     def _measure_poses(self) -> tuple[list[np.ndarray], list[np.ndarray]]:
@@ -234,6 +236,10 @@ class Story:
     def _is_alarmed(self) -> bool:
         anomaly = self._client.anomaly()
         return anomaly is not None and anomaly.is_anomaly
+
+    def _is_healthy(self) -> bool:
+        status = self._client.status("hal")
+        return status is not None and status.state == "running"
 
     def _follows(self) -> bool:
         return self._mode() in ("hold", "follow")
