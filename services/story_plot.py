@@ -47,12 +47,12 @@ def _silent_joint(axis: Axes, robot: RobotConfig, timeline: Timeline, marks: Mar
     rows = min(map(len, (time, truth, value)))
     estimated = timeline.column("estimated")[:rows, index] > 0
     axis.axvspan(*marks.silent, color="gold", alpha=0.3, label="encoder silent")
-    axis.plot(time[:rows], truth[:rows, index], color="black", linewidth=1.2, label="truth")
-    axis.plot(time[:rows], value[:rows, index], color=BLUE, linewidth=1, alpha=0.7, label="published value")
+    axis.plot(time[:rows], truth[:rows, index], color="black", linewidth=2.5, alpha=0.35, label="truth")
+    axis.plot(time[:rows], value[:rows, index], color=BLUE, linewidth=1, label="published value")
     guessed = np.where(estimated, value[:rows, index], np.nan)
     axis.plot(time[:rows], guessed, color=RED, linewidth=2, label="of which estimated")
     axis.set_ylabel(f"{SILENT_ELEMENT} [rad]")
-    axis.legend(loc="lower right", ncols=4, fontsize=8)
+    axis.legend(loc="lower left", ncols=4, fontsize=8)
 
 
 def _hidden_error(axis: Axes, timeline: Timeline, marks: Marks) -> None:
@@ -66,7 +66,7 @@ def _hidden_error(axis: Axes, timeline: Timeline, marks: Marks) -> None:
     axis.hlines(marks.error_after, marks.learning[1], last.end, color=GREEN, linewidth=2, label=f"{label} after")
     axis.set_ylabel("norm of 5 joints [rad]")
     axis.set_ylim(bottom=0.0)
-    axis.legend(loc="upper right", ncols=2, fontsize=8)
+    axis.legend(loc="upper left", ncols=2, fontsize=8)
 
 
 def _anomaly(axis: Axes, timeline: Timeline, marks: Marks) -> None:
@@ -86,4 +86,4 @@ def _command(axis: Axes, robot: RobotConfig, timeline: Timeline) -> None:
     for index, muscle in enumerate(robot.signals[robot.command.signal].elements):
         axis.plot(time[:rows], applied[:rows, index], linewidth=1, label=muscle)
     axis.set_ylabel("applied length [m]")
-    axis.legend(loc="lower left", ncols=5, fontsize=7)
+    axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=10, fontsize=7, frameon=False)
