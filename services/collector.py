@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -152,7 +152,7 @@ def _bounds(robot: RobotConfig) -> tuple[np.ndarray, np.ndarray]:
 
 
 def collect_direct(robot: RobotConfig, variant: str, seed: int, samples: int | None, progress: Progress) -> Collected:
-    """Record from the robot file's simulator without a bus.
+    """Record from the robot file's simulator without a bus; the first of its variants is the designer's.
 
     Raises:
         ConfigError: The robot file names no simulator or no motion.
@@ -165,7 +165,20 @@ def collect_direct(robot: RobotConfig, variant: str, seed: int, samples: int | N
         raise ConfigError(f"Robot '{robot.robot}' has no variant '{variant}'. Known variants: {known}.")
     motion = registry.load(config.motion)(robot, seed)
     with simulator.direct(robot, variant, seed) as body:
-        return gather(robot, DirectPlayground(body, config.rate), motion, config, variant, progress)
+        found = gather(robot, DirectPlayground(body, config.rate), motion, config, variant, progress)
+    is_designers = variant == simulator.variants[0]
+    return found if config.states is None or not is_designers else _with_states(robot, config, found, seed)
+
+
+def _with_states(robot: RobotConfig, config: CollectConfig, found: Collected, seed: int) -> Collected:
+    """What was recorded, and random states of the designer's geometry in episodes of the same length and condition."""
+    count = max(1, round(config.states_share * len(found.dataset)))
+    states = registry.load(config.states or "")(robot, count, seed)
+    condition = found.dataset.conditions[0]
+    parts = np.split(np.arange(count), range(round(EPISODE * config.rate), count, round(EPISODE * config.rate)))
+    added = tuple(Episode(condition, {name: rows[part] for name, rows in states.items()}) for part in parts)
+    dataset = Dataset(found.dataset.layout, found.dataset.episodes + added)
+    return replace(found, dataset=dataset)
 
 
 def simulator_of(robot: RobotConfig) -> "Simulator":

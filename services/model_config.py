@@ -57,7 +57,7 @@ class ControlConfig(Section):
 class UpdateConfig(Section):
     """The online update of W from a bounded window."""
 
-    window: Count = 3000
+    window: Count = 6000
     """Samples kept; the oldest is dropped."""
     interval: Positive = 0.1
     """Least time [s] between two samples of the window, so that it spans some motion."""
@@ -89,6 +89,11 @@ class CollectConfig(Section):
 
     motion: str
     """`module:name` of the random safe motion: (config, seed) -> (command, duration [s]) without end."""
+    states: str | None = None
+    """`module:name` of random states of the designer's geometry, added to what is collected from the designer's
+    variant: (config, count, seed) -> signal -> array (count, n)."""
+    states_share: Annotated[float, Field(gt=0, le=1)] = 0.5
+    """How many of them per recorded sample."""
     samples: Count = 10_000
     rate: Positive = 20.0
     """Samples per second of the robot's time."""

@@ -1,4 +1,4 @@
-"""Random safe motion, made by the designer's model: from posture to posture, at tensions that balance gravity."""
+"""Random safe motion, and random states of the body, made by the designer's model."""
 
 from collections.abc import Iterator
 
@@ -39,3 +39,20 @@ def random_motion(config: RobotConfig, seed: int) -> Iterator[tuple[np.ndarray, 
             yield wire_lengths(between, tension + share * (next_tension - tension)), STEP
         yield wire_lengths(next_position, next_tension), SETTLE
         position, tension = next_position, next_tension
+
+
+def random_states(config: RobotConfig, count: int, seed: int) -> dict[str, np.ndarray]:
+    """States of the geometric model, whether the arm could rest in them or not (paper, III-B, initial training).
+
+    Joint positions within the robot file's limits and tensions are drawn independently; wire lengths follow. Motion
+    alone shows only tensions that balance gravity, from which a model cannot tell what an unusual load would do.
+
+    Returns:
+        Signal -> values [its unit], shape (count, n).
+    """
+    random = np.random.default_rng(seed)
+    low, high = config.bounds("joint_position")
+    position = random.uniform(low, high, (count, 5))
+    tension = random.uniform(LEAST_TENSION, HIGHEST_WISH, (count, 10))
+    lengths = np.array([wire_lengths(q, f) for q, f in zip(position, tension, strict=True)])
+    return {"joint_position": position, "muscle_tension": tension, "muscle_length": lengths}
