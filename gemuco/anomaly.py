@@ -179,7 +179,11 @@ def score(schema: "BodySchema", values: Mapping[str, np.ndarray]) -> AnomalyScor
     # The square of the distance grows with the number of judged elements, so the threshold follows it.
     usual = int(np.isfinite(schema.normal.mean).sum())
     threshold = schema.normal.threshold * float(np.sqrt(judged / usual)) if judged else float("nan")
-    blamed = _blamed(schema, x, error, contribution) if judged else ""
+    blamed = ""
+    if distance > threshold:  # repairs cost more than the score itself
+        blamed = _blamed(schema, x, error, contribution)
+    elif judged:
+        blamed = schema.out_layout.element(int(np.nanargmax(contribution)))
     return AnomalyScore(distance, threshold, schema.out_layout.split(contribution), blamed)
 
 
