@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from statistics import NormalDist
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -127,9 +128,7 @@ class Normal:
 def _tail(scores: np.ndarray, false_alarm: float) -> float:
     """The score that is exceeded with a small probability: observed where there is data, else by a log-normal tail."""
     logs = np.log(np.maximum(scores, 1e-9))
-    # Normal quantile of a small tail: Abramowitz and Stegun 26.2.23, error below 4.5e-4.
-    t = np.sqrt(-2.0 * np.log(false_alarm))
-    z = t - (2.515517 + 0.802853 * t + 0.010328 * t**2) / (1.0 + 1.432788 * t + 0.189269 * t**2 + 0.001308 * t**3)
+    z = NormalDist().inv_cdf(1.0 - false_alarm)
     return max(float(np.quantile(scores, 1.0 - false_alarm)), float(np.exp(logs.mean() + z * logs.std())))
 
 
