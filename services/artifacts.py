@@ -23,10 +23,11 @@ def model_folder(robot: str) -> Path:
 
 
 def fingerprint(robot: RobotConfig) -> str:
-    """Hash of what a model depends on: the signals, and how the robot file wants it trained."""
+    """Hash of what a model depends on: the signals, and how the robot file wants data collected and it trained."""
     model = model_config(robot)
     content = {
         "signals": {name: list(signal.elements) for name, signal in robot.signals.items()},
+        "collect": robot.collect,
         "model": [part.model_dump() for part in (model.network, model.structure, model.training)],
     }
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]

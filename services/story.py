@@ -11,6 +11,7 @@ from hal.config import RobotConfig
 from hal.errors import CommandRefused
 from services.client import Client
 from services.errors import NotEngaged, ServiceError
+from services.messages import Anomaly
 from services.timeline import Timeline, hidden_error
 
 POSE_TIME = 2.5
@@ -78,6 +79,8 @@ class Story:
         self._client, self._timeline, self._idle, self._tell = client, timeline, idle, tell
         self._signal = "joint_position"
         self._elements = robot.signals[self._signal].elements
+        self._muscles = robot.signals[robot.command.signal].elements
+        self._muscle_signals = {name for name, signal in robot.signals.items() if signal.elements == self._muscles}
         self._low, self._high = robot.bounds(self._signal)
         self._random = np.random.default_rng(seed)
         self._poses = [self._pose() for _ in range(POSES)]
@@ -106,7 +109,8 @@ class Story:
             f"{POSES} targets, distance from the target {reached:.3f} rad (mean norm of 5 joints)",
             f"with all encoders hidden, the model would be wrong by {self.marks.error_before:.3f} rad",
         )
-        span = np.ptp(self._timeline.between("truth", start, self._timeline.now()), axis=0).max()
+        truth = self._timeline.between("truth", start, self._timeline.now())
+        span = float(np.nanmax(np.nanmax(truth, axis=0) - np.nanmin(truth, axis=0)))
         return Stage("moves to targets", start, self._timeline.now(), figures, reached < 0.5 and span > 0.3)
 
     def lose_sensor(self) -> Stage:
@@ -170,18 +174,28 @@ class Story:
         self.marks.alarm = self._timeline.now()
         for _ in range(CUT_POSES):
             self._go(self._pose(), LEARNING_TIME)
-        blamed = [element for at, element in self._timeline.blamed if start <= at < self.marks.alarm + 1.0]
-        self.marks.blamed = _most_common(blamed)
+        early = [anomaly for at, anomaly in self._timeline.anomalies if start <= at < self.marks.alarm + 1.0]
+        element = _most_common([anomaly.blamed for anomaly in early])
+        self.marks.blamed = self._blamed_muscle(early)
         end = self._timeline.now()
         after = float(np.nanmedian(self._timeline.between("score", self.marks.alarm, end)))
         limit = float(np.nanmedian(self._timeline.between("threshold", start, end)))
         figures = (
             f"anomaly score {score:.1f} before the cut, {after:.1f} after it, threshold {limit:.1f}",
-            f"told after {1e3 * (self.marks.alarm - start):.0f} ms, blaming {self.marks.blamed or 'nothing'}",
+            f"told after {1e3 * (self.marks.alarm - start):.0f} ms; blamed element {element or 'none'}",
+            f"muscle with the largest part in the score: {self.marks.blamed or 'none'}",
         )
-        right = self.marks.blamed.endswith(f".{MUSCLE}")
+        right = self.marks.blamed == MUSCLE
         self._client.disengage()
         return Stage("loses a muscle", start, end, figures, alarmed and right and not calm.any())
+
+    def _blamed_muscle(self, anomalies: list[Anomaly]) -> str:
+        """The muscle whose tension and length together contribute most; empty without anomalies."""
+        total = np.zeros(len(self._muscles))
+        for anomaly in anomalies:
+            for signal in self._muscle_signals & anomaly.contribution.keys():
+                total += np.nan_to_num(anomaly.contribution[signal])
+        return self._muscles[int(np.argmax(total))] if anomalies else ""
 
     def _engage(self) -> None:
         """Engage, again if the moment was a bad one: on a busy machine a sample may be late just then."""

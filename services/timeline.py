@@ -11,6 +11,7 @@ from gemuco.errors import SchemaError
 from hal.errors import HalError
 from services.client import Client
 from services.errors import ServiceError
+from services.messages import Anomaly
 
 EVERY = 0.05
 """Time between two rows [s]."""
@@ -34,8 +35,8 @@ class Timeline:
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="timeline", daemon=True)
         self._start = time.monotonic()
-        self.blamed: list[tuple[float, str]] = []
-        """Time [s] and `signal.element` of every row that was an anomaly."""
+        self.anomalies: list[tuple[float, Anomaly]] = []
+        """Time [s] and message of every row that was an anomaly."""
 
     def __enter__(self) -> "Timeline":
         self._start = time.monotonic()
@@ -82,7 +83,7 @@ class Timeline:
             "is_anomaly": anomaly is not None and anomaly.is_anomaly,
         }
         if anomaly is not None and anomaly.is_anomaly:
-            self.blamed.append((self.now(), anomaly.blamed))
+            self.anomalies.append((self.now(), anomaly))
         for name, value in add.items():
             self._columns[name].append(value)
         self._columns["time"].append(self.now())
