@@ -25,7 +25,7 @@ def load_model(robot: RobotConfig, folder: Path) -> BodySchema:
     if not folder.exists():
         raise CheckpointError(f"There is no model in '{folder}'. Make one with `gemuco collect` and `gemuco train`.")
     schema = BodySchema.load(folder)
-    if schema.layout != layout_of(robot):
+    if set(schema.layout.signals) != set(layout_of(robot).signals):
         theirs, ours = ", ".join(schema.layout.names), ", ".join(robot.signals)
         raise CheckpointError(
             f"The model in '{folder}' is of another body: its signals are {theirs}; the robot file's are {ours}, "

@@ -59,7 +59,6 @@ class OnlineUpdate:
         """
         self._freshness, self._living, self._config = freshness, living, config
         self._is_engaged = is_engaged
-        self._sizes = [(signal.name, signal.size) for signal in living.schema.layout.signals]
         self._make_learner, self._publish, self._clock = learner, publish, clock
         self._lock = threading.Lock()
         self._learner: Learner | None = None
@@ -99,10 +98,10 @@ class OnlineUpdate:
         with self._lock:
             samples = list(self._since_change)
             schema = self._living.schema
-            rows = {
-                name: np.array([sample[name] for sample in samples]).reshape(-1, size) for name, size in self._sizes
-            }
             try:
+                if not samples:
+                    raise NotEnoughData("No whole sample of the moving robot came since the model last changed.")
+                rows = {name: np.stack([sample[name] for sample in samples]) for name in samples[0]}
                 normal = Normal.fit(schema.predict_error(rows), schema.scaler.std[schema.out_index])
             except NotEnoughData as error:
                 raise NotEnoughData(f"{error} Let the robot move for a while with the update stopped.") from None

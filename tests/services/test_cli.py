@@ -1,0 +1,71 @@
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+
+def gemuco(*words: str, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "services.cli", *words]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, cwd=folder or ROOT, check=False)
+
+
+@pytest.mark.parametrize("verb", ["simulate", "hal", "serve", "collect", "train", "query", "top", "record", "demo"])
+def test_every_verb_explains_itself(verb: str) -> None:
+    told = gemuco(verb, "--help")
+    assert told.returncode == 0
+    assert "ROBOT" in told.stdout
+
+
+def test_a_wrong_robot_file_is_one_sentence_and_exit_code_2(tmp_path: Path) -> None:
+    wrong = tmp_path / "wrong.yaml"
+    wrong.write_text((ROOT / "robots" / "musashi_arm.yaml").read_text() + "\ncolour: blue\n")
+    for words, sentence in (
+        (("hal", str(wrong)), "unknown key 'colour'. Known keys there: robot, description"),
+        (("hal", "no_such_robot"), "There is no robot 'no_such_robot'"),
+        (("collect", str(tmp_path / "none.yaml")), "There is no robot file"),
+        (("collect", "musashi_arm", "--variant", "golden"), "no variant 'golden'. Known variants: geometric, actual."),
+    ):
+        told = gemuco(*words)
+        assert told.returncode == 2
+        assert sentence in told.stderr.replace("\n", " ")
+        assert "Traceback" not in told.stderr
+
+
+def test_what_is_missing_is_said(tmp_path: Path) -> None:
+    robot = str(ROOT / "robots" / "musashi_arm.yaml")
+    for words, sentence in (
+        (("serve", robot), "There is no model in 'runs/musashi_arm/model'. Make one with `gemuco collect`"),
+        (("train", robot), "There is no data file 'runs/musashi_arm/data.npz'. Record one with `gemuco collect`."),
+        (("query", "nobody_here", "estimate", "joint_position"), "Is `gemuco serve` running?"),
+        (("query", "nobody_here", "engage"), "Is `gemuco serve` running?"),
+    ):
+        told = gemuco(*words, folder=tmp_path)
+        assert told.returncode == 1
+        assert sentence in told.stderr.replace("\n", " ")
+        assert "Traceback" not in told.stderr
+
+
+def test_the_service_does_not_import_torch() -> None:
+    program = "import sys, services.gemuco_service; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", program], timeout=60, check=False, cwd=ROOT).returncode == 0
+
+
+def test_collect_and_train_make_a_model(tmp_path: Path) -> None:
+    text = (ROOT / "robots" / "musashi_arm.yaml").read_text()
+    robot = tmp_path / "small_arm.yaml"
+    text = text.replace("robot: musashi_arm", "robot: small_arm")
+    text += "\n  training: {epochs: 5}\n"
+    text = text.replace("structure: {", "structure: {epochs: 5, ").replace("threshold_in: 0.15", "threshold_in: 0.9")
+    robot.write_text(text)
+    collected = gemuco("collect", str(robot), "--samples", "1000", folder=tmp_path)
+    assert collected.returncode == 0, collected.stderr
+    assert "times real time" in collected.stdout
+    trained = gemuco("train", str(robot), folder=tmp_path)
+    assert trained.returncode == 0, trained.stderr
+    assert "L_i" in trained.stdout
+    assert "joint_position" in trained.stdout
+    assert "rad" in trained.stdout
+    assert (tmp_path / "runs" / "small_arm" / "model" / "manifest.json").exists()

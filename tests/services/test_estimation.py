@@ -1,0 +1,104 @@
+import math
+from dataclasses import replace
+
+import numpy as np
+from arm_model import arm, fresh, sample_of, small_model
+
+from hal.clock import ManualClock
+from services.anomaly_loop import AnomalyWatch
+from services.estimation import Estimation, Fresh, Freshness
+from services.messages import Anomaly, Estimates
+
+
+class Bench:
+    """The estimation loop with the newest sample in hand."""
+
+    def __init__(self) -> None:
+        self.clock = ManualClock()
+        self.newest: Fresh | None = None
+        self.published: list[Estimates] = []
+        self.freshness = Freshness(arm(), lambda: self.newest, self.clock)
+        self.estimation = Estimation(self.freshness, small_model, self.published.append, self.clock)
+
+    def tick(self) -> Estimates:
+        self.estimation.tick()
+        return self.published[-1]
+
+
+def test_measured_values_pass_through_unmarked() -> None:
+    bench = Bench()
+    bench.newest = fresh(3, bench.clock.monotonic(), cycle=42)
+    told = bench.tick()
+    assert told.cycle == 42
+    assert set(told.method.values()) == {"measured"}
+    assert not any(part.any() for part in told.estimated.values())
+    for name, value in bench.newest.sample.values.items():
+        np.testing.assert_array_equal(told.values[name], value)
+
+
+def test_a_silent_encoder_is_estimated_and_marked() -> None:
+    bench = Bench()
+    bench.newest = fresh(3, bench.clock.monotonic(), silent=("joint_position.elbow_pitch",))
+    told = bench.tick()
+    assert told.method["joint_position"] == "mask"
+    assert told.mask["joint_position"] == "muscle_tension+muscle_length"
+    assert told.estimated["joint_position"].tolist() == [False, False, False, True, False]
+    truth = sample_of(3).values["joint_position"]
+    assert abs(told.values["joint_position"][3] - truth[3]) < 0.2  # rad
+    np.testing.assert_array_equal(told.values["joint_position"][:3], truth[:3])
+    assert 0 < told.std["joint_position"][3] < 0.3
+    assert told.residual["joint_position"] > 0
+
+
+def test_no_sample_gives_nothing_and_no_old_values() -> None:
+    bench = Bench()
+    told = bench.tick()
+    assert told.cycle == -1
+    assert set(told.method.values()) == {"none"}
+    assert all(np.isnan(value).all() for value in told.values.values())
+
+
+def test_a_sample_that_waited_too_long_is_no_sample() -> None:
+    bench = Bench()
+    bench.newest = fresh(3, bench.clock.monotonic())
+    bench.clock.advance(0.021)
+    told = bench.tick()
+    assert told.cycle == -1
+    assert all(np.isnan(value).all() for value in told.values.values())
+
+
+def test_a_sample_of_wrong_shape_is_as_good_as_silent() -> None:
+    bench = Bench()
+    sample = sample_of(3)
+    broken = replace(sample, values=sample.values | {"joint_position": np.zeros(4)}, valid=dict(sample.valid))
+    bench.newest = Fresh(broken, bench.clock.monotonic())
+    assert bench.tick().method["joint_position"] == "mask"
+
+
+def test_an_anomaly_must_last() -> None:
+    bench = Bench()
+    told: list[Anomaly] = []
+    watch = AnomalyWatch(bench.freshness, small_model, 0.05, told.append, bench.clock)
+    sample = sample_of(5)
+    tension = sample.values["muscle_tension"].copy()
+    tension[1] += 150.0  # N
+    cut = replace(sample, values=sample.values | {"muscle_tension": tension})
+    for _ in range(4):
+        bench.newest = Fresh(cut, bench.clock.monotonic())
+        watch.tick()
+        bench.clock.advance(0.02)
+    assert all(one.score > one.threshold for one in told)
+    assert [one.is_anomaly for one in told] == [False, False, False, True]
+    assert told[-1].blamed.split(".")[0] in arm().signals
+    bench.newest = fresh(5, bench.clock.monotonic())
+    watch.tick()
+    assert not told[-1].is_anomaly
+
+
+def test_without_a_sample_nothing_is_judged() -> None:
+    bench = Bench()
+    told: list[Anomaly] = []
+    AnomalyWatch(bench.freshness, small_model, 0.05, told.append, bench.clock).tick()
+    assert math.isnan(told[0].score)
+    assert not told[0].is_anomaly
+    assert told[0].blamed == ""

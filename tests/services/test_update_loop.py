@@ -1,0 +1,101 @@
+import numpy as np
+import pytest
+from arm_model import arm, fresh, small_model
+
+from gemuco.adapt import UpdateConfig as Learning
+from gemuco.adapt import Updater
+from gemuco.errors import NotEnoughData
+from hal.clock import ManualClock
+from services.estimation import Fresh, Freshness
+from services.living_model import LivingModel
+from services.messages import Update
+from services.model_config import UpdateConfig
+from services.update_loop import OnlineUpdate
+
+
+class Bench:
+    """The update loop of an arm that goes from state to state."""
+
+    def __init__(self, window: int = 50) -> None:
+        self.clock = ManualClock()
+        self.newest: Fresh | None = None
+        self.engaged = False
+        self.told: list[Update] = []
+        self.living = LivingModel(small_model())
+        self.update = OnlineUpdate(
+            Freshness(arm(), lambda: self.newest, self.clock),
+            self.living,
+            UpdateConfig(window=window),
+            lambda schema: Updater(schema, Learning(window=window, minimum=10, batch=10)),
+            lambda: self.engaged,
+            self.told.append,
+            self.clock,
+        )
+
+    def turn(self, index: int, silent: tuple[str, ...] = ()) -> Update:
+        self.clock.advance(0.1)
+        self.newest = fresh(index, self.clock.monotonic(), silent=silent)
+        self.update.tick()
+        return self.told[-1]
+
+
+def test_the_window_is_bounded_and_the_oldest_go() -> None:
+    bench = Bench(window=20)
+    bench.turn(0)
+    bench.update.adapt(True)
+    for index in range(1, 31):
+        told = bench.turn(index)
+    assert (told.active, told.window, told.dropped) == (True, 20, 10)
+    assert told.model_version > 0
+    assert np.isfinite(told.loss)
+
+
+def test_a_model_is_swapped_whole_and_can_be_rolled_back() -> None:
+    bench = Bench()
+    first = bench.living.schema
+    bench.turn(0)
+    bench.update.adapt(True)
+    for index in range(1, 20):
+        bench.turn(index)
+    learned = bench.living.schema
+    assert learned is not first
+    assert bench.living.before is first
+    version = bench.living.version
+    assert bench.update.rollback() == version + 1
+    assert bench.living.schema is first
+    assert not bench.update.is_active
+    assert bench.turn(40).active is False
+    assert bench.living.schema is first
+
+
+@pytest.mark.parametrize("why", ["rest", "silent", "stale"])
+def test_a_useless_sample_is_not_learned_from(why: str) -> None:
+    bench = Bench()
+    bench.turn(0)
+    bench.update.adapt(True)
+    for _ in range(5):
+        if why == "stale":
+            bench.clock.advance(1.0)
+            bench.update.tick()
+        else:
+            bench.turn(0 if why == "rest" else 1, ("muscle_length.biceps",) if why == "silent" else ())
+    assert bench.told[-1].window == 0
+    assert bench.living.version == 0
+
+
+def test_the_normal_is_learned_from_samples_since_the_model_changed() -> None:
+    bench = Bench(window=200)
+    bench.engaged = True
+    for index in range(10):
+        bench.turn(index)
+    with pytest.raises(NotEnoughData, match="Let the robot move for a while"):
+        bench.update.learn_normal()
+    for index in range(10, 120):
+        bench.turn(index)
+    before = bench.living.schema.normal
+    assert bench.update.learn_normal() == 120
+    assert bench.living.schema.normal is not before
+    bench.update.adapt(True)
+    bench.update.adapt(False)
+    with pytest.raises(NotEnoughData):
+        bench.update.learn_normal()
