@@ -76,8 +76,8 @@ def _services(client: Client, statuses: Mapping[str, Status | None]) -> Table:
 
 def _loops(statuses: Mapping[str, Status | None]) -> Table:
     table = Table(title="loops", title_justify="left")
-    table.add_column("loop")
-    for column in ("wanted Hz", "rate Hz", "late p50 ms", "p99 ms", "max ms", "skipped", "busy %"):
+    table.add_column("loop", no_wrap=True)
+    for column in ("want Hz", "Hz", "late p50", "p99", "max ms", "skips", "busy %"):
         table.add_column(column, justify="right")
     for status in statuses.values():
         for name, loop in (status.loops if status else {}).items():
@@ -90,9 +90,9 @@ def _loops(statuses: Mapping[str, Status | None]) -> Table:
 
 def _signals(sample: Sample | None, estimate: Estimates | None) -> Table:
     table = Table(title="signals", title_justify="left")
-    table.add_column("signal")
+    table.add_column("signal", no_wrap=True)
     table.add_column("valid", justify="right")
-    table.add_column("oldest ms", justify="right")
+    table.add_column("age ms", justify="right")
     for column in ("estimate", "from", "values"):
         table.add_column(column)
     names = list(sample.values) if sample else list(estimate.values) if estimate else []
