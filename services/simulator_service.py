@@ -19,9 +19,10 @@ from services.service import Service, until_told
 log = logging.getLogger(__name__)
 
 TRUTH_RATE = 100.0
-PRIORITY = 55
-"""Above the HAL's: hardware does not wait for the programs that use it, nor must what stands in for it."""
-NETWORK_PRIORITY = 20
+PRIORITY = 15
+"""Above every normal program, below HAL and service: above them it would wake for each of the HAL's frames instead of
+once for all of a cycle, which costs a fifth of a core and the service every thirtieth anomaly tick."""
+NETWORK_PRIORITY = 15
 THREADS = ("physics", "nodes ", "hub ")
 
 
