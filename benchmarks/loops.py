@@ -21,7 +21,9 @@ from rich.console import Console
 from rich.table import Table
 
 from hal.config import RobotConfig, load_robot
+from hal.errors import CommandRefused
 from services.client import Client
+from services.errors import NotEngaged
 from services.gemuco_service import PRIORITIES
 from services.lateness import Lateness
 from services.realtime import prepare_process, prepare_thread
@@ -69,8 +71,33 @@ def bare_process(rates: dict[str, float], pipe: Connection) -> None:
     pipe.send(found)
 
 
-def move(client: Client, robot: RobotConfig, duration: float) -> None:
-    """Send a random target every second for `duration` [s]."""
+def measures(client: Client) -> bool:
+    """Whether every signal is measured and reaches this process."""
+    estimate = client.estimate()
+    return estimate is not None and set(estimate.method.values()) == {"measured"}
+
+
+def engage(client: Client) -> None:
+    """Engage the controller, out of a fault too; gives up after ten seconds."""
+    deadline = time.monotonic() + 10.0
+    while time.monotonic() < deadline:
+        applied = client.applied(timeout=1.0)
+        if applied is not None and applied.mode in ("hold", "follow"):
+            return
+        try:
+            if applied is not None and applied.mode == "fault":
+                print(f"fault: {client.describe('hal')}")
+                client.reset()
+            client.engage()
+        except (CommandRefused, NotEngaged) as error:
+            print(f"not engaged yet: {error}")
+        time.sleep(0.3)
+    raise TimeoutError("The controller was not engaged within ten seconds.")
+
+
+def move(client: Client, robot: RobotConfig, duration: float) -> int:
+    """Send a random target every second for `duration` [s]; how often the HAL had stopped the arm."""
+    stops = 0
     random = np.random.default_rng(0)
     low, high = robot.bounds("joint_position")
     middle, half = (low + high) / 2, (high - low) / 2
@@ -78,11 +105,11 @@ def move(client: Client, robot: RobotConfig, duration: float) -> None:
     while time.monotonic() < end:
         applied = client.applied()
         if applied is None or applied.mode not in ("follow", "hold", "enabling"):
-            print(f"not moving: {applied.mode if applied else 'no HAL'} {client.status('hal')}")
-            client.reset()
-            client.engage()
+            stops += 1
+            engage(client)
         client.target("joint_position", middle + REACH * half * random.uniform(-1, 1, low.size))
         time.sleep(TARGET_EVERY)
+    return stops
 
 
 def cpu_share(pid: int, since: tuple[float, float] | None = None) -> tuple[float, float]:
@@ -106,14 +133,14 @@ def run(robot_file: Path, minutes: float) -> dict[str, object]:
             "hal": supervisor.start("hal", gemuco_command("hal", str(robot_file))),
             "serve": supervisor.start("serve", gemuco_command("serve", str(robot_file))),
         }
-        supervisor.wait_ready("serve", lambda: client.estimate() is not None, 60)
-        client.engage()
+        supervisor.wait_ready("serve", lambda: measures(client), 60)
+        engage(client)
         client.adapt(True)
         time.sleep(3.0)
         bare.start()
         began = {name: cpu_share(child.process.pid) for name, child in children.items()}
         before = {name: client.status(name, timeout=3.0) for name in ("hal", "model")}
-        move(client, robot, 60 * minutes)
+        stops = move(client, robot, 60 * minutes)
         supervisor.check()
         pipe.send("stop")
         baseline = pipe.recv()
@@ -132,7 +159,7 @@ def run(robot_file: Path, minutes: float) -> dict[str, object]:
             rate = counted["ticks"] / (60 * minutes)
             loops[name] = kept | counted | {"rate": rate, "bare": baseline.get(name, {})}
     facts = {name: status.facts for name, status in after.items()}
-    return {"minutes": minutes, "loops": loops, "cores": shares, "facts": facts}
+    return {"minutes": minutes, "loops": loops, "cores": shares, "stops": stops, "facts": facts}
 
 
 def show(found: dict, console: Console) -> None:
@@ -156,6 +183,7 @@ def show(found: dict, console: Console) -> None:
         other = [f"{bare[key] * 1e3:.2f}" for key in ("total_p50", "total_p99", "total_max")] if bare else ["", "", ""]
         table.add_row(name, f"{one['rate']:.2f}", *row, skipped, *other, f"{bare.get('skipped', 0):.0f}")
     console.print(table)
+    console.print(f"the HAL stopped the arm {found['stops']} times")
     console.print("share of a core: " + ", ".join(f"{name} {share:.0%}" for name, share in found["cores"].items()))
     peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
     console.print(f"largest process: {peak:.0f} MiB")
