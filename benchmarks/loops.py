@@ -121,7 +121,7 @@ def cpu_share(pid: int, since: tuple[float, float] | None = None) -> tuple[float
 def run(robot_file: Path, minutes: float) -> dict[str, object]:
     """The whole measurement; loop name -> statistics of ours and of the bare loop, process -> share of a core."""
     robot = load_robot(robot_file)
-    rates = {"cycle": robot.rates.hal} | {name: getattr(robot.rates, name) for name in PRIORITIES}
+    rates = {"hal": robot.rates.hal} | {name: getattr(robot.rates, name) for name in PRIORITIES}
     context = multiprocessing.get_context("spawn")
     pipe, other = context.Pipe()
     bare = context.Process(target=bare_process, args=(rates, other), daemon=True)

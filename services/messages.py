@@ -143,7 +143,8 @@ class Anomaly(Message):
         score: Mahalanobis distance (paper, II-K) of the prediction error; NaN without normal data.
         threshold: Score above which it counts as an anomaly.
         is_anomaly: Score above threshold for as long as the robot file asks.
-        blamed: `signal.element` that contributes most.
+        blamed: `signal.element` whose repair makes the sample most normal; below the threshold, the one that
+            contributes most.
         contribution: Signal -> each element's part of score^2, shape (n,).
     """
 

@@ -128,14 +128,11 @@ class Supervisor:
         child.process.wait()
 
     def stop(self, *names: str) -> None:
-        """Ask children to end, and kill those that do not within the grace time."""
-        children = [self.children[name] for name in names if name in self.children]
-        for child in children:
+        """Ask children to end, one after the other, and kill those that do not within the grace time."""
+        for child in [self.children[name] for name in names if name in self.children]:
             _signal_group(child.process, signal.SIGTERM)
-        deadline = time.monotonic() + self.grace
-        for child in children:
             with contextlib.suppress(subprocess.TimeoutExpired):
-                child.process.wait(max(0.0, deadline - time.monotonic()))
+                child.process.wait(self.grace)
             _signal_group(child.process, signal.SIGKILL)
             child.process.wait()
             del self.children[child.name]
