@@ -60,19 +60,28 @@ class Caretaker:
         self._passes += 1
         for device in self._devices:
             running = self._running.get(device)
-            if running is not None and not running.done():
-                continue
+            if running is not None:
+                if not running.done():
+                    continue
+                del self._running[device]  # it has one pause to give its first answer in, before it counts as silent
+                self._not_before[device] = self._passes + self._pause(device)
             state = device.health().state
-            if state is not self._seen[device]:  # a silent node that boots need not wait for its next turn
-                self._seen[device], self._tries[device], self._not_before[device] = state, 0, 0
+            if state is not self._seen[device]:
+                self._seen[device] = state
+                if state is not DeviceState.SILENT:  # a node that boots need not wait for its turn
+                    self._tries[device], self._not_before[device] = 0, 0
             if state in NEED_OPENING and self._passes >= self._not_before[device] and self._pool:
-                pause = BACK_OFF[min(self._tries[device], len(BACK_OFF) - 1)]
                 self._tries[device] += 1
-                self._not_before[device] = self._passes + round(pause / PASS_PERIOD)
                 self._running[device] = self._pool.submit(self._open, device)
+
+    def _pause(self, device: Device) -> int:
+        """Passes between two tries."""
+        return round(BACK_OFF[min(self._tries[device], len(BACK_OFF)) - 1] / PASS_PERIOD)
 
     @staticmethod
     def _open(device: Device) -> None:
+        if device.health().state not in NEED_OPENING:
+            return  # it came back before its turn
         try:
             device.open()
         except HalError as error:

@@ -160,6 +160,8 @@ class CanopenNode(Device):
         elif self.missed > self._silent_cycles:
             health.state = DeviceState.SILENT
             health.text = f"{self._place} has not answered for {self.missed} cycles. Is it powered, is its cable in?"
+        elif self._opening.locked():  # it answers again, but what it was told may be forgotten and is being told anew
+            health.state, health.text = DeviceState.OPENING, "Being commissioned."
         elif self._emergency:
             health.state = DeviceState.FAULT
             health.text = f"{self._place} reports {cia301.describe_emergency(self._emergency)}."
