@@ -23,8 +23,6 @@ ANSWER_TIME = 0.3
 TRIES = 3
 HEARTBEAT_TIME = 0.1
 """Period [s] of a node's heartbeat."""
-WATCH_TIME = 0.15
-"""How long [s] a drive waits for the HAL's heartbeat before it stops."""
 
 _REQUEST = struct.Struct("<BHB4s")
 _READ = 0x40
@@ -52,14 +50,14 @@ class Plan:
         receives: Objects of RPDO1, in order; empty for none.
         sends: Objects of TPDO1, in order.
         writes: Further objects and the values to write to them before the node is started.
-        watches_us: Whether the node stops when the HAL's heartbeat fails.
+        watch_time: How long [s] the node waits for the HAL's heartbeat before it stops; 0 if it does not watch.
     """
 
     profile: int
     receives: tuple[Mapped, ...]
     sends: tuple[Mapped, ...]
     writes: tuple[tuple[Mapped, int], ...] = field(default=())
-    watches_us: bool = False
+    watch_time: float = 0.0
 
 
 class SdoClient:
@@ -199,8 +197,8 @@ def commission(sdo: SdoClient, plan: Plan, node: int) -> None:
     _map(sdo, cia301.RPDO_PARAMETERS, cia301.RPDO_MAPPING, cia301.RPDO1 + node, plan.receives)
     _map(sdo, cia301.TPDO_PARAMETERS, cia301.TPDO_MAPPING, cia301.TPDO1 + node, plan.sends)
     sdo.write_checked(cia301.PRODUCER_HEARTBEAT, 0, round(HEARTBEAT_TIME * 1000), 2)
-    if plan.watches_us:
-        watch_us(sdo, WATCH_TIME)
+    if plan.watch_time:
+        watch_us(sdo, plan.watch_time)
     for item, value in plan.writes:
         sdo.write_checked(item.index, item.subindex, value, item.bits // 8)
 

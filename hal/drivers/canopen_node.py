@@ -181,7 +181,7 @@ class CanopenNode(Device):
             self.is_commissioned = False
             self._trouble = (DeviceState.CLOSED, "Closed.")
             try:
-                if self._plan().watches_us and self.missed <= self._silent_cycles:
+                if self._plan().watch_time and self.missed <= self._silent_cycles:
                     watch_us(self._sdo, 0.0)
             except HalError as error:
                 log.warning("closing: %s", error)

@@ -38,6 +38,8 @@ class DriveSettings(NodeSettings):
     """Motor rated torque [N m], for `torque`."""
     max_torque: Annotated[int, Field(ge=0, le=10_000)] | None = None
     """Written to object 6072h [thousandths of the rated torque]; absent: left as it is."""
+    watch_time: Annotated[float, Field(ge=0.1, le=5.0)] = 0.15
+    """How long [s] the drive waits for the HAL's heartbeat before it stops by itself (object 1016h)."""
 
 
 class Cia402Drive(CanopenNode):
@@ -55,6 +57,7 @@ class Cia402Drive(CanopenNode):
         self._scale, self._zero = self._line.scale, self._line.zero
         self._rated_torque = settings.rated_torque
         self._max_torque = settings.max_torque
+        self._watch_time = settings.watch_time
         self._state = State.NOT_READY
         self._counts = 0
         self._torque = 0
@@ -76,7 +79,7 @@ class Cia402Drive(CanopenNode):
             writes.append((cia402.MAX_TORQUE, self._max_torque))
         if self._sdo.has(cia402.ABORT_CONNECTION.index):
             writes.append((cia402.ABORT_CONNECTION, cia402.ABORT_QUICK_STOP))
-        return Plan(cia402.PROFILE, cia402.COMMAND, cia402.STATUS, tuple(writes), watches_us=True)
+        return Plan(cia402.PROFILE, cia402.COMMAND, cia402.STATUS, tuple(writes), self._watch_time)
 
     def _before_commissioning(self) -> None:
         self._state = State.NOT_READY
