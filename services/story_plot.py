@@ -74,7 +74,7 @@ def _anomaly(axis: Axes, timeline: Timeline, marks: Marks) -> None:
     rows = min(map(len, (time, score, threshold)))
     axis.semilogy(time[:rows], score[:rows], color=BLUE, linewidth=1, label="anomaly score")
     axis.semilogy(time[:rows], threshold[:rows], color=RED, linewidth=1.5, linestyle="--", label="threshold")
-    blamed = f"{MUSCLE} cut; blamed: {marks.blamed or 'nothing'}"
+    blamed = f"{MUSCLE} cut; muscle with the largest part: {marks.blamed or 'none'}"
     axis.annotate(blamed, (marks.cut, 0.92), xycoords=axis.get_xaxis_transform(), ha="right", color=RED, fontsize=9)
     axis.set_ylabel("Mahalanobis distance")
     axis.legend(loc="lower left", fontsize=8)
