@@ -85,12 +85,10 @@ def engage(client: Client) -> None:
         if applied is not None and applied.mode in ("hold", "follow"):
             return
         try:
-            if applied is not None and applied.mode == "fault":
-                print(f"fault: {client.describe('hal')}")
-                client.reset()
             client.engage()
         except (CommandRefused, NotEngaged) as error:
             print(f"not engaged yet: {error}")
+            client.reset()  # drives whose HAL died latch a fault
         time.sleep(0.3)
     raise TimeoutError("The controller was not engaged within ten seconds.")
 
