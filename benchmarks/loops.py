@@ -20,6 +20,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.online_update import model
 from hal.config import RobotConfig, load_robot
 from hal.errors import CommandRefused
 from services.client import Client
@@ -119,6 +120,7 @@ def cpu_share(pid: int, since: tuple[float, float] | None = None) -> tuple[float
 def run(robot_file: Path, minutes: float) -> dict[str, object]:
     """The whole measurement; loop name -> statistics of ours and of the bare loop, process -> share of a core."""
     robot = load_robot(robot_file)
+    model(robot, Console())
     rates = {"hal": robot.rates.hal} | {name: getattr(robot.rates, name) for name in PRIORITIES}
     context = multiprocessing.get_context("spawn")
     pipe, other = context.Pipe()

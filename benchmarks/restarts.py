@@ -16,6 +16,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.loops import engage, measures
+from benchmarks.online_update import model
 from hal.config import load_robot
 from services.client import Client
 from services.supervisor import Supervisor, gemuco_command
@@ -40,6 +41,7 @@ def gone(client: Client) -> bool:
 def run(robot_file: Path, times: int) -> dict[str, list[float]]:
     """Process or event -> seconds, one per try."""
     robot = load_robot(robot_file)
+    model(robot, Console())
     commands = {
         "simulate": gemuco_command("simulate", str(robot_file), "--variant", "actual", "--seed", "1"),
         "hal": gemuco_command("hal", str(robot_file)),
