@@ -49,7 +49,8 @@ class UpdateResult:
     """What one step did.
 
     Attributes:
-        loss: Mean squared error of the batch before the step [standard deviations squared]; NaN if too few samples.
+        loss: Mean squared error of the batch before the step [standard deviations squared]; NaN if too few samples,
+            infinite if the step led out of the numbers and was not taken.
         window: Samples in the window.
         dropped: Oldest samples dropped so far.
     """
@@ -135,6 +136,9 @@ class Updater:
             count = max(1, int(there.sum()))
             losses.append(float(np.sum(difference**2)) / count)
             self._move(pull_weights(weights.whole, values, difference * np.float32(2.0 / count)))
+        if not all(np.isfinite(array).all() for array in self._arrays):
+            self._begin(self.schema)  # the step was too long: stay with the last W that is one
+            return UpdateResult(float("inf"), self._count, self._dropped)
         scale = self.schema.scaler.std[self.schema.out_index]
         errors = dict(self.schema.errors) | {("mask", m): np.sqrt(e) * scale for m, e in self._errors.items()}
         self.schema = self.schema.with_weights(weights.replaced([a.copy() for a in self._arrays]), errors)

@@ -100,3 +100,12 @@ def test_says_what_is_wrong(schema):
         Updater(schema).add({"wire": np.zeros(5)})
     with pytest.raises(WrongSize):
         Updater(schema).add({"muscle_length": np.zeros(4)})
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_a_step_out_of_the_numbers_is_not_taken(schema):
+    updater = Updater(schema, UpdateConfig(minimum=10, optimiser="sgd", rate=1e30))
+    result = live(updater, WORN, 12)
+    assert result.loss == np.inf
+    assert all(np.isfinite(array).all() for array in updater.schema.weights.arrays())
+    assert np.isfinite(joint_error(updater.schema, WORN))
