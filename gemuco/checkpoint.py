@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from gemuco.schema import BodySchema
 
 FORMAT = "gemuco.body_schema"
-VERSION = 1
+VERSION = 2
 TENSORS = "model.safetensors"
 MANIFEST = "manifest.json"
 
@@ -77,6 +77,7 @@ def _tensors(schema: "BodySchema") -> dict[str, np.ndarray]:
         tensors[f"biases.{index}"] = array
     tensors["bias"] = schema.bias
     tensors["anchors"] = schema.anchors
+    tensors["anchor_conditions"] = schema.anchor_conditions
     if schema.normal is not None:
         tensors["normal.mean"] = schema.normal.mean
         tensors["normal.covariance"] = schema.normal.covariance
@@ -146,6 +147,7 @@ def _schema(head: Mapping[str, Any], tensors: Mapping[str, np.ndarray]) -> "Body
             for index, (method, text) in enumerate(head["errors"])
         },
         anchors=tensors["anchors"],
+        anchor_conditions=tensors["anchor_conditions"],
         normal=normal,
         bias=tensors["bias"],
         biases={condition: tensors[f"biases.{index}"] for index, condition in enumerate(head["conditions"])},

@@ -9,6 +9,10 @@ class UnknownSignal(SchemaError):
     """A signal or element is not part of the layout."""
 
 
+class UnknownCondition(SchemaError):
+    """A condition of the body was not among those the schema was trained on."""
+
+
 class WrongSize(SchemaError):
     """An array does not have as many elements as its signal."""
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from gemuco import anomaly, checkpoint
 from gemuco.anomaly import AnomalyScore, Normal
-from gemuco.errors import UnknownSignal, WrongSize
+from gemuco.errors import UnknownCondition, UnknownSignal, WrongSize
 from gemuco.estimate import Estimate, estimate
 from gemuco.kernels import Weights, run
 from gemuco.masks import Mask, bits, label
@@ -37,6 +37,7 @@ class BodySchema:
         weights: The network's W.
         errors: How well every mask did on held-out data (1 sigma).
         anchors: Some rows of the training data [standard deviations], shape (n, layout.size): where a descent starts.
+        anchor_conditions: Index into `biases` of every anchor, shape (n,); empty without parametric bias.
         normal: What prediction errors are like on a healthy body; None if never learned.
         bias: The parametric bias p of the present condition, shape (bias_size,).
         biases: Condition -> its p.
@@ -55,6 +56,7 @@ class BodySchema:
     weights: Weights
     errors: ErrorTable = field(default_factory=dict)
     anchors: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    anchor_conditions: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
     normal: Normal | None = None
     bias: np.ndarray = field(default_factory=lambda: np.zeros(0, np.float32))
     biases: Mapping[str, np.ndarray] = field(default_factory=dict)
@@ -95,18 +97,21 @@ class BodySchema:
             self._gates[mask] = found
         return found
 
-    def network_input(self, normalised: np.ndarray, mask: Mask) -> np.ndarray:
+    def network_input(self, normalised: np.ndarray, mask: Mask, bias: np.ndarray | None = None) -> np.ndarray:
         """x_in masked and clipped, with m and p behind it.
 
         Args:
             normalised: Every signal [standard deviations], shape (size,) or (samples, size); NaN where masked is fine.
             mask: Which signals to let through.
+            bias: p of every sample, shape (samples, bias_size), or one for all; the present one if not given.
         """
         through, tail = self.gate(mask)
         x = np.empty((*normalised.shape[:-1], len(through) + len(tail)), np.float32)
         values = np.where(through, normalised[..., self.in_index], 0.0)
         np.clip(values, -CLIP, CLIP, out=x[..., : len(through)])
         x[..., len(through) :] = tail
+        if bias is not None and len(self.bias):
+            x[..., -len(self.bias) :] = bias
         return x
 
     def infer(self, normalised: np.ndarray, mask: Mask) -> np.ndarray:
@@ -157,6 +162,28 @@ class BodySchema:
     def with_weights(self, weights: Weights, errors: ErrorTable | None = None) -> "BodySchema":
         """The same body with another W, and with the errors it was found to make if they are known."""
         return replace(self, weights=weights, errors=self.errors if errors is None else errors)
+
+    def with_bias(self, bias: np.ndarray) -> "BodySchema":
+        """The same network under another p, shape (bias_size,).
+
+        Raises:
+            WrongSize: p does not have this schema's size.
+        """
+        p = np.array(bias, np.float32)
+        if p.shape != self.bias.shape:
+            raise WrongSize(f"p has shape {p.shape}; this schema's has {self.bias.shape}.")
+        return replace(self, bias=p)
+
+    def under(self, condition: str) -> "BodySchema":
+        """The same network under the p that a condition had in training.
+
+        Raises:
+            UnknownCondition: No condition has this name.
+        """
+        if condition not in self.biases:
+            known = ", ".join(self.biases) or "none (trained without parametric bias)"
+            raise UnknownCondition(f"Condition '{condition}' was not trained. Known conditions: {known}.")
+        return self.with_bias(self.biases[condition])
 
     def with_normal(self, normal: Normal | None) -> "BodySchema":
         """The same body with other statistics of the normal."""

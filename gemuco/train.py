@@ -211,8 +211,9 @@ class _Trainer:
     def schema(self) -> BodySchema:
         """What was learned, without errors and normal statistics."""
         rows = self.scaler.normalise(self.train_data.rows())
-        complete = rows[np.isfinite(rows).all(axis=1)]
-        chosen = np.random.default_rng(self.config.seed).permutation(len(complete))[:ANCHORS]
+        complete = np.flatnonzero(np.isfinite(rows).all(axis=1))
+        chosen = complete[np.random.default_rng(self.config.seed).permutation(len(complete))[:ANCHORS]]
+        order = np.array([self.data.conditions.index(c) for c in self.train_data.conditions], int)
         biases = {c: p.numpy().copy() for c, p in zip(self.data.conditions, self.biases.detach(), strict=True)}
         size = self.config.bias_size
         return BodySchema(
@@ -222,7 +223,8 @@ class _Trainer:
             masks=self.masks,
             scaler=self.scaler,
             weights=self.network.weights(),
-            anchors=complete[chosen].astype(np.float32),
+            anchors=rows[chosen].astype(np.float32),
+            anchor_conditions=order[self.train_data.condition_of_rows()[chosen]] if size else np.zeros(0, int),
             bias=np.mean(list(biases.values()), axis=0) if size else np.zeros(0, np.float32),
             biases=biases if size else {},
         )
