@@ -5,7 +5,7 @@ VMCAN ?= ../shared/tools/vmcan.sh
 STAMP := .venv/installed
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test check format bench test-socketcan results clean
+.PHONY: help setup demo reproduce test check format bench test-socketcan results clean
 
 help:            ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 18
@@ -19,6 +19,9 @@ setup: $(STAMP)  ## make .venv with the exact versions of constraints.txt
 
 demo: $(STAMP)   ## one minute with a muscle-driven arm that loses a sensor and a muscle
 	$(BIN)/gemuco demo
+
+reproduce: $(STAMP)  ## the paper's experiments on three simulated robots, its figures beside ours
+	for robot in pr2 musashi kxr; do $(BIN)/gemuco reproduce $$robot || exit 1; done
 
 test: $(STAMP)   ## all tests
 	$(BIN)/python -m pytest

@@ -240,6 +240,30 @@ def demo(
     return play(_load(robot), _file(robot), seed, out)
 
 
+@app.command()
+@speaks_plainly
+def reproduce(
+    robot: Annotated[str, typer.Argument(metavar="ROBOT", help="Whose experiments: pr2, musashi or kxr.")],
+    seeds: Annotated[int, typer.Option(min=1, help="How many runs, each with its own seed.")] = 5,
+    out: Annotated[Path, typer.Option(help="Where data, models, figures and tables go.")] = Path("runs/reproduce"),
+    fresh: Annotated[
+        bool, typer.Option("--fresh", help="Collect and train again, even what is there already.")
+    ] = False,
+) -> None:
+    """Run the paper's experiments on a simulated robot and print its figures beside ours."""
+    from rich.console import Console
+
+    from services.reproduce import experiment
+    from services.show import progress
+
+    run = experiment(robot)
+    with progress(f"reproduce {robot}") as tell:
+        report = run(range(seeds), out / robot, tell, fresh)
+    report.save(out / robot)
+    Console().print(report.table())
+    typer.echo(f"Figures and tables are in {out / robot}.")
+
+
 def _file(text: str) -> Path:
     from services.artifacts import robot_file
 
