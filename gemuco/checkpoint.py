@@ -11,6 +11,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
+from gemuco.activation import LINEAR, check
 from gemuco.anomaly import Normal
 from gemuco.errors import CheckpointError, SchemaError
 from gemuco.kernels import Chain, Layer, Weights
@@ -42,8 +43,8 @@ def save(schema: "BodySchema", folder: Path) -> None:
         "x_out": list(schema.x_out),
         "masks": [label(mask, schema.layout.names) for mask in schema.masks],
         "network": {
-            "encoder": [layer.curved for layer in schema.weights.encoder],
-            "decoder": [layer.curved for layer in schema.weights.decoder],
+            "encoder": [layer.activation for layer in schema.weights.encoder],
+            "decoder": [layer.activation for layer in schema.weights.decoder],
         },
         "errors": [[method, label(mask, schema.layout.names)] for method, mask in schema.errors],
         "conditions": list(schema.biases),
@@ -157,6 +158,10 @@ def _schema(head: Mapping[str, Any], tensors: Mapping[str, np.ndarray]) -> "Body
 
 def _chain(head: Mapping[str, Any], tensors: Mapping[str, np.ndarray], part: str) -> Chain:
     return tuple(
-        Layer(tensors[f"{part}.{index}.matrix"], tensors[f"{part}.{index}.offset"], bool(curved))
-        for index, curved in enumerate(head["network"][part])
+        Layer(tensors[f"{part}.{index}.matrix"], tensors[f"{part}.{index}.offset"], _activation(name))
+        for index, name in enumerate(head["network"][part])
     )
+
+
+def _activation(name: Any) -> str:
+    return LINEAR if name == LINEAR else check(name)

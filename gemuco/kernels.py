@@ -1,6 +1,6 @@
 """Forward and backward passes of the network on plain numpy arrays; no torch, no state.
 
-A chain of layers is y = W_n(... a(x W_1 + b_1) ...) + b_n, with a = tanh where a layer is curved. The latent state and
+A chain of layers is y = W_n(... a(x W_1 + b_1) ...) + b_n, with a the activation of each layer. The latent state and
 the output are linear, so encoder, decoder and both together are all chains, and one set of functions serves them all.
 Rows are samples. Derivatives carry the names of their direction: `pull` brings a gradient from the output to the input
 (reverse mode), `push` brings a change of the input to the output (forward mode).
@@ -11,13 +11,15 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gemuco.activation import ACTIVATIONS, LINEAR
+
 
 class Layer(NamedTuple):
-    """One affine map and whether tanh follows: matrix (n_in, n_out), offset (n_out,)."""
+    """One affine map and the name of the activation that follows: matrix (n_in, n_out), offset (n_out,)."""
 
     matrix: np.ndarray
     offset: np.ndarray
-    curved: bool
+    activation: str
 
 
 Chain = tuple[Layer, ...]
@@ -43,7 +45,7 @@ class Weights:
 
     def replaced(self, arrays: list[np.ndarray]) -> "Weights":
         """The same network with other numbers, given in the order of `arrays`."""
-        layers = tuple(Layer(arrays[2 * i], arrays[2 * i + 1], layer.curved) for i, layer in enumerate(self.whole))
+        layers = tuple(Layer(arrays[2 * i], arrays[2 * i + 1], layer.activation) for i, layer in enumerate(self.whole))
         return Weights(layers[: len(self.encoder)], layers[len(self.encoder) :])
 
     def astype(self, dtype: type) -> "Weights":
@@ -53,31 +55,31 @@ class Weights:
 
 def run(chain: Chain, x: np.ndarray) -> np.ndarray:
     """Forward pass, shape (n_in,) or (samples, n_in) -> (n_out,) or (samples, n_out)."""
-    for matrix, offset, curved in chain:
+    for matrix, offset, activation in chain:
         x = x @ matrix
         x += offset
-        if curved:
-            np.tanh(x, out=x)
+        if activation != LINEAR:
+            ACTIVATIONS[activation].apply(x)
     return x
 
 
 def trace(chain: Chain, x: np.ndarray) -> Trace:
     """Forward pass that keeps what the other passes need."""
     values = [x]
-    for matrix, offset, curved in chain:
+    for matrix, offset, activation in chain:
         x = x @ matrix
         x += offset
-        if curved:
-            np.tanh(x, out=x)
+        if activation != LINEAR:
+            ACTIVATIONS[activation].apply(x)
         values.append(x)
     return values
 
 
 def pull(chain: Chain, values: Trace, gradient: np.ndarray) -> np.ndarray:
     """Gradient of a scalar with respect to the output -> with respect to the input, shapes (samples, n)."""
-    for (matrix, _, curved), value in zip(reversed(chain), reversed(values), strict=False):
-        if curved:
-            gradient = gradient * (1.0 - value * value)
+    for (matrix, _, activation), value in zip(reversed(chain), reversed(values), strict=False):
+        if activation != LINEAR:
+            gradient = gradient * ACTIVATIONS[activation].slope(value)
         gradient = gradient @ matrix.T
     return gradient
 
@@ -86,9 +88,9 @@ def pull_weights(chain: Chain, values: Trace, gradient: np.ndarray) -> list[np.n
     """Gradient with respect to the output -> with respect to every matrix and offset, summed over the samples."""
     found: list[np.ndarray] = []
     for index in range(len(chain) - 1, -1, -1):
-        matrix, _, curved = chain[index]
-        if curved:
-            gradient = gradient * (1.0 - values[index + 1] ** 2)
+        matrix, _, activation = chain[index]
+        if activation != LINEAR:
+            gradient = gradient * ACTIVATIONS[activation].slope(values[index + 1])
         found.append(gradient.sum(axis=0))
         found.append(values[index].T @ gradient)
         if index:
@@ -98,10 +100,10 @@ def pull_weights(chain: Chain, values: Trace, gradient: np.ndarray) -> list[np.n
 
 def push(chain: Chain, values: Trace, tangent: np.ndarray) -> np.ndarray:
     """Change of the input -> change of the output to first order, shapes (samples, n)."""
-    for (matrix, _, curved), value in zip(chain, values[1:], strict=True):
+    for (matrix, _, activation), value in zip(chain, values[1:], strict=True):
         tangent = tangent @ matrix
-        if curved:
-            tangent *= 1.0 - value * value
+        if activation != LINEAR:
+            tangent *= ACTIVATIONS[activation].slope(value)
     return tangent
 
 
@@ -121,8 +123,8 @@ class Curvature:
         self._slopes: list[np.ndarray | None] = []
         self._gradients: list[np.ndarray] = []
         gradient = w
-        for (matrix, _, curved), value in zip(reversed(chain), reversed(self._values), strict=False):
-            slope = 1.0 - value * value if curved else None
+        for (matrix, _, activation), value in zip(reversed(chain), reversed(self._values), strict=False):
+            slope = None if activation == LINEAR else ACTIVATIONS[activation].slope(value)
             self._slopes.append(slope)
             self._gradients.append(gradient)
             gradient = (gradient if slope is None else gradient * slope) @ matrix.T
@@ -142,10 +144,9 @@ class Curvature:
         for index in range(len(self._chain) - 1, -1, -1):
             slope = self._slopes[index]
             if slope is not None:
-                # d/da of (1 - tanh(a)^2) is -2 tanh(a) (1 - tanh(a)^2).
-                bend = -2.0 * self._values[index + 1] * slope * tangents[index] * self._gradients[index]
+                bend = ACTIVATIONS[self._chain[index].activation].bend(self._values[index + 1], slope)
+                bend = bend * tangents[index] * self._gradients[index]
                 second = bend if second is None else second * slope + bend
             if second is not None:
                 second = second @ self._chain[index].matrix.T
-        assert second is not None or not any(layer.curved for layer in self._chain)
         return tangent, np.zeros_like(self.gradient) if second is None else second

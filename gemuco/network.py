@@ -6,32 +6,47 @@ from itertools import pairwise
 import torch
 from torch import nn
 
-from gemuco.kernels import Layer, Weights
+from gemuco.activation import LINEAR, check
+from gemuco.kernels import Chain, Layer, Weights
+
+MODULES: dict[str, type[nn.Module]] = {
+    "tanh": nn.Tanh,
+    "sigmoid": nn.Sigmoid,
+    "relu": nn.ReLU,
+    "elu": nn.ELU,
+    "softplus": nn.Softplus,
+}
 
 
-def _chain(sizes: Sequence[int]) -> nn.Sequential:
+def _chain(sizes: Sequence[int], activation: str) -> nn.Sequential:
     layers: list[nn.Module] = []
     for index, (wide, narrow) in enumerate(pairwise(sizes)):
         if index:
-            layers.append(nn.Tanh())
+            layers.append(MODULES[activation]())
         layers.append(nn.Linear(wide, narrow))
     return nn.Sequential(*layers)
 
 
+def _linear(chain: nn.Sequential) -> list[nn.Linear]:
+    return [layer for layer in chain if isinstance(layer, nn.Linear)]
+
+
 class Network(nn.Module):
-    """Encoder and decoder, tanh between linear layers; the latent state and the output are linear.
+    """Encoder and decoder, an activation between linear layers; the latent state and the output are linear.
 
     Args:
         inputs: Length of x_in, m and p together.
         outputs: Length of x_out.
         hidden: Widths from the input to the latent state; the decoder mirrors them.
         latent: Length of z.
+        activation: Its name.
     """
 
-    def __init__(self, inputs: int, outputs: int, hidden: Sequence[int], latent: int) -> None:
+    def __init__(self, inputs: int, outputs: int, hidden: Sequence[int], latent: int, activation: str = "tanh") -> None:
         super().__init__()
-        self.encoder = _chain([inputs, *hidden, latent])
-        self.decoder = _chain([latent, *reversed(hidden), outputs])
+        self.activation = check(activation)
+        self.encoder = _chain([inputs, *hidden, latent], activation)
+        self.decoder = _chain([latent, *reversed(hidden), outputs], activation)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Inputs (samples, inputs) -> x_out (samples, outputs)."""
@@ -40,15 +55,29 @@ class Network(nn.Module):
     def weights(self) -> Weights:
         """A copy of W for the numpy kernels."""
 
-        def export(chain: nn.Sequential) -> tuple[Layer, ...]:
-            linear = [layer for layer in chain if isinstance(layer, nn.Linear)]
+        def export(chain: nn.Sequential) -> Chain:
+            linear = _linear(chain)
             return tuple(
                 Layer(
                     layer.weight.detach().numpy().T.copy(),
                     layer.bias.detach().numpy().copy(),
-                    index < len(linear) - 1,
+                    self.activation if index < len(linear) - 1 else LINEAR,
                 )
                 for index, layer in enumerate(linear)
             )
 
         return Weights(export(self.encoder), export(self.decoder))
+
+    @classmethod
+    def of(cls, weights: Weights) -> "Network":
+        """The network that has a given W, to train it further."""
+        widths = [layer.matrix.shape[0] for layer in weights.encoder]
+        names = {layer.activation for layer in weights.whole} - {LINEAR}
+        latent, outputs = weights.decoder[0].matrix.shape[0], weights.decoder[-1].matrix.shape[1]
+        network = cls(widths[0], outputs, widths[1:], latent, names.pop() if names else "tanh")
+        linear = _linear(network.encoder) + _linear(network.decoder)
+        with torch.no_grad():
+            for layer, (matrix, offset, _) in zip(linear, weights.whole, strict=True):
+                layer.weight.copy_(torch.from_numpy(matrix.T.copy()))
+                layer.bias.copy_(torch.from_numpy(offset.copy()))
+        return network

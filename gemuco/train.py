@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from gemuco.activation import check
 from gemuco.anomaly import Normal
 from gemuco.dataset import Dataset
-from gemuco.errors import NotEnoughData, SchemaError
+from gemuco.errors import NotEnoughData
 from gemuco.estimate import STARTS, latent_search
 from gemuco.masks import Mask, all_masks, bits, label, mask
 from gemuco.network import Network
@@ -30,7 +31,7 @@ class TrainConfig:
     Attributes:
         hidden: Widths of the encoder's layers; the decoder mirrors them.
         latent: Length of z.
-        activation: Only `tanh` is known.
+        activation: What bends the layers: tanh, sigmoid, relu, elu or softplus.
         bias_size: Length of p, one p per condition; 0 without parametric bias.
         epochs: At most so many passes over the data.
         batch: Samples per step.
@@ -54,8 +55,7 @@ class TrainConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if self.activation != "tanh":
-            raise SchemaError(f"Activation '{self.activation}' is not known. Known activations: tanh.")
+        check(self.activation)
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +116,7 @@ class _Trainer:
             raise NotEnoughData(f"No training sample has all signals of any mask ({names}); check what was recorded.")
         torch.manual_seed(config.seed)
         inputs = self.through.shape[1] + len(self.x_in) + config.bias_size
-        self.network = Network(inputs, len(layout.indices(x_out)), config.hidden, config.latent)
+        self.network = Network(inputs, len(layout.indices(x_out)), config.hidden, config.latent, config.activation)
         self.biases = torch.nn.Parameter(torch.zeros(len(data.conditions), config.bias_size))
         self.generator = torch.Generator().manual_seed(config.seed)
 

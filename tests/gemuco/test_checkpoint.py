@@ -69,7 +69,7 @@ def break_tensor(folder):
         (lambda f: change(f, x_out=["joint_position"]), "is damaged"),
         (lambda f: change(f, signals=[]), "is damaged"),
         (lambda f: change(f, normal=[]), "is damaged"),
-        (lambda f: change(f, network={"encoder": [True] * 9, "decoder": [False]}), "is damaged"),
+        (lambda f: change(f, network={"encoder": ["tanh"] * 9, "decoder": ["linear"]}), "is damaged"),
         (break_tensor, "is not the one its manifest describes"),
         (lambda f: (f / "model.safetensors").write_bytes(b""), "is not the one its manifest describes"),
     ],

@@ -2,16 +2,18 @@ import numpy as np
 import pytest
 import torch
 
+from gemuco.activation import ACTIVATIONS
+from gemuco.errors import SchemaError
 from gemuco.kernels import Curvature, pull, pull_weights, push, run, trace
-from gemuco.network import Network
+from gemuco.network import MODULES, Network
 
 INPUTS, OUTPUTS, SAMPLES = 9, 6, 4
 
 
-@pytest.fixture
-def network():
+@pytest.fixture(params=sorted(ACTIVATIONS))
+def network(request):
     torch.manual_seed(3)
-    return Network(INPUTS, OUTPUTS, (20, 10), 5)
+    return Network(INPUTS, OUTPUTS, (20, 10), 5, request.param)
 
 
 @pytest.fixture
@@ -70,3 +72,36 @@ def test_second_derivative_agrees_with_finite_differences(network, x, seed):
         moved[:, column] = step
         rise = [np.sum(Curvature(chain, x + s * moved, seed).gradient * tangent, axis=1) for s in (1, -1)]
         np.testing.assert_allclose(mixed[:, column], (rise[0] - rise[1]) / (2 * step), rtol=1e-5, atol=1e-8)
+
+
+@pytest.mark.parametrize("name", sorted(ACTIVATIONS))
+def test_slope_and_bend_agree_with_finite_differences(name):
+    activation, step = ACTIVATIONS[name], 1e-5
+    x = np.array([-30.0, -3.0, -0.7, -0.1, 0.2, 0.9, 4.0, 30.0])
+
+    def value(at):
+        y = at.copy()
+        activation.apply(y)
+        return y
+
+    slope = activation.slope(value(x))
+    np.testing.assert_allclose(slope, (value(x + step) - value(x - step)) / (2 * step), rtol=1e-6, atol=1e-9)
+    rise = activation.slope(value(x + step)) - activation.slope(value(x - step))
+    np.testing.assert_allclose(activation.bend(value(x), slope), rise / (2 * step), rtol=1e-6, atol=1e-9)
+    single = x.astype(np.float32)
+    activation.apply(single)
+    assert single.dtype == np.float32
+    assert np.isfinite(single).all()
+
+
+def test_every_activation_is_known_to_torch_and_numpy():
+    assert set(MODULES) == set(ACTIVATIONS)
+    with pytest.raises(SchemaError, match="'swish' is not known. Known activations: tanh, sigmoid, relu"):
+        Network(INPUTS, OUTPUTS, (20,), 5, "swish")
+
+
+def test_a_network_comes_back_from_its_weights(network, x):
+    again = Network.of(network.weights())
+    assert again.activation == network.activation
+    with torch.no_grad():
+        torch.testing.assert_close(again(torch.from_numpy(x)), network(torch.from_numpy(x)), rtol=0, atol=0)

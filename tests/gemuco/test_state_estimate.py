@@ -3,8 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gemuco.errors import UnknownSignal, WrongSize
-from gemuco.train import SchemaError, TrainConfig, fit
+from gemuco.errors import SchemaError, UnknownSignal, WrongSize
+from gemuco.train import TrainConfig, fit
 
 FL = frozenset({"muscle_tension", "muscle_length"})
 

@@ -86,8 +86,8 @@ def test_measure_and_outputs_are_options(data, structure):
 
 
 def test_says_what_is_wrong(data):
-    with pytest.raises(SchemaError, match="Known activations: tanh"):
-        TrainConfig(activation="relu")
+    with pytest.raises(SchemaError, match="Known activations: tanh, sigmoid, relu"):
+        TrainConfig(activation="swish")
     with pytest.raises(SchemaError, match="Known: mse, rmse"):
         Thresholds(measure="mae")
     with pytest.raises(UnknownSignal, match="Mask names 'wire'"):
