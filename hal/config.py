@@ -1,5 +1,6 @@
 """robots/*.yaml -> typed models. An unknown key is an error that lists the known ones."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -20,6 +21,17 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
+class ComputedConfig(Section):
+    """How a signal follows from another one of the same sample."""
+
+    by: str
+    """`module:name` of a function: (values, **settings) -> the signal's values."""
+    inputs: str = Field(alias="from")
+    """The signal it is computed from."""
+    settings: dict[str, Any] = {}
+    """Passed to the function; lists as arrays."""
+
+
 class SignalConfig(Section):
     """A named vector of sensor or control values."""
 
@@ -27,6 +39,15 @@ class SignalConfig(Section):
     elements: tuple[str, ...] = Field(min_length=1)
     stale_after: Positive = 0.02
     """Age [s] beyond which an element is not valid any more."""
+    source: Literal["hal", "vision"] = "hal"
+    """Who publishes it: the HAL, or a camera's process of its own."""
+    computed: ComputedConfig | None = None
+    """Given: no device measures it, the HAL computes it."""
+
+    @property
+    def is_measured(self) -> bool:
+        """Whether devices on the buses measure it."""
+        return self.source == "hal" and self.computed is None
 
     @property
     def size(self) -> int:
@@ -112,6 +133,8 @@ class RobotConfig(Section):
     devices: dict[str, DeviceConfig] = {}
     simulator: str | None = None
     """`module:name` of what stands in for the hardware."""
+    conditions: tuple[str, ...] = ()
+    """Ways the body is known to be, such as the tools it may hold; the first unless said otherwise."""
     model: dict[str, Any] = {}
     """What the body schema service reads; it checks this section itself."""
     collect: dict[str, Any] = {}
@@ -124,10 +147,16 @@ class RobotConfig(Section):
         signals = ", ".join(self.signals)
         if self.command.signal not in self.signals:
             raise ValueError(f"command.signal '{self.command.signal}' is not a signal. Known: {signals}.")
+        if not self.signals[self.command.signal].is_measured:
+            raise ValueError(f"command.signal '{self.command.signal}' must be measured by devices, to start from it.")
+        for name in self.signals:
+            self._computed_fits(name)
         for name, limit in self.limits.items():
             if name not in self.signals:
                 raise ValueError(f"limits.{name} is not a signal. Known: {signals}.")
             self._limits_fit(name, limit)
+        if len(set(self.conditions)) < len(self.conditions) or not all(self.conditions):
+            raise ValueError(f"conditions must be names that differ, not {', '.join(map(repr, self.conditions))}.")
         addresses: dict[tuple[str, int], str] = {}
         elements: dict[str, str] = {}
         for name, device in self.devices.items():
@@ -139,10 +168,24 @@ class RobotConfig(Section):
             if taken != name:
                 raise ValueError(f"devices '{taken}' and '{name}' both claim element '{device.element}'.")
         if self.devices:
-            missing = [e for e in self.element_names() if e not in elements]
+            missing = [e for e in self.element_names(self.measured) if e not in elements]
             if missing:
-                raise ValueError(f"no device measures {', '.join(missing)}. Add one, or drop the element.")
+                raise ValueError(
+                    f"no device measures {', '.join(missing)}. Add one, drop the element, or say `source: vision`."
+                )
         return self
+
+    def _computed_fits(self, name: str) -> None:
+        computed, source = self.signals[name].computed, self.signals[name].source
+        if computed is None:
+            return
+        if source != "hal":
+            raise ValueError(f"signals.{name} is computed by the HAL, so its source cannot be '{source}'.")
+        if computed.inputs not in self.measured:
+            raise ValueError(
+                f"signals.{name}.computed.from '{computed.inputs}' is not a signal that devices measure. "
+                f"Those are {', '.join(self.measured)}."
+            )
 
     def _limits_fit(self, name: str, limit: LimitConfig) -> None:
         low, high = self.bounds(name)
@@ -150,21 +193,35 @@ class RobotConfig(Section):
             raise ValueError(f"limits.{name}: low must be below high in every element.")
         if limit.soft_high and limit.trip_high and limit.soft_high >= limit.trip_high:
             raise ValueError(f"limits.{name}: soft_high must be below trip_high.")
+        if self.signals[name].source != "hal" and (limit.soft_high or limit.trip_high):
+            raise ValueError(f"limits.{name}: soft_high and trip_high are the HAL's, which does not see this signal.")
 
     def _device_fits(self, name: str, device: DeviceConfig) -> None:
         if device.kind not in self.kinds:
             raise ValueError(f"device '{name}' is of kind '{device.kind}'. Known kinds: {', '.join(self.kinds)}.")
         if device.bus not in self.buses:
             raise ValueError(f"device '{name}' is on bus '{device.bus}'. Known buses: {', '.join(self.buses)}.")
-        if device.element not in self.element_names():
+        known = self.element_names(self.measured)
+        if device.element not in known:
+            which = "a device cannot measure" if device.element in self.element_names() else "no signal has"
             raise ValueError(
-                f"device '{name}' serves '{device.element}', which no signal has. "
-                f"Known elements: {', '.join(self.element_names())}."
+                f"device '{name}' serves '{device.element}', which {which}. Known elements: {', '.join(known)}."
             )
 
-    def element_names(self) -> list[str]:
-        """`signal.element` of every value of the robot, in order."""
-        return [f"{name}.{element}" for name, signal in self.signals.items() for element in signal.elements]
+    @property
+    def measured(self) -> tuple[str, ...]:
+        """Names of the signals that devices measure."""
+        return tuple(name for name, signal in self.signals.items() if signal.is_measured)
+
+    @property
+    def seen(self) -> tuple[str, ...]:
+        """Names of the signals that a camera's process publishes."""
+        return tuple(name for name, signal in self.signals.items() if signal.source == "vision")
+
+    def element_names(self, signals: Iterable[str] | None = None) -> list[str]:
+        """`signal.element` of every value of some signals, or of all, in order."""
+        names = self.signals if signals is None else signals
+        return [f"{name}.{element}" for name in names for element in self.signals[name].elements]
 
     def bounds(self, signal: str) -> tuple[np.ndarray, np.ndarray]:
         """Lowest and highest value of a signal [its unit], each of shape (n,); infinite where not stated."""
@@ -208,11 +265,13 @@ def load_robot(path: str | Path) -> RobotConfig:
 
 
 def explain(error: ValidationError, model: type[BaseModel]) -> str:
-    """The first problem in one sentence; for an unknown key, with the keys that are known there."""
-    first = error.errors()[0]
+    """One problem in one sentence: an unknown key, with the keys that are known there, or else the first."""
+    problems = error.errors()
+    first = next((problem for problem in problems if problem["type"] == "extra_forbidden"), problems[0])
     where = ".".join(str(part) for part in first["loc"])
     if first["type"] == "extra_forbidden":
-        known = ", ".join(_model_at(model, first["loc"][:-1]).model_fields)
+        fields = _model_at(model, first["loc"][:-1]).model_fields
+        known = ", ".join(field.alias or name for name, field in fields.items())
         return f"unknown key '{where}'. Known keys there: {known}."
     message = first["msg"].removeprefix("Value error, ")
     more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
@@ -233,6 +292,3 @@ def _model_at(model: type[BaseModel], location: tuple[int | str, ...]) -> type[B
 def _beside(path: Path) -> str:
     found = sorted(str(other) for other in path.parent.glob("*.yaml")) if path.parent.is_dir() else []
     return f"Robot files there: {', '.join(found)}." if found else f"Is '{path.parent}' the right folder?"
-
-
-Backend = Literal["bus", "direct"]

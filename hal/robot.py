@@ -70,7 +70,7 @@ class Robot:
         self._position = self._nothing
         self._position_known = -np.inf
         self._desired: tuple[np.ndarray, float] | None = None
-        self._measured = {name: np.full(signal.size, np.nan) for name, signal in config.signals.items()}
+        self._measured = {name: np.full(config.signals[name].size, np.nan) for name in self._assembler.signals}
         self._number = 0
         self._incomplete = 0
         self._is_open = False

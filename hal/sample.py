@@ -1,10 +1,11 @@
 """What the robot hands out each cycle: what was measured, and what was really sent."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from hal.computed import function_of
 from hal.config import RobotConfig
 from hal.device import Device
 from hal.errors import ConfigError
@@ -58,17 +59,33 @@ class Applied:
     limited_by: list[str]
 
 
+@dataclass(frozen=True, slots=True)
+class _Computed:
+    """A signal that is computed: from which slice of what was measured, how, and until what age [s]."""
+
+    function: Callable[[np.ndarray], np.ndarray]
+    inputs: slice
+    size: int
+    stale_after: float
+
+
 class Assembler:
     """Gathers the readings of all devices into the signals of the robot file, without a loop over elements."""
 
     def __init__(self, config: RobotConfig, devices: Sequence[Device]) -> None:
         """Work out where each device's values go.
 
+        Signals that a camera's process publishes are served only where a device measures them, as a simulator without
+        a bus does.
+
         Raises:
-            ConfigError: The devices measure an element twice, not at all, or one that the robot does not have.
+            ConfigError: The devices measure an element twice, not at all, or one that the robot does not have; or a
+                signal cannot be computed.
         """
-        names = config.element_names()
         measured = [element for device in devices for element in device.measures]
+        seen = [name for name in config.seen if any(e in measured for e in config.element_names([name]))]
+        direct = [name for name in config.signals if name in config.measured or name in seen]
+        names = config.element_names(direct)
         wrong = sorted(set(names) ^ set(measured)) or sorted({e for e in measured if measured.count(e) > 1})
         if wrong:
             raise ConfigError(
@@ -79,14 +96,26 @@ class Assembler:
         place = {element: index for index, element in enumerate(measured)}
         self._order = np.array([place[name] for name in names])
         self._stale_after = np.repeat(
-            [signal.stale_after for signal in config.signals.values()],
-            [signal.size for signal in config.signals.values()],
+            [config.signals[name].stale_after for name in direct], [config.signals[name].size for name in direct]
         )
-        self._slices: dict[str, slice] = {}
+        slices: dict[str, slice] = {}
         start = 0
+        for name in direct:
+            slices[name] = slice(start, start + config.signals[name].size)
+            start += config.signals[name].size
+        self._parts: dict[str, slice | _Computed] = {}
         for name, signal in config.signals.items():
-            self._slices[name] = slice(start, start + signal.size)
-            start += signal.size
+            if name in slices:
+                self._parts[name] = slices[name]
+            elif signal.computed is not None:
+                inputs = slices[signal.computed.inputs]
+                function = function_of(config, name)
+                self._parts[name] = _Computed(function, inputs, signal.size, signal.stale_after)
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """Signals that a sample has, in the order of the robot file."""
+        return tuple(self._parts)
 
     def assemble(self, now: float) -> tuple[Arrays, Arrays, Arrays]:
         """Values, ages [s] and validity of every signal at monotonic time `now` [s], in fresh arrays."""
@@ -97,9 +126,23 @@ class Assembler:
         age = np.maximum(now - received, 0.0)
         valid = (age <= self._stale_after) & np.isfinite(values)
         values[~valid] = np.nan
-        slices = self._slices.items()
-        return (
-            {name: values[part] for name, part in slices},
-            {name: age[part] for name, part in slices},
-            {name: valid[part] for name, part in slices},
-        )
+        found: tuple[Arrays, Arrays, Arrays] = ({}, {}, {})
+        for name, part in self._parts.items():
+            if isinstance(part, slice):
+                one = values[part], age[part], valid[part]
+            else:
+                one = _compute(part, values[part.inputs], age[part.inputs])
+            for arrays, array in zip(found, one, strict=True):
+                arrays[name] = array
+        return found
+
+
+def _compute(part: _Computed, values: np.ndarray, age: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Values, ages [s] and validity of a computed signal: valid only if every input is, and as old as the oldest."""
+    oldest = float(age.max())
+    ages = np.full(part.size, oldest)
+    if oldest > part.stale_after or not np.isfinite(values).all():
+        return np.full(part.size, np.nan), ages, np.zeros(part.size, bool)
+    computed = np.asarray(part.function(values), float)
+    valid = np.isfinite(computed)
+    return np.where(valid, computed, np.nan), ages, valid

@@ -26,7 +26,8 @@ def fingerprint(robot: RobotConfig) -> str:
     """Hash of what a model depends on: the signals, and how the robot file wants data collected and it trained."""
     model = model_config(robot)
     content = {
-        "signals": {name: list(signal.elements) for name, signal in robot.signals.items()},
+        "signals": {name: list(robot.signals[name].elements) for name in model.signals or robot.signals},
+        "conditions": list(robot.conditions),
         "collect": robot.collect,
         "model": [part.model_dump() for part in (model.network, model.structure, model.training)],
     }

@@ -137,12 +137,14 @@ def _problem(health: dict[str, Any]) -> str:
 def _describe(config: RobotConfig) -> dict[str, Any]:
     """What a client must know of the robot: signals with units and elements, command, limits, rates, devices."""
     signals = {
-        name: {"unit": signal.unit, "elements": list(signal.elements)} for name, signal in config.signals.items()
+        name: {"unit": signal.unit, "elements": list(signal.elements), "source": signal.source}
+        for name, signal in config.signals.items()
     }
     return {
         "description": config.description,
         "signals": signals,
         "command": config.command.model_dump(),
+        "conditions": list(config.conditions),
         "limits": {name: limit.model_dump(exclude_none=True) for name, limit in config.limits.items()},
         "rates": config.rates.model_dump(),
         "devices": {name: {"kind": device.kind, "element": device.element} for name, device in config.devices.items()},

@@ -7,13 +7,14 @@ from gemuco.errors import CheckpointError
 from gemuco.schema import BodySchema
 from gemuco.signals import Layout, Signal
 from hal.config import RobotConfig
+from services.model_config import model_config
 
 
 def layout_of(robot: RobotConfig) -> Layout:
-    """The robot file's signals as the model's layout."""
-    return Layout(
-        tuple(Signal(name, signal.size, signal.unit, signal.elements) for name, signal in robot.signals.items())
-    )
+    """The signals that the robot file gives the model, all of them unless it names some."""
+    names = model_config(robot).signals or tuple(robot.signals)
+    chosen = ((name, robot.signals[name]) for name in names)
+    return Layout(tuple(Signal(name, signal.size, signal.unit, signal.elements) for name, signal in chosen))
 
 
 def load_model(robot: RobotConfig, folder: Path) -> BodySchema:
@@ -26,7 +27,7 @@ def load_model(robot: RobotConfig, folder: Path) -> BodySchema:
         raise CheckpointError(f"There is no model in '{folder}'. Make one with `gemuco collect` and `gemuco train`.")
     schema = BodySchema.load(folder)
     if set(schema.layout.signals) != set(layout_of(robot).signals):
-        theirs, ours = ", ".join(schema.layout.names), ", ".join(robot.signals)
+        theirs, ours = ", ".join(schema.layout.names), ", ".join(layout_of(robot).names)
         raise CheckpointError(
             f"The model in '{folder}' is of another body: its signals are {theirs}; the robot file's are {ours}, "
             "or their elements or units differ. Train again."

@@ -75,6 +75,8 @@ class AnomalyConfig(Section):
 class ModelConfig(Section):
     """The whole `model` section."""
 
+    signals: tuple[str, ...] = ()
+    """The signals that are the body schema's x; all of the robot's if none is named."""
     network: NetworkConfig = NetworkConfig()
     structure: StructureConfig = StructureConfig()
     training: TrainingConfig = TrainingConfig()
@@ -108,6 +110,14 @@ def model_config(robot: RobotConfig) -> ModelConfig:
         ConfigError: An unknown key, a value out of range, or a signal the robot does not have.
     """
     model = _section(robot, "model", ModelConfig)
+    wrong = [name for name in model.signals if name not in robot.signals]
+    wrong += [name for name in model.signals if model.signals.count(name) > 1]
+    if wrong:
+        known = ", ".join(robot.signals)
+        raise ConfigError(
+            f"Robot '{robot.robot}': model.signals names '{wrong[0]}', which is no signal or there twice. "
+            f"Known: {known}."
+        )
     for key in ("target", "effort"):
         signal = getattr(model.control, key, None)
         if signal is not None and signal not in robot.signals:

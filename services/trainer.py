@@ -55,7 +55,8 @@ def train(robot: RobotConfig, dataset: Dataset, seed: int, progress: Progress) -
     if dataset.layout != layout_of(robot):
         raise DatasetError(
             f"The data are of another robot: their signals are {', '.join(dataset.layout.names)}, "
-            f"those of '{robot.robot}' are {', '.join(robot.signals)}, or elements differ. Use `gemuco collect`."
+            f"those of '{robot.robot}' are {', '.join(layout_of(robot).names)}, or elements differ. "
+            "Use `gemuco collect`."
         )
     started = time.monotonic()
     first = _train_config(config, config.structure.epochs, seed)

@@ -35,14 +35,14 @@ class WorldClock:
 
 
 class DirectDevice(Device):
-    """Every sensor and servo of a world in one device; it can neither fall silent nor fault."""
+    """Every sensor, camera and servo of a world in one device; it can neither fall silent nor fault."""
 
     def __init__(self, config: RobotConfig, world: World, clock: WorldClock, name: str = "direct") -> None:
         self.name = name
-        self.measures = tuple(config.element_names())
+        self._signals = tuple(name for name, signal in config.signals.items() if signal.computed is None)
+        self.measures = tuple(config.element_names(self._signals))
         signal = config.command.signal
         self.commands = tuple(f"{signal}.{element}" for element in config.signals[signal].elements)
-        self._signals = tuple(config.signals)
         self._commanded = signal
         self._world = world
         self._clock = clock

@@ -25,7 +25,7 @@ def test_shipped_sections_are_understood() -> None:
 @pytest.mark.parametrize(
     ("section", "content", "sentence"),
     [
-        ("model", {"netwrok": {}}, "unknown key 'netwrok'. Known keys there: network, structure, training"),
+        ("model", {"netwrok": {}}, "unknown key 'netwrok'. Known keys there: signals, network, structure"),
         (
             "model",
             {"update": {"windows": 3}},

@@ -1,0 +1,57 @@
+"""Signals that no device measures: what follows from another signal of the same sample."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from hal import registry
+from hal.config import RobotConfig
+from hal.errors import ConfigError
+
+LEAST_FORCE = 1.0
+"""Total force [N] below which a center of pressure is not told: it would be noise divided by nothing."""
+
+
+def center_of_pressure(forces: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Where the ground pushes, which for a body at rest is below its center of gravity.
+
+    Args:
+        forces: Of each load cell, upwards [N], shape (n,).
+        points: Where the cells are [m], shape (n, 2).
+
+    Returns:
+        Mean of the points weighted by force [m], shape (2,); NaN if the total force is too small to tell.
+    """
+    total = forces.sum()
+    if not total > LEAST_FORCE:
+        return np.full(points.shape[1], np.nan)
+    return forces @ points / total
+
+
+def function_of(config: RobotConfig, signal: str) -> Callable[[np.ndarray], np.ndarray]:
+    """What computes a signal [its unit], shape (n,), from the values of the signal it is computed from.
+
+    Raises:
+        ConfigError: There is no such function, or what it returns does not fit the signal.
+    """
+    computed = config.signals[signal].computed
+    if computed is None:
+        raise ConfigError(f"Signal '{signal}' of '{config.robot}' is not computed.")
+    settings: dict[str, Any] = {
+        key: np.array(value, float) if isinstance(value, list) else value for key, value in computed.settings.items()
+    }
+    function: Callable[[np.ndarray], np.ndarray] = partial(registry.load(computed.by), **settings)
+    where = f"signals.{signal}.computed of '{config.robot}'"
+    size = config.signals[computed.inputs].size
+    try:
+        shape = np.shape(function(np.full(size, 10.0)))
+    except (TypeError, ValueError, IndexError, AttributeError) as error:
+        raise ConfigError(
+            f"{where} cannot be computed by {computed.by} from {size} values of {computed.inputs} with the settings "
+            f"{', '.join(settings) or '(none)'}: {error}."
+        ) from None
+    if shape != (config.signals[signal].size,):
+        raise ConfigError(f"{where} has shape {shape}, but the signal has {config.signals[signal].size} elements.")
+    return function
