@@ -48,6 +48,7 @@ class BulletBody:
         self._body = pybullet.loadURDF(str(urdf), useFixedBase=True, flags=flags, **client)
         count = pybullet.getNumJoints(self._body, **client)
         indices = {pybullet.getJointInfo(self._body, i, **client)[1].decode(): i for i in range(count)}
+        self._index = indices
         self._joints = [indices[name] for name in joints]
         for index in range(-1, count):
             pybullet.changeDynamics(
@@ -87,6 +88,20 @@ class BulletBody:
         bias = pybullet.calculateInverseDynamics(self._body, position, velocity, self._still, physicsClientId=client)
         return np.array(mass), np.array(bias)
 
+    def place(self, position: np.ndarray) -> None:
+        """Put the joints at `position` [rad], shape (n,), at rest: kinematics without physics."""
+        for index, angle in zip(self._joints, position.tolist(), strict=True):
+            pybullet.resetJointState(self._body, index, angle, 0.0, physicsClientId=self._client)
+        self.position[:] = position
+        self.velocity[:] = 0.0
+
+    def frame(self, joint: str) -> tuple[np.ndarray, np.ndarray]:
+        """Where the link behind `joint` is: orientation (3, 3) and origin [m] (3,) of its frame in the base's."""
+        index = self._index[joint]
+        state = pybullet.getLinkState(self._body, index, computeForwardKinematics=1, physicsClientId=self._client)
+        rotation = pybullet.getMatrixFromQuaternion(state[5])
+        return np.array(rotation).reshape(3, 3), np.array(state[4])
+
     def energy(self) -> float:
         """Kinetic and potential energy of the links [J]."""
         joints = range(pybullet.getNumJoints(self._body, physicsClientId=self._client))
@@ -98,7 +113,7 @@ class BulletBody:
 
     def add_mass(self, joint: str, mass: float, radius: float) -> None:
         """Put a ball of `mass` [kg] and `radius` [m] at the centre of mass of the link behind `joint`."""
-        index = self._joints[self._names().index(joint)]
+        index = self._index[joint]
         link_mass, _, inertia, *_ = pybullet.getDynamicsInfo(self._body, index, physicsClientId=self._client)
         added = 0.4 * mass * radius**2
         pybullet.changeDynamics(
@@ -114,8 +129,3 @@ class BulletBody:
         if self._client >= 0:
             pybullet.disconnect(physicsClientId=self._client)
             self._client = -1
-
-    def _names(self) -> list[str]:
-        return [
-            pybullet.getJointInfo(self._body, index, physicsClientId=self._client)[1].decode() for index in self._joints
-        ]

@@ -73,7 +73,9 @@ class Chain:
 
     @classmethod
     def from_urdf(cls, path: Path) -> Self:
-        """Read a URDF whose joints are all revolute, one behind the other, without turned origins.
+        """Read a URDF whose joints all turn, one behind the other, without turned origins.
+
+        A continuous joint has infinite limits.
 
         Raises:
             ValueError: The URDF describes something else.
@@ -85,7 +87,8 @@ class Chain:
             if _child(joint, "parent").get("link") != _child(before, "child").get("link"):
                 raise ValueError(f"{path.name}: joint '{joint.get('name')}' does not follow '{before.get('name')}'.")
         for joint in joints:
-            if joint.get("type") != "revolute" or _vector(_child(joint, "origin").get("rpy", "0 0 0")).any():
+            turns = joint.get("type") in ("revolute", "continuous")
+            if not turns or _vector(_child(joint, "origin").get("rpy", "0 0 0")).any():
                 raise ValueError(f"{path.name}: joint '{joint.get('name')}' is not revolute with a straight origin.")
         bodies = [_child(links[_child(joint, "child").get("link")], "inertial") for joint in joints]
         limits = [_child(joint, "limit") for joint in joints]
@@ -97,8 +100,8 @@ class Chain:
             offsets=np.array([_vector(_child(joint, "origin").get("xyz")) for joint in joints]),
             masses=np.array([float(_child(body, "mass").get("value", "nan")) for body in bodies]),
             centers=np.array([_vector(_child(body, "origin").get("xyz")) for body in bodies]),
-            low=np.array([float(limit.get("lower", "nan")) for limit in limits]),
-            high=np.array([float(limit.get("upper", "nan")) for limit in limits]),
+            low=np.array([float(limit.get("lower", "-inf")) for limit in limits]),
+            high=np.array([float(limit.get("upper", "inf")) for limit in limits]),
             moves=np.tri(len(joints) + 1, len(joints), -1, dtype=bool),
             _cross=cross,
             _cross_squared=cross @ cross,
@@ -119,6 +122,21 @@ class Chain:
         origins = np.zeros((size + 1, 3))
         np.cumsum(np.matmul(before, self.offsets[:, :, None])[:, :, 0], axis=0, out=origins[1:])
         return Pose(rotations, origins, axes)
+
+    def ends(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The last frame at many joint positions [rad], shape (k, n).
+
+        Returns:
+            Its orientations, shape (k, 3, 3), and origins [m], shape (k, 3), in base coordinates.
+        """
+        rotation = np.broadcast_to(_UPRIGHT, (len(positions), 3, 3))
+        origin = np.zeros((len(positions), 3))
+        sine, versine = np.sin(positions)[:, :, None, None], (1.0 - np.cos(positions))[:, :, None, None]
+        for joint, offset in enumerate(self.offsets):
+            origin = origin + rotation @ offset
+            turn = _UPRIGHT + sine[:, joint] * self._cross[joint] + versine[:, joint] * self._cross_squared[joint]
+            rotation = rotation @ turn
+        return rotation, origin
 
     def gravity_torque(self, position: np.ndarray) -> np.ndarray:
         """Joint torques [N m] that hold the links against gravity at joint positions [rad]; both of shape (n,)."""
