@@ -86,11 +86,36 @@ class DeviceConfig(Section):
     """Added to the kind's settings; a key given in both takes the device's value."""
 
 
-class LimitConfig(Section):
-    """Bounds of one signal, per element or one for all. For a command: what may be applied."""
+class RangeConfig(Section):
+    """Bounds of one signal, per element or one for all."""
 
     low: Finite | tuple[Finite, ...] | None = None
     high: Finite | tuple[Finite, ...] | None = None
+
+    def bounds(self, size: int, where: str) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest value, each of shape (size,); infinite where not stated.
+
+        Args:
+            size: How many elements the signal has.
+            where: Named in what is raised.
+
+        Raises:
+            ValueError: Another number of values, or low is not below high.
+        """
+        bounds = []
+        for label, value, default in (("low", self.low, -np.inf), ("high", self.high, np.inf)):
+            array = np.asarray(default if value is None else value, float)
+            if array.ndim and array.shape != (size,):
+                raise ValueError(f"{where}.{label} has {array.size} values, the signal has {size}.")
+            bounds.append(np.broadcast_to(array, (size,)).copy())
+        if np.any(bounds[0] >= bounds[1]):
+            raise ValueError(f"{where}: low must be below high in every element.")
+        return bounds[0], bounds[1]
+
+
+class LimitConfig(RangeConfig):
+    """What of a signal is allowed. For a command: what may be applied."""
+
     rate: Positive | None = None
     """Largest change of a command [unit/s]."""
     soft_high: Positive | None = None
@@ -188,9 +213,7 @@ class RobotConfig(Section):
             )
 
     def _limits_fit(self, name: str, limit: LimitConfig) -> None:
-        low, high = self.bounds(name)
-        if np.any(low >= high):
-            raise ValueError(f"limits.{name}: low must be below high in every element.")
+        self.bounds(name)
         if limit.soft_high and limit.trip_high and limit.soft_high >= limit.trip_high:
             raise ValueError(f"limits.{name}: soft_high must be below trip_high.")
         if self.signals[name].source != "hal" and (limit.soft_high or limit.trip_high):
@@ -225,15 +248,8 @@ class RobotConfig(Section):
 
     def bounds(self, signal: str) -> tuple[np.ndarray, np.ndarray]:
         """Lowest and highest value of a signal [its unit], each of shape (n,); infinite where not stated."""
-        size = self.signals[signal].size
         limit = self.limits.get(signal, LimitConfig())
-        bounds = []
-        for label, value, default in (("low", limit.low, -np.inf), ("high", limit.high, np.inf)):
-            array = np.asarray(default if value is None else value, float)
-            if array.ndim and array.shape != (size,):
-                raise ValueError(f"limits.{signal}.{label} has {array.size} values, the signal has {size}.")
-            bounds.append(np.broadcast_to(array, (size,)).copy())
-        return bounds[0], bounds[1]
+        return limit.bounds(self.signals[signal].size, f"limits.{signal}")
 
     def settings_of(self, device: str) -> dict[str, Any]:
         """The kind's settings with the device's own on top."""

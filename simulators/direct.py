@@ -7,6 +7,7 @@ import numpy as np
 
 from hal.config import RobotConfig
 from hal.device import Device, DeviceHealth, DeviceState, Reading
+from hal.robot import Robot
 from simulators.world import World
 
 
@@ -88,3 +89,10 @@ class DirectDevice(Device):
     def _drive(self, targets: np.ndarray, enabled: bool) -> None:
         for element, target in zip(self.commands, targets.tolist(), strict=True):
             self._world.drive(element, target, enabled)
+
+
+def direct_robot(config: RobotConfig, world: World) -> Robot:
+    """A whole robot that is a world without a bus, as fast as it computes; not opened yet."""
+    clock = WorldClock(world)
+    device = DirectDevice(config, world, clock)
+    return Robot(config, devices=[device], buses=(), clock=clock, source="simulated")

@@ -1,6 +1,6 @@
 """Parts of a body that can break, named as a person types them: `muscle_cut:biceps`, `heavy_object`."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 
 class UnknownPart(ValueError):
@@ -9,6 +9,7 @@ class UnknownPart(ValueError):
 
 MUSCLE_CUT = "muscle_cut"
 HEAVY_OBJECT = "heavy_object"
+TOOL_CHANGED = "tool_changed"
 
 
 def known_parts(muscles: Iterable[str]) -> list[str]:
@@ -27,3 +28,31 @@ def check_part(part: str, muscles: Iterable[str]) -> tuple[str, str]:
         raise UnknownPart(f"'{part}' is no part that can break. Known parts: {', '.join(known)}.")
     kind, _, what = part.partition(":")
     return kind, what
+
+
+def check_condition(condition: str | None, known: Sequence[str]) -> str | None:
+    """The condition of a body; the first of the known ones, or None where there are none, if not given.
+
+    Raises:
+        UnknownPart: It is none of the known ones.
+    """
+    if condition is None:
+        return known[0] if known else None
+    if condition not in known:
+        raise UnknownPart(
+            f"'{condition}' is no condition of this body. Known conditions: {', '.join(known) or 'none'}."
+        )
+    return condition
+
+
+def changed_tool(part: str, known: Sequence[str]) -> str:
+    """The condition that `tool_changed:<condition>` asks for.
+
+    Raises:
+        UnknownPart: It asks for something else, or for a condition that is not known.
+    """
+    kind, _, condition = part.partition(":")
+    if kind != TOOL_CHANGED or condition not in known:
+        parts = ", ".join(f"{TOOL_CHANGED}:{name}" for name in known)
+        raise UnknownPart(f"'{part}' is no part that can break. Known parts: {parts}.")
+    return condition

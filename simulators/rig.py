@@ -10,6 +10,7 @@ import can
 import numpy as np
 
 from hal.config import BusConfig, RobotConfig
+from simulators.faults import TOOL_CHANGED
 from simulators.hub import HubServer
 from simulators.nodes.canopen_node import CanopenNode
 from simulators.nodes.drive import ServoDrive
@@ -124,7 +125,7 @@ class Rig:
         """Break something, or mend a node; the sentence tells what was done.
 
         `sensor_silent NODE`, `node_silent NODE`, `node_back NODE`, `node_reboot NODE`, `emcy NODE`; anything else is a
-        part of the world, as in `muscle_cut biceps`.
+        part of the world, as in `muscle_cut biceps` or `tool_changed CONDITION`.
 
         Raises:
             UnknownFault: There is no such fault, or no such node.
@@ -138,7 +139,7 @@ class Rig:
         except ValueError as error:
             known = ", ".join(f"{fault} NODE" for fault in _NODE_FAULTS)
             raise UnknownFault(f"{error} Faults of nodes: {known}.") from None
-        return f"Broke {' '.join(words)}."
+        return f"The tool is now {words[1]}." if words[0] == TOOL_CHANGED else f"Broke {' '.join(words)}."
 
     def truth(self) -> Mapping[str, np.ndarray]:
         """What is, without noise: every signal, shapes (n,)."""

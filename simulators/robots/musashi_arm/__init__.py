@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from simulators.faults import check_condition
 from simulators.robots.musashi_arm.body import VARIANTS, make_body
 from simulators.robots.musashi_arm.hardware import hardware
 from simulators.robots.musashi_arm.model import gravity_torque
@@ -22,28 +23,26 @@ class MusashiArm:
     """What stands in for the arm. PyBullet is imported when the first world is made."""
 
     variants = VARIANTS
+    conditions: tuple[str, ...] = ()
 
-    def world(self, variant: str, seed: int) -> MuscleWorld:
+    def world(self, variant: str, seed: int, condition: str | None = None) -> MuscleWorld:
         """The physics of one variant; the seed chooses among actual arms, and their noise."""
         from simulators.muscle_world import MuscleWorld
 
+        check_condition(condition, self.conditions)
         return MuscleWorld(make_body(variant, seed), seed)
 
-    def rig(self, config: RobotConfig, variant: str, seed: int) -> Rig:
+    def rig(self, config: RobotConfig, variant: str, seed: int, condition: str | None = None) -> Rig:
         """The world behind simulated nodes on the robot file's buses."""
         from simulators.rig import Rig
 
-        return Rig(config, self.world(variant, seed), hardware())
+        return Rig(config, self.world(variant, seed, condition), hardware())
 
-    def direct(self, config: RobotConfig, variant: str, seed: int) -> Robot:
+    def direct(self, config: RobotConfig, variant: str, seed: int, condition: str | None = None) -> Robot:
         """The world behind no bus at all, as fast as it computes."""
-        from hal.robot import Robot
-        from simulators.direct import DirectDevice, WorldClock
+        from simulators.direct import direct_robot
 
-        world = self.world(variant, seed)
-        clock = WorldClock(world)
-        device = DirectDevice(config, world, clock)
-        return Robot(config, devices=[device], buses=(), clock=clock, source="simulated")
+        return direct_robot(config, self.world(variant, seed, condition))
 
 
 simulator = MusashiArm()
