@@ -1,47 +1,72 @@
-"""Online update (paper, II-F): W follows the body, by gradient steps on a bounded window of what it lived through."""
+"""Online update (paper, II-F): p and W follow the body, each at its own pace, on a bounded window of samples.
+
+The default has two time scales. p is recognised from every sample by an extended Kalman filter (`gemuco.bias`); once it
+has settled W takes small gradient steps under that p, mixed with training data of the other conditions under their own,
+and goes back when it foretells held-out samples worse than it did. The paper's three ways are the other choices.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
+from gemuco.bias import RECOGNISERS, Prior, Recogniser
 from gemuco.errors import SchemaError
-from gemuco.kernels import pull_weights, trace
+from gemuco.optimiser import OPTIMISERS
+from gemuco.relearn import Relearner
 from gemuco.schema import BodySchema
 
-OPTIMISERS = ("adam", "sgd")
+WHAT = ("weights", "bias", "both", "bias_then_weights")
+METHODS = (*RECOGNISERS, "gradient")
 FORGET = 0.01
 """Share by which each new sample moves the running estimate of the model's errors."""
+ANOTHER = 0.3
+"""The body is another one when p is this far from where it was [standard deviations of the trained p]."""
+STEADY = 0.02
+"""p found by gradient is settled when a step moves it less than this [standard deviations of the trained p]."""
 
 
 @dataclass(frozen=True, slots=True)
 class UpdateConfig:
-    """How to update W.
+    """What to update, and how.
 
     Attributes:
+        what: `weights`, `bias`, `both` at once by gradient, or `bias_then_weights`: W moves only while p is settled.
+            Without parametric bias this is the same as `weights`.
+        bias_method: `ekf`, `gauss_newton` (both from the first sample), or `gradient`, the paper's.
         window: Samples kept; the oldest are dropped.
-        minimum: Samples needed before the first step.
-        batch: Samples per gradient step, drawn from window and replay; each is used under every mask it allows.
+        minimum: Samples needed before the first gradient step.
+        batch: Samples per gradient step, drawn from window, constraints and replay; each under every mask it allows.
         steps: Gradient steps per `Updater.step`.
-        rate: Learning rate.
-        optimiser: `adam` or `sgd` (with momentum 0.9).
-        replay: As how many samples of the window the training data counts. A young window then cannot pull W far
-            from what was known of postures it has not seen, and a full one outweighs what is known to be old.
+        rate: Learning rate of W.
+        bias_rate: Learning rate of p, for `gradient` and `both`.
+        optimiser: `adam` or `sgd` (with momentum 0.9), for W and p.
+        replay: As how many samples of the window the training data counts, each under the p of its own condition. A
+            young window then cannot pull W far from what was known, and a full one outweighs what is known to be old.
+        held_out: Every so many-th sample is never learned from and judges W, which goes back when it does worse there;
+            0 learns from all and never goes back.
         seed: For the draws.
     """
 
+    what: str = "bias_then_weights"
+    bias_method: str = "ekf"
     window: int = 6000
-    minimum: int = 50
+    minimum: int = 10
     batch: int = 100
     steps: int = 3
-    rate: float = 1e-3
+    rate: float = 1e-4
+    bias_rate: float = 0.02
     optimiser: str = "adam"
     replay: int = 300
+    held_out: int = 5
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if self.optimiser not in OPTIMISERS:
-            raise SchemaError(f"Optimiser '{self.optimiser}' is not known. Known optimisers: {', '.join(OPTIMISERS)}.")
+        for name, known in (("what", WHAT), ("bias_method", METHODS), ("optimiser", OPTIMISERS)):
+            if getattr(self, name) not in known:
+                raise SchemaError(f"{name} '{getattr(self, name)}' is not known. Known: {', '.join(known)}.")
+        if self.held_out == 1:
+            raise SchemaError("held_out 1 holds every sample out and leaves none to learn from; use 0 or 2 and more.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,42 +74,82 @@ class UpdateResult:
     """What one step did.
 
     Attributes:
-        loss: Mean squared error of the batch before the step [standard deviations squared]; NaN if too few samples,
-            infinite if the step led out of the numbers and was not taken.
+        loss: Mean squared error of the first batch before the step [standard deviations squared]; NaN if no gradient
+            step was taken, infinite if it led out of the numbers and was undone.
         window: Samples in the window.
-        dropped: Oldest samples dropped so far.
+        dropped: Samples dropped so far: the oldest, and those of the body before it changed.
+        bias: p now, shape (bias_size,).
+        bias_std: Its standard deviation, shape (bias_size,); NaN by gradient.
+        settled: Whether p is well known; always so when p is not updated.
+        changed: Whether this step found that the body is another one since some samples.
+        held_out: Mean squared error of held-out samples when last judged [standard deviations squared].
+        rolled_back: How often W went back so far.
     """
 
     loss: float
     window: int
     dropped: int
+    bias: np.ndarray
+    bias_std: np.ndarray
+    settled: bool
+    changed: bool
+    held_out: float
+    rolled_back: int
 
 
 class Updater:
-    """Learns W while the body moves. One thread may use it; every schema it hands out is immutable.
+    """Updates p and W while the body moves. One thread may use it; every schema it hands out is immutable.
 
     The errors of the schema it hands out are measured on each new sample before that sample is learned from, so the
     std of later estimates is honest about the body of today.
+
+    Args:
+        schema: Where to begin.
+        config: What to update, and how.
+        constraints: What is known of the body whatever its condition (origin, geometric model, ends of travel): signal
+            -> arrays [its unit], shape (n, size), NaN where nothing is known. They count as samples of the window that
+            never grow old.
+
+    Raises:
+        SchemaError: p shall be updated, but the schema has none.
+        UnknownSignal: A constraint names a signal that is not in the layout.
+        WrongSize: A constraint does not have its signal's size.
     """
 
-    def __init__(self, schema: BodySchema, config: UpdateConfig | None = None) -> None:
+    def __init__(
+        self,
+        schema: BodySchema,
+        config: UpdateConfig | None = None,
+        constraints: Mapping[str, np.ndarray] | None = None,
+    ) -> None:
         self.config = config or UpdateConfig()
+        if not len(schema.bias) and self.config.what in ("bias", "both"):
+            raise SchemaError(
+                f"what '{self.config.what}' needs a parametric bias; this schema was trained without (bias_size 0)."
+            )
         self._first = schema
-        self._rows = np.full((self.config.window, schema.layout.size), np.nan, np.float32)
-        self._random = np.random.default_rng(self.config.seed)
-        self._count = self._dropped = self._next = 0
+        known = np.atleast_2d(schema.normalise(constraints)) if constraints else np.zeros((0, schema.layout.size))
+        self._relearner = Relearner(schema, self.config, known.astype(np.float32))
         self._begin(schema)
 
     def _begin(self, schema: BodySchema) -> None:
+        config = self.config
         self.schema = schema
-        self._arrays = [array.copy() for array in schema.weights.arrays()]
-        self._slow = [np.zeros_like(array) for array in self._arrays]
-        self._square = [np.zeros_like(array) for array in self._arrays]
-        self._time = 0
+        self._pending: list[np.ndarray] = []
+        self._has_bias = len(schema.bias) > 0 and config.what != "weights"
+        by_gradient = config.what == "both" or config.bias_method == "gradient"
+        self._recogniser: Recogniser | None = None
+        if self._has_bias and not by_gradient:
+            self._recogniser = RECOGNISERS[config.bias_method](schema)
+        self._prior = Prior.of(schema)
+        self._since = self._relearner.window.added
+        self._bias_std = np.full(len(schema.bias), np.nan)
+        self._is_settled = not self._has_bias
         scale = schema.scaler.std[schema.out_index]
         self._errors = {
             m: (schema.errors[key] / scale) ** 2 for m in schema.masks if (key := ("mask", m)) in schema.errors
         }
+        self._relearner.restart(schema)
 
     def add(self, values: Mapping[str, np.ndarray]) -> bool:
         """Put a sample into the window.
@@ -100,16 +165,14 @@ class Updater:
             WrongSize: An array does not have its signal's size.
         """
         x = self.schema.normalise(values)
-        if x.ndim != 1 or not self._usable(x):
+        if x.ndim != 1 or not self._is_usable(x):
             return False
-        self._dropped += self._count == len(self._rows)
-        self._count = min(self._count + 1, len(self._rows))
-        self._rows[self._next] = x
-        self._next = (self._next + 1) % len(self._rows)
+        self._relearner.window.add(x)
+        self._pending.append(x)
         self._measure(x)
         return True
 
-    def _usable(self, x: np.ndarray) -> bool:
+    def _is_usable(self, x: np.ndarray) -> bool:
         whole = self.schema.layout.whole(np.isfinite(x))
         return any(m <= whole for m in self.schema.masks) and bool(np.isfinite(x[self.schema.out_index]).any())
 
@@ -123,60 +186,50 @@ class Updater:
                 self._errors[m] = np.where(np.isfinite(squared), known + FORGET * (squared - known), known)
 
     def step(self) -> UpdateResult:
-        """A few gradient steps; `schema` is the result."""
-        if self._count < self.config.minimum:
-            return UpdateResult(float("nan"), self._count, self._dropped)
-        losses: list[float] = []
-        weights = self.schema.weights.replaced(self._arrays)
-        for _ in range(self.config.steps):
-            inputs, wanted = self._batch()
-            values = trace(weights.whole, inputs)
-            there = np.isfinite(wanted)
-            difference = np.where(there, values[-1] - wanted, 0.0).astype(np.float32)
-            count = max(1, int(there.sum()))
-            losses.append(float(np.sum(difference**2)) / count)
-            self._move(pull_weights(weights.whole, values, difference * np.float32(2.0 / count)))
-        if not all(np.isfinite(array).all() for array in self._arrays):
-            self._begin(self.schema)  # the step was too long: stay with the last W that is one
-            return UpdateResult(float("inf"), self._count, self._dropped)
-        scale = self.schema.scaler.std[self.schema.out_index]
-        errors = dict(self.schema.errors) | {("mask", m): np.sqrt(e) * scale for m, e in self._errors.items()}
-        self.schema = self.schema.with_weights(weights.replaced([a.copy() for a in self._arrays]), errors)
-        return UpdateResult(losses[0], self._count, self._dropped)
+        """Recognise p from the samples since the last step, then take gradient steps; `schema` is the result."""
+        has_changed = self._recognise()
+        config, relearner = self.config, self._relearner
+        moves_weights = config.what in ("weights", "both") or (config.what == "bias_then_weights" and self._is_settled)
+        moves_bias = self._has_bias and self._recogniser is None
+        loss = float("nan")
+        if len(relearner.window) >= config.minimum and (moves_weights or moves_bias):
+            before = self.schema.bias
+            schema, loss = relearner.step(self.schema, moves_weights, moves_bias)
+            if moves_bias:
+                self._is_settled = self._prior.between(before, schema.bias) < STEADY
+            scale = schema.scaler.std[schema.out_index]
+            errors = dict(schema.errors) | {("mask", m): np.sqrt(e) * scale for m, e in self._errors.items()}
+            self.schema = schema.with_weights(schema.weights, errors)
+        return UpdateResult(
+            loss=loss,
+            window=len(relearner.window),
+            dropped=relearner.window.dropped,
+            bias=self.schema.bias,
+            bias_std=self._bias_std,
+            settled=self._is_settled,
+            changed=has_changed,
+            held_out=relearner.held_out,
+            rolled_back=relearner.rolled_back,
+        )
 
-    def _batch(self) -> tuple[np.ndarray, np.ndarray]:
-        """Inputs (rows, inputs) and wanted x_out (rows, out_size): each drawn sample once per mask it allows."""
-        config = self.config
-        anchors = self.schema.anchors
-        old = config.replay if len(anchors) else 0
-        drawn = self._random.random(config.batch) * (self._count + old)
-        lived = self._rows[drawn[drawn < self._count].astype(int)]
-        replayed = anchors[self._random.integers(0, max(1, len(anchors)), config.batch - len(lived))]
-        rows = np.concatenate([lived, replayed]) if len(replayed) else lived
-        finite = np.isfinite(rows)
-        inputs: list[np.ndarray] = []
-        wanted: list[np.ndarray] = []
-        for m in self.schema.masks:
-            allowed = finite[:, self.schema.layout.indices(m)].all(axis=1)
-            inputs.append(self.schema.network_input(rows[allowed], m))
-            wanted.append(rows[allowed][:, self.schema.out_index])
-        return np.concatenate(inputs), np.concatenate(wanted)
-
-    def _move(self, gradients: list[np.ndarray]) -> None:
-        """Adam, or gradient descent with momentum, in place on this updater's own copy of W."""
-        rate = self.config.rate
-        self._time += 1
-        if self.config.optimiser == "sgd":
-            for array, slow, gradient in zip(self._arrays, self._slow, gradients, strict=True):
-                slow *= 0.9
-                slow += gradient
-                array -= rate * slow
-            return
-        gain = rate * np.sqrt(1.0 - 0.999**self._time) / (1.0 - 0.9**self._time)
-        for array, slow, square, gradient in zip(self._arrays, self._slow, self._square, gradients, strict=True):
-            slow += 0.1 * (gradient - slow)
-            square += 0.001 * (gradient * gradient - square)
-            array -= (gain * slow / (np.sqrt(square) + 1e-8)).astype(array.dtype)
+    def _recognise(self) -> bool:
+        """Let every new sample move p; whether the body turned out to be another one."""
+        rows, self._pending = self._pending, []
+        if self._recogniser is None:
+            return False
+        has_changed = False
+        window = self._relearner.window
+        for index, row in enumerate(rows):
+            found = self._recogniser.see(self.schema, row)
+            since = window.added - len(rows) + index + 1 - found.since
+            if since > self._since and self._prior.between(found.bias, self.schema.bias) > ANOTHER:
+                window.forget_before(since)
+                self._since, has_changed = since, True
+            self._is_settled, self._bias_std = found.is_settled, np.sqrt(np.diag(found.covariance))
+            self.schema = self.schema.with_bias(found.bias)
+        if has_changed:
+            self._relearner.restart(self.schema)
+        return has_changed
 
     def rollback(self) -> BodySchema:
         """Back to the schema it began with; the window is kept."""

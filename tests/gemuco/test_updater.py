@@ -94,7 +94,7 @@ def test_learns_from_what_there_is(schema):
 
 
 def test_says_what_is_wrong(schema):
-    with pytest.raises(SchemaError, match="Known optimisers: adam, sgd"):
+    with pytest.raises(SchemaError, match="Known: adam, sgd"):
         UpdateConfig(optimiser="newton")
     with pytest.raises(UnknownSignal):
         Updater(schema).add({"wire": np.zeros(5)})

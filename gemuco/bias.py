@@ -1,0 +1,276 @@
+"""Recognition of p from samples (paper, usage (d), done with second-order information instead of gradient steps).
+
+`Kalman` is a bank of extended Kalman filters that differ in when they believe the body last changed (Bayesian change
+point detection): at every sample a new one begins from the spread of the trained p, and each is weighed by how well it
+foretold what came since. A tool that was put down is recognised as soon as the evidence of the newcomers outweighs the
+old belief, at once where one sample says enough, after many where each says little; without a change nothing is
+forgotten. The errors are taken as t-distributed, so one odd sample moves nothing.
+
+`GaussNewton` minimises the errors over the newest samples of a window from the same prior. It has no memory but that.
+"""
+
+from dataclasses import dataclass
+from math import lgamma
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from gemuco.innovation import Innovations
+
+if TYPE_CHECKING:
+    from gemuco.schema import BodySchema
+
+HAZARD = 0.01
+"""How often the body changes, per sample."""
+BANK = 10
+"""Beliefs kept."""
+DRIFT = 0.01
+"""Share of the prior's standard deviation by which p may wander per sample."""
+TRUST = 0.3
+"""Standard deviation of the p in use when recognition begins, as a share of the prior's."""
+FREEDOM = 8.0
+"""Degrees of freedom of the errors' t-distribution."""
+PASSES = 2
+"""How often a sample is linearised anew."""
+SCALE_MEMORY = 50
+"""Samples over which a belief learns that errors are larger here than in training."""
+SETTLED = 0.3
+"""p is settled when its standard deviation is below this share of the prior's in every direction."""
+RECENT = 20
+"""Samples that Gauss-Newton looks at."""
+FADE = 0.9
+"""Weight of a sample against the one after it, for Gauss-Newton."""
+
+
+@dataclass(frozen=True, slots=True)
+class Prior:
+    """What p can be: the spread of the trained ones.
+
+    Attributes:
+        mean: Shape (bias_size,).
+        covariance: Shape (bias_size, bias_size).
+        known: The trained p, shape (conditions, bias_size).
+    """
+
+    mean: np.ndarray
+    covariance: np.ndarray
+    known: np.ndarray
+
+    @classmethod
+    def of(cls, schema: "BodySchema") -> "Prior":
+        """From the p of the trained conditions; from the present one alone if there are none."""
+        known = np.stack([p.astype(float) for p in schema.biases.values()] or [schema.bias.astype(float)])
+        away = known - known.mean(axis=0)
+        covariance = away.T @ away / max(1, len(known) - 1)
+        floor = 0.01 * (np.trace(covariance) / max(1, len(covariance))) + 1e-4
+        return cls(known.mean(axis=0), covariance + floor * np.eye(len(covariance)), known)
+
+    def between(self, one: np.ndarray, other: np.ndarray) -> float:
+        """Distance of two p, in standard deviations of the trained ones."""
+        away = np.asarray(one, float) - other
+        return float(np.sqrt(away @ np.linalg.solve(self.covariance, away)))
+
+    def share(self, covariance: np.ndarray) -> float:
+        """Largest standard deviation of a p over all directions, as a share of the prior's."""
+        whiten = np.linalg.inv(np.linalg.cholesky(self.covariance))
+        return float(np.sqrt(np.linalg.eigvalsh(whiten @ covariance @ whiten.T)[-1]))
+
+
+@dataclass(frozen=True, slots=True)
+class Recognition:
+    """What is believed about p.
+
+    Attributes:
+        bias: p, shape (bias_size,).
+        covariance: Its uncertainty, shape (bias_size, bias_size).
+        since: Samples since which this is believed to be the body.
+        is_settled: Whether p is well known.
+    """
+
+    bias: np.ndarray
+    covariance: np.ndarray
+    since: int
+    is_settled: bool
+
+
+class Recogniser(Protocol):
+    """Finds p from samples, one at a time."""
+
+    def see(self, schema: "BodySchema", row: np.ndarray) -> Recognition:
+        """Take one sample [standard deviations], shape (size,), predicted by the W of a schema."""
+        ...
+
+
+class Kalman:
+    """A bank of extended Kalman filters, one per moment at which the body may have changed."""
+
+    def __init__(self, schema: "BodySchema") -> None:
+        self.prior = Prior.of(schema)
+        self._innovations = Innovations(schema)
+        self._mean = schema.bias.astype(float)[None]
+        self._covariance = TRUST**2 * self.prior.covariance[None]
+        self._scale = np.ones(1)
+        self._weight = np.zeros(1)
+        self._age = np.zeros(1, int)
+
+    def see(self, schema: "BodySchema", row: np.ndarray) -> Recognition:
+        """Weigh all beliefs by a sample, and move each."""
+        pairs = self._innovations.pairs(np.isfinite(row))
+        if len(pairs.index):
+            self._begin_anew()
+            rows = np.repeat(row[None], len(self._mean), axis=0)
+            at = self._start(schema, row)
+            for _ in range(PASSES):
+                error, slope = self._innovations.of(schema, pairs, rows, at.astype(np.float32))
+                error = error - np.einsum("hnk,hk->hn", slope, self._mean - at)
+                at = self._move(error, slope)
+            self._commit(error, slope, pairs.log_volume)
+            self._thin()
+        best = int(np.argmax(self._weight))
+        covariance = self._covariance[best]
+        settled = self.prior.share(covariance) < SETTLED
+        return Recognition(self._mean[best].copy(), covariance.copy(), int(self._age[best]), settled)
+
+    def _begin_anew(self) -> None:
+        """Everybody grows older and less sure; one more believes that the body changed just now."""
+        prior = self.prior
+        total = np.log(np.sum(np.exp(self._weight - self._weight.max()))) + self._weight.max()
+        self._weight = np.append(self._weight + np.log1p(-HAZARD), total + np.log(HAZARD))
+        self._mean = np.concatenate([self._mean, prior.mean[None]])
+        self._covariance = np.concatenate([self._covariance + DRIFT**2 * prior.covariance, prior.covariance[None]])
+        self._scale = np.append(self._scale, 1.0)
+        self._age = np.append(self._age + 1, 1)
+
+    def _start(self, schema: "BodySchema", row: np.ndarray) -> np.ndarray:
+        """Where every belief is linearised first: at its mean; the newcomer at the trained p that fits best."""
+        pairs = self._innovations.pairs(np.isfinite(row))
+        known = self.prior.known
+        error, _ = self._innovations.of(
+            schema, pairs, np.repeat(row[None], len(known), axis=0), known.astype(np.float32)
+        )
+        at = self._mean.copy()
+        at[-1] = known[int(np.argmin(np.einsum("ij,ij->i", error, error)))]
+        return at
+
+    def _information(self, slope: np.ndarray, scale: np.ndarray) -> np.ndarray:
+        """Inverse covariance of p after a sample, shape (beliefs, bias_size, bias_size)."""
+        gained = np.einsum("hnj,hnk->hjk", slope, slope) / scale[:, None, None]
+        return np.linalg.inv(self._covariance) + gained
+
+    def _move(self, error: np.ndarray, slope: np.ndarray) -> np.ndarray:
+        pull = np.einsum("hnk,hn->hk", slope, error) / self._scale[:, None]
+        return self._mean + np.linalg.solve(self._information(slope, self._scale), pull[..., None])[..., 0]
+
+    def _commit(self, error: np.ndarray, slope: np.ndarray, log_volume: float) -> None:
+        """Evidence of the sample for every belief, and the step, shorter where the sample is odd."""
+        count = error.shape[1]
+        information = self._information(slope, self._scale)
+        pull = np.einsum("hnk,hn->hk", slope, error) / self._scale[:, None]
+        step = np.linalg.solve(information, pull[..., None])[..., 0]
+        odd = np.einsum("hn,hn->h", error, error) / self._scale - np.einsum("hk,hk->h", pull, step)
+        volume = (
+            log_volume
+            + count * np.log(self._scale)
+            + np.linalg.slogdet(self._covariance)[1]
+            + np.linalg.slogdet(information)[1]
+        )
+        half = 0.5 * (FREEDOM + count)
+        constant = lgamma(half) - lgamma(0.5 * FREEDOM) - 0.5 * count * np.log(np.pi * FREEDOM)
+        self._weight = self._weight + constant - 0.5 * volume - half * np.log1p(np.maximum(odd, 0.0) / FREEDOM)
+        self._weight -= self._weight.max()
+        trust = (FREEDOM + count) / (FREEDOM + np.maximum(odd, 0.0))
+        information = self._information(slope, self._scale / np.minimum(trust, 1.0))
+        pull *= np.minimum(trust, 1.0)[:, None]
+        self._mean = self._mean + np.linalg.solve(information, pull[..., None])[..., 0]
+        self._covariance = np.linalg.inv(information)
+        rate = 1.0 / np.minimum(self._age + SCALE_MEMORY // 2, SCALE_MEMORY)
+        self._scale = np.maximum(1.0, self._scale * (1.0 + rate * (trust * odd / count - 1.0)))
+
+    def _thin(self) -> None:
+        """Too many beliefs: of the two whose ages differ least in proportion, the less likely goes; never the best."""
+        while len(self._weight) > BANK:
+            order = np.argsort(self._age)
+            ratio = self._age[order][1:] / self._age[order][:-1]
+            closest = int(np.argmin(ratio))
+            one, other = order[closest], order[closest + 1]
+            gone = one if self._weight[one] < self._weight[other] else other
+            for name in ("_mean", "_covariance", "_scale", "_weight", "_age"):
+                setattr(self, name, np.delete(getattr(self, name), gone, axis=0))
+
+
+class GaussNewton:
+    """The p that explains the newest samples best."""
+
+    def __init__(self, schema: "BodySchema") -> None:
+        self.prior = Prior.of(schema)
+        self._innovations = Innovations(schema)
+        self._rows: list[np.ndarray] = []
+        self._bias = schema.bias.astype(float)
+
+    def see(self, schema: "BodySchema", row: np.ndarray) -> Recognition:
+        """Take a sample and find p anew."""
+        self._rows = [row, *self._rows[: RECENT - 1]]
+        self._bias, covariance = solve(schema, self._innovations, self.prior, np.stack(self._rows), self._bias, FADE)
+        settled = self.prior.share(covariance) < SETTLED
+        return Recognition(self._bias.copy(), covariance, len(self._rows), settled)
+
+
+def solve(
+    schema: "BodySchema",
+    innovations: Innovations,
+    prior: Prior,
+    rows: np.ndarray,
+    start: np.ndarray,
+    fade: float = 1.0,
+    iterations: int = 6,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Gauss-Newton with damping: the p of the least squares of whitened errors and of the distance from the prior.
+
+    Args:
+        schema: Whose W predicts.
+        innovations: The errors and their covariance.
+        prior: What p can be.
+        rows: Samples [standard deviations], newest first, shape (n, size).
+        start: First p, shape (bias_size,); the trained ones are tried as well.
+        fade: Weight of a sample against the one after it.
+        iterations: At most so many steps.
+
+    Returns:
+        p and its covariance.
+    """
+    finite = np.isfinite(rows)
+    patterns = [np.flatnonzero((finite == pattern).all(axis=1)) for pattern in np.unique(finite, axis=0)]
+    groups = [(innovations.pairs(finite[index[0]]), index) for index in patterns]
+    precision = np.linalg.inv(prior.covariance)
+
+    def normal(bias: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+        """Cost, gradient and curvature."""
+        away = bias - prior.mean
+        cost, gradient, curvature = float(away @ precision @ away), precision @ away, precision.copy()
+        for pairs, index in groups:
+            if len(pairs.index):
+                biases = np.repeat(bias[None], len(index), axis=0).astype(np.float32)
+                error, slope = innovations.of(schema, pairs, rows[index], biases)
+                weight = fade**index
+                cost += float(weight @ np.einsum("ij,ij->i", error, error))
+                gradient = gradient - np.einsum("i,ijk,ij->k", weight, slope, error)
+                curvature += np.einsum("i,ijk,ijl->kl", weight, slope, slope)
+        return cost, gradient, curvature
+
+    best = min((start, *prior.known), key=lambda bias: normal(bias)[0])
+    cost, gradient, curvature = normal(best)
+    damping = 0.0
+    for _ in range(iterations):
+        step = np.linalg.solve(curvature + damping * np.diag(np.diag(curvature)), -gradient)
+        tried = normal(best + step)
+        if tried[0] < cost:
+            is_done = cost - tried[0] < 1e-3
+            best, (cost, gradient, curvature), damping = best + step, tried, 0.3 * damping
+            if is_done:
+                break
+        else:
+            damping = max(0.1, 4.0 * damping)
+    return best, np.linalg.inv(curvature)
+
+
+RECOGNISERS = {"ekf": Kalman, "gauss_newton": GaussNewton}

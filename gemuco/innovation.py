@@ -1,0 +1,144 @@
+"""What a sample says about p: the errors of everything that was predicted without being told, and how p moves them."""
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from gemuco.kernels import push, trace
+from gemuco.masks import Mask
+
+if TYPE_CHECKING:
+    from gemuco.schema import BodySchema
+
+SHRINK = 0.05
+"""Share of the covariance that is replaced by its diagonal."""
+FLOOR = 0.01
+"""Smallest standard deviation of an error [standard deviations of the signal]."""
+MOST = 96
+"""Errors judged at once; with more masks than fill this, those of the fewest signals come first."""
+
+
+class Pairs(NamedTuple):
+    """Which errors a sample allows: for each, a mask and an element of x_out that the mask does not contain.
+
+    Attributes:
+        masks: The masks that are whole.
+        index: Position of every error in the (masks, out_size) table, flattened, shape (n,).
+        whiten: Turns errors into independent ones of variance 1, shape (n, n).
+        log_volume: Logarithm of the determinant of the errors' covariance.
+    """
+
+    masks: tuple[Mask, ...]
+    index: np.ndarray
+    whiten: np.ndarray
+    log_volume: float
+
+
+class Innovations:
+    """Errors and their derivatives by p, with the covariance that errors had in training.
+
+    All feasible masks that are whole for a sample contribute. Their errors are of the same measurements and of the same
+    network, so they are far from independent: the covariance of all of them together is measured on the anchors, under
+    the p of each anchor's own condition, and enlarged to the errors of held-out data. A signal that is part of the mask
+    is left out, for the network then copies it, whatever p is.
+    """
+
+    def __init__(self, schema: "BodySchema") -> None:
+        self._schema = schema
+        self._pairs: dict[bytes, Pairs] = {}
+        anchors = schema.anchors
+        self._anchors = anchors[np.isfinite(anchors).all(axis=1)] if len(anchors) else anchors
+        self._biases = own_bias(schema, len(anchors))
+        if len(anchors):
+            self._biases = self._biases[np.isfinite(anchors).all(axis=1)]
+        self._anchor_errors: dict[Mask, np.ndarray] = {}
+
+    def pairs(self, finite: np.ndarray) -> Pairs:
+        """What a sample allows whose measured elements are given as truth values, shape (size,)."""
+        key = finite.tobytes()
+        found = self._pairs.get(key)
+        if found is None:
+            found = self._pairs[key] = self._allowed(finite)
+        return found
+
+    def _allowed(self, finite: np.ndarray) -> Pairs:
+        schema = self._schema
+        whole = schema.layout.whole(finite)
+        masks = sorted((m for m in schema.masks if m <= whole), key=lambda m: (len(m), sorted(m)))
+        there = finite[schema.out_index]
+        table = np.array([there & self._blind(m) for m in masks]).reshape(len(masks), len(there))
+        if not table.any():
+            table = np.repeat(there[None], len(masks), axis=0)
+        index = np.flatnonzero(table)[:MOST]
+        used = len(there) and (index[-1] // len(there) + 1 if len(index) else 0)
+        chosen = tuple(masks[:used])
+        covariance = self._covariance(chosen)[np.ix_(index, index)] if len(index) else np.zeros((0, 0))
+        lower = np.linalg.cholesky(covariance)
+        return Pairs(chosen, index, np.linalg.inv(lower), 2.0 * float(np.log(np.diag(lower)).sum()))
+
+    def _blind(self, mask: Mask) -> np.ndarray:
+        inside = [name in mask for name in self._schema.x_out]
+        sizes = [self._schema.layout.signal(name).size for name in self._schema.x_out]
+        return ~np.repeat(inside, sizes)
+
+    def _covariance(self, masks: tuple[Mask, ...]) -> np.ndarray:
+        """Covariance of the errors of all elements under all masks, shape (masks * out_size, masks * out_size)."""
+        schema = self._schema
+        scale = schema.scaler.std[schema.out_index]
+        held = np.concatenate([schema.errors.get(("mask", m), scale) / scale for m in masks])
+        held = np.where(np.isfinite(held), held, 1.0)
+        if len(self._anchors) < 3 * len(held):
+            return np.diag(held**2 + FLOOR**2)
+        errors = np.concatenate([self._errors_on_anchors(m) for m in masks], axis=1)
+        covariance = errors.T @ errors / len(errors)
+        spread = np.sqrt(np.diag(covariance))
+        growth = np.maximum(held / np.maximum(spread, 1e-9), 1.0)
+        covariance *= np.outer(growth, growth)
+        variance = np.diag(covariance)
+        return (1.0 - SHRINK) * covariance + np.diag(SHRINK * variance + FLOOR**2)
+
+    def _errors_on_anchors(self, mask: Mask) -> np.ndarray:
+        known = self._anchor_errors.get(mask)
+        if known is None:
+            schema = self._schema
+            inputs = schema.network_input(self._anchors, mask, self._biases)
+            found = trace(schema.weights.whole, inputs)[-1].astype(float)
+            known = self._anchor_errors[mask] = self._anchors[:, schema.out_index] - found
+        return known
+
+    def of(
+        self, schema: "BodySchema", pairs: Pairs, rows: np.ndarray, biases: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Whitened errors and their derivatives: error(p + dp) = error - derivative dp.
+
+        Args:
+            schema: Whose W predicts.
+            pairs: Which errors; every row must allow them.
+            rows: Samples [standard deviations], shape (rows, size).
+            biases: p of every row, shape (rows, bias_size).
+
+        Returns:
+            Errors, shape (rows, n), and derivatives, shape (rows, n, bias_size), in float64.
+        """
+        count, size = biases.shape
+        inputs = np.stack([schema.network_input(rows, m, biases) for m in pairs.masks], axis=1)
+        inputs = inputs.reshape(count * len(pairs.masks), -1)
+        values = trace(schema.weights.whole, inputs)
+        tangent = np.zeros_like(inputs)
+        moved: list[np.ndarray] = []
+        for j in range(size):
+            tangent[:] = 0.0
+            tangent[:, inputs.shape[1] - size + j] = 1.0
+            moved.append(push(schema.weights.whole, values, tangent).reshape(count, -1)[:, pairs.index])
+        predicted = values[-1].reshape(count, -1)[:, pairs.index]
+        measured = np.tile(rows[:, schema.out_index], (1, len(pairs.masks)))[:, pairs.index]
+        errors = (measured.astype(float) - predicted) @ pairs.whiten.T
+        slopes = np.stack(moved, axis=-1).astype(float)
+        return errors, np.einsum("ij,rjk->rik", pairs.whiten, slopes)
+
+
+def own_bias(schema: "BodySchema", count: int) -> np.ndarray:
+    """The p of the condition that every anchor was recorded under, shape (count, bias_size); the present p if unknown."""
+    if len(schema.anchor_conditions) == count and schema.biases and count:
+        return np.stack(list(schema.biases.values()))[schema.anchor_conditions]
+    return np.repeat(schema.bias[None], count, axis=0)

@@ -1,0 +1,180 @@
+"""Gradient steps on W, on p, or on both (paper, usages (c) and (d)), with replay, and a way back from harm."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from gemuco.bias import Prior
+from gemuco.innovation import own_bias
+from gemuco.kernels import pull, pull_weights, run, trace
+from gemuco.optimiser import Optimiser
+from gemuco.window import Window
+
+if TYPE_CHECKING:
+    from gemuco.adapt import UpdateConfig
+    from gemuco.schema import BodySchema
+
+JUDGED = 60
+"""Held-out samples that W is judged by, the newest."""
+JUDGE_EVERY = 5
+"""Calls of `step` between two judgements."""
+WORSE = 1.1
+"""W goes back when its held-out squared error exceeds that of the best W so far by this factor."""
+
+
+class Relearner:
+    """Learns from a window, from constraints and from the training data of other conditions.
+
+    Every `held_out`-th sample only judges. W goes back to the best one so far when it foretells those samples worse,
+    and its learning rate is halved until the body changes.
+
+    Args:
+        schema: Where to begin.
+        config: What to update, and how.
+        constraints: Samples that never grow old [standard deviations], shape (n, size).
+
+    Attributes:
+        window: What the body lived through.
+        held_out: Mean squared error on held-out samples when last judged; NaN before.
+        rolled_back: How often W went back so far.
+    """
+
+    def __init__(self, schema: "BodySchema", config: "UpdateConfig", constraints: np.ndarray) -> None:
+        self.window = Window(config.window, schema.layout.size, config.held_out)
+        self.rolled_back = 0
+        self._config, self._constraints = config, constraints
+        self._random = np.random.default_rng(config.seed)
+        self.restart(schema)
+
+    def restart(self, schema: "BodySchema") -> None:
+        """Forget momentum and judgements, and go on from the W and p of a schema."""
+        config = self._config
+        self._arrays = [array.copy() for array in schema.weights.arrays()]
+        self._bias = schema.bias.copy()
+        self._optimiser = Optimiser(config.optimiser, config.rate, self._arrays)
+        self._bias_optimiser = Optimiser(config.optimiser, config.bias_rate, [self._bias])
+        self._best = schema.weights
+        self._anchors, self._anchor_biases = _others(schema)
+        self._calls = 0
+        self.held_out = float("nan")
+
+    def step(self, schema: "BodySchema", weights: bool, bias: bool) -> tuple["BodySchema", float]:
+        """A few gradient steps.
+
+        Args:
+            schema: The schema in use; its p is taken over.
+            weights: Whether W moves.
+            bias: Whether p moves.
+
+        Returns:
+            The schema after the steps, and the mean squared error of the first batch before them; the schema as it
+            was and infinity where a step led out of the numbers.
+        """
+        self._bias[:] = schema.bias
+        first = float("nan")
+        for index in range(self._config.steps):
+            loss = self._descend(schema, weights, bias)
+            first = loss if index == 0 else first
+        if not all(np.isfinite(array).all() for array in (*self._arrays, self._bias)):
+            self.restart(schema)
+            return schema, float("inf")
+        if bias:
+            schema = schema.with_bias(self._bias)
+        if weights:
+            schema = self._judge(schema.with_weights(schema.weights.replaced([a.copy() for a in self._arrays])))
+        return schema, first
+
+    def _descend(self, schema: "BodySchema", weights: bool, bias: bool) -> float:
+        """One gradient step in place; returns the loss before it."""
+        inputs, wanted, present = self._batch(schema)
+        chain = schema.weights.replaced(self._arrays).whole
+        values = trace(chain, inputs)
+        there = np.isfinite(wanted)
+        difference = np.where(there, values[-1] - wanted, 0.0).astype(np.float32)
+        count = max(1, int(there.sum()))
+        gradient = difference * np.float32(2.0 / count)
+        if weights:
+            self._optimiser.move(self._arrays, pull_weights(chain, values, gradient))
+        if bias:
+            by_input = pull(chain, values, gradient)[present, -len(self._bias) :]
+            self._bias_optimiser.move([self._bias], [by_input.sum(axis=0)])
+        return float(np.sum(difference**2)) / count
+
+    def _batch(self, schema: "BodySchema") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Each drawn sample once per mask it allows.
+
+        Returns:
+            Inputs (rows, inputs), wanted x_out (rows, out_size), and which rows are of the present body (rows,).
+        """
+        config = self._config
+        lived = np.concatenate([self.window.learned(), self._constraints])
+        old = config.replay if len(self._anchors) else 0
+        drawn = self._random.random(config.batch) * (len(lived) + old)
+        now = lived[drawn[drawn < len(lived)].astype(int)]
+        replayed = self._random.integers(0, max(1, len(self._anchors)), config.batch - len(now))
+        rows, biases = now, np.repeat(self._bias[None], len(now), axis=0)
+        if old:
+            rows = np.concatenate([rows, self._anchors[replayed]])
+            biases = np.concatenate([biases, self._anchor_biases[replayed]])
+        present = np.arange(len(rows)) < len(now)
+        finite = np.isfinite(rows)
+        parts = []
+        for m in schema.masks:
+            allowed = finite[:, schema.layout.indices(m)].all(axis=1)
+            inputs = schema.network_input(rows[allowed], m, biases[allowed])
+            parts.append((inputs, rows[allowed][:, schema.out_index], present[allowed]))
+        inputs, wanted, present = (np.concatenate(column) for column in zip(*parts, strict=True))
+        return inputs, wanted, present
+
+    def _judge(self, schema: "BodySchema") -> "BodySchema":
+        """The schema, or the best W so far where the new one does worse on held-out samples."""
+        self._calls += 1
+        rows = self.window.held(JUDGED)
+        if self._calls % JUDGE_EVERY or not len(rows):
+            return schema
+        self.held_out = mean_error(schema, rows)
+        best = schema.with_weights(self._best)
+        before = mean_error(best, rows)
+        if self.held_out <= before:
+            self._best = schema.weights
+        elif self.held_out > WORSE * before:
+            rate = 0.5 * self._optimiser.rate
+            self._arrays = [array.copy() for array in self._best.arrays()]
+            self._optimiser = Optimiser(self._config.optimiser, rate, self._arrays)
+            self.held_out = before
+            self.rolled_back += 1
+            return best
+        return schema
+
+
+def mean_error(schema: "BodySchema", rows: np.ndarray) -> float:
+    """Mean squared error of samples under all masks they allow [standard deviations squared]."""
+    finite = np.isfinite(rows)
+    total, count = 0.0, 0
+    for m in schema.masks:
+        allowed = finite[:, schema.layout.indices(m)].all(axis=1)
+        wrong = run(schema.weights.whole, schema.network_input(rows[allowed], m)) - rows[allowed][:, schema.out_index]
+        there = np.isfinite(wrong)
+        total, count = total + float(np.sum(wrong[there] ** 2)), count + int(there.sum())
+    return total / max(1, count)
+
+
+def _others(schema: "BodySchema") -> tuple[np.ndarray, np.ndarray]:
+    """The anchors of conditions other than the present one, and p of each.
+
+    A trained condition is the present one where p is nearer to it than half the way to its nearest neighbour: what was
+    learned of it then must not hold back what is learned of it now. Without parametric bias all anchors count.
+    """
+    anchors = schema.anchors
+    biases = own_bias(schema, len(anchors))
+    known = np.array(list(schema.biases.values()))
+    if not len(anchors) or len(known) < 2 or len(schema.anchor_conditions) != len(anchors):
+        return anchors, biases
+    prior = Prior.of(schema)
+    away = [prior.between(schema.bias, p) for p in known]
+    nearest = int(np.argmin(away))
+    apart = min(prior.between(known[nearest], p) for i, p in enumerate(known) if i != nearest)
+    if away[nearest] > 0.5 * apart:
+        return anchors, biases
+    others = schema.anchor_conditions != nearest
+    return anchors[others], biases[others]
