@@ -16,14 +16,18 @@ class Friction:
     Attributes:
         joint_torque: Coulomb torque of each joint [N m], shape (n,).
         joint_presliding: Joint travel until it slips [rad].
-        wire: Share of the tension that is lost along a wire, shape (m,).
+        wire: Share of the tension that is lost along a wire over the joints, shape (m,).
         wire_presliding: Path travel until it slips [m].
+        guide: Share of the tension that is lost between load cell (at the spool) and elastic element, shape (m,).
+        guide_presliding: Travel of the spool until it slips [m].
     """
 
     joint_torque: np.ndarray
     joint_presliding: float
     wire: np.ndarray
     wire_presliding: float
+    guide: np.ndarray
+    guide_presliding: float
 
 
 @dataclass(frozen=True, slots=True)

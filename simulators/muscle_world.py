@@ -1,8 +1,10 @@
 """A muscle-driven body as a World: rigid links in PyBullet, wires, elastic elements, spool servos and sensors in numpy.
 
-A wire's length is what its spool has paid out; the path is longer by what the elastic element gives. Tensions are
-brought to the joints by the moment arms, tau = -G^T f, once per physics step. Wires are stiff and a forearm is light,
-so steps are linearly implicit: tensions are taken where the joints will be at the end of the step.
+A wire's length is what its spool has paid out; the path is longer by what the elastic element gives. The load cell sits
+at the spool: friction on the way makes it read more than the elastic element carries when the wire was last wound in,
+and less when it was paid out. Tensions of the elastic elements are brought to the joints by the moment arms,
+tau = -G^T f, once per physics step. Wires are stiff and a forearm is light, so steps are linearly implicit: tensions
+are taken where the joints will be at the end of the step.
 """
 
 import math
@@ -45,6 +47,7 @@ class MuscleWorld:
             "muscle_tension": (body.noise.get("muscle_tension", 0.0), len(muscles)),
             "muscle_length": (body.noise.get("muscle_length", 0.0), len(muscles)),
         }
+        self._pull = body.rest_tension.copy()
         self._tension = body.rest_tension.copy()
         self._refresh(self._longest_step)
         self._spool = self._lengths - body.elastic.elongation(body.rest_tension)
@@ -55,6 +58,7 @@ class MuscleWorld:
         self._whole = np.ones(len(muscles))
         self._slid_joint = np.zeros(len(joints))
         self._slid_wire = np.zeros(len(muscles))
+        self._slid_guide = np.zeros(len(muscles))
 
     def step(self, duration: float) -> None:
         """See `World.step`."""
@@ -117,8 +121,8 @@ class MuscleWorld:
         self._solved_at = self._bullet.position.copy()
         self._lengths, self._arms = body.paths.solve(self._solved_at)
         mass, self._bias = self._bullet.inertia()
-        elastic = body.elastic.stiffness(self._tension) * duration**2
-        viscous = body.loss_time * body.elastic.rate * self._tension * duration
+        elastic = body.elastic.stiffness(self._pull) * duration**2
+        viscous = body.loss_time * body.elastic.rate * self._pull * duration
         held = (self._arms.T * (elastic + viscous)) @ self._arms
         held[self._diagonal] += body.joint_damping * duration
         if body.friction is not None:
@@ -141,15 +145,16 @@ class MuscleWorld:
         move = np.minimum(np.maximum(move, -reach), reach) * self._follows
         spool = np.maximum(self._spool + move, path - self._grip)
 
-        stretch_rate = path_rate - (spool - self._spool) / duration
+        paid_out = spool - self._spool
+        stretch_rate = path_rate - paid_out / duration
         self._spool = spool
         loss = 1.0 + body.loss_time * body.elastic.rate * stretch_rate
         loss = np.minimum(np.maximum(loss, 0.0), 1.5)
-        self._tension = body.elastic.tension(path - spool) * loss * self._whole
+        self._pull = self._tension = pull = body.elastic.tension(path - spool) * loss * self._whole
 
-        pull = self._tension
         torque = -body.joint_damping * bullet.velocity
         if body.friction is not None:
+            self._tension = pull * (1.0 - self._guide_friction(body.friction, paid_out))
             pull = pull * (1.0 + self._wire_friction(body.friction, path_rate * duration))
             torque -= self._joint_friction(body.friction, bullet.velocity * duration)
         torque -= pull @ self._arms
@@ -160,6 +165,12 @@ class MuscleWorld:
         limit = friction.wire_presliding
         self._slid_wire = np.minimum(np.maximum(self._slid_wire + travel, -limit), limit)
         return friction.wire * self._slid_wire / limit
+
+    def _guide_friction(self, friction: Friction, paid_out: np.ndarray) -> np.ndarray:
+        """Share of the tension that the load cell does not see, shape (m,); negative where it sees more."""
+        limit = friction.guide_presliding
+        self._slid_guide = np.minimum(np.maximum(self._slid_guide + paid_out, -limit), limit)
+        return friction.guide * self._slid_guide / limit
 
     def _joint_friction(self, friction: Friction, travel: np.ndarray) -> np.ndarray:
         """Torque [N m] against the motion, shape (n,)."""

@@ -166,3 +166,18 @@ def test_worlds_do_not_see_each_other():
 def test_the_urdf_is_part_of_the_package():
     assert URDF.is_file()
     assert {"README.md", "LICENSE"} <= {path.name for path in URDF.parent.iterdir()}
+
+
+def test_a_load_cell_remembers_which_way_the_wire_ran():
+    """Wound in and paid out again to the same length, the cell at the spool reads less: hysteresis."""
+    world = simulator.world("actual", 1)
+    held = world.truth()["muscle_length"]
+    readings = []
+    for offset in (-0.01, 0.0, 0.01, 0.0):
+        drive(world, held + offset)
+        run(world, 2.0)
+        readings.append(world.truth()["muscle_tension"])
+    world.close()
+    after_winding_in, after_paying_out = readings[3], readings[1]
+    assert np.mean(after_winding_in - after_paying_out) > 2.0
+    assert np.all(after_winding_in > 0.9 * after_paying_out)

@@ -29,7 +29,7 @@ REST_PRETENSION = 40.0
 
 JOINT_DAMPING = np.array([0.8, 0.8, 0.3, 0.35, 0.08])
 """[N m s/rad]"""
-ZERO_ERROR = 0.003
+ZERO_ERROR = 0.006
 """Standard deviation of an actual robot's wire length calibration [m]."""
 LOSS_TIME = 0.025
 """Of the elastic elements [s]."""
@@ -62,21 +62,23 @@ def make_body(variant: str, seed: int) -> Body:
 
 
 def _actual(geometric: Body, random: np.random.Generator) -> Body:
-    """An arm as it was really built: every via point 5 to 10 mm off, bent wires, other elasticity, friction, noise."""
+    """An arm as it was really built: every via point 7 to 10 mm off, bent wires, other elasticity, friction, noise."""
     size = len(ROUTES)
     routes = {name: tuple(_moved(via, random) for via in route) for name, route in ROUTES.items()}
-    radius = random.uniform(0.020, 0.028, 2)
+    radius = random.uniform(0.025, 0.035, 2)
     spheres = (
         Sphere(UPPER_ARM, (0.0, 0.0, 0.0), radius[0]),
         Sphere(ULNA, (0.0, 0.0, 0.0), radius[1]),
     )
     paths = Paths(chain(), routes, spheres)
-    elastic = Elastic(20.0 * random.uniform(0.75, 1.3, size), 120.0 * random.uniform(0.8, 1.2, size))
+    elastic = Elastic(20.0 * random.uniform(0.6, 1.4, size), 120.0 * random.uniform(0.6, 1.15, size))
     friction = Friction(
         joint_torque=np.array([0.25, 0.25, 0.12, 0.12, 0.05]) * random.uniform(0.6, 1.4, 5),
         joint_presliding=0.01,
         wire=random.uniform(0.04, 0.10, size),
         wire_presliding=0.001,
+        guide=random.uniform(0.10, 0.25, size),
+        guide_presliding=0.002,
     )
     slack = paths.lengths(REST) - designed_paths().lengths(REST) + random.normal(0.0, ZERO_ERROR, size)
     return replace(geometric, paths=paths, elastic=elastic, slack=slack, friction=friction, noise=NOISE)
