@@ -1,19 +1,18 @@
-"""Control (paper, II-H): the command whose predicted outcome loses least."""
+"""Control (paper, II-I): the command whose predicted outcome loses least."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gemuco.descent import DescentConfig, descend
+from gemuco.descent import DescentConfig
 from gemuco.errors import NotFinite, NotObservable, SchemaError
-from gemuco.kernels import pull, run, trace
-from gemuco.losses import Bound, Term
-from gemuco.masks import Mask, covered_by
+from gemuco.losses import Hold, Match, Term
+from gemuco.masks import Mask, label
+from gemuco.routes import Limits, Search, checked_mask, checked_route
 from gemuco.schema import BodySchema
 
-ROUTES = ("auto", "input", "latent")
-STARTS = 16
+SEARCH = DescentConfig(gamma_max=0.5, candidates=10, iterations=20)
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,12 +20,13 @@ class Solution:
     """What to do, and what is expected of it.
 
     Attributes:
-        command: The commanded signal [its unit], shape (n,).
+        command: The commanded signal [its unit], shape (n,), inside its limits.
         predicted: Signal -> its value when the command has been followed [its unit], shape (n,).
         loss: Sum of the terms.
-        residual: How far the body that the command leads to, asked of the network again, is from the target (root
-            mean square over the target's elements, standard deviations); NaN if no mask can tell.
-        route: `mask` (usages a and b), `input` (f) or `latent` (e).
+        residual: How far the body that the command leads to, asked of the network again, is from what was to be matched
+            (root mean square, standard deviations); NaN if no mask can tell.
+        route: `mask` (usages a and b), `latent` (e) or `input` (f).
+        mask: The signals that the network was given; empty for `latent`.
     """
 
     command: np.ndarray
@@ -34,62 +34,84 @@ class Solution:
     loss: float
     residual: float
     route: str
+    mask: Mask
 
 
 class Controller:
     """Finds commands for targets, each solve beginning where the last one ended.
 
-    Two ways, `auto` prefers the first:
+    Route `auto` is the paper's rule. `mask`, usages (a) and (b): the command is in x_out, and a feasible mask is
+    exactly what is asked. `latent`, usage (e): the command is in x_out, and what is asked needs a loss; z descends.
+    `input`, usage (f): the command is not in x_out; the command itself descends as part of x_in.
 
-    - `input`: a feasible mask holds the target and leaves out the command, as (theta, f) does for l. The target is
-      given to the network as if it were measured, and descent runs over the rest of the mask (f) inside the bounds of
-      the training data. The pair stays on the data manifold, so the command does what was predicted.
-    - `latent`: descent on z, as in the paper. It can end beside the manifold, where the predicted posture fits but the
-      predicted command does not lead there: see `Solution.residual`.
+    A robot may know better and name route and mask:
+
+    - Descent on z can end beside the data's manifold, where the predicted target fits but the predicted command does
+      not lead there (see `Solution.residual`). With route `input` and a mask that holds the command the command itself
+      descends, as if it were not in x_out, and what is predicted is what it leads to.
+    - With route `input` and a mask that leaves out the command, as (theta, f) does for l, the target is given to the
+      network as if it were measured, and descent runs over the rest of the mask.
     """
 
     def __init__(
         self,
         schema: BodySchema,
-        terms: Sequence[Term],
+        terms: Sequence[Term | Hold] | None,
         command: str,
         route: str = "auto",
         search: DescentConfig | None = None,
+        mask: Mask | None = None,
+        limits: Limits | None = None,
     ) -> None:
         """Prepare for commands of one signal.
 
+        Args:
+            schema: The body schema.
+            terms: What is asked; to match every target if not given.
+            command: The signal that is commanded.
+            route: `auto`, `mask`, `latent` or `input`.
+            search: How to descend.
+            mask: Signals that the network is given; chosen from the route if not given.
+            limits: Signal -> bounds of what may be tried; a command that the network infers is clipped to them.
+
         Raises:
-            SchemaError: The route is not known.
-            NotObservable: The schema does not infer the commanded signal.
+            SchemaError: The route is not known, or terms or limits make no sense.
+            UnknownSignal: The command is not in the layout.
+            NotObservable: The schema can neither infer the command nor try it, or the mask is not feasible.
         """
-        if route not in ROUTES:
-            raise SchemaError(f"Control route '{route}' is not known. Known routes: {', '.join(ROUTES)}.")
-        self.terms = tuple(terms)
-        self.command = command
-        self.route = route
-        self.search = search or DescentConfig(gamma_max=0.5, candidates=10, iterations=20)
-        self._warm: np.ndarray | None = None
-        self._asked: frozenset[str] = frozenset()
+        self.terms = None if terms is None else tuple(terms)
+        self.command, self.route, self.mask = command, checked_route(route), mask
+        self.limits = dict(limits or {})
+        self._search = Search(search or SEARCH, self.limits)
+        if mask is not None and route in ("latent", "auto"):
+            raise SchemaError(f"A mask goes with route mask or input, not with '{route}'.")
         self.swap(schema)
 
     def swap(self, schema: BodySchema) -> None:
         """Go on with another schema of the same body; the warm start is kept."""
         schema.layout.slice(self.command)
-        if self.command not in schema.x_out:
+        if self.command not in (*schema.x_in, *schema.x_out):
             raise NotObservable(
-                f"'{self.command}' is commanded but not inferred by this schema; it infers {', '.join(schema.x_out)}."
+                f"'{self.command}' is commanded, but this schema neither infers nor takes it; it takes "
+                f"{', '.join(schema.x_in)} and infers {', '.join(schema.x_out)}."
             )
+        if self.mask is not None:
+            checked_mask(schema, self.mask)
+        for term in self.terms or ():
+            for name in signals_of(term):
+                schema.layout.slice(name)
         self.schema = schema
 
     def restart(self) -> None:
         """Forget the warm start."""
-        self._warm = None
+        self._search.restart()
 
-    def solve(self, target: Mapping[str, np.ndarray], now: Mapping[str, np.ndarray]) -> Solution:
+    def solve(self, target: Mapping[str, np.ndarray], now: Mapping[str, np.ndarray] | None = None) -> Solution:
         """The command for a target.
 
         Args:
-            target: Signal -> reference [its unit], shape (n,).
+            target: Signal -> reference [its unit], shape (n,): what `Match` reaches, `Hold` holds and `StayNear` stays
+                near.
             now: Signal -> present value [its unit], shape (n,); NaN or absent where it is not known.
 
         Raises:
@@ -99,128 +121,130 @@ class Controller:
             NotObservable: A term or the route cannot work with this schema.
         """
         schema = self.schema
-        reference = schema.normalise(target)
-        for name in target:
-            if not np.isfinite(reference[schema.layout.slice(name)]).all():
-                raise NotFinite(f"The target of '{name}' is not finite; every element needs a number.")
-        present = schema.normalise(now)
-        if frozenset(target) != self._asked:
-            self._asked = frozenset(target)
-            self._warm = None
-        bounds = [term.bind(schema, target, now) for term in self.terms]
-        mask = None if self.route == "latent" else self._holding_mask(self._asked)
-        if mask is None and self.route == "input":
-            raise NotObservable(
-                f"No feasible mask holds {', '.join(sorted(target))} and leaves out '{self.command}'; use route latent."
-            )
-        x, loss, route = (
-            self._by_latent(bounds, present) if mask is None else self._by_input(mask, bounds, reference, present)
-        )
+        terms = self._terms(target)
+        present = schema.normalise(now or {})
+        wishes = [term for term in terms if not isinstance(term, Hold)]
+        holds = [term for term in terms if isinstance(term, Hold)]
+        held = merged(schema, [hold.wanted(schema, target) for hold in holds])
+        direct = held.copy()
+        for wish in wishes:
+            if isinstance(wish, Match) and wish.matrix is None and wish.signal != self.command:
+                direct = np.where(np.isfinite(direct), direct, schema.normalise({wish.signal: wish.reference(target)}))
+        route, mask = self._choose(wishes, schema.layout.whole(np.isfinite(direct)))
+        bounds = [wish.bind(schema, target, now or {}) for wish in wishes]
+        needed = {name for wish in wishes for name in wish.signals} | {hold.signal for hold in holds}
+        found = self._search.find(schema, route, mask, bounds, direct, held, sorted(needed), present)
+        x = self._limited(found.x)
         values = schema.scaler.restore(x)
         predicted = {name: part for name, part in schema.layout.split(values).items() if np.isfinite(part).all()}
-        return Solution(predicted[self.command].copy(), predicted, loss, self._residual(x, reference), route)
+        return Solution(
+            predicted[self.command].copy(), predicted, found.loss, self._residual(x, wishes, target), route, mask
+        )
 
-    def _holding_mask(self, asked: Mask) -> Mask | None:
-        fitting = [m for m in self.schema.masks if asked <= m and self.command not in m]
-        return max(fitting, key=len) if fitting else None
+    def _terms(self, target: Mapping[str, np.ndarray]) -> tuple[Term | Hold, ...]:
+        """The terms, after a look at whether they and the target are about the same signals."""
+        for name, value in target.items():
+            self.schema.layout.slice(name)
+            if self.terms is None and not np.isfinite(np.asarray(value, float)).all():
+                raise NotFinite(f"The target of '{name}' is not finite; every element needs a number.")
+        if self.terms is None:
+            if not target:
+                raise NotObservable("Nothing was asked: give a target, or terms with values of their own.")
+            return tuple(Match(name) for name in target)
+        minded = {name for term in self.terms for name in signals_of(term)}
+        minded |= {name for term in self.terms if (name := getattr(term, "position", "")) in target}
+        for name in target:
+            if name not in minded:
+                known = ", ".join(sorted(minded)) or "nothing"
+                raise NotObservable(f"A target of '{name}' was given, but no term is about it; they are about {known}.")
+        for term in self.terms:
+            if isinstance(term, Match) and not np.isfinite(term.reference(target)).all():
+                raise NotFinite(f"The target of '{term.signal}' is not finite; every element needs a number.")
+        return self.terms
 
-    def _by_input(
-        self, mask: Mask, bounds: list[Bound], reference: np.ndarray, present: np.ndarray
-    ) -> tuple[np.ndarray, float, str]:
+    def _choose(self, wishes: Sequence[Term], direct: Mask) -> tuple[str, Mask]:
+        """Route and mask for what is asked; `direct` are the signals whose whole value was decided by the asker."""
         schema = self.schema
-        free = schema.layout.indices(mask - self._asked)
-        known = np.where(np.isfinite(reference), reference, 0.0)
-        base = schema.network_input(known, mask)
-        columns = np.flatnonzero(np.isin(schema.in_index, free))
-        inferred = np.isin(schema.out_index, schema.layout.indices(mask), invert=True)
-        outputs = schema.out_index[inferred]
-        needs_network = any(not set(term.signals) <= mask for term in self.terms)
-        chain = schema.weights.whole
+        asked = {wish.signals[0] for wish in wishes if isinstance(wish, Match)}
+        infers = self.command in schema.x_out
+        if self.mask is not None:
+            if self.command not in self.mask and not infers:
+                raise NotObservable(f"'{self.command}' is neither in the mask nor inferred; the mask must hold it.")
+            if self.route == "mask" and not self.mask <= direct:
+                missing = label(self.mask - direct, schema.layout.names)
+                raise NotObservable(f"Route mask needs a target of {missing}; give one, or use route input.")
+            return self.route, self.mask
+        plain = all(isinstance(wish, Match) and wish.matrix is None for wish in wishes)
+        if self.route == "mask" or (self.route == "auto" and infers and plain and direct in schema.masks):
+            if not (infers and plain and direct in schema.masks):
+                raise NotObservable(
+                    f"Route mask needs '{self.command}' in x_out, plain targets only, and a feasible mask of exactly "
+                    f"{label(direct, schema.layout.names) or 'nothing'}; use route latent or input."
+                )
+            return "mask", direct
+        if self.route == "latent" or (self.route == "auto" and infers):
+            self._check_latent(wishes)
+            return "latent", frozenset()
+        trying = [m for m in schema.masks if self.command in m]
+        giving = [m for m in schema.masks if infers and asked and asked <= (m & direct) and self.command not in m]
+        if giving:
+            return "input", max(giving, key=len)
+        if not trying:
+            raise NotObservable(
+                f"No feasible mask holds '{self.command}', nor all of {', '.join(sorted(asked)) or 'what is asked'} "
+                f"without it; use route latent."
+            )
+        return "input", min(trying, key=lambda m: (len(m & asked), len(m)))
 
-        def objective(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            x = np.repeat(known[None].astype(points.dtype), len(points), axis=0)
-            x[:, free] = points
-            if needs_network:
-                inputs = np.repeat(base[None], len(points), axis=0)
-                inputs[:, columns] = points
-                values = trace(chain, inputs)
-                x[:, outputs] = values[-1][:, inferred]
-            loss, gradient = _sum(bounds, x)
-            descent = gradient[:, free]
-            if needs_network:
-                out = np.zeros_like(values[-1])
-                out[:, inferred] = gradient[:, outputs]
-                descent = descent + pull(chain, values, out)[:, columns]
-            return loss, descent
+    def _check_latent(self, wishes: Sequence[Term]) -> None:
+        if self.command not in self.schema.x_out:
+            raise NotObservable(f"Route latent decodes the command, but '{self.command}' is not in x_out; use input.")
+        for wish in wishes:
+            for name in wish.signals:
+                if name not in self.schema.x_out:
+                    raise NotObservable(
+                        f"Route latent predicts only x_out ({', '.join(self.schema.x_out)}), but a term is about "
+                        f"'{name}'; use route input."
+                    )
 
-        loss = float("nan")
-        if len(free):
-            low, high = ((schema.scaler.normalise(b))[free].astype(np.float32) for b in self._bounds())
-            found = descend(objective, self._starts(free, present), self.search, low, high)
-            self._warm, loss = found.point, found.loss
-            known[free] = found.point
-        x = np.full(schema.layout.size, np.nan)
-        held = schema.layout.indices(mask)
-        x[schema.out_index] = schema.infer(known, mask)
-        x[held] = known[held]
-        if not len(free):
-            loss = float(_sum(bounds, np.nan_to_num(x)[None])[0][0])
-        return x, loss, "input" if len(free) else "mask"
+    def _limited(self, x: np.ndarray) -> np.ndarray:
+        if self.command not in self.limits:
+            return x
+        span, scaler = self.schema.layout.slice(self.command), self.schema.scaler
+        low, high = (np.asarray(b, float) for b in self.limits[self.command])
+        x = x.copy()
+        x[span] = (np.clip(x[span] * scaler.std[span] + scaler.mean[span], low, high) - scaler.mean[span]) / (
+            scaler.std[span]
+        )
+        return x
 
-    def _bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        return self.schema.scaler.low, self.schema.scaler.high
-
-    def _starts(self, free: np.ndarray, present: np.ndarray) -> np.ndarray:
-        if self._warm is not None and len(self._warm) == len(free):
-            return self._warm[None]
-        starts = [self.schema.anchors[:STARTS, free]] if len(self.schema.anchors) else [np.zeros((1, len(free)))]
-        if np.isfinite(present[free]).all():
-            starts.append(present[None, free])
-        return np.concatenate(starts).astype(np.float32)
-
-    def _by_latent(self, bounds: list[Bound], present: np.ndarray) -> tuple[np.ndarray, float, str]:
+    def _residual(self, x: np.ndarray, wishes: Sequence[Term], target: Mapping[str, np.ndarray]) -> float:
+        """What was to be matched, asked of the network again, from the command and as little else as possible."""
         schema = self.schema
-        decoder = schema.weights.decoder
-
-        def objective(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            values = trace(decoder, points)
-            x = np.zeros((len(points), schema.layout.size), points.dtype)
-            x[:, schema.out_index] = values[-1]
-            loss, gradient = _sum(bounds, x)
-            return loss, pull(decoder, values, np.ascontiguousarray(gradient[:, schema.out_index]))
-
-        found = descend(objective, self._latent_starts(present), self.search)
-        self._warm = found.point
-        x = np.full(schema.layout.size, np.nan)
-        x[schema.out_index] = run(decoder, found.point)
-        return x, found.loss, "latent"
-
-    def _latent_starts(self, present: np.ndarray) -> np.ndarray:
-        schema = self.schema
-        latent = schema.weights.decoder[0].matrix.shape[0]
-        if self._warm is not None and len(self._warm) == latent:
-            return self._warm[None]
-        covered = covered_by(schema.masks, schema.layout.whole(np.isfinite(present)))
-        if covered:
-            return run(schema.weights.encoder, schema.network_input(present, covered[0]))[None]
-        if len(schema.anchors):
-            return run(schema.weights.encoder, schema.network_input(schema.anchors[:STARTS], schema.masks[0]))
-        return np.zeros((1, latent), np.float32)
-
-    def _residual(self, x: np.ndarray, reference: np.ndarray) -> float:
-        """The target asked of the network again, from the command and whatever else was found."""
-        schema = self.schema
+        matches = [wish for wish in wishes if isinstance(wish, Match) and wish.signal in schema.x_out]
+        judged = {wish.signal for wish in matches} - {self.command}
         there = schema.layout.whole(np.isfinite(x))
-        judged = self._asked & set(schema.x_out)
-        blind = [m for m in covered_by(schema.masks, there) if self.command in m and not m & judged]
+        blind = [m for m in schema.masks if self.command in m and m <= there and not m & judged]
         if not blind or not judged:
             return float("nan")
-        again = np.full(schema.layout.size, np.nan)
-        again[schema.out_index] = schema.infer(x, max(blind, key=len))
-        index = schema.layout.indices(judged)
-        return float(np.sqrt(np.mean((again[index] - reference[index]) ** 2)))
+        again = np.zeros(schema.layout.size)
+        again[schema.out_index] = schema.infer(x, min(blind, key=len))
+        amiss = [
+            replace(wish, unit="std").difference(schema, target).at(again[None])[0]
+            for wish in matches
+            if wish.signal in judged
+        ]
+        return float(np.sqrt(np.mean(np.concatenate(amiss) ** 2)))
 
 
-def _sum(bounds: list[Bound], x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    losses, gradients = zip(*(bound(x) for bound in bounds), strict=True)
-    return np.sum(losses, axis=0), np.sum(gradients, axis=0)
+def signals_of(term: Term | Hold) -> tuple[str, ...]:
+    """The signals that a term is about."""
+    return (term.signal,) if isinstance(term, Hold) else term.signals
+
+
+def merged(schema: BodySchema, parts: Sequence[np.ndarray]) -> np.ndarray:
+    """What several holds hold together, shape (size,) [standard deviations]; NaN where free."""
+    merged = np.full(schema.layout.size, np.nan)
+    for part in parts:
+        merged = np.where(np.isfinite(part), part, merged)
+    return merged

@@ -1,9 +1,12 @@
-"""The one optimiser (paper, II-F): gradient descent that tries many step sizes at once.
+"""The one optimiser (paper, II-G): gradient descent that tries many step sizes at once.
 
 It knows no loss and no robot. From the present point it takes the gradient, makes one candidate per step size in
 [0, gamma_max], evaluates all of them as a batch, and goes on from the best. Because the step size 0 is among them the
 loss never rises; where it wins, every other step was too long, and the next ones are spread between 0 and the shortest
 of them. A single candidate is plain descent with the constant step gamma_max.
+
+A constraint is met at every candidate, not weighed against the loss: steps go along it, and what the steps bend away
+from it Newton steps bring back.
 """
 
 from collections.abc import Callable
@@ -11,8 +14,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gemuco.errors import SchemaError
+
 Objective = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 """Points (candidates, n) -> losses (candidates,) and their gradients (candidates, n)."""
+Constraint = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+"""Points (candidates, n) -> what must be zero (candidates, k) and its Jacobian (candidates, k, n)."""
+
+RETURNS = 3
+"""Newton steps back to the constraint after every step."""
+LAST_RETURNS = 10
+"""And after the last one."""
+BREACH = 100.0
+"""Loss per unit of a constraint that is not met after all: a candidate that could not be brought back does not win."""
+DAMPING = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +43,13 @@ class DescentConfig:
     gamma_max: float = 0.5
     candidates: int = 12
     iterations: int = 30
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.gamma_max) and self.gamma_max > 0 and self.candidates >= 1 and self.iterations >= 0):
+            raise SchemaError(
+                f"A descent needs gamma_max > 0, at least 1 candidate and no negative number of iterations, not "
+                f"{self.gamma_max}, {self.candidates} and {self.iterations}."
+            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +73,7 @@ def descend(
     config: DescentConfig,
     low: np.ndarray | None = None,
     high: np.ndarray | None = None,
+    constraint: Constraint | None = None,
 ) -> Descent:
     """Minimise an objective.
 
@@ -60,6 +83,7 @@ def descend(
         config: Step sizes and iterations.
         low: Lower bounds of a point, shape (n,); candidates are moved inside.
         high: Upper bounds of a point, shape (n,).
+        constraint: What must be zero.
     """
     points = np.atleast_2d(start)
     if config.candidates > 1:
@@ -69,9 +93,14 @@ def descend(
     history: list[float] = []
     best_point, best_loss = points[0], np.inf
     for iteration in range(config.iterations + 1):
-        if low is not None or high is not None:
-            points = np.clip(points, low, high)
+        points = _inside(points, low, high)
+        breach: np.ndarray | float = 0.0
+        if constraint is not None:
+            points = _back(constraint, points, RETURNS, low, high)
+            amiss, jacobian = constraint(points)
+            breach = BREACH * np.abs(amiss).sum(axis=1)
         losses, gradients = objective(points)
+        losses = losses + breach
         chosen = int(np.argmin(losses))
         loss = float(losses[chosen])
         history.append(loss)
@@ -80,5 +109,33 @@ def descend(
         if iteration < config.iterations:
             if iteration and config.candidates > 1 and chosen == 0:
                 gammas = gammas / np.float32(config.candidates - 1)
-            points = points[chosen] - gammas * gradients[chosen]
+            gradient = gradients[chosen]
+            if constraint is not None:
+                gradient = gradient - _least(jacobian[chosen : chosen + 1], jacobian[chosen : chosen + 1] @ gradient)[0]
+            points = points[chosen] - gammas * gradient
+    if constraint is not None:
+        last = _back(constraint, best_point[None], LAST_RETURNS, low, high)
+        best_point, best_loss = last[0], float(objective(last)[0][0])
     return Descent(best_point, best_loss, tuple(history))
+
+
+def _inside(points: np.ndarray, low: np.ndarray | None, high: np.ndarray | None) -> np.ndarray:
+    return points if low is None and high is None else np.clip(points, low, high)
+
+
+def _back(
+    constraint: Constraint, points: np.ndarray, steps: int, low: np.ndarray | None, high: np.ndarray | None
+) -> np.ndarray:
+    """Newton steps of least length towards the constraint."""
+    for _ in range(steps):
+        amiss, jacobian = constraint(points)
+        points = _inside(points - _least(jacobian, amiss), low, high)
+    return points
+
+
+def _least(jacobian: np.ndarray, amiss: np.ndarray) -> np.ndarray:
+    """The shortest step that changes the constraint by so much: J^T (J J^T)^-1 amiss, shape (candidates, n)."""
+    square = jacobian @ jacobian.transpose(0, 2, 1)
+    square = square + DAMPING * np.eye(square.shape[1], dtype=square.dtype)
+    step = jacobian.transpose(0, 2, 1) @ np.linalg.solve(square, amiss[:, :, None])
+    return step[:, :, 0].astype(jacobian.dtype)

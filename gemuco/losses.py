@@ -1,21 +1,23 @@
-"""What is asked of a prediction: terms that add up to a loss (paper, II-H and III-B).
+"""What is asked of a prediction: terms that add up to a loss (paper, II-H, II-I and III).
 
-A term says what is wanted (`Match("joint_position")`). Bound to a body schema, a target and the present, it becomes a
-function of predictions: every signal of the layout in standard deviations, shape (candidates, size), to losses
-(candidates,) and their gradients (candidates, size).
+A term says what is wanted (`Match("joint_position")`). Bound to a body schema, the references of this solve and the
+present, it becomes a function of predictions: every signal of the layout in standard deviations, shape
+(candidates, size), to losses (candidates,) and their gradients (candidates, size). A new term is a class with
+`signals` and `bind`.
 
-Units: `Match` and `StayNear` measure in standard deviations of the training data. `StaySmall` does too, but from the
-physical zero and not from the mean. `TorqueBalance` measures in N m (or N for sliding joints).
+Units: the paper adds metres, radians and newtons and does not say how. Here `Match`, `StayNear` and `StaySmall` measure
+in standard deviations of the training data (`unit="std"`), so that one weight means the same for every signal, or in
+the signal's own unit (`unit="si"`). `StaySmall` measures from the physical zero either way, not from the mean.
+`TorqueBalance` (in `gemuco.torque`) measures in N m. `Hold` has no weight: it is met exactly.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from gemuco.errors import NotFinite, NotObservable
-from gemuco.kernels import Curvature, Layer
+from gemuco.errors import NotFinite, NotObservable, SchemaError, WrongSize
 
 if TYPE_CHECKING:
     from gemuco.schema import BodySchema
@@ -25,6 +27,7 @@ Bound = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 """Predictions [standard deviations], (candidates, size) -> losses (candidates,), gradients (candidates, size)."""
 
 TINY = 1e-9
+UNITS = ("std", "si")
 
 
 class Term(Protocol):
@@ -40,7 +43,7 @@ class Term(Protocol):
 
         Args:
             schema: Whose predictions.
-            target: Signal -> reference [its unit].
+            target: Signal -> reference of this solve [its unit].
             now: Signal -> measured value [its unit]; NaN where nothing was measured.
         """
         ...
@@ -48,30 +51,73 @@ class Term(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Match:
-    """weight * ||x - target||: reach the reference of a signal."""
+    """weight * ||A x - reference||: reach the reference of a signal.
+
+    Attributes:
+        signal: What to predict.
+        weight: Loss per unit of the norm.
+        matrix: Rows of A, which acts on the signal in its own unit; the signal itself if not given.
+        value: A reference that is always the same, such as (0, 0) for the center of gravity; else the target's.
+        unit: `std`: every row of A x in its own standard deviation; `si`: in the unit of A x.
+    """
 
     signal: str
     weight: float = 1.0
+    matrix: tuple[tuple[float, ...], ...] | None = None
+    value: tuple[float, ...] | None = None
+    unit: str = "std"
+
+    def __post_init__(self) -> None:
+        _check(self)
+        if self.matrix is not None:
+            object.__setattr__(self, "matrix", tuple(tuple(float(a) for a in row) for row in self.matrix))
+        _freeze_value(self)
 
     @property
     def signals(self) -> tuple[str, ...]:
         """The signals whose prediction the loss depends on."""
         return (self.signal,)
 
-    def bind(self, schema: "BodySchema", target: Values, now: Values) -> Bound:
-        """See `Term.bind`; nothing is asked where the target is NaN."""
+    def reference(self, target: Values) -> np.ndarray:
+        """What A x shall be [its unit], shape (rows,).
+
+        Raises:
+            NotObservable: There is neither a value nor a target.
+        """
+        if self.value is not None:
+            return np.asarray(self.value, float)
         if self.signal not in target:
             raise NotObservable(f"Nothing was asked of '{self.signal}', but the loss wants to match it; give a target.")
-        return _norm(schema, self.signal, np.asarray(target[self.signal], float), self.weight)
+        return np.asarray(target[self.signal], float)
+
+    def bind(self, schema: "BodySchema", target: Values, now: Values) -> Bound:
+        """See `Term.bind`; nothing is asked where the reference is NaN."""
+        return self.difference(schema, target).norm(self.weight)
+
+    def difference(self, schema: "BodySchema", target: Values) -> "Difference":
+        """A x - reference as a function of predictions."""
+        return Difference.of(schema, self.signal, self.reference(target), self.matrix, self.unit)
 
 
 @dataclass(frozen=True, slots=True)
 class StayNear:
-    """weight * ||x - value||: keep a signal where it is now, or at a given value [its unit]."""
+    """weight * ||x - near||: keep a signal near a posture, such as 0.3 ||theta - theta_orig||.
+
+    Attributes:
+        signal: What to keep.
+        weight: Loss per unit of the norm.
+        value: Where; if not given, the reference of this solve, and without one where the signal is now.
+        unit: `std` or `si`.
+    """
 
     signal: str
     weight: float = 1.0
     value: tuple[float, ...] | None = None
+    unit: str = "std"
+
+    def __post_init__(self) -> None:
+        _check(self)
+        _freeze_value(self)
 
     @property
     def signals(self) -> tuple[str, ...]:
@@ -79,18 +125,22 @@ class StayNear:
         return (self.signal,)
 
     def bind(self, schema: "BodySchema", target: Values, now: Values) -> Bound:
-        """See `Term.bind`; nothing is asked where the present is not known."""
-        size = schema.layout.signal(self.signal).size
-        near = self.value if self.value is not None else now.get(self.signal, np.full(size, np.nan))
-        return _norm(schema, self.signal, np.asarray(near, float), self.weight)
+        """See `Term.bind`; nothing is asked where it is not known what to stay near."""
+        unknown = np.full(schema.layout.signal(self.signal).size, np.nan)
+        near = target.get(self.signal, now.get(self.signal, unknown)) if self.value is None else np.array(self.value)
+        return Difference.of(schema, self.signal, np.asarray(near, float), None, self.unit).norm(self.weight)
 
 
 @dataclass(frozen=True, slots=True)
 class StaySmall:
-    """weight * ||x / std||: keep a signal near its physical zero."""
+    """weight * ||x||: keep a signal near its physical zero."""
 
     signal: str
     weight: float = 1.0
+    unit: str = "std"
+
+    def __post_init__(self) -> None:
+        _check(self)
 
     @property
     def signals(self) -> tuple[str, ...]:
@@ -99,130 +149,144 @@ class StaySmall:
 
     def bind(self, schema: "BodySchema", target: Values, now: Values) -> Bound:
         """See `Term.bind`."""
-        return _norm(schema, self.signal, np.zeros(schema.layout.signal(self.signal).size), self.weight)
-
-
-def _norm(schema: "BodySchema", signal: str, value: np.ndarray, weight: float) -> Bound:
-    span = schema.layout.slice(signal)
-    schema.layout.join({signal: value})
-    wanted = (value - schema.scaler.mean[span]) / schema.scaler.std[span]
-    asked = np.isfinite(wanted)
-    wanted = np.where(asked, wanted, 0.0)
-
-    def bound(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        difference = (x[:, span] - wanted) * asked
-        norm = np.sqrt(np.einsum("ij,ij->i", difference, difference))
-        gradient = np.zeros_like(x)
-        gradient[:, span] = difference * (weight / np.maximum(norm, TINY))[:, None]
-        return weight * norm, gradient
-
-    return bound
+        zero = np.zeros(schema.layout.signal(self.signal).size)
+        return Difference.of(schema, self.signal, zero, None, self.unit).norm(self.weight)
 
 
 @dataclass(frozen=True, slots=True)
-class TorqueBalance:
-    """weight * ||tau + G^T f||: muscle tensions that hold the reference posture.
+class Hold:
+    """A signal is forced to a value: a condition that every prediction meets, not a wish that others can outweigh.
 
-    G = dl/dtheta is the muscle Jacobian at the reference posture and the predicted tensions, had by differentiating the
-    network under the mask (theta, f).
+    Where the signal is an input of the route's mask it is given to the network and not searched for; where it is
+    predicted, the search moves only along predictions that meet it.
 
     Attributes:
-        gravity: Posture [rad], shape (joints,) -> joint torque that the muscles must supply [N m], shape (joints,).
-        weight: Loss per N m.
-        position: theta, rad.
-        tension: f, N.
-        length: l, m.
+        signal: What is held.
+        value: Where, NaN for elements that are free; the reference of this solve if not given.
     """
 
-    gravity: Callable[[np.ndarray], np.ndarray]
-    weight: float = 0.01
-    position: str = "joint_position"
-    tension: str = "muscle_tension"
-    length: str = "muscle_length"
+    signal: str
+    value: tuple[float, ...] | None = None
 
-    @property
-    def signals(self) -> tuple[str, ...]:
-        """The signals whose prediction the loss depends on."""
-        return (self.tension,)
+    def __post_init__(self) -> None:
+        _freeze_value(self)
 
-    def bind(self, schema: "BodySchema", target: Values, now: Values) -> Bound:
-        """See `Term.bind`."""
-        if self.position not in target or not np.isfinite(target[self.position]).all():
-            raise NotFinite(f"Torque balance needs a whole reference of '{self.position}'; some of it is missing.")
-        muscles = MuscleModel(schema, np.asarray(target[self.position], float), self)
-        torque = np.asarray(self.gravity(np.asarray(target[self.position], float)), float)
-        span = schema.layout.slice(self.tension)
+    def wanted(self, schema: "BodySchema", target: Values) -> np.ndarray:
+        """Every element of the layout [standard deviations], shape (size,); NaN where nothing is held.
+
+        Raises:
+            NotObservable: There is neither a value nor a reference.
+            NotFinite: No element is held.
+        """
+        if self.value is None and self.signal not in target:
+            raise NotObservable(f"'{self.signal}' shall be held, but nobody says where; give a value or a reference.")
+        value = np.asarray(self.value if self.value is not None else target[self.signal], float)
+        x = schema.normalise({self.signal: value})
+        if not np.isfinite(x).any():
+            raise NotFinite(f"'{self.signal}' shall be held, but no element of where is a number.")
+        return x
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """M x - w of one signal's prediction [standard deviations]: scaled, and zero where nothing is asked.
+
+    Attributes:
+        span: Where the signal lies in the layout.
+        matrix: M, shape (rows, n); None for one.
+        wanted: w, shape (rows,).
+        asked: Which rows count, shape (rows,).
+    """
+
+    span: slice
+    matrix: np.ndarray | None
+    wanted: np.ndarray
+    asked: np.ndarray
+
+    @classmethod
+    def of(
+        cls,
+        schema: "BodySchema",
+        signal: str,
+        reference: np.ndarray,
+        matrix: Sequence[Sequence[float]] | None,
+        unit: str,
+    ) -> "Difference":
+        """From the signal's own unit.
+
+        Raises:
+            UnknownSignal: The signal is not in the layout.
+            WrongSize: Reference and matrix do not fit the signal.
+        """
+        span = schema.layout.slice(signal)
+        mean, std = schema.scaler.mean[span], schema.scaler.std[span]
+        if matrix is None:
+            schema.layout.join({signal: reference})
+            scale = std if unit == "std" else np.ones_like(std)
+            scaled = None if unit == "std" else np.diag(std)
+            wanted = (reference - mean) / scale
+        else:
+            try:
+                rows = np.array(matrix, float)
+            except ValueError:
+                rows = np.zeros(0)
+            if rows.ndim != 2 or rows.shape[1] != len(std):
+                raise WrongSize(f"The matrix of '{signal}' needs {len(std)} columns in every row.")
+            if reference.shape != (len(rows),):
+                raise WrongSize(
+                    f"The matrix of '{signal}' has {len(rows)} rows, but its reference has shape {reference.shape}."
+                )
+            scale = np.maximum(np.sqrt(rows**2 @ std**2), TINY) if unit == "std" else np.ones(len(rows))
+            scaled = rows * std / scale[:, None]
+            wanted = (reference - rows @ mean) / scale
+        asked = np.isfinite(wanted)
+        return cls(span, scaled, np.where(asked, wanted, 0.0), asked)
+
+    def at(self, x: np.ndarray) -> np.ndarray:
+        """The difference at predictions, shape (candidates, size) -> (candidates, rows)."""
+        part = x[:, self.span]
+        return ((part if self.matrix is None else part @ self.matrix.T) - self.wanted) * self.asked
+
+    def norm(self, weight: float) -> Bound:
+        """The loss weight * ||M x - w||."""
 
         def bound(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            losses, part = muscles.imbalance(x[:, span], torque)
+            difference = self.at(x)
+            norm = np.sqrt(np.einsum("ij,ij->i", difference, difference))
+            slope = difference * (weight / np.maximum(norm, TINY))[:, None]
             gradient = np.zeros_like(x)
-            gradient[:, span] = self.weight * part
-            return self.weight * losses, gradient
+            gradient[:, self.span] = slope if self.matrix is None else slope @ self.matrix
+            return weight * norm, gradient
 
         return bound
 
 
-class MuscleModel:
-    """The muscles at one posture, as the network knows them."""
-
-    __slots__ = ("_base", "_chain", "_f", "_f_mean", "_f_std", "_l_std", "_theta", "_theta_std")
-
-    def __init__(self, schema: "BodySchema", posture: np.ndarray, names: TorqueBalance) -> None:
-        """Prepare the network under the mask (position, tension) at a posture [rad], shape (joints,).
-
-        Raises:
-            NotObservable: The schema does not infer length from position and tension.
-        """
-        mask = frozenset({names.position, names.tension})
-        if mask not in schema.masks or names.length not in schema.x_out:
-            raise NotObservable(
-                f"Torque balance differentiates '{names.length}' by '{names.position}', but this schema does not infer "
-                f"it from '{names.position}' and '{names.tension}'; see the masks that structure determination found."
-            )
-        layout, scaler = schema.layout, schema.scaler
-        theta, f, length = (layout.slice(n) for n in (names.position, names.tension, names.length))
-        known = np.zeros(layout.size)
-        known[theta] = (posture - scaler.mean[theta]) / scaler.std[theta]
-        self._base = schema.network_input(known, mask).astype(schema.weights.encoder[0].matrix.dtype)
-        self._theta = _columns(schema.in_index, theta)
-        self._f = _columns(schema.in_index, f)
-        last = schema.weights.decoder[-1]
-        columns = _columns(schema.out_index, length)
-        last = Layer(np.ascontiguousarray(last.matrix[:, columns]), last.offset[columns], False)
-        self._chain = (*schema.weights.whole[:-1], last)
-        dtype = self._base.dtype
-        self._theta_std, self._f_std, self._l_std = (scaler.std[s].astype(dtype) for s in (theta, f, length))
-        self._f_mean = scaler.mean[f].astype(dtype)
-
-    def imbalance(self, tension: np.ndarray, torque: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """||torque + G^T f|| and its gradient.
-
-        Args:
-            tension: f [standard deviations], shape (candidates, muscles).
-            torque: tau [N m], shape (joints,).
-
-        Returns:
-            Norms [N m], shape (candidates,), and gradients with respect to f [N m per standard deviation].
-        """
-        muscles = self._at(tension)
-        rest = torque.astype(self._base.dtype) + muscles.gradient[:, self._theta] / self._theta_std
-        norm = np.sqrt(np.einsum("ij,ij->i", rest, rest))
-        tangent = np.zeros_like(muscles.gradient)
-        tangent[:, self._theta] = rest / (np.maximum(norm, TINY)[:, None] * self._theta_std)
-        pushed, bent = muscles.mixed(tangent)
-        return norm, self._f_std * self._l_std * pushed + bent[:, self._f]
-
-    def torque(self, tension: np.ndarray) -> np.ndarray:
-        """G^T f [N m], shape (candidates, joints), of tensions [standard deviations]."""
-        return self._at(tension).gradient[:, self._theta] / self._theta_std
-
-    def _at(self, tension: np.ndarray) -> Curvature:
-        inputs = np.repeat(self._base[None], len(tension), axis=0)
-        inputs[:, self._f] = tension
-        w = (inputs[:, self._f] * self._f_std + self._f_mean) * self._l_std
-        return Curvature(self._chain, inputs, w)
+def total(bounds: Sequence[Bound], x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Sum of bound terms and its gradient; nothing wanted loses nothing."""
+    loss, gradient = np.zeros(len(x), x.dtype), np.zeros_like(x)
+    for bound in bounds:
+        part, slope = bound(x)
+        loss = loss + part
+        gradient = gradient + slope
+    return loss, gradient
 
 
-def _columns(index: np.ndarray, span: slice) -> np.ndarray:
-    """Where the elements of a span of the layout lie among those of an index."""
-    return np.flatnonzero((index >= span.start) & (index < span.stop))
+def check_weight(weight: float, what: str) -> None:
+    """Refuse a weight that would reward what it should punish.
+
+    Raises:
+        SchemaError: It is negative, infinite or no number.
+    """
+    if not (np.isfinite(weight) and weight >= 0.0):
+        raise SchemaError(f"The weight of {what} is {weight}; it must be a finite number that is not negative.")
+
+
+def _check(term: Match | StayNear | StaySmall) -> None:
+    check_weight(term.weight, f"{type(term).__name__}('{term.signal}')")
+    if term.unit not in UNITS:
+        raise SchemaError(f"The unit of a term is {' or '.join(UNITS)}, not '{term.unit}'.")
+
+
+def _freeze_value(term: Match | StayNear | Hold) -> None:
+    if term.value is not None:
+        object.__setattr__(term, "value", tuple(float(v) for v in np.ravel(term.value)))

@@ -4,10 +4,10 @@ Nothing here changes in place. What is learned later is another schema (`with_we
 holds one can go on with it while another thread makes the next.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,6 +19,15 @@ from gemuco.kernels import Weights, run
 from gemuco.masks import Mask, bits, label
 from gemuco.scaler import CLIP, Scaler
 from gemuco.signals import Layout
+
+if TYPE_CHECKING:
+    from gemuco.adapt import UpdateConfig
+    from gemuco.control import Solution
+    from gemuco.dataset import Dataset
+    from gemuco.losses import Hold, Term
+    from gemuco.simulate import Simulated
+    from gemuco.structure import Structure, Thresholds
+    from gemuco.train import TrainConfig
 
 ErrorTable = Mapping[tuple[str, Mask], np.ndarray]
 """(method, signals it was inferred from) -> expected error of every x_out element [unit], shape (out_size,)."""
@@ -143,9 +152,102 @@ class BodySchema:
         """
         return anomaly.prediction_error(self, values)
 
-    def score(self, values: Mapping[str, np.ndarray]) -> AnomalyScore:
+    def anomaly(self, values: Mapping[str, np.ndarray]) -> AnomalyScore:
         """How unlike normal a sample is (paper, II-K)."""
         return anomaly.score(self, values)
+
+    def control(
+        self,
+        target: Mapping[str, np.ndarray],
+        now: Mapping[str, np.ndarray] | None = None,
+        *,
+        command: str,
+        terms: Sequence["Term | Hold"] | None = None,
+        **options: Any,
+    ) -> "Solution":
+        """The command that brings about a target (paper, II-I), from scratch; `Controller` goes on from its last solve.
+
+        Args:
+            target: Signal -> reference [its unit].
+            now: Signal -> present value [its unit].
+            command: The signal that is commanded.
+            terms: What is asked; to match every target if not given.
+            options: Of `Controller`: route, mask, search, limits.
+        """
+        from gemuco.control import Controller
+
+        return Controller(self, terms, command, **options).solve(target, now)
+
+    def simulate(
+        self,
+        commands: Iterable[np.ndarray | Sequence[float]],
+        *,
+        command: str,
+        terms: Sequence["Term | Hold"] = (),
+        given: Mapping[str, np.ndarray] | None = None,
+        now: Mapping[str, np.ndarray] | None = None,
+        **options: Any,
+    ) -> list["Simulated"]:
+        """The states that commands bring about one after the other (paper, II-J); `Simulator` takes them singly.
+
+        Args:
+            commands: What is sent [unit of the commanded signal], each of shape (n,).
+            command: The signal that is commanded.
+            terms: Constraints.
+            given: Signal -> reference of terms that take one [its unit].
+            now: Signal -> value [its unit] of the state to begin from.
+            options: Of `Simulator`: route, mask, search, limits.
+        """
+        from gemuco.simulate import Simulator
+
+        return list(Simulator(self, terms, command, **options).run(commands, given, now))
+
+    def adapt(self, samples: Iterable[Mapping[str, np.ndarray]], config: "UpdateConfig | None" = None) -> "BodySchema":
+        """The schema after the online update (paper, II-F) on samples, one step each; `Updater` takes them singly.
+
+        Args:
+            samples: Signal -> value [its unit], shape (n,), oldest first.
+            config: How; see `gemuco.adapt`.
+        """
+        from gemuco.adapt import UpdateConfig, Updater
+
+        updater = Updater(self, config or UpdateConfig())
+        for values in samples:
+            updater.add(values)
+            updater.step()
+        return updater.schema
+
+    @classmethod
+    def determine(
+        cls, dataset: "Dataset", config: "TrainConfig", thresholds: "Thresholds | None" = None
+    ) -> "Structure":
+        """Which signals can be inferred, and from which masks (paper, II-E); imports torch."""
+        from gemuco.structure import determine
+
+        return determine(dataset, config, thresholds)
+
+    @classmethod
+    def fit(
+        cls,
+        dataset: "Dataset",
+        config: "TrainConfig",
+        masks: Iterable[Iterable[str]] | None = None,
+        x_out: Iterable[str] | None = None,
+    ) -> "BodySchema":
+        """Learn a body from data (paper, II-D); imports torch. `gemuco.train.fit` also tells how training went.
+
+        Args:
+            dataset: Episodes of one body.
+            config: How to train.
+            masks: The feasible masks; determined from the data if not given, and x_out with them.
+            x_out: What to infer; every signal if masks are given and this is not.
+        """
+        from gemuco.train import fit
+
+        if masks is None:
+            structure = cls.determine(dataset, config)
+            masks, x_out = structure.masks, x_out or structure.x_out
+        return fit(dataset, config, masks, x_out=x_out)[0]
 
     def error_rows(self) -> list[tuple[str, str, str, float]]:
         """For a table: (mask, signal, unit, root mean square error over its elements) on held-out data."""

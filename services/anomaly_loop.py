@@ -36,7 +36,7 @@ class AnomalyWatch:
     def tick(self) -> None:
         """Score the newest sample; NaN, and nobody is blamed, without a fresh one or without normal data."""
         fresh, values = self._freshness.take()
-        found = self._schema().score(values)
+        found = self._schema().anomaly(values)
         now = self._clock.monotonic()
         self._above_since = min(self._above_since, now) if found.score > found.threshold else math.inf
         self.latest = Anomaly(

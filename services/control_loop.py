@@ -9,10 +9,10 @@ import numpy as np
 
 from hal.clock import Clock
 from hal.config import RobotConfig
+from services.control_config import ControlConfig
 from services.errors import NotEngaged, TargetRefused
 from services.estimation import Estimation, Fresh, Newest
 from services.messages import Applied, Command, Target
-from services.model_config import ControlConfig
 
 BUMP = 0.3
 """Time constant [s] in which the first command's distance from where the servos are fades out."""

@@ -13,19 +13,19 @@ from gemuco import adapt
 from gemuco.control import Controller
 from gemuco.descent import DescentConfig
 from gemuco.errors import SchemaError
-from gemuco.losses import Match, StaySmall, Term, TorqueBalance
+from gemuco.routes import Limits
 from gemuco.schema import BodySchema
-from hal import registry
 from hal.clock import SystemClock
 from hal.config import RobotConfig
 from services import keys, query
 from services.anomaly_loop import AnomalyWatch
+from services.control_config import ControlConfig, mask_of, terms_of
 from services.control_loop import Control
 from services.estimation import Estimation, Fresh, Freshness
 from services.living_model import LivingModel, load_model
 from services.loop import Loop
 from services.messages import Anomaly, Applied, Command, Estimates, Sample, Status, Target, Update
-from services.model_config import ControlConfig, ModelConfig, model_config
+from services.model_config import ModelConfig, model_config
 from services.model_verbs import ModelVerbs
 from services.realtime import freeze, prepare_process, promote_rest
 from services.service import Service, until_told
@@ -44,21 +44,18 @@ PRIORITIES = {"estimation": 40, "control": 35, "anomaly": 30, "update": 10}
 class ModelSolver:
     """The controller of whichever model is in use."""
 
-    def __init__(self, living: LivingModel, config: ControlConfig, command: str) -> None:
-        """Prepare for the commanded signal.
+    def __init__(self, living: LivingModel, config: ControlConfig, command: str, limits: Limits | None = None) -> None:
+        """Prepare for the commanded signal, inside its limits [its unit].
 
         Raises:
             SchemaError: This model cannot control; the text says what it lacks.
         """
-        terms: list[Term] = [Match(config.target)]
-        if config.effort is not None:
-            terms.append(StaySmall(config.effort, config.effort_weight))
-            if config.gravity is not None:
-                gravity = registry.load(config.gravity)
-                terms.append(TorqueBalance(gravity, config.torque_weight, config.target, config.effort, command))
+        schema = living.schema
         self._living = living
-        self._controller = Controller(living.schema, terms, command, search=SEARCH)
-        middle = living.schema.layout.split(living.schema.scaler.mean)
+        self._controller = Controller(
+            schema, terms_of(config), command, config.route, SEARCH, mask_of(config), limits=limits
+        )
+        middle = schema.layout.split(schema.scaler.mean)
         self._controller.solve({config.target: middle[config.target]}, {})
         self._controller.restart()
         self._reference = np.zeros(0)
@@ -184,7 +181,9 @@ class GemucoService:
         if config.control is None:
             return None, f"The robot file of '{self.robot.robot}' has no model.control section."
         try:
-            solver = ModelSolver(self.living, config.control, self.robot.command.signal)
+            commanded = self.robot.command.signal
+            limits = {commanded: self.robot.bounds(commanded)}
+            solver = ModelSolver(self.living, config.control, commanded, limits)
         except SchemaError as error:
             return None, f"This model cannot control: {error}"
         sender = self.service.publisher(keys.command(self.robot.robot), Command).put

@@ -4,8 +4,9 @@ from typing import Annotated, Literal, TypeVar
 
 from pydantic import Field, ValidationError
 
-from hal.config import Positive, RobotConfig, Section, explain
+from hal.config import Positive, RangeConfig, RobotConfig, Section, explain
 from hal.errors import ConfigError
+from services.control_config import ControlConfig, SimulationConfig, named_signals
 
 Count = Annotated[int, Field(ge=1)]
 
@@ -37,23 +38,6 @@ class TrainingConfig(Section):
     """Peak learning rate of the one-cycle schedule."""
 
 
-class ControlConfig(Section):
-    """What the controller reaches, and what else it minds (paper, III-B)."""
-
-    target: str
-    effort: str | None = None
-    """Signal to keep small."""
-    gravity: str | None = None
-    """`module:name` of the joint torque [N m] that balances gravity at a posture [rad]."""
-    effort_weight: Annotated[float, Field(ge=0)] = 0.1
-    """Loss per standard deviation of effort. The paper's 1 drives all muscles to the lowest tensions that were ever
-    recorded, where they are soft and the model is worst: control error 0.25 rad against 0.08."""
-    torque_weight: Annotated[float, Field(ge=0)] = 0.3
-    """Loss per N m that the muscles lack to hold the posture."""
-    speed: Positive = 1.0
-    """Speed [unit/s] at which the reference moves from where the body is to the target."""
-
-
 class UpdateConfig(Section):
     """The online update of W from a bounded window."""
 
@@ -82,15 +66,25 @@ class ModelConfig(Section):
     training: TrainingConfig = TrainingConfig()
     control: ControlConfig | None = None
     """Absent: the robot is observed and never commanded."""
+    simulation: SimulationConfig = SimulationConfig()
     update: UpdateConfig = UpdateConfig()
     anomaly: AnomalyConfig = AnomalyConfig()
 
 
 class CollectConfig(Section):
-    """The whole `collect` section."""
+    """The whole `collect` section: a motion of the robot's own, or random postures within limits and constraints."""
 
-    motion: str
-    """`module:name` of the random safe motion: (config, seed) -> (command, duration [s]) without end."""
+    motion: str | None = None
+    """`module:name` of the random safe motion: (config, seed) -> (command, duration [s]) without end. Absent: random
+    postures within the limits of the commanded signal, and smooth moves from one to the next."""
+    speed: Positive = 1.0
+    """Highest speed of a commanded element on the way [its unit per second]."""
+    hold: Annotated[float, Field(ge=0)] = 0.3
+    """Rest in every posture [s]."""
+    forecast: str | None = None
+    """`module:name` of the designer's model: (config, condition, commands of shape (n, k)) -> signal -> (n, m)."""
+    constraints: dict[str, RangeConfig] = {}
+    """Signal -> range within which the forecast of every posture, and of the way there, must lie."""
     states: str | None = None
     """`module:name` of random states of the designer's geometry, added to what is collected from the designer's
     variant: (config, count, seed) -> signal -> array (count, n)."""
@@ -118,11 +112,14 @@ def model_config(robot: RobotConfig) -> ModelConfig:
             f"Robot '{robot.robot}': model.signals names '{wrong[0]}', which is no signal or there twice. "
             f"Known: {known}."
         )
-    for key in ("target", "effort"):
-        signal = getattr(model.control, key, None)
-        if signal is not None and signal not in robot.signals:
-            known = ", ".join(robot.signals)
-            raise ConfigError(f"Robot '{robot.robot}': model.control.{key} '{signal}' is not a signal. Known: {known}.")
+    for section in ("control", "simulation"):
+        part = getattr(model, section)
+        for key, signal in [] if part is None else named_signals(part):
+            if signal not in (there := model.signals or tuple(robot.signals)):
+                raise ConfigError(
+                    f"Robot '{robot.robot}': model.{section}.{key} '{signal}' is not a signal of the model. "
+                    f"Known: {', '.join(there)}."
+                )
     return model
 
 
@@ -132,7 +129,22 @@ def collect_config(robot: RobotConfig) -> CollectConfig:
     Raises:
         ConfigError: It is missing or wrong.
     """
-    return _section(robot, "collect", CollectConfig)
+    collect = _section(robot, "collect", CollectConfig)
+    where = f"Robot '{robot.robot}', section 'collect'"
+    if not robot.collect:
+        raise ConfigError(f"Robot '{robot.robot}' has no 'collect' section, so how it may be moved is not known.")
+    if collect.motion is not None and collect.model_fields_set & {"speed", "hold", "forecast", "constraints"}:
+        raise ConfigError(f"{where}: 'motion' moves as it likes; speed, hold, forecast and constraints are without it.")
+    if collect.constraints and collect.forecast is None:
+        raise ConfigError(f"{where}: 'constraints' need a 'forecast' of what they constrain.")
+    for name, allowed in collect.constraints.items():
+        if name not in robot.signals:
+            raise ConfigError(f"{where}: constraints.{name} is not a signal. Known: {', '.join(robot.signals)}.")
+        try:
+            allowed.bounds(robot.signals[name].size, f"constraints.{name}")
+        except ValueError as error:
+            raise ConfigError(f"{where}: {error}") from None
+    return collect
 
 
 S = TypeVar("S", bound=Section)

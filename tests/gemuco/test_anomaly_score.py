@@ -20,8 +20,8 @@ def cut(values, muscle):
 @pytest.mark.parametrize("muscle", range(5))
 def test_finds_a_cut_muscle_and_blames_it(schema, arm, muscle):
     healthy, broken = arm.sample(300, 77), cut(arm.sample(300, 78), muscle)
-    normal = np.array([schema.score(row).score for row in rows(healthy)])
-    found = [schema.score(row) for row in rows(broken)]
+    normal = np.array([schema.anomaly(row).score for row in rows(healthy)])
+    found = [schema.anomaly(row) for row in rows(broken)]
     odd = np.array([score.score for score in found])
     auc = np.mean(odd[:, None] > normal[None, :])
     assert auc > 0.9
@@ -33,7 +33,7 @@ def test_finds_a_cut_muscle_and_blames_it(schema, arm, muscle):
 
 
 def test_keeps_the_wanted_false_alarm_rate(schema, arm):
-    alarms = [schema.score(row).is_anomaly for row in rows(arm.sample(2000, 99))]
+    alarms = [schema.anomaly(row).is_anomaly for row in rows(arm.sample(2000, 99))]
     assert np.mean(alarms) < 0.01  # asked for 0.001, learned from 480 samples
 
 
@@ -53,19 +53,19 @@ def test_contribution_is_the_drop_without_the_element():
 def test_judges_by_what_is_there(schema, arm):
     row = rows(arm.sample(1, 5))[0]
     row["joint_position"][0] = np.nan
-    found = schema.score(row)
+    found = schema.anomaly(row)
     assert np.isfinite(found.score)
     assert np.isnan(found.contribution["joint_position"][0])
     assert found.threshold < schema.normal.threshold
     row["muscle_tension"][:] = np.nan
-    silent = schema.score(row)
+    silent = schema.anomaly(row)
     assert np.isnan(silent.score)
     assert silent.blamed == ""
     assert not silent.is_anomaly
 
 
 def test_without_normal_data_there_is_no_score(schema, arm):
-    found = schema.with_normal(None).score(rows(arm.sample(1, 5))[0])
+    found = schema.with_normal(None).anomaly(rows(arm.sample(1, 5))[0])
     assert np.isnan(found.score)
     assert np.isnan(found.threshold)
     assert not found.is_anomaly

@@ -25,7 +25,7 @@ def test_comes_back_the_same(schema, arm, folder):
         np.testing.assert_array_equal(other.std, found.std)
         assert (other.method, other.mask, other.residual) == (found.method, found.mask, found.residual)
     values = {name: array[0] for name, array in arm.sample(1, 3).items()}
-    assert again.score(values).score == schema.score(values).score
+    assert again.anomaly(values).score == schema.anomaly(values).score
     assert again.masks == schema.masks
     assert again.manifest == {"robot": "arm", "hash": "abc"}
 

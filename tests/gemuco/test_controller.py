@@ -7,7 +7,8 @@ from muscle_arm import HIGH, LOW, gravity
 from gemuco.control import Controller
 from gemuco.descent import DescentConfig
 from gemuco.errors import NotFinite, NotObservable, SchemaError, UnknownSignal
-from gemuco.losses import Match, StayNear, StaySmall, TorqueBalance
+from gemuco.losses import Match, StayNear, StaySmall
+from gemuco.torque import TorqueBalance
 
 PAPER = (Match("joint_position"), StaySmall("muscle_tension"), TorqueBalance(gravity, weight=0.01))
 HOLDING = (Match("joint_position"), StaySmall("muscle_tension", 0.05), TorqueBalance(gravity, weight=1.0))
@@ -21,7 +22,7 @@ def posture_of(arm, tension, length):
 
 
 def test_reaches_a_reference(schema, arm):
-    controller = Controller(schema, HOLDING, "muscle_length", search=DescentConfig(0.5, 10, 30))
+    controller = Controller(schema, HOLDING, "muscle_length", "input", search=DescentConfig(0.5, 10, 30))
     errors = []
     for theta in np.random.default_rng(7).uniform(LOW + 0.2, HIGH - 0.2, (8, 2)):
         solution = controller.solve({"joint_position": theta}, {})
@@ -42,7 +43,7 @@ def test_latent_route_predicts_the_reference(schema):
 
 def test_tensions_balance_gravity(schema, arm):
     theta = np.array([0.6, 1.0])
-    solution = Controller(schema, HOLDING, "muscle_length", search=DescentConfig(0.5, 10, 60)).solve(
+    solution = Controller(schema, HOLDING, "muscle_length", "input", search=DescentConfig(0.5, 10, 60)).solve(
         {"joint_position": theta}, {}
     )
     torque = -arm.jacobian(theta).T @ solution.predicted["muscle_tension"]
@@ -53,13 +54,13 @@ def test_tensions_balance_gravity(schema, arm):
 
 def test_input_route_stays_on_the_manifold(schema):
     target = {"joint_position": np.array([0.4, 1.2])}
-    solution = Controller(schema, PAPER, "muscle_length").solve(target, {})
+    solution = Controller(schema, PAPER, "muscle_length", "input").solve(target, {})
     assert solution.residual < 0.3  # standard deviations
     np.testing.assert_allclose(solution.predicted["joint_position"], target["joint_position"])
 
 
 def test_goes_on_from_where_it_was(schema):
-    controller = Controller(schema, HOLDING, "muscle_length", search=DescentConfig(0.5, 10, 5))
+    controller = Controller(schema, HOLDING, "muscle_length", "input", search=DescentConfig(0.5, 10, 5))
     target = {"joint_position": np.array([0.4, 1.2])}
     losses = [controller.solve(target, {}).loss for _ in range(8)]
     assert all(after <= before + 1e-6 for before, after in pairwise(losses))
@@ -70,7 +71,7 @@ def test_a_term_on_the_command_is_pulled_back_through_the_network(schema, arm):
     theta = np.array([0.4, 1.2])
     near = arm.length(theta[None], np.full((1, 5), 60.0))[0]
     terms = (Match("joint_position"), StayNear("muscle_length", value=tuple(near)))
-    solution = Controller(schema, terms, "muscle_length", search=DescentConfig(0.5, 10, 80)).solve(
+    solution = Controller(schema, terms, "muscle_length", "input", search=DescentConfig(0.5, 10, 80)).solve(
         {"joint_position": theta}, {}
     )
     assert np.abs(solution.command - near).max() < 0.003  # m
@@ -78,12 +79,12 @@ def test_a_term_on_the_command_is_pulled_back_through_the_network(schema, arm):
 
 
 def test_says_what_is_wrong(schema):
-    with pytest.raises(SchemaError, match="Known routes: auto, input, latent"):
+    with pytest.raises(SchemaError, match="Known routes: auto, mask, latent, input"):
         Controller(schema, PAPER, "muscle_length", "magic")
     with pytest.raises(UnknownSignal, match="Known signals"):
         Controller(schema, PAPER, "wire")
     controller = Controller(schema, PAPER, "muscle_length")
     with pytest.raises(NotFinite, match="every element needs a number"):
         controller.solve({"joint_position": np.array([0.1, np.nan])}, {})
-    with pytest.raises(NotObservable, match="leaves out 'muscle_tension'"):
-        Controller(schema, PAPER, "muscle_tension", "input").solve({"joint_position": np.zeros(2)}, {})
+    with pytest.raises(NotObservable, match="a feasible mask of exactly muscle_length"):
+        Controller(schema, None, "joint_position", "mask").solve({"muscle_length": np.full(5, 0.3)}, {})

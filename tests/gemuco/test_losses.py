@@ -5,7 +5,8 @@ import pytest
 from muscle_arm import gravity
 
 from gemuco.errors import NotFinite, NotObservable, UnknownSignal, WrongSize
-from gemuco.losses import Match, MuscleModel, StayNear, StaySmall, TorqueBalance
+from gemuco.losses import Match, StayNear, StaySmall
+from gemuco.torque import MuscleModel, TorqueBalance
 
 TARGET = {"joint_position": np.array([0.3, 0.9])}
 NOW = {"muscle_length": np.full(5, 0.3), "muscle_tension": np.array([10.0, np.nan, 30.0, 40.0, 50.0])}
@@ -26,6 +27,12 @@ def precise(schema):
         StayNear("muscle_tension", value=(20.0, 20.0, 20.0, 20.0, 20.0)),
         StaySmall("muscle_tension", 0.1),
         TorqueBalance(gravity, weight=0.7),
+        TorqueBalance(gravity, weight=0.7, at="predicted"),
+        Match("joint_position", 2.0, matrix=((1.0, 1.0), (0.0, -0.5), (2.0, 0.3)), value=(0.4, 0.1, 0.0)),
+        Match("joint_position", 2.0, matrix=((1.0, 1.0),), value=(0.4,), unit="si"),
+        Match("muscle_length", value=(0.3, 0.31, 0.32, 0.33, 0.34), unit="si"),
+        StayNear("joint_position", 0.3),
+        StaySmall("muscle_tension", 0.1, unit="si"),
     ],
 )
 def test_gradient_agrees_with_finite_differences(precise, term):
@@ -53,9 +60,10 @@ def test_units(schema):
 def test_network_knows_the_moment_arms(schema, arm):
     theta = np.array([0.2, 0.8])
     span = schema.layout.slice("muscle_tension")
-    muscles = MuscleModel(schema, theta, TorqueBalance(gravity))
+    muscles = MuscleModel(schema, TorqueBalance(gravity))
+    posture = (theta - schema.scaler.mean[:2]) / schema.scaler.std[:2]
     tension = np.random.default_rng(4).uniform(10.0, 90.0, (50, 5))
-    found = muscles.torque((tension - schema.scaler.mean[span]) / schema.scaler.std[span])
+    found = muscles.torque(np.tile(posture, (50, 1)), (tension - schema.scaler.mean[span]) / schema.scaler.std[span])
     wanted = tension @ arm.jacobian(theta)
     assert np.abs(found - wanted).mean() < 0.3  # N m, of torques of about 2 N m
     assert np.corrcoef(found.ravel(), wanted.ravel())[0, 1] > 0.98

@@ -35,7 +35,7 @@ def test_shipped_sections_are_understood() -> None:
         (
             "model",
             {"control": {"target": "elbow"}},
-            "model.control.target 'elbow' is not a signal. Known: joint_position",
+            "model.control.target 'elbow' is not a signal of the model. Known: joint_position",
         ),
         ("collect", {}, "motion: Field required"),
     ],

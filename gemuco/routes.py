@@ -1,0 +1,298 @@
+"""What a descent moves (paper, II-C): z, from which every x_out is decoded (e), or some x_in, from which the network
+infers the rest (f). Estimation, control and simulation differ in what they ask; what moves is here for all three.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from gemuco.descent import Constraint, DescentConfig, descend
+from gemuco.errors import NotObservable, SchemaError, WrongSize
+from gemuco.kernels import pull, run, trace
+from gemuco.losses import Bound, total
+from gemuco.masks import Mask, label
+from gemuco.scaler import CLIP
+
+if TYPE_CHECKING:
+    from gemuco.schema import BodySchema
+
+ROUTES = ("auto", "mask", "latent", "input")
+STARTS = 64
+"""How many anchors of the training data a descent chooses its start from."""
+
+Limits = Mapping[str, tuple[np.ndarray, np.ndarray]]
+"""Signal -> lowest and highest value [its unit], shapes (n,)."""
+Back = Callable[[np.ndarray], np.ndarray]
+"""Gradient with respect to predictions, (candidates, size) -> with respect to points, (candidates, n)."""
+
+
+class Route(Protocol):
+    """A way from points to predictions."""
+
+    def predict(self, points: np.ndarray) -> tuple[np.ndarray, Back]:
+        """Points (candidates, n) -> predictions [standard deviations], (candidates, size), and how gradients return.
+
+        A signal that the route says nothing about is 0, and gradients with respect to it are dropped.
+        """
+        ...
+
+
+class LatentRoute:
+    """Usage (e): z moves, and every x_out is decoded from it."""
+
+    def __init__(self, schema: "BodySchema") -> None:
+        self._schema = schema
+        self._decoder = schema.weights.decoder
+
+    def predict(self, points: np.ndarray) -> tuple[np.ndarray, Back]:
+        """See `Route.predict`."""
+        values = trace(self._decoder, points)
+        x = np.zeros((len(points), self._schema.layout.size), points.dtype)
+        x[:, self._schema.out_index] = values[-1]
+
+        def back(gradient: np.ndarray) -> np.ndarray:
+            return pull(self._decoder, values, np.ascontiguousarray(gradient[:, self._schema.out_index]))
+
+        return x, back
+
+    def final(self, point: np.ndarray) -> np.ndarray:
+        """What was found, shape (size,) [standard deviations]; NaN for what is not in x_out."""
+        x = np.full(self._schema.layout.size, np.nan)
+        x[self._schema.out_index] = run(self._decoder, point)
+        return x
+
+    def starts(self, present: np.ndarray) -> np.ndarray:
+        """Latent states of the present, as far as it is known, and of training data, shape (starts, latent)."""
+        schema = self._schema
+        encoder = schema.weights.encoder
+        found = []
+        there = schema.layout.whole(np.isfinite(present))
+        covered = [mask for mask in schema.masks if mask <= there]
+        if covered:
+            found.append(run(encoder, schema.network_input(present, covered[0]))[None])
+        if len(schema.anchors):
+            found.append(run(encoder, schema.network_input(schema.anchors[:STARTS], schema.masks[0])))
+        return np.concatenate(found) if found else np.zeros((1, self._decoder[0].matrix.shape[0]), np.float32)
+
+
+class InputRoute:
+    """Usage (f): inputs under a mask move as far as they are not given, and the network infers the rest of x_out."""
+
+    def __init__(
+        self, schema: "BodySchema", mask: Mask, given: np.ndarray, needed: Sequence[str], limits: Limits | None = None
+    ) -> None:
+        """Prepare.
+
+        Args:
+            schema: The body schema.
+            mask: The inputs.
+            given: Inputs that are not searched for [standard deviations], shape (size,); NaN where free.
+            needed: Signals whose prediction somebody looks at; the network runs if one of them is not in the mask.
+            limits: Narrower bounds of the inputs than those of the training data.
+
+        Raises:
+            NotObservable: A needed signal is neither given nor inferred.
+        """
+        for name in needed:
+            if name not in mask and name not in schema.x_out:
+                raise NotObservable(
+                    f"A term is about '{name}', which this schema does not infer ({', '.join(schema.x_out)}) and which "
+                    f"is not among the inputs {label(mask, schema.layout.names)}."
+                )
+        inside = schema.layout.indices(mask)
+        self.mask, self._schema, self._chain = mask, schema, schema.weights.whole
+        self.free = inside[~np.isfinite(given[inside])]
+        self._known = np.where(np.isfinite(given), given, 0.0)
+        self._base = schema.network_input(self._known, mask).astype(self._chain[0].matrix.dtype)
+        self._columns = np.flatnonzero(np.isin(schema.in_index, self.free))
+        self._inferred = np.isin(schema.out_index, inside, invert=True)
+        self._outputs = schema.out_index[self._inferred]
+        self._runs = any(name not in mask for name in needed)
+        low, high = bounds_of(schema, limits)
+        dtype = self._base.dtype
+        self.low, self.high = low[self.free].astype(dtype), high[self.free].astype(dtype)
+
+    def predict(self, points: np.ndarray) -> tuple[np.ndarray, Back]:
+        """See `Route.predict`."""
+        x = np.repeat(self._known[None].astype(points.dtype), len(points), axis=0)
+        x[:, self.free] = points
+        if not self._runs:
+            return x, lambda gradient: gradient[:, self.free]
+        inputs = np.repeat(self._base[None], len(points), axis=0)
+        inputs[:, self._columns] = points
+        values = trace(self._chain, inputs)
+        x[:, self._outputs] = values[-1][:, self._inferred]
+
+        def back(gradient: np.ndarray) -> np.ndarray:
+            out = np.zeros_like(values[-1])
+            out[:, self._inferred] = gradient[:, self._outputs]
+            return gradient[:, self.free] + pull(self._chain, values, out)[:, self._columns]
+
+        return x, back
+
+    def final(self, point: np.ndarray) -> np.ndarray:
+        """What was found, shape (size,) [standard deviations]; NaN for what is neither input nor output."""
+        schema = self._schema
+        inputs = self._base.copy()
+        inputs[self._columns] = point
+        x = np.full(schema.layout.size, np.nan)
+        x[schema.out_index] = run(self._chain, inputs)
+        inside = schema.layout.indices(self.mask)
+        x[inside] = self._known[inside]
+        x[self.free] = point
+        return x
+
+    def starts(self, present: np.ndarray) -> np.ndarray:
+        """The present, where it is known, and training data, shape (starts, free)."""
+        found = []
+        if np.isfinite(present[self.free]).all():
+            found.append(present[None, self.free])
+        if len(self._schema.anchors):
+            found.append(self._schema.anchors[:STARTS, self.free])
+        return np.concatenate(found or [np.zeros((1, len(self.free)))]).astype(np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """Where a search along a route ended.
+
+    Attributes:
+        x: What is predicted there, shape (size,) [standard deviations]; NaN for what the route says nothing about.
+        loss: Sum of the terms.
+    """
+
+    x: np.ndarray
+    loss: float
+
+
+class Search:
+    """Searches along one route after the other, each beginning where the last one ended if the route is the same."""
+
+    def __init__(self, config: DescentConfig, limits: Limits | None) -> None:
+        self.config, self.limits = config, limits
+        self._warm: np.ndarray | None = None
+        self._way: tuple[str, Mask, int] | None = None
+
+    def restart(self) -> None:
+        """Forget where the last one ended."""
+        self._warm = None
+
+    def find(
+        self,
+        schema: "BodySchema",
+        route: str,
+        mask: Mask,
+        bounds: Sequence[Bound],
+        given: np.ndarray,
+        held: np.ndarray,
+        needed: Sequence[str],
+        present: np.ndarray,
+    ) -> Found:
+        """Minimise terms along a route.
+
+        Args:
+            schema: The body schema.
+            route: `latent`; or `mask` or `input`, which differ only in how much of the mask is left free.
+            mask: The inputs of the network.
+            bounds: The terms.
+            given: What inputs are given and not searched for [standard deviations], shape (size,); NaN where free.
+            held: What predictions must equal, shape (size,) [standard deviations]; NaN where free.
+            needed: Signals that the terms are about.
+            present: What is known of the present [standard deviations], shape (size,); NaN where nothing is.
+        """
+        way: LatentRoute | InputRoute
+        if route == "latent":
+            way, size, low, high = LatentRoute(schema), -1, None, None
+        else:
+            way = InputRoute(schema, mask, given, needed, self.limits)
+            size, low, high = len(way.free), way.low, way.high
+            held = held.copy()
+            held[schema.layout.indices(mask)] = np.nan
+        starts = self._warm[None] if self._warm is not None and self._way == (route, mask, size) else None
+        if starts is None:
+            starts = way.starts(present)
+        if size:
+            point = descend(
+                lambda points: _loss(way, bounds, points), starts, self.config, low, high, _constraint(way, held)
+            ).point
+        else:
+            point = starts[0]
+        self._warm, self._way = point, (route, mask, size)
+        x = way.final(point)
+        return Found(x, float(total(bounds, np.nan_to_num(x)[None])[0][0]))
+
+
+def _loss(route: Route, bounds: Sequence[Bound], points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    x, back = route.predict(points)
+    loss, gradient = total(bounds, x)
+    return loss, back(gradient)
+
+
+def _constraint(route: Route, held: np.ndarray) -> Constraint | None:
+    index = np.flatnonzero(np.isfinite(held))
+    if not len(index):
+        return None
+    wanted = held[index]
+
+    def constraint(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        x, back = route.predict(points)
+        rows = []
+        for element in index:
+            one = np.zeros_like(x)
+            one[:, element] = 1.0
+            rows.append(back(one))
+        return x[:, index] - wanted.astype(x.dtype), np.stack(rows, axis=1)
+
+    return constraint
+
+
+def bounds_of(schema: "BodySchema", limits: Limits | None) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest value of every element that a search may try [standard deviations], shapes (size,).
+
+    The range of the training data, narrowed by the limits.
+
+    Raises:
+        UnknownSignal: A limit is of a signal that is not in the layout.
+        WrongSize: A limit does not have its signal's size.
+        SchemaError: A lower limit is above its upper limit.
+    """
+    scaler = schema.scaler
+    low, high = scaler.normalise(scaler.low).clip(-CLIP, CLIP), scaler.normalise(scaler.high).clip(-CLIP, CLIP)
+    for name, pair in (limits or {}).items():
+        span = schema.layout.slice(name)
+        if len(pair) != 2:
+            raise WrongSize(f"The limits of '{name}' are a lower and an upper bound, not {len(pair)} of them.")
+        bounds = [schema.layout.join({name: np.asarray(bound, float)}) for bound in pair]
+        below, above = (scaler.normalise(bound)[span] for bound in bounds)
+        if not (below <= above).all():
+            raise SchemaError(f"A lower limit of '{name}' is above its upper limit, or one of them is no number.")
+        low[span], high[span] = low[span].clip(below, above), high[span].clip(below, above)
+    return low, high
+
+
+def checked_mask(schema: "BodySchema", mask: Mask) -> Mask:
+    """A mask that was found feasible.
+
+    Raises:
+        NotObservable: This schema was not trained with it.
+    """
+    if mask not in schema.masks:
+        known = ", ".join(label(m, schema.layout.names) for m in schema.masks)
+        raise NotObservable(
+            f"The mask {label(mask, schema.layout.names) or ', '.join(sorted(mask))} is not feasible for this schema. "
+            f"Feasible masks: {known}."
+        )
+    return mask
+
+
+def checked_route(route: str) -> str:
+    """A route that exists.
+
+    Raises:
+        SchemaError: It does not.
+    """
+    if route not in ROUTES:
+        raise SchemaError(f"Route '{route}' is not known. Known routes: {', '.join(ROUTES)}.")
+    return route
