@@ -75,7 +75,7 @@ def model(robot: RobotConfig, console: Console) -> BodySchema:
         console.print("collecting and training")
         data = artifacts.data_path(robot.robot)
         if not data.exists():
-            collector.collect_direct(robot, "geometric", 0, None, lambda *_: None).dataset.save(data)
+            collector.collect_direct(robot, "geometric", 0).dataset.save(data)
         trainer.train(robot, Dataset.load(data), 0, lambda *_: None).schema.save(folder)
     return load_model(robot, folder)
 

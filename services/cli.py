@@ -27,7 +27,12 @@ Connect = Annotated[
     typer.Option("--connect", metavar="ENDPOINT", help="Another zenoh endpoint to connect to (tcp/192.168.0.5:7447)."),
 ]
 Seed = Annotated[int, typer.Option(help="Seed of all that is random.")]
-VARIANT_HELP = "Which variant of the robot to simulate: the designer's model, or one built differently."
+Variant = Annotated[
+    str | None,
+    typer.Option(
+        help="Which variant of the robot to simulate; the designer's model, which is the first, if not given."
+    ),
+]
 
 
 def speaks_plainly(verb: Callable[..., Any]) -> Callable[..., Any]:
@@ -74,8 +79,11 @@ def main(
 @speaks_plainly
 def simulate(
     robot: RobotFile,
-    variant: Annotated[str, typer.Option(help=VARIANT_HELP)] = "geometric",
+    variant: Variant = None,
     seed: Seed = 0,
+    condition: Annotated[
+        str | None, typer.Option(help="Condition of the body, such as its tool; the file's first if not given.")
+    ] = None,
     connect: Connect = None,
 ) -> int:
     """Pretend to be the hardware: simulated CANopen nodes on the robot file's buses, until Ctrl-C.
@@ -84,7 +92,7 @@ def simulate(
     """
     from services.simulator_service import run_simulator
 
-    return run_simulator(_load(robot), variant, seed, connect or ())
+    return run_simulator(_load(robot), variant, seed, condition, connect or ())
 
 
 @app.command()
@@ -118,26 +126,33 @@ def serve(
 @speaks_plainly
 def collect(
     robot: RobotFile,
-    variant: Annotated[str, typer.Option(help=VARIANT_HELP)] = "geometric",
+    variant: Variant = None,
     seed: Seed = 0,
+    condition: Annotated[
+        list[str] | None,
+        typer.Option("--condition", help="Condition of the body to record; again for another; all if not given."),
+    ] = None,
     samples: Annotated[
-        int | None, typer.Option(min=100, help="How many; the robot file's number if not given.")
+        int | None, typer.Option(min=1, help="How many per condition; the robot file's number if not given.")
+    ] = None,
+    postures: Annotated[
+        Path | None, typer.Option(metavar="CSV", help="Play these taught postures in place of random motion.")
     ] = None,
     bus: Annotated[
         bool, typer.Option("--bus", help="Move the robot that `gemuco hal` runs, in its own time; else no bus at all.")
     ] = False,
     out: Annotated[Path | None, typer.Option(help="Where to write; runs/<robot>/data.npz if not given.")] = None,
 ) -> None:
-    """Record random safe motion to train from."""
+    """Record random safe motion, or taught postures, to train from."""
     from services import artifacts, collector
     from services.show import progress
 
-    config = _load(robot)
+    config, wanted = _load(robot), collector.Wanted(tuple(condition or ()), samples, postures)
     with progress("collecting") as tell:
         if bus:
-            found = collector.collect_bus(config, seed, samples, tell)
+            found = collector.collect_bus(config, seed, wanted, tell)
         else:
-            found = collector.collect_direct(config, variant, seed, samples, tell)
+            found = collector.collect_direct(config, variant, seed, wanted, tell)
     path = out or artifacts.data_path(config.robot)
     found.dataset.save(path)
     typer.echo(

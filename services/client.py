@@ -61,6 +61,10 @@ class Client:
         """The newest measurement; None if none arrived in the last `max_age` [s], nor while waiting `timeout` [s]."""
         return self._fresh(keys.sample(self.robot), Sample, max_age, timeout)
 
+    def vision(self, max_age: float = FRESH, timeout: float = 0.0) -> Sample | None:
+        """What a camera saw last, or None; see `sample`."""
+        return self._fresh(keys.vision(self.robot), Sample, max_age, timeout)
+
     def applied(self, max_age: float = FRESH, timeout: float = 0.0) -> Applied | None:
         """What was last sent to the drives, or None; see `sample`."""
         return self._fresh(keys.applied(self.robot), Applied, max_age, timeout)
@@ -163,9 +167,14 @@ class Client:
         arguments = {"signal": signal, "hide": list(hide)} | ({} if values is None else {"values": dict(values)})
         return self.ask("model", "estimate", arguments, SLOW_TIMEOUT)
 
-    def fault(self, text: str) -> dict[str, Any]:
-        """Break something in the simulator (`sensor_silent elbow_pitch_encoder`, `muscle_cut biceps`)."""
-        return self.ask("simulator", "fault", {"text": text})
+    def fault(self, text: str, service: str = "simulator") -> dict[str, Any]:
+        """Break something in the simulator (`sensor_silent elbow_pitch_encoder`, `muscle_cut biceps`).
+
+        Args:
+            text: What to break.
+            service: Who plays it: `simulator`, or `vision` for the camera (`camera_covered`).
+        """
+        return self.ask(service, "fault", {"text": text})
 
     def describe(self, service: str = "hal") -> dict[str, Any]:
         """Who a service is and what it serves."""

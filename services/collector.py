@@ -1,47 +1,52 @@
-"""Random safe motion, recorded: without a bus as fast as it computes, or on a running robot in its own time."""
+"""Safe motion, recorded: random or taught, condition by condition, without a bus or on a running robot."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from pathlib import Path
 
 import numpy as np
 
 from gemuco.dataset import Dataset, Episode
+from gemuco.signals import Layout
 from hal import registry
 from hal.config import RobotConfig
-from hal.errors import ConfigError
-from hal.robot import Robot
 from services.client import Client
-from services.errors import ServiceError
 from services.living_model import layout_of
 from services.model_config import CollectConfig, collect_config
+from services.motion import Motion, random_postures
+from services.playground import BusPlayground, CollectionStopped, DirectPlayground, Playground, Values
+from services.postures import load_postures, taught
+from services.stand_in import condition_of, simulator_of, variant_of
 
 EPISODE = 10.0
 """Length of an episode [s of the robot's time]: held-out data are whole episodes."""
 MARGIN = 0.05
 """Share of the range between two limits by which a sample may lie outside."""
-ENABLE_WITHIN = 5.0
-"""Time [s] within which the drives must be enabled."""
+STARVED = 30.0
+"""Robot time [s] without a sample that counts, after which collecting is given up."""
+BUS = "bus"
+"""Condition of what was recorded on a bus, of a robot whose file has no conditions, if none was told."""
 
-Values = dict[str, np.ndarray]
 Progress = Callable[[float, str], None]
 
 
-class CollectionStopped(ServiceError):
-    """The robot stopped before enough was recorded; the text says why."""
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """What to record, where the robot file leaves a choice.
+
+    Attributes:
+        conditions: Names of conditions; all of the robot file's if empty.
+        samples: Per condition; the robot file's number, or all of the taught postures, if None.
+        postures: A CSV file of taught postures to play, in place of random motion.
+    """
+
+    conditions: Sequence[str] = ()
+    samples: int | None = None
+    postures: Path | None = None
 
 
-class Playground(Protocol):
-    """A robot that can be moved and looked at."""
-
-    def play(self, command: np.ndarray, duration: float) -> Iterator[Values]:
-        """Hold a command [unit of the commanded signal], shape (n,), for so long [s]; yield what is to be recorded."""
-        ...
-
-    def elapsed(self) -> float:
-        """The robot's own time [s]."""
-        ...
+EVERYTHING = Wanted()
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,110 +69,176 @@ class Collected:
         return self.robot_time / max(self.wall_time, 1e-9)
 
 
-class DirectPlayground:
-    """A simulated robot without a bus; its time is the simulation's."""
-
-    def __init__(self, robot: Robot, rate: float) -> None:
-        """Enable the robot; `rate` [Hz] is how often a sample is recorded.
-
-        Raises:
-            CollectionStopped: The drives do not come.
-        """
-        self._robot = robot
-        self._every = max(1, round(1.0 / (rate * robot.period)))
-        self._next = robot.clock.monotonic()
-        self._start = self._next
-        self._cycle = 0
-        self._turn()
-        robot.enable()
-        for _ in range(round(ENABLE_WITHIN / robot.period)):
-            self._turn()
-            if robot.mode in ("hold", "follow"):
-                return
-        raise CollectionStopped(f"The drives did not become enabled within {ENABLE_WITHIN:g} s: mode '{robot.mode}'.")
-
-    def play(self, command: np.ndarray, duration: float) -> Iterator[Values]:
-        """See `Playground.play`."""
-        for _ in range(max(1, round(duration / self._robot.period))):
-            self._robot.command(command, self._cycle)
-            sample = self._turn()
-            if self._robot.mode == "fault":
-                raise CollectionStopped(f"The robot stopped: {self._robot.fault_text}")
-            if self._cycle % self._every == 0:
-                yield sample
-
-    def elapsed(self) -> float:
-        """See `Playground.elapsed`."""
-        return self._robot.clock.monotonic() - self._start
-
-    def _turn(self) -> Values:
-        sample, _ = self._robot.cycle()
-        self._cycle = sample.cycle
-        self._next += self._robot.period
-        self._robot.clock.sleep_until(self._next)
-        return sample.values
+def _quiet(share: float, text: str) -> None:
+    """Tell nobody."""
 
 
-def gather(
+def collect_direct(
+    robot: RobotConfig,
+    variant: str | None = None,
+    seed: int = 0,
+    wanted: Wanted = EVERYTHING,
+    progress: Progress = _quiet,
+) -> Collected:
+    """Record from the robot file's simulator without a bus, under one condition after the other.
+
+    Args:
+        robot: The robot file.
+        variant: Of the simulator; the designer's if None.
+        seed: Chooses the robot among those of the variant, its noise, and the motion.
+        wanted: What to record.
+        progress: Told the share done, 0 to 1, and a line of text.
+
+    Raises:
+        ConfigError: The robot file names no simulator, or cannot be moved; an unknown variant or condition.
+        BadPostures, NowhereToGo, CollectionStopped: Nothing, or not enough, was recorded.
+    """
+    config, simulator = collect_config(robot), simulator_of(robot)
+    variant = variant_of(robot, variant)
+    conditions = [condition_of(robot, one) for one in (wanted.conditions or robot.conditions or (None,))]
+    motions = [_motion(robot, config, condition, seed, wanted) for condition in conditions]
+    found: list[Collected] = []
+    for index, condition in enumerate(conditions):
+
+        def tell(share: float, text: str, index: int = index, condition: str | None = condition) -> None:
+            progress((index + share) / len(conditions), text if condition is None else f"{condition}: {text}")
+
+        with simulator.direct(robot, variant, seed, condition) as body:
+            place = DirectPlayground(body, config.rate)
+            found.append(_gather(robot, place, motions[index], config, wanted, condition or variant, tell))
+    whole = _joined(found)
+    if config.states is None or variant != simulator.variants[0] or wanted.postures is not None:
+        return whole
+    return _with_states(robot, config, whole, seed)
+
+
+def collect_bus(
+    robot: RobotConfig, seed: int = 0, wanted: Wanted = EVERYTHING, progress: Progress = _quiet
+) -> Collected:
+    """Record from the robot that a HAL runs, as a client of it, and let it go at the end.
+
+    Args:
+        robot: The robot file.
+        seed: Of the motion.
+        wanted: What to record; of conditions at most one, any name, for what the body holds while it is recorded.
+        progress: Told the share done, 0 to 1, and a line of text.
+
+    Raises:
+        ConfigError: The robot file does not say how to move.
+        ServiceUnavailable: No HAL answers.
+        BadPostures, NowhereToGo, CollectionStopped: Nothing, or not enough, was recorded.
+    """
+    if len(wanted.conditions) > 1:
+        raise CollectionStopped(
+            f"A running robot is under one condition at a time, not {', '.join(wanted.conditions)}: collect each by "
+            "itself, and change the tool in between."
+        )
+    config = collect_config(robot)
+    told = wanted.conditions[0] if wanted.conditions else None
+    condition = condition_of(robot, told if told in robot.conditions else None)
+    motion = _motion(robot, config, condition, seed, wanted)
+    with Client(robot.robot) as client:
+        try:
+            place = BusPlayground(robot, client, config.rate)
+            return _gather(robot, place, motion, config, wanted, told or condition or BUS, progress)
+        finally:
+            client.disable()
+
+
+def _motion(robot: RobotConfig, config: CollectConfig, condition: str | None, seed: int, wanted: Wanted) -> Motion:
+    if wanted.postures is not None:
+        return taught(robot, config, load_postures(wanted.postures, robot, config.hold))
+    if config.motion is not None:
+        own = registry.load(config.motion)
+        return lambda start: own(robot, seed)
+    return random_postures(robot, config, condition, seed)
+
+
+def _gather(
     robot: RobotConfig,
     body: Playground,
-    motion: Iterator[tuple[np.ndarray, float]],
+    motion: Motion,
     config: CollectConfig,
+    wanted: Wanted,
     condition: str,
     progress: Progress,
 ) -> Collected:
-    """Play the motion until enough samples are recorded.
-
-    Only samples in which every value is valid and within the robot file's limits count: beyond them, on a mechanical
-    stop or with slack muscles, the signals do not say where the body is.
-    """
-    layout = layout_of(robot)
-    low, high = _bounds(robot)
-    per_episode = max(2, round(EPISODE * config.rate))
+    """Play the motion until enough samples are recorded, or to its end."""
+    table = _Table(robot, config, condition)
     started = time.monotonic()
-    rows: list[np.ndarray] = []
+    most = wanted.samples
+    if most is None and wanted.postures is None:
+        most = config.samples
     told = 0.0
-    while len(rows) < config.samples:
-        command, duration = next(motion)
+    for command, duration in motion(body.start):
         for values in body.play(command, duration):
-            row = layout.join(values)
-            if body.elapsed() >= config.settle and np.all((row >= low) & (row <= high)):
-                rows.append(row)
+            table.add(values, body.elapsed())
         if time.monotonic() - told > 0.1:
             told = time.monotonic()
             speed = body.elapsed() / max(told - started, 1e-9)
-            progress(min(1.0, len(rows) / config.samples), f"{len(rows)} samples, {speed:.0f} x real time")
-    table = np.array(rows[: config.samples])
-    parts = np.split(table, range(per_episode, len(table), per_episode))
-    episodes = tuple(Episode(condition, layout.split(part)) for part in parts)
-    return Collected(Dataset(layout, episodes), body.elapsed(), time.monotonic() - started)
+            progress(len(table.rows) / most if most else 0.5, f"{len(table.rows)} samples, {speed:.0f} x real time")
+        if most is not None and len(table.rows) >= most:
+            break
+    return Collected(table.dataset(most), body.elapsed(), time.monotonic() - started)
 
 
-def _bounds(robot: RobotConfig) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest value that counts of every element, limits widened by a share of their range."""
-    bounds = [robot.bounds(name) for name in robot.signals]
-    low, high = (np.concatenate(part) for part in zip(*bounds, strict=True))
-    margin = np.where(np.isfinite(high - low), MARGIN * (high - low), 0.0)
-    return low - margin, high + margin
+class _Table:
+    """The rows that count.
 
-
-def collect_direct(robot: RobotConfig, variant: str, seed: int, samples: int | None, progress: Progress) -> Collected:
-    """Record from the robot file's simulator without a bus; the first of its variants is the designer's.
-
-    Raises:
-        ConfigError: The robot file names no simulator or no motion.
-        CollectionStopped: The robot stopped by itself.
+    A value that a device measures must be there and within the robot file's limits: beyond them, on a mechanical stop
+    or with slack muscles, the signals do not say where the body is. What a camera sees may be missing.
     """
-    config = _with_samples(collect_config(robot), samples)
-    simulator = simulator_of(robot)
-    if variant not in simulator.variants:
-        known = ", ".join(simulator.variants)
-        raise ConfigError(f"Robot '{robot.robot}' has no variant '{variant}'. Known variants: {known}.")
-    motion = registry.load(config.motion)(robot, seed)
-    with simulator.direct(robot, variant, seed) as body:
-        found = gather(robot, DirectPlayground(body, config.rate), motion, config, variant, progress)
-    is_designers = variant == simulator.variants[0]
-    return found if config.states is None or not is_designers else _with_states(robot, config, found, seed)
+
+    def __init__(self, robot: RobotConfig, config: CollectConfig, condition: str) -> None:
+        self._config, self._condition = config, condition
+        self._layout: Layout = layout_of(robot)
+        bounds = [robot.bounds(name) for name in self._layout.names]
+        low, high = (np.concatenate(part) for part in zip(*bounds, strict=True))
+        margin = np.where(np.isfinite(high - low), MARGIN * (high - low), 0.0)
+        self._low, self._high = low - margin, high + margin
+        sizes = [signal.size for signal in self._layout.signals]
+        self._may_miss = np.repeat([name in robot.seen for name in self._layout.names], sizes)
+        self._fed = config.settle
+        self.rows: list[np.ndarray] = []
+
+    def add(self, values: Values, elapsed: float) -> None:
+        """Take a sample at the robot's time [s] if it counts.
+
+        Raises:
+            CollectionStopped: None has counted for long.
+        """
+        if elapsed < self._config.settle:
+            return
+        row = self._layout.join({name: values[name] for name in self._layout.names if name in values})
+        counts = ((row >= self._low) & (row <= self._high)) | (self._may_miss & np.isnan(row))
+        if counts.all():
+            self.rows.append(row)
+            self._fed = elapsed
+        elif elapsed - self._fed > STARVED:
+            index = int(np.argmin(counts))
+            raise CollectionStopped(
+                f"No sample counted for {STARVED:g} s: {self._layout.element(index)} is {row[index]:.4g}, and must be "
+                f"measured, from {self._low[index]:.4g} to {self._high[index]:.4g}. {len(self.rows)} were recorded."
+            )
+
+    def dataset(self, most: int | None) -> Dataset:
+        """At most so many rows, in episodes.
+
+        Raises:
+            CollectionStopped: There is none.
+        """
+        if not self.rows:
+            raise CollectionStopped("The motion ended before a sample was recorded. Is it too short for collect.rate?")
+        table = np.array(self.rows[:most])
+        per_episode = max(2, round(EPISODE * self._config.rate))
+        parts = np.split(table, range(per_episode, len(table), per_episode))
+        return Dataset(self._layout, tuple(Episode(self._condition, self._layout.split(part)) for part in parts))
+
+
+def _joined(parts: Sequence[Collected]) -> Collected:
+    episodes = tuple(episode for part in parts for episode in part.dataset.episodes)
+    dataset = Dataset(parts[0].dataset.layout, episodes)
+    return Collected(dataset, sum(part.robot_time for part in parts), sum(part.wall_time for part in parts))
 
 
 def _with_states(robot: RobotConfig, config: CollectConfig, found: Collected, seed: int) -> Collected:
@@ -179,89 +250,3 @@ def _with_states(robot: RobotConfig, config: CollectConfig, found: Collected, se
     added = tuple(Episode(condition, {name: rows[part] for name, rows in states.items()}) for part in parts)
     dataset = Dataset(found.dataset.layout, found.dataset.episodes + added)
     return replace(found, dataset=dataset)
-
-
-def simulator_of(robot: RobotConfig) -> "Simulator":
-    """What the robot file names as its simulator.
-
-    Raises:
-        ConfigError: It names none.
-    """
-    if robot.simulator is None:
-        raise ConfigError(f"Robot '{robot.robot}' names no simulator; add `simulator: module:name` to its file.")
-    return registry.load(robot.simulator)
-
-
-class Simulator(Protocol):
-    """What stands in for a robot, as far as services go into it."""
-
-    variants: tuple[str, ...]
-
-    def direct(self, config: RobotConfig, variant: str, seed: int) -> Robot:
-        """The simulated robot without a bus; not opened yet."""
-        ...
-
-
-def _with_samples(config: CollectConfig, samples: int | None) -> CollectConfig:
-    return config if samples is None else config.model_copy(update={"samples": samples})
-
-
-class BusPlayground:
-    """A running robot; its time is the wall's."""
-
-    def __init__(self, robot: RobotConfig, client: Client, rate: float) -> None:
-        """Enable the robot; `rate` [Hz] is how often a sample is recorded.
-
-        Raises:
-            ServiceUnavailable: No HAL answers.
-            CommandRefused: It does not enable.
-            CollectionStopped: The drives do not come.
-        """
-        self._robot, self._client = robot, client
-        self._interval = 1.0 / rate
-        self._start = self._recorded = time.monotonic()
-        deadline = time.monotonic() + ENABLE_WITHIN
-        client.enable()
-        while self._mode() not in ("hold", "follow"):
-            if time.monotonic() > deadline:
-                raise CollectionStopped(f"The drives did not become enabled within {ENABLE_WITHIN:g} s.")
-            time.sleep(0.01)
-
-    def play(self, command: np.ndarray, duration: float) -> Iterator[Values]:
-        """See `Playground.play`."""
-        end = time.monotonic() + duration
-        while (now := time.monotonic()) < end:
-            sample = self._client.next_sample(self._robot.command.time_to_live)
-            if sample is None:
-                raise CollectionStopped("No sample comes from the HAL any more. Is `gemuco hal` running?")
-            if (mode := self._mode()) not in ("hold", "follow"):
-                raise CollectionStopped(f"The robot went to '{mode}'. `gemuco top {self._robot.robot}` may tell why.")
-            self._client.command(self._robot.command.signal, command, sample)
-            if now - self._recorded >= self._interval:
-                self._recorded = now
-                yield dict(sample.values)
-
-    def elapsed(self) -> float:
-        """See `Playground.elapsed`."""
-        return time.monotonic() - self._start
-
-    def _mode(self) -> str:
-        applied = self._client.applied(timeout=self._robot.command.time_to_live)
-        return "off" if applied is None else applied.mode
-
-
-def collect_bus(robot: RobotConfig, seed: int, samples: int | None, progress: Progress) -> Collected:
-    """Record from the robot that a HAL runs, as a client of it, and let it go at the end.
-
-    Raises:
-        ConfigError: The robot file names no motion.
-        ServiceUnavailable: No HAL answers.
-        CollectionStopped: The robot stopped by itself.
-    """
-    config = _with_samples(collect_config(robot), samples)
-    motion = registry.load(config.motion)(robot, seed)
-    with Client(robot.robot) as client:
-        try:
-            return gather(robot, BusPlayground(robot, client, config.rate), motion, config, "bus", progress)
-        finally:
-            client.disable()

@@ -69,7 +69,7 @@ def make_model(robot: RobotConfig, console: Console) -> None:
         "No model yet: the designer's geometric model moves at random, and the body schema is learned from it."
     )
     with progress("collecting") as tell:
-        found = collector.collect_direct(robot, "geometric", 0, None, tell)
+        found = collector.collect_direct(robot, "geometric", 0, progress=tell)
     console.print(f"{len(found.dataset)} samples, {found.speed:.0f} times faster than real time.")
     with progress("training") as tell:
         trained = trainer.train(robot, found.dataset, 0, tell)

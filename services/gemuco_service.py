@@ -29,6 +29,7 @@ from services.model_config import ModelConfig, model_config
 from services.model_verbs import ModelVerbs
 from services.realtime import freeze, prepare_process, promote_rest
 from services.service import Service, until_told
+from services.streams import Newest
 from services.update_loop import OnlineUpdate
 
 SEARCH = DescentConfig(gamma_max=0.1, candidates=10, iterations=8)
@@ -85,10 +86,11 @@ class GemucoService:
         self.living = LivingModel(schema)
         self.verbs = ModelVerbs(self)
         self._samples = service.newest(keys.sample(robot.robot), Sample)
+        self._seen = service.newest(keys.vision(robot.robot), Sample) if robot.seen else None
         self._applied = service.newest(keys.applied(robot.robot), Applied)
         self._targets = service.newest(keys.target(robot.robot), Target)
         self._target_seen: Target | None = None
-        self.freshness = Freshness(robot, self.newest_sample, self.clock)
+        self.freshness = Freshness(robot, self.newest_sample, self.clock, self._newest_seen)
         self.estimation = Estimation(
             self.freshness, self._schema, service.publisher(keys.estimate(robot.robot), Estimates).put, self.clock
         )
@@ -120,8 +122,10 @@ class GemucoService:
 
     def newest_sample(self) -> Fresh | None:
         """The last sample that arrived, however old."""
-        last = self._samples.last()
-        return None if last is None else Fresh(last[1], last[0])
+        return Fresh.of(self._samples)
+
+    def _newest_seen(self) -> Fresh | None:
+        return None if self._seen is None else Fresh.of(self._seen)
 
     def enable_hal(self) -> dict[str, Any]:
         """Ask the HAL to enable the drives."""
@@ -136,7 +140,7 @@ class GemucoService:
         if fresh is None:
             text = "No fresh sample comes from the HAL. Is `gemuco hal` running?"
         elif missing:
-            text = f"Estimating {', '.join(missing)}: not measured at the moment."
+            text = f"Estimating {', '.join(missing)}: not measured at the moment.{self._blind()}"
         elif failing:
             text = failing[0]
         return Status(
@@ -150,7 +154,7 @@ class GemucoService:
                 "adapting": self.update.is_active,
                 "control": self.no_control if self.control is None else self.control.facts(),
                 "scheduling": {loop.name: loop.scheduling for loop in self.loops},
-                "rejected": self._samples.rejected + self._applied.rejected + self._targets.rejected,
+                "rejected": sum(reader.rejected for reader in self._readers()),
                 "failing": failing,
             },
         )
@@ -168,6 +172,14 @@ class GemucoService:
         finally:
             for loop in self.loops:
                 loop.stop()
+
+    def _blind(self) -> str:
+        """What to check when nothing comes from the camera's process; empty when something does."""
+        seen = self._newest_seen()
+        longest = max((self.robot.signals[name].stale_after for name in self.robot.seen), default=0.0)
+        if not self.robot.seen or (seen is not None and self.clock.monotonic() - seen.received <= longest):
+            return ""
+        return " No camera publishes. Is `gemuco vision` running?"
 
     def _schema(self) -> BodySchema:
         return self.living.schema
@@ -194,6 +206,10 @@ class GemucoService:
             ),
             "",
         )  # fmt: skip
+
+    def _readers(self) -> list[Newest[Any]]:
+        readers: list[Newest[Any] | None] = [self._samples, self._seen, self._applied, self._targets]
+        return [reader for reader in readers if reader is not None]
 
     def _newest_applied(self) -> Applied | None:
         return self._applied.get(self.robot.command.time_to_live)

@@ -1,7 +1,7 @@
 """The key space, whole. Nouns are published, verbs are queried; docs/keys.md says it in words."""
 
 ROOT = "gemuco"
-SERVICES = ("simulator", "hal", "model", "recorder")
+SERVICES = ("simulator", "hal", "vision", "model", "recorder")
 
 
 def robot_key(robot: str, *parts: str) -> str:
@@ -17,6 +17,11 @@ def sample(robot: str) -> str:
 def applied(robot: str) -> str:
     """Published by hal every cycle: `messages.Applied`, what was really sent to the drives."""
     return robot_key(robot, "hal", "applied")
+
+
+def vision(robot: str) -> str:
+    """Published by whatever looks at the robot, at its own rate: `messages.Sample` of what it sees."""
+    return robot_key(robot, "vision", "sample")
 
 
 def command(robot: str) -> str:

@@ -46,11 +46,11 @@ class Message:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sample(Message):
-    """One coherent cycle of the robot's sensors.
+    """One coherent cycle of the robot's sensors, or one frame of a camera.
 
     Attributes:
-        cycle: The HAL's cycle number.
-        source: `can`, `simulated` or `truth`.
+        cycle: The HAL's cycle number, or the number of the frame.
+        source: `can`, `camera`, `simulated` or `truth`.
         complete: Whether every device answered in this cycle.
         values: Signal -> values [the signal's unit], shape (n,); NaN where not valid.
         age: Signal -> age of each value when published [s], shape (n,); inf if never measured.

@@ -16,7 +16,9 @@ class NetworkConfig(Section):
 
     hidden: tuple[Count, ...] = (200, 30)
     latent: Count = 15
-    activation: Literal["tanh"] = "tanh"
+    activation: Literal["tanh", "relu", "sigmoid", "elu", "softplus"] = "tanh"
+    bias: Annotated[int, Field(ge=0)] = 0
+    """Length of the parametric bias p, one p per condition; 0 without."""
 
 
 class StructureConfig(Section):
@@ -36,6 +38,14 @@ class TrainingConfig(Section):
     batch: Count = 250
     rate: Positive = 3e-3
     """Peak learning rate of the one-cycle schedule."""
+    bias_rate: Positive = 1e-2
+    """Peak learning rate of p."""
+    held_out: Annotated[float, Field(gt=0, lt=1)] = 0.2
+    """Share of every condition's data that only measures."""
+    patience: Count | None = None
+    """Stop after so many epochs without a better held-out loss; to the end if absent."""
+    outliers: Positive = 8.0
+    """Reject a measured signal that the others contradict by so many robust standard deviations; `.inf`: none."""
 
 
 class UpdateConfig(Section):
@@ -83,7 +93,7 @@ class CollectConfig(Section):
     """Rest in every posture [s]."""
     forecast: str | None = None
     """`module:name` of the designer's model: (config, condition, commands of shape (n, k)) -> signal -> (n, m)."""
-    constraints: dict[str, RangeConfig] = {}
+    constraints: dict[str, RangeConfig] = Field(default_factory=dict)
     """Signal -> range within which the forecast of every posture, and of the way there, must lie."""
     states: str | None = None
     """`module:name` of random states of the designer's geometry, added to what is collected from the designer's

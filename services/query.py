@@ -28,6 +28,7 @@ APPEAR = 2.0
 STARTED_BY = {
     "simulator": "gemuco simulate",
     "hal": "gemuco hal",
+    "vision": "gemuco vision",
     "model": "gemuco serve",
     "recorder": "gemuco record",
 }

@@ -19,8 +19,8 @@ from services.errors import ServiceError
 from services.messages import MAX_BYTES
 
 FIRST_PORT = 20000
-PORT_GROUPS = 3000
-"""Ports 20000 to 31999: registered range, and below Linux's ephemeral ports (32768 and up)."""
+PORT_GROUPS = 2500
+"""Ports 20000 to 32499: registered range, and below Linux's ephemeral ports (32768 and up)."""
 CLIENT = "client"
 LEASE_MS = 1000
 """How long a frozen or unreachable process counts as alive; one that dies is noticed within milliseconds."""

@@ -8,13 +8,12 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from hal import registry
 from hal.config import RobotConfig
-from hal.errors import ConfigError
 from services import keys, messages, realtime
 from services.loop import Loop
 from services.messages import MessageError, Status
 from services.service import Service, until_told
+from services.stand_in import condition_of, simulator_of, variant_of
 
 log = logging.getLogger(__name__)
 
@@ -127,8 +126,9 @@ class SimulatorService:
 
 def run_simulator(
     config: RobotConfig,
-    variant: str,
+    variant: str | None = None,
     seed: int = 0,
+    condition: str | None = None,
     connect: Iterable[str] = (),
     stop: threading.Event | None = None,
 ) -> int:
@@ -136,8 +136,9 @@ def run_simulator(
 
     Args:
         config: The robot file.
-        variant: One of the simulator's variants.
+        variant: One of the simulator's variants; the designer's if None.
         seed: Chooses among the robots of a variant, and their noise.
+        condition: One of the robot file's conditions; the first if None.
         connect: More zenoh endpoints, such as a router's.
         stop: Ends the service in place of the signals.
 
@@ -145,18 +146,21 @@ def run_simulator(
         The process's exit code; 1 if the simulation failed.
 
     Raises:
-        ConfigError: The robot file names no simulator, or one that is not there; an unknown variant.
+        ConfigError: The robot file names no simulator, or one that is not there; an unknown variant or condition.
         AlreadyRunning: The robot is simulated already.
         ServiceError: No session.
     """
     realtime.prepare_process()
-    if not config.simulator:
-        raise ConfigError(f"Robot '{config.robot}' has no 'simulator' in its robot file, so there is none to run.")
-    simulator = registry.load(config.simulator)
-    if variant not in simulator.variants:
-        known = ", ".join(simulator.variants)
-        raise ConfigError(f"The simulator of '{config.robot}' has no variant '{variant}'. Known variants: {known}.")
-    told_apart = {"variant": variant, "seed": seed, "variants": list(simulator.variants)}
+    simulator = simulator_of(config)
+    variant, condition = variant_of(config, variant), condition_of(config, condition)
+    told_apart = {
+        "variant": variant,
+        "condition": condition,
+        "seed": seed,
+        "variants": list(simulator.variants),
+        "conditions": list(simulator.conditions),
+    }
     with until_told(stop) as told, Service(config.robot, "simulator", connect, lambda: told_apart) as service:
         log.info("Simulator of robot '%s' runs (%s, seed %d)", config.robot, variant, seed)
-        return SimulatorService(config.robot, simulator.rig(config, variant, seed), service, variant).run(told)
+        rig = simulator.rig(config, variant, seed, condition)
+        return SimulatorService(config.robot, rig, service, variant).run(told)

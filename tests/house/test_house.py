@@ -57,7 +57,16 @@ def test_nothing_is_swallowed(path: Path) -> None:
 
 def test_key_table_lists_every_key() -> None:
     table = (ROOT / "docs" / "keys.md").read_text()
-    for noun in (keys.sample, keys.applied, keys.command, keys.estimate, keys.anomaly, keys.update, keys.target):
+    for noun in (
+        keys.sample,
+        keys.vision,
+        keys.applied,
+        keys.command,
+        keys.estimate,
+        keys.anomaly,
+        keys.update,
+        keys.target,
+    ):
         assert f"`{noun('<robot>')}`" in table
     assert f"`{keys.truth('<robot>')}`" in table
     for pattern in (keys.status("<robot>", "<service>"), keys.alive("<robot>", "<service>")):
@@ -67,6 +76,7 @@ def test_key_table_lists_every_key() -> None:
 def test_key_table_lists_no_other_key() -> None:
     known = {
         keys.sample("<robot>"),
+        keys.vision("<robot>"),
         keys.applied("<robot>"),
         keys.command("<robot>"),
         keys.estimate("<robot>"),

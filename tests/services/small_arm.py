@@ -111,7 +111,9 @@ class WireWorld:
 class SmallArm:
     variants = ("plain",)
 
-    def rig(self, config: RobotConfig, variant: str, seed: int) -> Rig:
+    conditions: tuple[str, ...] = ()
+
+    def rig(self, config: RobotConfig, variant: str, seed: int, condition: str | None = None) -> Rig:
         return Rig(config, WireWorld(), _hardware())
 
 

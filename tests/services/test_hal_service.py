@@ -79,7 +79,7 @@ def test_status_and_description_tell_what_runs(arm: Processes) -> None:
     assert {name: bus["state"] for name, bus in status.facts["buses"].items()} == {"can0": "ok", "can1": "ok"}
     who = arm.client.describe()
     assert who["pid"] == arm.pid("hal")
-    assert who["signals"]["muscle_length"] == {"unit": "m", "elements": ["biceps", "triceps"]}
+    assert who["signals"]["muscle_length"] == {"unit": "m", "elements": ["biceps", "triceps"], "source": "hal"}
     assert arm.client.alive() == {"hal", "simulator"}
 
 

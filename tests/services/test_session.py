@@ -18,8 +18,8 @@ def test_ports_are_the_robots_own_and_below_the_ephemeral_range() -> None:
 
 def test_each_pair_of_services_has_one_connection() -> None:
     links = [(role, settings("a", role)["connect"]["endpoints"]) for role in keys.SERVICES]
-    assert [len(endpoints) for _, endpoints in links] == [0, 1, 2, 3]
-    assert len(settings("a", "client", ["tcp/10.0.0.1:7447"])["connect"]["endpoints"]) == 5
+    assert [len(endpoints) for _, endpoints in links] == [0, 1, 2, 3, 4]
+    assert len(settings("a", "client", ["tcp/10.0.0.1:7447"])["connect"]["endpoints"]) == 6
 
 
 def test_nothing_leaves_the_machine_by_default() -> None:
@@ -32,7 +32,7 @@ def test_nothing_leaves_the_machine_by_default() -> None:
 
 
 def test_unknown_role_lists_the_known_ones() -> None:
-    with pytest.raises(ServiceError, match="Known roles: simulator, hal, model, recorder, client"):
+    with pytest.raises(ServiceError, match="Known roles: simulator, hal, vision, model, recorder, client"):
         open_session("a", "boss")
 
 
