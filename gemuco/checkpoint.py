@@ -26,6 +26,7 @@ FORMAT = "gemuco.body_schema"
 VERSION = 2
 TENSORS = "model.safetensors"
 MANIFEST = "manifest.json"
+SCALES = ("mean", "std", "low", "high", "dead")
 
 
 def save(schema: "BodySchema", folder: Path) -> None:
@@ -70,7 +71,7 @@ def _tensors(schema: "BodySchema") -> dict[str, np.ndarray]:
         for index, layer in enumerate(chain):
             tensors[f"{part}.{index}.matrix"] = layer.matrix
             tensors[f"{part}.{index}.offset"] = layer.offset
-    for name in ("mean", "std", "low", "high"):
+    for name in SCALES:
         tensors[f"scaler.{name}"] = getattr(schema.scaler, name)
     for index, array in enumerate(schema.errors.values()):
         tensors[f"errors.{index}"] = array
@@ -141,7 +142,7 @@ def _schema(head: Mapping[str, Any], tensors: Mapping[str, np.ndarray]) -> "Body
         x_in=tuple(head["x_in"]),
         x_out=tuple(head["x_out"]),
         masks=tuple(frozenset(text.split("+")) for text in head["masks"]),
-        scaler=Scaler(*(tensors[f"scaler.{name}"] for name in ("mean", "std", "low", "high"))),
+        scaler=Scaler(*(tensors[f"scaler.{name}"] for name in SCALES)),
         weights=Weights(_chain(head, tensors, "encoder"), _chain(head, tensors, "decoder")),
         errors={
             (method, frozenset(text.split("+")) if text else frozenset()): tensors[f"errors.{index}"]

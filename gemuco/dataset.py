@@ -14,7 +14,9 @@ from gemuco.signals import Layout, Signal
 FORMAT = "gemuco.dataset"
 VERSION = 1
 MIN_EPISODES = 5
-"""With fewer episodes than this, data is split by time block instead of by episode."""
+"""With fewer episodes than this, a condition is split by time block instead of by episode."""
+BLOCKS = 10
+"""Into so many blocks an episode is cut then."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,9 +55,11 @@ class Dataset:
         return tuple(dict.fromkeys(episode.condition for episode in self.episodes))
 
     def rows(self) -> np.ndarray:
-        """All samples [unit], shape (samples, layout.size)."""
+        """All samples [unit], shape (samples, layout.size); NaN where nothing was measured, or nothing finite."""
         parts = [self.layout.join(episode.values) for episode in self.episodes]
-        return np.concatenate(parts) if parts else np.zeros((0, self.layout.size))
+        rows = np.concatenate(parts) if parts else np.zeros((0, self.layout.size))
+        rows[~np.isfinite(rows)] = np.nan
+        return rows
 
     def condition_of_rows(self) -> np.ndarray:
         """Index into `conditions` of every row, shape (samples,)."""
@@ -64,33 +68,78 @@ class Dataset:
         return np.concatenate(parts) if parts else np.zeros(0, int)
 
     def split(self, held_out: float, seed: int = 0) -> tuple["Dataset", "Dataset"]:
-        """Training and held-out data, by episode, or by time block if there are few episodes.
+        """Training and held-out data: of every condition some episodes, or time blocks if it has few episodes.
 
         Never by random rows: neighbours in time are nearly equal, so a random split measures memory.
 
         Args:
-            held_out: Share of the episodes or blocks to hold out, 0 to 1.
+            held_out: Share of the episodes or blocks to hold out, 0 to 1; at least one of every condition.
             seed: Which ones.
 
         Raises:
-            NotEnoughData: Less than two episodes or blocks.
+            NotEnoughData: A condition has less than two samples, or there is none at all.
         """
-        parts = self.episodes if len(self.episodes) >= MIN_EPISODES else self._blocks(10)
-        if len(parts) < 2:
-            raise NotEnoughData(f"{len(self)} samples cannot be split into training and held-out data; collect more.")
-        order = np.random.default_rng(seed).permutation(len(parts))
-        count = min(max(1, round(held_out * len(parts))), len(parts) - 1)
-        away = set(order[:count].tolist())
-        kept = tuple(part for index, part in enumerate(parts) if index not in away)
-        return Dataset(self.layout, kept), Dataset(self.layout, tuple(parts[i] for i in sorted(away)))
+        random = np.random.default_rng(seed)
+        kept: list[Episode] = []
+        away: list[Episode] = []
+        for condition in self.conditions:
+            parts = self._parts(condition)
+            if len(parts) < 2:
+                raise NotEnoughData(
+                    f"Condition '{condition}' has {len(self._of(condition))} samples; they cannot be split into "
+                    "training and held-out data. Collect more of it, or leave it out."
+                )
+            count = min(max(1, round(held_out * len(parts))), len(parts) - 1)
+            chosen = set(random.permutation(len(parts))[:count].tolist())
+            for index, part in enumerate(parts):
+                (away if index in chosen else kept).append(part)
+        if not kept:
+            raise NotEnoughData("There are no samples to train from; record some with `gemuco collect`.")
+        return Dataset(self.layout, tuple(kept)), Dataset(self.layout, tuple(away))
 
-    def _blocks(self, count: int) -> tuple[Episode, ...]:
+    def _of(self, condition: str) -> np.ndarray:
+        """The rows of one condition [unit], shape (samples, layout.size)."""
+        return self.rows()[self.condition_of_rows() == self.conditions.index(condition)]
+
+    def _parts(self, condition: str) -> list[Episode]:
+        """What the split may not cut: a condition's episodes, or blocks of time where those are few."""
+        episodes = [e for e in self.episodes if e.condition == condition and len(self.layout.join(e.values))]
+        if len(episodes) >= MIN_EPISODES:
+            return episodes
         blocks: list[Episode] = []
-        for episode in self.episodes:
+        for episode in episodes:
             rows = self.layout.join(episode.values)
-            for block in np.array_split(rows, min(count, len(rows) // 2 or 1)):
-                blocks.append(Episode(episode.condition, self.layout.split(block)))
-        return tuple(blocks)
+            count = min(BLOCKS, max(len(rows) // 2, 2 if len(rows) > 1 and len(episodes) == 1 else 1))
+            blocks += [Episode(condition, self.layout.split(block)) for block in np.array_split(rows, count)]
+        return blocks
+
+    def of(self, layout: Layout) -> "Dataset":
+        """The same episodes with the signals of another layout, in its order.
+
+        Raises:
+            DatasetError: A signal is not in the data, or has another unit or other elements there.
+        """
+        if layout == self.layout:
+            return self
+        for signal in layout.signals:
+            if signal.name not in self.layout.names:
+                raise DatasetError(
+                    f"Signal '{signal.name}' is not in the data. They hold: {', '.join(self.layout.names)}."
+                )
+            theirs = self.layout.signal(signal.name)
+            if theirs.unit != signal.unit:
+                raise DatasetError(
+                    f"Signal '{signal.name}' is in {theirs.unit} in the data, but {signal.unit} is wanted. Convert "
+                    "the data, or write the unit they have."
+                )
+            if theirs.elements != signal.elements:
+                raise DatasetError(
+                    f"Signal '{signal.name}' has the elements {', '.join(theirs.elements)} in the data, but "
+                    f"{', '.join(signal.elements)} are wanted."
+                )
+        index = np.concatenate([np.arange(self.layout.size)[self.layout.slice(name)] for name in layout.names])
+        parts = [Episode(e.condition, layout.split(self.layout.join(e.values)[:, index])) for e in self.episodes]
+        return Dataset(layout, tuple(parts))
 
     def save(self, path: str | Path) -> None:
         """Write one .npz file; nothing in it is pickled."""

@@ -1,233 +1,26 @@
-"""Training (paper, II-D): W and every p together, each sample under a random feasible mask that its data allow."""
+"""Training (paper, II-D): from episodes to a body schema, and from a schema to one that fits a few new episodes."""
 
-import math
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Iterable
+from pathlib import Path
 
 import numpy as np
 import torch
 
-from gemuco.activation import check
-from gemuco.anomaly import Normal
+from gemuco.accuracy import assess
 from gemuco.dataset import Dataset
+from gemuco.draft import Draft, key_of
 from gemuco.errors import NotEnoughData
-from gemuco.estimate import STARTS, latent_search
-from gemuco.masks import Mask, all_masks, bits, label, mask
+from gemuco.history import History
+from gemuco.learner import Learner, Progress, one_thread
+from gemuco.masks import Mask, label, mask
+from gemuco.material import Material
 from gemuco.network import Network
-from gemuco.scaler import CLIP, Scaler
+from gemuco.scaler import Scaler
 from gemuco.schema import BodySchema
-
-Progress = Callable[[float, str], None]
-"""Called with the share that is done, 0 to 1, and one line of text."""
+from gemuco.task import Task
+from gemuco.train_config import TrainConfig
 
 ANCHORS = 1000
-
-
-@dataclass(frozen=True, slots=True)
-class TrainConfig:
-    """How to train.
-
-    Attributes:
-        hidden: Widths of the encoder's layers; the decoder mirrors them.
-        latent: Length of z.
-        activation: What bends the layers: tanh, sigmoid, relu, elu or softplus.
-        bias_size: Length of p, one p per condition; 0 without parametric bias.
-        epochs: At most so many passes over the data.
-        batch: Samples per step.
-        rate: Peak of the one-cycle learning rate of W (Adam).
-        bias_rate: Learning rate of p.
-        held_out: Share of the episodes (or time blocks) that only measures.
-        patience: Stop after so many epochs without a better held-out loss.
-        seed: For the split, the first weights, the masks and the order of samples.
-    """
-
-    hidden: tuple[int, ...] = (200, 30)
-    latent: int = 15
-    activation: str = "tanh"
-    bias_size: int = 0
-    epochs: int = 150
-    batch: int = 500
-    rate: float = 1e-2
-    bias_rate: float = 1e-2
-    held_out: float = 0.2
-    patience: int = 40
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        check(self.activation)
-
-
-@dataclass(frozen=True, slots=True)
-class History:
-    """How training went: mean squared errors [standard deviations squared] after every epoch.
-
-    Attributes:
-        train: Loss on the training data while it was learned, one per epoch.
-        held_out: Loss on held-out data, one per epoch.
-        best_epoch: Whose weights were kept, counted from 0.
-    """
-
-    train: tuple[float, ...]
-    held_out: tuple[float, ...]
-    best_epoch: int
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Torch on one thread: on layers this small a second one only waits (256 samples: 1.7 ms against 42 ms)."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
-@dataclass(slots=True)
-class _Material:
-    """Rows ready for the network: normalised, with gaps filled by zero and remembered."""
-
-    x_in: torch.Tensor  # (rows, in_size), clipped
-    x_out: torch.Tensor  # (rows, out_size)
-    there: torch.Tensor  # (rows, out_size), 1 where x_out was measured
-    allowed: torch.Tensor  # (rows, masks), whether the row has all that a mask needs
-    condition: torch.Tensor  # (rows,)
-
-
-class _Trainer:
-    """The network, its data and its masks during one training."""
-
-    def __init__(self, data: Dataset, config: TrainConfig, masks: tuple[Mask, ...], x_out: tuple[str, ...]) -> None:
-        layout = data.layout
-        self.layout, self.config, self.masks, self.x_out = layout, config, masks, x_out
-        self.x_in = tuple(name for name in layout.names if any(name in m for m in masks))
-        self.data = data
-        self.train_data, self.held_data = data.split(config.held_out, config.seed)
-        self.scaler = Scaler.fit(layout, self.train_data.rows())
-        gates = np.stack([bits(m, self.x_in) for m in masks])
-        self.tails = torch.from_numpy(gates)
-        sizes = [layout.signal(name).size for name in self.x_in]
-        self.through = torch.from_numpy(np.repeat(gates, sizes, axis=1))
-        self.material = self._material(self.train_data)
-        self.held = self._material(self.held_data, limit=2000)
-        if not self.material.allowed.any():
-            names = ", ".join(label(m, layout.names) for m in masks)
-            raise NotEnoughData(f"No training sample has all signals of any mask ({names}); check what was recorded.")
-        torch.manual_seed(config.seed)
-        inputs = self.through.shape[1] + len(self.x_in) + config.bias_size
-        self.network = Network(inputs, len(layout.indices(x_out)), config.hidden, config.latent, config.activation)
-        self.biases = torch.nn.Parameter(torch.zeros(len(data.conditions), config.bias_size))
-        self.generator = torch.Generator().manual_seed(config.seed)
-
-    def _material(self, data: Dataset, limit: int | None = None) -> _Material:
-        x = self.scaler.normalise(data.rows())
-        order = {c: i for i, c in enumerate(self.data.conditions)}
-        condition = np.array([order[c] for c in data.conditions], int)[data.condition_of_rows()]
-        usable = np.isfinite(x).any(axis=1)
-        x, condition = x[usable], condition[usable]
-        if limit is not None and len(x) > limit:
-            chosen = np.linspace(0, len(x) - 1, limit).astype(int)
-            x, condition = x[chosen], condition[chosen]
-        finite = np.isfinite(x)
-        whole = {name: finite[:, self.layout.slice(name)].all(axis=1) for name in self.layout.names}
-        allowed = np.stack([np.all([whole[name] for name in m], axis=0) for m in self.masks], axis=1)
-        filled = np.where(finite, x, 0.0)
-        into, out = self.layout.indices(self.x_in), self.layout.indices(self.x_out)
-        return _Material(
-            torch.from_numpy(np.clip(filled[:, into], -CLIP, CLIP).astype(np.float32)),
-            torch.from_numpy(filled[:, out].astype(np.float32)),
-            torch.from_numpy(finite[:, out].astype(np.float32)),
-            torch.from_numpy(allowed),
-            torch.from_numpy(condition),
-        )
-
-    def loss(self, material: _Material, rows: torch.Tensor, chosen: torch.Tensor) -> torch.Tensor:
-        """Mean squared error of some rows, each under its mask, over what was measured."""
-        parts = [material.x_in[rows] * self.through[chosen], self.tails[chosen]]
-        if self.config.bias_size:
-            parts.append(self.biases[material.condition[rows]])
-        difference = self.network(torch.cat(parts, dim=1)) - material.x_out[rows]
-        there = material.there[rows]
-        return (there * difference.square()).sum() / there.sum().clamp(min=1.0)
-
-    def batches(self) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
-        """One pass over the training rows in random order, each with a random mask it allows."""
-        allowed = self.material.allowed
-        usable = torch.nonzero(allowed.any(dim=1)).squeeze(1)
-        order = usable[torch.randperm(len(usable), generator=self.generator)]
-        for rows in order.split(self.config.batch):
-            draw = torch.rand(len(rows), len(self.masks), generator=self.generator)
-            yield rows, torch.where(allowed[rows], draw, -1.0).argmax(dim=1)
-
-    @torch.no_grad()
-    def held_out_loss(self) -> float:
-        """Mean over the masks of the held-out loss under each."""
-        losses: list[float] = []
-        for index in range(len(self.masks)):
-            rows = torch.nonzero(self.held.allowed[:, index]).squeeze(1)
-            if len(rows):
-                losses.append(float(self.loss(self.held, rows, torch.full((len(rows),), index))))
-        return float(np.mean(losses)) if losses else math.inf
-
-    def train(self, progress: Progress | None, title: str) -> History:
-        """Adam with a one-cycle rate; keeps the weights of the best held-out loss."""
-        config = self.config
-        steps = config.epochs * math.ceil(int(self.material.allowed.any(dim=1).sum()) / config.batch)
-        groups = [{"params": list(self.network.parameters()), "lr": config.rate}]
-        peaks = [config.rate]
-        if config.bias_size:
-            groups.append({"params": [self.biases], "lr": config.bias_rate})
-            peaks.append(config.bias_rate)
-        optimiser = torch.optim.Adam(groups, fused=True)
-        schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, max_lr=peaks, total_steps=steps)
-        train: list[float] = []
-        held_out: list[float] = []
-        best_epoch, best_state, best_biases = 0, self._state(), self.biases.detach().clone()
-        for epoch in range(config.epochs):
-            losses: list[torch.Tensor] = []
-            for rows, chosen in self.batches():
-                optimiser.zero_grad(set_to_none=True)
-                loss = self.loss(self.material, rows, chosen)
-                loss.backward()
-                optimiser.step()
-                schedule.step()
-                losses.append(loss.detach())
-            train.append(float(torch.stack(losses).mean()))
-            held_out.append(self.held_out_loss())
-            if epoch == 0 or held_out[-1] < held_out[best_epoch]:
-                best_epoch, best_state, best_biases = epoch, self._state(), self.biases.detach().clone()
-            if progress is not None:
-                progress((epoch + 1) / config.epochs, f"{title}: held-out loss {held_out[best_epoch]:.4f}")
-            if epoch - best_epoch >= config.patience:
-                break
-        self.network.load_state_dict(best_state)
-        self.biases.data.copy_(best_biases)
-        return History(tuple(train), tuple(held_out), best_epoch)
-
-    def _state(self) -> dict[str, torch.Tensor]:
-        return {name: tensor.clone() for name, tensor in self.network.state_dict().items()}
-
-    def schema(self) -> BodySchema:
-        """What was learned, without errors and normal statistics."""
-        rows = self.scaler.normalise(self.train_data.rows())
-        complete = np.flatnonzero(np.isfinite(rows).all(axis=1))
-        chosen = complete[np.random.default_rng(self.config.seed).permutation(len(complete))[:ANCHORS]]
-        order = np.array([self.data.conditions.index(c) for c in self.train_data.conditions], int)
-        biases = {c: p.numpy().copy() for c, p in zip(self.data.conditions, self.biases.detach(), strict=True)}
-        size = self.config.bias_size
-        return BodySchema(
-            layout=self.layout,
-            x_in=self.x_in,
-            x_out=self.x_out,
-            masks=self.masks,
-            scaler=self.scaler,
-            weights=self.network.weights(),
-            anchors=rows[chosen].astype(np.float32),
-            anchor_conditions=order[self.train_data.condition_of_rows()[chosen]] if size else np.zeros(0, int),
-            bias=np.mean(list(biases.values()), axis=0) if size else np.zeros(0, np.float32),
-            biases=biases if size else {},
-        )
 
 
 def fit(
@@ -237,6 +30,7 @@ def fit(
     progress: Progress | None = None,
     x_out: Iterable[str] | None = None,
     title: str = "training",
+    resume: str | Path | None = None,
 ) -> tuple[BodySchema, History]:
     """Train a body schema.
 
@@ -247,6 +41,8 @@ def fit(
         progress: Called after every epoch.
         x_out: What to infer; every signal if not given.
         title: Begins the progress text.
+        resume: A file to keep the unfinished training in. If it holds this very training, begun and interrupted, it
+            goes on there and ends with the same result; it is removed when the training is done.
 
     Returns:
         The schema with its held-out errors and the statistics of the normal, and how training went.
@@ -260,48 +56,191 @@ def fit(
     if not checked or frozenset() in checked:
         raise NotEnoughData("Training needs at least one mask, and none of them empty.")
     outputs = layout.subset(layout.names if x_out is None else x_out).names
+    train_data, held_data = dataset.split(config.held_out, config.seed)
+    scaler = Scaler.fit(layout, train_data.rows())
+    task, notes = _heard(dataset, checked, outputs)
+    conditions = dataset.conditions
+    material = _material(task, scaler, train_data, conditions)
+    held = _material(task, scaler, held_data, conditions)
+    frozen = np.full(len(conditions), len(conditions) == 1)
+    if config.bias_size and frozen.all():
+        notes.append(
+            f"All data are of one condition ('{conditions[0]}'), so the parametric bias has nothing to tell apart: p "
+            "stays 0 and has no effect. Collect other conditions, or set `bias: 0`."
+        )
+    draft = Draft(None if resume is None else Path(resume), _key(config, task, dataset))
     with one_thread():
-        trainer = _Trainer(dataset, config, checked, outputs)
-        history = trainer.train(progress, title)
-        schema = trainer.schema()
-    held = trainer.held_data.rows()
-    schema = schema.with_weights(schema.weights, measure_errors(schema, held))
-    try:
-        errors = schema.predict_error(layout.split(held))
-        schema = schema.with_normal(Normal.fit(errors, schema.scaler.std[schema.out_index]))
-    except NotEnoughData:
-        schema = schema.with_normal(None)
-    return schema, history
+        torch.manual_seed(config.seed)
+        size = len(task.in_index) + len(task.x_in) + config.bias_size
+        network = Network(size, len(task.out_index), config.hidden, config.latent, config.activation)
+        _mute(network, task, scaler.dead, config.bias_size if frozen.all() else 0)
+        biases = np.zeros((len(conditions), config.bias_size), np.float32)
+        learner = Learner(config, network, biases, frozen, material, held)
+        learner.run(progress, title, draft)
+        schema = _assessed(_schema(learner, scaler, conditions), learner, conditions)
+    draft.remove()
+    return schema, _history(learner, scaler, notes)
 
 
-def measure_errors(schema: BodySchema, rows: np.ndarray) -> dict[tuple[str, Mask], np.ndarray]:
-    """Root mean square errors of every way to estimate.
+def fine_tune(
+    schema: BodySchema,
+    dataset: Dataset,
+    config: TrainConfig,
+    progress: Progress | None = None,
+    title: str = "fine-tuning",
+    resume: str | Path | None = None,
+) -> tuple[BodySchema, History]:
+    """Train a schema further on few samples of a body that is like the one it knows: simulation to real robot.
+
+    W starts from the schema's, and so does the p of every condition it knows; others start from the p in use. The
+    scale stays. The schema's anchors are replayed under the p they had, which stays: what was known of postures that
+    the new samples do not show is kept, while the new conditions move away from the old ones. Shape and masks are the
+    schema's; `config` says the rest.
 
     Args:
-        schema: The body schema.
-        rows: Held-out samples [unit], shape (samples, size), NaN where nothing was measured.
+        schema: What is known.
+        dataset: Episodes of the body as it is, with the signals of the schema.
+        config: How; `rate` is the peak, smaller than in training.
+        progress: Called after every epoch.
+        title: Begins the progress text.
+        resume: As in `fit`.
 
     Returns:
-        (method, signals given) -> error of every x_out element [unit], shape (out_size,).
+        The schema under the p of all conditions, old and new, with errors and normal statistics of the new data.
+
+    Raises:
+        DatasetError: A signal is missing, or has other elements or another unit.
+        NotEnoughData: Too few samples to hold some out, or none that fits a mask.
     """
-    x = schema.scaler.normalise(rows)
-    truth, scale = x[:, schema.out_index], schema.scaler.std[schema.out_index]
-    found: dict[tuple[str, Mask], np.ndarray] = {}
-    for m in schema.masks:
-        there = np.isfinite(x[:, schema.layout.indices(m)]).all(axis=1)
-        if there.any():
-            found["mask", m] = _rms(schema.infer(x[there], m) - truth[there]) * scale
-    complete = x[np.isfinite(x).all(axis=1)]
-    some = complete[np.linspace(0, len(complete) - 1, min(STARTS, len(complete))).astype(int)] if len(complete) else []
-    for given in all_masks(schema.x_out):
-        if len(some) and len(given) < len(schema.x_out) and not any(m <= given for m in schema.masks):
-            hidden = np.array(some)
-            hidden[:, ~np.isin(np.arange(x.shape[1]), schema.layout.indices(given))] = np.nan
-            guesses = np.stack([latent_search(schema, row) for row in hidden])
-            found["latent", given] = _rms(guesses - np.array(some)[:, schema.out_index]) * scale
-    return found
+    dataset = dataset.of(schema.layout)
+    task = Task(schema.layout, schema.masks, schema.x_out)
+    train_data, held_data = dataset.split(config.held_out, config.seed)
+    fresh = dataset.conditions
+    old = list(schema.biases.values()) if len(schema.bias) else [schema.bias]
+    start = np.stack([*(schema.biases.get(c, schema.bias) for c in fresh), *old])
+    frozen = np.arange(len(start)) >= len(fresh)
+    material = _material(task, schema.scaler, train_data, fresh, schema)
+    held = _material(task, schema.scaler, held_data, fresh)
+    key = _key(config, task, dataset, *schema.weights.arrays(), start, schema.anchors, schema.scaler.std)
+    draft = Draft(None if resume is None else Path(resume), key)
+    with one_thread():
+        learner = Learner(config, Network.of(schema.weights), start, frozen, material, held)
+        learner.run(progress, title, draft)
+        tuned = _assessed(_schema(learner, schema.scaler, fresh, schema), learner, fresh)
+    draft.remove()
+    return tuned, _history(learner, Scaler.fit(schema.layout, train_data.rows()), [])
 
 
-def _rms(errors: np.ndarray) -> np.ndarray:
-    with np.errstate(invalid="ignore"):
-        return np.sqrt(np.nanmean(errors**2, axis=0))
+def _heard(dataset: Dataset, masks: tuple[Mask, ...], x_out: tuple[str, ...]) -> tuple[Task, list[str]]:
+    """The task without signals that were never measured, and a sentence on each of those."""
+    layout, measured = dataset.layout, np.isfinite(dataset.rows()).any(axis=0)
+    silent = [name for name in layout.names if not measured[layout.slice(name)].any()]
+    notes = [
+        f"Signal '{name}' was never measured: nothing is inferred from it, and it is not inferred. Check its sensor, "
+        "or leave it out of the model's signals."
+        for name in silent
+    ]
+    left = tuple(m for m in masks if not m & set(silent))
+    outputs = tuple(name for name in x_out if name not in silent)
+    if not left or not outputs:
+        raise NotEnoughData(f"Nothing can be learned: {', '.join(silent)} was never measured; check what was recorded.")
+    return Task(layout, left, outputs), notes
+
+
+def _material(
+    task: Task, scaler: Scaler, data: Dataset, conditions: tuple[str, ...], before: BodySchema | None = None
+) -> Material:
+    """The samples of a dataset, and behind them those that a schema brings along.
+
+    Raises:
+        NotEnoughData: None of the dataset's samples is of use.
+    """
+    rows = scaler.normalise(data.rows())
+    order = np.array([conditions.index(c) for c in data.conditions], int)
+    owner = order[data.condition_of_rows()]
+    if before is None or not len(before.anchors):
+        material = Material(task, rows, owner, scaler.dead)
+    else:
+        old = before.anchor_conditions if len(before.anchor_conditions) else np.zeros(len(before.anchors), int)
+        both = np.concatenate([rows, before.anchors.astype(float)])
+        material = Material(task, both, np.concatenate([owner, len(conditions) + old]), scaler.dead, len(rows))
+    if material.skipped == material.new:
+        names = ", ".join(label(m, task.layout.names) for m in task.masks)
+        raise NotEnoughData(f"No sample has all signals of any mask ({names}); check what was recorded.")
+    return material
+
+
+def _mute(network: Network, task: Task, dead: np.ndarray, unused: int) -> None:
+    """Let dead elements and an unused p have no effect, and a dead output be its mean.
+
+    What enters with weight 0 and is always 0 gets no gradient, so it stays muted through all of the training.
+    """
+    with torch.no_grad():
+        first = network.encoder[0].weight
+        first[:, np.flatnonzero(np.isin(task.in_index, dead))] = 0.0
+        first[:, first.shape[1] - unused :] = 0.0
+        outputs = np.flatnonzero(np.isin(task.out_index, dead))
+        network.decoder[-1].weight[outputs] = 0.0
+        network.decoder[-1].bias[outputs] = 0.0
+
+
+def _key(config: TrainConfig, task: Task, dataset: Dataset, *arrays: np.ndarray) -> str:
+    """What tells one training from another."""
+    masks = [label(m, task.layout.names) for m in task.masks]
+    return key_of(config, task.layout, masks, task.x_out, dataset.conditions, dataset.rows(), *arrays)
+
+
+def _schema(
+    learner: Learner, scaler: Scaler, conditions: tuple[str, ...], before: BodySchema | None = None
+) -> BodySchema:
+    """What was learned, without errors and normal statistics."""
+    material, task = learner.material, learner.task
+    learned = learner.biases.detach().numpy()[: len(conditions)].copy()
+    known = {} if before is None else dict(before.biases)
+    biases = {**known, **dict(zip(conditions, learned, strict=True))} if learned.shape[1] else {}
+    rows = np.where(material.suspected[:, task.signal_of], np.nan, material.rows)[: material.new]
+    complete = np.flatnonzero(np.isfinite(np.delete(rows, scaler.dead, axis=1)).all(axis=1))
+    chosen = complete[np.random.default_rng(learner.config.seed).permutation(len(complete))[:ANCHORS]]
+    anchors, names = np.nan_to_num(rows[chosen]), list(biases)
+    owners = np.array([names.index(c) for c in conditions] if biases else [], int)
+    owner = owners[material.condition[chosen]] if biases else np.zeros(0, int)
+    if before is not None and biases:  # what is known of conditions that the new data do not show
+        others = ~np.isin(before.anchor_conditions, owners)
+        anchors = np.concatenate([anchors, before.anchors[others]])
+        owner = np.concatenate([owner, before.anchor_conditions[others]])
+    return BodySchema(
+        layout=task.layout,
+        x_in=task.x_in,
+        x_out=task.x_out,
+        masks=task.masks,
+        scaler=scaler,
+        weights=learner.network.weights(),
+        anchors=anchors.astype(np.float32),
+        anchor_conditions=owner,
+        bias=learned.mean(axis=0),
+        biases=biases,
+    )
+
+
+def _assessed(schema: BodySchema, learner: Learner, conditions: tuple[str, ...]) -> BodySchema:
+    """The schema with errors and normal statistics of the held-out data, but for what was rejected there."""
+    held = learner.held
+    rows = schema.scaler.restore(np.where(held.suspected[:, held.task.signal_of], np.nan, held.rows))
+    names = list(schema.biases)
+    owners = np.array([names.index(c) for c in conditions] if names else [0] * len(conditions), int)
+    return assess(schema, rows, owners[held.condition])
+
+
+def _history(learner: Learner, scaler: Scaler, notes: list[str]) -> History:
+    course, material = learner.course, learner.material
+    dead = tuple(material.task.layout.element(int(index)) for index in scaler.dead)
+    return History(
+        train=tuple(course.train),
+        held_out=tuple(course.held_out),
+        best_epoch=course.best_epoch,
+        skipped=material.skipped,
+        rejected=int(material.suspected[: material.new].sum()),
+        dead=dead,
+        notes=tuple(notes),
+        resumed=course.resumed,
+    )

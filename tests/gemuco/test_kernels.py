@@ -96,7 +96,7 @@ def test_slope_and_bend_agree_with_finite_differences(name):
 
 def test_every_activation_is_known_to_torch_and_numpy():
     assert set(MODULES) == set(ACTIVATIONS)
-    with pytest.raises(SchemaError, match="'swish' is not known. Known activations: tanh, sigmoid, relu"):
+    with pytest.raises(SchemaError, match=r"'swish' is not known\. Known activations: tanh, sigmoid, relu"):
         Network(INPUTS, OUTPUTS, (20,), 5, "swish")
 
 

@@ -1,0 +1,73 @@
+"""What a network is asked: which signals it is given, under which masks, and which it must tell."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from gemuco.masks import Mask, bits
+from gemuco.scaler import CLIP
+from gemuco.signals import Layout
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Task:
+    """Masks and signals as arrays.
+
+    Attributes:
+        layout: Every signal.
+        masks: What may be given.
+        x_out: Signals to tell, in the order of the layout.
+        x_in: The union of the masks, in the order of the layout.
+        in_index: Where the elements of x_in lie in the layout, shape (in_size,).
+        out_index: Where the elements of x_out lie in the layout, shape (out_size,).
+        signal_of: Index of the signal that each element of the layout belongs to, shape (layout.size,).
+        needs: Which signals of the layout a mask is made of, shape (masks, signals), float32.
+        tails: The m that the network sees, shape (masks, signals of x_in), float32.
+        through: Which elements of x_in a mask lets through, shape (masks, in_size), float32.
+    """
+
+    layout: Layout
+    masks: tuple[Mask, ...]
+    x_out: tuple[str, ...]
+    x_in: tuple[str, ...] = field(init=False)
+    in_index: np.ndarray = field(init=False, repr=False)
+    out_index: np.ndarray = field(init=False, repr=False)
+    signal_of: np.ndarray = field(init=False, repr=False)
+    needs: np.ndarray = field(init=False, repr=False)
+    tails: np.ndarray = field(init=False, repr=False)
+    through: np.ndarray = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        set_field = object.__setattr__
+        layout = self.layout
+        x_in = tuple(name for name in layout.names if any(name in m for m in self.masks))
+        set_field(self, "x_in", x_in)
+        set_field(self, "in_index", layout.indices(x_in))
+        set_field(self, "out_index", layout.indices(self.x_out))
+        set_field(self, "signal_of", np.repeat(np.arange(len(layout.names)), [s.size for s in layout.signals]))
+        set_field(self, "needs", np.stack([bits(m, layout.names) for m in self.masks]))
+        set_field(self, "tails", np.stack([bits(m, x_in) for m in self.masks]))
+        set_field(self, "through", np.repeat(self.tails, [layout.signal(name).size for name in x_in], axis=1))
+
+    def whole(self, present: np.ndarray) -> np.ndarray:
+        """Which signals have all their elements, shape (samples, signals), of what elements are there."""
+        starts = np.searchsorted(self.signal_of, np.arange(len(self.layout.names)))
+        return np.logical_and.reduceat(present, starts, axis=1)
+
+    def allowed(self, present: np.ndarray) -> np.ndarray:
+        """Which masks find all they need, shape (samples, masks), of what elements are there."""
+        lacking = (~self.whole(present)).astype(np.float32)
+        return lacking @ self.needs.T < 0.5
+
+    def inputs(self, x: np.ndarray, chosen: int, bias: np.ndarray) -> np.ndarray:
+        """x_in, m and p under one mask, shape (samples, inputs), float32.
+
+        Args:
+            x: Every signal [standard deviations], shape (samples, layout.size); NaN where masked is fine.
+            chosen: Index of the mask.
+            bias: p of every sample, shape (samples, bias_size).
+        """
+        through = self.through[chosen]
+        values = np.clip(np.where(through > 0, x[:, self.in_index], 0.0), -CLIP, CLIP)
+        tail = np.broadcast_to(self.tails[chosen], (len(x), len(self.x_in)))
+        return np.concatenate([values, tail, bias], axis=1, dtype=np.float32)

@@ -1,0 +1,59 @@
+"""How to train."""
+
+from dataclasses import dataclass
+
+from gemuco.activation import check
+from gemuco.errors import SchemaError
+
+
+@dataclass(frozen=True, slots=True)
+class TrainConfig:
+    """How to train.
+
+    Attributes:
+        hidden: Widths of the encoder's layers; the decoder mirrors them.
+        latent: Length of z.
+        activation: What bends the layers: tanh, relu, sigmoid, elu or softplus.
+        bias_size: Length of p, one p per condition; 0 without parametric bias.
+        epochs: At most so many passes over the data.
+        batch: Samples per step.
+        rate: Peak of the one-cycle learning rate of W (Adam).
+        bias_rate: Peak of the one-cycle learning rate of p.
+        held_out: Share of every condition's episodes (or time blocks) that only measures.
+        patience: Stop after so many epochs without a better held-out loss.
+        outliers: A measured signal is rejected while the model, which does not see it, misses it by more than so many
+            robust standard deviations of its misses. Infinite: nothing is rejected, and the loss is the plain square.
+        replay: Fine-tuning only: samples of the old training data per new sample.
+        seed: For the split, the first weights, the masks and the order of samples.
+    """
+
+    hidden: tuple[int, ...] = (200, 30)
+    latent: int = 15
+    activation: str = "tanh"
+    bias_size: int = 0
+    epochs: int = 150
+    batch: int = 500
+    rate: float = 1e-2
+    bias_rate: float = 1e-2
+    held_out: float = 0.2
+    patience: int = 40
+    outliers: float = 8.0
+    replay: float = 0.5
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check(self.activation)
+        object.__setattr__(self, "hidden", tuple(self.hidden))
+        for name, least in (("latent", 1), ("bias_size", 0), ("epochs", 1), ("batch", 1), ("patience", 1)):
+            if getattr(self, name) < least:
+                raise SchemaError(f"Training: {name} is {getattr(self, name)}; it must be at least {least}.")
+        for width in self.hidden:
+            if width < 1:
+                raise SchemaError(f"Training: a hidden layer of {width} is none; leave it out or make it wider.")
+        for name in ("rate", "bias_rate", "replay"):
+            if not 0.0 <= getattr(self, name) < float("inf"):
+                raise SchemaError(f"Training: {name} is {getattr(self, name)}; it must be 0 or a positive number.")
+        if not 0.0 < self.held_out < 1.0:
+            raise SchemaError(f"Training: held_out is {self.held_out}; it is a share between 0 and 1.")
+        if not self.outliers > 0.0:
+            raise SchemaError(f"Training: outliers is {self.outliers}; use infinity to reject nothing.")
