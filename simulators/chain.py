@@ -123,20 +123,29 @@ class Chain:
         np.cumsum(np.matmul(before, self.offsets[:, :, None])[:, :, 0], axis=0, out=origins[1:])
         return Pose(rotations, origins, axes)
 
-    def ends(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The last frame at many joint positions [rad], shape (k, n).
+    def frames(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Every frame at many joint positions [rad], shape (k, n); see `Pose` for their numbers.
 
         Returns:
-            Its orientations, shape (k, 3, 3), and origins [m], shape (k, 3), in base coordinates.
+            Orientations, shape (n + 1, k, 3, 3), and origins [m], shape (n + 1, k, 3), in base coordinates.
         """
-        rotation = np.broadcast_to(_UPRIGHT, (len(positions), 3, 3))
-        origin = np.zeros((len(positions), 3))
-        sine, versine = np.sin(positions)[:, :, None, None], (1.0 - np.cos(positions))[:, :, None, None]
-        for joint, offset in enumerate(self.offsets):
-            origin = origin + rotation @ offset
-            turn = _UPRIGHT + sine[:, joint] * self._cross[joint] + versine[:, joint] * self._cross_squared[joint]
-            rotation = rotation @ turn
-        return rotation, origin
+        turns = np.sin(positions)[:, :, None, None] * self._cross
+        turns += (1.0 - np.cos(positions))[:, :, None, None] * self._cross_squared
+        turns += _UPRIGHT
+        size = len(self.joints)
+        rotations = np.empty((size + 1, len(positions), 3, 3))
+        origins = np.zeros((size + 1, len(positions), 3))
+        rotations[0] = _UPRIGHT
+        for joint in range(size):
+            np.matmul(rotations[joint], turns[:, joint], out=rotations[joint + 1])
+        before = np.matmul(rotations[:-1], self.offsets[:, None, :, None])[..., 0]
+        np.cumsum(before, axis=0, out=origins[1:])
+        return rotations, origins
+
+    def ends(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The last frame at many joint positions [rad], shape (k, n): orientations (k, 3, 3), origins [m] (k, 3)."""
+        rotations, origins = self.frames(positions)
+        return rotations[-1], origins[-1]
 
     def gravity_torque(self, position: np.ndarray) -> np.ndarray:
         """Joint torques [N m] that hold the links against gravity at joint positions [rad]; both of shape (n,)."""

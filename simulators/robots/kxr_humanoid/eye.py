@@ -1,0 +1,58 @@
+"""The camera on the head: a marker on the tool's tip gives its position, the tip's colour its place in the image."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from simulators.faults import UnknownPart
+from simulators.robots.kxr_humanoid.body import Body
+from simulators.robots.kxr_humanoid.statics import is_in_view
+
+POSITION, PIXEL = "tool_tip_position", "tool_tip_pixel"
+
+_FAULTS: Mapping[str, tuple[str, bool, str]] = {
+    "marker_removed": ("_has_marker", False, "The marker is off the tool; its tip is still seen by its colour."),
+    "marker_back": ("_has_marker", True, "The marker is on the tool again."),
+    "camera_covered": ("_is_open", False, "The camera is covered."),
+    "camera_back": ("_is_open", True, "The camera sees again."),
+}
+
+
+class Eye:
+    """What the camera's process makes of the scene; not thread-safe.
+
+    The position is in the frame of the feet: a second marker, on the ground, tells the camera where it is.
+    """
+
+    def __init__(self, body: Body, random: np.random.Generator) -> None:
+        self._camera = body.camera
+        self._noise = body.noise
+        self._random = random
+        self._has_marker = self._is_open = True
+
+    def see(self, truth: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Both signals [m, px], shapes (3,), (2,); NaN where the tip is out of sight, or for want of a marker.
+
+        Args:
+            truth: Signal -> what is; the image point may be beyond the image.
+        """
+        seen = {name: np.full(len(truth[name]), np.nan) for name in (POSITION, PIXEL)}
+        if not self._is_open or not is_in_view(self._camera, truth[PIXEL][None])[0]:
+            return seen
+        for name in (POSITION, PIXEL) if self._has_marker else (PIXEL,):
+            deviation = self._noise.get(name, 0.0)
+            noise = deviation * self._random.standard_normal(len(truth[name])) if deviation else 0.0
+            seen[name] = truth[name] + noise
+        return seen
+
+    def fault(self, text: str) -> str:
+        """`marker_removed`, `marker_back`, `camera_covered` or `camera_back`; the sentence tells what was done.
+
+        Raises:
+            UnknownPart: It is none of them.
+        """
+        if text not in _FAULTS:
+            raise UnknownPart(f"'{text}' is no fault of the camera. Known faults: {', '.join(_FAULTS)}.")
+        name, value, sentence = _FAULTS[text]
+        setattr(self, name, value)
+        return sentence

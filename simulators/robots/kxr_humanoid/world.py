@@ -1,0 +1,108 @@
+"""The humanoid as a World: servos that follow, and a body that is at rest wherever they are."""
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from simulators.faults import UnknownPart, changed_tool, check_condition
+from simulators.robots.kxr_humanoid.body import REST, Body
+from simulators.robots.kxr_humanoid.eye import PIXEL, POSITION, Eye
+from simulators.robots.kxr_humanoid.feet import center_of, foot_forces
+from simulators.robots.kxr_humanoid.statics import rest
+
+COMMAND, FORCE, CENTER = "joint_position", "foot_force", "center_of_gravity"
+JOINTS = ("shoulder_pitch", "shoulder_yaw", "elbow_pitch", "ankle_pitch")
+
+FASTEST = 7.48
+"""Highest speed of a servo [rad/s]."""
+LAG = 0.03
+"""Time constant of its position loop [s]."""
+
+
+class HumanoidWorld:
+    """See `simulators.world.World`. Quasi-static: links, feet and camera are where the motors' angles put them at rest.
+
+    joint_position is the motors' side, what the servos' encoders measure; what the links do beyond is deflection.
+    """
+
+    def __init__(self, body: Body, seed: int, condition: str | None = None) -> None:
+        """Put the body at rest, a tool in its hand, servos without power.
+
+        Raises:
+            UnknownPart: No such condition.
+        """
+        self.time = 0.0
+        self._body = body
+        self._conditions = tuple(body.tools)
+        self._tool = body.tools[str(check_condition(condition, self._conditions))]
+        self._random = np.random.default_rng([seed, 12])
+        self._eye = Eye(body, self._random)
+        self._servos = {f"{COMMAND}.{joint}": index for index, joint in enumerate(JOINTS)}
+        self._motor = REST.copy()
+        self._target = REST.copy()
+        self._follows = np.zeros(len(JOINTS))
+        self._state: dict[str, np.ndarray] | None = None
+
+    def step(self, duration: float) -> None:
+        """See `World.step`."""
+        self.time += duration
+        reach = FASTEST * duration
+        move = (self._target - self._motor) * (-math.expm1(-duration / LAG))
+        move = np.minimum(np.maximum(move, -reach), reach) * self._follows
+        if np.abs(move).max() > _STILL:
+            self._motor = self._motor + move
+            self._state = None
+
+    def measure(self) -> Mapping[str, np.ndarray]:
+        """See `World.measure`."""
+        values = dict(self.truth())
+        for name in (COMMAND, FORCE):
+            deviation = self._body.noise.get(name, 0.0)
+            if deviation:
+                values[name] = values[name] + deviation * self._random.standard_normal(len(values[name]))
+        values[CENTER] = center_of(values[FORCE])
+        return values | self._eye.see(values)
+
+    def truth(self) -> Mapping[str, np.ndarray]:
+        """See `World.truth`; the image point also where the image does not reach."""
+        if self._state is None:
+            state = rest(self._body, self._tool, self._motor[None])
+            forces = foot_forces(state.center[0], state.weight)
+            self._state = {
+                COMMAND: self._motor,
+                FORCE: forces,
+                CENTER: center_of(forces),
+                POSITION: state.tip[0],
+                PIXEL: state.pixel[0],
+            }
+        return {name: value.copy() for name, value in self._state.items()}
+
+    def drive(self, element: str, target: float, enabled: bool) -> None:
+        """See `World.drive`; a servo without power is held by the friction of its gear."""
+        index = self._servos.get(element)
+        if index is None:
+            raise KeyError(f"No servo moves '{element}'. Known servos: {', '.join(self._servos)}.")
+        if not math.isfinite(target):
+            raise ValueError(f"The set-point of '{element}' is {target}; it must be an angle in radians.")
+        self._target[index] = target
+        self._follows[index] = enabled
+
+    def break_part(self, part: str) -> None:
+        """See `World.break_part`: `tool_changed:<condition>`, or one of the camera's faults."""
+        if part.startswith("tool_changed"):
+            self._tool = self._body.tools[changed_tool(part, self._conditions)]
+            self._state = None
+            return
+        try:
+            self._eye.fault(part)
+        except UnknownPart as error:
+            tools = ", ".join(f"tool_changed:{name}" for name in self._conditions)
+            raise UnknownPart(f"{error} Tools to change to: {tools}.") from None
+
+    def close(self) -> None:
+        """See `World.close`; there is nothing to let go of."""
+
+
+_STILL = 1e-7
+"""A motor that has less than this to go is where it should be [rad]: at rest nothing is computed anew."""
