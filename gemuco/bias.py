@@ -10,7 +10,6 @@ forgotten. The errors are taken as t-distributed, so one odd sample moves nothin
 """
 
 from dataclasses import dataclass
-from math import lgamma
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -22,14 +21,20 @@ if TYPE_CHECKING:
 
 HAZARD = 0.01
 """How often the body changes, per sample."""
-BANK = 10
-"""Beliefs kept."""
+BANK = 8
+"""Filters kept."""
 DRIFT = 0.01
 """Share of the prior's standard deviation by which p may wander per sample."""
-TRUST = 0.3
-"""Standard deviation of the p in use when recognition begins, as a share of the prior's."""
+TRUST = 0.5
+"""How likely the p in use when recognition begins is right."""
 FREEDOM = 8.0
 """Degrees of freedom of the errors' t-distribution."""
+NARROW = 0.05
+"""Standard deviation of p within a known condition, as a share of the prior's."""
+FAMILIAR = 0.9
+"""How often the body that comes is one of the known conditions."""
+FAINTEST = -60.0
+"""Logarithm of the smallest weight against the largest, so that no condition becomes impossible."""
 PASSES = 2
 """How often a sample is linearised anew."""
 SCALE_MEMORY = 50
@@ -102,72 +107,91 @@ class Recogniser(Protocol):
 
 
 class Kalman:
-    """A bank of extended Kalman filters, one per moment at which the body may have changed."""
+    """A bank of beliefs about p, weighed by how well each foretells what comes.
+
+    First the trained conditions, whose p stays; then filters that know no condition, one per moment at which the body
+    may have become a new one.
+    """
 
     def __init__(self, schema: "BodySchema") -> None:
         self.prior = Prior.of(schema)
         self._innovations = Innovations(schema)
-        self._mean = schema.bias.astype(float)[None]
-        self._covariance = TRUST**2 * self.prior.covariance[None]
-        self._scale = np.ones(1)
-        self._weight = np.zeros(1)
-        self._age = np.zeros(1, int)
+        self._known = known = len(schema.biases)
+        self._mean = self.prior.known[:known]
+        share = np.full(known, (1.0 - TRUST) / max(1, known))
+        away = [self.prior.between(schema.bias, p) for p in self._mean]
+        if known and min(away) < NARROW:
+            share[int(np.argmin(away))] += TRUST
+        else:
+            self._mean = np.concatenate([self._mean, schema.bias.astype(float)[None]])
+            share = np.append(share, TRUST)
+        self._covariance = np.repeat(NARROW**2 * self.prior.covariance[None], len(share), axis=0)
+        self._weight = np.log(share)
+        self._age = np.zeros(len(share))
+        self._scale = 1.0
 
     def see(self, schema: "BodySchema", row: np.ndarray) -> Recognition:
-        """Weigh all beliefs by a sample, and move each."""
+        """Weigh all beliefs by a sample, and move those that are not of a known condition."""
         pairs = self._innovations.pairs(np.isfinite(row))
         if len(pairs.index):
             self._begin_anew()
             rows = np.repeat(row[None], len(self._mean), axis=0)
-            at = self._start(schema, row)
-            for _ in range(PASSES):
+            at = self._mean.copy()
+            for index in range(PASSES):
                 error, slope = self._innovations.of(schema, pairs, rows, at.astype(np.float32))
+                if index == 0:  # the newcomer knows nothing: it is linearised where the sample fits best
+                    nearest = int(np.argmin(np.einsum("hn,hn->h", error, error)))
+                    at[-1], error[-1], slope[-1] = at[nearest], error[nearest], slope[nearest]
                 error = error - np.einsum("hnk,hk->hn", slope, self._mean - at)
-                at = self._move(error, slope)
+                at = self._moved(error, slope)
             self._commit(error, slope, pairs.log_volume)
             self._thin()
-        best = int(np.argmax(self._weight))
-        covariance = self._covariance[best]
-        settled = self.prior.share(covariance) < SETTLED
-        return Recognition(self._mean[best].copy(), covariance.copy(), int(self._age[best]), settled)
+        return self._found()
+
+    def _found(self) -> Recognition:
+        """The mean over all beliefs; its covariance contains how far they are apart."""
+        share = np.exp(self._weight)
+        share /= share.sum()
+        mean = share @ self._mean
+        away = self._mean - mean
+        covariance = np.einsum("h,hjk->jk", share, self._covariance) + np.einsum("h,hj,hk->jk", share, away, away)
+        since = int(round(float(self._age[int(np.argmax(self._weight))])))
+        return Recognition(mean, covariance, since, self.prior.share(covariance) < SETTLED)
 
     def _begin_anew(self) -> None:
-        """Everybody grows older and less sure; one more believes that the body changed just now."""
-        prior = self.prior
-        total = np.log(np.sum(np.exp(self._weight - self._weight.max()))) + self._weight.max()
-        self._weight = np.append(self._weight + np.log1p(-HAZARD), total + np.log(HAZARD))
+        """The body may have changed just now, to a known condition or to a new one; everybody else is less sure."""
+        prior, known = self.prior, self._known
+        total = float(np.exp(self._weight).sum())
+        stays = np.exp(self._weight) * (1.0 - HAZARD)
+        comes = np.zeros(len(stays))
+        if known:
+            comes[:known] = HAZARD * FAMILIAR * total / known
+        unknown = HAZARD * (1.0 - FAMILIAR if known else 1.0) * total
+        self._age = np.append((stays * (self._age + 1) + comes) / (stays + comes), 1.0)
+        self._weight = np.log(np.append(stays + comes, unknown))
+        self._covariance[known:] += DRIFT**2 * prior.covariance
         self._mean = np.concatenate([self._mean, prior.mean[None]])
-        self._covariance = np.concatenate([self._covariance + DRIFT**2 * prior.covariance, prior.covariance[None]])
-        self._scale = np.append(self._scale, 1.0)
-        self._age = np.append(self._age + 1, 1)
-
-    def _start(self, schema: "BodySchema", row: np.ndarray) -> np.ndarray:
-        """Where every belief is linearised first: at its mean; the newcomer at the trained p that fits best."""
-        pairs = self._innovations.pairs(np.isfinite(row))
-        known = self.prior.known
-        error, _ = self._innovations.of(
-            schema, pairs, np.repeat(row[None], len(known), axis=0), known.astype(np.float32)
-        )
-        at = self._mean.copy()
-        at[-1] = known[int(np.argmin(np.einsum("ij,ij->i", error, error)))]
-        return at
+        self._covariance = np.concatenate([self._covariance, prior.covariance[None]])
 
     def _information(self, slope: np.ndarray, scale: np.ndarray) -> np.ndarray:
         """Inverse covariance of p after a sample, shape (beliefs, bias_size, bias_size)."""
         gained = np.einsum("hnj,hnk->hjk", slope, slope) / scale[:, None, None]
         return np.linalg.inv(self._covariance) + gained
 
-    def _move(self, error: np.ndarray, slope: np.ndarray) -> np.ndarray:
-        pull = np.einsum("hnk,hn->hk", slope, error) / self._scale[:, None]
-        return self._mean + np.linalg.solve(self._information(slope, self._scale), pull[..., None])[..., 0]
+    def _moved(self, error: np.ndarray, slope: np.ndarray) -> np.ndarray:
+        scale = np.full(len(error), self._scale)
+        pull = np.einsum("hnk,hn->hk", slope, error) / self._scale
+        return self._mean + np.linalg.solve(self._information(slope, scale), pull[..., None])[..., 0]
 
     def _commit(self, error: np.ndarray, slope: np.ndarray, log_volume: float) -> None:
         """Evidence of the sample for every belief, and the step, shorter where the sample is odd."""
-        count = error.shape[1]
-        information = self._information(slope, self._scale)
-        pull = np.einsum("hnk,hn->hk", slope, error) / self._scale[:, None]
+        count, known = error.shape[1], self._known
+        scale = np.full(len(error), self._scale)
+        information = self._information(slope, scale)
+        pull = np.einsum("hnk,hn->hk", slope, error) / self._scale
         step = np.linalg.solve(information, pull[..., None])[..., 0]
         odd = np.einsum("hn,hn->h", error, error) / self._scale - np.einsum("hk,hk->h", pull, step)
+        odd = np.maximum(odd, 0.0)
         volume = (
             log_volume
             + count * np.log(self._scale)
@@ -175,26 +199,26 @@ class Kalman:
             + np.linalg.slogdet(information)[1]
         )
         half = 0.5 * (FREEDOM + count)
-        constant = lgamma(half) - lgamma(0.5 * FREEDOM) - 0.5 * count * np.log(np.pi * FREEDOM)
-        self._weight = self._weight + constant - 0.5 * volume - half * np.log1p(np.maximum(odd, 0.0) / FREEDOM)
-        self._weight -= self._weight.max()
-        trust = (FREEDOM + count) / (FREEDOM + np.maximum(odd, 0.0))
-        information = self._information(slope, self._scale / np.minimum(trust, 1.0))
-        pull *= np.minimum(trust, 1.0)[:, None]
-        self._mean = self._mean + np.linalg.solve(information, pull[..., None])[..., 0]
-        self._covariance = np.linalg.inv(information)
-        rate = 1.0 / np.minimum(self._age + SCALE_MEMORY // 2, SCALE_MEMORY)
-        self._scale = np.maximum(1.0, self._scale * (1.0 + rate * (trust * odd / count - 1.0)))
+        self._weight = self._weight - 0.5 * volume - half * np.log1p(odd / FREEDOM)
+        self._weight = np.maximum(self._weight - self._weight.max(), FAINTEST)
+        trust = (FREEDOM + count) / (FREEDOM + odd)
+        information = self._information(slope, scale / np.minimum(trust, 1.0))
+        step = np.linalg.solve(information, (pull * np.minimum(trust, 1.0)[:, None])[..., None])[..., 0]
+        self._mean[known:] += step[known:]
+        self._covariance[known:] = np.linalg.inv(information[known:])
+        share = np.exp(self._weight)
+        seen = float(share @ (trust * odd)) / float(share.sum()) / count
+        self._scale = max(1.0, self._scale * (1.0 + (seen - 1.0) / SCALE_MEMORY))
 
     def _thin(self) -> None:
-        """Too many beliefs: of the two whose ages differ least in proportion, the less likely goes; never the best."""
-        while len(self._weight) > BANK:
-            order = np.argsort(self._age)
+        """Too many filters: of the two whose ages differ least in proportion, the less likely goes."""
+        while len(self._weight) > self._known + BANK:
+            order = self._known + np.argsort(self._age[self._known :])
             ratio = self._age[order][1:] / self._age[order][:-1]
             closest = int(np.argmin(ratio))
             one, other = order[closest], order[closest + 1]
             gone = one if self._weight[one] < self._weight[other] else other
-            for name in ("_mean", "_covariance", "_scale", "_weight", "_age"):
+            for name in ("_mean", "_covariance", "_weight", "_age"):
                 setattr(self, name, np.delete(getattr(self, name), gone, axis=0))
 
 

@@ -138,7 +138,7 @@ class Innovations:
 
 
 def own_bias(schema: "BodySchema", count: int) -> np.ndarray:
-    """The p of the condition that every anchor was recorded under, shape (count, bias_size); the present p if unknown."""
+    """The p of the condition that every anchor was recorded under, shape (count, bias_size), or the present p."""
     if len(schema.anchor_conditions) == count and schema.biases and count:
         return np.stack(list(schema.biases.values()))[schema.anchor_conditions]
     return np.repeat(schema.bias[None], count, axis=0)
