@@ -7,7 +7,7 @@ import numpy as np
 
 from gemuco.descent import DescentConfig
 from gemuco.errors import NotFinite, NotObservable, SchemaError
-from gemuco.losses import Hold, Match, Term
+from gemuco.losses import Hold, Match, StayNear, Term
 from gemuco.masks import Mask, label
 from gemuco.routes import Limits, Search, checked_mask, checked_route
 from gemuco.schema import BodySchema
@@ -47,8 +47,8 @@ class Controller:
     A robot may know better and name route and mask:
 
     - Descent on z can end beside the data's manifold, where the predicted target fits but the predicted command does
-      not lead there (see `Solution.residual`). With route `input` and a mask that holds the command the command itself
-      descends, as if it were not in x_out, and what is predicted is what it leads to.
+      not lead there (see `Solution.residual`). With route `input` the command itself descends, as if it were not in
+      x_out, under the smallest mask that holds it, and what is predicted is what it leads to.
     - With route `input` and a mask that leaves out the command, as (theta, f) does for l, the target is given to the
       network as if it were measured, and descent runs over the rest of the mask.
     """
@@ -111,7 +111,8 @@ class Controller:
 
         Args:
             target: Signal -> reference [its unit], shape (n,): what `Match` reaches, `Hold` holds and `StayNear` stays
-                near.
+                near; a search that shall stay near something begins there, the others from the present and from training
+                data.
             now: Signal -> present value [its unit], shape (n,); NaN or absent where it is not known.
 
         Raises:
@@ -133,7 +134,13 @@ class Controller:
         route, mask = self._choose(wishes, schema.layout.whole(np.isfinite(direct)))
         bounds = [wish.bind(schema, target, now or {}) for wish in wishes]
         needed = {name for wish in wishes for name in wish.signals} | {hold.signal for hold in holds}
-        found = self._search.find(schema, route, mask, bounds, direct, held, sorted(needed), present)
+        near = [
+            schema.normalise({wish.signal: wish.reference(schema, target, now or {})})
+            for wish in wishes
+            if isinstance(wish, StayNear)
+        ]
+        begin = merged(schema, [present, *near])
+        found = self._search.find(schema, route, mask, bounds, direct, held, sorted(needed), begin, bool(near))
         x = self._limited(found.x)
         values = schema.scaler.restore(x)
         predicted = {name: part for name, part in schema.layout.split(values).items() if np.isfinite(part).all()}
@@ -187,14 +194,12 @@ class Controller:
             return "latent", frozenset()
         trying = [m for m in schema.masks if self.command in m]
         giving = [m for m in schema.masks if infers and asked and asked <= (m & direct) and self.command not in m]
-        if giving:
-            return "input", max(giving, key=len)
-        if not trying:
+        if not trying and not giving:
             raise NotObservable(
                 f"No feasible mask holds '{self.command}', nor all of {', '.join(sorted(asked)) or 'what is asked'} "
                 f"without it; use route latent."
             )
-        return "input", min(trying, key=lambda m: (len(m & asked), len(m)))
+        return "input", min(trying, key=lambda m: (len(m & asked), len(m))) if trying else max(giving, key=len)
 
     def _check_latent(self, wishes: Sequence[Term]) -> None:
         if self.command not in self.schema.x_out:

@@ -29,7 +29,8 @@ class Estimate:
         method: `measured`, `mask` (usages a and b), `latent` (e), `input` (f) or `none`.
         mask: The signals it was estimated from; empty where measured.
         residual: How badly the model explains what it was given (root mean square, standard deviations of the
-            training data); 0 where measured, NaN if impossible.
+            training data), for `latent` also when what was found is given to the network again: a z beside the data's
+            manifold fits what was measured, and yet its body does not exist. 0 where measured, NaN if impossible.
     """
 
     value: np.ndarray
@@ -100,7 +101,7 @@ def _route(schema: "BodySchema", name: str, whole: Mask, finite: np.ndarray) -> 
             return "mask", mask
         return ("latent", whole & set(schema.x_out)) if finite[schema.out_index].any() else ("none", frozenset())
     if name in schema.x_in and finite[schema.out_index].any() and covered_by(schema.masks, whole | {name}):
-        return "input", whole
+        return "input", whole & {*schema.x_in, *schema.x_out}
     return "none", frozenset()
 
 
@@ -112,13 +113,29 @@ def _guess(schema: "BodySchema", method: str, mask: Mask, x: np.ndarray) -> _Gue
         full[schema.out_index] = latent_search(schema, x)
     elif method == "input":
         full = input_search(schema, x, mask)
-    given = np.isfinite(x) & np.isfinite(full)
-    residual = float(np.sqrt(np.mean((full[given] - x[given]) ** 2))) if given.any() else float("nan")
+    residual = _residual(x, full)
+    if method == "latent":
+        residual = max(residual, _residual(x, _again(schema, full)))
     std = np.full(schema.layout.size, np.nan)
     known = schema.errors.get((method, mask))
     if known is not None:
-        std[schema.out_index] = known
+        std[schema.out_index if len(known) == len(schema.out_index) else slice(None)] = known
     return _Guess(schema.scaler.restore(full), std, method, mask, residual)
+
+
+def _residual(x: np.ndarray, full: np.ndarray) -> float:
+    """Root mean square of what was given minus what the model says of it; NaN if it says nothing."""
+    given = np.isfinite(x) & np.isfinite(full)
+    return float(np.sqrt(np.mean((full[given] - x[given]) ** 2))) if given.any() else float("nan")
+
+
+def _again(schema: "BodySchema", full: np.ndarray) -> np.ndarray:
+    """What the network makes of a body it was given as found, by the first mask that can, shape (size,)."""
+    again = full.copy()
+    covered = covered_by(schema.masks, schema.layout.whole(np.isfinite(full)))
+    if covered:
+        again[schema.out_index] = schema.infer(full, covered[0])
+    return again
 
 
 def _distance(chain: tuple[Layer, ...], points: np.ndarray, data: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

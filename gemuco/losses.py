@@ -126,9 +126,15 @@ class StayNear:
 
     def bind(self, schema: "BodySchema", target: Values, now: Values) -> Bound:
         """See `Term.bind`; nothing is asked where it is not known what to stay near."""
+        near = self.reference(schema, target, now)
+        return Difference.of(schema, self.signal, near, None, self.unit).norm(self.weight)
+
+    def reference(self, schema: "BodySchema", target: Values, now: Values) -> np.ndarray:
+        """What to stay near [its unit], shape (n,); NaN where that is not known."""
+        if self.value is not None:
+            return np.asarray(self.value, float)
         unknown = np.full(schema.layout.signal(self.signal).size, np.nan)
-        near = target.get(self.signal, now.get(self.signal, unknown)) if self.value is None else np.array(self.value)
-        return Difference.of(schema, self.signal, np.asarray(near, float), None, self.unit).norm(self.weight)
+        return np.asarray(target.get(self.signal, now.get(self.signal, unknown)), float)
 
 
 @dataclass(frozen=True, slots=True)

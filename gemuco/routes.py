@@ -10,6 +10,7 @@ import numpy as np
 
 from gemuco.descent import Constraint, DescentConfig, descend
 from gemuco.errors import NotObservable, SchemaError, WrongSize
+from gemuco.estimate import STARTS
 from gemuco.kernels import pull, run, trace
 from gemuco.losses import Bound, total
 from gemuco.masks import Mask, label
@@ -19,9 +20,6 @@ if TYPE_CHECKING:
     from gemuco.schema import BodySchema
 
 ROUTES = ("auto", "mask", "latent", "input")
-STARTS = 64
-"""How many anchors of the training data a descent chooses its start from."""
-
 Limits = Mapping[str, tuple[np.ndarray, np.ndarray]]
 """Signal -> lowest and highest value [its unit], shapes (n,)."""
 Back = Callable[[np.ndarray], np.ndarray]
@@ -63,16 +61,16 @@ class LatentRoute:
         x[self._schema.out_index] = run(self._decoder, point)
         return x
 
-    def starts(self, present: np.ndarray) -> np.ndarray:
-        """Latent states of the present, as far as it is known, and of training data, shape (starts, latent)."""
+    def starts(self, begin: np.ndarray, only_there: bool = False) -> np.ndarray:
+        """Latent states of what is known and of training data, shape (starts, latent); see `Search.find`."""
         schema = self._schema
         encoder = schema.weights.encoder
         found = []
-        there = schema.layout.whole(np.isfinite(present))
+        there = schema.layout.whole(np.isfinite(begin))
         covered = [mask for mask in schema.masks if mask <= there]
         if covered:
-            found.append(run(encoder, schema.network_input(present, covered[0]))[None])
-        if len(schema.anchors):
+            found.append(run(encoder, schema.network_input(begin, covered[0]))[None])
+        if len(schema.anchors) and not (found and only_there):
             found.append(run(encoder, schema.network_input(schema.anchors[:STARTS], schema.masks[0])))
         return np.concatenate(found) if found else np.zeros((1, self._decoder[0].matrix.shape[0]), np.float32)
 
@@ -144,12 +142,12 @@ class InputRoute:
         x[self.free] = point
         return x
 
-    def starts(self, present: np.ndarray) -> np.ndarray:
-        """The present, where it is known, and training data, shape (starts, free)."""
+    def starts(self, begin: np.ndarray, only_there: bool = False) -> np.ndarray:
+        """What is known, and training data, shape (starts, free); see `Search.find`."""
         found = []
-        if np.isfinite(present[self.free]).all():
-            found.append(present[None, self.free])
-        if len(self._schema.anchors):
+        if np.isfinite(begin[self.free]).all():
+            found.append(begin[None, self.free])
+        if len(self._schema.anchors) and not (found and only_there):
             found.append(self._schema.anchors[:STARTS, self.free])
         return np.concatenate(found or [np.zeros((1, len(self.free)))]).astype(np.float32)
 
@@ -188,7 +186,8 @@ class Search:
         given: np.ndarray,
         held: np.ndarray,
         needed: Sequence[str],
-        present: np.ndarray,
+        begin: np.ndarray,
+        only_there: bool = False,
     ) -> Found:
         """Minimise terms along a route.
 
@@ -200,7 +199,8 @@ class Search:
             given: What inputs are given and not searched for [standard deviations], shape (size,); NaN where free.
             held: What predictions must equal, shape (size,) [standard deviations]; NaN where free.
             needed: Signals that the terms are about.
-            present: What is known of the present [standard deviations], shape (size,); NaN where nothing is.
+            begin: Where to begin [standard deviations], shape (size,); NaN where nothing is known.
+            only_there: Begin nowhere else if that is known; else training data are tried too.
         """
         way: LatentRoute | InputRoute
         if route == "latent":
@@ -212,7 +212,7 @@ class Search:
             held[schema.layout.indices(mask)] = np.nan
         starts = self._warm[None] if self._warm is not None and self._way == (route, mask, size) else None
         if starts is None:
-            starts = way.starts(present)
+            starts = way.starts(begin, only_there)
         if size:
             point = descend(
                 lambda points: _loss(way, bounds, points), starts, self.config, low, high, _constraint(way, held)

@@ -30,7 +30,8 @@ if TYPE_CHECKING:
     from gemuco.train import TrainConfig
 
 ErrorTable = Mapping[tuple[str, Mask], np.ndarray]
-"""(method, signals it was inferred from) -> expected error of every x_out element [unit], shape (out_size,)."""
+"""(method, signals it was inferred from) -> expected error of every x_out element [unit], shape (out_size,); of every
+element of the layout, shape (size,), for the method `input`, which finds what is not in x_out."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,6 +10,8 @@ from gemuco.errors import NotFinite, NotObservable, SchemaError, UnknownSignal
 from gemuco.losses import Match, StayNear, StaySmall
 from gemuco.torque import TorqueBalance
 
+GIVEN = frozenset({"joint_position", "muscle_tension"})
+"""The target is given to the network as if it were measured, and the tensions descend."""
 PAPER = (Match("joint_position"), StaySmall("muscle_tension"), TorqueBalance(gravity, weight=0.01))
 HOLDING = (Match("joint_position"), StaySmall("muscle_tension", 0.05), TorqueBalance(gravity, weight=1.0))
 
@@ -22,7 +24,7 @@ def posture_of(arm, tension, length):
 
 
 def test_reaches_a_reference(schema, arm):
-    controller = Controller(schema, HOLDING, "muscle_length", "input", search=DescentConfig(0.5, 10, 30))
+    controller = Controller(schema, HOLDING, "muscle_length", "input", mask=GIVEN, search=DescentConfig(0.5, 10, 30))
     errors = []
     for theta in np.random.default_rng(7).uniform(LOW + 0.2, HIGH - 0.2, (8, 2)):
         solution = controller.solve({"joint_position": theta}, {})
@@ -43,9 +45,9 @@ def test_latent_route_predicts_the_reference(schema):
 
 def test_tensions_balance_gravity(schema, arm):
     theta = np.array([0.6, 1.0])
-    solution = Controller(schema, HOLDING, "muscle_length", "input", search=DescentConfig(0.5, 10, 60)).solve(
-        {"joint_position": theta}, {}
-    )
+    solution = Controller(
+        schema, HOLDING, "muscle_length", "input", mask=GIVEN, search=DescentConfig(0.5, 10, 60)
+    ).solve({"joint_position": theta}, {})
     torque = -arm.jacobian(theta).T @ solution.predicted["muscle_tension"]
     assert solution.loss < 0.4
     assert np.linalg.norm(torque - gravity(theta)) < 1.0  # N m, of 2.1 N m
@@ -54,13 +56,13 @@ def test_tensions_balance_gravity(schema, arm):
 
 def test_input_route_stays_on_the_manifold(schema):
     target = {"joint_position": np.array([0.4, 1.2])}
-    solution = Controller(schema, PAPER, "muscle_length", "input").solve(target, {})
+    solution = Controller(schema, PAPER, "muscle_length", "input", mask=GIVEN).solve(target, {})
     assert solution.residual < 0.3  # standard deviations
     np.testing.assert_allclose(solution.predicted["joint_position"], target["joint_position"])
 
 
 def test_goes_on_from_where_it_was(schema):
-    controller = Controller(schema, HOLDING, "muscle_length", "input", search=DescentConfig(0.5, 10, 5))
+    controller = Controller(schema, HOLDING, "muscle_length", "input", mask=GIVEN, search=DescentConfig(0.5, 10, 5))
     target = {"joint_position": np.array([0.4, 1.2])}
     losses = [controller.solve(target, {}).loss for _ in range(8)]
     assert all(after <= before + 1e-6 for before, after in pairwise(losses))
@@ -71,7 +73,7 @@ def test_a_term_on_the_command_is_pulled_back_through_the_network(schema, arm):
     theta = np.array([0.4, 1.2])
     near = arm.length(theta[None], np.full((1, 5), 60.0))[0]
     terms = (Match("joint_position"), StayNear("muscle_length", value=tuple(near)))
-    solution = Controller(schema, terms, "muscle_length", "input", search=DescentConfig(0.5, 10, 80)).solve(
+    solution = Controller(schema, terms, "muscle_length", "input", mask=GIVEN, search=DescentConfig(0.5, 10, 80)).solve(
         {"joint_position": theta}, {}
     )
     assert np.abs(solution.command - near).max() < 0.003  # m
