@@ -10,7 +10,7 @@ import typer
 
 from services import keys
 from services.client import Client
-from services.errors import ServiceError, ServiceUnavailable
+from services.errors import RemoteError, ServiceError, ServiceUnavailable
 
 PLAIN = {
     "enable": "hal",
@@ -100,7 +100,7 @@ def _answer(client: Client, verb: str, words: Sequence[str]) -> dict[str, Any]:
     if verb == "fault":
         if not words:
             raise BadQuestion("'fault' needs to be told what to break: fault muscle_cut biceps")
-        return client.fault(" ".join(words))
+        return _fault(client, " ".join(words))
     if verb == "describe":
         service = words[0] if words else "hal"
         if service not in keys.SERVICES:
@@ -109,6 +109,19 @@ def _answer(client: Client, verb: str, words: Sequence[str]) -> dict[str, Any]:
     if words:
         raise BadQuestion(f"'{verb}' takes nothing more, but got '{' '.join(words)}'.")
     return client.ask(PLAIN[verb], verb)
+
+
+def _fault(client: Client, text: str) -> dict[str, Any]:
+    """Break something in the simulator, or in the simulated camera if the simulator does not know it."""
+    try:
+        return client.fault(text)
+    except RemoteError as error:
+        if "vision" not in client.alive():
+            raise
+        try:
+            return client.fault(text, "vision")
+        except RemoteError as other:
+            raise RemoteError(f"{error} {other}") from None
 
 
 def _one(verb: str, words: Sequence[str], what: str) -> str:

@@ -17,8 +17,9 @@ app = typer.Typer(
     rich_markup_mode="rich",
     help="A body schema for robots, run as a real-time service.\n\n"
     "A robot is a YAML file (robots/musashi_arm.yaml). Three processes run it: [bold]simulate[/] pretends to be the "
-    "hardware, [bold]hal[/] reads and moves the hardware, [bold]serve[/] thinks. [bold]collect[/] and [bold]train[/] "
-    "make the model that serve needs. [bold]demo[/] does all of it in a minute.",
+    "hardware, [bold]hal[/] reads and moves the hardware, [bold]serve[/] thinks; [bold]vision[/] is a fourth where a "
+    "camera looks on. [bold]collect[/] and [bold]train[/] make the model that serve needs. [bold]demo[/] does all of "
+    "it in a minute.",
 )
 
 RobotFile = Annotated[str, typer.Argument(metavar="ROBOT", help="A robot file, or the name of one in robots/.")]
@@ -105,6 +106,18 @@ def hal(robot: RobotFile, connect: Connect = None) -> int:
     from services.hal_service import run_hal
 
     return run_hal(_load(robot), connect or ())
+
+
+@app.command()
+@speaks_plainly
+def vision(robot: RobotFile, variant: Variant = None, seed: Seed = 0, connect: Connect = None) -> None:
+    """Play the camera of a simulated robot: looks at the simulator's truth, publishes what it sees, until Ctrl-C.
+
+    A real robot's camera publishes on the same key instead. Cover it with `gemuco query ROBOT fault camera_covered`.
+    """
+    from services.vision_service import run_vision
+
+    run_vision(_load(robot), variant, seed, connect or ())
 
 
 @app.command()

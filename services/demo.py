@@ -95,6 +95,7 @@ def start(
     commands = {
         "simulator": ("simulate", str(path), "--variant", "actual", "--seed", str(seed)),
         "hal": ("hal", str(path)),
+        **({"vision": ("vision", str(path), "--variant", "actual", "--seed", str(seed))} if robot.seen else {}),
         "model": ("serve", str(path)),
         "recorder": ("record", str(path), str(recording)),
     }

@@ -79,9 +79,12 @@ def condition_of(robot: RobotConfig, condition: str | None) -> str | None:
     """The condition that was asked for, or the robot file's first; None if the file has none.
 
     Raises:
-        ConfigError: The robot file has no such condition.
+        ConfigError: Neither the robot file nor its simulator knows it.
     """
-    if condition is not None and condition not in robot.conditions:
-        known = ", ".join(robot.conditions) or "none, its file has no 'conditions'"
-        raise ConfigError(f"Robot '{robot.robot}' has no condition '{condition}'. Known conditions: {known}.")
-    return condition or (robot.conditions[0] if robot.conditions else None)
+    if condition is None:
+        return robot.conditions[0] if robot.conditions else None
+    known = dict.fromkeys((*robot.conditions, *simulator_of(robot).conditions))
+    if condition not in known:
+        told = ", ".join(known) or "none"
+        raise ConfigError(f"Robot '{robot.robot}' has no condition '{condition}'. Known conditions: {told}.")
+    return condition

@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 from rich.console import Console, Group, RenderableType
@@ -45,9 +45,9 @@ def watch(robot: str, once: bool, connect: Iterable[str], console: Console | Non
 def view(client: Client) -> RenderableType:
     """Everything at a glance, of this moment."""
     statuses = {name: client.status(name) for name in keys.SERVICES}
-    sample, estimate = client.sample(), client.estimate()
+    samples, estimate = (client.sample(), client.vision()), client.estimate()
     return Group(
-        _services(client, statuses), _loops(statuses), _signals(sample, estimate), _anomaly(client), _update(client)
+        _services(client, statuses), _loops(statuses), _signals(samples, estimate), _anomaly(client), _update(client)
     )
 
 
@@ -88,17 +88,17 @@ def _loops(statuses: Mapping[str, Status | None]) -> Table:
     return table
 
 
-def _signals(sample: Sample | None, estimate: Estimates | None) -> Table:
+def _signals(samples: Sequence[Sample | None], estimate: Estimates | None) -> Table:
     table = Table(title="signals", title_justify="left")
     table.add_column("signal", no_wrap=True)
     table.add_column("valid", justify="right")
     table.add_column("age ms", justify="right")
     for column in ("estimate", "from", "values"):
         table.add_column(column)
-    names = list(sample.values) if sample else list(estimate.values) if estimate else []
-    for name in names:
+    measured = {name: sample for sample in samples if sample is not None for name in sample.values}
+    for name in dict.fromkeys((*measured, *(estimate.values if estimate else ()))):
         valid = age = method = source = values = "-"
-        if sample is not None:
+        if (sample := measured.get(name)) is not None:
             valid = f"{int(sample.valid[name].sum())}/{sample.valid[name].size}"
             age = f"{1e3 * float(sample.age[name].max()):.1f}"
         if estimate is not None and name in estimate.values:

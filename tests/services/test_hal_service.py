@@ -265,7 +265,7 @@ def test_a_simulator_that_is_not_there_is_told(arm: Processes) -> None:
     config = load_robot(arm.file)
     with pytest.raises(ConfigError, match=r"has no variant 'broken'\. Known variants: plain"):
         run_simulator(config, "broken", stop=threading.Event())
-    with pytest.raises(ConfigError, match="has no 'simulator' in its robot file"):
+    with pytest.raises(ConfigError, match="names no simulator; add `simulator: module:name`"):
         run_simulator(config.model_copy(update={"simulator": None}), "plain", stop=threading.Event())
 
 

@@ -1,0 +1,233 @@
+"""A simulated camera as a service: new truths only, honest ages, faults; and any other camera in its place."""
+
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_arm import description as arm_description
+from small_arm import eventually
+from small_hand import HandWorld, config
+
+from hal.clock import ManualClock
+from hal.config import RobotConfig
+from hal.errors import ConfigError
+from services import keys
+from services.ask import ask_robot
+from services.client import Client
+from services.collector import Wanted, collect_direct
+from services.errors import AlreadyRunning, RemoteError
+from services.estimation import Fresh, Freshness
+from services.messages import MessageError, Sample
+from services.recorder import Recorder
+from services.recording import read
+from services.service import Service
+from services.top import watch
+from services.vision_service import run_vision
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "publish_marker.py"
+
+
+def sample(values: dict[str, np.ndarray], cycle: int = 1, source: str = "simulated", age: float = 0.0) -> Sample:
+    return Sample(
+        stamp_ns=time.time_ns(),
+        cycle=cycle,
+        source=source,
+        complete=True,
+        values=values,
+        age={name: np.full(value.shape, age) for name, value in values.items()},
+        valid={name: np.isfinite(value) for name, value in values.items()},
+    )
+
+
+class Truth:
+    """A simulator's truth, published while it is let."""
+
+    def __init__(self, robot: str) -> None:
+        self.world = HandWorld("short")
+        self._service = Service(robot, "simulator")
+        self._robot = robot
+        self._stop, self.pause = threading.Event(), threading.Event()
+
+    def __enter__(self) -> "Truth":
+        self._service.__enter__()
+        self._put = self._service.publisher(keys.truth(self._robot), Sample).put
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join()
+        self._service.__exit__(None, None, None)
+
+    def _run(self) -> None:
+        while not self._stop.wait(0.01):
+            if not self.pause.is_set():
+                self._put(sample(self.world.truth(), source="truth"))
+
+
+@contextmanager
+def camera_of(robot: RobotConfig) -> Iterator[None]:
+    stop = threading.Event()
+    thread = threading.Thread(target=run_vision, args=(robot,), kwargs={"stop": stop})
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
+
+
+def test_the_camera_sees_what_is_and_says_how_old_it_is(robot: str) -> None:
+    with Truth(robot) as truth, camera_of(config(robot)), Client(robot) as client:
+        frame = client.vision(timeout=10.0)
+        assert frame is not None
+        assert list(frame.values) == ["tool_tip_position"]
+        assert frame.source == "simulated"
+        np.testing.assert_allclose(frame.values["tool_tip_position"], truth.world.truth()["tool_tip_position"])
+        assert frame.valid["tool_tip_position"].all()
+        assert 0.0 <= frame.age["tool_tip_position"][0] < 0.1
+        following = client.reader(keys.vision(robot), Sample).wait(2.0)
+        assert following is not None
+        assert following.cycle > frame.cycle
+        status = client.status("vision", timeout=5.0)
+        assert status is not None
+        assert status.state == "running"
+        assert client.describe("vision")["signals"] == {"tool_tip_position": {"unit": "m", "elements": ["x", "y"]}}
+
+
+def test_a_camera_with_nothing_to_look_at_is_silent_and_says_so(robot: str) -> None:
+    with Truth(robot) as truth, camera_of(config(robot)), Client(robot) as client:
+        assert client.vision(timeout=10.0) is not None
+        truth.pause.set()
+        reader = client.reader(keys.vision(robot), Sample)
+        while reader.wait(0.3) is not None:
+            pass
+        assert client.vision() is None
+        eventually(lambda: "nothing to look at" in getattr(client.status("vision", timeout=2.0), "text", ""))
+        truth.pause.clear()
+        assert client.vision(timeout=5.0) is not None
+
+
+def test_faults_of_the_camera(robot: str) -> None:
+    with Truth(robot), camera_of(config(robot)), Client(robot) as client:
+        assert client.vision(timeout=10.0) is not None
+        assert client.fault("camera_covered", "vision") == {"text": "The camera sees nothing."}
+        eventually(lambda: not client.vision(timeout=2.0).valid["tool_tip_position"].any())
+        assert np.isnan(client.vision(timeout=2.0).values["tool_tip_position"]).all()
+        eventually(lambda: getattr(client.status("vision"), "text", "") == "Out of sight: tool_tip_position.")
+        assert client.fault("camera_back", "vision") == {"text": "The camera sees again."}
+        eventually(lambda: bool(client.vision(timeout=2.0).valid["tool_tip_position"].all()))
+        with pytest.raises(RemoteError, match="Known: camera_covered, camera_back"):
+            client.fault("camera_dropped", "vision")
+        with pytest.raises(MessageError, match="as in 'camera_covered'"):
+            client.ask("vision", "fault", {"text": " "})
+
+
+def test_there_is_one_camera(robot: str) -> None:
+    with Truth(robot), camera_of(config(robot)), Client(robot) as client:
+        assert client.vision(timeout=10.0) is not None
+        with pytest.raises(AlreadyRunning, match="already has a 'vision' service"):
+            run_vision(config(robot), stop=threading.Event())
+
+
+def test_a_robot_without_a_camera_is_told(robot: str) -> None:
+    with pytest.raises(ConfigError, match="has no signal with `source: vision`"):
+        run_vision(RobotConfig.model_validate(arm_description(robot)))
+    with pytest.raises(ConfigError, match="has no variant 'best'"):
+        run_vision(config(robot), "best")
+
+
+def test_top_and_the_recorder_show_what_is_seen(robot: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with Truth(robot), camera_of(config(robot)), Service(robot, "recorder") as service:
+        with Recorder(service.session, robot, tmp_path / "seen.mcap"), Client(robot) as client:
+            assert client.vision(timeout=10.0) is not None
+            watch(robot, True, ())
+        told = capsys.readouterr().out
+        assert "tool_tip_position" in told
+        assert "2/2" in told
+    assert len(list(read(tmp_path / "seen.mcap", [keys.vision(robot)]))) > 0
+
+
+def test_any_program_may_be_the_camera(robot: str) -> None:
+    program = subprocess.Popen([sys.executable, str(EXAMPLE), robot, "20"])
+    try:
+        with Client(robot) as client:
+            frame = client.vision(timeout=15.0)
+            assert frame is not None
+            assert frame.source == "camera"
+            assert frame.values["tool_tip_position"].shape == (3,)
+            assert client.alive() >= {"vision"}
+    finally:
+        program.kill()
+        program.wait()
+
+
+class Bench:
+    """Freshness with both newest samples in hand."""
+
+    def __init__(self) -> None:
+        self.clock = ManualClock()
+        self.hal: Fresh | None = None
+        self.seen: Fresh | None = None
+        self.freshness = Freshness(config(), lambda: self.hal, self.clock, lambda: self.seen)
+        truth = HandWorld("short").truth()
+        self.tip = truth.pop("tool_tip_position")
+        self.body = truth
+
+    def now(self, values: dict[str, np.ndarray], age: float = 0.0) -> Fresh:
+        return Fresh(sample(values, age=age), self.clock.monotonic())
+
+
+def test_each_signal_is_fresh_for_as_long_as_its_own_stale_after() -> None:
+    bench = Bench()
+    bench.hal, bench.seen = bench.now(bench.body), bench.now({"tool_tip_position": bench.tip}, age=0.01)
+    assert list(bench.freshness.take()[1]) == ["joint_position", "center_of_gravity", "tool_tip_position"]
+    assert all(np.isfinite(value).all() for value in bench.freshness.take()[1].values())
+    bench.clock.advance(0.1)
+    fresh, values = bench.freshness.take()
+    assert fresh is None, "the HAL is silent"
+    assert np.isnan(values["joint_position"]).all()
+    np.testing.assert_array_equal(values["tool_tip_position"], bench.tip)
+    bench.hal = bench.now(bench.body)
+    bench.clock.advance(0.019)
+    assert bench.freshness.take()[0] is bench.hal
+    bench.clock.advance(0.1)
+    bench.hal = bench.now(bench.body)
+    fresh, values = bench.freshness.take()
+    assert fresh is bench.hal
+    assert np.isnan(values["tool_tip_position"]).all(), "older than 0.2 s"
+
+
+def test_a_signal_is_taken_from_its_own_source_and_no_other() -> None:
+    bench = Bench()
+    bench.hal = bench.now(bench.body | {"tool_tip_position": bench.tip})
+    bench.seen = bench.now({"joint_position": np.zeros(2)})
+    fresh, values = bench.freshness.take()
+    assert fresh is bench.hal
+    assert np.isnan(values["tool_tip_position"]).all()
+    np.testing.assert_array_equal(values["joint_position"], bench.body["joint_position"])
+
+
+def test_collected_data_have_what_the_camera_sees() -> None:
+    dataset = collect_direct(config(), wanted=Wanted(("short",), 20)).dataset
+    assert np.isfinite(dataset.rows()[:, -2:]).any()
+
+
+def test_the_command_line_finds_who_plays_a_fault(robot: str, capsys: pytest.CaptureFixture[str]) -> None:
+    def refuse(arguments: dict[str, str]) -> dict[str, str]:
+        raise ValueError(f"'{arguments['text']}' is no part that can break.")
+
+    with Truth(robot) as truth, camera_of(config(robot)), Client(robot) as client:
+        truth._service.verb("fault", refuse)
+        assert client.vision(timeout=10.0) is not None
+        assert ask_robot(robot, "fault", ("camera_covered",), (), False, ()) == 0
+        assert "The camera sees nothing." in capsys.readouterr().out
+        with pytest.raises(RemoteError, match=r"no part that can break.*nothing that can happen here"):
+            ask_robot(robot, "fault", ("camera_dropped",), (), False, ())
