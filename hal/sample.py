@@ -95,6 +95,7 @@ class Assembler:
         self._devices = tuple(device for device in devices if device.measures)
         place = {element: index for index, element in enumerate(measured)}
         self._order = np.array([place[name] for name in names])
+        self._is_in_order = bool((self._order == np.arange(len(names))).all())
         self._stale_after = np.repeat(
             [config.signals[name].stale_after for name in direct], [config.signals[name].size for name in direct]
         )
@@ -121,28 +122,32 @@ class Assembler:
         """Values, ages [s] and validity of every signal at monotonic time `now` [s], in fresh arrays."""
         readings = [device.read() for device in self._devices]
         # The times first: a value that arrives in between then looks older than it is, never newer.
-        received = np.concatenate([reading.received for reading in readings])[self._order]
-        values = np.concatenate([reading.values for reading in readings])[self._order]
+        received = np.concatenate([reading.received for reading in readings])
+        values = np.concatenate([reading.values for reading in readings])
+        if not self._is_in_order:
+            received, values = received[self._order], values[self._order]
         age = np.maximum(now - received, 0.0)
         valid = (age <= self._stale_after) & np.isfinite(values)
-        values[~valid] = np.nan
-        found: tuple[Arrays, Arrays, Arrays] = ({}, {}, {})
+        np.copyto(values, np.nan, where=~valid)
+        values_of: Arrays = {}
+        age_of: Arrays = {}
+        valid_of: Arrays = {}
         for name, part in self._parts.items():
             if isinstance(part, slice):
-                one = values[part], age[part], valid[part]
+                values_of[name], age_of[name], valid_of[name] = values[part], age[part], valid[part]
             else:
-                one = _compute(part, values[part.inputs], age[part.inputs])
-            for arrays, array in zip(found, one, strict=True):
-                arrays[name] = array
-        return found
+                inputs = part.inputs
+                values_of[name], age_of[name], valid_of[name] = _compute(part, values[inputs], age[inputs])
+        return values_of, age_of, valid_of
 
 
 def _compute(part: _Computed, values: np.ndarray, age: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Values, ages [s] and validity of a computed signal: valid only if every input is, and as old as the oldest."""
-    oldest = float(age.max())
+    oldest = max(age.tolist())
     ages = np.full(part.size, oldest)
     if oldest > part.stale_after or not np.isfinite(values).all():
         return np.full(part.size, np.nan), ages, np.zeros(part.size, bool)
-    computed = np.asarray(part.function(values), float)
+    computed = np.array(part.function(values), float)
     valid = np.isfinite(computed)
-    return np.where(valid, computed, np.nan), ages, valid
+    np.copyto(computed, np.nan, where=~valid)
+    return computed, ages, valid
