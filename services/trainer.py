@@ -59,8 +59,8 @@ def train(robot: RobotConfig, dataset: Dataset, seed: int, progress: Progress) -
             "Use `gemuco collect`."
         )
     started = time.monotonic()
-    first = _train_config(config, config.structure.epochs, seed)
-    last = _train_config(config, config.training.epochs, seed)
+    first = train_config(config, config.structure.epochs, seed)
+    last = train_config(config, config.training.epochs, seed)
     share = first.epochs / (first.epochs + last.epochs)
     thresholds = structure.Thresholds(config.structure.threshold_out, config.structure.threshold_in)
     found = structure.determine(dataset, first, thresholds, lambda done, text: progress(share * done, text))
@@ -100,7 +100,8 @@ def show(trained: Trained, console: Console) -> None:
     console.print(f"{trained.samples} samples, structure and training in {trained.seconds:.1f} s.")
 
 
-def _train_config(config: ModelConfig, epochs: int, seed: int) -> "TrainConfig":
+def train_config(config: ModelConfig, epochs: int, seed: int) -> "TrainConfig":
+    """The robot file's way to train, for so many epochs."""
     from gemuco.train import TrainConfig
 
     return TrainConfig(
