@@ -16,8 +16,9 @@ import numpy as np
 
 from gemuco.errors import SchemaError
 
-Objective = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""Points (candidates, n) -> losses (candidates,) and their gradients (candidates, n)."""
+Objective = Callable[[np.ndarray, bool], tuple[np.ndarray, np.ndarray]]
+"""Points (candidates, n) -> losses (candidates,) and, if wanted, their gradients (candidates, n). Of all candidates only
+the best needs one, so the many are evaluated without."""
 Constraint = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 """Points (candidates, n) -> what must be zero (candidates, k) and its Jacobian (candidates, k, n)."""
 
@@ -78,7 +79,7 @@ def descend(
     """Minimise an objective.
 
     Args:
-        objective: Losses and gradients of a batch of points.
+        objective: Losses and gradients of points.
         start: First point, shape (n,), or several to begin from the best of, shape (starts, n).
         config: Step sizes and iterations.
         low: Lower bounds of a point, shape (n,); candidates are moved inside.
@@ -99,8 +100,7 @@ def descend(
             points = _back(constraint, points, RETURNS, low, high)
             amiss, jacobian = constraint(points)
             breach = BREACH * np.abs(amiss).sum(axis=1)
-        losses, gradients = objective(points)
-        losses = losses + breach
+        losses = objective(points, False)[0] + breach
         chosen = int(np.argmin(losses))
         loss = float(losses[chosen])
         history.append(loss)
@@ -109,13 +109,13 @@ def descend(
         if iteration < config.iterations:
             if iteration and config.candidates > 1 and chosen == 0:
                 gammas = gammas / np.float32(config.candidates - 1)
-            gradient = gradients[chosen]
+            gradient = objective(points[chosen : chosen + 1], True)[1][0]
             if constraint is not None:
                 gradient = gradient - _least(jacobian[chosen : chosen + 1], jacobian[chosen : chosen + 1] @ gradient)[0]
             points = points[chosen] - gammas * gradient
     if constraint is not None:
         last = _back(constraint, best_point[None], LAST_RETURNS, low, high)
-        best_point, best_loss = last[0], float(objective(last)[0][0])
+        best_point, best_loss = last[0], float(objective(last, False)[0][0])
     return Descent(best_point, best_loss, tuple(history))
 
 

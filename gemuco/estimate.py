@@ -138,13 +138,15 @@ def _again(schema: "BodySchema", full: np.ndarray) -> np.ndarray:
     return again
 
 
-def _distance(chain: tuple[Layer, ...], points: np.ndarray, data: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _distance(
+    chain: tuple[Layer, ...], points: np.ndarray, data: np.ndarray, slope: bool
+) -> tuple[np.ndarray, np.ndarray]:
     """Norm of the difference to the given outputs (paper, eq. state-loss), and its gradient with respect to points."""
     given = np.isfinite(data)
     values = trace(chain, points)
     difference = np.where(given, values[-1] - data, 0.0).astype(points.dtype)
     norm = np.sqrt(np.einsum("ij,ij->i", difference, difference))
-    return norm, pull(chain, values, difference / np.maximum(norm, 1e-9)[:, None])
+    return norm, pull(chain, values, difference / np.maximum(norm, 1e-9)[:, None]) if slope else points
 
 
 def latent_search(schema: "BodySchema", x: np.ndarray) -> np.ndarray:
@@ -161,7 +163,7 @@ def latent_search(schema: "BodySchema", x: np.ndarray) -> np.ndarray:
     else:
         starts = np.zeros((1, decoder[0].matrix.shape[0]), np.float32)
     data = x[schema.out_index]
-    return run(decoder, descend(lambda z: _distance(decoder, z, data), starts, SEARCH).point)
+    return run(decoder, descend(lambda z, slope: _distance(decoder, z, data, slope), starts, SEARCH).point)
 
 
 def input_search(schema: "BodySchema", x: np.ndarray, available: Mask) -> np.ndarray:
@@ -184,11 +186,11 @@ def input_search(schema: "BodySchema", x: np.ndarray, available: Mask) -> np.nda
     columns = np.flatnonzero(np.isin(schema.in_index, sought) & (through > 0))
     data = x[schema.out_index]
 
-    def objective(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def objective(points: np.ndarray, slope: bool) -> tuple[np.ndarray, np.ndarray]:
         inputs = np.repeat(base[None], len(points), axis=0)
         inputs[:, columns] = points
-        norm, gradient = _distance(schema.weights.whole, inputs, data)
-        return norm, gradient[:, columns]
+        norm, gradient = _distance(schema.weights.whole, inputs, data, slope)
+        return norm, gradient[:, columns] if slope else points
 
     anchors = schema.anchors[:STARTS]
     starts = anchors[:, sought] if len(anchors) else np.zeros((1, len(sought)))

@@ -11,7 +11,7 @@ the signal's own unit (`unit="si"`). `StaySmall` measures from the physical zero
 `TorqueBalance` (in `gemuco.torque`) measures in N m. `Hold` has no weight: it is met exactly.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
@@ -23,8 +23,20 @@ if TYPE_CHECKING:
     from gemuco.schema import BodySchema
 
 Values = Mapping[str, np.ndarray]
-Bound = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""Predictions [standard deviations], (candidates, size) -> losses (candidates,), gradients (candidates, size)."""
+
+
+class Bound(Protocol):
+    """A term bound to a schema, references and the present: a function of predictions."""
+
+    def __call__(self, x: np.ndarray, slope: bool = True) -> tuple[np.ndarray, np.ndarray]:
+        """Losses, shape (candidates,), and their gradients, shape (candidates, size).
+
+        Args:
+            x: Predictions [standard deviations], shape (candidates, size).
+            slope: Whether gradients are wanted; they may be anything if not.
+        """
+        ...
+
 
 TINY = 1e-9
 UNITS = ("std", "si")
@@ -256,24 +268,25 @@ class Difference:
     def norm(self, weight: float) -> Bound:
         """The loss weight * ||M x - w||."""
 
-        def bound(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        def bound(x: np.ndarray, slope: bool = True) -> tuple[np.ndarray, np.ndarray]:
             difference = self.at(x)
             norm = np.sqrt(np.einsum("ij,ij->i", difference, difference))
-            slope = difference * (weight / np.maximum(norm, TINY))[:, None]
             gradient = np.zeros_like(x)
-            gradient[:, self.span] = slope if self.matrix is None else slope @ self.matrix
+            if slope:
+                way = difference * (weight / np.maximum(norm, TINY))[:, None]
+                gradient[:, self.span] = way if self.matrix is None else way @ self.matrix
             return weight * norm, gradient
 
         return bound
 
 
-def total(bounds: Sequence[Bound], x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def total(bounds: Sequence[Bound], x: np.ndarray, slope: bool = True) -> tuple[np.ndarray, np.ndarray]:
     """Sum of bound terms and its gradient; nothing wanted loses nothing."""
     loss, gradient = np.zeros(len(x), x.dtype), np.zeros_like(x)
     for bound in bounds:
-        part, slope = bound(x)
+        part, way = bound(x, slope)
         loss = loss + part
-        gradient = gradient + slope
+        gradient = gradient + way
     return loss, gradient
 
 

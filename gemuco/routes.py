@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from gemuco.descent import Constraint, DescentConfig, descend
+from gemuco.descent import Constraint, DescentConfig, Objective, descend
 from gemuco.errors import NotObservable, SchemaError, WrongSize
 from gemuco.estimate import STARTS
 from gemuco.kernels import pull, run, trace
@@ -214,9 +214,7 @@ class Search:
         if starts is None:
             starts = way.starts(begin, only_there)
         if size:
-            point = descend(
-                lambda points: _loss(way, bounds, points), starts, self.config, low, high, _constraint(way, held)
-            ).point
+            point = descend(_objective(way, bounds), starts, self.config, low, high, _constraint(way, held)).point
         else:
             point = starts[0]
         self._warm, self._way = point, (route, mask, size)
@@ -224,10 +222,13 @@ class Search:
         return Found(x, float(total(bounds, np.nan_to_num(x)[None])[0][0]))
 
 
-def _loss(route: Route, bounds: Sequence[Bound], points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    x, back = route.predict(points)
-    loss, gradient = total(bounds, x)
-    return loss, back(gradient)
+def _objective(route: Route, bounds: Sequence[Bound]) -> Objective:
+    def objective(points: np.ndarray, slope: bool) -> tuple[np.ndarray, np.ndarray]:
+        x, back = route.predict(points)
+        loss, gradient = total(bounds, x, slope)
+        return loss, back(gradient) if slope else gradient
+
+    return objective
 
 
 def _constraint(route: Route, held: np.ndarray) -> Constraint | None:

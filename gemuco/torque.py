@@ -68,12 +68,13 @@ class TorqueBalance:
         normalised = (posture - schema.scaler.mean[theta]) / schema.scaler.std[theta]
         torque = self._torque(posture)[None]
 
-        def bound(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        def bound(x: np.ndarray, slope: bool = True) -> tuple[np.ndarray, np.ndarray]:
             postures = np.repeat(normalised[None], len(x), axis=0)
-            losses, _, by_tension, _ = muscles.imbalance(postures, x[:, f], torque)
+            missing = muscles.missing(postures, x[:, f], torque)
             gradient = np.zeros_like(x)
-            gradient[:, f] = self.weight * by_tension
-            return self.weight * losses, gradient
+            if slope:
+                gradient[:, f] = self.weight * missing.slopes()[1]
+            return self.weight * missing.norm, gradient
 
         return bound
 
@@ -81,14 +82,16 @@ class TorqueBalance:
         theta, f = schema.layout.slice(self.position), schema.layout.slice(self.tension)
         mean, std = schema.scaler.mean[theta], schema.scaler.std[theta]
 
-        def bound(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        def bound(x: np.ndarray, slope: bool = True) -> tuple[np.ndarray, np.ndarray]:
             postures = x[:, theta] * std + mean
             torques = np.stack([self._torque(posture) for posture in postures])
-            losses, by_posture, by_tension, way = muscles.imbalance(x[:, theta], x[:, f], torques)
+            missing = muscles.missing(x[:, theta], x[:, f], torques)
             gradient = np.zeros_like(x)
-            gradient[:, f] = self.weight * by_tension
-            gradient[:, theta] = self.weight * (by_posture + self._slope(postures, torques, way) * std)
-            return self.weight * losses, gradient
+            if slope:
+                by_posture, by_tension = missing.slopes()
+                gradient[:, f] = self.weight * by_tension
+                gradient[:, theta] = self.weight * (by_posture + self._slope(postures, torques, missing.way) * std)
+            return self.weight * missing.norm, gradient
 
         return bound
 
@@ -109,7 +112,7 @@ class TorqueBalance:
 class MuscleModel:
     """The muscles as the network knows them under the mask (position, tension)."""
 
-    __slots__ = ("_base", "_chain", "_f", "_f_mean", "_f_std", "_l_std", "_theta", "_theta_std")
+    __slots__ = ("_base", "_chain", "_f_mean", "f", "f_std", "l_std", "theta", "theta_std")
 
     def __init__(self, schema: "BodySchema", names: TorqueBalance) -> None:
         """Prepare the network.
@@ -127,48 +130,63 @@ class MuscleModel:
             )
         dtype = schema.weights.encoder[0].matrix.dtype
         self._base = schema.network_input(np.zeros(layout.size), mask).astype(dtype)
-        self._theta = _columns(schema.in_index, theta)
-        self._f = _columns(schema.in_index, f)
+        self.theta = _columns(schema.in_index, theta)
+        self.f = _columns(schema.in_index, f)
         last = schema.weights.decoder[-1]
         columns = _columns(schema.out_index, length)
         last = Layer(np.ascontiguousarray(last.matrix[:, columns]), last.offset[columns], last.activation)
         self._chain = (*schema.weights.whole[:-1], last)
-        self._theta_std, self._f_std, self._l_std = (scaler.std[s].astype(dtype) for s in (theta, f, length))
+        self.theta_std, self.f_std, self.l_std = (scaler.std[s].astype(dtype) for s in (theta, f, length))
         self._f_mean = scaler.mean[f].astype(dtype)
 
-    def imbalance(
-        self, posture: np.ndarray, tension: np.ndarray, torque: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """||torque + G^T f|| and its gradients with torque held constant.
+    def missing(self, posture: np.ndarray, tension: np.ndarray, torque: np.ndarray) -> "Missing":
+        """What the muscles lack, torque + G^T f.
 
         Args:
             posture: theta [standard deviations], shape (candidates, joints).
             tension: f [standard deviations], shape (candidates, muscles).
             torque: tau_ext [N m], shape (candidates or 1, joints).
-
-        Returns:
-            Norms [N m], shape (candidates,); gradients with respect to theta and to f [N m per standard deviation]; and
-            with respect to torque, shape (candidates, joints).
         """
         muscles = self._at(posture, tension)
-        rest = torque.astype(self._base.dtype) + muscles.gradient[:, self._theta] / self._theta_std
+        rest = torque.astype(self._base.dtype) + muscles.gradient[:, self.theta] / self.theta_std
         norm = np.sqrt(np.einsum("ij,ij->i", rest, rest))
-        way = rest / np.maximum(norm, TINY)[:, None]
-        tangent = np.zeros_like(muscles.gradient)
-        tangent[:, self._theta] = way / self._theta_std
-        pushed, bent = muscles.mixed(tangent)
-        return norm, bent[:, self._theta], self._f_std * self._l_std * pushed + bent[:, self._f], way
+        return Missing(norm, rest / np.maximum(norm, TINY)[:, None], self, muscles)
 
     def torque(self, posture: np.ndarray, tension: np.ndarray) -> np.ndarray:
         """G^T f [N m], shape (candidates, joints), of postures and tensions [standard deviations]."""
-        return self._at(posture, tension).gradient[:, self._theta] / self._theta_std
+        return self._at(posture, tension).gradient[:, self.theta] / self.theta_std
 
     def _at(self, posture: np.ndarray, tension: np.ndarray) -> Curvature:
         inputs = np.repeat(self._base[None], len(tension), axis=0)
-        inputs[:, self._theta] = posture
-        inputs[:, self._f] = tension
-        w = (inputs[:, self._f] * self._f_std + self._f_mean) * self._l_std
+        inputs[:, self.theta] = posture
+        inputs[:, self.f] = tension
+        w = (inputs[:, self.f] * self.f_std + self._f_mean) * self.l_std
         return Curvature(self._chain, inputs, w)
+
+
+@dataclass(frozen=True, slots=True)
+class Missing:
+    """What the muscles lack to hold a posture.
+
+    Attributes:
+        norm: ||torque + G^T f|| [N m], shape (candidates,).
+        way: Its gradient with respect to torque, shape (candidates, joints).
+        model: The muscles.
+        at: Their network where it was asked.
+    """
+
+    norm: np.ndarray
+    way: np.ndarray
+    model: MuscleModel
+    at: Curvature
+
+    def slopes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Gradients of the norm with respect to theta and to f [N m per standard deviation], torque held constant."""
+        model = self.model
+        tangent = np.zeros_like(self.at.gradient)
+        tangent[:, model.theta] = self.way / model.theta_std
+        pushed, bent = self.at.mixed(tangent)
+        return bent[:, model.theta], model.f_std * model.l_std * pushed + bent[:, model.f]
 
 
 def _columns(index: np.ndarray, span: slice) -> np.ndarray:

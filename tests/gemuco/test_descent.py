@@ -6,7 +6,7 @@ import pytest
 from gemuco.descent import DescentConfig, descend
 
 
-def valley(points):
+def valley(points, slope=True):
     """Narrow in one direction; least at (1, -2)."""
     difference = points - np.array([1.0, -2.0])
     scale = np.array([1.0, 30.0])
@@ -38,3 +38,23 @@ def test_stays_inside_its_bounds():
     found = descend(valley, np.zeros(2), DescentConfig(iterations=50), low=np.array([-1.0, -1.0]), high=np.ones(2))
     assert found.point[1] == -1.0
     assert found.point[0] == pytest.approx(1.0, abs=0.05)
+
+
+def circle(points):
+    """Distance from the unit circle, and its gradient."""
+    radius = np.linalg.norm(points, axis=1)
+    return (radius - 1.0)[:, None], (points / radius[:, None])[:, None, :]
+
+
+def test_meets_a_constraint_and_moves_along_it():
+    found = descend(valley, np.array([0.3, 2.0]), DescentConfig(gamma_max=0.1, iterations=60), constraint=circle)
+    assert np.linalg.norm(found.point) == pytest.approx(1.0, abs=1e-6)
+    turn = np.linspace(0.0, 2 * np.pi, 3601)
+    least = valley(np.stack([np.cos(turn), np.sin(turn)], axis=1))[0].min()
+    assert found.loss == pytest.approx(least, abs=0.01)
+
+
+def test_an_impossible_constraint_ends_where_least_is_missing():
+    low, high = np.array([-0.5, -0.5]), np.array([0.5, 0.5])
+    found = descend(valley, np.array([0.3, 0.2]), DescentConfig(iterations=30), low, high, circle)
+    assert np.linalg.norm(found.point) == pytest.approx(np.sqrt(0.5), abs=0.02)
