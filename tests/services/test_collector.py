@@ -5,9 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import small_hand
+import yaml
 from small_hand import OUT_OF_SIGHT, config, gravity_of, tip_of
+from typer.testing import CliRunner
 
+from gemuco.schema import BodySchema
 from hal.errors import ConfigError
+from services.cli import app
 from services.collector import Wanted, collect_direct
 from services.motion import NowhereToGo, random_postures, way
 from services.playground import CollectionStopped
@@ -190,3 +194,28 @@ def test_a_file_of_postures_that_cannot_be_read_is_told(tmp_path: Path) -> None:
     binary.write_bytes(b"\xff\xfe\x00\x01")
     with pytest.raises(BadPostures, match="cannot be read"):
         collected(None, "short", postures=binary)
+
+
+def test_from_the_command_line_to_a_model_that_knows_every_condition(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = config().model | {
+        "network": {"hidden": [12], "latent": 4, "bias": 2},
+        "structure": {"threshold_out": 0.9, "threshold_in": 0.9, "epochs": 10},
+        "training": {"epochs": 3, "batch": 25, "rate": 0.02},
+    }
+    robot = tmp_path / "small_hand.yaml"
+    robot.write_text(yaml.safe_dump(small_hand.description("small_hand") | {"model": model}))
+    monkeypatch.chdir(tmp_path)
+
+    def gemuco(*words: str) -> tuple[int, str]:
+        told = CliRunner().invoke(app, words)
+        return told.exit_code, told.output.replace("\n", " ")
+
+    code, told = gemuco("collect", str(robot), "--condition", "short", "--condition", "long", "--samples", "150")
+    assert (code, "300 samples in runs/small_hand/data.npz" in told) == (0, True), told
+    code, told = gemuco("train", str(robot))
+    assert code == 0, told
+    assert tuple(BodySchema.load(tmp_path / "runs" / "small_hand" / "model").biases) == ("short", "long")
+    code, told = gemuco("collect", str(robot), "--condition", "middle")
+    assert (code, "has no condition 'middle'. Known conditions: short, long" in told) == (2, True), told
