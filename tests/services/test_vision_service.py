@@ -27,6 +27,7 @@ from services.messages import MessageError, Sample
 from services.recorder import Recorder
 from services.recording import read
 from services.service import Service
+from services.session import port
 from services.top import watch
 from services.vision_service import run_vision
 
@@ -167,6 +168,23 @@ def test_any_program_may_be_the_camera(robot: str) -> None:
     finally:
         program.kill()
         program.wait()
+
+
+def test_the_frame_of_the_documentation_is_one(robot: str) -> None:
+    program = (EXAMPLE.parents[1] / "docs" / "keys.md").read_text().split("```python\n")[-1].split("```")[0]
+    program = program.replace("PORT", str(port(robot, "model"))).replace("gemuco/kxr_humanoid/", f"gemuco/{robot}/")
+    with Service(robot, "model") as model:
+        frames = model.newest(keys.vision(robot), Sample)
+        for _ in range(5):
+            exec(program, {})
+            if frames.wait(2.0) is not None:
+                break
+        last = frames.last()
+    assert frames.rejected == 0, frames.rejected_text
+    assert last is not None
+    assert last[1].source == "camera"
+    np.testing.assert_array_equal(last[1].values["tool_tip_position"], [0.12, -0.05, 0.31])
+    assert last[1].valid["tool_tip_position"].all()
 
 
 class Bench:
