@@ -5,7 +5,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from gemuco.estimate import Estimate
 from gemuco.masks import label
+from gemuco.schema import BodySchema
+from gemuco.signals import Signal
+from services.control_config import controller_of, simulator_of
 from services.control_loop import Control
 from services.errors import BadArguments, NotEngaged
 from services.messages import Target
@@ -13,6 +17,9 @@ from services.query import Handler
 
 if TYPE_CHECKING:
     from services.gemuco_service import GemucoService
+
+MOST_STEPS = 200
+"""Commands that one question may simulate; a step takes some ten milliseconds."""
 
 
 class ModelVerbs:
@@ -25,6 +32,9 @@ class ModelVerbs:
         """Verb -> handler; `describe` comes with every service."""
         return {
             "estimate": self.estimate,
+            "control": self.solve,
+            "simulate": self.simulate,
+            "anomaly": self.anomaly,
             "engage": self.engage,
             "disengage": self.disengage,
             "target": self.target,
@@ -40,6 +50,7 @@ class ModelVerbs:
             "signals": {s.name: {"unit": s.unit, "elements": list(s.elements)} for s in schema.layout.signals},
             "x_in": list(schema.x_in),
             "x_out": list(schema.x_out),
+            "conditions": list(schema.biases),
             "masks": [label(mask, schema.layout.names) for mask in schema.masks],
             "rates": robot.rates.model_dump(),
             "controls": control.target if control and self._service.control else "",
@@ -48,27 +59,75 @@ class ModelVerbs:
         }
 
     def estimate(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Estimate one signal, from the newest sample or from given values, some of them hidden."""
+        """Estimate one signal or all, from the newest sample or from given values, some of them hidden."""
         _only(arguments, "signal", "values", "hide")
         schema = self._service.living.schema
-        if not isinstance(arguments.get("signal"), str):
-            raise BadArguments(f"'estimate' needs a signal. Known signals: {', '.join(schema.layout.names)}.")
-        signal = schema.layout.signal(arguments["signal"])
-        values, cycle = self._values(arguments.get("values"))
-        for name in arguments.get("hide") or []:
-            schema.layout.slice(name)
-            values.pop(name, None)
-        found = schema.estimate(values)[signal.name]
+        if not isinstance(arguments.get("signal", ""), str):
+            raise BadArguments(f"'signal' must be a name. Known signals: {', '.join(schema.layout.names)}.")
+        values, cycle = self._values(arguments)
+        facts = {"cycle": cycle, "model_version": self._service.living.version}
+        if "signal" in arguments:
+            signal = schema.layout.signal(arguments["signal"])
+            return _estimate(schema, signal, schema.estimate(values)[signal.name]) | facts
+        found = schema.estimate(values)
+        return {"signals": {s.name: _estimate(schema, s, found[s.name]) for s in schema.layout.signals}} | facts
+
+    def solve(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """The command that the robot file's loss finds for a target; nothing is sent, nothing moves."""
+        _only(arguments, "target", "values")
+        service, schema = self._service, self._service.living.schema
+        if service.config.control is None:
+            raise NotEngaged(service.no_control)
+        target = _signals(arguments.get("target"), "target")
+        now, cycle = self._values({"values": arguments.get("values")})
+        found = controller_of(schema, service.robot, service.config.control).solve(target, now)
+        signal = schema.layout.signal(service.robot.command.signal)
         return {
             "signal": signal.name,
             "unit": signal.unit,
             "elements": list(signal.elements),
-            "values": found.value,
-            "std": found.std,
-            "estimated": found.estimated,
-            "method": found.method,
-            "mask": label(found.mask, schema.layout.names),
+            "values": found.command,
+            "predicted": found.predicted,
+            "loss": found.loss,
             "residual": found.residual,
+            "route": found.route,
+            "mask": label(found.mask, schema.layout.names),
+            "cycle": cycle,
+            "model_version": service.living.version,
+        }
+
+    def simulate(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """The states that commands bring about one after the other, under the robot file's constraints."""
+        _only(arguments, "commands", "given", "values")
+        service, schema = self._service, self._service.living.schema
+        commands = arguments.get("commands")
+        if not isinstance(commands, list) or not 1 <= len(commands) <= MOST_STEPS:
+            what = service.robot.command.signal
+            raise BadArguments(f"'commands' must be a list of 1 to {MOST_STEPS} commands of '{what}'.")
+        given = _signals(arguments.get("given") or {}, "given")
+        now, _ = self._values({"values": arguments.get("values")})
+        simulator = simulator_of(schema, service.robot, service.config.simulation)
+        steps = list(simulator.run([_numbers(command, "commands") for command in commands], given, now))
+        return {
+            "states": {name: np.stack([step.values[name] for step in steps]) for name in steps[0].values},
+            "loss": [step.loss for step in steps],
+            "residual": [step.residual for step in steps],
+            "route": steps[0].route,
+            "mask": label(steps[0].mask, schema.layout.names),
+            "model_version": service.living.version,
+        }
+
+    def anomaly(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """How unlike normal the newest sample is, or given values, some of them hidden."""
+        _only(arguments, "values", "hide")
+        values, cycle = self._values(arguments)
+        found = self._service.living.schema.anomaly(values)
+        return {
+            "score": found.score,
+            "threshold": found.threshold,
+            "is_anomaly": found.is_anomaly,
+            "blamed": found.blamed,
+            "contribution": found.contribution,
             "cycle": cycle,
             "model_version": self._service.living.version,
         }
@@ -120,14 +179,32 @@ class ModelVerbs:
             raise NotEngaged(self._service.no_control)
         return self._service.control
 
-    def _values(self, given: Any) -> tuple[dict[str, np.ndarray], int]:
-        """What to estimate from, and the cycle it is of; -1 when it was given or nothing is fresh."""
+    def _values(self, arguments: Mapping[str, Any]) -> tuple[dict[str, np.ndarray], int]:
+        """What to judge by, without what is hidden, and its cycle; -1 when it was given or nothing is fresh."""
+        given, cycle = arguments.get("values"), -1
         if given is None:
             fresh, values = self._service.freshness.take()
-            return values, -1 if fresh is None else fresh.sample.cycle
-        if not isinstance(given, dict):
-            raise BadArguments("'values' must be a map from signal to a list of numbers.")
-        return {name: _numbers(value, name) for name, value in given.items()}, -1
+            cycle = -1 if fresh is None else fresh.sample.cycle
+        else:
+            values = _signals(given, "values")
+        for name in arguments.get("hide") or []:
+            self._service.living.schema.layout.slice(name)
+            values.pop(name, None)
+        return values, cycle
+
+
+def _estimate(schema: BodySchema, signal: Signal, found: Estimate) -> dict[str, Any]:
+    return {
+        "signal": signal.name,
+        "unit": signal.unit,
+        "elements": list(signal.elements),
+        "values": found.value,
+        "std": found.std,
+        "estimated": found.estimated,
+        "method": found.method,
+        "mask": label(found.mask, schema.layout.names),
+        "residual": found.residual,
+    }
 
 
 def _only(arguments: Mapping[str, Any], *known: str) -> None:
@@ -143,3 +220,9 @@ def _numbers(value: Any, name: str) -> np.ndarray:
     if array.ndim != 1:
         raise BadArguments(f"'{name}' must be a list of numbers.")
     return array
+
+
+def _signals(value: Any, name: str) -> dict[str, np.ndarray]:
+    if not isinstance(value, dict):
+        raise BadArguments(f"'{name}' must be a map from signal to a list of numbers.")
+    return {signal: _numbers(numbers, signal) for signal, numbers in value.items()}
