@@ -38,7 +38,8 @@ FAINTEST = -60.0
 PASSES = 2
 """How often a sample is linearised anew."""
 SCALE_MEMORY = 50
-"""Samples over which a belief learns that errors are larger here than in training."""
+"""Samples over which it is learned that errors are larger here than in training; at first fewer, to be there soon."""
+SCALE_FIRST = 5
 SETTLED = 0.3
 """p is settled when its standard deviation is below this share of the prior's in every direction."""
 RECENT = 20
@@ -129,6 +130,7 @@ class Kalman:
         self._weight = np.log(share)
         self._age = np.zeros(len(share))
         self._scale = 1.0
+        self._seen = 0
 
     def see(self, schema: "BodySchema", row: np.ndarray) -> Recognition:
         """Weigh all beliefs by a sample, and move those that are not of a known condition."""
@@ -155,7 +157,7 @@ class Kalman:
         mean = share @ self._mean
         away = self._mean - mean
         covariance = np.einsum("h,hjk->jk", share, self._covariance) + np.einsum("h,hj,hk->jk", share, away, away)
-        since = int(round(float(self._age[int(np.argmax(self._weight))])))
+        since = round(float(self._age[int(np.argmax(self._weight))]))
         return Recognition(mean, covariance, since, self.prior.share(covariance) < SETTLED)
 
     def _begin_anew(self) -> None:
@@ -199,6 +201,7 @@ class Kalman:
             + np.linalg.slogdet(information)[1]
         )
         half = 0.5 * (FREEDOM + count)
+        foretold = np.exp(self._weight)
         self._weight = self._weight - 0.5 * volume - half * np.log1p(odd / FREEDOM)
         self._weight = np.maximum(self._weight - self._weight.max(), FAINTEST)
         trust = (FREEDOM + count) / (FREEDOM + odd)
@@ -206,9 +209,9 @@ class Kalman:
         step = np.linalg.solve(information, (pull * np.minimum(trust, 1.0)[:, None])[..., None])[..., 0]
         self._mean[known:] += step[known:]
         self._covariance[known:] = np.linalg.inv(information[known:])
-        share = np.exp(self._weight)
-        seen = float(share @ (trust * odd)) / float(share.sum()) / count
-        self._scale = max(1.0, self._scale * (1.0 + (seen - 1.0) / SCALE_MEMORY))
+        seen = float(foretold @ (trust * odd)) / float(foretold.sum()) / count
+        self._seen += 1
+        self._scale = max(1.0, self._scale * (1.0 + (seen - 1.0) / min(SCALE_FIRST + self._seen, SCALE_MEMORY)))
 
     def _thin(self) -> None:
         """Too many filters: of the two whose ages differ least in proportion, the less likely goes."""
