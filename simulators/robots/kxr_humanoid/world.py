@@ -104,5 +104,5 @@ class HumanoidWorld:
         """See `World.close`; there is nothing to let go of."""
 
 
-_STILL = 1e-7
-"""A motor that has less than this to go is where it should be [rad]: at rest nothing is computed anew."""
+_STILL = 1e-5
+"""A motor that would move less than this in a step is where it should be [rad]: at rest nothing is computed anew."""
