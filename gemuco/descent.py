@@ -17,7 +17,7 @@ import numpy as np
 from gemuco.errors import SchemaError
 
 Objective = Callable[[np.ndarray, bool], tuple[np.ndarray, np.ndarray]]
-"""Points (candidates, n) -> losses (candidates,) and, if wanted, their gradients (candidates, n). Of all candidates only
+"""Points (candidates, n) -> losses (candidates,) and, if wanted, gradients (candidates, n). Of all candidates only
 the best needs one, so the many are evaluated without."""
 Constraint = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 """Points (candidates, n) -> what must be zero (candidates, k) and its Jacobian (candidates, k, n)."""

@@ -9,7 +9,7 @@ import numpy as np
 import typer
 
 from services import keys
-from services.client import Client
+from services.client import SLOW_TIMEOUT, Client
 from services.errors import RemoteError, ServiceError, ServiceUnavailable
 
 PLAIN = {
@@ -22,7 +22,7 @@ PLAIN = {
     "rollback": "model",
     "normal": "model",
 }
-VERBS = ("estimate", "target", "adapt", "describe", "fault", *PLAIN)
+VERBS = ("estimate", "anomaly", "control", "simulate", "target", "adapt", "describe", "fault", *PLAIN)
 WATCH_EVERY = 1.0
 
 
@@ -48,7 +48,7 @@ def ask_robot(
                 return _watch(client, signal, hide)
             typer.echo(line_of(_estimate(client, signal, hide)))
             return 0
-        for key, value in _answer(client, verb, words).items():
+        for key, value in _answer(client, verb, words, hide).items():
             typer.echo(f"{key}: {value if isinstance(value, str) else json.dumps(value)}")
     return 0
 
@@ -83,15 +83,18 @@ def _watch(client: Client, signal: str, hide: Sequence[str]) -> int:
         time.sleep(WATCH_EVERY)
 
 
-def _answer(client: Client, verb: str, words: Sequence[str]) -> dict[str, Any]:
-    if verb == "target":
+def _answer(client: Client, verb: str, words: Sequence[str], hide: Sequence[str]) -> dict[str, Any]:
+    if verb in ("target", "control"):
         if len(words) < 2:
-            raise BadQuestion("'target' needs a signal and a value per element: target joint_position 0 0 0 -0.6 0")
-        try:
-            values = [float(word) for word in words[1:]]
-        except ValueError:
-            raise BadQuestion(f"'target' takes numbers after the signal, not '{' '.join(words[1:])}'.") from None
+            raise BadQuestion(f"'{verb}' needs a signal and a value per element: {verb} joint_position 0 0 0 -0.6 0")
+        values = _numbers(verb, words[1:], "after the signal")
+        if verb == "control":
+            return client.control({words[0]: values})
         return client.ask("model", "target", {"signal": words[0], "values": values})
+    if verb == "simulate":
+        if not words:
+            raise BadQuestion("'simulate' needs a command, a value per element of the commanded signal.")
+        return client.simulate([_numbers(verb, words, "only")])
     if verb == "adapt":
         switch = _one(verb, words, "on or off")
         if switch not in ("on", "off"):
@@ -108,7 +111,16 @@ def _answer(client: Client, verb: str, words: Sequence[str]) -> dict[str, Any]:
         return client.describe(service)
     if words:
         raise BadQuestion(f"'{verb}' takes nothing more, but got '{' '.join(words)}'.")
+    if verb == "anomaly":
+        return client.ask("model", "anomaly", {"hide": list(hide)}, SLOW_TIMEOUT)
     return client.ask(PLAIN[verb], verb)
+
+
+def _numbers(verb: str, words: Sequence[str], where: str) -> list[float]:
+    try:
+        return [float(word) for word in words]
+    except ValueError:
+        raise BadQuestion(f"'{verb}' takes numbers {where}, not '{' '.join(words)}'.") from None
 
 
 def _fault(client: Client, text: str) -> dict[str, Any]:

@@ -205,7 +205,7 @@ def query(
     robot: RobotFile,
     verb: Annotated[str, typer.Argument(help="What to ask: estimate, engage, target, adapt, describe, fault, ...")],
     words: Annotated[list[str] | None, typer.Argument(metavar="[WORDS]...", help="What the verb needs.")] = None,
-    hide: Annotated[list[str] | None, typer.Option(help="estimate: act as if this signal were not measured.")] = None,
+    hide: Annotated[list[str] | None, typer.Option(help="estimate, anomaly: act as if this signal were not measured.")] = None,
     watch: Annotated[bool, typer.Option("--watch", help="estimate: go on once a second until Ctrl-C.")] = False,
     connect: Connect = None,
 ) -> int:
@@ -215,7 +215,9 @@ def query(
 
     [bold]engage[/], [bold]disengage[/] let the model move the robot or not    [bold]adapt on|off[/] online update
 
-    [bold]rollback[/] the model before the update    [bold]normal[/] learn anew what is normal
+    [bold]control SIGNAL V1 V2 ...[/] the command for a target    [bold]simulate V1 V2 ...[/] the state a command leads to
+
+    [bold]anomaly[/] how unlike normal    [bold]rollback[/] the model before the update    [bold]normal[/] learn anew what is normal
 
     [bold]enable[/], [bold]disable[/], [bold]stop[/], [bold]reset[/] the HAL's motors    [bold]describe [SERVICE][/]
 

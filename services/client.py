@@ -23,6 +23,8 @@ TIMEOUT = 2.0
 """Deadline [s] of a verb."""
 SLOW_TIMEOUT = 10.0
 """Deadline [s] of a verb that computes."""
+LONG_TIMEOUT = 60.0
+"""Deadline [s] of a verb that computes step after step."""
 
 
 class Client:
@@ -69,13 +71,53 @@ class Client:
         """What was last sent to the drives, or None; see `sample`."""
         return self._fresh(keys.applied(self.robot), Applied, max_age, timeout)
 
-    def estimate(self, max_age: float = FRESH, timeout: float = 0.0) -> Estimates | None:
-        """The newest estimate of every signal, or None; see `sample`."""
-        return self._fresh(keys.estimate(self.robot), Estimates, max_age, timeout)
+    def estimate(
+        self,
+        values: Mapping[str, Sequence[float] | np.ndarray] | None = None,
+        hide: Iterable[str] = (),
+        *,
+        max_age: float = FRESH,
+        timeout: float = 0.0,
+    ) -> Estimates | None:
+        """The newest estimate of every signal, or None; see `sample`.
 
-    def anomaly(self, max_age: float = FRESH, timeout: float = 0.0) -> Anomaly | None:
-        """The newest anomaly score, or None; see `sample`."""
-        return self._fresh(keys.anomaly(self.robot), Anomaly, max_age, timeout)
+        With values, or with signals to hide, the model estimates from those instead, as `BodySchema.estimate` does.
+        """
+        hidden = list(hide)
+        if values is None and not hidden:
+            return self._fresh(keys.estimate(self.robot), Estimates, max_age, timeout)
+        found = self.ask("model", "estimate", _given(values) | {"hide": hidden}, SLOW_TIMEOUT)
+        signals: dict[str, dict[str, Any]] = found["signals"]
+        return Estimates(
+            cycle=found["cycle"],
+            values={name: np.array(one["values"], float) for name, one in signals.items()},
+            estimated={name: np.array(one["estimated"], bool) for name, one in signals.items()},
+            std={name: np.array(one["std"], float) for name, one in signals.items()},
+            method={name: one["method"] for name, one in signals.items()},
+            mask={name: one["mask"] for name, one in signals.items()},
+            residual={name: one["residual"] for name, one in signals.items()},
+        )
+
+    def anomaly(
+        self,
+        values: Mapping[str, Sequence[float] | np.ndarray] | None = None,
+        hide: Iterable[str] = (),
+        *,
+        max_age: float = FRESH,
+        timeout: float = 0.0,
+    ) -> Anomaly | None:
+        """The newest anomaly score, or None; see `sample`.
+
+        With values, or with signals to hide, the model judges those instead, as `BodySchema.anomaly` does: one sample
+        by itself, however long.
+        """
+        hidden = list(hide)
+        if values is None and not hidden:
+            return self._fresh(keys.anomaly(self.robot), Anomaly, max_age, timeout)
+        found = self.ask("model", "anomaly", _given(values) | {"hide": hidden}, SLOW_TIMEOUT)
+        contribution = {name: np.array(part, float) for name, part in found["contribution"].items()}
+        names = ("cycle", "score", "threshold", "is_anomaly", "blamed")
+        return Anomaly(contribution=contribution, **{name: found[name] for name in names})
 
     def update(self, max_age: float = 4 * FRESH, timeout: float = 0.0) -> Update | None:
         """What the online update does, or None; see `sample`."""
@@ -161,11 +203,39 @@ class Client:
         return self.ask("model", "rollback", timeout=SLOW_TIMEOUT)
 
     def infer(
-        self, signal: str, values: Mapping[str, Sequence[float]] | None = None, hide: Iterable[str] = ()
+        self, signal: str, values: Mapping[str, Sequence[float] | np.ndarray] | None = None, hide: Iterable[str] = ()
     ) -> dict[str, Any]:
         """Ask the model for a signal, from given values or from the newest sample with some signals hidden."""
-        arguments = {"signal": signal, "hide": list(hide)} | ({} if values is None else {"values": dict(values)})
-        return self.ask("model", "estimate", arguments, SLOW_TIMEOUT)
+        return self.ask("model", "estimate", {"signal": signal, "hide": list(hide)} | _given(values), SLOW_TIMEOUT)
+
+    def control(
+        self,
+        target: Mapping[str, Sequence[float] | np.ndarray],
+        values: Mapping[str, Sequence[float] | np.ndarray] | None = None,
+    ) -> dict[str, Any]:
+        """Ask for the command that brings about a target, and what is expected of it; nothing moves.
+
+        Args:
+            target: Signal -> reference [its unit].
+            values: Where the body is [its unit]; the newest sample if not given.
+        """
+        return self.ask("model", "control", {"target": _plain(target)} | _given(values), SLOW_TIMEOUT)
+
+    def simulate(
+        self,
+        commands: Iterable[Sequence[float] | np.ndarray],
+        given: Mapping[str, Sequence[float] | np.ndarray] | None = None,
+        values: Mapping[str, Sequence[float] | np.ndarray] | None = None,
+    ) -> dict[str, Any]:
+        """Ask for the states that commands bring about one after the other; nothing moves.
+
+        Args:
+            commands: What is sent [unit of the commanded signal], each of shape (n,).
+            given: References of the robot file's constraints that take one [its unit].
+            values: Where the body is [its unit]; the newest sample if not given.
+        """
+        arguments = {"commands": [np.asarray(command, float).tolist() for command in commands]}
+        return self.ask("model", "simulate", arguments | {"given": _plain(given or {})} | _given(values), LONG_TIMEOUT)
 
     def fault(self, text: str, service: str = "simulator") -> dict[str, Any]:
         """Break something in the simulator (`sensor_silent elbow_pitch_encoder`, `muscle_cut biceps`).
@@ -207,3 +277,11 @@ class Client:
         while (message := reader.get(max_age)) is None and (remaining := deadline - time.monotonic()) > 0:
             reader.wait(remaining)
         return message
+
+
+def _plain(values: Mapping[str, Sequence[float] | np.ndarray]) -> dict[str, list[float]]:
+    return {name: np.asarray(value, float).tolist() for name, value in values.items()}
+
+
+def _given(values: Mapping[str, Sequence[float] | np.ndarray] | None) -> dict[str, Any]:
+    return {} if values is None else {"values": _plain(values)}

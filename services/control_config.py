@@ -1,13 +1,17 @@
-"""The `control` and `simulation` parts of a robot file's model section, and the terms they name as `gemuco` terms."""
+"""The `control` and `simulation` parts of a robot file's model section, and what they make of a model."""
 
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
+from gemuco.control import Controller
+from gemuco.descent import DescentConfig
 from gemuco.losses import Hold, Match, StayNear, StaySmall, Term
+from gemuco.schema import BodySchema
+from gemuco.simulate import Simulator
 from gemuco.torque import TorqueBalance
 from hal import registry
-from hal.config import Finite, Positive, Section
+from hal.config import Finite, Positive, RobotConfig, Section
 
 Weight = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Route = Literal["auto", "mask", "latent", "input"]
@@ -109,8 +113,29 @@ def terms_of(config: ControlConfig | SimulationConfig) -> tuple[Term | Hold, ...
     return tuple(term.term() for term in config.terms)
 
 
-def mask_of(config: ControlConfig | SimulationConfig) -> frozenset[str] | None:
-    """The section's mask; None if the route shall choose."""
+def controller_of(
+    schema: BodySchema, robot: RobotConfig, config: ControlConfig, search: DescentConfig | None = None
+) -> Controller:
+    """The robot file's controller, which stays inside the limits of the commanded signal.
+
+    Raises:
+        SchemaError: This model cannot control; the text says what it lacks.
+    """
+    signal = robot.command.signal
+    limits = {signal: robot.bounds(signal)}
+    return Controller(schema, terms_of(config), signal, config.route, search, _mask(config), limits)
+
+
+def simulator_of(schema: BodySchema, robot: RobotConfig, config: SimulationConfig) -> Simulator:
+    """The robot file's simulator.
+
+    Raises:
+        SchemaError: This model cannot simulate; the text says what it lacks.
+    """
+    return Simulator(schema, terms_of(config), robot.command.signal, config.route, mask=_mask(config))
+
+
+def _mask(config: ControlConfig | SimulationConfig) -> frozenset[str] | None:
     return None if config.mask is None else frozenset(config.mask)
 
 

@@ -10,16 +10,14 @@ from typing import Any
 import numpy as np
 
 from gemuco import adapt
-from gemuco.control import Controller
 from gemuco.descent import DescentConfig
 from gemuco.errors import SchemaError
-from gemuco.routes import Limits
 from gemuco.schema import BodySchema
 from hal.clock import SystemClock
 from hal.config import RobotConfig
 from services import keys, query
 from services.anomaly_loop import AnomalyWatch
-from services.control_config import ControlConfig, mask_of, terms_of
+from services.control_config import ControlConfig, controller_of
 from services.control_loop import Control
 from services.estimation import Estimation, Fresh, Freshness
 from services.living_model import LivingModel, load_model
@@ -45,17 +43,15 @@ PRIORITIES = {"estimation": 40, "control": 35, "anomaly": 30, "update": 10}
 class ModelSolver:
     """The controller of whichever model is in use."""
 
-    def __init__(self, living: LivingModel, config: ControlConfig, command: str, limits: Limits | None = None) -> None:
-        """Prepare for the commanded signal, inside its limits [its unit].
+    def __init__(self, living: LivingModel, robot: RobotConfig, config: ControlConfig) -> None:
+        """Prepare for the robot file's control section.
 
         Raises:
             SchemaError: This model cannot control; the text says what it lacks.
         """
         schema = living.schema
         self._living = living
-        self._controller = Controller(
-            schema, terms_of(config), command, config.route, SEARCH, mask_of(config), limits=limits
-        )
+        self._controller = controller_of(schema, robot, config, SEARCH)
         middle = schema.layout.split(schema.scaler.mean)
         self._controller.solve({config.target: middle[config.target]}, {})
         self._controller.restart()
@@ -193,9 +189,7 @@ class GemucoService:
         if config.control is None:
             return None, f"The robot file of '{self.robot.robot}' has no model.control section."
         try:
-            commanded = self.robot.command.signal
-            limits = {commanded: self.robot.bounds(commanded)}
-            solver = ModelSolver(self.living, config.control, commanded, limits)
+            solver = ModelSolver(self.living, self.robot, config.control)
         except SchemaError as error:
             return None, f"This model cannot control: {error}"
         sender = self.service.publisher(keys.command(self.robot.robot), Command).put

@@ -1,0 +1,111 @@
+"""What the model service can be asked, near and far: the same verbs, the same numbers, the same exceptions."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from arm_model import arm, small_model, states
+
+from gemuco.errors import NotFinite, NotObservable, UnknownSignal, WrongSize
+from services.ask import ask_robot
+from services.client import Client
+from services.control_config import controller_of, simulator_of
+from services.errors import BadArguments
+from services.gemuco_service import GemucoService
+from services.service import Service
+
+
+@pytest.fixture
+def model(robot: str) -> Iterator[GemucoService]:
+    config = arm().model_copy(update={"robot": robot})
+    with Service(robot, "model", (), dict) as service:
+        made = GemucoService(config, small_model(), service)
+        for name, handler in made.verbs.handlers().items():
+            service.verb(name, handler)
+        yield made
+
+
+@pytest.fixture
+def client(model: GemucoService, robot: str) -> Iterator[Client]:
+    with Client(robot) as far:
+        yield far
+
+
+@pytest.fixture
+def sample() -> dict[str, np.ndarray]:
+    return {name: rows[3] for name, rows in states(seed=5).items()}
+
+
+def test_estimates_given_values_like_the_schema_itself(client: Client, sample: dict[str, np.ndarray]) -> None:
+    far = client.estimate(sample, hide=["joint_position"])
+    near = small_model().estimate({name: value for name, value in sample.items() if name != "joint_position"})
+    assert far is not None
+    for name, estimate in near.items():
+        np.testing.assert_allclose(far.values[name], estimate.value)
+        np.testing.assert_allclose(far.std[name], estimate.std)
+        assert far.method[name] == estimate.method
+    assert far.mask["joint_position"] == "muscle_tension+muscle_length"
+
+
+def test_judges_given_values_like_the_schema_itself(client: Client, sample: dict[str, np.ndarray]) -> None:
+    broken = {**sample, "muscle_tension": sample["muscle_tension"] + 100.0}
+    for values in (sample, broken):
+        far, near = client.anomaly(values), small_model().anomaly(values)
+        assert far is not None
+        assert far.score == pytest.approx(near.score)
+        assert (far.is_anomaly, far.blamed) == (near.is_anomaly, near.blamed)
+    assert near.is_anomaly
+
+
+def test_solves_for_a_command_without_moving(
+    client: Client, model: GemucoService, sample: dict[str, np.ndarray]
+) -> None:
+    target = {"joint_position": sample["joint_position"]}
+    assert model.config.control is not None
+    near = controller_of(small_model(), model.robot, model.config.control).solve(target, sample)
+    far = client.control(target, sample)
+    np.testing.assert_allclose(far["values"], near.command)
+    assert (far["signal"], far["route"], far["mask"]) == ("muscle_length", "input", "joint_position+muscle_tension")
+    assert far["residual"] == pytest.approx(near.residual)
+    low, high = model.robot.bounds("muscle_length")
+    assert ((low <= far["values"]) & (far["values"] <= high)).all()
+
+
+def test_simulates_commands_step_after_step(
+    client: Client, model: GemucoService, sample: dict[str, np.ndarray]
+) -> None:
+    commands = [sample["muscle_length"], sample["muscle_length"] + 0.005]
+    far = client.simulate(commands, values=sample)
+    near = list(simulator_of(small_model(), model.robot, model.config.simulation).run(commands, None, sample))
+    np.testing.assert_allclose(far["states"]["joint_position"], [step.values["joint_position"] for step in near])
+    np.testing.assert_allclose(far["residual"], [step.residual for step in near])
+    assert far["route"] == near[0].route
+
+
+def test_an_error_is_the_same_near_and_far(client: Client, sample: dict[str, np.ndarray]) -> None:
+    with pytest.raises(UnknownSignal, match="Known signals: joint_position"):
+        client.control({"elbow": [0.0]})
+    with pytest.raises(NotObservable, match="no term is about it"):
+        client.control({"joint_position": sample["joint_position"], "muscle_length": sample["muscle_length"]})
+    with pytest.raises(NotFinite, match="every element needs a number"):
+        client.control({"joint_position": [0.0, np.nan, 0.0, 0.0, 0.0]})
+    with pytest.raises(WrongSize, match="has 10 elements"):
+        client.simulate([[0.1, 0.2]])
+    with pytest.raises(UnknownSignal, match="Known signals"):
+        client.anomaly(hide=["elbow"])
+    with pytest.raises(BadArguments, match="must be a list of 1 to 200 commands"):
+        client.simulate([])
+    with pytest.raises(BadArguments, match="must be a map"):
+        client.ask("model", "control", {"target": [1.0]})
+    with pytest.raises(BadArguments, match="Known arguments: target, values"):
+        client.ask("model", "control", {"targets": {}})
+
+
+def test_the_command_line_asks_too(model: GemucoService, robot: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert ask_robot(robot, "control", ["joint_position", "0", "0", "0", "-0.6", "0"], (), False, ()) == 0
+    assert "signal: muscle_length" in capsys.readouterr().out
+    assert ask_robot(robot, "anomaly", [], ["joint_position"], False, ()) == 0
+    assert "score:" in capsys.readouterr().out
+    command = [str(value) for value in states(seed=5)["muscle_length"][3]]
+    assert ask_robot(robot, "simulate", command, (), False, ()) == 0
+    assert "states:" in capsys.readouterr().out
