@@ -124,16 +124,17 @@ def _numbers(verb: str, words: Sequence[str], where: str) -> list[float]:
 
 
 def _fault(client: Client, text: str) -> dict[str, Any]:
-    """Break something in the simulator, or in the simulated camera if the simulator does not know it."""
+    """Break what the camera's process plays, or else the simulator, which may know the same name and not be watched."""
+    told = ""
+    if "vision" in client.alive():
+        try:
+            return client.fault(text, "vision")
+        except (RemoteError, ServiceUnavailable) as error:
+            told = str(error)
     try:
         return client.fault(text)
     except RemoteError as error:
-        if "vision" not in client.alive():
-            raise
-        try:
-            return client.fault(text, "vision")
-        except RemoteError as other:
-            raise RemoteError(f"{error} {other}") from None
+        raise RemoteError(f"{error} {told}".rstrip()) from None
 
 
 def _one(verb: str, words: Sequence[str], what: str) -> str:

@@ -51,13 +51,13 @@ class Truth:
 
     def __init__(self, robot: str) -> None:
         self.world = HandWorld("short")
-        self._service = Service(robot, "simulator")
+        self.service = Service(robot, "simulator")
         self._robot = robot
         self._stop, self.pause = threading.Event(), threading.Event()
 
     def __enter__(self) -> "Truth":
-        self._service.__enter__()
-        self._put = self._service.publisher(keys.truth(self._robot), Sample).put
+        self.service.__enter__()
+        self._put = self.service.publisher(keys.truth(self._robot), Sample).put
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
         return self
@@ -65,7 +65,7 @@ class Truth:
     def __exit__(self, *_: object) -> None:
         self._stop.set()
         self._thread.join()
-        self._service.__exit__(None, None, None)
+        self.service.__exit__(None, None, None)
 
     def _run(self) -> None:
         while not self._stop.wait(0.01):
@@ -239,13 +239,17 @@ def test_collected_data_have_what_the_camera_sees() -> None:
 
 
 def test_the_command_line_finds_who_plays_a_fault(robot: str, capsys: pytest.CaptureFixture[str]) -> None:
-    def refuse(arguments: dict[str, str]) -> dict[str, str]:
-        raise ValueError(f"'{arguments['text']}' is no part that can break.")
+    def play(arguments: dict[str, str]) -> dict[str, str]:
+        if arguments["text"] == "camera_dropped":
+            raise ValueError("'camera_dropped' is no part that can break.")
+        return {"text": f"The simulator plays {arguments['text']}."}
 
     with Truth(robot) as truth, camera_of(config(robot)), Client(robot) as client:
-        truth._service.verb("fault", refuse)
+        truth.service.verb("fault", play)
         assert client.vision(timeout=10.0) is not None
-        assert ask_robot(robot, "fault", ("camera_covered",), (), False, ()) == 0
+        ask_robot(robot, "fault", ("camera_covered",), (), False, ())
         assert "The camera sees nothing." in capsys.readouterr().out
+        ask_robot(robot, "fault", ("tool_changed", "long"), (), False, ())
+        assert "The simulator plays tool_changed long." in capsys.readouterr().out
         with pytest.raises(RemoteError, match=r"no part that can break.*nothing that can happen here"):
             ask_robot(robot, "fault", ("camera_dropped",), (), False, ())
