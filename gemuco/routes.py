@@ -19,6 +19,8 @@ from gemuco.scaler import CLIP
 if TYPE_CHECKING:
     from gemuco.schema import BodySchema
 
+SLIPPED = 0.05
+"""A held element this far [standard deviations] from where it shall be is not held."""
 ROUTES = ("auto", "mask", "latent", "input")
 Limits = Mapping[str, tuple[np.ndarray, np.ndarray]]
 """Signal -> lowest and highest value [its unit], shapes (n,)."""
@@ -201,6 +203,9 @@ class Search:
             needed: Signals that the terms are about.
             begin: Where to begin [standard deviations], shape (size,); NaN where nothing is known.
             only_there: Begin nowhere else if that is known; else training data are tried too.
+
+        Raises:
+            NotObservable: What is held cannot be, or a term is about a signal that is neither given nor inferred.
         """
         way: LatentRoute | InputRoute
         if route == "latent":
@@ -217,8 +222,14 @@ class Search:
             point = descend(_objective(way, bounds), starts, self.config, low, high, _constraint(way, held)).point
         else:
             point = starts[0]
-        self._warm, self._way = point, (route, mask, size)
         x = way.final(point)
+        for element in np.flatnonzero(np.abs(x - held) > SLIPPED):
+            reached, asked = schema.scaler.restore(x)[element], schema.scaler.restore(held)[element]
+            raise NotObservable(
+                f"'{schema.layout.element(int(element))}' cannot be held at {asked:.4g}: the nearest found is "
+                f"{reached:.4g}. Is it within what the body can do, and within the limits?"
+            )
+        self._warm, self._way = point, (route, mask, size)
         return Found(x, float(total(bounds, np.nan_to_num(x)[None])[0][0]))
 
 
