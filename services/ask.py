@@ -24,6 +24,8 @@ PLAIN = {
 }
 VERBS = ("estimate", "anomaly", "control", "simulate", "target", "adapt", "describe", "fault", *PLAIN)
 WATCH_EVERY = 1.0
+CONNECTS_WITHIN = 0.5
+"""Time [s] that connections to running services take at most."""
 
 
 class BadQuestion(ServiceError):
@@ -126,7 +128,7 @@ def _numbers(verb: str, words: Sequence[str], where: str) -> list[float]:
 def _fault(client: Client, text: str) -> dict[str, Any]:
     """Break what the camera's process plays, or else the simulator, which may know the same name and not be watched."""
     told = ""
-    if "vision" in client.alive():
+    if _is_alive(client, "vision"):
         try:
             return client.fault(text, "vision")
         except (RemoteError, ServiceUnavailable) as error:
@@ -135,6 +137,16 @@ def _fault(client: Client, text: str) -> dict[str, Any]:
         return client.fault(text)
     except RemoteError as error:
         raise RemoteError(f"{error} {told}".rstrip()) from None
+
+
+def _is_alive(client: Client, service: str) -> bool:
+    """Whether a service runs; a client that was just opened is not connected at once."""
+    deadline = time.monotonic() + CONNECTS_WITHIN
+    while service not in client.alive():
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.02)
+    return True
 
 
 def _one(verb: str, words: Sequence[str], what: str) -> str:
