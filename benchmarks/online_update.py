@@ -28,6 +28,7 @@ from hal.robot import Robot
 from services import artifacts, collector, trainer
 from services.living_model import load_model
 from services.model_config import model_config
+from services.playground import DirectPlayground
 from simulators.direct import DirectDevice, WorldClock
 
 HIDDEN = "joint_position"
@@ -37,7 +38,7 @@ MARKS = (0, 10, 20, 30, 60, 120, 300, 600)
 
 def motion(robot: RobotConfig, body: Robot, seed: int, rate: float, duration: float) -> Iterator[dict[str, np.ndarray]]:
     """Samples [unit] at a rate [Hz] of so much random motion [s of the arm's time]."""
-    playground = collector.DirectPlayground(body, rate)
+    playground = DirectPlayground(body, rate)
     for command, hold in registry.load(robot.collect["motion"])(robot, seed):
         yield from playground.play(command, hold)
         if playground.elapsed() > duration:
