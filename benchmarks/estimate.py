@@ -10,6 +10,7 @@ median of its calls, and the table shows the median of the rounds. Ratios travel
 import argparse
 import time
 from collections.abc import Callable, Iterator
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -48,7 +49,16 @@ BODIES = {
             "tool_tip_position": (3, "m"),
             "tool_tip_pixel": (2, "px"),
         },
-        (("joint_position",), ("joint_position", "center_of_gravity")),
+        (
+            ("joint_position",),
+            ("joint_position", "center_of_gravity"),
+            ("joint_position", "tool_tip_position"),
+            ("joint_position", "tool_tip_pixel"),
+            ("joint_position", "center_of_gravity", "tool_tip_position"),
+            ("joint_position", "center_of_gravity", "tool_tip_pixel"),
+            ("joint_position", "tool_tip_position", "tool_tip_pixel"),
+            ("center_of_gravity", "tool_tip_position", "tool_tip_pixel"),
+        ),
         ("joint_position", "center_of_gravity", "tool_tip_position", "tool_tip_pixel"),
         (200, 100, 8, 100, 200),
         2,
@@ -73,13 +83,20 @@ def body(name: str) -> tuple[BodySchema, dict[str, np.ndarray]]:
             np.zeros(narrow, np.float32),
             "linear" if index in (latent, len(ends) - 2) else "tanh",
         )
-        for index, (wide, narrow) in enumerate(zip(ends[:-1], ends[1:], strict=True))
+        for index, (wide, narrow) in enumerate(pairwise(ends))
     )
     ones = np.ones(layout.size)
+    size = len(layout.indices(x_out))
     schema = BodySchema(
-        layout, x_in, x_out, masks, Scaler(0 * ones, ones, -ones, ones), Weights(layers[: latent + 1], layers[latent + 1 :]),
+        layout,
+        x_in,
+        x_out,
+        masks,
+        Scaler(0 * ones, ones, -ones, ones),
+        Weights(layers[: latent + 1], layers[latent + 1 :]),
+        errors={("mask", mask): random.uniform(0.1, 0.5, size) for mask in masks},
         bias=np.zeros(bias, np.float32),
-    )  # fmt: skip
+    )
     values = {s.name: random.standard_normal(s.size) for s in layout.signals if s.name != hidden}
     return schema, values
 

@@ -6,9 +6,9 @@ import numpy as np
 
 from gemuco.anomaly import Normal
 from gemuco.errors import NotEnoughData
-from gemuco.estimate import STARTS, latent_search
+from gemuco.estimate import STARTS, input_search, latent_search
 from gemuco.kernels import run
-from gemuco.masks import Mask, all_masks
+from gemuco.masks import Mask, all_masks, covered_by
 from gemuco.schema import BodySchema
 
 MOST_OUTPUTS = 6
@@ -16,6 +16,9 @@ MOST_OUTPUTS = 6
 
 MOST_PAIRS = 400_000
 """Pairs of sample and mask that are measured, at most; the samples are thinned evenly."""
+
+MOST_SEARCHED = 4
+"""Up to so many signals, every set of them is tried as what an input search is given; beyond, sets that lack one."""
 
 
 def assess(schema: BodySchema, rows: np.ndarray, conditions: np.ndarray) -> BodySchema:
@@ -45,8 +48,9 @@ def measure_errors(schema: BodySchema, rows: np.ndarray, conditions: np.ndarray)
         conditions: Index into `schema.biases` of every row, shape (samples,); ignored without parametric bias.
 
     Returns:
-        (method, signals given) -> error of every x_out element [unit], shape (out_size,). Where nothing was measured
-        it is the element's standard deviation: as if nothing was known.
+        (method, signals given) -> error of every x_out element [unit], shape (out_size,); for the method `input` of
+        every element of the layout, shape (size,). Where nothing was measured it is the element's standard deviation:
+        as if nothing was known.
     """
     kept = np.linspace(0, len(rows) - 1, min(len(rows), MOST_PAIRS // len(schema.masks) + 1)).astype(int)
     rows, conditions = rows[kept], conditions[kept]
@@ -69,6 +73,13 @@ def measure_errors(schema: BodySchema, rows: np.ndarray, conditions: np.ndarray)
             for under, chosen in _by_condition(schema, conditions[some]):
                 guesses[chosen] = [latent_search(under, row) for row in hidden[chosen]]
             found["latent", given] = _rms(guesses - truth[some]) * scale
+        for given in _inverse(schema):
+            hidden = x[some]
+            hidden[:, ~np.isin(np.arange(x.shape[1]), schema.layout.indices(given))] = np.nan
+            guesses = np.empty_like(hidden)
+            for under, chosen in _by_condition(schema, conditions[some]):
+                guesses[chosen] = [input_search(under, row, given) for row in hidden[chosen]]
+            found["input", given] = _rms(guesses - x[some]) * schema.scaler.std
     return found
 
 
@@ -93,6 +104,20 @@ def _partial(schema: BodySchema) -> Iterable[Mask]:
     many = len(outputs) > MOST_OUTPUTS
     sets = [frozenset(outputs) - {name} for name in outputs] if many else all_masks(outputs)
     return [g for g in sets if len(g) < len(outputs) and not any(m <= g for m in schema.masks)]
+
+
+def _inverse(schema: BodySchema) -> Iterable[Mask]:
+    """Sets of signals from which an input search may have to tell inputs that are no outputs."""
+    names = schema.layout.subset({*schema.x_in, *schema.x_out}).names
+    sought = [name for name in names if name not in schema.x_out]
+    sets = all_masks(names) if len(names) <= MOST_SEARCHED else [frozenset(names) - {name} for name in sought]
+    return [
+        given
+        for given in sets
+        if any(name in given for name in schema.x_out)
+        and any(name not in given and covered_by(schema.masks, given | {name}) for name in sought)
+        and not all(name in given for name in sought)
+    ]
 
 
 def _rms(errors: np.ndarray) -> np.ndarray:

@@ -111,8 +111,8 @@ class Controller:
 
         Args:
             target: Signal -> reference [its unit], shape (n,): what `Match` reaches, `Hold` holds and `StayNear` stays
-                near; a search that shall stay near something begins there, the others from the present and from training
-                data.
+                near; a search that shall stay near something begins there, others begin from the present and from
+                training data.
             now: Signal -> present value [its unit], shape (n,); NaN or absent where it is not known.
 
         Raises:

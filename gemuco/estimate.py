@@ -8,7 +8,7 @@ import numpy as np
 
 from gemuco.descent import DescentConfig, descend
 from gemuco.kernels import Layer, pull, run, trace
-from gemuco.masks import Mask, best, covered_by
+from gemuco.masks import Mask, covered_by
 
 if TYPE_CHECKING:
     from gemuco.schema import BodySchema
@@ -96,7 +96,7 @@ def mask_error(schema: "BodySchema", mask: Mask, name: str) -> float:
 def _route(schema: "BodySchema", name: str, whole: Mask, finite: np.ndarray) -> tuple[str, Mask]:
     """How to estimate a signal, and from which signals."""
     if name in schema.x_out:
-        mask = best(schema.masks, whole, lambda m: mask_error(schema, m, name))
+        mask = next((m for m in schema.ranked(name) if m <= whole), None)
         if mask is not None:
             return "mask", mask
         return ("latent", whole & set(schema.x_out)) if finite[schema.out_index].any() else ("none", frozenset())
@@ -183,6 +183,7 @@ def input_search(schema: "BodySchema", x: np.ndarray, available: Mask) -> np.nda
     base = schema.network_input(full, mask)
     through, _ = schema.gate(mask)
     sought = schema.layout.indices(mask - available)
+    sought = sought[~np.isfinite(x[sought])]
     columns = np.flatnonzero(np.isin(schema.in_index, sought) & (through > 0))
     data = x[schema.out_index]
 

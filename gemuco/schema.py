@@ -14,8 +14,8 @@ import numpy as np
 from gemuco import anomaly, checkpoint
 from gemuco.anomaly import AnomalyScore, Normal
 from gemuco.errors import UnknownCondition, UnknownSignal, WrongSize
-from gemuco.estimate import Estimate, estimate
-from gemuco.kernels import Weights, run
+from gemuco.estimate import Estimate, estimate, mask_error
+from gemuco.kernels import Chain, Weights, run
 from gemuco.masks import Mask, bits, label
 from gemuco.scaler import CLIP, Scaler
 from gemuco.signals import Layout
@@ -76,6 +76,8 @@ class BodySchema:
     out_index: np.ndarray = field(init=False, repr=False)
     judges: Mapping[str, Mask] = field(init=False, repr=False)
     _gates: dict[Mask, tuple[np.ndarray, np.ndarray]] = field(init=False, repr=False)
+    _ranked: dict[str, tuple[Mask, ...]] = field(init=False, repr=False)
+    _chain: Chain = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         set_field = object.__setattr__
@@ -89,6 +91,8 @@ class BodySchema:
                 f"The network is {shape[0]} -> {shape[1]}; the layout asks for {inputs} -> {len(self.out_index)}."
             )
         set_field(self, "_gates", {})
+        set_field(self, "_ranked", {})
+        set_field(self, "_chain", self.weights.whole)
         for mask in self.masks:
             self.gate(mask)
         set_field(self, "judges", anomaly.judging_masks(self))
@@ -105,6 +109,13 @@ class BodySchema:
             sizes = [self.layout.signal(name).size for name in self.x_in]
             found = np.repeat(m, sizes), np.concatenate([m, self.bias]).astype(np.float32)
             self._gates[mask] = found
+        return found
+
+    def ranked(self, name: str) -> tuple[Mask, ...]:
+        """The feasible masks, the one that infers a signal of x_out best first."""
+        found = self._ranked.get(name)
+        if found is None:
+            found = self._ranked[name] = tuple(sorted(self.masks, key=lambda m: mask_error(self, m, name)))
         return found
 
     def network_input(self, normalised: np.ndarray, mask: Mask, bias: np.ndarray | None = None) -> np.ndarray:
@@ -126,7 +137,7 @@ class BodySchema:
 
     def infer(self, normalised: np.ndarray, mask: Mask) -> np.ndarray:
         """Usage (a) and (b): every x_out from the signals of a mask [standard deviations], shape (..., out_size)."""
-        return run(self.weights.whole, self.network_input(normalised, mask))
+        return run(self._chain, self.network_input(normalised, mask))
 
     def normalise(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
         """Named arrays [unit] -> one vector [standard deviations]; NaN where a value is absent or infinite."""

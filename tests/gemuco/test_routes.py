@@ -135,7 +135,7 @@ def test_says_what_is_wrong(simple, full):
     tip = {TIP: np.array([0.5, 0.5])}
     with pytest.raises(NotObservable, match="not in x_out; use input"):
         simple.control(tip, command=COMMAND, route="latent")
-    with pytest.raises(NotObservable, match="is not feasible for this schema. Feasible masks: joint_position,"):
+    with pytest.raises(NotObservable, match=r"is not feasible for this schema\. Feasible masks: joint_position,"):
         full.control(tip, command=COMMAND, route="input", mask=frozenset({TIP}))
     with pytest.raises(SchemaError, match="A mask goes with route mask or input"):
         full.control(tip, command=COMMAND, route="latent", mask=frozenset({COMMAND}))

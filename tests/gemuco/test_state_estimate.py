@@ -71,18 +71,47 @@ def test_without_a_feasible_mask_it_searches_the_latent_space(schema, fresh):
     assert found["muscle_tension"].estimated.tolist() == [True, False, False, False, False]
 
 
-def test_a_signal_that_is_only_an_input_is_sought_there(arm, fresh):
+@pytest.fixture(scope="module")
+def inverse(arm):
+    """Lengths from joints and tensions, and nothing else."""
     config = TrainConfig(hidden=(60, 20), latent=7, epochs=40, batch=100)
-    masks = [{"joint_position", "muscle_tension"}]
-    schema, _ = fit(arm.episodes(8, 200), config, masks, x_out=["muscle_length"])
-    errors = []
+    return fit(arm.episodes(8, 200), config, [{"joint_position", "muscle_tension"}], x_out=["muscle_length"])[0]
+
+
+def test_a_signal_that_is_only_an_input_is_sought_there(inverse, fresh):
+    errors, claimed = [], []
     for index in range(20):
         values = row(fresh, index)
         truth = values.pop("joint_position")
-        found = schema.estimate(values)["joint_position"]
+        found = inverse.estimate(values)["joint_position"]
         assert found.method == "input"
-        errors.append(np.linalg.norm(found.value - truth))
-    assert np.median(errors) < 0.3  # rad
+        errors.append(found.value - truth)
+        claimed.append(found.std)
+    assert np.median(np.linalg.norm(errors, axis=1)) < 0.3  # rad
+    rms = np.sqrt(np.mean(np.square(errors), axis=0))
+    assert (rms < 2.0 * np.mean(claimed, axis=0)).all()
+    assert (np.mean(claimed, axis=0) < 2.0 * rms).all()
+
+
+def test_one_element_that_is_only_an_input_is_sought_beside_the_others(inverse, fresh):
+    values = row(fresh, 1)
+    truth = values["joint_position"][1]
+    values["joint_position"][1] = np.nan
+    found = inverse.estimate(values)["joint_position"]
+    assert found.estimated.tolist() == [False, True]
+    assert found.value[1] == pytest.approx(truth, abs=0.15)
+
+
+def test_the_residual_of_a_latent_search_tells_a_body_that_does_not_exist(schema, fresh):
+    """Lengths far from any that were trained on are fitted by some z, but by no body."""
+    values = row(fresh, 5)
+    values.pop("muscle_tension")
+    values.pop("joint_position")
+    usual = schema.estimate(values)["joint_position"]
+    values["muscle_length"] = values["muscle_length"] + np.array([0.08, 0.08, -0.08, 0.08, -0.08])
+    strange = schema.estimate(values)["joint_position"]
+    assert usual.method == strange.method == "latent"
+    assert strange.residual > 3 * usual.residual
 
 
 def test_nothing_at_all_is_none(schema):
