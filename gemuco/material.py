@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from gemuco.scaler import CLIP
+from gemuco.scaler import CLIP, Scaler
 from gemuco.task import Task
 
 
@@ -33,15 +33,19 @@ class Material:
         task: Masks and signals.
         rows: Samples [standard deviations], shape (samples, layout.size), NaN where nothing was measured.
         condition: Whose p goes with every sample, shape (samples,).
-        dead: Positions of dead elements. What is stuck or silent for ever says nothing, so its absence hinders
-            nothing: a mask needs only the living elements of its signals.
+        scaler: What is usual, and which elements are dead. What is stuck or silent for ever says nothing, so its
+            absence hinders nothing: a mask needs only the living elements of its signals.
         new: Samples from this one on are old ones, replayed lest they be forgotten; all are new if not given.
     """
 
     def __init__(
-        self, task: Task, rows: np.ndarray, condition: np.ndarray, dead: np.ndarray, new: int | None = None
+        self, task: Task, rows: np.ndarray, condition: np.ndarray, scaler: Scaler, new: int | None = None
     ) -> None:
         self.task, self.rows, self.condition = task, rows, condition
+        dead = scaler.dead
+        outside = (rows < scaler.normalise(scaler.low) - 1e-6) | (rows > scaler.normalise(scaler.high) + 1e-6)
+        outside[:, dead] = False
+        self.far = task.any_of(outside)
         self.new = len(rows) if new is None else new
         self._measured = np.isfinite(rows)
         self._granted = self._measured.copy()

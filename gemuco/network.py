@@ -52,6 +52,11 @@ class Network(nn.Module):
         """Inputs (samples, inputs) -> x_out (samples, outputs)."""
         return self.decoder(self.encoder(x))
 
+    @property
+    def linear(self) -> list[nn.Linear]:
+        """Every affine map, from the input to the output."""
+        return _linear(self.encoder) + _linear(self.decoder)
+
     def weights(self) -> Weights:
         """A copy of W for the numpy kernels."""
 
@@ -75,9 +80,8 @@ class Network(nn.Module):
         names = {layer.activation for layer in weights.whole} - {LINEAR}
         latent, outputs = weights.decoder[0].matrix.shape[0], weights.decoder[-1].matrix.shape[1]
         network = cls(widths[0], outputs, widths[1:], latent, names.pop() if names else "tanh")
-        linear = _linear(network.encoder) + _linear(network.decoder)
         with torch.no_grad():
-            for layer, (matrix, offset, _) in zip(linear, weights.whole, strict=True):
+            for layer, (matrix, offset, _) in zip(network.linear, weights.whole, strict=True):
                 layer.weight.copy_(torch.from_numpy(matrix.T.copy()))
                 layer.bias.copy_(torch.from_numpy(offset.copy()))
         return network

@@ -49,14 +49,14 @@ class Task:
         set_field(self, "tails", np.stack([bits(m, x_in) for m in self.masks]))
         set_field(self, "through", np.repeat(self.tails, [layout.signal(name).size for name in x_in], axis=1))
 
-    def whole(self, present: np.ndarray) -> np.ndarray:
-        """Which signals have all their elements, shape (samples, signals), of what elements are there."""
+    def any_of(self, elements: np.ndarray) -> np.ndarray:
+        """Of which signals any element is marked, shape (samples, signals); elements (samples, layout.size)."""
         starts = np.searchsorted(self.signal_of, np.arange(len(self.layout.names)))
-        return np.logical_and.reduceat(present, starts, axis=1)
+        return np.logical_or.reduceat(elements, starts, axis=1)
 
     def allowed(self, present: np.ndarray) -> np.ndarray:
         """Which masks find all they need, shape (samples, masks), of what elements are there."""
-        lacking = (~self.whole(present)).astype(np.float32)
+        lacking = self.any_of(~present).astype(np.float32)
         return lacking @ self.needs.T < 0.5
 
     def inputs(self, x: np.ndarray, chosen: int, bias: np.ndarray) -> np.ndarray:

@@ -159,11 +159,11 @@ def _material(
     order = np.array([conditions.index(c) for c in data.conditions], int)
     owner = order[data.condition_of_rows()]
     if before is None or not len(before.anchors):
-        material = Material(task, rows, owner, scaler.dead)
+        material = Material(task, rows, owner, scaler)
     else:
         old = before.anchor_conditions if len(before.anchor_conditions) else np.zeros(len(before.anchors), int)
         both = np.concatenate([rows, before.anchors.astype(float)])
-        material = Material(task, both, np.concatenate([owner, len(conditions) + old]), scaler.dead, len(rows))
+        material = Material(task, both, np.concatenate([owner, len(conditions) + old]), scaler, len(rows))
     if material.skipped == material.new:
         names = ", ".join(label(m, task.layout.names) for m in task.masks)
         raise NotEnoughData(f"No sample has all signals of any mask ({names}); check what was recorded.")
@@ -175,13 +175,13 @@ def _mute(network: Network, task: Task, dead: np.ndarray, unused: int) -> None:
 
     What enters with weight 0 and is always 0 gets no gradient, so it stays muted through all of the training.
     """
+    first, last = network.linear[0], network.linear[-1]
     with torch.no_grad():
-        first = network.encoder[0].weight
-        first[:, np.flatnonzero(np.isin(task.in_index, dead))] = 0.0
-        first[:, first.shape[1] - unused :] = 0.0
+        first.weight[:, np.flatnonzero(np.isin(task.in_index, dead))] = 0.0
+        first.weight[:, first.in_features - unused :] = 0.0
         outputs = np.flatnonzero(np.isin(task.out_index, dead))
-        network.decoder[-1].weight[outputs] = 0.0
-        network.decoder[-1].bias[outputs] = 0.0
+        last.weight[outputs] = 0.0
+        last.bias[outputs] = 0.0
 
 
 def _key(config: TrainConfig, task: Task, dataset: Dataset, *arrays: np.ndarray) -> str:

@@ -37,7 +37,7 @@ class TrainConfig:
     bias_rate: float = 1e-2
     held_out: float = 0.2
     patience: int = 40
-    outliers: float = 8.0
+    outliers: float = 6.0
     replay: float = 0.5
     seed: int = 0
 

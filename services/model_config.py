@@ -21,13 +21,22 @@ class NetworkConfig(Section):
     """Length of the parametric bias p, one p per condition; 0 without."""
 
 
-class StructureConfig(Section):
-    """Thresholds of the paper, II-E: normalised mean squared error on held-out data."""
+Threshold = Annotated[float, Field(gt=0, le=1)]
 
-    threshold_out: Positive = 0.15
+
+class StructureConfig(Section):
+    """Thresholds of the paper, II-E: normalised error on held-out data; 1 is that of always guessing the mean."""
+
+    threshold_out: Threshold = 0.15
     """A signal that the others explain better than this becomes an output."""
-    threshold_in: Positive = 0.15
+    threshold_in: Threshold = 0.15
     """A mask that explains the outputs better than this is feasible."""
+    measure: Literal["mse", "rmse"] = "mse"
+    """What is compared with them: the mean squared error, or its root."""
+    over: Literal["masked", "all"] = "masked"
+    """Outputs that a mask is judged by: those it does not give, or all."""
+    splits: Count = 1
+    """How often to train and measure, each time with other episodes held out."""
     epochs: Count = 80
 
 
@@ -44,7 +53,7 @@ class TrainingConfig(Section):
     """Share of every condition's data that only measures."""
     patience: Count | None = None
     """Stop after so many epochs without a better held-out loss; to the end if absent."""
-    outliers: Positive = 8.0
+    outliers: Positive = 6.0
     """Reject a measured signal that the others contradict by so many robust standard deviations; `.inf`: none."""
 
 

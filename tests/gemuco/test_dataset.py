@@ -4,6 +4,7 @@ from muscle_arm import LAYOUT
 
 from gemuco.dataset import Dataset, Episode
 from gemuco.errors import DatasetError, NotEnoughData
+from gemuco.signals import Layout, Signal
 
 
 def test_comes_back_from_disk(data, tmp_path):
@@ -49,6 +50,49 @@ def test_splits_few_episodes_by_time_block(arm):
     np.testing.assert_array_equal(held.rows()[:10], rows[first : first + 10])
 
 
-def test_too_little_to_split():
-    with pytest.raises(NotEnoughData, match="collect more"):
+@pytest.mark.parametrize(("episodes", "size"), [(1, 60), (3, 40), (6, 20), (2, 1)])
+def test_every_condition_is_on_both_sides(arm, episodes, size):
+    names = ("light", "heavy", "none")
+    parts = [Episode(name, arm.sample(size, i)) for i in range(episodes) for name in names]
+    for seed in range(5):
+        train, held = Dataset(LAYOUT, tuple(parts)).split(0.2, seed)
+        assert set(train.conditions) == set(held.conditions) == set(names)
+        assert len(train) + len(held) == 3 * episodes * size
+
+
+def test_too_little_to_split(arm):
+    with pytest.raises(NotEnoughData, match="record some with"):
         Dataset(LAYOUT, ()).split(0.2)
+    parts = (Episode("light", arm.sample(50, 0)), Episode("heavy", arm.sample(1, 0)))
+    with pytest.raises(NotEnoughData, match="Condition 'heavy' has 1 samples"):
+        Dataset(LAYOUT, parts).split(0.2)
+
+
+def test_infinite_is_not_measured(arm):
+    values = arm.sample(20, 0)
+    values["muscle_length"][3, 1] = np.inf
+    data = Dataset(LAYOUT, (Episode("new", values),))
+    assert np.isnan(data.rows()[3, LAYOUT.slice("muscle_length")][1])
+
+
+def test_takes_the_signals_of_another_layout(data):
+    swapped = Layout((LAYOUT.signal("muscle_length"), LAYOUT.signal("joint_position")))
+    part = data.of(swapped)
+    np.testing.assert_array_equal(part.rows()[:, 5:], data.rows()[:, :2])
+    np.testing.assert_array_equal(part.rows()[:, :5], data.rows()[:, 7:])
+
+
+@pytest.mark.parametrize(
+    ("signal", "text"),
+    [
+        (Signal("wire", 2, "m"), "Signal 'wire' is not in the data. They hold: joint_position, muscle_tension"),
+        (Signal("joint_position", 2, "deg", ("shoulder", "elbow")), "is in rad in the data, but deg is wanted"),
+        (Signal("joint_position", 2, "rad", ("elbow", "shoulder")), "has the elements shoulder, elbow in the data"),
+        (Signal("joint_position", 3, "rad"), "has the elements shoulder, elbow in the data, but 0, 1, 2"),
+    ],
+)
+def test_other_signals_are_a_sentence(data, signal, text):
+    with pytest.raises(DatasetError) as caught:
+        data.of(Layout((signal,)))
+    assert text in str(caught.value)
+    assert "\n" not in str(caught.value)

@@ -5,7 +5,6 @@ from muscle_arm import LAYOUT
 
 from gemuco.dataset import Dataset, Episode
 from gemuco.errors import NotEnoughData, SchemaError, UnknownSignal
-from gemuco.structure import Thresholds, determine
 from gemuco.train import TrainConfig, fit
 
 MASKS = [{"joint_position", "muscle_tension"}, {"muscle_tension", "muscle_length"}]
@@ -63,46 +62,18 @@ def test_one_bias_per_condition(arm):
     assert abs(schema.biases["new"][0] - schema.biases["worn"][0]) > 0.1
 
 
-def test_finds_the_structure_of_a_muscle_driven_arm(structure):
-    assert {"joint_position", "muscle_length"} <= set(structure.x_out)
-    assert frozenset({"joint_position", "muscle_tension"}) in structure.masks
-    assert frozenset({"muscle_tension", "muscle_length"}) in structure.masks
-    assert frozenset({"muscle_tension"}) not in structure.masks
-    assert structure.L_i["muscle_tension"] > structure.L_i["joint_position"]
-    report = structure.report()
-    assert "muscle_tension+muscle_length" in report
-    assert "x_in  = joint_position, muscle_tension, muscle_length" in report
-
-
-def test_measure_and_outputs_are_options(data, structure):
-    options = Thresholds(out=10.0, into=10.0, measure="rmse", over="all")
-    config = TrainConfig(hidden=(60, 20), latent=7, epochs=30, batch=100)
-    wide = determine(data, config, options)
-    assert frozenset(LAYOUT.names) not in wide.L_m
-    assert len(wide.masks) == 6
-    for name, value in structure.L_i.items():
-        assert wide.L_i[name] == pytest.approx(np.sqrt(value), rel=1e-5)
-    assert "root mean square error" in wide.report()
-
-
 def test_says_what_is_wrong(data):
     with pytest.raises(SchemaError, match="Known activations: tanh, sigmoid, relu"):
         TrainConfig(activation="swish")
-    with pytest.raises(SchemaError, match="Known: mse, rmse"):
-        Thresholds(measure="mae")
     with pytest.raises(UnknownSignal, match="Mask names 'wire'"):
         fit(data, TINY, [{"wire"}])
     with pytest.raises(NotEnoughData, match="at least one mask"):
         fit(data, TINY, [])
-    with pytest.raises(NotEnoughData, match="smallest L_i"):
-        determine(data, TINY, Thresholds(out=1e-9))
-    with pytest.raises(NotEnoughData, match="smallest L_m"):
-        determine(data, TINY, Thresholds(out=10.0, into=1e-9))
 
 
 def test_rows_that_fit_no_mask(arm):
     values = arm.sample(200, 0)
     values["muscle_tension"][0::2, 0] = np.nan
     values["muscle_tension"][1::2, 1] = np.nan
-    with pytest.raises(NotEnoughData, match="No training sample has all signals of any mask"):
+    with pytest.raises(NotEnoughData, match="No sample has all signals of any mask"):
         fit(Dataset(LAYOUT, (Episode("new", values),)), TINY, [{"muscle_tension"}])
