@@ -1,18 +1,37 @@
-"""Structure determination (paper, II-E): which signals can be inferred, and from which masks."""
+"""Structure determination (paper, II-E): which signals can be inferred, and from which masks.
+
+Up to 10 signals every mask is tried, and there are 2^n - 1 of them; with more the border between too little and enough
+is searched for (`mask_search`). Either way a mask is feasible only if its own error was measured and is small enough.
+"""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from gemuco.dataset import Dataset
 from gemuco.errors import NotEnoughData, SchemaError
-from gemuco.masks import Mask, all_masks, label
+from gemuco.mask_choice import choose
+from gemuco.mask_errors import MaskErrors
+from gemuco.mask_search import find_border
+from gemuco.masks import Mask, all_masks, bits, label
+from gemuco.scaler import Scaler
 from gemuco.signals import Layout
 from gemuco.train import Progress, TrainConfig, fit
 
-MAX_SIGNALS = 10
-"""Every mask is tried, and there are 2^n - 1 of them."""
+LISTED = 10
+"""Up to so many signals every mask is tried."""
+MOST_MASKS = 64
+"""A schema gets at most so many masks: each is trained, has its errors measured, and is looked at in every estimate."""
+TRAINED = 2000
+"""With more signals the network is trained with so many masks, and is right about the others too."""
+BUDGET = 20_000
+"""About how many masks the search tries at most."""
+ROWS, SEARCH_ROWS = 2000, 400
+"""Held-out rows that judge a mask, and that guide the search."""
+SHOWN = 40
+"""Lines of the report's table of masks."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +59,12 @@ class Thresholds:
         ):
             if value not in known:
                 raise SchemaError(f"Structure {name} '{value}' is not known. Known: {', '.join(known)}.")
+        for name, threshold in (("out", self.out), ("in", self.into)):
+            if not 0.0 < threshold <= 1.0:
+                raise SchemaError(
+                    f"threshold_{name} is {threshold:g}; it must be above 0, and at most 1, the error of always "
+                    "guessing the mean. The paper uses 0.15."
+                )
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,12 +73,13 @@ class Structure:
 
     Attributes:
         layout: The signals it is about.
-        x_in: Inputs, the union of the feasible masks.
+        x_in: Inputs, the union of the masks.
         x_out: Outputs.
-        masks: Feasible masks, the best first.
-        L_i: Signal -> error when inferred from all others.
-        L_m: Mask -> error of x_out.
+        masks: Feasible masks for the schema, the best first; at most `MOST_MASKS`.
+        L_i: Signal -> error when inferred from all others; infinite if no held-out sample tells.
+        L_m: Mask -> error of x_out, of every mask that was tried.
         thresholds: What the errors were compared with.
+        is_whole: Whether every mask was tried, or the search ended with nothing left to look at.
     """
 
     layout: Layout
@@ -63,68 +89,221 @@ class Structure:
     L_i: dict[str, float]
     L_m: dict[Mask, float]
     thresholds: Thresholds
+    is_whole: bool = True
+
+    @property
+    def feasible(self) -> tuple[Mask, ...]:
+        """Every tried mask below the threshold, the best first."""
+        return tuple(sorted((m for m in self.L_m if self.L_m[m] < self.thresholds.into), key=lambda m: self.L_m[m]))
+
+    @property
+    def listed(self) -> tuple[Mask, ...]:
+        """The masks of the report: those of the smallest errors, at most `SHOWN`."""
+        return tuple(sorted(self.L_m, key=lambda m: self.L_m[m])[:SHOWN])
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What a reader of the tables may overlook, one sentence each."""
+        found: list[str] = []
+        for name in self.x_out:
+            if all(name in m for m in self.masks):
+                found.append(
+                    f"'{name}' is an output, but no feasible mask does without it (threshold_in is lower than what it "
+                    "needs): where it is missing it is estimated by descent on z."
+                )
+        for name in self.layout.names:
+            if name not in self.x_in and name not in self.x_out:
+                found.append(f"'{name}' is neither input nor output: the model does not use it.")
+        if len(self.masks) < len(self.feasible):
+            found.append(
+                f"{len(self.feasible)} of {len(self.L_m)} tried masks are feasible; the {len(self.masks)} that serve "
+                "random sets of available signals best are kept."
+            )
+        if not self.is_whole:
+            found.append("The search stopped at its budget: there may be feasible masks that it did not see.")
+        return tuple(found)
 
     def report(self) -> str:
         """A table for people."""
-        width = max([len(label(m, self.layout.names)) for m in self.L_m] + [len(n) for n in self.L_i])
+        shown = self.listed
+        width = max([len(label(m, self.layout.names)) for m in shown] + [len(n) for n in self.L_i])
         unit = "mean squared error" if self.thresholds.measure == "mse" else "root mean square error"
         lines = [f"Errors on held-out data: {unit} in standard deviations.", ""]
         lines.append(f"{'inferred from all others':<{width}}  {'L_i':>7}  output if below {self.thresholds.out:g}")
         for name, value in self.L_i.items():
             lines.append(f"{name:<{width}}  {value:7.3f}  {'yes' if name in self.x_out else 'no'}")
         lines += ["", f"{'mask':<{width}}  {'L_m':>7}  feasible if below {self.thresholds.into:g}"]
-        for m, value in sorted(self.L_m.items(), key=lambda item: item[1]):
-            lines.append(f"{label(m, self.layout.names):<{width}}  {value:7.3f}  {'yes' if m in self.masks else 'no'}")
-        lines += ["", f"x_in  = {', '.join(self.x_in)}", f"x_out = {', '.join(self.x_out)}"]
+        for m in shown:
+            feasible = self.L_m[m] < self.thresholds.into
+            lines.append(f"{label(m, self.layout.names):<{width}}  {self.L_m[m]:7.3f}  {'yes' if feasible else 'no'}")
+        if len(shown) < len(self.L_m):
+            lines.append(f"and {len(self.L_m) - len(shown)} more")
+        lines += ["", f"x_in  = {', '.join(self.x_in)}", f"x_out = {', '.join(self.x_out)}", *self.remarks]
         return "\n".join(lines)
 
 
+class _Judge:
+    """Errors of masks compared with the thresholds."""
+
+    def __init__(self, names: tuple[str, ...], errors: tuple[MaskErrors, ...], thresholds: Thresholds) -> None:
+        self.names, self.errors, self.thresholds = names, errors, thresholds
+        rows = [split.thinned(ROWS) for split in errors]
+        self.L_i = {
+            name: self._measured(float(np.mean([split.from_others(i) for split in rows])))
+            for i, name in enumerate(names)
+        }
+        self.outputs = np.array([self.L_i[name] < thresholds.out for name in self.names])
+
+    def _measured(self, squared: float) -> float:
+        if not np.isfinite(squared):
+            return float("inf")
+        return float(squared if self.thresholds.measure == "mse" else np.sqrt(squared))
+
+    def is_judged(self, masks: np.ndarray) -> np.ndarray:
+        """Whether a mask leaves any output to infer, shape (n,): the others are not judged (paper, II-E.3)."""
+        return (self.outputs & ~masks).any(axis=1)
+
+    def of(self, masks: np.ndarray, rows: int = ROWS) -> tuple[np.ndarray, np.ndarray]:
+        """Errors of the outputs, shape (n,), and squared errors of every signal, shape (n, signals)."""
+        found, sizes = self._mean(masks, rows)
+        judged = np.broadcast_to(self.outputs, masks.shape)
+        if self.thresholds.over == "masked":
+            judged = judged & ~masks
+        weights = (judged & np.isfinite(found)) * sizes
+        total = weights.sum(axis=1)
+        squared = (np.nan_to_num(found) * weights).sum(axis=1) / np.where(total > 0.0, total, 1.0)
+        return np.array([self._measured(value) for value in np.where(total > 0.0, squared, np.nan)]), found
+
+    def _mean(self, masks: np.ndarray, rows: int) -> tuple[np.ndarray, np.ndarray]:
+        """Squared errors of every signal over all splits, shape (n, signals), and its elements, shape (signals,)."""
+        found, sizes = zip(*(errors.thinned(rows).of(masks) for errors in self.errors), strict=True)
+        return np.mean(found, axis=0), np.max(sizes, axis=0)
+
+
 def determine(
-    dataset: Dataset, config: TrainConfig, thresholds: Thresholds | None = None, progress: Progress | None = None
+    dataset: Dataset,
+    config: TrainConfig,
+    thresholds: Thresholds | None = None,
+    progress: Progress | None = None,
+    splits: int = 1,
+    drafts: Path | None = None,
 ) -> Structure:
-    """Train once under all masks, measure each on held-out episodes, and keep what can be inferred.
+    """Train once under all masks, measure masks on held-out episodes, and keep what can be inferred.
+
+    Args:
+        dataset: Episodes of one body.
+        config: How to train.
+        thresholds: When something counts as inferable; the paper's if not given.
+        progress: Told the share done, 0 to 1, and a line of text.
+        splits: How often to train, each time with other episodes held out; errors are means over all. One is the
+            paper's way. Short recordings need more: which part is held out changes their errors many times over.
+        drafts: A folder to keep trainings in, so that what was interrupted goes on; see `fit`.
 
     Raises:
-        NotEnoughData: Too few samples, or no signal or mask is below its threshold.
+        NotEnoughData: Too few samples or signals, a signal that never varies, or no signal or mask below its threshold.
     """
     thresholds = thresholds or Thresholds()
-    layout = dataset.layout
-    names = layout.names
-    if not 2 <= len(names) <= MAX_SIGNALS:
-        raise NotEnoughData(f"Structure determination handles 2 to {MAX_SIGNALS} signals; there are {len(names)}.")
-    schema, _ = fit(dataset, config, all_masks(names), progress, title="structure")
-    held = dataset.split(config.held_out, config.seed)[1].rows()
-    x = schema.scaler.normalise(held)
-    x = x[np.isfinite(x).all(axis=1)]
-    if not len(x):
-        raise NotEnoughData("No held-out sample has every signal; structure determination needs some that do.")
-    squared = {m: (schema.infer(x, m) - x) ** 2 for m in all_masks(names)}
-
-    def error(m: Mask, judged: Iterable[str]) -> float:
-        mse = float(squared[m][:, layout.indices(judged)].mean())
-        return mse if thresholds.measure == "mse" else float(np.sqrt(mse))
-
-    L_i = {name: error(frozenset(names) - {name}, [name]) for name in names}
-    x_out = tuple(name for name in names if L_i[name] < thresholds.out)
-    if not x_out:
+    names = dataset.layout.names
+    if len(names) < 2:
         raise NotEnoughData(
-            f"No signal can be inferred from the others (smallest L_i {min(L_i.values()):.3f}, threshold "
-            f"{thresholds.out:g}); collect more data or raise the threshold."
+            f"There is one signal, '{names[0]}', and nothing to infer it from; structure needs at least two."
+            if names
+            else "There is no signal; structure determination needs at least two."
         )
-    L_m: dict[Mask, float] = {}
-    for m in all_masks(names):
-        if not set(x_out) <= m:
-            L_m[m] = error(m, set(x_out) - m if thresholds.over == "masked" else x_out)
-    masks = tuple(sorted((m for m in L_m if L_m[m] < thresholds.into), key=lambda m: L_m[m]))
-    if not masks:
+    judge = _Judge(names, _trained(dataset, config, splits, progress, drafts), thresholds)
+    if not judge.outputs.any():
+        least = min(judge.L_i, key=lambda name: judge.L_i[name])
         raise NotEnoughData(
-            f"No mask is enough to infer x_out (smallest L_m {min(L_m.values()):.3f}, threshold {thresholds.into:g}); "
-            "collect more data or raise the threshold."
+            f"No signal can be inferred from the others (smallest L_i {judge.L_i[least]:.3f} of '{least}', "
+            f"threshold_out {thresholds.out:g}); collect more data or raise the threshold."
         )
-    x_in = tuple(name for name in names if any(name in m for m in masks))
-    return Structure(layout, x_in, x_out, masks, L_i, L_m, thresholds)
+    if len(names) <= LISTED:
+        tried, is_whole = np.array([bits(m, names) > 0 for m in all_masks(names)]), True
+    else:
+        tried, is_whole = _searched(judge, config.seed)
+    tried = tried[judge.is_judged(tried)]
+    L_m, squared = judge.of(tried)
+    feasible = L_m < thresholds.into
+    if not feasible.any():
+        raise NotEnoughData(
+            f"No mask is enough to infer x_out ({', '.join(_named(names, judge.outputs))}): smallest L_m "
+            f"{L_m.min():.3f}, threshold_in {thresholds.into:g}; collect more data or raise the threshold."
+        )
+    kept = np.flatnonzero(feasible)
+    kept = kept[choose(tried[kept], squared[kept], judge.outputs, MOST_MASKS, config.seed)]
+    kept = kept[np.argsort(L_m[kept], kind="stable")]
+    masks = tuple(frozenset(_named(names, line)) for line in tried[kept])
+    return Structure(
+        layout=dataset.layout,
+        x_in=_named(names, tried[kept].any(axis=0)),
+        x_out=_named(names, judge.outputs),
+        masks=masks,
+        L_i=judge.L_i,
+        L_m={frozenset(_named(names, line)): float(value) for line, value in zip(tried, L_m, strict=True)},
+        thresholds=thresholds,
+        is_whole=is_whole,
+    )
 
 
-def for_structure(config: TrainConfig) -> TrainConfig:
-    """The same training, shortened: structure needs errors to one digit, the model needs all it can get."""
-    return replace(config, epochs=max(1, config.epochs // 3))
+def _trained(
+    dataset: Dataset, config: TrainConfig, splits: int, progress: Progress | None, drafts: Path | None
+) -> tuple[MaskErrors, ...]:
+    """One network per split, and what it makes of masks on the episodes that it did not see."""
+    found: list[MaskErrors] = []
+    for split in range(splits):
+
+        def tell(done: float, text: str, before: int = split) -> None:
+            if progress is not None:
+                progress((before + done) / splits, text)
+
+        own = replace(config, seed=config.seed + split)
+        train, held = dataset.split(own.held_out, own.seed)
+        _check_alive(train)
+        masks = _training_masks(dataset.layout.names, own.seed)
+        resume = None if drafts is None else drafts / f"structure_{split}.safetensors"
+        schema, _ = fit(dataset, own, masks, tell, title="structure", resume=resume)
+        found.append(MaskErrors.of_schema(schema, train, held, own.outliers))
+    return tuple(found)
+
+
+def _check_alive(train: Dataset) -> None:
+    """Refuse signals about which there is nothing to say."""
+    rows = train.rows()
+    dead = np.isin(np.arange(train.layout.size), Scaler.fit(train.layout, rows).dead)
+    for name in train.layout.names:
+        span = train.layout.slice(name)
+        if dead[span].all():
+            fact = "never varies" if np.isfinite(rows[:, span]).any() else "was never measured"
+            raise NotEnoughData(
+                f"Signal '{name}' {fact} in the training data, so nothing can be learned of it; collect data in which "
+                "it moves, or leave it out of the model."
+            )
+
+
+def _training_masks(names: tuple[str, ...], seed: int) -> tuple[Mask, ...]:
+    """All masks, or `TRAINED` random ones of all sizes from which the network learns to do with any."""
+    if len(names) <= LISTED:
+        return all_masks(names)
+    random = np.random.default_rng(seed)
+    drawn = random.random((TRAINED, len(names))) < random.random((TRAINED, 1))
+    drawn[~drawn.any(axis=1), 0] = True
+    others = ~np.eye(len(names), dtype=bool)
+    return tuple(dict.fromkeys(frozenset(_named(names, line)) for line in np.concatenate([others, drawn])))
+
+
+def _searched(judge: _Judge, seed: int) -> tuple[np.ndarray, bool]:
+    """The masks that the search found to be enough, to be measured on all rows; and whether it came to an end."""
+    enough: list[np.ndarray] = []
+
+    def is_enough(masks: np.ndarray) -> np.ndarray:
+        found = ~judge.is_judged(masks)  # what leaves nothing to infer is enough
+        found[~found] = judge.of(masks[~found], SEARCH_ROWS)[0] < judge.thresholds.into
+        enough.append(masks[found])
+        return found
+
+    border = find_border(is_enough, len(judge.names), BUDGET, seed)
+    return np.concatenate([border.largest, *enough]), border.is_complete
+
+
+def _named(names: tuple[str, ...], chosen: Iterable[bool]) -> tuple[str, ...]:
+    return tuple(name for name, is_chosen in zip(names, chosen, strict=True) if is_chosen)

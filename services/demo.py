@@ -74,7 +74,7 @@ def make_model(robot: RobotConfig, console: Console) -> None:
     with progress("training") as tell:
         trained = trainer.train(robot, found.dataset, 0, tell)
     trainer.show(trained, console)
-    trained.schema.save(folder)
+    trainer.save(trained, folder)
 
 
 def start(

@@ -12,13 +12,11 @@ from matplotlib.axes import Axes
 from gemuco.structure import Structure
 
 GOOD, BAD = "tab:green", "0.6"
-MOST = 40
-"""So many masks are drawn at most, those of the smallest error."""
 
 
 def plot(structure: Structure, path: Path) -> None:
     """Draw L_i and L_m against their thresholds into a PNG."""
-    masks = sorted(structure.L_m, key=lambda m: structure.L_m[m])[:MOST]
+    masks = list(structure.listed)
     heights = [len(structure.L_i) + 2, len(masks) + 2]
     figure, (upper, lower) = plt.subplots(
         2, 1, figsize=(10, 1.6 + 0.27 * sum(heights)), height_ratios=heights, layout="constrained"
@@ -41,7 +39,7 @@ def _outputs(axis: Axes, structure: Structure, title: str) -> None:
 
 def _masks(axis: Axes, structure: Structure, masks: list[frozenset[str]]) -> None:
     """One row per mask: a square per signal it contains, and its error."""
-    names, feasible = structure.layout.names, set(structure.masks)
+    names, feasible = structure.layout.names, set(structure.feasible)
     rows = ["".join("■" if n in m else "□" for n in names) for m in masks]
     _bars(axis, rows, [structure.L_m[m] for m in masks], [m in feasible for m in masks], structure.thresholds.into)
     known = len(structure.L_m)

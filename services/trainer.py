@@ -1,5 +1,6 @@
 """From recorded data to a model that can serve: structure, training, and what the errors mean in physical units."""
 
+import shutil
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ from rich.table import Table
 
 from gemuco.dataset import Dataset
 from gemuco.errors import CheckpointError, DatasetError
+from gemuco.history import History
 from gemuco.masks import label
 from gemuco.schema import BodySchema
 from hal.config import RobotConfig
@@ -19,6 +21,7 @@ from services.living_model import layout_of
 from services.model_config import ModelConfig, model_config
 
 if TYPE_CHECKING:
+    from gemuco.structure import Structure
     from gemuco.train import TrainConfig
 
 Progress = Callable[[float, str], None]
@@ -30,53 +33,81 @@ class Trained:
 
     Attributes:
         schema: The body schema, with the robot file's fingerprint in its manifest.
-        report: The L_i and L_m tables for people.
+        structure: What was found out about the signals.
+        history: How the training went.
         samples: How many samples it was made from.
         seconds: How long structure and training took.
     """
 
     schema: BodySchema
-    report: str
+    structure: "Structure"
+    history: History
     samples: int
     seconds: float
 
 
-def train(robot: RobotConfig, dataset: Dataset, seed: int, progress: Progress) -> Trained:
-    """Determine the structure and train; `progress` is told the share done, 0 to 1, and a line of text.
+def train(robot: RobotConfig, dataset: Dataset, seed: int, progress: Progress, drafts: Path | None = None) -> Trained:
+    """The model of a robot; see `learn`.
 
     Raises:
-        DatasetError: The data are of another robot.
+        DatasetError: The data are of another robot, or in other units.
+        NotEnoughData: Too few samples, or nothing can be inferred.
+    """
+    try:
+        own = dataset.of(layout_of(robot))
+    except DatasetError as error:
+        raise DatasetError(
+            f"The data do not fit '{robot.robot}': {error} Record data of this robot with `gemuco collect`."
+        ) from None
+    facts = {"robot": robot.robot, "fingerprint": fingerprint(robot)}
+    return learn(model_config(robot), own, seed, progress, drafts, **facts)
+
+
+def learn(
+    config: ModelConfig, dataset: Dataset, seed: int, progress: Progress, drafts: Path | None = None, **facts: str
+) -> Trained:
+    """Determine the structure and train.
+
+    Args:
+        config: How.
+        dataset: Episodes of one body.
+        seed: Of all that is random.
+        progress: Told the share done, 0 to 1, and a line of text.
+        drafts: A folder to keep trainings in, so that what was interrupted goes on; nothing is kept without one.
+        facts: For the model's manifest.
+
+    Raises:
         NotEnoughData: Too few samples, or nothing can be inferred.
     """
     from gemuco import structure
     from gemuco import train as training
 
-    config = model_config(robot)
-    if dataset.layout != layout_of(robot):
-        raise DatasetError(
-            f"The data are of another robot: their signals are {', '.join(dataset.layout.names)}, "
-            f"those of '{robot.robot}' are {', '.join(layout_of(robot).names)}, or elements differ. "
-            "Use `gemuco collect`."
-        )
     started = time.monotonic()
     first = train_config(config, config.structure.epochs, seed)
     last = train_config(config, config.training.epochs, seed)
-    share = first.epochs / (first.epochs + last.epochs)
-    thresholds = structure.Thresholds(config.structure.threshold_out, config.structure.threshold_in)
-    found = structure.determine(dataset, first, thresholds, lambda done, text: progress(share * done, text))
+    wanted = config.structure
+    share = first.epochs * wanted.splits / (first.epochs * wanted.splits + last.epochs)
+    thresholds = structure.Thresholds(wanted.threshold_out, wanted.threshold_in, wanted.measure, wanted.over)
+    found = structure.determine(
+        dataset, first, thresholds, lambda done, text: progress(share * done, text), wanted.splits, drafts
+    )
     schema, history = training.fit(
-        dataset, last, found.masks, lambda done, text: progress(share + (1 - share) * done, text), x_out=found.x_out
+        dataset,
+        last,
+        found.masks,
+        lambda done, text: progress(share + (1 - share) * done, text),
+        found.x_out,
+        resume=None if drafts is None else drafts / "training.safetensors",
     )
     names = dataset.layout.names
     schema = schema.with_manifest(
-        robot=robot.robot,
-        fingerprint=fingerprint(robot),
+        **facts,
         samples=len(dataset),
-        held_out_loss=history.held_out[history.best_epoch],
+        held_out_loss=history.best,
         L_i=found.L_i,
-        L_m={label(mask, names): value for mask, value in found.L_m.items()},
+        L_m={label(mask, names): found.L_m[mask] for mask in found.listed},
     )
-    return Trained(schema, found.report(), len(dataset), time.monotonic() - started)
+    return Trained(schema, found, history, len(dataset), time.monotonic() - started)
 
 
 def fits(robot: RobotConfig, folder: Path) -> bool:
@@ -87,9 +118,24 @@ def fits(robot: RobotConfig, folder: Path) -> bool:
         return False
 
 
+def save(trained: Trained, folder: Path) -> None:
+    """Write the model, the pictures of its structure and training beside it; its drafts are of no more use."""
+    from services import structure_plot, training_plot
+
+    trained.schema.save(folder)
+    structure_plot.plot(trained.structure, folder / "structure.png")
+    training_plot.plot(trained.history, f"{trained.samples} samples", folder / "training.png")
+    shutil.rmtree(drafts_of(folder), ignore_errors=True)
+
+
+def drafts_of(folder: Path) -> Path:
+    """Where unfinished trainings of the model in a folder are kept."""
+    return folder.with_name(folder.name + ".draft")
+
+
 def show(trained: Trained, console: Console) -> None:
     """Print the structure, and the error of each signal under each mask in its own unit."""
-    console.print(trained.report, highlight=False)
+    console.print(trained.structure.report(), highlight=False)
     table = Table(title="Error on held-out data, by what it is estimated from", title_justify="left")
     table.add_column("estimated from")
     table.add_column("signal")
@@ -98,6 +144,28 @@ def show(trained: Trained, console: Console) -> None:
         table.add_row(mask, name, f"{rms:.4g} {unit}")
     console.print(table)
     console.print(f"{trained.samples} samples, structure and training in {trained.seconds:.1f} s.")
+    for sentence in remarks(trained.history):
+        console.print(sentence, style="yellow", highlight=False)
+
+
+def remarks(history: History) -> list[str]:
+    """What a person should know of the data and the training."""
+    found = list(history.notes)
+    if history.resumed:
+        found.append(f"An interrupted training went on at epoch {history.resumed + 1}.")
+    if history.dead:
+        found.append(
+            f"Never varied or never measured: {', '.join(history.dead)}. What they say has no effect on the model. "
+            "Check these sensors, or leave them out."
+        )
+    if history.skipped:
+        found.append(f"{history.skipped} training samples were skipped: they lack something of every mask.")
+    if history.rejected:
+        found.append(
+            f"{history.rejected} measured signals in the training data were taken for outliers: the other signals of "
+            "their samples contradict them. If there are many, look for a loose sensor."
+        )
+    return found
 
 
 def train_config(config: ModelConfig, epochs: int, seed: int) -> "TrainConfig":

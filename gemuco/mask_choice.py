@@ -1,0 +1,50 @@
+"""Which of very many feasible masks to keep: those that serve best whatever signals happen to be available."""
+
+import numpy as np
+
+SCENES = 1500
+"""Random sets of available signals on which masks are compared."""
+
+
+def choose(candidates: np.ndarray, errors: np.ndarray, outputs: np.ndarray, most: int, seed: int = 0) -> np.ndarray:
+    """Pick masks one after another, each the one that lowers the mean error over the scenes most.
+
+    A scene is a set of available signals: all but one, or a random one with any share of the signals lost. Its error is
+    that of the outputs it lacks under the best picked mask that it covers, and 1 (guess the mean) if it covers none.
+
+    Args:
+        candidates: Feasible masks, shape (n, signals), truth values.
+        errors: Mean squared error of every signal under every mask [standard deviations squared], shape (n, signals).
+        outputs: Which signals are outputs, truth values, shape (signals,).
+        most: How many to pick.
+        seed: Of the scenes.
+
+    Returns:
+        Indices of the picked masks in the order of their picking; fewer than `most` if more would serve no scene.
+    """
+    if len(candidates) <= most:
+        return np.arange(len(candidates))
+    scenes = _scenes(candidates.shape[1], seed)
+    needed = (outputs & ~scenes).astype(float)  # (scenes, signals)
+    scenes, needed = scenes[needed.any(axis=1)], needed[needed.any(axis=1)]
+    lacking = (~scenes).astype(np.float32) @ candidates.T.astype(np.float32)
+    # Where no row tells (NaN) the mask does not serve; an error above 1 is worse than none.
+    cost = needed @ np.clip(np.nan_to_num(errors, nan=1.0), 0.0, 1.0).T / needed.sum(axis=1, keepdims=True)
+    cost = np.where(lacking < 0.5, cost, 1.0)
+    least = np.ones(len(scenes))
+    picked: list[int] = []
+    while len(picked) < most:
+        gain = np.maximum(least[:, None] - cost, 0.0).sum(axis=0)
+        best = int(gain.argmax())
+        if gain[best] <= 0.0:
+            break
+        picked.append(best)
+        least = np.minimum(least, cost[:, best])
+    return np.array(picked, int)
+
+
+def _scenes(signals: int, seed: int) -> np.ndarray:
+    """Sets of available signals, shape (scenes, signals), truth values."""
+    random = np.random.default_rng(seed)
+    shares = random.random((SCENES, 1))
+    return np.concatenate([~np.eye(signals, dtype=bool), random.random((SCENES, signals)) < shares])

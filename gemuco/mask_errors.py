@@ -1,0 +1,128 @@
+"""How badly one network infers every signal from any mask, measured on held-out rows."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gemuco import outliers
+from gemuco.dataset import Dataset
+from gemuco.kernels import Chain, run
+from gemuco.material import Material
+from gemuco.scaler import CLIP
+from gemuco.schema import BodySchema
+from gemuco.signals import Layout
+from gemuco.task import Task
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MaskErrors:
+    """A network that infers every signal from any mask, and rows to try it on.
+
+    Errors are shares of variance: 1 is what always guessing the mean costs. For elements that vary, this is the mean
+    squared error in standard deviations. An element that hardly moves (below the floor of its signal's scale) counts as
+    little as it moves, and one that never does not at all, or dead channels would make a signal look well inferred.
+
+    Attributes:
+        layout: The signals.
+        chain: The network: all signals, a bit per signal and p in, all signals out.
+        x: Held-out rows [standard deviations], clipped, gaps filled by zero, shape (rows, size).
+        there: Which elements count: measured, and alive; shape (rows, size).
+        whole: Which signals are whole, shape (rows, signals).
+        p: Parametric bias of every row, shape (rows, bias_size).
+        liveliness: Variance of every element in the training data, at most 1 [standard deviations squared], (size,).
+    """
+
+    layout: Layout
+    chain: Chain
+    x: np.ndarray
+    there: np.ndarray
+    whole: np.ndarray
+    p: np.ndarray
+    liveliness: np.ndarray
+
+    @classmethod
+    def of_schema(cls, schema: BodySchema, train: Dataset, held: Dataset, limit: float) -> "MaskErrors":
+        """For a schema whose inputs and outputs are all signals, on samples that it was not trained on.
+
+        Each sample is judged under the p of its condition. Outliers (`TrainConfig.outliers`) do not count.
+        """
+        layout, scaler = schema.layout, schema.scaler
+        x = scaler.normalise(held.rows())
+        p = np.zeros((len(x), len(schema.bias)), np.float32)
+        if len(schema.bias):
+            p = np.stack([schema.biases[c] for c in held.conditions])[held.condition_of_rows()]
+        task = Task(layout, schema.masks, schema.x_out)
+        material = Material(task, x, held.condition_of_rows(), scaler)
+        wild = outliers.find(task, schema.weights, x, p, limit, material.far, material.suspected)
+        there = np.isfinite(x) & ~wild[:, task.signal_of]
+        granted = there.copy()
+        granted[:, scaler.dead] = True  # what is stuck hinders no mask
+        there[:, scaler.dead] = False
+        whole = np.stack([granted[:, layout.slice(name)].all(axis=1) for name in layout.names], axis=1)
+        known = scaler.normalise(train.rows())
+        liveliness = np.zeros(layout.size)
+        for element in np.setdiff1d(np.arange(layout.size), scaler.dead):
+            liveliness[element] = min(1.0, float(np.nanvar(known[:, element])))
+        x = np.clip(np.where(there, x, 0.0), -CLIP, CLIP).astype(np.float32)
+        return cls(layout, schema.weights.whole, x, there, whole, p, liveliness)
+
+    def thinned(self, rows: int) -> "MaskErrors":
+        """On at most so many rows, evenly chosen: a quicker and rougher judgement."""
+        if len(self.x) <= rows:
+            return self
+        return self._rows(np.linspace(0, len(self.x) - 1, rows).astype(int))
+
+    def of(self, bits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Errors under masks.
+
+        Args:
+            bits: One mask per line, shape (masks, signals), truth values.
+
+        Returns:
+            Share of the variance of every signal that every mask leaves unexplained, shape (masks, signals), NaN where
+            no row tells; and how much of each signal there is to explain, shape (signals,): its elements, if all vary.
+        """
+        starts = np.cumsum([0, *self._sizes[:-1]])
+        variance = np.add.reduceat(self.liveliness, starts)
+        found = np.empty((len(bits), len(starts)))
+        for index, chosen in enumerate(bits):
+            squared, count = self._squared(chosen, np.repeat(chosen, self._sizes))
+            measured = np.add.reduceat(np.where(count > 0, self.liveliness, 0.0), starts)
+            missed = np.add.reduceat(squared / np.maximum(count, 1), starts)
+            found[index] = np.where(measured > 0, missed / np.maximum(measured, 1e-12), np.nan)
+        return found, variance
+
+    def from_others(self, signal: int) -> float:
+        """Error of a signal (by its index) from all others; NaN if no row tells.
+
+        Where no row has all of them, every row that has the signal is inferred from whatever others it has.
+        """
+        others = np.arange(len(self.layout.names)) != signal
+        whole = float(self.of(others[None])[0][0, signal])
+        if np.isfinite(whole):
+            return whole
+        span = self.layout.slice(self.layout.names[signal])
+        total, count = np.zeros(self.layout.size), np.zeros(self.layout.size)
+        patterns, which = np.unique(self.whole & others, axis=0, return_inverse=True)
+        for index in np.flatnonzero(patterns.any(axis=1)):
+            part = self._rows(np.flatnonzero(which.ravel() == index))
+            squared, rows = part._squared(patterns[index], np.repeat(patterns[index], self._sizes))
+            total, count = total + squared, count + rows
+        known = self.liveliness[span] * (count[span] > 0)
+        return float((total[span] / np.maximum(count[span], 1)).sum() / known.sum()) if known.any() else float("nan")
+
+    @property
+    def _sizes(self) -> list[int]:
+        return [signal.size for signal in self.layout.signals]
+
+    def _rows(self, chosen: np.ndarray) -> "MaskErrors":
+        return replace(self, **{name: getattr(self, name)[chosen] for name in ("x", "there", "whole", "p")})
+
+    def _squared(self, chosen: np.ndarray, gate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Sum of squared errors of every element, and of how many rows, shapes (size,)."""
+        usable = self.whole[:, chosen].all(axis=1)
+        rows = slice(None) if usable.all() else usable
+        truth, there = self.x[rows], self.there[rows]
+        tail = np.broadcast_to(chosen.astype(np.float32), (len(truth), len(chosen)))
+        told = run(self.chain, np.concatenate([truth * gate, tail, self.p[rows]], axis=1, dtype=np.float32))
+        return np.where(there, (told - truth) ** 2, 0.0).sum(axis=0, dtype=float), there.sum(axis=0)
