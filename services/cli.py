@@ -177,26 +177,52 @@ def collect(
 @app.command()
 @speaks_plainly
 def train(
-    robot: RobotFile,
-    data: Annotated[Path | None, typer.Option(help="Recorded samples; runs/<robot>/data.npz if not given.")] = None,
+    robot: Annotated[
+        str, typer.Argument(metavar="ROBOT", help="A robot file, its name, or a description of measured data.")
+    ],
+    data: Annotated[
+        Path | None,
+        typer.Option(
+            help="Recorded samples; runs/<robot>/data.npz if not given. With a description of measured data the folder "
+            "of its files; that of the description if not given."
+        ),
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="Where to write; runs/<robot>/model if not given.")] = None,
     seed: Seed = 0,
 ) -> None:
-    """Find out which signals explain which, train, and tell the errors in physical units."""
+    """Find out which signals explain which, train, and tell the errors in physical units.
+
+    Interrupted (Ctrl-C, or killed), the same command goes on where it was.
+    """
     from rich.console import Console
 
     from gemuco.dataset import Dataset
-    from services import artifacts, trainer
+    from services import artifacts, measured, trainer
     from services.show import progress
 
-    config = _load(robot)
-    dataset = Dataset.load(data or artifacts.data_path(config.robot))
-    with progress("training") as tell:
-        trained = trainer.train(config, dataset, seed, tell)
+    file = _file(robot)
+    if measured.is_description(file):
+        described = measured.load_measured(file)
+        name, dataset = described.recording, measured.read(described, data or file.parent)
+    else:
+        config = _load(robot)
+        name, dataset = config.robot, Dataset.load(data or artifacts.data_path(config.robot))
+    folder = out or artifacts.model_folder(name)
+    drafts = trainer.drafts_of(folder)
+    if drafts.exists():
+        typer.echo(f"A training of {folder} was interrupted; it goes on if data and settings are the same.")
+    try:
+        with progress("training") as tell:
+            if measured.is_description(file):
+                trained = trainer.learn(described.model, dataset, seed, tell, drafts, recording=name)
+            else:
+                trained = trainer.train(config, dataset, seed, tell, drafts)
+    except KeyboardInterrupt:
+        typer.echo("Interrupted. The same command goes on from here.", err=True)
+        raise
     trainer.show(trained, Console())
-    folder = out or artifacts.model_folder(config.robot)
-    trained.schema.save(folder)
-    typer.echo(f"Saved in {folder}.")
+    trainer.save(trained, folder)
+    typer.echo(f"Saved in {folder}, with pictures of the structure and of the training.")
 
 
 @app.command(context_settings={"ignore_unknown_options": True})  # a target may be negative
@@ -205,7 +231,9 @@ def query(
     robot: RobotFile,
     verb: Annotated[str, typer.Argument(help="What to ask: estimate, engage, target, adapt, describe, fault, ...")],
     words: Annotated[list[str] | None, typer.Argument(metavar="[WORDS]...", help="What the verb needs.")] = None,
-    hide: Annotated[list[str] | None, typer.Option(help="estimate, anomaly: act as if this signal were not measured.")] = None,
+    hide: Annotated[
+        list[str] | None, typer.Option(help="estimate, anomaly: act as if this signal were not measured.")
+    ] = None,
     watch: Annotated[bool, typer.Option("--watch", help="estimate: go on once a second until Ctrl-C.")] = False,
     connect: Connect = None,
 ) -> int:
