@@ -37,7 +37,7 @@ def test_shipped_sections_are_understood() -> None:
             {"control": {"target": "elbow"}},
             "model.control.target 'elbow' is not a signal of the model. Known: joint_position",
         ),
-        ("collect", {}, "motion: Field required"),
+        ("collect", {}, "has no 'collect' section"),
     ],
 )
 def test_a_mistake_is_one_sentence(section: str, content: dict, sentence: str) -> None:
