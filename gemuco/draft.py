@@ -1,4 +1,4 @@
-"""An unfinished training on disk, so that an interrupted one goes on: one safetensors file, nothing pickled."""
+"""A training on disk, so that an interrupted one goes on: one safetensors file, nothing pickled."""
 
 import hashlib
 import json
@@ -24,7 +24,7 @@ def key_of(*parts: Any) -> str:
 
 
 class Draft:
-    """Where an unfinished training is kept.
+    """Where a training is kept as far as it is.
 
     Args:
         path: The file; nothing is kept without one.
@@ -60,11 +60,6 @@ class Draft:
         part = self.path.with_name(self.path.name + ".part")
         save_file(whole, part, head)
         part.replace(self.path)
-
-    def remove(self) -> None:
-        """The training is finished."""
-        if self.path is not None:
-            self.path.unlink(missing_ok=True)
 
 
 def _digest(arrays: Iterable[tuple[str, np.ndarray]], facts: str) -> str:

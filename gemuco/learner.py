@@ -33,7 +33,7 @@ LOOKS = 16
 """How often outliers are looked for during a training, beginning when a quarter of it is done."""
 
 DRAFTS = 40
-"""How often an unfinished training is written down."""
+"""How often a training is written down."""
 
 MOST_HELD = 4000
 """Pairs of held-out sample and mask that are measured after every epoch, at most."""
@@ -128,7 +128,7 @@ class Learner:
             if progress is not None:
                 best = course.held_out[course.best_epoch]
                 progress((epoch + 1) / config.epochs, f"{title}: held-out loss {best:.4f}")
-            if (epoch + 1) % max(1, config.epochs // DRAFTS) == 0:
+            if (epoch + 1) % max(1, config.epochs // DRAFTS) == 0 or epoch + 1 == config.epochs:
                 draft.save(*self._written())
         with torch.no_grad():
             for name, parameter in self._parameters().items():

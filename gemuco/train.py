@@ -41,8 +41,8 @@ def fit(
         progress: Called after every epoch.
         x_out: What to infer; every signal if not given.
         title: Begins the progress text.
-        resume: A file to keep the unfinished training in. If it holds this very training, begun and interrupted, it
-            goes on there and ends with the same result; it is removed when the training is done.
+        resume: A file to keep the training in. If it holds this very training, interrupted, that goes on and ends
+            with the same result; if it is finished there, nothing is trained. Whoever names it removes it.
 
     Returns:
         The schema with its held-out errors and the statistics of the normal, and how training went.
@@ -78,7 +78,6 @@ def fit(
         learner = Learner(config, network, biases, frozen, material, held)
         learner.run(progress, title, draft)
         schema = _assessed(_schema(learner, scaler, conditions), learner, conditions)
-    draft.remove()
     return schema, _history(learner, scaler, notes)
 
 
@@ -127,7 +126,6 @@ def fine_tune(
         learner = Learner(config, Network.of(schema.weights), start, frozen, material, held)
         learner.run(progress, title, draft)
         tuned = _assessed(_schema(learner, schema.scaler, fresh, schema), learner, fresh)
-    draft.remove()
     return tuned, _history(learner, Scaler.fit(schema.layout, train_data.rows()), [])
 
 
