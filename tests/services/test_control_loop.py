@@ -28,7 +28,7 @@ class Bench:
         self.sent: list[Command] = []
         freshness = Freshness(robot, lambda: self.newest, self.clock)
         self.estimation = Estimation(freshness, small_model, lambda _: None, self.clock)
-        solver = ModelSolver(LivingModel(small_model()), config, robot.command.signal)
+        solver = ModelSolver(LivingModel(small_model()), robot, config)
         self.control = Control(
             robot, config, lambda: self.newest, self.applied, self.estimation, solver, self.sent.append, self.clock
         )
