@@ -40,9 +40,13 @@ class MusashiArm:
 
     def direct(self, config: RobotConfig, variant: str, seed: int, condition: str | None = None) -> Robot:
         """The world behind no bus at all, as fast as it computes."""
+        return self.without_bus(config, self.world(variant, seed, condition))
+
+    def without_bus(self, config: RobotConfig, world: MuscleWorld) -> Robot:
+        """Likewise for a world that the caller keeps, to break parts of it on the way."""
         from simulators.direct import direct_robot
 
-        return direct_robot(config, self.world(variant, seed, condition))
+        return direct_robot(config, world)
 
 
 simulator = MusashiArm()

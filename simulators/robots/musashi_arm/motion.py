@@ -6,7 +6,7 @@ import numpy as np
 
 from hal.config import RobotConfig
 from simulators.robots.musashi_arm.body import REST
-from simulators.robots.musashi_arm.model import LEAST_TENSION, balanced_tensions, wire_lengths
+from simulators.robots.musashi_arm.model import LEAST_TENSION, MOST_TENSION, balanced_tensions, wire_lengths
 
 HIGHEST_WISH = 110.0
 """Random tensions are drawn below this, so that balancing gravity finds room above [N]."""
@@ -44,8 +44,9 @@ def random_motion(config: RobotConfig, seed: int) -> Iterator[tuple[np.ndarray, 
 def random_states(config: RobotConfig, count: int, seed: int) -> dict[str, np.ndarray]:
     """States of the geometric model, whether the arm could rest in them or not (paper, III-B, initial training).
 
-    Joint positions within the robot file's limits and tensions are drawn independently; wire lengths follow. Motion
-    alone shows only tensions that balance gravity, from which a model cannot tell what an unusual load would do.
+    Joint positions within the robot file's limits and tensions up to the highest that is ever asked for are drawn
+    independently; wire lengths follow. Motion alone shows only tensions that balance gravity, from which a model cannot
+    tell what an unusual load would do; and an arm that was built otherwise pulls harder than was asked.
 
     Returns:
         Signal -> values [its unit], shape (count, n).
@@ -53,6 +54,6 @@ def random_states(config: RobotConfig, count: int, seed: int) -> dict[str, np.nd
     random = np.random.default_rng(seed)
     low, high = config.bounds("joint_position")
     position = random.uniform(low, high, (count, 5))
-    tension = random.uniform(LEAST_TENSION, HIGHEST_WISH, (count, 10))
+    tension = random.uniform(LEAST_TENSION, MOST_TENSION, (count, 10))
     lengths = np.array([wire_lengths(q, f) for q, f in zip(position, tension, strict=True)])
     return {"joint_position": position, "muscle_tension": tension, "muscle_length": lengths}
