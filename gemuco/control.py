@@ -9,7 +9,7 @@ from gemuco.descent import DescentConfig
 from gemuco.errors import NotFinite, NotObservable, SchemaError
 from gemuco.losses import Hold, Match, StayNear, Term
 from gemuco.masks import Mask, label
-from gemuco.routes import Limits, Search, checked_mask, checked_route
+from gemuco.routes import Limits, Search, bounds_of, checked_mask, checked_route
 from gemuco.schema import BodySchema
 
 SEARCH = DescentConfig(gamma_max=0.5, candidates=10, iterations=20)
@@ -97,6 +97,7 @@ class Controller:
             )
         if self.mask is not None:
             checked_mask(schema, self.mask)
+        bounds_of(schema, self.limits)
         for term in self.terms or ():
             for name in signals_of(term):
                 schema.layout.slice(name)
@@ -150,24 +151,21 @@ class Controller:
 
     def _terms(self, target: Mapping[str, np.ndarray]) -> tuple[Term | Hold, ...]:
         """The terms, after a look at whether they and the target are about the same signals."""
-        for name, value in target.items():
+        for name in target:
             self.schema.layout.slice(name)
-            if self.terms is None and not np.isfinite(np.asarray(value, float)).all():
-                raise NotFinite(f"The target of '{name}' is not finite; every element needs a number.")
-        if self.terms is None:
-            if not target:
-                raise NotObservable("Nothing was asked: give a target, or terms with values of their own.")
-            return tuple(Match(name) for name in target)
-        minded = {name for term in self.terms for name in signals_of(term)}
-        minded |= {name for term in self.terms if (name := getattr(term, "position", "")) in target}
+        if not target and not self.terms:
+            raise NotObservable("Nothing was asked: give a target, or terms with values of their own.")
+        terms = tuple(Match(name) for name in target) if self.terms is None else self.terms
+        minded = {name for term in terms for name in signals_of(term)}
+        minded |= {name for term in terms if (name := getattr(term, "position", "")) in target}
         for name in target:
             if name not in minded:
                 known = ", ".join(sorted(minded)) or "nothing"
                 raise NotObservable(f"A target of '{name}' was given, but no term is about it; they are about {known}.")
-        for term in self.terms:
+        for term in terms:
             if isinstance(term, Match) and not np.isfinite(term.reference(target)).all():
                 raise NotFinite(f"The target of '{term.signal}' is not finite; every element needs a number.")
-        return self.terms
+        return terms
 
     def _choose(self, wishes: Sequence[Term], direct: Mask) -> tuple[str, Mask]:
         """Route and mask for what is asked; `direct` are the signals whose whole value was decided by the asker."""

@@ -100,7 +100,7 @@ class Match:
             return np.asarray(self.value, float)
         if self.signal not in target:
             raise NotObservable(f"Nothing was asked of '{self.signal}', but the loss wants to match it; give a target.")
-        return np.asarray(target[self.signal], float)
+        return _numbers(self.signal, target[self.signal])
 
     def bind(self, schema: "BodySchema", target: Values, now: Values) -> Bound:
         """See `Term.bind`; nothing is asked where the reference is NaN."""
@@ -146,7 +146,7 @@ class StayNear:
         if self.value is not None:
             return np.asarray(self.value, float)
         unknown = np.full(schema.layout.signal(self.signal).size, np.nan)
-        return np.asarray(target.get(self.signal, now.get(self.signal, unknown)), float)
+        return _numbers(self.signal, target.get(self.signal, now.get(self.signal, unknown)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,7 +198,7 @@ class Hold:
         """
         if self.value is None and self.signal not in target:
             raise NotObservable(f"'{self.signal}' shall be held, but nobody says where; give a value or a reference.")
-        value = np.asarray(self.value if self.value is not None else target[self.signal], float)
+        value = _numbers(self.signal, self.value if self.value is not None else target[self.signal])
         x = schema.normalise({self.signal: value})
         if not np.isfinite(x).any():
             raise NotFinite(f"'{self.signal}' shall be held, but no element of where is a number.")
@@ -288,6 +288,13 @@ def total(bounds: Sequence[Bound], x: np.ndarray, slope: bool = True) -> tuple[n
         loss = loss + part
         gradient = gradient + way
     return loss, gradient
+
+
+def _numbers(signal: str, value: object) -> np.ndarray:
+    try:
+        return np.asarray(value, float)
+    except (TypeError, ValueError):
+        raise WrongSize(f"The reference of '{signal}' needs numbers; what was given are none.") from None
 
 
 def check_weight(weight: float, what: str) -> None:

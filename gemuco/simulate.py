@@ -10,7 +10,7 @@ from gemuco.descent import DescentConfig
 from gemuco.errors import NotFinite, NotObservable, SchemaError
 from gemuco.losses import Hold, Match, Term
 from gemuco.masks import Mask, best, label
-from gemuco.routes import Limits, Search, checked_mask, checked_route
+from gemuco.routes import Limits, Search, bounds_of, checked_mask, checked_route
 from gemuco.schema import BodySchema
 
 SEARCH = DescentConfig(gamma_max=0.5, candidates=12, iterations=30)
@@ -82,6 +82,7 @@ class Simulator:
                 raise SchemaError(f"A mask goes with route mask or input, not with '{route}'.")
         if command not in (*schema.x_in, *schema.x_out):
             raise NotObservable(f"'{command}' is commanded, but this schema neither infers nor takes it.")
+        bounds_of(schema, self.limits)
         self.terms: tuple[Term | Hold, ...] = ()
         self.constrain(terms)
 

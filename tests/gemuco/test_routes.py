@@ -161,3 +161,9 @@ def test_says_what_is_wrong(simple, full):
         full.control(tip, command=COMMAND, terms=(Match(TIP, matrix=((1.0,),)),))
     with pytest.raises(SchemaError, match="gamma_max > 0"):
         DescentConfig(gamma_max=float("nan"))
+    with pytest.raises(WrongSize, match="needs numbers"):
+        full.control({TIP: ["far", "away"]}, command=COMMAND)
+    with pytest.raises(UnknownSignal, match="Known signals"):
+        full.control(tip, command=COMMAND, limits={"tip": (np.zeros(2), np.ones(2))})
+    with pytest.raises(WrongSize, match="has 3 elements"):
+        full.control(tip, command=COMMAND, limits={COMMAND: (np.zeros(2), np.ones(2))})

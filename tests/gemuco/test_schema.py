@@ -1,0 +1,31 @@
+"""The body schema as the face of it all, on plain arrays."""
+
+import numpy as np
+
+from gemuco.schema import BodySchema
+from gemuco.train import TrainConfig
+
+LENGTH, TENSION, POSITION = "muscle_length", "muscle_tension", "joint_position"
+
+
+def test_every_verb_from_arrays_to_a_stored_body(arm, data, tmp_path):
+    config = TrainConfig(hidden=(60, 20), latent=7, epochs=40, batch=100)
+    body = BodySchema.fit(data, config)  # structure determined on the way
+    assert frozenset({TENSION, LENGTH}) in body.masks
+    sample = {name: rows[0] for name, rows in arm.sample(1, 9).items()}
+
+    estimate = body.estimate({name: sample[name] for name in (LENGTH, TENSION)})[POSITION]
+    assert np.linalg.norm(estimate.value - sample[POSITION]) < 0.3  # rad
+    solution = body.control({POSITION: sample[POSITION], TENSION: sample[TENSION]}, sample, command=LENGTH)
+    assert solution.route == "mask"
+    assert np.abs(solution.command - sample[LENGTH]).max() < 0.01  # m
+    (state,) = body.simulate([sample[LENGTH]], command=LENGTH, route="input", mask=frozenset({POSITION, TENSION}))
+    assert np.abs(state.values[LENGTH] - sample[LENGTH]).max() < 0.02  # m
+    assert not body.anomaly(sample).is_anomaly
+
+    lived = arm.sample(40, 11)
+    wiser = body.adapt({name: rows[i] for name, rows in lived.items()} for i in range(40))
+    assert wiser is not body
+    wiser.save(tmp_path)
+    again = BodySchema.load(tmp_path)
+    np.testing.assert_array_equal(again.estimate(sample)[POSITION].value, wiser.estimate(sample)[POSITION].value)
