@@ -3,6 +3,7 @@
 import hashlib
 import json
 from collections.abc import Mapping
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,7 +31,7 @@ SCALES = ("mean", "std", "low", "high", "dead")
 
 
 def save(schema: "BodySchema", folder: Path) -> None:
-    """Write both files; the manifest comes last and names the arrays' hash, so a torn write is noticed."""
+    """Write both files; the manifest comes last with the hash of the arrays and its own, so any damage is noticed."""
     folder.mkdir(parents=True, exist_ok=True)
     data = save_tensors({name: np.ascontiguousarray(array) for name, array in _tensors(schema).items()})
     head = {
@@ -56,7 +57,14 @@ def save(schema: "BodySchema", folder: Path) -> None:
         "tensors": {"file": TENSORS, "sha256": hashlib.sha256(data).hexdigest()},
     }
     _replace(folder / TENSORS, data)
-    _replace(folder / MANIFEST, json.dumps(head, indent=2).encode())
+    _replace(folder / MANIFEST, json.dumps(signed(head), indent=2).encode())
+
+
+def signed(head: Mapping[str, Any]) -> dict[str, Any]:
+    """The manifest with the hash of all its other entries."""
+    rest = {name: value for name, value in head.items() if name != "sha256"}
+    text = json.dumps(rest, sort_keys=True)
+    return {**rest, "sha256": hashlib.sha256(text.encode()).hexdigest()}
 
 
 def _replace(path: Path, data: bytes) -> None:
@@ -96,7 +104,7 @@ def load(folder: Path) -> "BodySchema":
     try:
         if hashlib.sha256(data).hexdigest() != head["tensors"]["sha256"]:
             raise CheckpointError(f"{TENSORS} in '{folder}' is not the one its manifest describes; train it again.")
-        return _schema(head, load_tensors(data))
+        return _sound(_schema(head, load_tensors(data)))
     except CheckpointError:
         raise
     except (KeyError, TypeError, ValueError, AttributeError, IndexError, SafetensorError, SchemaError) as error:
@@ -124,6 +132,8 @@ def _manifest(folder: Path) -> dict[str, Any]:
         raise CheckpointError(
             f"The model in '{folder}' has version {version!r}; this gemuco reads {VERSION}: {advice}."
         )
+    if signed(head) != head:
+        raise CheckpointError(f"'{path}' is damaged: it is not as it was written; train the model again.")
     return head
 
 
@@ -166,3 +176,37 @@ def _chain(head: Mapping[str, Any], tensors: Mapping[str, np.ndarray], part: str
 
 def _activation(name: Any) -> str:
     return LINEAR if name == LINEAR else check(name)
+
+
+def _sound(schema: "BodySchema") -> "BodySchema":
+    """The schema, if its arrays fit each other.
+
+    Raises:
+        ValueError: They do not.
+    """
+    size, outputs, p = schema.layout.size, len(schema.out_index), len(schema.bias)
+    wanted: list[tuple[str, np.ndarray, tuple[int, ...]]] = [
+        *((f"scaler.{name}", getattr(schema.scaler, name), (size,)) for name in SCALES[:-1]),
+        *((f"p of '{condition}'", array, (p,)) for condition, array in schema.biases.items()),
+        *((f"error of {method}", array, (outputs,)) for (method, _), array in schema.errors.items()),
+        ("anchor_conditions", schema.anchor_conditions, (len(schema.anchors) if schema.biases else 0,)),
+    ]
+    if len(schema.anchors):
+        wanted.append(("anchors", schema.anchors, (len(schema.anchors), size)))
+    if schema.normal is not None:
+        wanted.append(("normal.mean", schema.normal.mean, (outputs,)))
+        wanted.append(("normal.covariance", schema.normal.covariance, (outputs, outputs)))
+    for before, layer in pairwise(schema.weights.whole):
+        wanted.append(("layer", layer.matrix, (len(before.offset), len(layer.offset))))
+    for name, array, shape in wanted:
+        if array.shape != shape:
+            raise ValueError(f"array {name} has shape {array.shape} in place of {shape}")
+    for name, index, count in (
+        ("scaler.dead", schema.scaler.dead, size),
+        ("anchor_conditions", schema.anchor_conditions, len(schema.biases)),
+    ):
+        if len(index) and not (index.min() >= 0 and index.max() < count):
+            raise ValueError(f"array {name} points beyond {count} entries")
+    if (schema.scaler.std <= 0).any():
+        raise ValueError("array scaler.std is not positive")
+    return schema

@@ -1,3 +1,4 @@
+import contextlib
 import json
 import subprocess
 import sys
@@ -5,7 +6,8 @@ import sys
 import numpy as np
 import pytest
 
-from gemuco.errors import CheckpointError
+from gemuco import checkpoint
+from gemuco.errors import CheckpointError, NotObservable
 from gemuco.schema import BodySchema
 
 
@@ -44,7 +46,7 @@ def change(folder, **entries):
             del head[key]
         else:
             head[key] = value
-    path.write_text(json.dumps(head))
+    path.write_text(json.dumps(checkpoint.signed(head)))
 
 
 def break_tensor(folder):
@@ -87,3 +89,75 @@ def test_the_service_side_never_loads_torch():
     modules = "schema, adapt, control, losses, dataset, estimate, anomaly, checkpoint, signals, masks, scaler, descent"
     code = f"import sys; from gemuco import {modules}; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def usable(again, arm):
+    """Everything that a service asks of a schema runs and stays finite."""
+    values = {name: array[0] for name, array in arm.sample(1, 3).items()}
+    values.pop("joint_position")
+    for found in again.estimate(values).values():
+        assert np.isfinite(found.value).all()
+    for condition in again.biases:
+        again.under(condition)
+    again.anomaly(values)
+
+
+@pytest.mark.parametrize("name", ["manifest.json", "model.safetensors"])
+def test_whatever_happens_to_a_byte_is_noticed_or_harmless(schema, arm, folder, name):
+    random = np.random.default_rng(4)
+    sound = (folder / name).read_bytes()
+    noticed = 0
+    for trial in range(150):
+        data = bytearray(sound)
+        kind = trial % 3
+        where = int(random.integers(len(data)))
+        if kind == 0:
+            data[where] ^= 1 << int(random.integers(8))
+        elif kind == 1:
+            del data[where : where + int(random.integers(1, 40))]
+        else:
+            data[where:where] = random.bytes(int(random.integers(1, 20)))
+        (folder / name).write_bytes(data)
+        try:
+            again = BodySchema.load(folder)
+        except CheckpointError as error:
+            noticed += 1
+            assert "\n" not in str(error)
+        else:
+            usable(again, arm)
+            assert again.layout == schema.layout
+    assert noticed > 140
+
+
+JUNK = [None, -1, 3, 0.5, "", "wire", "tanh", [], ["wire"], [["mask", "wire"]], {}, {"a": 1}, True]
+
+
+def places(node, path=()):
+    """Every place in a JSON value that can hold something else."""
+    items = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ()
+    for key, value in items:
+        yield (*path, key)
+        yield from places(value, (*path, key))
+
+
+def test_a_manifest_of_nonsense_is_noticed_or_harmless(arm, folder):
+    path = folder / "manifest.json"
+    sound = path.read_text()
+    found = [place for place in places(json.loads(sound)) if place[0] not in ("facts", "sha256")]
+    random = np.random.default_rng(5)
+    for trial in range(300):
+        head = json.loads(sound)
+        place = found[trial % len(found)]
+        node = head
+        for key in place[:-1]:
+            node = node[key]
+        node[place[-1]] = JUNK[random.integers(len(JUNK))]
+        path.write_text(json.dumps(checkpoint.signed(head)))
+        try:
+            again = BodySchema.load(folder)
+        except CheckpointError as error:
+            assert "\n" not in str(error)
+        else:
+            with contextlib.suppress(NotObservable):
+                values = {name: value[0] for name, value in arm.sample(1, 3).items() if name in again.layout.names}
+                again.estimate(values)
