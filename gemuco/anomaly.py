@@ -43,8 +43,15 @@ def prediction_error(schema: "BodySchema", values: Mapping[str, np.ndarray]) -> 
     return prediction_errors(schema, schema.normalise(values))
 
 
-def score(schema: "BodySchema", values: Mapping[str, np.ndarray]) -> AnomalyScore:
-    """How unlike normal a sample is; see `BodySchema.anomaly`."""
+def score(schema: "BodySchema", values: Mapping[str, np.ndarray], blame: bool = True) -> AnomalyScore:
+    """How unlike normal a sample is; see `BodySchema.anomaly`.
+
+    Args:
+        schema: With statistics of the normal.
+        values: Signal -> measured array [its unit], shape (n,).
+        blame: Whether to find what is most likely wrong, which costs many times the score; else the element that
+            contributes most is named.
+    """
     x = schema.normalise(values)
     if schema.normal is None:
         unknown = np.full(schema.out_layout.size, np.nan)
@@ -52,7 +59,7 @@ def score(schema: "BodySchema", values: Mapping[str, np.ndarray]) -> AnomalyScor
     distance, contribution, judged = schema.normal.distance(prediction_errors(schema, x))
     threshold = float(schema.normal.threshold_of(judged))
     blamed = ""
-    if distance > threshold:  # hypotheses cost more than the score itself
+    if blame and distance > threshold:
         blamed = suspects(schema, x[None])[0].name
     elif judged:
         blamed = schema.out_layout.element(int(np.nanargmax(contribution)))

@@ -44,6 +44,8 @@ SETTLED = 0.3
 """p is settled when its standard deviation is below this share of the prior's in every direction."""
 RECENT = 20
 """Samples that Gauss-Newton looks at."""
+FEW = 3
+"""Newest samples by which Gauss-Newton chooses among the trained p where to begin."""
 FADE = 0.9
 """Weight of a sample against the one after it, for Gauss-Newton."""
 
@@ -270,12 +272,13 @@ def solve(
     groups = [(innovations.pairs(finite[index[0]]), index) for index in patterns]
     precision = np.linalg.inv(prior.covariance)
 
-    def normal(bias: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-        """Cost, gradient and curvature."""
+    def fit(bias: np.ndarray, newest: int) -> tuple[float, np.ndarray, np.ndarray]:
+        """Cost, gradient and curvature over the newest samples."""
         away = bias - prior.mean
         cost, gradient, curvature = float(away @ precision @ away), precision @ away, precision.copy()
-        for pairs, index in groups:
-            if len(pairs.index):
+        for pairs, everything in groups:
+            index = everything[everything < newest]
+            if len(pairs.index) and len(index):
                 biases = np.repeat(bias[None], len(index), axis=0).astype(np.float32)
                 error, slope = innovations.of(schema, pairs, rows[index], biases)
                 weight = fade**index
@@ -284,12 +287,12 @@ def solve(
                 curvature += np.einsum("i,ijk,ijl->kl", weight, slope, slope)
         return cost, gradient, curvature
 
-    best = min((start, *prior.known), key=lambda bias: normal(bias)[0])
-    cost, gradient, curvature = normal(best)
+    best = min((start, *prior.known), key=lambda bias: fit(bias, FEW)[0])
+    cost, gradient, curvature = fit(best, len(rows))
     damping = 0.0
     for _ in range(iterations):
         step = np.linalg.solve(curvature + damping * np.diag(np.diag(curvature)), -gradient)
-        tried = normal(best + step)
+        tried = fit(best + step, len(rows))
         if tried[0] < cost:
             is_done = cost - tried[0] < 1e-3
             best, (cost, gradient, curvature), damping = best + step, tried, 0.3 * damping

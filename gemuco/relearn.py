@@ -18,6 +18,8 @@ JUDGED = 60
 """Held-out samples that W is judged by, the newest."""
 JUDGE_EVERY = 5
 """Calls of `step` between two judgements."""
+RECOVERY = 1.2
+"""By how much the learning rate grows with every better W, after it was halved."""
 WORSE = 1.1
 """W goes back when its held-out squared error exceeds that of the best W so far by this factor."""
 
@@ -26,7 +28,7 @@ class Relearner:
     """Learns from a window, from constraints and from the training data of other conditions.
 
     Every `held_out`-th sample only judges. W goes back to the best one so far when it foretells those samples worse,
-    and its learning rate is halved until the body changes.
+    and its learning rate is halved until it does well again.
 
     Args:
         schema: Where to begin.
@@ -137,6 +139,7 @@ class Relearner:
         before = mean_error(best, rows)
         if self.held_out <= before:
             self._best = schema.weights
+            self._optimiser.rate = min(self._config.rate, RECOVERY * self._optimiser.rate)
         elif self.held_out > WORSE * before:
             rate = 0.5 * self._optimiser.rate
             self._arrays = [array.copy() for array in self._best.arrays()]

@@ -182,7 +182,7 @@ class GemucoService:
 
     def _learner(self, schema: BodySchema) -> adapt.Updater:
         config = self.config.update
-        return adapt.Updater(schema, adapt.UpdateConfig(window=config.window, rate=config.rate))
+        return adapt.Updater(schema, adapt.UpdateConfig(**config.model_dump(exclude={"interval"})))
 
     def _make_control(self, config: ModelConfig) -> tuple[Control | None, str]:
         """The controller, or why there is none."""

@@ -142,9 +142,11 @@ class Anomaly(Message):
         cycle: `Sample.cycle` it was made from.
         score: Mahalanobis distance (paper, II-K) of the prediction error; NaN without normal data.
         threshold: Score above which it counts as an anomaly.
-        is_anomaly: Score above threshold for as long as the robot file asks.
-        blamed: `signal.element` whose repair makes the sample most normal; below the threshold, the one that
+        is_anomaly: Score above threshold for as long as the robot file asks, and not for a change of environment.
+        blamed: `signal.element` that is most likely wrong over the samples above the threshold; below it, the one that
             contributes most.
+        verdict: `normal`, `environment` (another condition of the body explains the samples above the threshold),
+            `anomaly` (none does), or empty while there is nothing to judge.
         contribution: Signal -> each element's part of score^2, shape (n,).
     """
 
@@ -155,6 +157,7 @@ class Anomaly(Message):
     is_anomaly: bool
     blamed: str
     contribution: Arrays
+    verdict: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -167,6 +170,9 @@ class Update(Message):
         window: Samples in the bounded window.
         dropped: Oldest samples dropped so far.
         loss: Mean squared error over the window, in standard deviations of the training data.
+        bias: The parametric bias p in use, shape (n,); empty without.
+        settled: Whether p is well known, so that W may follow.
+        rolled_back: How often W went back because it did worse on held-out samples.
     """
 
     TYPE: ClassVar[str] = "update"
@@ -175,6 +181,9 @@ class Update(Message):
     window: int
     dropped: int
     loss: float
+    bias: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    settled: bool = True
+    rolled_back: int = 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

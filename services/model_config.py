@@ -58,14 +58,28 @@ class TrainingConfig(Section):
 
 
 class UpdateConfig(Section):
-    """The online update of W from a bounded window."""
+    """The online update of p and W from a bounded window; see `gemuco.adapt.UpdateConfig`."""
 
+    what: Literal["weights", "bias", "both", "bias_then_weights"] = "bias_then_weights"
+    """Without parametric bias, W alone is updated."""
+    bias_method: Literal["ekf", "gauss_newton", "gradient"] = "ekf"
     window: Count = 6000
     """Samples kept; the oldest is dropped."""
+    minimum: Count = 10
+    """Samples before the first gradient step."""
     interval: Positive = 0.1
     """Least time [s] between two samples of the window, so that it spans some motion."""
-    rate: Positive = 1e-3
-    """Learning rate."""
+    steps: Count = 3
+    """Gradient steps per tick of the update loop."""
+    rate: Positive = 1e-4
+    """Learning rate of W."""
+    bias_rate: Positive = 0.02
+    """Learning rate of p, by gradient."""
+    optimiser: Literal["adam", "sgd"] = "adam"
+    replay: Annotated[int, Field(ge=0)] = 300
+    """As how many samples of the window the training data counts."""
+    held_out: Annotated[int, Field(ge=0)] = 5
+    """Every so many-th sample only judges W; 0 none."""
 
 
 class AnomalyConfig(Section):

@@ -118,6 +118,8 @@ def _anomaly(client: Client) -> Text:
     if anomaly is None or not math.isfinite(anomaly.score):
         return Text("anomaly: not judged")
     text = f"anomaly: score {anomaly.score:.1f}, threshold {anomaly.threshold:.1f}"
+    if anomaly.verdict == "environment":
+        return Text(f"{text}: ENVIRONMENT CHANGED, another condition of the body explains it", style="bold yellow")
     if anomaly.is_anomaly:
         return Text(f"{text}: ANOMALY, most of it in {anomaly.blamed}", style="bold red")
     return Text(text, style="green")
@@ -127,8 +129,11 @@ def _update(client: Client) -> Text:
     update = client.update()
     if update is None:
         return Text("update: not heard of")
-    state = "learning" if update.active else "resting"
-    return Text(f"update: {state}, model {update.model_version}, window {update.window}, loss {update.loss:.4f}")
+    state = "resting" if not update.active else "learning" if update.settled else "recognising"
+    text = f"update: {state}, model {update.model_version}, window {update.window}, loss {update.loss:.4f}"
+    if len(update.bias):
+        text += f", p {_numbers(update.bias, np.zeros(len(update.bias), bool))}"
+    return Text(f"{text}, W rolled back {update.rolled_back} times" if update.rolled_back else text)
 
 
 def _word(word: str) -> Text:

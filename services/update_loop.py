@@ -1,4 +1,4 @@
-"""The update loop: W learns online from a bounded window, and every model it accepts is swapped in whole."""
+"""The update loop: p and W learn online from a bounded window, and every model they make is swapped in whole."""
 
 import math
 import threading
@@ -23,7 +23,7 @@ that rests would fill it with one posture."""
 
 
 class Learner(Protocol):
-    """An updater of W with a window of its own (`gemuco.adapt.Updater`)."""
+    """An updater of p and W with a window of its own (`gemuco.adapt.Updater`)."""
 
     schema: BodySchema
 
@@ -32,7 +32,7 @@ class Learner(Protocol):
         ...
 
     def step(self) -> Any:
-        """Learn a little; the result has `loss`, `window` and `dropped`."""
+        """Learn a little; the result is `gemuco.adapt.UpdateResult`."""
         ...
 
 
@@ -69,7 +69,7 @@ class OnlineUpdate:
 
     @property
     def is_active(self) -> bool:
-        """Whether W is being updated."""
+        """Whether p and W are being updated."""
         return self._learner is not None
 
     def adapt(self, active: bool) -> None:
@@ -122,6 +122,8 @@ class OnlineUpdate:
                     window=len(self._since_change),
                     dropped=0,
                     loss=self._told.loss,
+                    bias=np.asarray(self._living.schema.bias, float),
+                    rolled_back=self._told.rolled_back,
                 )
             else:
                 told = self._learn(self._learner, sample if moved else None)
@@ -157,4 +159,7 @@ class OnlineUpdate:
             window=int(result.window),
             dropped=int(result.dropped),
             loss=float(result.loss),
+            bias=np.asarray(result.bias, float),
+            settled=bool(result.settled),
+            rolled_back=int(result.rolled_back),
         )

@@ -29,7 +29,7 @@ def test_shipped_sections_are_understood() -> None:
         (
             "model",
             {"update": {"windows": 3}},
-            "unknown key 'update.windows'. Known keys there: window, interval, rate.",
+            "unknown key 'update.windows'. Known keys there: what, bias_method, window",
         ),
         ("model", {"update": {"window": 0}}, "update.window: Input should be greater than or equal to 1"),
         (
