@@ -142,11 +142,23 @@ class Structure:
         return "\n".join(lines)
 
 
-class _Judge:
-    """Errors of masks compared with the thresholds."""
+class Judge:
+    """Errors of masks compared with the thresholds.
+
+    Args:
+        names: Of the signals.
+        errors: One per split of the data.
+        thresholds: What is small enough.
+
+    Attributes:
+        L_i: Signal -> error when inferred from all others.
+        outputs: Which signals can be inferred, truth values, shape (signals,).
+        tried: How many masks the search has asked for.
+    """
 
     def __init__(self, names: tuple[str, ...], errors: tuple[MaskErrors, ...], thresholds: Thresholds) -> None:
         self.names, self.errors, self.thresholds = names, errors, thresholds
+        self.tried = 0
         rows = [split.thinned(ROWS) for split in errors]
         self.L_i = {
             name: self._measured(float(np.mean([split.from_others(i) for split in rows])))
@@ -210,7 +222,7 @@ def determine(
             if names
             else "There is no signal; structure determination needs at least two."
         )
-    judge = _Judge(names, _trained(dataset, config, splits, progress, drafts), thresholds)
+    judge = Judge(names, train_masks(dataset, config, splits, progress, drafts), thresholds)
     if not judge.outputs.any():
         least = min(judge.L_i, key=lambda name: judge.L_i[name])
         raise NotEnoughData(
@@ -220,7 +232,17 @@ def determine(
     if len(names) <= LISTED:
         tried, is_whole = np.array([bits(m, names) > 0 for m in all_masks(names)]), True
     else:
-        tried, is_whole = _searched(judge, config.seed)
+        tried, is_whole = search(judge, config.seed)
+    return select(dataset.layout, judge, tried, is_whole, config.seed)
+
+
+def select(layout: Layout, judge: Judge, tried: np.ndarray, is_whole: bool, seed: int) -> Structure:
+    """Measure masks, shape (n, signals), and keep those that are enough.
+
+    Raises:
+        NotEnoughData: None is.
+    """
+    names, thresholds = layout.names, judge.thresholds
     tried = tried[judge.is_judged(tried)]
     L_m, squared = judge.of(tried)
     feasible = L_m < thresholds.into
@@ -230,11 +252,11 @@ def determine(
             f"{L_m.min():.3f}, threshold_in {thresholds.into:g}; collect more data or raise the threshold."
         )
     kept = np.flatnonzero(feasible)
-    kept = kept[choose(tried[kept], squared[kept], judge.outputs, MOST_MASKS, config.seed)]
+    kept = kept[choose(tried[kept], squared[kept], judge.outputs, MOST_MASKS, seed)]
     kept = kept[np.argsort(L_m[kept], kind="stable")]
     masks = tuple(frozenset(_named(names, line)) for line in tried[kept])
     return Structure(
-        layout=dataset.layout,
+        layout=layout,
         x_in=_named(names, tried[kept].any(axis=0)),
         x_out=_named(names, judge.outputs),
         masks=masks,
@@ -245,8 +267,12 @@ def determine(
     )
 
 
-def _trained(
-    dataset: Dataset, config: TrainConfig, splits: int, progress: Progress | None, drafts: Path | None
+def train_masks(
+    dataset: Dataset,
+    config: TrainConfig,
+    splits: int = 1,
+    progress: Progress | None = None,
+    drafts: Path | None = None,
 ) -> tuple[MaskErrors, ...]:
     """One network per split, and what it makes of masks on the episodes that it did not see."""
     found: list[MaskErrors] = []
@@ -291,11 +317,12 @@ def _training_masks(names: tuple[str, ...], seed: int) -> tuple[Mask, ...]:
     return tuple(dict.fromkeys(frozenset(_named(names, line)) for line in np.concatenate([others, drawn])))
 
 
-def _searched(judge: _Judge, seed: int) -> tuple[np.ndarray, bool]:
+def search(judge: Judge, seed: int) -> tuple[np.ndarray, bool]:
     """The masks that the search found to be enough, to be measured on all rows; and whether it came to an end."""
     enough: list[np.ndarray] = []
 
     def is_enough(masks: np.ndarray) -> np.ndarray:
+        judge.tried += len(masks)
         found = ~judge.is_judged(masks)  # what leaves nothing to infer is enough
         found[~found] = judge.of(masks[~found], SEARCH_ROWS)[0] < judge.thresholds.into
         enough.append(masks[found])
