@@ -1,4 +1,4 @@
-"""The arm's body schema: learned from its designer's geometry, then from the motion of an arm that was built otherwise."""
+"""The body schema of the arm: learned from its design, then from the motion of an arm that was built otherwise."""
 
 from dataclasses import dataclass
 
@@ -66,7 +66,7 @@ class Learned:
 def learn(robot: RobotConfig, schema: BodySchema, lived: Dataset, seed: int) -> Learned:
     """Live through a recording with the online update of the robot file."""
     config = model_config(robot).update
-    updater = Updater(schema, UpdateConfig(what="weights", window=config.window, rate=config.rate, seed=seed))
+    updater = Updater(schema, UpdateConfig(**config.model_dump(exclude={"interval"}), seed=seed))
     errors = []
     for row in lived.rows()[:, : schema.layout.size]:
         errors.append(float(joint_errors(updater.schema, row[None])[0]))

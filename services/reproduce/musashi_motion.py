@@ -1,4 +1,4 @@
-"""One arm that was built differently from its design: moved at random or to targets, recorded, and broken on the way."""
+"""One arm that was built otherwise than designed: moved at random or to targets, recorded, and broken on the way."""
 
 from collections.abc import Iterator, Sequence
 from types import TracebackType

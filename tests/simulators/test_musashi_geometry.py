@@ -7,9 +7,9 @@ import pybullet
 import pytest
 
 from hal.config import load_robot
-from simulators.robots.musashi_arm import gravity_torque
+from simulators.robots.musashi_arm import force_torque, gravity_torque
 from simulators.robots.musashi_arm.body import make_body
-from simulators.robots.musashi_arm.model import ROUTES, URDF, chain
+from simulators.robots.musashi_arm.model import HAND, RADIUS, ROUTES, URDF, chain
 
 CONFIG = load_robot(URDF.parents[3] / "robots" / "musashi_arm.yaml")
 FOURS = np.array(list(combinations(range(10), 4)))
@@ -47,6 +47,17 @@ def test_gravity_torque_is_pybullets_inverse_dynamics(loaded):
         still = [0.0] * 5
         torque = pybullet.calculateInverseDynamics(body, position.tolist(), still, still, physicsClientId=client)
         assert gravity_torque(position) == pytest.approx(torque, abs=1e-6)
+
+
+def test_a_force_on_the_hand_turns_the_joints_as_virtual_work_says():
+    force, step = np.array([5.0, -20.0, 30.0]), 1e-6
+    position = postures(1, 2)[0]
+
+    def hand(q):
+        return chain().pose(q).points(np.array([RADIUS]), HAND[None])[0]
+
+    turned = [(hand(position + step * e) - hand(position - step * e)) / (2 * step) @ force for e in np.eye(5)]
+    assert force_torque(position, force) == pytest.approx(turned, abs=1e-5)
 
 
 def test_the_robot_file_stays_inside_the_mechanical_stops():

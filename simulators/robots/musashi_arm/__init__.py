@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from simulators.faults import check_condition
 from simulators.robots.musashi_arm.body import VARIANTS, make_body
 from simulators.robots.musashi_arm.hardware import hardware
-from simulators.robots.musashi_arm.model import gravity_torque
+from simulators.robots.musashi_arm.model import force_torque, gravity_torque
 from simulators.robots.musashi_arm.motion import random_motion, random_states
 
 if TYPE_CHECKING:
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from simulators.muscle_world import MuscleWorld
     from simulators.rig import Rig
 
-__all__ = ["MusashiArm", "gravity_torque", "hardware", "random_motion", "random_states", "simulator"]
+__all__ = ["MusashiArm", "force_torque", "gravity_torque", "hardware", "random_motion", "random_states", "simulator"]
 
 
 class MusashiArm:

@@ -19,6 +19,9 @@ TORSO, UPPER_ARM, ULNA, RADIUS = 0, 3, 4, 5
 LEAST_TENSION, MOST_TENSION = 10.0, 180.0
 """Tensions that are ever asked for [N]."""
 
+HAND = np.array([0.0, 0.0, -0.25])
+"""Where the hand ends, in the frame of the last link [m]."""
+
 ROUTES: dict[str, tuple[Via, ...]] = {
     "deltoid_front": (Via(TORSO, 0.038, 0.005, 0.03), Via(UPPER_ARM, 0.029, -0.004, -0.129)),
     "deltoid_side": (
@@ -72,6 +75,14 @@ def designed_elastic() -> Elastic:
 def gravity_torque(position: np.ndarray) -> np.ndarray:
     """Joint torques [N m] that hold the arm's own weight at joint positions [rad]; shapes (5,)."""
     return chain().gravity_torque(np.asarray(position, float))
+
+
+def force_torque(position: np.ndarray, force: np.ndarray) -> np.ndarray:
+    """Joint torques J^T F [N m], shape (5,), that a force [N] on the hand, shape (3,), exerts at joint positions [rad]."""
+    pose = chain().pose(np.asarray(position, float))
+    hand = pose.points(np.array([RADIUS]), HAND[None])[0]
+    wrench = np.concatenate([force, np.cross(hand, force)])
+    return np.asarray(chain().moves[RADIUS] * (wrench @ pose.screws()))
 
 
 def wire_lengths(position: np.ndarray, tension: np.ndarray) -> np.ndarray:

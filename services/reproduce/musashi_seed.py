@@ -1,0 +1,141 @@
+"""All Musashi experiments of one seed: one training, one actual arm."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from gemuco.dataset import Dataset
+from gemuco.schema import BodySchema
+from gemuco.structure import Structure
+from hal.config import RobotConfig
+from services.reproduce import musashi_anomaly as anomaly
+from services.reproduce import musashi_control as control
+from services.reproduce import musashi_model as model
+from services.reproduce import musashi_simulation as simulation
+from services.reproduce.musashi_motion import TENSION, record
+from services.reproduce.runs import Run, open_run
+
+LIVED, NORMAL, FRESH, CUT = 600.0, 240.0, 120.0, 30.0
+"""Lengths of recordings [s]: learned from, what is normal, judged, and with a cut muscle."""
+STORY = (60.0, 120.0, 180.0)
+"""Figure (b): until when the arm is healthy, carries the heavy object, and lacks a muscle [s]."""
+STORY_MUSCLE = "biceps"
+STARTS = {control.OURS: control.STARTS, control.WEIGHTS: 1}
+"""How many starts per target are tried."""
+BEFORE, AFTER = "before", "after"
+HEAVY = ((0.0, "heavy_object"),)
+
+Pair = Mapping[str, np.ndarray]
+"""`before` and `after` the online update -> values."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What was measured.
+
+    Attributes:
+        seed: Of training and arm.
+        structure: What structure determination found on the geometric data.
+        time: Of every sample of the online update [s], shape (n,).
+        learning: Error of the estimate before each was learned from [rad], shape (n,).
+        unchanged: Errors of the model as trained on the same samples [rad], shape (n,).
+        fresh: Errors of the estimate on fresh random motion [rad].
+        heavy: The same with a heavy object in the hand [rad].
+        areas: Muscle -> area under the ROC curve of its cut, before and after.
+        story: Errors of the estimate [rad] while the arm is healthy, loaded, and cut.
+        scores: Anomaly scores then.
+        threshold: Of the scores after the update.
+        control: Way -> errors [rad], shape (targets, starts), before and after.
+        courses: Loss -> simulated motion, before and after.
+        forced: Figure (f), after the update; see `musashi_simulation.forced`.
+    """
+
+    seed: int
+    structure: Structure
+    time: np.ndarray
+    learning: np.ndarray
+    unchanged: np.ndarray
+    fresh: Pair
+    heavy: Pair
+    areas: Mapping[str, Mapping[str, float]]
+    story: Pair
+    scores: Pair
+    threshold: float
+    control: Mapping[str, Pair]
+    courses: Mapping[str, Mapping[str, simulation.Course]]
+    forced: Mapping[str, Mapping[str, np.ndarray]]
+
+
+def run_seed(robot: RobotConfig, seed: int, folder: Path, fresh: bool) -> Outcome:
+    """Train, move the actual arm, learn from it and use what was learned."""
+    run = open_run(robot, folder, seed, fresh)
+    data = run.dataset("geometric", lambda: model.geometric_data(robot, seed))
+    structure = model.determine(robot, data, seed)
+    before = run.schema(BEFORE, lambda: model.train(robot, data, structure.masks, seed))
+    lived = _recorded(run, "lived", 100, LIVED)
+    learned = model.learn(robot, before, lived, seed)
+    normal = _recorded(run, "normal", 200, NORMAL)
+    schemas = {
+        BEFORE: anomaly.with_normal(before, normal),
+        AFTER: anomaly.with_normal(learned.schema, normal),
+    }
+    motion, loaded = _recorded(run, "fresh", 300, FRESH), _recorded(run, "heavy", 400, FRESH, HEAVY)
+    story = _story(run)
+    cut = _cuts(run)
+
+    def both(measure: Callable[[BodySchema, Dataset], np.ndarray], recording: Dataset) -> dict[str, np.ndarray]:
+        return {name: measure(schema, recording) for name, schema in schemas.items()}
+
+    return Outcome(
+        seed=seed,
+        structure=structure,
+        time=learned.time,
+        learning=learned.errors,
+        unchanged=model.recorded_errors(before, lived),
+        fresh=both(model.recorded_errors, motion),
+        heavy=both(model.recorded_errors, loaded),
+        areas={name: anomaly.areas(schema, [motion, loaded], cut) for name, schema in schemas.items()},
+        story=both(model.recorded_errors, story),
+        scores=both(anomaly.scores, story),
+        threshold=getattr(schemas[AFTER].normal, "threshold", float("nan")),
+        control={
+            name: {which: control.errors(robot, schema, seed, way, STARTS[name]) for which, schema in schemas.items()}
+            for name, way in control.ways(robot).items()
+        },
+        courses={
+            name: {which: simulation.simulate(robot, schema, motion, terms) for which, schema in schemas.items()}
+            for name, terms in simulation.losses(robot).items()
+        },
+        forced=simulation.forced(robot, schemas[AFTER]),
+    )
+
+
+def _recorded(run: Run, name: str, motion: int, duration: float, parts: tuple[tuple[float, str], ...] = ()) -> Dataset:
+    """Random motion of the run's arm; every name has a motion of its own."""
+    seed = 1000 * motion + run.seed
+    broken = [list(part) for part in parts]
+    return run.dataset(
+        name,
+        lambda: record(run.robot, run.seed, seed, duration, parts),
+        motion=seed,
+        duration=duration,
+        broken=broken,
+    )
+
+
+def _story(run: Run) -> Dataset:
+    healthy, loaded, end = STORY
+    parts = ((healthy, "heavy_object"), (loaded, f"muscle_cut:{STORY_MUSCLE}"))
+    return _recorded(run, "story", 500, end, parts)
+
+
+def _cuts(run: Run) -> dict[str, Dataset]:
+    """Muscle -> motion after it was cut."""
+    found = {}
+    for index, muscle in enumerate(run.robot.signals[TENSION].elements):
+        parts = ((anomaly.CUT_AFTER, f"muscle_cut:{muscle}"),)
+        whole = _recorded(run, f"cut_{muscle}", 600 + index, CUT, parts)
+        found[muscle] = anomaly.since_cut(whole)
+    return found
