@@ -188,7 +188,10 @@ def _sound(schema: "BodySchema") -> "BodySchema":
     wanted: list[tuple[str, np.ndarray, tuple[int, ...]]] = [
         *((f"scaler.{name}", getattr(schema.scaler, name), (size,)) for name in SCALES[:-1]),
         *((f"p of '{condition}'", array, (p,)) for condition, array in schema.biases.items()),
-        *((f"error of {method}", array, (outputs,)) for (method, _), array in schema.errors.items()),
+        *(
+            (f"error of {method}", array, (size if method == "input" else outputs,))
+            for (method, _), array in schema.errors.items()
+        ),
         ("anchor_conditions", schema.anchor_conditions, (len(schema.anchors) if schema.biases else 0,)),
     ]
     if len(schema.anchors):
