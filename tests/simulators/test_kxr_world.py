@@ -8,7 +8,7 @@ import pytest
 from hal.config import load_robot
 from simulators.bullet import BulletBody
 from simulators.faults import UnknownPart
-from simulators.robots.kxr_humanoid import forecast, geometric, simulator
+from simulators.robots.kxr_humanoid import forecast, simulator
 from simulators.robots.kxr_humanoid.body import CELLS, REST, TOOLS, URDF, nominal
 from simulators.robots.kxr_humanoid.feet import center_of, foot_forces
 from simulators.robots.kxr_humanoid.statics import is_in_view, rest
@@ -191,7 +191,7 @@ def test_the_forecast_is_the_nominal_world():
     truth = world.truth()
     for name, told in forecast(CONFIG, "short_heavy", command[None]).items():
         assert told[0] == pytest.approx(truth[name], rel=1e-3, abs=1e-4)
-    stiff = geometric(CONFIG, "short_heavy", command[None])["tool_tip_position"][0]
+    stiff = simulator.geometric("short_heavy", command[None])["tool_tip_position"][0]
     assert 0.02 < np.linalg.norm(stiff - truth["tool_tip_position"]) < 0.25
 
 

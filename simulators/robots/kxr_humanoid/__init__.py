@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from hal.robot import Robot
     from simulators.rig import Rig
 
-__all__ = ["KxrHumanoid", "forecast", "geometric", "hardware", "simulator"]
+__all__ = ["KxrHumanoid", "forecast", "hardware", "simulator"]
 
 
 class KxrHumanoid:
@@ -52,6 +52,10 @@ class KxrHumanoid:
         """The camera of one variant, by itself."""
         return Eye(make_body(variant, seed), np.random.default_rng([seed, 13]))
 
+    def geometric(self, condition: str | None, command: np.ndarray) -> Mapping[str, np.ndarray]:
+        """As `forecast`, of a body that does not give way at all: the model of a full-body inverse kinematics."""
+        return _told(condition, command, stiff=True)
+
 
 simulator = KxrHumanoid()
 
@@ -67,11 +71,6 @@ def forecast(config: RobotConfig, condition: str | None, command: np.ndarray) ->
         UnknownPart: No such condition.
     """
     return _told(condition, command, stiff=False)
-
-
-def geometric(config: RobotConfig, condition: str | None, command: np.ndarray) -> Mapping[str, np.ndarray]:
-    """The same for a body that does not give way at all: the model of a full-body inverse kinematics."""
-    return _told(condition, command, stiff=True)
 
 
 def _told(condition: str | None, command: np.ndarray, stiff: bool) -> Mapping[str, np.ndarray]:
