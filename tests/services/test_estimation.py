@@ -89,10 +89,12 @@ def test_an_anomaly_must_last() -> None:
         bench.clock.advance(0.02)
     assert all(one.score > one.threshold for one in told)
     assert [one.is_anomaly for one in told] == [False, False, False, True]
+    assert [one.verdict for one in told] == ["", "", "", "anomaly"]
     assert told[-1].blamed.split(".")[0] in arm().signals
     bench.newest = fresh(5, bench.clock.monotonic())
     watch.tick()
     assert not told[-1].is_anomaly
+    assert told[-1].verdict == "normal"
 
 
 def test_without_a_sample_nothing_is_judged() -> None:

@@ -1,0 +1,95 @@
+import numpy as np
+import pytest
+from tool_arm import ToolArm, dataset, tools
+
+from gemuco.anomaly import Normal
+from gemuco.blame import parts, suspects
+from gemuco.schema import BodySchema
+from gemuco.train import fit
+from gemuco.train_config import TrainConfig
+from gemuco.verdict import judge, window_score
+
+TOOLS = tools((0.2, 0.35, 0.5), (0.0, 0.8), (0.3,))
+HELD, OTHER = "0.2/0.0/0.3", "0.5/0.8/0.3"
+
+
+@pytest.fixture(scope="module")
+def grips() -> BodySchema:
+    """A model whose normal is of one tool."""
+    masks = [("joint_position",), ("joint_position", "center_of_gravity")]
+    config = TrainConfig(hidden=(50, 25), latent=8, bias_size=2, epochs=80, batch=100, rate=5e-3)
+    outputs = ("center_of_gravity", "tool_tip_position")
+    schema = fit(dataset(TOOLS, 300), config, masks, x_out=outputs)[0].under(HELD)
+    errors = schema.predict_error(TOOLS[HELD].sample(1000, 3))
+    return schema.with_normal(Normal.fit(errors, schema.scaler.std[schema.out_index]))
+
+
+def rows(values: dict[str, np.ndarray]) -> list[dict[str, np.ndarray]]:
+    return [{name: array[i] for name, array in values.items()} for i in range(len(values["joint_position"]))]
+
+
+def test_the_tool_in_use_is_normal(grips):
+    found = judge(grips, rows(TOOLS[HELD].walk(10, 5)))
+    assert found.kind == "normal"
+    assert found.blamed == ""
+    assert np.array_equal(found.bias, grips.bias)
+
+
+@pytest.mark.parametrize("condition", [c for c in TOOLS if c != HELD])
+def test_another_tool_is_a_change_of_environment(grips, condition):
+    found = judge(grips, rows(TOOLS[condition].walk(10, 6)))
+    assert found.kind == "environment"
+    assert found.explained < 1.0 < found.score
+    assert window_score(grips.with_bias(found.bias), grips.normalise(TOOLS[condition].walk(50, 7))) < 1.2
+
+
+def test_a_sensor_that_is_stuck_is_an_anomaly(grips):
+    values = TOOLS[HELD].walk(20, 8, step=0.4)
+    values["tool_tip_position"][:] = values["tool_tip_position"][0] + 0.2
+    found = judge(grips, rows(values)[5:])
+    assert found.kind == "anomaly"
+    assert found.explained > 1.0
+    assert found.blamed.startswith(("tool_tip_position", "joint_position"))
+
+
+def test_a_tool_of_impossible_size_is_an_anomaly(grips):
+    assert judge(grips, rows(ToolArm(2.5).walk(10, 9))).kind == "anomaly"
+
+
+def test_without_parametric_bias_only_normal_and_anomaly(schema, arm):
+    healthy = arm.sample(10, 55)
+    assert judge(schema, rows(healthy)).kind == "normal"
+    healthy["muscle_length"][:, 1] += 0.05  # m
+    found = judge(schema, rows(healthy))
+    assert found.kind == "anomaly"
+    assert found.explained == found.score
+    assert found.blamed.endswith(".back")
+
+
+def test_nothing_to_judge_is_no_verdict(grips, schema, arm):
+    assert judge(grips, []).kind == ""
+    assert judge(schema.with_normal(None), rows(arm.sample(3, 1))).kind == ""
+    assert suspects(schema.with_normal(None), np.zeros((3, 12))) == []
+    assert suspects(schema, np.full((3, 12), np.nan)) == []
+
+
+@pytest.mark.parametrize("muscle", range(5))
+def test_a_window_blames_the_muscle_that_was_cut(schema, arm, muscle):
+    values = arm.sample(200, 78)
+    pulled = np.flatnonzero(values["muscle_tension"][:, muscle] > 50.0)[:10]  # N
+    cut = {name: array[pulled] for name, array in values.items()}
+    cut["muscle_tension"][:, muscle] = 0.0
+    found = suspects(schema, schema.normalise(cut))[0]
+    assert found.name.endswith(f".{schema.layout.signal('muscle_tension').elements[muscle]}")
+    assert found.remains < 0.5
+
+
+def test_a_joint_sensor_that_is_off_is_blamed_itself(schema, arm):
+    values = arm.sample(10, 79)
+    values["joint_position"][:, 0] += 0.5  # rad
+    assert suspects(schema, schema.normalise(values))[0].name == "joint_position.shoulder"
+
+
+def test_a_part_has_a_name_in_several_signals(schema, grips):
+    assert parts(schema, list(range(12))) == [(2 + i, 7 + i) for i in range(5)]
+    assert parts(grips, list(range(6))) == []  # `x` and `0` are no names
