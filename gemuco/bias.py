@@ -9,6 +9,7 @@ forgotten. The errors are taken as t-distributed, so one odd sample moves nothin
 `GaussNewton` minimises the errors over the newest samples of a window from the same prior. It has no memory but that.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
@@ -303,4 +304,4 @@ def solve(
     return best, np.linalg.inv(curvature)
 
 
-RECOGNISERS = {"ekf": Kalman, "gauss_newton": GaussNewton}
+RECOGNISERS: dict[str, Callable[["BodySchema"], Recogniser]] = {"ekf": Kalman, "gauss_newton": GaussNewton}

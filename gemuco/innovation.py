@@ -1,6 +1,7 @@
 """What a sample says about p: the errors of everything that was predicted without being told, and how p moves them."""
 
-from typing import TYPE_CHECKING, NamedTuple
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,7 +19,8 @@ MOST = 96
 """Errors judged at once; with more masks than fill this, those of the fewest signals come first."""
 
 
-class Pairs(NamedTuple):
+@dataclass(frozen=True, slots=True, eq=False)
+class Pairs:
     """Which errors a sample allows: for each, a mask and an element of x_out that the mask does not contain.
 
     Attributes:
