@@ -1,0 +1,154 @@
+"""The paper's experiments on the PR2 with a duster (section III-A), in simulation and on the actual variant."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hal.config import load_robot
+from services.artifacts import robot_file
+from services.reproduce.pr2_actual import MODELS, Actual, actual
+from services.reproduce.pr2_arm import JOINTS, TIP
+from services.reproduce.pr2_figures import draw
+from services.reproduce.pr2_simulated import CASES, POINTS, RECOGNISERS, WAYS, Simulated, simulate
+from services.reproduce.report import Report, Row
+from services.reproduce.runs import open_run
+from services.show import Tell
+
+ROBOT = "pr2_duster"
+PAPER_ESTIMATE = {"(1)": "52.2", "(2)": "25.9"}
+PAPER_CONTROL = {"p by gradient": ("31.5", "22.6"), "W": ("19.2", "207")}
+CONTROL_BARS = {"p, then W (default)": 6.0, "p": 15.0}
+SAME_POSTURE_BAR, OTHERS_BAR, ESTIMATE_BAR, ORDER_BAR = 15.0, 25.0, 12.0, 0.95
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """One seed of both experiments."""
+
+    simulated: Simulated
+    actual: Actual
+
+
+def reproduce(seeds: Sequence[int], folder: Path, progress: Tell, fresh: bool) -> Report:
+    """See `services.reproduce.Experiment`."""
+    robot = load_robot(robot_file(ROBOT))
+    outcomes: list[Outcome] = []
+    for index, seed in enumerate(seeds):
+        run = open_run(robot, folder, seed, fresh)
+
+        def tell(share: float, text: str, index: int = index, seed: int = seed) -> None:
+            progress((index + share) / len(seeds), f"seed {seed}: {text}")
+
+        simulated = simulate(run, lambda share, text, tell=tell: tell(0.7 * share, text))  # type: ignore[misc]
+        found = actual(run, simulated.schema, lambda share, text, tell=tell: tell(0.7 + 0.3 * share, text))  # type: ignore[misc]
+        outcomes.append(Outcome(simulated, found))
+    draw(folder, [outcome.simulated for outcome in outcomes], [outcome.actual for outcome in outcomes])
+    return summary(seeds, outcomes)
+
+
+def summary(seeds: Sequence[int], outcomes: Sequence[Outcome]) -> Report:
+    """Every figure of some seeds, beside the paper's."""
+    report = Report(ROBOT, tuple(seeds))
+    _add_structure(report, outcomes)
+    _add_simulated(report, outcomes)
+    _add_actual(report, outcomes)
+    return report
+
+
+def _add_structure(report: Report, outcomes: Sequence[Outcome]) -> None:
+    row = _adder(report, outcomes)
+    row("L of joint_position (an output if below 0.15)", "", "above 0.15", lambda o: o.simulated.fact("L_i")[JOINTS])
+    row("L of tool_tip_position", "", "below 0.15", lambda o: o.simulated.fact("L_i")[TIP])
+    outputs = "seeds whose only output is tool_tip_position, only mask joint_position"
+    right = [
+        o.simulated.schema.x_out == (TIP,) and o.simulated.schema.masks == (frozenset({JOINTS}),) for o in outcomes
+    ]
+    report.add(Row(outputs, "%", "100", tuple(100.0 * one for one in right)))
+    row("tool tip by the model, fresh samples, p of the grasp", "mm", "", lambda o: 1e3 * o.simulated.held_out)
+    row("R^2 of l on p", "", "", lambda o: o.simulated.order.length, ORDER_BAR, "higher")
+    row("R^2 of phi on p", "", "", lambda o: o.simulated.order.angle, ORDER_BAR, "higher")
+    for length in outcomes[0].simulated.order.spread:
+        row(
+            f"distance of p between 0 and 60 deg, l = {length} mm",
+            "",
+            "grows with l",
+            lambda o, length=length: o.simulated.order.spread[length],
+        )
+
+
+def _add_simulated(report: Report, outcomes: Sequence[Outcome]) -> None:
+    row = _adder(report, outcomes)
+    for case in CASES:
+        for name in RECOGNISERS:
+            row(
+                f"estimate {case} after {POINTS} points, p by {name}",
+                "mm",
+                PAPER_ESTIMATE[case],
+                lambda o, key=(case, name): o.simulated.estimated[key].mean(POINTS),
+                ESTIMATE_BAR if name == "ekf" else None,
+            )
+    row("control, first point", "mm", "240", lambda o: 1e3 * o.simulated.controlled["p"].course.errors[0])
+    for way in WAYS:
+        paper = PAPER_CONTROL.get(way, ("", ""))
+        is_asked = way in CONTROL_BARS
+        row(
+            f"control after {POINTS} points, update {way}",
+            "mm",
+            paper[0],
+            lambda o, way=way: o.simulated.controlled[way].course.mean(POINTS),
+            CONTROL_BARS.get(way),
+        )
+        row(
+            f"at the other posture, update {way}",
+            "mm",
+            paper[1],
+            lambda o, way=way: o.simulated.controlled[way].elsewhere.mean(),
+            SAME_POSTURE_BAR if is_asked else None,
+        )
+        row(
+            f"model under the other grasps, update {way}",
+            "mm",
+            "",
+            lambda o, way=way: 1e3 * o.simulated.controlled[way].others,
+            OTHERS_BAR if is_asked else None,
+        )
+
+
+def _add_actual(report: Report, outcomes: Sequence[Outcome]) -> None:
+    row = _adder(report, outcomes)
+    row("actual: samples for fine-tuning", "", "1500", lambda o: o.actual.samples)
+    for model in MODELS:
+        row(
+            f"actual: tool tip by {model}, best p of every grasp",
+            "mm",
+            "",
+            lambda o, model=model: 1e3 * float(np.mean(list(o.actual.errors[model].values()))),
+        )
+    for model in MODELS:
+        row(
+            f"actual: control by {model}, after {POINTS} points",
+            "mm",
+            "",
+            lambda o, model=model: 1e3 * float(o.actual.controlled[model][POINTS : o.actual.change].mean()),
+        )
+    row("actual: control, first point", "mm", "1000", lambda o: 1e3 * o.actual.course.errors[0])
+    row(f"after {POINTS} points", "mm", "150", lambda o: o.actual.course.mean(POINTS, o.actual.change))
+    row("right after the tool was changed", "mm", "500", lambda o: 1e3 * o.actual.course.errors[o.actual.change])
+    row(f"{POINTS} points later", "mm", "200", lambda o: o.actual.course.mean(o.actual.change + POINTS))
+
+
+def _adder(report: Report, outcomes: Sequence[Outcome]) -> Callable[..., None]:
+    def add(
+        name: str,
+        unit: str,
+        paper: str,
+        figure: Callable[[Outcome], float],
+        bar: float | None = None,
+        better: str = "lower",
+    ) -> None:
+        values = tuple(figure(outcome) for outcome in outcomes)
+        report.add(Row(name, unit, paper, values, bar, "higher" if better == "higher" else "lower"))
+
+    return add
