@@ -15,6 +15,7 @@ from services.reproduce.kxr_robot import CENTER
 from services.reproduce.kxr_simulated import (
     AFTER,
     CASES,
+    KNOWING,
     LEADS,
     RUNS,
     SAMPLES,
@@ -26,7 +27,7 @@ from services.reproduce.kxr_simulated import (
     mask_errors,
     simulate,
 )
-from services.reproduce.kxr_trials import Course, order
+from services.reproduce.kxr_trials import Course, order, steps_until
 from services.reproduce.report import Report, Row
 from services.reproduce.runs import open_run
 from services.show import Tell
@@ -120,44 +121,45 @@ def _share(outcome: Outcome, case: str, way: str) -> float:
 
 def _add_control(report: Report, outcomes: Sequence[Outcome], bounds: tuple[np.ndarray, np.ndarray]) -> None:
     row = _adder(report, outcomes)
-    for way in outcomes[0].simulated.controlled:
-        is_asked = way == "ekf"
-        for index, tool in enumerate(SEQUENCE):
-
-            def settled(o: Outcome, way: str = way, index: int = index) -> slice:
-                return slice(index * STEPS + SETTLED, (index + 1) * STEPS)
-
-            if index:
-                row(
-                    f"tip, first step with {tool}, {way}",
-                    "mm",
-                    "",
-                    lambda o, way=way, index=index: 1e3 * o.simulated.controlled[way].tips[index * STEPS],
-                )
+    for index, tool in enumerate(SEQUENCE):
+        begin, after = index * STEPS, slice(index * STEPS + SETTLED, (index + 1) * STEPS)
+        whole = slice(begin, (index + 1) * STEPS)
+        row(f"{tool}: tip, first step, {KNOWING}", "mm", "", lambda o, at=begin: 1e3 * _known(o).tips[at])
+        row(
+            f"{tool}: steps until the tip's average of 5 stays below {TIP_BAR:g} mm",
+            "",
+            "",
+            lambda o, at=whole: min(steps_until(1e3 * _known(o).tips[at], TIP_BAR), STEPS),
+            SETTLED + 0.5,
+        )
+        for way in outcomes[0].simulated.controlled:
+            is_asked = way == KNOWING
             row(
-                f"tip, {tool} after {SETTLED} steps, {way}",
+                f"{tool}: tip after {SETTLED} steps, {way}",
                 "mm",
                 "",
-                lambda o, way=way, at=settled: 1e3 * o.simulated.controlled[way].tips[at(o)].mean(),
+                lambda o, way=way, at=after: 1e3 * o.simulated.controlled[way].tips[at].mean(),
                 TIP_BAR if is_asked else None,
             )
             row(
-                f"center of gravity, {tool} after {SETTLED} steps, {way}",
+                f"{tool}: center of gravity after {SETTLED} steps, {way}",
                 "mm",
                 "",
-                lambda o, way=way, at=settled: 1e3 * o.simulated.controlled[way].off_center[at(o)].mean(),
+                lambda o, way=way, at=after: 1e3 * o.simulated.controlled[way].off_center[at].mean(),
                 CENTER_BAR if is_asked else None,
             )
-    row(
-        "center of gravity inside collect.constraints, ekf",
-        "%",
-        "",
-        lambda o: 100.0 * _inside(o.simulated.controlled["ekf"], bounds),
-        99.0,
-        "higher",
-    )
-    row("limit: tip, by a perfect model", "mm", "", lambda o: 1e3 * o.simulated.limit.tips.mean())
-    row("limit: center of gravity, by a perfect model", "mm", "", lambda o: 1e3 * o.simulated.limit.off_center.mean())
+        row(
+            f"{tool}: center of gravity, limit (perfect model)",
+            "mm",
+            "",
+            lambda o, at=after: 1e3 * o.simulated.limit.off_center[at].mean(),
+        )
+    share = "center of gravity inside collect.constraints, steps with a known tool"
+    row(share, "%", "", lambda o: 100.0 * _inside(_known(o), bounds), 99.0, "higher")
+
+
+def _known(outcome: Outcome) -> Course:
+    return outcome.simulated.controlled[KNOWING]
 
 
 def _inside(course: Course, bounds: tuple[np.ndarray, np.ndarray]) -> float:

@@ -8,7 +8,18 @@ from matplotlib.axes import Axes
 
 from services.reproduce import figures
 from services.reproduce.kxr_actual import FOLLOWING, MODELS, Actual
-from services.reproduce.kxr_simulated import AFTER, CASES, SEQUENCE, STEPS, TOOLS, Simulated, mask_errors
+from services.reproduce.kxr_simulated import (
+    AFTER,
+    BLIND,
+    CASES,
+    GRADIENT,
+    KNOWING,
+    SEQUENCE,
+    STEPS,
+    TOOLS,
+    Simulated,
+    mask_errors,
+)
 from services.reproduce.kxr_trials import smoothed
 
 SHOWN = ("ekf", "gradient")
@@ -62,12 +73,12 @@ def _maps(path: Path, one: Simulated) -> None:
             axis.set_title(f"short_middle to {AFTER}, p by {way}", fontsize=10)
         figures.bias_map(axes[2], biases, one.leads)
         axes[2].set_title("to two tools, all sensors", fontsize=10)
-        figures.bias_map(axes[3], biases, {way: one.controlled[way].biases for way in SHOWN})
+        figures.bias_map(axes[3], biases, {way: one.controlled[way].biases for way in (KNOWING, GRADIENT)})
         axes[3].set_title(f"while controlled: {', '.join(SEQUENCE)}", fontsize=10)
 
 
 def _control(path: Path, simulated: Sequence[Simulated]) -> None:
-    ways = ("not updated", *SHOWN)
+    ways = (BLIND, KNOWING, GRADIENT)
     with figures.picture(path, "Targets reached while tools change, all seeds", columns=2, rows=2) as axes:
         for row, (smooth, title) in enumerate(((False, "raw"), (True, "average of 5 steps"))):
             tips = {way: _curves([one.controlled[way].tips for one in simulated], smooth) for way in ways}
@@ -78,10 +89,12 @@ def _control(path: Path, simulated: Sequence[Simulated]) -> None:
             figures.over_steps(axes[2 * row + 1], centers, "mm", bar=15.0)
             axes[2 * row + 1].set_title(f"center of gravity, {title}", fontsize=10)
         for axis in axes:
+            low, high = axis.get_ylim()
+            axis.set_ylim(low - 0.1 * (high - low), high)
             for index, tool in enumerate(SEQUENCE):
                 axis.axvline(index * STEPS + 0.5, color="0.5", linestyle=":", linewidth=1)
                 axis.annotate(
-                    tool, (index * STEPS + 1.5, 0.02), xycoords=("data", "axes fraction"), fontsize=8, color="0.3"
+                    tool, (index * STEPS + 1.5, 0.015), xycoords=("data", "axes fraction"), fontsize=8, color="0.3"
                 )
 
 

@@ -42,8 +42,14 @@ CASES = {
     "C: and tip": (JOINTS, CENTER, TIP, PIXEL),
 }
 BEFORE, AFTER = "short_middle", "long_middle"
-WAYS = {name: UpdateConfig(what="bias", bias_method=name, minimum=1) for name in ("ekf", "gauss_newton", "gradient")}
-"""Ways to recognise; the first is the default, the last the paper's."""
+WAYS = {
+    "ekf": UpdateConfig(what="bias"),
+    "gauss_newton": UpdateConfig(what="bias", bias_method="gauss_newton"),
+    "gradient": UpdateConfig(what="bias", bias_method="gradient", minimum=1, window=10),
+}
+"""Ways to find p; the first is the default, the last the paper's."""
+KNOWING, GRADIENT, BLIND, LIGHT = "p by ekf", "p by gradient", "p not updated", "p by ekf, weight 0.01"
+"""Ways to control; the last with the paper's weight of the center of gravity."""
 LEADS = ("long_light", "short_heavy")
 """Tools whose recognition the paper draws."""
 RUNS, SAMPLES = 10, 35
@@ -66,7 +72,7 @@ class Simulated:
         needed: (case, way) -> samples until the tool is recognised, shape (runs,).
         paths: (case, way) -> p along the first run, shape (samples + 1, bias_size).
         leads: Tool -> p on the way to it with all sensors, by the paper's way.
-        controlled: Way to update, or `not updated`, or `paper's weight` -> what happened.
+        controlled: Way to control -> what happened.
         limit: What a perfect model of the robot reaches.
     """
 
@@ -132,10 +138,10 @@ def _controls(run: Run, schema: BodySchema) -> tuple[dict[str, Course], Course]:
     changes = {index * STEPS: tool for index, tool in enumerate(SEQUENCE)}
     control = control_of(run)
     ways = {
-        "ekf": (control, WAYS["ekf"]),
-        "gradient": (control, WAYS["gradient"]),
-        "not updated": (control, None),
-        "paper's weight": (with_weight(control, PAPER_WEIGHT), WAYS["ekf"]),
+        KNOWING: (control, WAYS["ekf"]),
+        GRADIENT: (control, WAYS["gradient"]),
+        BLIND: (control, None),
+        LIGHT: (with_weight(control, PAPER_WEIGHT), WAYS["ekf"]),
     }
     controlled = {}
     for name, (asked, update) in ways.items():

@@ -44,7 +44,7 @@ class Course:
 
 
 def recognise(schema: BodySchema, samples: Sequence[Sample], given: Sequence[str], update: UpdateConfig) -> np.ndarray:
-    """Return p before the first and after every sample, of which only some signals are given; shape (n + 1, bias_size)."""
+    """Show samples of which only some signals are given; p before the first and after each, (n + 1, bias_size)."""
     updater = Updater(schema, update)
     path = [schema.bias]
     for sample in samples:
@@ -109,6 +109,14 @@ def follow_blindly(body: Standing, targets: np.ndarray, commands: np.ndarray) ->
         tips.append(np.linalg.norm(body.truth(TIP) - target))
         centers.append(body.truth(CENTER))
     return Course(np.array(tips), np.stack(centers), np.zeros((len(tips), 0)))
+
+
+def steps_until(errors: np.ndarray, bar: float) -> float:
+    """Steps after which the average of the last few errors stays below a bar; infinite if it does not."""
+    above = np.flatnonzero(smoothed(errors) >= bar)
+    if not len(above):
+        return 0.0
+    return float("inf") if above[-1] == len(errors) - 1 else float(above[-1] + 1)
 
 
 def smoothed(errors: np.ndarray) -> np.ndarray:
