@@ -37,7 +37,7 @@ def _smooth(values: np.ndarray) -> np.ndarray:
 
 
 def _update(outcomes: Sequence[Outcome], path: Path) -> None:
-    with picture(path, "Online update: joint error with the encoders hidden, 5 s averages and exponential fits") as (
+    with picture(path, "Joint error with hidden encoders, 5 s averages and fits") as (
         axis,
     ):
         for outcome in outcomes:
@@ -82,7 +82,7 @@ def _story(outcome: Outcome, path: Path) -> None:
 
 
 def _control(outcomes: Sequence[Outcome], path: Path) -> None:
-    with picture(path, "Control error, 5 targets from 5 starts each (bars: arms; dots: targets)") as (axis,):
+    with picture(path, "Control error, 5 targets (dots) from 5 starts each") as (axis,):
         for index, outcome in enumerate(outcomes):
             for side, name in ((-0.2, BEFORE), (0.2, AFTER)):
                 missed = outcome.control[OURS][name]

@@ -72,6 +72,8 @@ def simulate(robot: RobotConfig, schema: BodySchema, recording: Dataset, terms: 
 def forced(robot: RobotConfig, schema: BodySchema) -> dict[str, dict[str, np.ndarray]]:
     """Figure (f): the bent arm under forces on its hand, and with its shoulder forced to a posture.
 
+    Far from any motion that was learned, descent on z may answer with tensions below zero, which no muscle has.
+
     Returns:
         What was done -> signal -> simulated value [its unit], shape (k,).
     """
