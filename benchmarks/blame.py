@@ -14,7 +14,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.online_update import model, record
+from benchmarks.actual_arms import model, record
 from gemuco.adapt import UpdateConfig, Updater
 from gemuco.blame import suspects
 from gemuco.normal import Normal, prediction_errors

@@ -20,7 +20,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.online_update import model
+from benchmarks.actual_arms import model
 from hal.config import RobotConfig, load_robot
 from hal.errors import CommandRefused
 from services.client import Client

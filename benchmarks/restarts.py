@@ -15,8 +15,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.actual_arms import model
 from benchmarks.loops import engage, measures
-from benchmarks.online_update import model
 from hal.config import load_robot
 from services.client import Client
 from services.supervisor import Supervisor, gemuco_command

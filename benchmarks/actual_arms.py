@@ -1,0 +1,49 @@
+"""What several benchmarks need: the trained model of the arm, and random motion of arms that were built otherwise."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from rich.console import Console
+
+from gemuco.dataset import Dataset
+from gemuco.schema import BodySchema
+from hal import registry
+from hal.config import RobotConfig
+from hal.robot import Robot
+from services import artifacts, collector, trainer
+from services.living_model import load_model
+from simulators.direct import DirectDevice, WorldClock
+
+
+def motion(robot: RobotConfig, body: Robot, seed: int, rate: float, duration: float) -> Iterator[dict[str, np.ndarray]]:
+    """Samples [unit] at a rate [Hz] of so much random motion [s of the arm's time]."""
+    playground = DirectPlayground(body, rate)
+    for command, hold in registry.load(robot.collect["motion"])(robot, seed):
+        yield from playground.play(command, hold)
+        if playground.elapsed() > duration:
+            return
+
+
+def record(
+    robot: RobotConfig, arm: int, seed: int, rate: float, duration: float, part: str = ""
+) -> dict[str, np.ndarray]:
+    """Signal -> samples (count, n) [unit] of one actual arm."""
+    world = registry.load(robot.simulator or "").world("actual", arm)
+    if part:
+        world.break_part(part)
+    clock = WorldClock(world)
+    with Robot(robot, [DirectDevice(robot, world, clock)], clock=clock, source="simulated") as body:
+        rows = list(motion(robot, body, seed, rate, duration))
+    return {name: np.array([row[name] for row in rows]) for name in robot.signals}
+
+
+def model(robot: RobotConfig, console: Console) -> BodySchema:
+    """The trained model of the robot; collected and trained here if it is missing."""
+    folder = artifacts.model_folder(robot.robot)
+    if not folder.exists():
+        console.print("collecting and training")
+        data = artifacts.data_path(robot.robot)
+        if not data.exists():
+            collector.collect_direct(robot, "geometric", 0).dataset.save(data)
+        trainer.train(robot, Dataset.load(data), 0, lambda *_: None).schema.save(folder)
+    return load_model(robot, folder)
