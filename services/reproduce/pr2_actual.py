@@ -57,11 +57,9 @@ class Actual:
 def actual(run: Run, simulated: BodySchema, tell: Tell) -> Actual:
     """Collect on the actual arm, fine-tune what was learned in simulation, and run every trial of one seed."""
     tell(0.0, "collecting on the actual arm")
-    robot = with_flexible(run.robot)
-    count = round(COLLECTED * collect_config(robot).samples)
-    data = run.dataset(
-        "actual", lambda: collect_direct(robot, ACTUAL, run.seed, Wanted(samples=count)).dataset, samples=count
-    )
+    count = round(COLLECTED * collect_config(run.robot).samples)
+    wanted = Wanted(flexible(run.robot), samples=count)
+    data = run.dataset("actual", lambda: collect_direct(run.robot, ACTUAL, run.seed, wanted).dataset, samples=count)
     learned, judged = parted(data, LEARNED / COLLECTED)
     schema = run.schema(
         "actual_model", lambda: _tuned(run, simulated, learned, tell), samples=len(learned), epochs=EPOCHS, rate=RATE
@@ -79,10 +77,9 @@ def actual(run: Run, simulated: BodySchema, tell: Tell) -> Actual:
     )
 
 
-def with_flexible(robot: RobotConfig) -> RobotConfig:
-    """The robot with the grasps of the flexible duster, those that its simulator knows and its file does not list."""
-    others = tuple(name for name in simulator_of(robot).conditions if name not in robot.conditions)
-    return robot.model_copy(update={"conditions": others})
+def flexible(robot: RobotConfig) -> tuple[str, ...]:
+    """The grasps of the flexible duster: those that the simulator knows and the robot file does not list."""
+    return tuple(name for name in simulator_of(robot).conditions if name not in robot.conditions)
 
 
 def parted(data: Dataset, share: float) -> tuple[Dataset, Dataset]:

@@ -9,7 +9,7 @@ from gemuco.descent import DescentConfig
 from hal.config import RobotConfig, load_robot
 from services.reproduce import pr2_arm, pr2_trials
 from services.reproduce.pr2 import Outcome, summary
-from services.reproduce.pr2_actual import actual, parted, with_flexible
+from services.reproduce.pr2_actual import actual, flexible, parted
 from services.reproduce.pr2_arm import JOINTS, TIP, Arm, Geometry, duster_motion
 from services.reproduce.pr2_figures import draw
 from services.reproduce.pr2_simulated import BELIEVED, ELEVATION, OTHER_ELEVATION, simulate
@@ -57,8 +57,8 @@ def test_the_arm_arrives_within_its_limits_and_takes_another_duster():
 
 
 def test_the_flexible_dusters_grasps_are_those_the_file_does_not_list():
-    assert len(with_flexible(ROBOT).conditions) == 6
-    assert not set(with_flexible(ROBOT).conditions) & set(ROBOT.conditions)
+    assert len(flexible(ROBOT)) == 6
+    assert not set(flexible(ROBOT)) & set(ROBOT.conditions)
 
 
 def test_both_experiments_run_and_tell_their_figures(tmp_path, monkeypatch):
