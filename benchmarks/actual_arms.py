@@ -11,8 +11,8 @@ from hal import registry
 from hal.config import RobotConfig
 from hal.robot import Robot
 from services import artifacts, collector, trainer
-from services.collector import DirectPlayground
 from services.living_model import load_model
+from services.playground import DirectPlayground
 from simulators.direct import DirectDevice, WorldClock
 
 

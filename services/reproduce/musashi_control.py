@@ -4,9 +4,9 @@ import numpy as np
 
 from gemuco.schema import BodySchema
 from hal.config import RobotConfig
-from services.collector import CollectionStopped
 from services.control_config import ControlConfig, TermConfig, controller_of
 from services.model_config import model_config
+from services.playground import CollectionStopped
 from services.reproduce.musashi_motion import POSITION, TENSION, ActualArm, go
 
 TARGETS, STARTS = 5, 5
