@@ -18,7 +18,8 @@ from services.show import Tell
 
 ROBOT = "pr2_duster"
 PAPER_ESTIMATE = {"(1)": "52.2", "(2)": "25.9"}
-PAPER_CONTROL = {"p by gradient": ("31.5", "22.6"), "W": ("19.2", "207")}
+PAPER_CONTROL = {"p": ("31.5", "22.6"), "p by gradient": ("31.5", "22.6"), "W": ("19.2", "207")}
+"""Way to update -> error while it goes on, and afterwards at the other posture [mm]; the paper's p is by gradient."""
 CONTROL_BARS = {"p, then W (default)": 6.0, "p": 15.0}
 SAME_POSTURE_BAR, OTHERS_BAR, ESTIMATE_BAR, ORDER_BAR = 15.0, 25.0, 12.0, 0.95
 
