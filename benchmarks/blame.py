@@ -68,6 +68,6 @@ if __name__ == "__main__":
         }
         for label, faults in (("muscle cut", cut), ("encoder off", off)):
             found = [hit for name, rows in faults.items() if (hit := judged(schema, rows, name)) is not None]
-            single, window = np.mean(found, axis=0)
+            single, window = np.mean(found, axis=0) if found else (np.nan, np.nan)
             table.add_row(str(arm), label, str(len(found)), f"{single:.2f}", f"{window:.2f}")
     console.print(table)
