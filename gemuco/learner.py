@@ -174,8 +174,7 @@ class Learner:
         """Suspect outliers anew, in what is learned and in what measures."""
         weights, p, limit = self.network.weights(), self.biases.detach().numpy(), self.config.outliers
         for part in (self.material, self.held):
-            known = part.suspected
-            found = outliers.find(part.task, weights, part.rows, p[part.condition], limit, part.far, known)
+            found = outliers.find(part, weights, p[part.condition], limit)
             if patient:  # several signals are far out together: perhaps a rare motion that is yet to be learned
                 found &= (part.far.sum(axis=1) < 2)[:, None]
             part.hide(found)

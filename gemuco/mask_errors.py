@@ -53,7 +53,7 @@ class MaskErrors:
             p = np.stack([schema.biases[c] for c in held.conditions])[held.condition_of_rows()]
         task = Task(layout, schema.masks, schema.x_out)
         material = Material(task, x, held.condition_of_rows(), scaler)
-        wild = outliers.find(task, schema.weights, x, p, limit, material.far, material.suspected)
+        wild = outliers.find(material, schema.weights, p, limit)
         there = np.isfinite(x) & ~wild[:, task.signal_of]
         granted = there.copy()
         granted[:, scaler.dead] = True  # what is stuck hinders no mask

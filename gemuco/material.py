@@ -48,10 +48,10 @@ class Material:
         self.far = task.any_of(outside)
         self.new = len(rows) if new is None else new
         self._measured = np.isfinite(rows)
-        self._granted = self._measured.copy()
+        self.granted = self._measured.copy()
         self._measured[:, dead] = False
         alive = np.delete(task.signal_of, dead)
-        self._granted[:, dead[np.isin(task.signal_of[dead], alive)]] = True
+        self.granted[:, dead[np.isin(task.signal_of[dead], alive)]] = True
         filled = np.where(self._measured, rows, 0.0)
         self._x_in = torch.from_numpy(np.clip(filled[:, task.in_index], -CLIP, CLIP).astype(np.float32))
         self._x_out = torch.from_numpy(filled[:, task.out_index].astype(np.float32))
@@ -65,7 +65,7 @@ class Material:
         hidden = suspected[:, self.task.signal_of]
         there = (self._measured & ~hidden)[:, self.task.out_index]
         self._there = torch.from_numpy(there.astype(np.float32))
-        self.allowed = self.task.allowed(self._granted & ~hidden)
+        self.allowed = self.task.allowed(self.granted & ~hidden)
         self.usable = np.flatnonzero(self.allowed.any(axis=1) & there.any(axis=1))
         self._complete = bool(there.all())
 

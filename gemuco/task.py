@@ -63,11 +63,11 @@ class Task:
         """x_in, m and p under one mask, shape (samples, inputs), float32.
 
         Args:
-            x: Every signal [standard deviations], shape (samples, layout.size); NaN where masked is fine.
+            x: Every signal [standard deviations], shape (samples, layout.size); NaN counts as the mean.
             chosen: Index of the mask.
             bias: p of every sample, shape (samples, bias_size).
         """
         through = self.through[chosen]
-        values = np.clip(np.where(through > 0, x[:, self.in_index], 0.0), -CLIP, CLIP)
+        values = np.clip(np.nan_to_num(np.where(through > 0, x[:, self.in_index], 0.0)), -CLIP, CLIP)
         tail = np.broadcast_to(self.tails[chosen], (len(x), len(self.x_in)))
         return np.concatenate([values, tail, bias], axis=1, dtype=np.float32)

@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 from muscle_arm import LAYOUT
 
+from gemuco import outliers
 from gemuco.dataset import Dataset, Episode
 from gemuco.errors import NotEnoughData, SchemaError
+from gemuco.material import Material
 from gemuco.scaler import Scaler
+from gemuco.task import Task
 from gemuco.train import TrainConfig, fit
 
 MASKS = [{"joint_position", "muscle_tension"}, {"muscle_tension", "muscle_length"}]
@@ -200,3 +203,14 @@ def test_nothing_measured_at_all():
     values = {name: np.full((40, LAYOUT.signal(name).size), np.nan) for name in LAYOUT.names}
     with pytest.raises(NotEnoughData, match="no measured value at all"):
         fit(Dataset(LAYOUT, (Episode("new", values),)), SMALL, MASKS)
+
+
+def test_a_suspicion_is_cleared_once_the_model_bears_the_sample_out(schema, arm):
+    rows = schema.scaler.normalise(LAYOUT.join(arm.sample(100, 8)))
+    task = Task(LAYOUT, schema.masks, schema.x_out)
+    material = Material(task, rows, np.zeros(100, int), schema.scaler)
+    suspected = np.zeros((100, 3), bool)
+    suspected[:40, 1] = True  # tension, which is in every mask: only masks with it can judge it
+    suspected[40:80, 0] = True
+    material.hide(suspected)
+    assert outliers.find(material, schema.weights, np.zeros((100, 0)), 6.0).sum() == 0
