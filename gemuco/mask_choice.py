@@ -9,6 +9,8 @@ SCENES = 1500
 def choose(candidates: np.ndarray, errors: np.ndarray, outputs: np.ndarray, most: int, seed: int = 0) -> np.ndarray:
     """Pick masks one after another, each the one that lowers the mean error over the scenes most.
 
+    If there is room, the masks of which no signal can be spared come first, so that whatever is enough is served.
+
     A scene is a set of available signals: all but one, or a random one with any share of the signals lost. Its error is
     that of the outputs it lacks under the best picked mask that it covers, and 1 (guess the mean) if it covers none.
 
@@ -32,7 +34,12 @@ def choose(candidates: np.ndarray, errors: np.ndarray, outputs: np.ndarray, most
     cost = needed @ np.clip(np.nan_to_num(errors, nan=1.0), 0.0, 1.0).T / needed.sum(axis=1, keepdims=True)
     cost = np.where(lacking < 0.5, cost, 1.0)
     least = np.ones(len(scenes))
-    picked: list[int] = []
+    smallest = (~candidates).astype(np.float32) @ candidates.T.astype(np.float32) < 0.5  # [i, j]: i contains j
+    picked = np.flatnonzero(smallest.sum(axis=1) == 1).tolist()
+    if len(picked) > most:
+        picked = []
+    elif picked:
+        least = np.minimum(least, cost[:, picked].min(axis=1))
     while len(picked) < most:
         gain = np.maximum(least[:, None] - cost, 0.0).sum(axis=0)
         best = int(gain.argmax())

@@ -28,8 +28,8 @@ TRAINED = 2000
 """With more signals the network is trained with so many masks, and is right about the others too."""
 BUDGET = 20_000
 """About how many masks the search tries at most."""
-ROWS, SEARCH_ROWS = 2000, 400
-"""Held-out rows that judge a mask, and that guide the search."""
+ROWS = 1000
+"""Held-out rows that judge a mask, at most."""
 SHOWN = 40
 """Lines of the report's table of masks."""
 
@@ -157,11 +157,11 @@ class Judge:
     """
 
     def __init__(self, names: tuple[str, ...], errors: tuple[MaskErrors, ...], thresholds: Thresholds) -> None:
-        self.names, self.errors, self.thresholds = names, errors, thresholds
+        self.names, self.thresholds = names, thresholds
+        self.errors = [split.thinned(ROWS) for split in errors]
         self.tried = 0
-        rows = [split.thinned(ROWS) for split in errors]
         self.L_i = {
-            name: self._measured(float(np.mean([split.from_others(i) for split in rows])))
+            name: self._measured(float(np.mean([split.from_others(i) for split in self.errors])))
             for i, name in enumerate(names)
         }
         self.outputs = np.array([self.L_i[name] < thresholds.out for name in self.names])
@@ -175,9 +175,9 @@ class Judge:
         """Whether a mask leaves any output to infer, shape (n,): the others are not judged (paper, II-E.3)."""
         return (self.outputs & ~masks).any(axis=1)
 
-    def of(self, masks: np.ndarray, rows: int = ROWS) -> tuple[np.ndarray, np.ndarray]:
+    def of(self, masks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Errors of the outputs, shape (n,), and squared errors of every signal, shape (n, signals)."""
-        found, sizes = self._mean(masks, rows)
+        found, sizes = self._mean(masks)
         judged = np.broadcast_to(self.outputs, masks.shape)
         if self.thresholds.over == "masked":
             judged = judged & ~masks
@@ -186,9 +186,9 @@ class Judge:
         squared = (np.nan_to_num(found) * weights).sum(axis=1) / np.where(total > 0.0, total, 1.0)
         return np.array([self._measured(value) for value in np.where(total > 0.0, squared, np.nan)]), found
 
-    def _mean(self, masks: np.ndarray, rows: int) -> tuple[np.ndarray, np.ndarray]:
+    def _mean(self, masks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Squared errors of every signal over all splits, shape (n, signals), and its elements, shape (signals,)."""
-        found, sizes = zip(*(errors.thinned(rows).of(masks) for errors in self.errors), strict=True)
+        found, sizes = zip(*(errors.of(masks) for errors in self.errors), strict=True)
         return np.mean(found, axis=0), np.max(sizes, axis=0)
 
 
@@ -318,13 +318,13 @@ def _training_masks(names: tuple[str, ...], seed: int) -> tuple[Mask, ...]:
 
 
 def search(judge: Judge, seed: int) -> tuple[np.ndarray, bool]:
-    """The masks that the search found to be enough, to be measured on all rows; and whether it came to an end."""
+    """The masks that the search found to be enough, and those just below; and whether it came to an end."""
     enough: list[np.ndarray] = []
 
     def is_enough(masks: np.ndarray) -> np.ndarray:
         judge.tried += len(masks)
         found = ~judge.is_judged(masks)  # what leaves nothing to infer is enough
-        found[~found] = judge.of(masks[~found], SEARCH_ROWS)[0] < judge.thresholds.into
+        found[~found] = judge.of(masks[~found])[0] < judge.thresholds.into
         enough.append(masks[found])
         return found
 
