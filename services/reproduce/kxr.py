@@ -84,7 +84,7 @@ def _add_structure(report: Report, outcomes: Sequence[Outcome]) -> None:
     row("of these 0110 (center of gravity, tip)", "", "0", lambda o: len(_feasible(o) & {"0110"}))
     for mask in ("0111", "0110", "0011", "0101"):
         paper = "below 0.15" if mask == "0111" else "above 0.15"
-        row(f"L of mask {mask}", "", paper, lambda o, mask=mask: mask_errors(o.simulated.schema)[mask])
+        row(f"L of mask {mask}", "", paper, lambda o, mask=mask: mask_errors(o.simulated.schema).get(mask, np.nan))
     row("R^2 of p on weight and length", "", "", lambda o: order(o.simulated.schema.biases, TOOLS), ORDER_BAR, "higher")
 
 
