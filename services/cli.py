@@ -243,9 +243,11 @@ def query(
 
     [bold]engage[/], [bold]disengage[/] let the model move the robot or not    [bold]adapt on|off[/] online update
 
-    [bold]control SIGNAL V1 V2 ...[/] the command for a target    [bold]simulate V1 V2 ...[/] the state a command leads to
+    [bold]control SIGNAL V1 V2 ...[/] the command for a target    [bold]simulate V1 V2 ...[/] where a command leads
 
-    [bold]anomaly[/] how unlike normal    [bold]rollback[/] the model before the update    [bold]normal[/] learn anew what is normal
+    [bold]anomaly[/] how unlike normal    [bold]rollback[/] the model before the update
+
+    [bold]normal[/] learn anew what is normal
 
     [bold]enable[/], [bold]disable[/], [bold]stop[/], [bold]reset[/] the HAL's motors    [bold]describe [SERVICE][/]
 

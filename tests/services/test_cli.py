@@ -12,7 +12,9 @@ def gemuco(*words: str, folder: Path | None = None) -> subprocess.CompletedProce
     return subprocess.run(command, capture_output=True, text=True, timeout=60, cwd=folder or ROOT, check=False)
 
 
-@pytest.mark.parametrize("verb", ["simulate", "hal", "serve", "collect", "train", "query", "top", "record", "demo", "reproduce"])
+@pytest.mark.parametrize(
+    "verb", ["simulate", "hal", "serve", "collect", "train", "query", "top", "record", "demo", "reproduce"]
+)
 def test_every_verb_explains_itself(verb: str) -> None:
     told = gemuco(verb, "--help")
     assert told.returncode == 0

@@ -78,7 +78,7 @@ def gravity_torque(position: np.ndarray) -> np.ndarray:
 
 
 def force_torque(position: np.ndarray, force: np.ndarray) -> np.ndarray:
-    """Joint torques J^T F [N m], shape (5,), that a force [N] on the hand, shape (3,), exerts at joint positions [rad]."""
+    """Joint torques J^T F [N m], shape (5,), of a force on the hand [N], shape (3,), at joint positions [rad]."""
     pose = chain().pose(np.asarray(position, float))
     hand = pose.points(np.array([RADIUS]), HAND[None])[0]
     wrench = np.concatenate([force, np.cross(hand, force)])
