@@ -135,9 +135,11 @@ def _add_actual(report: Report, outcomes: Sequence[Outcome]) -> None:
             lambda o, model=model: 1e3 * float(o.actual.controlled[model][POINTS : o.actual.change].mean()),
         )
     row("actual: control, first point", "mm", "1000", lambda o: 1e3 * o.actual.course.errors[0])
-    row(f"after {POINTS} points", "mm", "150", lambda o: o.actual.course.mean(POINTS, o.actual.change))
-    row("right after the tool was changed", "mm", "500", lambda o: 1e3 * o.actual.course.errors[o.actual.change])
-    row(f"{POINTS} points later", "mm", "200", lambda o: o.actual.course.mean(o.actual.change + POINTS))
+    row(f"actual: after {POINTS} points", "mm", "150", lambda o: o.actual.course.mean(POINTS, o.actual.change))
+    row(
+        "actual: right after the tool was changed", "mm", "500", lambda o: 1e3 * o.actual.course.errors[o.actual.change]
+    )
+    row(f"actual: {POINTS} points later", "mm", "200", lambda o: o.actual.course.mean(o.actual.change + POINTS))
 
 
 def _adder(report: Report, outcomes: Sequence[Outcome]) -> Callable[..., None]:
