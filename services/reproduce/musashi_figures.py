@@ -37,9 +37,7 @@ def _smooth(values: np.ndarray) -> np.ndarray:
 
 
 def _update(outcomes: Sequence[Outcome], path: Path) -> None:
-    with picture(path, "Joint error with hidden encoders, 5 s averages and fits") as (
-        axis,
-    ):
+    with picture(path, "Joint error with hidden encoders, 5 s averages and fits") as (axis,):
         for outcome in outcomes:
             half = SMOOTH // 2
             smooth = _smooth(outcome.learning)

@@ -72,7 +72,9 @@ def simulate(robot: RobotConfig, schema: BodySchema, recording: Dataset, terms: 
 def forced(robot: RobotConfig, schema: BodySchema) -> dict[str, dict[str, np.ndarray]]:
     """Figure (f): the bent arm under forces on its hand, and with its shoulder forced to a posture.
 
-    Far from any motion that was learned, descent on z may answer with tensions below zero, which no muscle has.
+    Every search begins anew from the training data: from the last state, where the lengths fit, descent along the norms
+    goes nowhere. Far from any motion that was learned, descent on z may answer with tensions below zero, which no
+    muscle has.
 
     Returns:
         What was done -> signal -> simulated value [its unit], shape (k,).
@@ -93,9 +95,10 @@ def forced(robot: RobotConfig, schema: BodySchema) -> dict[str, dict[str, np.nda
     simulator = Simulator(schema, terms, robot.command.signal)
     for name, force in FORCES.items():
         simulator.constrain([*keep, balance(np.array(force))])
+        simulator.restart()
         found[name] = simulator.step(sent).values
-    simulator.constrain([*keep, Match(POSITION)])
-    found["pitch wished (paper)"] = simulator.step(sent, {POSITION: FORCED}).values
-    simulator.constrain([*keep, Hold(POSITION)])
-    found["pitch held"] = simulator.step(sent, {POSITION: FORCED}).values
+    for name, wish in (("pitch wished (paper)", Match(POSITION)), ("pitch held", Hold(POSITION))):
+        simulator.constrain([*keep, wish])
+        simulator.restart()
+        found[name] = simulator.step(sent, {POSITION: FORCED}).values
     return found
