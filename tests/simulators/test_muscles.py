@@ -79,9 +79,9 @@ def test_the_elastic_element_and_its_inverse():
     assert elastic.stiffness(tension) == pytest.approx(slope, rel=1e-4)
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
-def test_200_newton_stretch_every_element_by_about_20_millimetres(variant):
+@pytest.mark.parametrize(("variant", "least", "most"), [("geometric", 0.019, 0.021), ("actual", 0.015, 0.040)])
+def test_200_newton_stretch_every_element_by_about_20_millimetres(variant, least, most):
     for seed in range(5):
         elongation = make_body(variant, seed).elastic.elongation(np.full(10, 200.0))
-        assert elongation.min() > 0.012
-        assert elongation.max() < 0.030
+        assert elongation.min() > least
+        assert elongation.max() < most
