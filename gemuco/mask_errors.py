@@ -13,6 +13,9 @@ from gemuco.schema import BodySchema
 from gemuco.signals import Layout
 from gemuco.task import Task
 
+RARE = 0.05
+"""An outlier is rare: where more than this share of a signal would be, the model is wrong, and all counts."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MaskErrors:
@@ -54,6 +57,7 @@ class MaskErrors:
         task = Task(layout, schema.masks, schema.x_out)
         material = Material(task, x, held.condition_of_rows(), scaler)
         wild = outliers.find(material, schema.weights, p, limit)
+        wild[:, wild.mean(axis=0) > RARE] = False
         there = np.isfinite(x) & ~wild[:, task.signal_of]
         granted = there.copy()
         granted[:, scaler.dead] = True  # what is stuck hinders no mask

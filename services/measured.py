@@ -114,6 +114,9 @@ class MeasuredConfig(Section):
     """Absent: a file is one episode."""
     conditions: dict[str, str] = Field(default_factory=dict)
     """Pattern of an episode's name -> condition of the body; absent: all are under one."""
+    together: tuple[tuple[str, ...], ...] = ()
+    """Groups of patterns of episodes' names. Repetitions of one motion belong together: they become one episode, so
+    that none is held out to measure what was learned from its twin."""
     network: NetworkConfig = NetworkConfig()
     structure: StructureConfig = StructureConfig()
     training: TrainingConfig = TrainingConfig()
@@ -179,8 +182,23 @@ def read(config: MeasuredConfig, folder: Path) -> Dataset:
         if not found:
             raise DatasetError(f"Nothing in '{folder}' matches '{pattern}'. Is that the folder of the recording?")
         places.update(dict.fromkeys(found))
-    episodes = [episode for place in places for episode in _episodes(config, place)]
-    return Dataset(config.layout, tuple(episodes))
+    episodes = [(place.name, episode) for place in places for episode in _episodes(config, place)]
+    return Dataset(config.layout, _together(config, episodes))
+
+
+def _together(config: MeasuredConfig, episodes: list[tuple[str, Episode]]) -> tuple[Episode, ...]:
+    """The episodes with every group made one."""
+    merged: list[Episode] = []
+    left = dict(enumerate(episodes))
+    for group in config.together:
+        chosen = [i for i, (name, _) in left.items() if any(fnmatch(name, pattern) for pattern in group)]
+        parts = [left.pop(index)[1] for index in chosen]
+        if len({part.condition for part in parts}) != 1:
+            fact = "of several conditions" if parts else "none"
+            raise DatasetError(f"together: the episodes that match {', '.join(group)} are {fact}; they must be of one.")
+        values = {name: np.concatenate([part.values[name] for part in parts]) for name in config.signals}
+        merged.append(Episode(parts[0].condition, values))
+    return (*merged, *(episode for _, episode in left.values()))
 
 
 def _episodes(config: MeasuredConfig, place: Path) -> Iterator[Episode]:

@@ -60,6 +60,16 @@ def test_a_pause_or_a_step_back_begins_an_episode(tmp_path):
     assert [len(e.values["load"]) for e in read(config, tmp_path).episodes] == [2, 3, 1]
 
 
+def test_repetitions_become_one_episode(tmp_path):
+    for index in range(4):
+        table(tmp_path, *["0,0,0,0"] * (index + 1), name=f"{index}.csv")
+    text = HEAD + SIGNALS + "together: [['1.csv', '3.csv']]\n"
+    data = read(load_measured(describe(tmp_path, text)), tmp_path)
+    assert [len(e.values["load"]) for e in data.episodes] == [6, 1, 3]
+    with pytest.raises(DatasetError, match="match seven are none"):
+        read(load_measured(describe(tmp_path, text.replace("'1.csv', '3.csv'", "seven"))), tmp_path)
+
+
 @pytest.mark.parametrize(
     ("lines", "sentence"),
     [
@@ -112,7 +122,7 @@ def test_descriptions_and_robots_are_told_apart():
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason=f"no recordings in {DATA}; name their folder in GEMUCO_DATA")
-@pytest.mark.parametrize(("name", "samples", "episodes"), [("joint_capsule", 1263, 1), ("schunk_arm", 18720, 20)])
+@pytest.mark.parametrize(("name", "samples", "episodes"), [("joint_capsule", 1263, 1), ("schunk_arm", 18720, 6)])
 def test_shipped_descriptions_fit_the_recordings(name, samples, episodes):
     data = read(load_measured(ROOT / "examples" / f"{name}.yaml"), DATA / name)
     assert (len(data), len(data.episodes)) == (samples, episodes)
