@@ -82,8 +82,11 @@ def test_scaler_does_not_blow_up_an_element_that_hardly_moved():
     np.testing.assert_allclose(scaler.restore(scaler.normalise(rows)), rows, atol=1e-12)
 
 
-def test_scaler_needs_two_measurements():
-    rows = np.ones((5, 12))
+def test_scaler_takes_an_element_that_was_never_measured_as_dead():
+    rows = np.random.default_rng(0).normal(size=(5, 12))
     rows[:, 3] = np.nan
-    with pytest.raises(NotEnoughData, match=r"'muscle_tension.back' was measured less than twice"):
-        Scaler.fit(LAYOUT, rows)
+    scaler = Scaler.fit(LAYOUT, rows)
+    assert scaler.dead.tolist() == [3]
+    assert np.isfinite(scaler.std).all()
+    with pytest.raises(NotEnoughData, match="no measured value at all"):
+        Scaler.fit(LAYOUT, np.full((5, 12), np.nan))
