@@ -45,7 +45,22 @@ def since_cut(recording: Dataset) -> Dataset:
     return Dataset(recording.layout, (Episode(episode.condition, kept),))
 
 
-def areas(schema: BodySchema, healthy: Sequence[Dataset], cut: Mapping[str, Dataset]) -> dict[str, float]:
-    """Muscle -> area under the ROC curve of the scores after its cut against those of all healthy recordings."""
-    well = np.concatenate([scores(schema, recording) for recording in healthy])
-    return {muscle: area(scores(schema, recording), well) for muscle, recording in cut.items()}
+def areas(
+    schema: BodySchema, healthy: Sequence[Dataset], cut: Mapping[str, Dataset], over: float = 0.0
+) -> dict[str, float]:
+    """Muscle -> area under the ROC curve of the scores after its cut against those of all healthy recordings.
+
+    Args:
+        schema: With what is normal.
+        healthy: Recordings of whole arms.
+        cut: Muscle -> recording after its cut.
+        over: Scores are averaged over so long before they are judged [s]; 0 judges every sample alone.
+    """
+    weights = np.ones(max(1, round(over * RATE)))
+    weights /= weights.sum()
+
+    def held(recording: Dataset) -> np.ndarray:
+        return np.convolve(scores(schema, recording), weights, "valid")
+
+    well = np.concatenate([held(recording) for recording in healthy])
+    return {muscle: area(held(recording), well) for muscle, recording in cut.items()}

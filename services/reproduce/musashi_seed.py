@@ -24,6 +24,8 @@ STORY = (60.0, 120.0, 180.0)
 STORY_MUSCLE = "biceps"
 STARTS = {control.OURS: control.STARTS, control.WEIGHTS: 1}
 """How many starts per target are tried."""
+HELD = (1.0, 5.0, 10.0)
+"""Times over which anomaly scores are averaged [s]."""
 BEFORE, AFTER = "before", "after"
 HEAVY = ((0.0, "heavy_object"),)
 
@@ -44,6 +46,7 @@ class Outcome:
         fresh: Errors of the estimate on fresh random motion [rad].
         heavy: The same with a heavy object in the hand [rad].
         areas: Muscle -> area under the ROC curve of its cut, before and after.
+        areas_held: The same after the update, of scores averaged over so many seconds.
         story: Errors of the estimate [rad] while the arm is healthy, loaded, and cut.
         scores: Anomaly scores then.
         threshold: Of the scores after the update.
@@ -60,6 +63,7 @@ class Outcome:
     fresh: Pair
     heavy: Pair
     areas: Mapping[str, Mapping[str, float]]
+    areas_held: Mapping[float, Mapping[str, float]]
     story: Pair
     scores: Pair
     threshold: float
@@ -97,6 +101,7 @@ def run_seed(robot: RobotConfig, seed: int, folder: Path, fresh: bool) -> Outcom
         fresh=both(model.recorded_errors, motion),
         heavy=both(model.recorded_errors, loaded),
         areas={name: anomaly.areas(schema, [motion, loaded], cut) for name, schema in schemas.items()},
+        areas_held={over: anomaly.areas(schemas[AFTER], [motion, loaded], cut, over) for over in HELD},
         story=both(model.recorded_errors, story),
         scores=both(anomaly.scores, story),
         threshold=getattr(schemas[AFTER].normal, "threshold", float("nan")),
