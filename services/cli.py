@@ -288,10 +288,12 @@ def record(
 @speaks_plainly
 def demo(
     robot: RobotFile = "musashi_arm",
-    seed: Annotated[int, typer.Option(help="Which of the actual arms to simulate.")] = 1,
+    seed: Annotated[int, typer.Option(help="Which of the actual robots to simulate.")] = 1,
     out: Annotated[Path, typer.Option(help="Where the plot, the recording and the logs go.")] = Path("runs/demo"),
 ) -> int:
     """One minute with an arm that loses a sensor, learns its own body, and loses a muscle.
+
+    A robot with tools and a camera loses its sight instead, is given another tool, and finds out which.
 
     Makes a model first if there is none; then starts simulated hardware, HAL and model as processes, and plays.
     """

@@ -8,18 +8,24 @@ from rich.console import Console
 from rich.table import Table
 
 from hal.config import RobotConfig
+from hal.errors import ConfigError
 from services import artifacts, collector, trainer
+from services.actor import Actor, Stage
 from services.client import Client
+from services.control_config import ControlConfig
+from services.living_model import load_model
+from services.model_config import model_config
 from services.show import progress
-from services.story import Marks, Story
+from services.story import Story
 from services.supervisor import Supervisor, gemuco_command
 from services.timeline import Timeline
+from services.tool_story import ToolStory
 
 READY_WITHIN = 30.0
 """Time [s] that a process has to come up on a busy machine."""
 CLIENT = "remote client"
 LEAST_LINES = 20
-"""What the remote client must have printed for stage (e) to count."""
+"""What the remote client must have printed to count as observed."""
 
 
 def play(robot: RobotConfig, path: Path, seed: int, out: Path) -> int:
@@ -36,27 +42,58 @@ def play(robot: RobotConfig, path: Path, seed: int, out: Path) -> int:
     make_model(robot, console)
     recording = out / "story.mcap"
     recording.unlink(missing_ok=True)
+    target = control_of(robot).target
     with Supervisor(out) as supervisor:
-        remote = RemoteClient(out / "client.log", console)
+        remote = RemoteClient(f"{target} [{robot.signals[target].unit}]", out / "client.log", console)
         with Client(robot.robot) as client:
-            start(robot, path, seed, recording, supervisor, client, console)
+            start(robot, path, seed, target, recording, supervisor, client, console)
 
             def idle() -> None:
                 supervisor.check()
                 remote.tell()
 
-            signal, command = "joint_position", robot.command.signal
-            sizes = robot.signals[signal].size, robot.signals[command].size
-            with Timeline(client, signal, *sizes) as timeline:
-                marks = Story(robot, client, timeline, seed, idle, console.print).play()
+            actor = Actor(client, idle, console.print)
+            stages = perform(robot, client, target, seed, actor, out / "story.png", console)
         supervisor.stop("client", "recorder")
         remote.tell()
-    from services.story_plot import plot
-
-    plot(robot, timeline, marks, out / "story.png")
-    ok = summary(marks, remote, out, console)
+    ok = summary(stages, actor.stops, remote, out, console)
     console.print(f"{time.monotonic() - started:.0f} s in all.")
     return 0 if ok else 1
+
+
+def control_of(robot: RobotConfig) -> ControlConfig:
+    """How the robot is controlled.
+
+    Raises:
+        ConfigError: Not at all.
+    """
+    control = model_config(robot).control
+    if control is None:
+        raise ConfigError(
+            f"The robot file of '{robot.robot}' has no model.control section, so there is nothing to play."
+        )
+    return control
+
+
+def perform(
+    robot: RobotConfig, client: Client, target: str, seed: int, actor: Actor, picture: Path, console: Console
+) -> list[Stage]:
+    """Play the story that suits the robot, about its tools if it has some, and draw it."""
+    sizes = robot.signals[target].size, robot.signals[robot.command.signal].size
+    if robot.conditions and robot.seen:
+        from services import tool_plot
+
+        schema = load_model(robot, artifacts.model_folder(robot.robot))
+        with Timeline(client, target, *sizes, robot.seen) as timeline:
+            told = ToolStory(robot, client, timeline, seed, actor, console.print, schema).play()
+        tool_plot.plot(robot, target, schema, timeline, told, picture)
+        return told.stages
+    from services import story_plot
+
+    with Timeline(client, target, *sizes, [target]) as timeline:
+        marks = Story(robot, client, timeline, seed, actor, console.print).play()
+    story_plot.plot(robot, timeline, marks, picture)
+    return marks.stages
 
 
 def make_model(robot: RobotConfig, console: Console) -> None:
@@ -65,11 +102,9 @@ def make_model(robot: RobotConfig, console: Console) -> None:
     if trainer.fits(robot, folder):
         console.print(f"Using the model in {folder}.")
         return
-    console.print(
-        "No model yet: the designer's geometric model moves at random, and the body schema is learned from it."
-    )
+    console.print("No model yet: the designer's model moves at random, and the body schema is learned from it.")
     with progress("collecting") as tell:
-        found = collector.collect_direct(robot, "geometric", 0, progress=tell)
+        found = collector.collect_direct(robot, None, 0, progress=tell)
     console.print(f"{len(found.dataset)} samples, {found.speed:.0f} times faster than real time.")
     with progress("training") as tell:
         trained = trainer.train(robot, found.dataset, 0, tell)
@@ -81,12 +116,13 @@ def start(
     robot: RobotConfig,
     path: Path,
     seed: int,
+    target: str,
     recording: Path,
     supervisor: Supervisor,
     client: Client,
     console: Console,
 ) -> None:
-    """Start the processes one after another, each when the one before is ready.
+    """Start the processes one after another, each when the one before is ready; the last one watches `target`.
 
     Raises:
         ChildDied: One of them ended.
@@ -102,7 +138,7 @@ def start(
     for name, command in commands.items():
         supervisor.start(name, gemuco_command(*command))
         supervisor.wait_ready(name, _is_running(client, name), READY_WITHIN)
-    supervisor.start("client", gemuco_command("query", robot.robot, "estimate", "joint_position", "--watch"))
+    supervisor.start("client", gemuco_command("query", robot.robot, "estimate", target, "--watch"))
     names = ", ".join(f"{child.name} {child.process.pid}" for child in supervisor.children.values())
     console.print(f"[bold]Processes:[/] {names}")
 
@@ -118,8 +154,9 @@ def _is_running(client: Client, name: str) -> Callable[[], bool]:
 class RemoteClient:
     """Shows what the remote client's process prints."""
 
-    def __init__(self, log: Path, console: Console) -> None:
-        self._log, self._console = log, console
+    def __init__(self, sign: str, log: Path, console: Console) -> None:
+        """`sign` is what a line begins with that is an estimate."""
+        self._sign, self._log, self._console = sign, log, console
         self._read = 0
         self.lines = 0
         """Estimates that it printed."""
@@ -136,27 +173,27 @@ class RemoteClient:
         whole, newline, _ = text.rpartition("\n")
         self._read += len((whole + newline).encode())
         for line in whole.splitlines():
-            self.lines += "joint_position [rad]" in line
+            self.lines += self._sign in line
             self.estimated += "estimated from" in line
             self._console.print(f"    {CLIENT}: {line}", style="dim", highlight=False, markup=False)
 
 
-def summary(marks: Marks, remote: RemoteClient, out: Path, console: Console) -> bool:
+def summary(stages: list[Stage], stops: int, remote: RemoteClient, out: Path, console: Console) -> bool:
     """Print what happened as a table; whether every stage was really observed."""
     table = Table(title="What happened", title_justify="left", show_lines=True)
     table.add_column("stage")
     table.add_column("measured")
     table.add_column("observed", justify="center")
-    for stage in marks.stages:
+    for stage in stages:
         table.add_row(stage.name, "\n".join(stage.figures), _yes(stage.observed))
     heard = remote.lines >= LEAST_LINES and remote.estimated > 0
     text = f"{remote.lines} estimates printed by a process of its own, {remote.estimated} of them not measured"
     table.add_row(CLIENT, text, _yes(heard))
     console.print(table)
-    if marks.stops:
-        console.print(f"The HAL stopped the arm {marks.stops} times by itself, see above.")
+    if stops:
+        console.print(f"The HAL stopped the arm {stops} times by itself, see above.")
     console.print(f"Plot: {out / 'story.png'}   recording: {out / 'story.mcap'}   logs: {out}/*.log")
-    return heard and all(stage.observed for stage in marks.stages)
+    return heard and all(stage.observed for stage in stages)
 
 
 def _yes(observed: bool) -> str:

@@ -1,6 +1,5 @@
 """The story of the demo: an arm moves, loses a sensor, learns its body, loses a muscle."""
 
-import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -8,9 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from hal.config import RobotConfig
-from hal.errors import CommandRefused
+from services.actor import NOTICED_WITHIN, Actor, Stage
 from services.client import Client
-from services.errors import NotEngaged, ServiceError
 from services.messages import Anomaly
 from services.timeline import Timeline, hidden_error
 
@@ -26,30 +24,6 @@ INSIDE = 0.15
 """Targets keep this share of the range away from the limits."""
 ENCODER, SILENT_ELEMENT = "shoulder_roll_encoder", "shoulder_roll"
 MUSCLE = "deltoid_side"
-RECOVERED_WITHIN = 8.0
-"""Time [s] that nodes have to come back after a fault."""
-ENGAGED_WITHIN = 1.0
-NOTICED_WITHIN = 3.0
-"""Time [s] within which a fault must be told."""
-
-
-@dataclass(frozen=True, slots=True)
-class Stage:
-    """One stage of the story.
-
-    Attributes:
-        name: What happened.
-        start: When it began [s of the timeline].
-        end: When it ended.
-        figures: What was measured, in physical units.
-        observed: Whether what the stage is about was really seen.
-    """
-
-    name: str
-    start: float
-    end: float
-    figures: tuple[str, ...]
-    observed: bool
 
 
 @dataclass(slots=True)
@@ -61,8 +35,6 @@ class Marks:
     cut: float = 0.0
     alarm: float = float("nan")
     blamed: str = ""
-    stops: int = 0
-    """How often the HAL stopped the arm by itself."""
     error_before: float = float("nan")
     error_after: float = float("nan")
     stages: list[Stage] = field(default_factory=list)
@@ -72,11 +44,11 @@ class Story:
     """Plays the stages through a client, as any remote program could."""
 
     def __init__(
-        self, robot: RobotConfig, client: Client, timeline: Timeline, seed: int, idle: Callable[[], None],
+        self, robot: RobotConfig, client: Client, timeline: Timeline, seed: int, actor: Actor,
         tell: Callable[[str], None],
     ) -> None:  # fmt: skip
-        """`idle` is called all the time while waiting, `tell` with what happens."""
-        self._client, self._timeline, self._idle, self._tell = client, timeline, idle, tell
+        """`tell` is called with what happens."""
+        self._client, self._timeline, self._actor, self._tell = client, timeline, actor, tell
         self._signal = "joint_position"
         self._elements = robot.signals[self._signal].elements
         self._muscles = robot.signals[robot.command.signal].elements
@@ -89,19 +61,14 @@ class Story:
     def play(self) -> Marks:
         """All stages, about a minute."""
         for stage in (self.move, self.lose_sensor, self.learn, self.lose_muscle):
-            done = stage()
-            self.marks.stages.append(done)
-            for figure in done.figures:
-                self._tell(f"    {figure}")
-            if not done.observed:
-                self._tell("    [red]That is not what should have been seen.[/]")
+            self.marks.stages.append(self._actor.play(stage))
         return self.marks
 
     def move(self) -> Stage:
         """(a) Targets are reached."""
         self._tell("[bold](a)[/] The controller moves the arm to targets.")
         start = self._timeline.now()
-        self._engage()
+        self._actor.engage()
         misses, errors = self._measure_poses()
         self.marks.error_before = _mean_norm(errors)
         reached = _mean_norm(misses)
@@ -119,13 +86,13 @@ class Story:
         index = self._elements.index(SILENT_ELEMENT)
         start = self._timeline.now()
         self._client.fault(f"sensor_silent {ENCODER}")
-        noticed = self._wait(lambda: self._is_estimated(index), NOTICED_WITHIN)
+        noticed = self._actor.wait(lambda: self._is_estimated(index), NOTICED_WITHIN)
         delay = self._timeline.now() - start
         for _ in range(SILENT_POSES):
             self._go(self._pose(), LEARNING_TIME)
         end = self._timeline.now()
         self._client.fault(f"node_back {ENCODER}")
-        returned = self._wait(lambda: not self._is_estimated(index), NOTICED_WITHIN)
+        returned = self._actor.wait(lambda: not self._is_estimated(index), NOTICED_WITHIN)
         self.marks.silent = (start, end)
         error = np.abs(self._silent_error(index, start + delay, end))
         source = _most_common(self._timeline.between("source", start + delay, end).tolist())
@@ -170,7 +137,7 @@ class Story:
         score = float(np.nanmedian(self._timeline.between("score", start - 2.0, start)))
         self._client.fault(f"muscle_cut {MUSCLE}")
         self.marks.cut = start
-        alarmed = self._wait(self._is_alarmed, NOTICED_WITHIN)
+        alarmed = self._actor.wait(self._is_alarmed, NOTICED_WITHIN)
         self.marks.alarm = self._timeline.now()
         for _ in range(CUT_POSES):
             self._go(self._pose(), LEARNING_TIME)
@@ -197,57 +164,17 @@ class Story:
                 total += np.nan_to_num(anomaly.contribution[signal])
         return self._muscles[int(np.argmax(total))] if anomalies else ""
 
-    def _engage(self) -> None:
-        """Engage, again if the moment was a bad one: on a busy machine a sample may be late just then."""
-        refusal = ""
-        deadline = time.monotonic() + NOTICED_WITHIN
-        while not self._follows():
-            if time.monotonic() > deadline:
-                raise ServiceError(f"The arm did not begin to follow. {refusal or 'See the logs beside the plot.'}")
-            try:
-                self._client.engage()
-            except (NotEngaged, CommandRefused) as error:
-                refusal = str(error)
-            self._wait(self._follows, ENGAGED_WITHIN)
-
-    def _recover(self) -> None:
-        """Go on after the HAL stopped the arm, as a person would: read why, reset, engage again."""
-        mode, status = self._mode(), self._client.status("hal", timeout=1.0)
-        fault = status.facts.get("fault") if status else ""
-        why = f"({mode}). {fault or 'Commands came too late.'}"
-        self._tell(f"    [yellow]The HAL stopped the arm {why} It is reset and engaged again.[/]")
-        self.marks.stops += 1
-        self._client.reset()
-        self._wait(lambda: self._mode() == "off" and self._is_healthy(), RECOVERED_WITHIN)
-        self._engage()
-
     def _measure_poses(self) -> tuple[list[np.ndarray], list[np.ndarray]]:
         """At every fresh pose: target minus truth, and estimate with the encoders hidden minus truth [rad]."""
         misses, errors = [], []
         for pose in self._poses:
             self._go(pose, POSE_TIME)
-            truth = self._client.truth(timeout=1.0)
-            if truth is None:
-                raise ServiceError("The simulator does not tell the truth any more; see the logs beside the plot.")
-            misses.append(pose - truth.values[self._signal])
-            errors.append(hidden_error(self._client, self._signal))
+            misses.append(pose - self._actor.truth(self._signal))
+            errors.append(hidden_error(self._client, self._signal, [self._signal]))
         return misses, errors
 
     def _go(self, pose: np.ndarray, duration: float) -> None:
-        if not self._follows():
-            self._recover()
-        self._client.ask("model", "target", {"signal": self._signal, "values": pose.tolist()})
-        self._wait(lambda: False, duration)
-
-    def _wait(self, condition: Callable[[], bool], duration: float) -> bool:
-        """Wait for so long [s] or until the condition holds; whether it did."""
-        deadline = time.monotonic() + duration
-        while not condition():
-            if time.monotonic() >= deadline:
-                return False
-            self._idle()
-            time.sleep(0.01)
-        return True
+        self._actor.go(self._signal, pose, duration)
 
     def _pose(self) -> np.ndarray:
         margin = INSIDE * (self._high - self._low)
@@ -260,17 +187,6 @@ class Story:
     def _is_alarmed(self) -> bool:
         anomaly = self._client.anomaly()
         return anomaly is not None and anomaly.is_anomaly
-
-    def _is_healthy(self) -> bool:
-        status = self._client.status("hal")
-        return status is not None and status.state == "running"
-
-    def _follows(self) -> bool:
-        return self._mode() in ("hold", "follow")
-
-    def _mode(self) -> str:
-        applied = self._client.applied(timeout=0.5)
-        return "unheard" if applied is None else applied.mode
 
     def _silent_error(self, index: int, start: float, end: float) -> np.ndarray:
         value, truth = (self._timeline.between(name, start, end) for name in ("value", "truth"))

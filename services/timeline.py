@@ -4,6 +4,7 @@ import math
 import threading
 import time
 from collections import defaultdict
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from gemuco.errors import SchemaError
 from hal.errors import HalError
 from services.client import Client
 from services.errors import ServiceError
-from services.messages import Anomaly
+from services.messages import Anomaly, Update
 
 EVERY = 0.05
 """Time between two rows [s]."""
@@ -23,13 +24,14 @@ class Timeline:
     """Rows of a story in a thread of its own, as columns of arrays.
 
     Columns are `time` [s since the start], `truth`, `value`, `estimated` and `source` (method and signals) of one
-    signal, `applied` command, `score`, `threshold` and `is_anomaly`; and on a time axis of their own `hidden_time` and
-    `hidden_error`, the norm of what the model says of the hidden signal minus the truth [its unit]. What was not there
-    is NaN.
+    signal, `applied` command, `score`, `threshold`, `is_anomaly` and `verdict`; and on a time axis of their own
+    `hidden_time` and `hidden_error`, the norm of what the model says of the hidden signal minus the truth [its unit].
+    What was not there is NaN.
     """
 
-    def __init__(self, client: Client, signal: str, size: int, commands: int) -> None:
-        self._client, self._signal = client, signal
+    def __init__(self, client: Client, signal: str, size: int, commands: int, hide: Sequence[str]) -> None:
+        """Prepare for a signal of so many elements, and for asking the model with some signals hidden."""
+        self._client, self._signal, self._hide = client, signal, hide
         self._nothing, self._no_command = np.full(size, np.nan), np.full(commands, np.nan)
         self._columns: dict[str, list[object]] = defaultdict(list)
         self._stop = threading.Event()
@@ -37,6 +39,8 @@ class Timeline:
         self._start = time.monotonic()
         self.anomalies: list[tuple[float, Anomaly]] = []
         """Time [s] and message of every row that was an anomaly."""
+        self.updates: list[tuple[float, Update]] = []
+        """Time [s] and message of what the online update said, once each."""
 
     def __enter__(self) -> "Timeline":
         self._start = time.monotonic()
@@ -81,7 +85,11 @@ class Timeline:
             "score": math.nan if anomaly is None else anomaly.score,
             "threshold": math.nan if anomaly is None else anomaly.threshold,
             "is_anomaly": anomaly is not None and anomaly.is_anomaly,
+            "verdict": "" if anomaly is None else anomaly.verdict,
         }
+        update = self._client.update()
+        if update is not None and (not self.updates or update is not self.updates[-1][1]):
+            self.updates.append((self.now(), update))
         if anomaly is not None and anomaly.is_anomaly:
             self.anomalies.append((self.now(), anomaly))
         for name, value in add.items():
@@ -90,16 +98,16 @@ class Timeline:
 
     def _ask_hidden(self) -> None:
         try:
-            error = hidden_error(self._client, self._signal)
+            error = hidden_error(self._client, self._signal, self._hide)
         except (ServiceError, SchemaError, HalError):
             error = self._nothing
         self._columns["hidden_error"].append(float(np.linalg.norm(error)))
         self._columns["hidden_time"].append(self.now())
 
 
-def hidden_error(client: Client, signal: str) -> np.ndarray:
-    """What the model says of a signal that is hidden from it, minus the truth [unit], shape (n,); NaN if unknown."""
-    answer = client.infer(signal, hide=[signal])
+def hidden_error(client: Client, signal: str, hide: Sequence[str]) -> np.ndarray:
+    """What the model says of a signal while some are hidden, minus the truth [unit], shape (n,); NaN if unknown."""
+    answer = client.infer(signal, hide=hide)
     truth = client.truth()
     value = np.asarray(answer["values"], float)
     return value - truth.values[signal] if truth is not None else np.full(len(value), np.nan)
