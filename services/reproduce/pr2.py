@@ -86,9 +86,9 @@ def _add_simulated(report: Report, outcomes: Sequence[Outcome]) -> None:
             row(
                 f"estimate {case} after {POINTS} points, p by {name}",
                 "mm",
-                PAPER_ESTIMATE[case],
+                PAPER_ESTIMATE.get(case, ""),
                 lambda o, key=(case, name): o.simulated.estimated[key].mean(POINTS),
-                ESTIMATE_BAR if name == "ekf" else None,
+                ESTIMATE_BAR if name == "ekf" and case in PAPER_ESTIMATE else None,
             )
     row("control, first point", "mm", "240", lambda o: 1e3 * o.simulated.controlled["p"].course.errors[0])
     for way in WAYS:

@@ -20,9 +20,9 @@ def draw(folder: Path, simulated: Sequence[Simulated], actual: Sequence[Actual])
 
 def _maps(path: Path, simulated: Simulated, actual: Actual) -> None:
     with figures.picture(path, "p of every grasp, and its ways while it was updated", columns=2) as (left, right):
-        ways = {f"{case} {name}": simulated.estimated[case, name].biases for case in CASES for name in RECOGNISERS}
-        wanted = {name: way for name, way in ways.items() if not name.endswith("gauss_newton")}
-        figures.bias_map(left, simulated.schema.biases, wanted)
+        shown = [(case, name) for case in ("(1)", "(2)") for name in ("ekf", "gradient")]
+        ways = {f"{case} {name}": simulated.estimated[case, name].biases for case, name in shown}
+        figures.bias_map(left, simulated.schema.biases, ways)
         left.set_title("simulation: normal duster")
         flexible = {name: p for name, p in actual.schema.biases.items() if name not in simulated.schema.biases}
         biases, change = actual.course.biases, actual.change
@@ -31,13 +31,14 @@ def _maps(path: Path, simulated: Simulated, actual: Actual) -> None:
 
 
 def _estimation(path: Path, simulated: Sequence[Simulated]) -> None:
-    with figures.picture(path, "Error of the estimated tool tip while p is updated", columns=2) as axes:
+    with figures.picture(path, "Error of the estimated tool tip while p is updated", columns=2, rows=2) as axes:
         for axis, (case, (believed, held)) in zip(axes, CASES.items(), strict=True):
             curves = {
                 name: np.stack([1e3 * one.estimated[case, name].errors for one in simulated]) for name in RECOGNISERS
             }
             figures.over_steps(axis, curves, "mm", "data points", bar=12.0)
-            axis.set_title(f"{case}: {believed} is believed, {held} is held")
+            trained = "" if held in simulated[0].schema.biases else " (never trained)"
+            axis.set_title(f"{case}: {believed} is believed, {held} is held{trained}")
 
 
 def _control(path: Path, simulated: Sequence[Simulated]) -> None:

@@ -29,8 +29,14 @@ POINTS = 20
 FRESH, FRESH_SHARE = 1000, 0.1
 """Added to the seed for samples on which models are judged; a tenth of what is learned from."""
 
-CASES = {"(1)": ("l500_phi60", "l500_phi0"), "(2)": ("l700_phi30", "l300_phi30")}
-"""Estimation: the grasp that is believed at first, the one that is there."""
+CASES = {
+    "(1)": ("l500_phi60", "l500_phi0"),
+    "(2)": ("l700_phi30", "l300_phi30"),
+    "(3)": ("l500_phi60", "l400_phi15"),
+    "(4)": ("l300_phi30", "l600_phi45"),
+}
+"""Estimation: the grasp that is believed at first, the one that is there. (3) and (4) are ours: of grasps between those
+that were trained."""
 RECOGNISERS = {
     name: UpdateConfig(what="bias", bias_method=name, minimum=1) for name in ("ekf", "gauss_newton", "gradient")
 }

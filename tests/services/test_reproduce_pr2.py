@@ -56,7 +56,7 @@ def test_the_arm_arrives_within_its_limits_and_takes_another_duster():
         assert arm.go(geometry.high + 1.0)[JOINTS] == pytest.approx(geometry.high, abs=1e-3)
 
 
-def test_the_flexible_dusters_grasps_are_those_the_file_does_not_list():
+def test_the_flexible_duster_has_six_grasps_that_the_file_does_not_list():
     assert len(flexible(ROBOT)) == 6
     assert not set(flexible(ROBOT)) & set(ROBOT.conditions)
 

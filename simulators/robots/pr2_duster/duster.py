@@ -16,6 +16,8 @@ CLOTH = 0.1
 LENGTHS = (0.3, 0.5, 0.7)
 ANGLES = (0, 30, 60)
 """Grasping angles of the paper [deg]."""
+BETWEEN = ((0.4, 15), (0.6, 45))
+"""Lengths [m] and angles [deg] that no model is trained on: what was never held must be recognised too."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,12 +96,13 @@ _FOAM = Foam(length=0.5, stiffness=0.7, moment=0.1 * 0.25 + 0.05 * 0.5)
 
 GRASPS: Mapping[str, Grasp] = {
     **{f"l{1e3 * length:.0f}_phi{phi}": Grasp(length, math.radians(phi)) for length in LENGTHS for phi in ANGLES},
+    **{f"l{1e3 * length:.0f}_phi{phi}": Grasp(length, math.radians(phi)) for length, phi in BETWEEN},
     **{
         f"{name}_phi{phi}": Grasp(length, math.radians(phi), _FOAM)
         for name, length in (("short", 0.1), ("long", 0.2))
         for phi in ANGLES
     },
 }
-"""Condition -> grasp: nine of the normal duster, six of the flexible one."""
-NORMAL = tuple(name for name, grasp in GRASPS.items() if grasp.foam is None)
+"""Condition -> grasp: nine of the normal duster and two between them, six of the flexible one."""
+NORMAL = tuple(f"l{1e3 * length:.0f}_phi{phi}" for length in LENGTHS for phi in ANGLES)
 FLEXIBLE = tuple(name for name, grasp in GRASPS.items() if grasp.foam is not None)
