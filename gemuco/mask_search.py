@@ -8,7 +8,7 @@ it stays too little. Each such walk ends on the border and is n tries long; walk
 their tries are evaluated together.
 
 The assumption only guides: every mask that is returned was tried itself, and when the border is complete its masks are
-tried with one signal less, for exceptions from which new walks begin.
+tried with one signal less and with two, for exceptions from which new walks begin.
 """
 
 from collections.abc import Callable
@@ -18,6 +18,8 @@ import numpy as np
 
 TOGETHER = 32
 """Walks at a time."""
+DEPTH = 2
+"""How far below the border exceptions are looked for."""
 SEEDS = 4000
 """Random masks looked through for one that the border says nothing about, before the border counts as complete."""
 
@@ -107,13 +109,19 @@ def _unexplored(smallest: np.ndarray, largest: np.ndarray, signals: int, random:
 
 
 def _exceptions(smallest: np.ndarray, largest: np.ndarray, oracle: _Oracle) -> np.ndarray:
-    """Masks one signal short of the border that are enough all the same, shape (n, signals)."""
-    whole = np.concatenate([smallest, largest])
-    lines, signals = np.nonzero(whole)
-    short = whole[lines]
-    short[np.arange(len(short)), signals] = False
-    short = np.unique(short[short.any(axis=1)], axis=0)
-    return short[oracle(short) & ~_contains(short, smallest)] if len(short) else short
+    """Masks up to `DEPTH` signals short of the border that are enough all the same, shape (n, signals)."""
+    short = np.concatenate([smallest, largest])
+    for _ in range(DEPTH):
+        lines, signals = np.nonzero(short)
+        short = short[lines]
+        short[np.arange(len(short)), signals] = False
+        short = np.unique(short[short.any(axis=1)], axis=0)
+        if not len(short):
+            return short
+        found = short[oracle(short) & ~_contains(short, smallest)]
+        if len(found):
+            return found
+    return found
 
 
 def _contains(masks: np.ndarray, parts: np.ndarray) -> np.ndarray:

@@ -20,7 +20,7 @@ def test_the_border_of_a_monotone_rule_is_found_whole(seed):
     assert border.is_complete
     assert {m.tobytes() for m in border.smallest} == {m.tobytes() for m in parts}
     assert not contains(border.largest, parts).any()
-    assert border.tried < 1000
+    assert border.tried < 2048
 
 
 def test_exceptions_beside_the_border_are_found():
