@@ -1,5 +1,6 @@
 """Every example that needs no running robot runs as its docstring says; the others say what they need."""
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -19,6 +20,14 @@ def test_lost_sensor_is_estimated() -> None:
     done = run("lost_sensor.py")
     assert done.returncode == 0, done.stderr
     assert "mask says" in done.stdout
+
+
+def test_a_tool_that_was_never_held_is_recognised() -> None:
+    done = run("another_tool.py")
+    assert done.returncode == 0, done.stderr
+    before, after = (int(number) for number in re.findall(r"by (\d+) mm", done.stdout))
+    assert before > 200
+    assert after < 30
 
 
 def test_arm_moves_without_a_bus() -> None:
