@@ -30,8 +30,15 @@ def plot(robot: RobotConfig, signal: str, schema: BodySchema, timeline: Timeline
     _anomaly(axes[4], timeline)
     for axis in axes:
         _stages(axis, marks)
-    for stage in marks.stages:
-        axes[0].text(stage.start, 1.02, stage.name, transform=axes[0].get_xaxis_transform(), color=GREY, fontsize=9)
+    for index, stage in enumerate(marks.stages):
+        axes[0].text(
+            stage.start,
+            1.02 + 0.06 * (index % 2),
+            stage.name,
+            transform=axes[0].get_xaxis_transform(),
+            color=GREY,
+            fontsize=9,
+        )
     axes[0].set_ylabel(f"{signal} [{robot.signals[signal].unit}]")
     axes[-1].set_xlabel("time [s]")
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -104,7 +111,7 @@ def _bias(axis: Axes, schema: BodySchema, timeline: Timeline, marks: ToolMarks) 
         )  # fmt: skip
     axis.set_ylabel("p to known tools [std]")
     axis.set_ylim(bottom=0.0)
-    axis.legend(loc="center left", fontsize=8)
+    axis.legend(loc="best", fontsize=8)
 
 
 def _anomaly(axis: Axes, timeline: Timeline) -> None:
@@ -116,4 +123,4 @@ def _anomaly(axis: Axes, timeline: Timeline) -> None:
         at = verdict[:rows] == word
         axis.plot(time[:rows][at], score[:rows][at], ".", color=color, markersize=4, label=f"verdict {word}")
     axis.set_ylabel("Mahalanobis distance")
-    axis.legend(loc="upper left", ncols=4, fontsize=8)
+    axis.legend(loc="lower left", ncols=4, fontsize=8)

@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import cycle
 
 import numpy as np
 
@@ -20,7 +21,9 @@ from services.tool_targets import common_targets
 TARGETS = 4
 """Targets at which the tip's error is measured: with the first tool, with the other one, and when it is known."""
 LEARNING_TARGETS = 4
-"""Targets between which a tool is recognised."""
+"""Targets between which the model learns."""
+LEARNING_TIME = 7.0
+"""How long it learns at least [s]."""
 SETTLE = 1.5
 """Time [s] at a target beside the time of the way there."""
 HURRY = 0.4
@@ -39,7 +42,6 @@ class ToolMarks:
     covered: tuple[float, float] = (0.0, 0.0)
     adapting: list[tuple[float, float]] = field(default_factory=list)
     changed: float = float("nan")
-    recognised: float = float("nan")
     targets: list[tuple[float, np.ndarray]] = field(default_factory=list)
     """When which target was given."""
     reached: list[tuple[float, float]] = field(default_factory=list)
@@ -78,14 +80,21 @@ class ToolStory:
         return self.marks
 
     def move(self) -> Stage:
-        """(a) The tool in the hand is recognised, and targets are reached."""
+        """(a) The model gets to know this body and its tool, and targets are reached."""
         self._tell(f"[bold](a)[/] Which tool is in the hand is found out, and its tip moves to {TARGETS} targets.")
         start = self._timeline.now()
         self._actor.engage()
         known = self._adapt(self.marks.conditions[0])
         self._before = self._measure()
-        figures = (*known[1], f"{TARGETS} targets, tip {1e3 * self._before:.0f} mm away from them on average")
-        return self._stage("moves a tool to targets", start, figures, known[0] and self._before < FOLLOWS)
+        for target in self._learning:
+            self._go(target, HURRY)
+        normal = self._client.ask("model", "normal")
+        figures = (
+            *known[1],
+            f"{TARGETS} targets, tip {1e3 * self._before:.0f} mm away from them on average",
+            f"what is normal learned anew from {normal['samples']} samples",
+        )
+        return self._stage("moves a tool to targets", start, figures, self._before < FOLLOWS)
 
     def lose_sight(self) -> Stage:
         """(b) The camera is covered; the tip goes on being known, and marked as estimated."""
@@ -123,14 +132,12 @@ class ToolStory:
         self._client.fault(f"tool_changed {new}")
         self._without = self._measure()
         end = self._timeline.now()
-        verdicts = [word for word in self._timeline.between("verdict", start, end).tolist() if word]
-        odd = [word for word in verdicts if word != "normal"]
-        verdict = _most_common(odd) or "normal"
+        verdict, share = self._verdict(start)
         score, limit = (self._timeline.between(name, start, end) for name in ("score", "threshold"))
         figures = (
             f"the same targets: tip {1e3 * self._before:.0f} mm away before, {1e3 * self._without:.0f} mm now",
             f"anomaly score {np.nanmedian(score):.1f}, threshold {np.nanmedian(limit):.1f}",
-            f"verdict: {verdict} ({odd.count(verdict) / max(1, len(verdicts)):.0%} of the time)",
+            f"verdict: {verdict} ({share:.0%} of the time)",
         )
         missed = self._without > self._before / BETTER
         return self._stage("its tool is changed", start, figures, missed and verdict == "environment")
@@ -140,13 +147,12 @@ class ToolStory:
         self._tell("[bold](d)[/] The online update looks which tool that is.")
         start = self._timeline.now()
         known, told = self._adapt(self.marks.conditions[1])
-        self.marks.recognised = self._settled_at(start, self.marks.conditions[1])
         after = self._measure()
         self._client.disengage()
         figures = (
             *told,
             f"the same targets: tip {1e3 * self._without:.0f} mm away before, {1e3 * after:.0f} mm now",
-            f"verdict now: {self._client_verdict()}",
+            f"verdict now: {self._verdict(self._timeline.now() - 1.0)[0]}",
         )
         return self._stage("recognises the tool", start, figures, known and after < BETTER * self._without)
 
@@ -154,7 +160,9 @@ class ToolStory:
         """Update while the tip moves; whether the condition was recognised, and what there is to say."""
         start = self._timeline.now()
         self._client.adapt(True)
-        for target in self._learning:
+        for target in cycle(self._learning):
+            if self._timeline.now() > start + LEARNING_TIME:
+                break
             self._go(target, HURRY)
         self._client.adapt(False)
         end = self._timeline.now()
@@ -165,7 +173,7 @@ class ToolStory:
         last = updates[-1][1]
         away = self._distances(last)
         nearest = self._names[int(np.argmin(away))]
-        at = self._settled_at(start, condition)
+        at = self._settled_at(start, nearest)
         when = "p did not settle there"
         if np.isfinite(at):
             first = next(update for moment, update in updates if moment >= at)
@@ -210,9 +218,11 @@ class ToolStory:
         estimate = self._client.estimate()
         return estimate is not None and bool((estimate.estimated[self._signal] == wanted).all())
 
-    def _client_verdict(self) -> str:
-        anomaly = self._client.anomaly(timeout=1.0)
-        return "none" if anomaly is None else f"{anomaly.verdict or 'none'}, score {anomaly.score:.1f}"
+    def _verdict(self, start: float) -> tuple[str, float]:
+        """What the body was judged to be most of the time since then, and in which share of it."""
+        words = [word for word in self._timeline.between("verdict", start, np.inf).tolist() if word]
+        verdict = _most_common(words) or "none"
+        return verdict, words.count(verdict) / max(1, len(words))
 
     def _stage(self, name: str, start: float, figures: tuple[str, ...], observed: bool) -> Stage:
         return Stage(name, start, self._timeline.now(), figures, observed)

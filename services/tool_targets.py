@@ -12,6 +12,8 @@ DRAWN = 30_000
 """Random postures per tool."""
 INSIDE = 0.1
 """Postures keep this share of the range away from the limits."""
+TRIED = 3000
+"""Of those, how many are tried as a target."""
 CLOSE = 0.02
 """So near [unit of the target] a posture with the other tool must come to a target."""
 APART = (0.08, 0.25)
@@ -40,7 +42,7 @@ def common_targets(
     """
     random = np.random.default_rng(seed)
     (postures, first), (_, second) = (_reached(robot, signal, condition, random) for condition in conditions)
-    order = random.permutation(len(first))
+    order = random.permutation(len(first))[:TRIED]
     chosen: list[int] = []
     for _ in range(count):
         chosen.append(_next(order, first, second, chosen))

@@ -1,0 +1,81 @@
+"""The demo of a robot with tools and a camera, interrupted while the robot moves."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from gemuco.dataset import Dataset, Episode
+from gemuco.train import TrainConfig, fit
+from hal.config import load_robot
+from services.artifacts import fingerprint
+from services.living_model import layout_of
+from services.supervisor import gemuco_command
+
+SERVICES_TESTS = Path(__file__).parents[1] / "services"
+sys.path.append(str(SERVICES_TESTS))
+from small_hand import TOOLS, description, gravity_of, tip_of  # noqa: E402
+
+LOW, HIGH = [-1.0, -2.2], [1.0, 2.2]
+"""Of the joints [rad]: so far that the long tool comes to where the short one is."""
+PATIENCE = 30.0
+"""Longer than anything takes, on a machine with other work [s]."""
+
+
+def robot_with_model(folder: Path) -> Path:
+    """A robot file, beside the model that the demo looks for."""
+    name = f"tools_{os.getpid()}"
+    file = folder / f"{name}.yaml"
+    content = description(name)
+    content["model"] |= {"network": {"bias": 2}, "control": {"target": "tool_tip_position", "route": "input"}}
+    content["limits"]["joint_position"] |= {"low": LOW, "high": HIGH}
+    file.write_text(yaml.safe_dump(content))
+    robot = load_robot(file)
+    random = np.random.default_rng(0)
+    episodes = []
+    for condition, tool in TOOLS.items():
+        for _ in range(6):
+            position = random.uniform(LOW, HIGH, (100, 2))
+            tip, gravity = tip_of(position, tool), gravity_of(position, tool)
+            whole = {"joint_position": position, "center_of_gravity": gravity, "tool_tip_position": tip}
+            episodes.append(Episode(condition, whole))
+    dataset = Dataset(layout_of(robot), tuple(episodes))
+    config = TrainConfig(hidden=(30, 20), latent=6, bias_size=2, epochs=10, batch=100, rate=1e-2)
+    schema, _ = fit(dataset, config, (("joint_position",),), x_out=("center_of_gravity", "tool_tip_position"))
+    schema.with_manifest(fingerprint=fingerprint(robot)).save(folder / "runs" / name / "model")
+    return file
+
+
+def test_an_interrupted_demo_of_tools_leaves_no_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(SERVICES_TESTS))
+    file, log = robot_with_model(tmp_path), tmp_path / "demo.log"
+    deadline = time.monotonic() + PATIENCE
+    with log.open("w") as sink:
+        demo = subprocess.Popen(
+            gemuco_command("demo", str(file)), cwd=tmp_path, stdout=sink, stderr=sink, start_new_session=True
+        )
+    try:
+        while "(a)" not in log.read_text():
+            assert demo.poll() is None, log.read_text()
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        told = log.read_text()
+        words = told[told.index("Processes:") : told.index("(a)")].replace(",", " ").split()
+        assert [word for word in words if word.isalpha()] == [
+            "simulator", "hal", "vision", "model", "recorder", "client",
+        ]  # fmt: skip
+        demo.send_signal(signal.SIGINT)
+        assert demo.wait(PATIENCE) != 0
+        pids = [int(word) for word in words if word.isdigit()]
+        while any(Path(f"/proc/{pid}").exists() for pid in pids):
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+    finally:
+        demo.kill()
+        demo.wait()
