@@ -131,18 +131,19 @@ class OnlineUpdate:
         self._publish(told)
 
     def _newest(self) -> tuple[dict[str, np.ndarray] | None, bool]:
-        """The newest sample, if every value is fresh and it is late enough; and whether it is far from the last."""
+        """The newest sample, if every value is fresh; and whether it is far and late enough to be learned from."""
         fresh, values = self._freshness.take()
-        now = self._clock.monotonic()
-        if fresh is None or now - self._taken_at < 0.9 * self._config.interval:
+        if fresh is None:
             return None, False
         row = self._living.schema.normalise(values)
         if not np.isfinite(row).all():
             return None, False
-        self._taken_at = now
+        now = self._clock.monotonic()
+        if now - self._taken_at < 0.9 * self._config.interval:
+            return values, False
         if self._last is not None and float(np.abs(row - self._last).max()) < SPREAD:
             return values, False
-        moved, self._last = self._last is not None, row
+        moved, self._last, self._taken_at = self._last is not None, row, now
         return values, moved
 
     def _learn(self, learner: Learner, sample: dict[str, np.ndarray] | None) -> Update:

@@ -16,7 +16,7 @@ from services.update_loop import OnlineUpdate
 class Bench:
     """The update loop of an arm that goes from state to state."""
 
-    def __init__(self, window: int = 50) -> None:
+    def __init__(self, window: int = 50, interval: float = 0.1) -> None:
         self.clock = ManualClock()
         self.newest: Fresh | None = None
         self.engaged = False
@@ -25,7 +25,7 @@ class Bench:
         self.update = OnlineUpdate(
             Freshness(arm(), lambda: self.newest, self.clock),
             self.living,
-            UpdateConfig(window=window),
+            UpdateConfig(window=window, interval=interval),
             lambda schema: Updater(schema, Learning(window=window, minimum=10, batch=10)),
             lambda: self.engaged,
             self.told.append,
@@ -99,3 +99,15 @@ def test_the_normal_is_learned_from_samples_since_the_model_changed() -> None:
     bench.update.adapt(False)
     with pytest.raises(NotEnoughData):
         bench.update.learn_normal()
+
+
+def test_the_interval_is_between_samples_that_are_learned_from() -> None:
+    bench = Bench(window=200, interval=0.4)
+    bench.engaged = True
+    for index in range(80):
+        bench.turn(index)
+    assert bench.update.learn_normal() == 80
+    bench.update.adapt(True)
+    for index in range(80, 100):
+        told = bench.turn(index)
+    assert told.window == 5
