@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gemuco.bias import RECOGNISERS, Prior, Recogniser
-from gemuco.errors import SchemaError
+from gemuco.errors import SchemaError, whole_number
 from gemuco.optimiser import OPTIMISERS
 from gemuco.relearn import Relearner
 from gemuco.schema import BodySchema
@@ -65,6 +65,12 @@ class UpdateConfig:
         for name, known in (("what", WHAT), ("bias_method", METHODS), ("optimiser", OPTIMISERS)):
             if getattr(self, name) not in known:
                 raise SchemaError(f"{name} '{getattr(self, name)}' is not known. Known: {', '.join(known)}.")
+        for name, least in (("window", 1), ("minimum", 1), ("batch", 1), ("steps", 0), ("replay", 0), ("held_out", 0)):
+            whole_number(f"Update: {name}", getattr(self, name), least)
+        whole_number("Update: seed", self.seed, 0)
+        for name in ("rate", "bias_rate"):
+            if not 0.0 <= getattr(self, name) < float("inf"):
+                raise SchemaError(f"Update: {name} is {getattr(self, name)}; it must be 0 or a positive number.")
         if self.held_out == 1:
             raise SchemaError("held_out 1 holds every sample out and leaves none to learn from; use 0 or 2 and more.")
 
@@ -164,8 +170,8 @@ class Updater:
             UnknownSignal: A name is not in the layout.
             WrongSize: An array does not have its signal's size.
         """
-        x = self.schema.normalise(values)
-        if x.ndim != 1 or not self._is_usable(x):
+        x = self.schema.normalise_one(values)
+        if not self._is_usable(x):
             return False
         self._relearner.window.add(x)
         self._pending.append(x)

@@ -52,7 +52,7 @@ def score(schema: "BodySchema", values: Mapping[str, np.ndarray], blame: bool = 
         blame: Whether to find what is most likely wrong, which costs many times the score; else the element that
             contributes most is named.
     """
-    x = schema.normalise(values)
+    x = schema.normalise_one(values)
     if schema.normal is None:
         unknown = np.full(schema.out_layout.size, np.nan)
         return AnomalyScore(float("nan"), float("nan"), schema.out_layout.split(unknown), "")

@@ -124,7 +124,7 @@ class Controller:
         """
         schema = self.schema
         terms = self._terms(target)
-        present = schema.normalise(now or {})
+        present = schema.normalise_one(now or {})
         wishes = [term for term in terms if not isinstance(term, Hold)]
         holds = [term for term in terms if isinstance(term, Hold)]
         held = merged(schema, [hold.wanted(schema, target) for hold in holds])

@@ -1,5 +1,7 @@
 """What can be wrong with values, data or a stored model."""
 
+from numbers import Integral
+
 
 class SchemaError(Exception):
     """Base of every exception that `gemuco` raises on purpose."""
@@ -35,3 +37,15 @@ class DatasetError(SchemaError):
 
 class CheckpointError(SchemaError):
     """A stored model is missing, damaged, or of another version."""
+
+
+def whole_number(what: str, value: object, least: int) -> None:
+    """Refuse what is no whole number, or too small.
+
+    Raises:
+        SchemaError: It is; the sentence begins with `what`.
+    """
+    if not isinstance(value, Integral):
+        raise SchemaError(f"{what} is {value!r}; it must be a whole number.")
+    if value < least:
+        raise SchemaError(f"{what} is {value}; it must be at least {least}.")

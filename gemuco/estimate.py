@@ -54,7 +54,7 @@ class _Guess:
 
 def estimate(schema: "BodySchema", values: Mapping[str, np.ndarray]) -> dict[str, Estimate]:
     """Every signal of the layout; see `BodySchema.estimate`."""
-    joined = schema.layout.join(values)
+    joined = schema.layout.join_one(values)
     finite = np.isfinite(joined)
     whole = schema.layout.whole(finite)
     guesses: dict[tuple[str, Mask], _Guess] = {}

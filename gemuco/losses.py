@@ -292,9 +292,12 @@ def total(bounds: Sequence[Bound], x: np.ndarray, slope: bool = True) -> tuple[n
 
 def _numbers(signal: str, value: object) -> np.ndarray:
     try:
-        return np.asarray(value, float)
+        array = np.asarray(value, float)
     except (TypeError, ValueError):
         raise WrongSize(f"The reference of '{signal}' needs numbers; what was given are none.") from None
+    if array.ndim != 1:
+        raise WrongSize(f"The reference of '{signal}' has shape {array.shape}; it is one array, of shape (n,).")
+    return array
 
 
 def check_weight(weight: float, what: str) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 
 from gemuco import anomaly, checkpoint
 from gemuco.anomaly import AnomalyScore, Normal
-from gemuco.errors import UnknownCondition, UnknownSignal, WrongSize
+from gemuco.errors import NotFinite, UnknownCondition, UnknownSignal, WrongSize
 from gemuco.estimate import Estimate, estimate, mask_error
 from gemuco.kernels import Chain, Weights, run
 from gemuco.masks import Mask, bits, label
@@ -141,7 +141,13 @@ class BodySchema:
 
     def normalise(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
         """Named arrays [unit] -> one vector [standard deviations]; NaN where a value is absent or infinite."""
-        joined = self.layout.join(values)
+        return self._normalised(self.layout.join(values))
+
+    def normalise_one(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
+        """`normalise` of one sample, shape (size,); several are refused."""
+        return self._normalised(self.layout.join_one(values))
+
+    def _normalised(self, joined: np.ndarray) -> np.ndarray:
         joined[~np.isfinite(joined)] = np.nan
         return self.scaler.normalise(joined)
 
@@ -282,10 +288,13 @@ class BodySchema:
 
         Raises:
             WrongSize: p does not have this schema's size.
+            NotFinite: p holds something that is not a number.
         """
         p = np.array(bias, np.float32)
         if p.shape != self.bias.shape:
             raise WrongSize(f"p has shape {p.shape}; this schema's has {self.bias.shape}.")
+        if not np.isfinite(p).all():
+            raise NotFinite(f"p is {p.tolist()}; every element needs a finite number.")
         return replace(self, bias=p)
 
     def under(self, condition: str) -> "BodySchema":

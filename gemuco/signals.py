@@ -128,6 +128,20 @@ class Layout:
             joined[..., self._slices[name]] = array
         return joined
 
+    def join_one(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
+        """`join` of one sample, shape (size,).
+
+        Raises:
+            WrongSize: Several samples were given, or what `join` raises it for.
+        """
+        joined = self.join(values)
+        if joined.ndim != 1:
+            raise WrongSize(
+                f"One sample at a time is taken, an array of shape (n,) per signal; here are {len(joined)}. Give them "
+                "one after the other."
+            )
+        return joined
+
     def split(self, vector: np.ndarray) -> dict[str, np.ndarray]:
         """One vector, shape (..., size) -> signal -> array, shape (..., n). The arrays are views."""
         if vector.shape[-1] != self.size:

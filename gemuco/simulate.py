@@ -122,11 +122,11 @@ class Simulator:
         """
         schema = self.schema
         target = {**(given or {}), self.command: np.asarray(command, float)}
-        sent = schema.normalise({self.command: target[self.command]})
+        sent = schema.normalise_one({self.command: target[self.command]})
         if not np.isfinite(sent[schema.layout.slice(self.command)]).all():
             raise NotFinite(f"The command of '{self.command}' is not finite; every element needs a number.")
         self._check(target)
-        present = schema.normalise(now or {})
+        present = schema.normalise_one(now or {})
         wishes = [term for term in self.terms if not isinstance(term, Hold)]
         holds = [term for term in self.terms if isinstance(term, Hold)]
         held = merged(schema, [hold.wanted(schema, target) for hold in holds])

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from gemuco.activation import check
-from gemuco.errors import SchemaError
+from gemuco.errors import SchemaError, whole_number
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,12 +44,12 @@ class TrainConfig:
     def __post_init__(self) -> None:
         check(self.activation)
         object.__setattr__(self, "hidden", tuple(self.hidden))
-        for name, least in (("latent", 1), ("bias_size", 0), ("epochs", 1), ("batch", 1), ("patience", 1)):
-            if getattr(self, name) < least:
-                raise SchemaError(f"Training: {name} is {getattr(self, name)}; it must be at least {least}.")
+        for name, least in (("latent", 1), ("bias_size", 0), ("epochs", 1), ("batch", 1), ("patience", 1), ("seed", 0)):
+            whole_number(f"Training: {name}", getattr(self, name), least)
         for width in self.hidden:
             if width < 1:
                 raise SchemaError(f"Training: a hidden layer of {width} is none; leave it out or make it wider.")
+            whole_number("Training: the width of a hidden layer", width, 1)
         for name in ("rate", "bias_rate", "replay"):
             if not 0.0 <= getattr(self, name) < float("inf"):
                 raise SchemaError(f"Training: {name} is {getattr(self, name)}; it must be 0 or a positive number.")

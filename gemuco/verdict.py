@@ -54,7 +54,7 @@ def judge(schema: "BodySchema", samples: Iterable[Mapping[str, np.ndarray]]) -> 
         UnknownSignal: A name is not in the layout.
         WrongSize: An array does not have its signal's size.
     """
-    rows = np.array([schema.normalise(sample) for sample in samples]).reshape(-1, schema.layout.size)
+    rows = np.array([schema.normalise_one(sample) for sample in samples]).reshape(-1, schema.layout.size)
     score = window_score(schema, rows)
     if not np.isfinite(score):
         return Verdict("", score, score, schema.bias, "")

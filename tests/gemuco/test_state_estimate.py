@@ -146,6 +146,23 @@ def test_says_what_is_wrong(schema):
         replace(schema, x_out=("joint_position",))
 
 
+def test_several_samples_at_once_are_refused(schema, arm):
+    many = arm.sample(3, 0)
+    posture = {"joint_position": many["joint_position"][0]}
+    questions = (
+        schema.estimate,
+        schema.anomaly,
+        lambda values: schema.adapt([values]),
+        lambda values: schema.control(posture, values, command="muscle_length"),
+        lambda values: schema.simulate([many["muscle_length"][0]], command="muscle_length", now=values),
+    )
+    for ask in questions:
+        with pytest.raises(WrongSize, match="One sample at a time"):
+            ask(many)
+    with pytest.raises(WrongSize, match="it is one array"):
+        schema.control({"joint_position": many["joint_position"]}, command="muscle_length")
+
+
 def test_nothing_in_it_can_be_changed(schema):
     with pytest.raises(ValueError, match="read-only"):
         schema.weights.encoder[0].matrix[0, 0] = 1.0

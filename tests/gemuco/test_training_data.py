@@ -191,6 +191,9 @@ def test_errors_are_measured_under_each_p(arm):
         ({"held_out": 1.0}, "held_out is 1.0"),
         ({"outliers": 0.0}, "use infinity to reject nothing"),
         ({"bias_size": -1}, "bias_size is -1"),
+        ({"latent": 2.5}, "latent is 2.5; it must be a whole number"),
+        ({"hidden": (1.5,)}, "hidden layer is 1.5; it must be a whole number"),
+        ({"seed": -1}, "seed is -1"),
     ],
 )
 def test_a_wrong_setting_is_a_sentence(wrong, text):

@@ -102,6 +102,23 @@ def test_says_what_is_wrong(schema):
         Updater(schema).add({"muscle_length": np.zeros(4)})
 
 
+@pytest.mark.parametrize(
+    ("wrong", "text"),
+    [
+        ({"window": 0}, "window is 0; it must be at least 1"),
+        ({"batch": 2.5}, "batch is 2.5; it must be a whole number"),
+        ({"steps": -1}, "steps is -1"),
+        ({"rate": float("nan")}, "rate is nan"),
+        ({"held_out": -1}, "held_out is -1"),
+        ({"held_out": 1}, "holds every sample out"),
+    ],
+)
+def test_a_wrong_setting_is_a_sentence(wrong, text):
+    with pytest.raises(SchemaError) as caught:
+        UpdateConfig(**wrong)
+    assert text in str(caught.value)
+
+
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 def test_a_step_out_of_the_numbers_is_not_taken(schema):
     updater = Updater(schema, UpdateConfig(minimum=10, optimiser="sgd", rate=1e30))
