@@ -19,6 +19,7 @@ from gemuco.kernels import Chain, Layer, Weights
 from gemuco.masks import label
 from gemuco.scaler import Scaler
 from gemuco.signals import Layout, Signal
+from gemuco.writing import writing
 
 if TYPE_CHECKING:
     from gemuco.schema import BodySchema
@@ -32,7 +33,6 @@ SCALES = ("mean", "std", "low", "high", "dead")
 
 def save(schema: "BodySchema", folder: Path) -> None:
     """Write both files; the manifest comes last with the hash of the arrays and its own, so any damage is noticed."""
-    folder.mkdir(parents=True, exist_ok=True)
     data = save_tensors({name: np.ascontiguousarray(array) for name, array in _tensors(schema).items()})
     head = {
         "format": FORMAT,
@@ -56,8 +56,10 @@ def save(schema: "BodySchema", folder: Path) -> None:
         "facts": dict(schema.manifest),
         "tensors": {"file": TENSORS, "sha256": hashlib.sha256(data).hexdigest()},
     }
-    _replace(folder / TENSORS, data)
-    _replace(folder / MANIFEST, json.dumps(signed(head), indent=2).encode())
+    with writing("The model", folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        _replace(folder / TENSORS, data)
+        _replace(folder / MANIFEST, json.dumps(signed(head), indent=2).encode())
 
 
 def signed(head: Mapping[str, Any]) -> dict[str, Any]:

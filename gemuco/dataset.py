@@ -10,6 +10,7 @@ import numpy as np
 
 from gemuco.errors import DatasetError, NotEnoughData, SchemaError
 from gemuco.signals import Layout, Signal
+from gemuco.writing import writing
 
 FORMAT = "gemuco.dataset"
 VERSION = 1
@@ -151,11 +152,12 @@ class Dataset:
         }
         arrays = {f"episode_{i}": self.layout.join(e.values) for i, e in enumerate(self.episodes)}
         path = Path(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
         draft = path.with_name(path.name + ".draft")
-        with draft.open("wb") as file:
-            np.savez_compressed(file, head=np.array(json.dumps(head)), **arrays)  # type: ignore[arg-type]
-        draft.replace(path)
+        with writing("The data", path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with draft.open("wb") as file:
+                np.savez_compressed(file, head=np.array(json.dumps(head)), **arrays)  # type: ignore[arg-type]
+            draft.replace(path)
 
     @classmethod
     def load(cls, path: str | Path) -> "Dataset":

@@ -10,6 +10,8 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
+from gemuco.writing import writing
+
 FORMAT = "gemuco.draft.1"
 
 
@@ -53,13 +55,14 @@ class Draft:
         """Replace what was kept, in one step: a process killed here leaves the draft before."""
         if self.path is None:
             return
-        self.path.parent.mkdir(parents=True, exist_ok=True)
         text = json.dumps(dict(facts))
         whole = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
         head = {"format": FORMAT, "key": self.key, "facts": text, "sha256": _digest(whole.items(), text)}
         part = self.path.with_name(self.path.name + ".part")
-        save_file(whole, part, head)
-        part.replace(self.path)
+        with writing("The training", self.path):
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            save_file(whole, part, head)
+            part.replace(self.path)
 
 
 def _digest(arrays: Iterable[tuple[str, np.ndarray]], facts: str) -> str:

@@ -35,6 +35,10 @@ class DatasetError(SchemaError):
     """A data file is damaged, or is not a data file."""
 
 
+class NotWritten(SchemaError):
+    """A model or data cannot be stored: the disk is full, or the place may not be written to."""
+
+
 class CheckpointError(SchemaError):
     """A stored model is missing, damaged, or of another version."""
 

@@ -11,10 +11,11 @@ from rich.console import Console
 from rich.table import Table
 
 from gemuco.dataset import Dataset
-from gemuco.errors import CheckpointError, DatasetError
+from gemuco.errors import CheckpointError, DatasetError, NotWritten
 from gemuco.history import History
 from gemuco.masks import label
 from gemuco.schema import BodySchema
+from gemuco.writing import writing
 from hal.config import RobotConfig
 from services.artifacts import fingerprint
 from services.living_model import layout_of
@@ -123,13 +124,20 @@ def save(trained: Trained, folder: Path) -> None:
     from services import structure_plot, training_plot
 
     trained.schema.save(folder)
-    structure_plot.plot(trained.structure, folder / "structure.png")
-    training_plot.plot(trained.history, f"{trained.samples} samples", folder / "training.png")
+    with writing("The pictures", folder):
+        structure_plot.plot(trained.structure, folder / "structure.png")
+        training_plot.plot(trained.history, f"{trained.samples} samples", folder / "training.png")
     shutil.rmtree(drafts_of(folder), ignore_errors=True)
 
 
 def drafts_of(folder: Path) -> Path:
-    """Where unfinished trainings of the model in a folder are kept."""
+    """Where unfinished trainings of the model in a folder are kept.
+
+    Raises:
+        NotWritten: The folder is a file: better told before training than after.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise NotWritten(f"'{folder}' is a file; a model is kept in a folder. Name another place.")
     return folder.with_name(folder.name + ".draft")
 
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from gemuco import checkpoint
-from gemuco.errors import CheckpointError, NotObservable
+from gemuco.draft import Draft
+from gemuco.errors import CheckpointError, NotObservable, NotWritten
 from gemuco.schema import BodySchema
 
 
@@ -30,6 +31,21 @@ def test_comes_back_the_same(schema, arm, folder):
     assert again.anomaly(values).score == schema.anomaly(values).score
     assert again.masks == schema.masks
     assert again.manifest == {"robot": "arm", "hash": "abc"}
+
+
+def test_a_place_that_cannot_be_written_to_is_a_sentence(schema, data, tmp_path):
+    file = tmp_path / "file"
+    file.write_text("x")
+    kept = {"a": np.zeros(3)}
+    for what, write in (
+        ("The model", lambda: schema.save(file / "model")),
+        ("The model", lambda: schema.save(file)),
+        ("The data", lambda: data.save(file / "data.npz")),
+        ("The data", lambda: data.save(tmp_path)),
+        ("The training", lambda: Draft(file / "training.safetensors", "key").save(kept, {})),
+    ):
+        with pytest.raises(NotWritten, match=f"{what} cannot be written to '.*': [A-Z].*name another place"):
+            write()
 
 
 def test_overwrites_what_was_there(schema, folder):

@@ -8,7 +8,7 @@ from arm_model import arm, states
 from rich.console import Console
 
 from gemuco.dataset import Dataset, Episode
-from gemuco.errors import DatasetError
+from gemuco.errors import DatasetError, NotWritten
 from gemuco.history import History
 from gemuco.signals import Layout
 from services import trainer
@@ -77,6 +77,12 @@ def test_data_in_another_unit_are_refused(robot, dataset):
         trainer.train(robot, other, 0, quiet)
     assert "'joint_position' is in deg in the data, but rad is wanted" in str(caught.value)
     assert "gemuco collect" in str(caught.value)
+
+
+def test_a_file_where_the_model_shall_be_is_told_before_training(tmp_path):
+    (tmp_path / "model").write_text("x")
+    with pytest.raises(NotWritten, match="a model is kept in a folder"):
+        trainer.drafts_of(tmp_path / "model")
 
 
 def test_what_a_person_should_know_is_said():
