@@ -147,6 +147,7 @@ class GemucoService:
             loops={loop.name: loop.statistics() for loop in self.loops},
             facts={
                 "model_version": self.living.version,
+                "camera": bool(self.robot.seen),
                 "adapting": self.update.is_active,
                 "control": self.no_control if self.control is None else self.control.facts(),
                 "scheduling": {loop.name: loop.scheduling for loop in self.loops},

@@ -43,6 +43,7 @@ class HalService:
         self._intake = CommandIntake(service.session, config, robot, service.boot)
         self._loop = Loop("hal", config.rates.hal, self.tick, robot.clock, CYCLE_PRIORITY)
         self._is_open = False
+        self._has_camera = bool(config.seen)
         service.verb("enable", lambda _: self._do(robot.enable))
         service.verb("disable", lambda _: self._do(robot.disable))
         service.verb("stop", lambda _: self._do(lambda: robot.stop("A client asked to stop.")))
@@ -110,7 +111,12 @@ class HalService:
             state=state,
             text=problem or self._intake.news(),
             loops={"hal": self._loop.statistics()},
-            facts={**health, "commands": self._intake.facts(), "scheduling": self._loop.scheduling},
+            facts={
+                **health,
+                "camera": self._has_camera,
+                "commands": self._intake.facts(),
+                "scheduling": self._loop.scheduling,
+            },
         )
 
     def _do(self, act: Any) -> dict[str, str]:

@@ -67,11 +67,19 @@ def _services(client: Client, statuses: Mapping[str, Status | None]) -> Table:
     for column in ("service", "state", ""):
         table.add_column(column)
     for name, status in statuses.items():
-        if status is None:
+        if status is not None:
+            table.add_row(name, _word(status.state), status.text)
+        elif name in _needed(statuses):
             table.add_row(name, _word("absent"), "")
         else:
-            table.add_row(name, _word(status.state), status.text)
+            table.add_row(name, "-", "")
     return table
+
+
+def _needed(statuses: Mapping[str, Status | None]) -> set[str]:
+    """The services that this robot cannot do without; whether it has a camera only they know, who read its file."""
+    has_camera = any(status is not None and status.facts.get("camera") for status in statuses.values())
+    return {"hal", "model", "vision"} if has_camera else {"hal", "model"}
 
 
 def _loops(statuses: Mapping[str, Status | None]) -> Table:

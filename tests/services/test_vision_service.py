@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,7 @@ from services.client import Client
 from services.collector import Wanted, collect_direct
 from services.errors import AlreadyRunning, RemoteError
 from services.estimation import Fresh, Freshness
-from services.messages import MessageError, Sample
+from services.messages import MessageError, Sample, Status
 from services.recorder import Recorder
 from services.recording import read
 from services.service import Service
@@ -154,6 +155,27 @@ def test_top_and_the_recorder_show_what_is_seen(robot: str, tmp_path: Path, caps
         assert "tool_tip_position" in told
         assert "2/2" in told
     assert len(list(read(tmp_path / "seen.mcap", [keys.vision(robot)]))) > 0
+
+
+@pytest.mark.parametrize("has_camera", [True, False])
+def test_top_misses_a_camera_only_where_there_is_one(
+    robot: str, has_camera: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with Service(robot, "hal") as service:
+        stop = threading.Event()
+        status = partial(Status, service="hal", state="running", facts={"camera": has_camera})
+        telling = threading.Thread(target=service.run, args=(lambda: status(stamp_ns=time.time_ns()), stop))
+        telling.start()
+        try:
+            watch(robot, True, ())
+        finally:
+            stop.set()
+            telling.join()
+    lines = capsys.readouterr().out.splitlines()
+    rows = {name: next(line for line in lines if name in line) for name in ("vision", "model", "recorder")}
+    assert ("absent" in rows["vision"]) == has_camera
+    assert "absent" in rows["model"]
+    assert "absent" not in rows["recorder"]
 
 
 def test_any_program_may_be_the_camera(robot: str) -> None:
