@@ -64,6 +64,7 @@ class OnlineUpdate:
         self._learner: Learner | None = None
         self._since_change: deque[dict[str, np.ndarray]] = deque(maxlen=config.window)
         self._last: np.ndarray | None = None
+        self._awaits_first = False
         self._taken_at = -math.inf
         self._told = Update(active=False, model_version=0, window=0, dropped=0, loss=math.nan)
 
@@ -78,14 +79,16 @@ class OnlineUpdate:
             if active and self._learner is None:
                 self._living.keep()
                 self._learner = self._make_learner(self._living.schema)
+                # One sample may tell what p is, and the robot may rest when it is asked to learn.
+                self._awaits_first = len(self._living.schema.bias) > 0
             elif not active:
-                self._learner = None
+                self._learner, self._awaits_first = None, False
                 self._since_change.clear()
 
     def rollback(self) -> int:
         """Stop, and go back to the model before adaption began; returns the model's version."""
         with self._lock:
-            self._learner = None
+            self._learner, self._awaits_first = None, False
             self._since_change.clear()
             return self._living.rollback()
 
@@ -141,9 +144,11 @@ class OnlineUpdate:
         now = self._clock.monotonic()
         if now - self._taken_at < 0.9 * self._config.interval:
             return values, False
-        if self._last is not None and float(np.abs(row - self._last).max()) < SPREAD:
+        far = self._last is None or float(np.abs(row - self._last).max()) >= SPREAD
+        if not far and not self._awaits_first:
             return values, False
-        moved, self._last, self._taken_at = self._last is not None, row, now
+        moved = self._last is not None or self._awaits_first
+        self._awaits_first, self._last, self._taken_at = False, row, now
         return values, moved
 
     def _learn(self, learner: Learner, sample: dict[str, np.ndarray] | None) -> Update:

@@ -1,13 +1,16 @@
 import numpy as np
 import pytest
-from arm_model import arm, fresh, small_model
+from arm_model import MASKS, arm, fresh, small_model, states
 
 from gemuco.adapt import UpdateConfig as Learning
 from gemuco.adapt import Updater
+from gemuco.dataset import Dataset, Episode
 from gemuco.errors import NotEnoughData
+from gemuco.schema import BodySchema
+from gemuco.train import TrainConfig, fit
 from hal.clock import ManualClock
 from services.estimation import Fresh, Freshness
-from services.living_model import LivingModel
+from services.living_model import LivingModel, layout_of
 from services.messages import Update
 from services.model_config import UpdateConfig
 from services.update_loop import OnlineUpdate
@@ -16,12 +19,12 @@ from services.update_loop import OnlineUpdate
 class Bench:
     """The update loop of an arm that goes from state to state."""
 
-    def __init__(self, window: int = 50, interval: float = 0.1) -> None:
+    def __init__(self, window: int = 50, interval: float = 0.1, schema: BodySchema | None = None) -> None:
         self.clock = ManualClock()
         self.newest: Fresh | None = None
         self.engaged = False
         self.told: list[Update] = []
-        self.living = LivingModel(small_model())
+        self.living = LivingModel(schema or small_model())
         self.update = OnlineUpdate(
             Freshness(arm(), lambda: self.newest, self.clock),
             self.living,
@@ -81,6 +84,21 @@ def test_a_useless_sample_is_not_learned_from(why: str) -> None:
             bench.turn(0 if why == "rest" else 1, ("muscle_length.biceps",) if why == "silent" else ())
     assert bench.told[-1].window == 0
     assert bench.living.version == 0
+
+
+def test_one_sample_of_a_body_at_rest_tells_p() -> None:
+    rows, layout = states(count=400), layout_of(arm())
+    halves = zip(("empty", "loaded"), np.split(np.arange(len(rows["joint_position"])), 2), strict=True)
+    episodes = tuple(Episode(name, {signal: value[part] for signal, value in rows.items()}) for name, part in halves)
+    config = TrainConfig(hidden=(20,), epochs=2, bias_size=1)
+    bench = Bench(schema=fit(Dataset(layout, episodes), config, MASKS)[0])
+    bench.turn(0)
+    bench.update.adapt(True)
+    assert [bench.turn(0).window for _ in range(3)] == [1, 1, 1]
+    bench.update.adapt(False)
+    bench.update.adapt(True)
+    bench.update.adapt(False)
+    assert bench.turn(0).window == 0
 
 
 def test_the_normal_is_learned_from_samples_since_the_model_changed() -> None:
