@@ -16,7 +16,7 @@ from services.control_config import ControlConfig
 from services.living_model import load_model
 from services.model_config import model_config
 from services.show import progress
-from services.story import Story
+from services.story import MUSCLE, Story
 from services.supervisor import Supervisor, gemuco_command
 from services.timeline import Timeline
 from services.tool_story import ToolStory
@@ -34,15 +34,15 @@ def play(robot: RobotConfig, path: Path, seed: int, out: Path) -> int:
     Args:
         robot: The robot file's content.
         path: The robot file.
-        seed: Which of the actual arms.
+        seed: Which of the actual robots.
         out: Folder for plot, recording and logs.
     """
     console = Console()
     started = time.monotonic()
+    target = control_of(robot).target
     make_model(robot, console)
     recording = out / "story.mcap"
     recording.unlink(missing_ok=True)
-    target = control_of(robot).target
     with Supervisor(out) as supervisor:
         remote = RemoteClient(f"{target} [{robot.signals[target].unit}]", out / "client.log", console)
         with Client(robot.robot) as client:
@@ -62,12 +62,17 @@ def play(robot: RobotConfig, path: Path, seed: int, out: Path) -> int:
 
 
 def control_of(robot: RobotConfig) -> ControlConfig:
-    """How the robot is controlled.
+    """How the robot is controlled in its story.
 
     Raises:
-        ConfigError: Not at all.
+        ConfigError: Not at all, or there is no story of such a robot.
     """
     control = model_config(robot).control
+    if not has_tools(robot) and MUSCLE not in robot.signals[robot.command.signal].elements:
+        raise ConfigError(
+            f"There is no story for '{robot.robot}': it has neither conditions with a signal that a camera sees, nor a "
+            f"muscle {MUSCLE} to cut."
+        )
     if control is None:
         raise ConfigError(
             f"The robot file of '{robot.robot}' has no model.control section, so there is nothing to play."
@@ -75,12 +80,17 @@ def control_of(robot: RobotConfig) -> ControlConfig:
     return control
 
 
+def has_tools(robot: RobotConfig) -> bool:
+    """Whether the robot holds one of several tools, and a camera looks on."""
+    return bool(robot.conditions and robot.seen)
+
+
 def perform(
     robot: RobotConfig, client: Client, target: str, seed: int, actor: Actor, picture: Path, console: Console
 ) -> list[Stage]:
     """Play the story that suits the robot, about its tools if it has some, and draw it."""
     sizes = robot.signals[target].size, robot.signals[robot.command.signal].size
-    if robot.conditions and robot.seen:
+    if has_tools(robot):
         from services import tool_plot
 
         schema = load_model(robot, artifacts.model_folder(robot.robot))

@@ -14,13 +14,15 @@ import yaml
 from gemuco.dataset import Dataset, Episode
 from gemuco.train import TrainConfig, fit
 from hal.config import load_robot
+from hal.errors import ConfigError
+from services import demo
 from services.artifacts import fingerprint
 from services.living_model import layout_of
 from services.supervisor import gemuco_command
 
 SERVICES_TESTS = Path(__file__).parents[1] / "services"
 sys.path.append(str(SERVICES_TESTS))
-from small_hand import TOOLS, description, gravity_of, tip_of  # noqa: E402
+from small_hand import TOOLS, config, description, gravity_of, tip_of  # noqa: E402
 
 LOW, HIGH = [-1.0, -2.2], [1.0, 2.2]
 """Of the joints [rad]: so far that the long tool comes to where the short one is."""
@@ -46,8 +48,8 @@ def robot_with_model(folder: Path) -> Path:
             whole = {"joint_position": position, "center_of_gravity": gravity, "tool_tip_position": tip}
             episodes.append(Episode(condition, whole))
     dataset = Dataset(layout_of(robot), tuple(episodes))
-    config = TrainConfig(hidden=(30, 20), latent=6, bias_size=2, epochs=10, batch=100, rate=1e-2)
-    schema, _ = fit(dataset, config, (("joint_position",),), x_out=("center_of_gravity", "tool_tip_position"))
+    training = TrainConfig(hidden=(30, 20), latent=6, bias_size=2, epochs=10, batch=100, rate=1e-2)
+    schema, _ = fit(dataset, training, (("joint_position",),), x_out=("center_of_gravity", "tool_tip_position"))
     schema.with_manifest(fingerprint=fingerprint(robot)).save(folder / "runs" / name / "model")
     return file
 
@@ -57,12 +59,12 @@ def test_an_interrupted_demo_of_tools_leaves_no_process(tmp_path: Path, monkeypa
     file, log = robot_with_model(tmp_path), tmp_path / "demo.log"
     deadline = time.monotonic() + PATIENCE
     with log.open("w") as sink:
-        demo = subprocess.Popen(
+        played = subprocess.Popen(
             gemuco_command("demo", str(file)), cwd=tmp_path, stdout=sink, stderr=sink, start_new_session=True
         )
     try:
         while "(a)" not in log.read_text():
-            assert demo.poll() is None, log.read_text()
+            assert played.poll() is None, log.read_text()
             assert time.monotonic() < deadline
             time.sleep(0.02)
         told = log.read_text()
@@ -70,12 +72,20 @@ def test_an_interrupted_demo_of_tools_leaves_no_process(tmp_path: Path, monkeypa
         assert [word for word in words if word.isalpha()] == [
             "simulator", "hal", "vision", "model", "recorder", "client",
         ]  # fmt: skip
-        demo.send_signal(signal.SIGINT)
-        assert demo.wait(PATIENCE) != 0
+        played.send_signal(signal.SIGINT)
+        assert played.wait(PATIENCE) != 0
         pids = [int(word) for word in words if word.isdigit()]
         while any(Path(f"/proc/{pid}").exists() for pid in pids):
             assert time.monotonic() < deadline
             time.sleep(0.02)
     finally:
-        demo.kill()
-        demo.wait()
+        played.kill()
+        played.wait()
+
+
+def test_a_robot_without_a_story_is_told_so_before_anything_starts(tmp_path: Path) -> None:
+    control = {"control": {"target": "joint_position"}}
+    for changes, sentence in (({}, "no model.control section"), ({"model": control, "conditions": []}, "no story for")):
+        with pytest.raises(ConfigError, match=sentence):
+            demo.play(config("untold", **changes), tmp_path / "untold.yaml", 1, tmp_path)
+    assert not list(tmp_path.iterdir())
