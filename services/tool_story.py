@@ -139,8 +139,9 @@ class ToolStory:
             f"anomaly score {np.nanmedian(score):.1f}, threshold {np.nanmedian(limit):.1f}",
             f"verdict: {verdict} ({share:.0%} of the time)",
         )
-        missed = self._without > self._before / BETTER
-        return self._stage("its tool is changed", start, figures, missed and verdict == "environment")
+        # Which of the two it is depends on how near this body is to its designer's; that something is new must be told.
+        noticed = verdict in ("environment", "anomaly")
+        return self._stage("its tool is changed", start, figures, noticed and self._without > self._before / BETTER)
 
     def recognise(self) -> Stage:
         """(d) The update finds out which tool it is."""
