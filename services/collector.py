@@ -95,7 +95,9 @@ def collect_direct(
     """
     config, simulator = collect_config(robot), simulator_of(robot)
     variant = variant_of(robot, variant)
-    conditions = [condition_of(robot, one) for one in (wanted.conditions or robot.conditions or (None,))]
+    # Each once: the same motion again would be in the data twice, and held out from itself.
+    chosen = dict.fromkeys(wanted.conditions or robot.conditions or (None,))
+    conditions = [condition_of(robot, one) for one in chosen]
     motions = [_motion(robot, config, condition, seed, wanted) for condition in conditions]
     found: list[Collected] = []
     for index, condition in enumerate(conditions):

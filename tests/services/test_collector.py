@@ -38,6 +38,12 @@ def test_every_condition_is_recorded_and_told_in_its_episodes() -> None:
         np.testing.assert_allclose(episode.values["center_of_gravity"], gravity, atol=1e-9)
 
 
+def test_a_condition_named_twice_is_recorded_once() -> None:
+    dataset = collect_direct(config(), None, 0, Wanted(("long", "short", "long"), 20)).dataset
+    assert dataset.conditions == ("long", "short")
+    assert len(dataset) == 40
+
+
 def test_values_that_the_camera_misses_are_kept_and_the_rest_is_whole() -> None:
     rows = collected(None, "long", samples=300)
     tip = np.concatenate([episode.values["tool_tip_position"] for episode in rows.episodes])
