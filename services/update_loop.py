@@ -115,7 +115,7 @@ class OnlineUpdate:
         """Take the newest sample if the robot moves or is engaged, and learn if active."""
         with self._lock:
             sample, moved = self._newest()
-            if sample is not None and (moved or self._is_engaged()):
+            if sample is not None and _is_whole(sample) and (moved or self._is_engaged()):
                 self._since_change.append(sample)
             if self._learner is None:
                 told = Update(
@@ -134,17 +134,22 @@ class OnlineUpdate:
         self._publish(told)
 
     def _newest(self) -> tuple[dict[str, np.ndarray] | None, bool]:
-        """The newest sample, if every value is fresh; and whether it is far and late enough to be learned from."""
+        """The newest sample, and whether it is far and late enough to be learned from.
+
+        A sample that lacks something still tells p, from whatever is left. Where there is no p it is not taken: W would
+        drift where nothing is measured, and no other condition's data hold it.
+        """
         fresh, values = self._freshness.take()
         if fresh is None:
             return None, False
         row = self._living.schema.normalise(values)
-        if not np.isfinite(row).all():
+        if not len(self._living.schema.bias) and not np.isfinite(row).all():
             return None, False
         now = self._clock.monotonic()
         if now - self._taken_at < 0.9 * self._config.interval:
             return values, False
-        far = self._last is None or float(np.abs(row - self._last).max()) >= SPREAD
+        away = np.full(1, math.inf) if self._last is None else np.abs(row - self._last)
+        far = not np.isfinite(away).any() or float(np.nanmax(away)) >= SPREAD
         if not far and not self._awaits_first:
             return values, False
         moved = self._last is not None or self._awaits_first
@@ -169,3 +174,7 @@ class OnlineUpdate:
             settled=bool(result.settled),
             rolled_back=int(result.rolled_back),
         )
+
+
+def _is_whole(sample: Mapping[str, np.ndarray]) -> bool:
+    return all(np.isfinite(value).all() for value in sample.values())

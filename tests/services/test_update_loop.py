@@ -99,6 +99,9 @@ def test_one_sample_of_a_body_at_rest_tells_p() -> None:
     bench.update.adapt(True)
     bench.update.adapt(False)
     assert bench.turn(0).window == 0
+    bench.update.adapt(True)
+    assert bench.turn(1, ("muscle_length.biceps",)).window == 1, "what is left still tells p"
+    bench.update.adapt(False)
 
 
 def test_the_normal_is_learned_from_samples_since_the_model_changed() -> None:
