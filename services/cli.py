@@ -188,41 +188,21 @@ def train(
         ),
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Where to write; runs/<robot>/model if not given.")] = None,
+    base: Annotated[
+        Path | None,
+        typer.Option(
+            "--from", help="Fine-tune this model, such as one trained in simulation, on few samples of the robot."
+        ),
+    ] = None,
     seed: Seed = 0,
 ) -> None:
     """Find out which signals explain which, train, and tell the errors in physical units.
 
     Interrupted (Ctrl-C, or killed), the same command goes on where it was.
     """
-    from rich.console import Console
+    from services.train_verb import run_training
 
-    from gemuco.dataset import Dataset
-    from services import artifacts, measured, trainer
-    from services.show import progress
-
-    file = _file(robot)
-    if measured.is_description(file):
-        described = measured.load_measured(file)
-        name, dataset = described.recording, measured.read(described, data or file.parent)
-    else:
-        config = _load(robot)
-        name, dataset = config.robot, Dataset.load(data or artifacts.data_path(config.robot))
-    folder = out or artifacts.model_folder(name)
-    drafts = trainer.drafts_of(folder)
-    if drafts.exists():
-        typer.echo(f"A training of {folder} was interrupted; it goes on if data and settings are the same.")
-    try:
-        with progress("training") as tell:
-            if measured.is_description(file):
-                trained = trainer.learn(described.model, dataset, seed, tell, drafts, recording=name)
-            else:
-                trained = trainer.train(config, dataset, seed, tell, drafts)
-    except KeyboardInterrupt:
-        typer.echo("Interrupted. The same command goes on from here.", err=True)
-        raise
-    trainer.show(trained, Console())
-    trainer.save(trained, folder)
-    typer.echo(f"Saved in {folder}, with pictures of the structure and of the training.")
+    run_training(_file(robot), data, out, base, seed)
 
 
 @app.command(context_settings={"ignore_unknown_options": True})  # a target may be negative

@@ -3,7 +3,7 @@
 import shutil
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,6 +27,9 @@ if TYPE_CHECKING:
 
 Progress = Callable[[float, str], None]
 
+GENTLER = 1.0 / 3.0
+"""Peak learning rate of fine-tuning, as a share of the robot file's."""
+
 
 @dataclass(frozen=True, slots=True)
 class Trained:
@@ -34,21 +37,28 @@ class Trained:
 
     Attributes:
         schema: The body schema, with the robot file's fingerprint in its manifest.
-        structure: What was found out about the signals.
+        structure: What was found out about the signals; None where an older model's was kept.
         history: How the training went.
         samples: How many samples it was made from.
         seconds: How long structure and training took.
     """
 
     schema: BodySchema
-    structure: "Structure"
+    structure: "Structure | None"
     history: History
     samples: int
     seconds: float
 
 
-def train(robot: RobotConfig, dataset: Dataset, seed: int, progress: Progress, drafts: Path | None = None) -> Trained:
-    """The model of a robot; see `learn`.
+def train(
+    robot: RobotConfig,
+    dataset: Dataset,
+    seed: int,
+    progress: Progress,
+    drafts: Path | None = None,
+    base: BodySchema | None = None,
+) -> Trained:
+    """The model of a robot; see `learn`, or `tune` where there is a model to begin from.
 
     Raises:
         DatasetError: The data are of another robot, or in other units.
@@ -61,6 +71,8 @@ def train(robot: RobotConfig, dataset: Dataset, seed: int, progress: Progress, d
             f"The data do not fit '{robot.robot}': {error} Record data of this robot with `gemuco collect`."
         ) from None
     facts = {"robot": robot.robot, "fingerprint": fingerprint(robot)}
+    if base is not None:
+        return tune(base, model_config(robot), own, seed, progress, drafts, **facts)
     return learn(model_config(robot), own, seed, progress, drafts, **facts)
 
 
@@ -111,6 +123,41 @@ def learn(
     return Trained(schema, found, history, len(dataset), time.monotonic() - started)
 
 
+def tune(
+    base: BodySchema,
+    config: ModelConfig,
+    dataset: Dataset,
+    seed: int,
+    progress: Progress,
+    drafts: Path | None = None,
+    **facts: str,
+) -> Trained:
+    """Train a model further on few samples of the real body; network and masks stay those of the model.
+
+    Args:
+        base: The model to begin from, such as one trained in simulation.
+        config: How; the learning rate is a third of it.
+        dataset: Episodes of the body as it is.
+        seed: Of all that is random.
+        progress: Told the share done, 0 to 1, and a line of text.
+        drafts: As for `learn`.
+        facts: For the model's manifest.
+
+    Raises:
+        DatasetError: The data lack a signal of the model, or are in other units.
+        NotEnoughData: Too few samples.
+    """
+    from gemuco.train import fine_tune
+
+    started = time.monotonic()
+    gentle = train_config(config, config.training.epochs, seed)
+    gentle = replace(gentle, rate=GENTLER * gentle.rate)
+    resume = None if drafts is None else drafts / "training.safetensors"
+    schema, history = fine_tune(base, dataset, gentle, progress, resume=resume)
+    schema = schema.with_manifest(**facts, samples=len(dataset), held_out_loss=history.best)
+    return Trained(schema, None, history, len(dataset), time.monotonic() - started)
+
+
 def fits(robot: RobotConfig, folder: Path) -> bool:
     """Whether a sound model lies there that was made for this robot file."""
     try:
@@ -125,7 +172,8 @@ def save(trained: Trained, folder: Path) -> None:
 
     trained.schema.save(folder)
     with writing("The pictures", folder):
-        structure_plot.plot(trained.structure, folder / "structure.png")
+        if trained.structure is not None:
+            structure_plot.plot(trained.structure, folder / "structure.png")
         training_plot.plot(trained.history, f"{trained.samples} samples", folder / "training.png")
     shutil.rmtree(drafts_of(folder), ignore_errors=True)
 
@@ -143,7 +191,8 @@ def drafts_of(folder: Path) -> Path:
 
 def show(trained: Trained, console: Console) -> None:
     """Print the structure, and the error of each signal under each mask in its own unit."""
-    console.print(trained.structure.report(), highlight=False)
+    if trained.structure is not None:
+        console.print(trained.structure.report(), highlight=False)
     table = Table(title="Error on held-out data, by what it is estimated from", title_justify="left")
     table.add_column("estimated from")
     table.add_column("signal")
@@ -151,7 +200,8 @@ def show(trained: Trained, console: Console) -> None:
     for mask, name, unit, rms in trained.schema.error_rows():
         table.add_row(mask, name, f"{rms:.4g} {unit}")
     console.print(table)
-    console.print(f"{trained.samples} samples, structure and training in {trained.seconds:.1f} s.")
+    what = "training" if trained.structure is None else "structure and training"
+    console.print(f"{trained.samples} samples, {what} in {trained.seconds:.1f} s.")
     for sentence in remarks(trained.history):
         console.print(sentence, style="yellow", highlight=False)
 

@@ -91,3 +91,22 @@ def test_what_a_person_should_know_is_said():
     for part in ("one condition", "arm.elbow", "3 training samples were skipped", "5 measured signals"):
         assert part in said
     assert trainer.remarks(History((1.0,), (1.0,), 0)) == []
+
+
+def test_a_model_is_fine_tuned_on_few_samples_of_another_body(robot, dataset, straight, tmp_path):
+    longer = {name: values + (0.03 if name == "muscle_length" else 0.0) for name, values in states(count=300).items()}
+    parts = np.split(np.arange(300), 6)
+    few = Dataset(
+        layout_of(robot), tuple(Episode("", {name: value[part] for name, value in longer.items()}) for part in parts)
+    )
+    patient = robot.model_copy(update={"model": SMALL | {"training": {"epochs": 60, "batch": 50, "rate": 0.01}}})
+    tuned = trainer.train(patient, few, 0, quiet, base=straight.schema)
+    assert tuned.structure is None
+    assert tuned.schema.masks == straight.schema.masks
+
+    def wrong(schema):
+        return float(np.abs(schema.predict_error(longer)[:, schema.out_layout.slice("muscle_length")]).mean())
+
+    assert wrong(tuned.schema) < 0.7 * wrong(straight.schema)
+    trainer.save(tuned, tmp_path / "model")
+    assert not (tmp_path / "model" / "structure.png").exists()
