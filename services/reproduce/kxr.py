@@ -1,6 +1,6 @@
 """The paper's experiments on the humanoid with tools (section III-C), in simulation and on the actual variant."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,8 +28,8 @@ from services.reproduce.kxr_simulated import (
     simulate,
 )
 from services.reproduce.kxr_trials import Course, order, steps_until
-from services.reproduce.report import Report, Row
-from services.reproduce.runs import open_run
+from services.reproduce.report import Report, adder
+from services.reproduce.runs import Run, between, each_seed
 from services.show import Tell
 
 ROBOT = "kxr_humanoid"
@@ -55,16 +55,12 @@ class Outcome:
 def reproduce(seeds: Sequence[int], folder: Path, progress: Tell, fresh: bool) -> Report:
     """See `services.reproduce.Experiment`."""
     robot = load_robot(robot_file(ROBOT))
-    outcomes: list[Outcome] = []
-    for index, seed in enumerate(seeds):
-        run = open_run(robot, folder, seed, fresh)
 
-        def tell(share: float, text: str, index: int = index, seed: int = seed) -> None:
-            progress((index + share) / len(seeds), f"seed {seed}: {text}")
+    def experiment(run: Run, tell: Tell) -> Outcome:
+        simulated = simulate(run, between(tell, 0.0, 0.9))
+        return Outcome(simulated, actual(run, simulated.schema, between(tell, 0.9, 1.0)))
 
-        simulated = simulate(run, lambda share, text, tell=tell: tell(0.9 * share, text))  # type: ignore[misc]
-        found = actual(run, simulated.schema, lambda share, text, tell=tell: tell(0.9 + 0.1 * share, text))  # type: ignore[misc]
-        outcomes.append(Outcome(simulated, found))
+    outcomes = each_seed(robot, seeds, folder, progress, fresh, experiment)
     report = Report(ROBOT, tuple(seeds))
     _add_structure(report, outcomes)
     _add_recognition(report, outcomes)
@@ -76,7 +72,7 @@ def reproduce(seeds: Sequence[int], folder: Path, progress: Tell, fresh: bool) -
 
 
 def _add_structure(report: Report, outcomes: Sequence[Outcome]) -> None:
-    row = _adder(report, outcomes)
+    row = adder(report, outcomes)
     for signal in outcomes[0].simulated.schema.layout.names:
         row(f"L of {signal}", "", "below 0.15", lambda o, s=signal: o.simulated.schema.manifest["L_i"][s], SIGNAL_BAR)
     row("the paper's 8 masks that are feasible", "", "8", lambda o: len(_feasible(o) & set(PAPER_MASKS)), 7.5, "higher")
@@ -94,7 +90,7 @@ def _feasible(outcome: Outcome) -> set[str]:
 
 
 def _add_recognition(report: Report, outcomes: Sequence[Outcome]) -> None:
-    row = _adder(report, outcomes)
+    row = adder(report, outcomes)
     for case, paper in RECOGNITION.items():
         if paper.isdigit():
             row(f"recognised, {case}, samples", "", paper, lambda o, c=case: _mean(o, c, "ekf"), SAMPLES_BAR)
@@ -112,15 +108,25 @@ def _add_recognition(report: Report, outcomes: Sequence[Outcome]) -> None:
 
 
 def _mean(outcome: Outcome, case: str, way: str) -> float:
-    return float(np.minimum(outcome.simulated.needed[case, way], SAMPLES + 1).mean())
+    return _needed(outcome.simulated.needed[case, way])
 
 
 def _share(outcome: Outcome, case: str, way: str) -> float:
-    return 100.0 * float(np.isfinite(outcome.simulated.needed[case, way]).mean())
+    return _found(outcome.simulated.needed[case, way])
+
+
+def _needed(samples: np.ndarray) -> float:
+    """Mean over the runs, shape (runs,), of the samples until recognition."""
+    return float(np.minimum(samples, SAMPLES + 1).mean())
+
+
+def _found(samples: np.ndarray) -> float:
+    """Share [%] of the runs, shape (runs,), in which the tool was recognised."""
+    return 100.0 * float(np.isfinite(samples).mean())
 
 
 def _add_control(report: Report, outcomes: Sequence[Outcome], bounds: tuple[np.ndarray, np.ndarray]) -> None:
-    row = _adder(report, outcomes)
+    row = adder(report, outcomes)
     for index, tool in enumerate(SEQUENCE):
         begin, after = index * STEPS, slice(index * STEPS + SETTLED, (index + 1) * STEPS)
         whole = slice(begin, (index + 1) * STEPS)
@@ -170,11 +176,14 @@ def _inside(course: Course, bounds: tuple[np.ndarray, np.ndarray]) -> float:
 
 
 def _add_actual(report: Report, outcomes: Sequence[Outcome]) -> None:
-    row = _adder(report, outcomes)
+    row = adder(report, outcomes)
     row("actual: samples for fine-tuning", "", "480", lambda o: o.actual.samples)
     row("actual: R^2 of p on weight and length", "", "", lambda o: order(o.actual.schema.biases, TOOLS))
     for tool in LEADS:
         row(f"actual: {tool} recognised, samples", "", "", lambda o, tool=tool: min(o.actual.needed[tool], SAMPLES + 1))
+    for case in CASES:
+        row(f"actual: recognised in {SAMPLES}, {case}", "%", "", lambda o, c=case: _found(o.actual.recognised[c]))
+        row(f"actual: recognised, {case}, samples", "", "", lambda o, c=case: _needed(o.actual.recognised[c]))
     papers = dict(zip(MODELS, ("largest", "smaller", "smallest"), strict=True))
     for model in (*MODELS, FOLLOWING):
         row(
@@ -183,18 +192,3 @@ def _add_actual(report: Report, outcomes: Sequence[Outcome]) -> None:
             papers.get(model, ""),
             lambda o, model=model: 1e3 * o.actual.controlled[model].tips.mean(),
         )
-
-
-def _adder(report: Report, outcomes: Sequence[Outcome]) -> Callable[..., None]:
-    def add(
-        name: str,
-        unit: str,
-        paper: str,
-        figure: Callable[[Outcome], float],
-        bar: float | None = None,
-        better: str = "lower",
-    ) -> None:
-        values = tuple(figure(outcome) for outcome in outcomes)
-        report.add(Row(name, unit, paper, values, bar, "higher" if better == "higher" else "lower"))
-
-    return add

@@ -13,7 +13,7 @@ from hal.config import RobotConfig
 from services.living_model import layout_of
 from services.model_config import model_config
 from services.reproduce.kxr_robot import JOINTS, Standing, inverse, random_targets, safe_postures, stiff
-from services.reproduce.kxr_simulated import AFTER, FRESH, LEADS, TOOLS, WAYS, control_of, leads
+from services.reproduce.kxr_simulated import AFTER, FRESH, LEADS, TOOLS, WAYS, control_of, leads, recognitions
 from services.reproduce.kxr_trials import Course, follow, follow_blindly, samples_until
 from services.reproduce.runs import Run
 from services.show import Tell
@@ -43,6 +43,7 @@ class Actual:
         samples: How many it was tuned with.
         leads: Way of p, by label, to a tool with all sensors.
         needed: Tool -> samples until it is recognised by the default way.
+        recognised: Case -> samples until long_middle is recognised by the default way, shape (runs,).
         controlled: Model -> targets at long_middle.
     """
 
@@ -50,6 +51,7 @@ class Actual:
     samples: int
     leads: Mapping[str, np.ndarray]
     needed: Mapping[str, float]
+    recognised: Mapping[str, np.ndarray]
     controlled: Mapping[str, Course]
 
 
@@ -64,7 +66,8 @@ def actual(run: Run, simulated: BodySchema, tell: Tell) -> Actual:
     tell(0.8, "trials on the actual robot")
     ways = leads(run, schema, ACTUAL)
     needed = {tool: samples_until(ways[f"to {tool}, ekf"], schema, tool) for tool in LEADS}
-    return Actual(schema, len(data), ways, needed, _controlled(run, simulated, schema))
+    recognised = {case: found for (case, _), found in recognitions(run, schema, ACTUAL, ["ekf"])[0].items()}
+    return Actual(schema, len(data), ways, needed, recognised, _controlled(run, simulated, schema))
 
 
 def taught_postures(robot: RobotConfig) -> np.ndarray:

@@ -1,6 +1,6 @@
 """The simulation experiments on the humanoid (paper, III-C): the nominal robot and its six tools."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import product
 
@@ -93,7 +93,7 @@ def simulate(run: Run, tell: Tell) -> Simulated:
         "nominal_model", lambda: train(robot, data, seed, lambda done, text: tell(0.2 + 0.5 * done, text)).schema
     )
     tell(0.7, "recognising tools")
-    needed, paths = _recognitions(run, schema)
+    needed, paths = recognitions(run, schema, NOMINAL, WAYS)
     tell(0.85, "reaching targets while tools change")
     controlled, limit = _controls(run, schema)
     return Simulated(schema, needed, paths, leads(run, schema, NOMINAL), controlled, limit)
@@ -117,13 +117,14 @@ def leads(run: Run, schema: BodySchema, variant: str) -> dict[str, np.ndarray]:
     }
 
 
-def _recognitions(
-    run: Run, schema: BodySchema
+def recognitions(
+    run: Run, schema: BodySchema, variant: str, ways: Iterable[str]
 ) -> tuple[dict[tuple[str, str], np.ndarray], dict[tuple[str, str], np.ndarray]]:
-    needed: dict[tuple[str, str], list[float]] = {key: [] for key in product(CASES, WAYS)}
+    """Samples until long_middle is recognised by some ways in every case, and p along the first run of each."""
+    needed: dict[tuple[str, str], list[float]] = {key: [] for key in product(CASES, ways)}
     paths: dict[tuple[str, str], np.ndarray] = {}
     for chance in range(RUNS):
-        samples = samples_of(run, NOMINAL, AFTER, chance)
+        samples = samples_of(run, variant, AFTER, chance)
         for case, way in needed:
             path = recognise(schema.under(BEFORE), samples, CASES[case], WAYS[way])
             needed[case, way].append(samples_until(path, schema, AFTER))

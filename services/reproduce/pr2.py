@@ -1,6 +1,6 @@
 """The paper's experiments on the PR2 with a duster (section III-A), in simulation and on the actual variant."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,8 +12,8 @@ from services.reproduce.pr2_actual import MODELS, Actual, actual
 from services.reproduce.pr2_arm import JOINTS, TIP
 from services.reproduce.pr2_figures import draw
 from services.reproduce.pr2_simulated import CASES, POINTS, RECOGNISERS, WAYS, Simulated, simulate
-from services.reproduce.report import Report, Row
-from services.reproduce.runs import open_run
+from services.reproduce.report import Report, Row, adder
+from services.reproduce.runs import Run, between, each_seed
 from services.show import Tell
 
 ROBOT = "pr2_duster"
@@ -35,16 +35,12 @@ class Outcome:
 def reproduce(seeds: Sequence[int], folder: Path, progress: Tell, fresh: bool) -> Report:
     """See `services.reproduce.Experiment`."""
     robot = load_robot(robot_file(ROBOT))
-    outcomes: list[Outcome] = []
-    for index, seed in enumerate(seeds):
-        run = open_run(robot, folder, seed, fresh)
 
-        def tell(share: float, text: str, index: int = index, seed: int = seed) -> None:
-            progress((index + share) / len(seeds), f"seed {seed}: {text}")
+    def experiment(run: Run, tell: Tell) -> Outcome:
+        simulated = simulate(run, between(tell, 0.0, 0.7))
+        return Outcome(simulated, actual(run, simulated.schema, between(tell, 0.7, 1.0)))
 
-        simulated = simulate(run, lambda share, text, tell=tell: tell(0.7 * share, text))  # type: ignore[misc]
-        found = actual(run, simulated.schema, lambda share, text, tell=tell: tell(0.7 + 0.3 * share, text))  # type: ignore[misc]
-        outcomes.append(Outcome(simulated, found))
+    outcomes = each_seed(robot, seeds, folder, progress, fresh, experiment)
     draw(folder, [outcome.simulated for outcome in outcomes], [outcome.actual for outcome in outcomes])
     return summary(seeds, outcomes)
 
@@ -59,7 +55,7 @@ def summary(seeds: Sequence[int], outcomes: Sequence[Outcome]) -> Report:
 
 
 def _add_structure(report: Report, outcomes: Sequence[Outcome]) -> None:
-    row = _adder(report, outcomes)
+    row = adder(report, outcomes)
     row("L of joint_position (an output if below 0.15)", "", "above 0.15", lambda o: o.simulated.fact("L_i")[JOINTS])
     row("L of tool_tip_position", "", "below 0.15", lambda o: o.simulated.fact("L_i")[TIP])
     outputs = "seeds whose only output is tool_tip_position, only mask joint_position"
@@ -80,7 +76,7 @@ def _add_structure(report: Report, outcomes: Sequence[Outcome]) -> None:
 
 
 def _add_simulated(report: Report, outcomes: Sequence[Outcome]) -> None:
-    row = _adder(report, outcomes)
+    row = adder(report, outcomes)
     for case in CASES:
         for name in RECOGNISERS:
             row(
@@ -118,7 +114,7 @@ def _add_simulated(report: Report, outcomes: Sequence[Outcome]) -> None:
 
 
 def _add_actual(report: Report, outcomes: Sequence[Outcome]) -> None:
-    row = _adder(report, outcomes)
+    row = adder(report, outcomes)
     row("actual: samples for fine-tuning", "", "1500", lambda o: o.actual.samples)
     for model in MODELS:
         row(
@@ -140,18 +136,3 @@ def _add_actual(report: Report, outcomes: Sequence[Outcome]) -> None:
         "actual: right after the tool was changed", "mm", "500", lambda o: 1e3 * o.actual.course.errors[o.actual.change]
     )
     row(f"actual: {POINTS} points later", "mm", "200", lambda o: o.actual.course.mean(o.actual.change + POINTS))
-
-
-def _adder(report: Report, outcomes: Sequence[Outcome]) -> Callable[..., None]:
-    def add(
-        name: str,
-        unit: str,
-        paper: str,
-        figure: Callable[[Outcome], float],
-        bar: float | None = None,
-        better: str = "lower",
-    ) -> None:
-        values = tuple(figure(outcome) for outcome in outcomes)
-        report.add(Row(name, unit, paper, values, bar, "higher" if better == "higher" else "lower"))
-
-    return add

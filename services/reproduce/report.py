@@ -1,10 +1,10 @@
 """What an experiment measured, beside what the paper reports and what was to be reached."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from rich.table import Table
@@ -114,3 +114,19 @@ class Report:
         rows = [{**asdict(row), "mean": row.mean, "spread": row.spread, "reached": row.reached} for row in self.rows]
         content = {"robot": self.robot, "seeds": list(self.seeds), "rows": rows, "notes": self.notes}
         (folder / "report.json").write_text(json.dumps(content, indent=2) + "\n")
+
+
+def adder(report: Report, outcomes: Sequence[Any]) -> Callable[..., None]:
+    """Adds rows whose values are a figure of every seed's outcome."""
+
+    def add(
+        name: str,
+        unit: str,
+        paper: str,
+        figure: Callable[[Any], float],
+        bar: float | None = None,
+        better: Literal["lower", "higher"] = "lower",
+    ) -> None:
+        report.add(Row(name, unit, paper, tuple(figure(outcome) for outcome in outcomes), bar, better))
+
+    return add

@@ -3,16 +3,19 @@
 import hashlib
 import json
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from gemuco.dataset import Dataset
 from gemuco.errors import CheckpointError, DatasetError
 from gemuco.schema import BodySchema
 from hal.config import RobotConfig
 from services.artifacts import fingerprint
+from services.show import Tell
+
+Outcome = TypeVar("Outcome")
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,3 +84,24 @@ def open_run(robot: RobotConfig, folder: Path, seed: int, fresh: bool = False) -
         for stamp in place.glob("*.stamp"):
             stamp.unlink()
     return Run(robot, seed, place)
+
+
+def each_seed(
+    robot: RobotConfig,
+    seeds: Sequence[int],
+    folder: Path,
+    progress: Tell,
+    fresh: bool,
+    experiment: Callable[[Run, Tell], Outcome],
+) -> list[Outcome]:
+    """One experiment for every seed, one after the other; progress is told over all of them."""
+    outcomes = []
+    for index, seed in enumerate(seeds):
+        tell = between(progress, index / len(seeds), (index + 1) / len(seeds), f"seed {seed}: ")
+        outcomes.append(experiment(open_run(robot, folder, seed, fresh), tell))
+    return outcomes
+
+
+def between(tell: Tell, first: float, last: float, prefix: str = "") -> Tell:
+    """Progress of a part of the work, told as progress of the whole from `first` to `last`."""
+    return lambda done, text: tell(first + (last - first) * done, prefix + text)
