@@ -25,9 +25,9 @@ Progress = Callable[[float, str], None]
 
 HUBER = (0.3, 1.0)
 """Misses above this many standard deviations count in proportion and no longer squared, before outliers were looked for
-and after: what is not found out yet pulls at W like any large miss and not thirty times as hard. Measured with 1 % of
-all values ten standard deviations off, 40 to 50 epochs: PR2 stand-in 166 mm with the plain square, 22 mm so (clean data
-16 to 17); muscle tension 21 N and 4.2 N (clean 3.8 to 4.1)."""
+and after: what is not found out yet pulls at W like any large miss and not thirty times as hard. With 1 % of
+all values ten standard deviations off the PR2's tip is wrong by 141 mm with the plain square and by 14 mm so (clean data
+8 mm; benchmarks/imperfect_data.py)."""
 
 LOOKS = 16
 """How often outliers are looked for during a training, beginning when a quarter of it is done."""
