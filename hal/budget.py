@@ -10,8 +10,6 @@ from hal import registry
 from hal.config import RobotConfig
 from hal.errors import ConfigError
 
-HEARTBEAT_RATE = 10.0
-"""Of every node [Hz]."""
 OWN_HEARTBEAT_RATE = 50.0
 """Of the HAL [Hz]; a drive stops after 0.15 s without one, of which a machine under load may sleep most."""
 
@@ -58,12 +56,16 @@ def budgets(config: RobotConfig) -> list[BusBudget]:
     found = []
     for name, bus in config.buses.items():
         sizes = [0]
-        nodes = 0
-        for device in config.devices.values():
-            if device.bus == name:
-                nodes += 1
-                sizes += registry.driver(config.kinds[device.kind].driver).FRAMES
-        beats = (nodes * HEARTBEAT_RATE + OWN_HEARTBEAT_RATE) * frame_bits(1)
+        beats = OWN_HEARTBEAT_RATE * frame_bits(1)
+        for device, entry in config.devices.items():
+            if entry.bus != name:
+                continue
+            driver, settings = registry.equipment(config, device)
+            for size, rate in driver.traffic(settings, config.rates.hal):
+                if rate == config.rates.hal:
+                    sizes.append(size)
+                else:
+                    beats += rate * frame_bits(size)
         bits = sum(frame_bits(size) for size in sizes)
         found.append(BusBudget(name, len(sizes), bits, beats, config.rates.hal, bus.bitrate))
     return found

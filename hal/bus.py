@@ -66,9 +66,8 @@ class BusState(StrEnum):
 
 
 class Answers(Protocol):
-    """A node that answers every SYNC."""
+    """A device that answers once in every cycle."""
 
-    node: int
     missed: int
     """Cycles in a row without its answer."""
     is_commissioned: bool
@@ -104,13 +103,15 @@ class Bus:
         self.counters = dict.fromkeys(
             ("received", "sent", "opened", "unknown", "ignored", "error_frames", "broken_handlers", "send_failures"), 0
         )
+        self.needs_sync = False
+        """Whether there are CANopen nodes, which wait for the SYNC and for the HAL's heartbeat."""
         self.network = canopen.Network(_Sender(self.send))  # type: ignore[arg-type]
         self._config = config
         self._clock = clock
         self._can: can.BusABC | None = None
         self._handlers: dict[int, Handler] = {}
         self._nodes: list[Answers] = []
-        self._waiting: set[int] = set()
+        self._waiting: set[Answers] = set()
         self._answered = threading.Event()
         self._tried = threading.Event()
         self._closing = threading.Event()
@@ -132,11 +133,11 @@ class Bus:
         self._handlers[cob_id] = handler
 
     def expect(self, node: Answers) -> None:
-        """Wait in every cycle for `answered(node.node)` after the SYNC."""
+        """Wait in every cycle for `answered(node)`."""
         self._nodes.append(node)
 
-    def answered(self, node: int) -> None:
-        """A node's answer to the SYNC has come; called in the receive thread."""
+    def answered(self, node: Answers) -> None:
+        """A device's answer of this cycle has come; called in the receive thread."""
         waiting = self._waiting
         waiting.discard(node)
         if not waiting:
@@ -176,17 +177,22 @@ class Bus:
             self._bits += _BITS[len(message.data)]
             return True
 
-    def sync(self, now: float) -> None:
-        """Begin a cycle: the SYNC, and now and then the HAL's own heartbeat."""
-        self._waiting = {n.node for n in self._nodes if n.is_commissioned and n.missed < MISSES_FORGIVEN}
+    def begin(self) -> None:
+        """Begin a cycle, before anything is sent: some devices answer their set-point, others the SYNC."""
+        self._waiting = {n for n in self._nodes if n.is_commissioned and n.missed < MISSES_FORGIVEN}
         self._answered.clear()
+
+    def sync(self, now: float) -> None:
+        """Send the SYNC, and now and then the HAL's own heartbeat, if anybody waits for them."""
+        if not self.needs_sync:
+            return
         self.send(self._sync)
         if now - self._beat >= OWN_HEARTBEAT_PERIOD:
             self._beat = now
             self.send(self._heartbeat)
 
     def wait(self, deadline: float) -> bool:
-        """Wait until every node has answered the SYNC, or the deadline [monotonic s]; whether every node has."""
+        """Wait until every device has answered, or the deadline [monotonic s]; whether every node has."""
         waiting = self._waiting
         while waiting and self._clock.wait(self._answered, deadline):
             self._answered.clear()

@@ -1,7 +1,22 @@
-"""Counts to SI units and back."""
+"""Counts to SI units and back, and what was measured of one device."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """What was measured of one very device; it belongs to that device and no other.
+
+    Attributes:
+        identity: `Device.identity` of the device that was measured.
+        settings: Settings of its driver, such as `zero` and `direction`, to be laid over those of the robot file.
+    """
+
+    identity: str
+    settings: Mapping[str, Any]
 
 
 @dataclass(frozen=True, slots=True)

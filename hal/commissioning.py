@@ -167,8 +167,11 @@ def nmt(bus: Bus, command: NmtCommand, node: int) -> None:
     bus.send(can.Message(arbitration_id=cia301.NMT, is_extended_id=False, data=data))
 
 
-def identify(sdo: SdoClient, plan: Plan, label: str) -> None:
-    """Check that the node is what its data sheet says; one try, since nobody may be there.
+def identify(sdo: SdoClient, plan: Plan, label: str) -> str:
+    """Check that the node is what its data sheet says, and tell it from all others; one try, since nobody may be there.
+
+    Returns:
+        `canopen:<vendor>-<product>-<serial>` in hexadecimal digits.
 
     Raises:
         DeviceSilent: No answer.
@@ -179,11 +182,17 @@ def identify(sdo: SdoClient, plan: Plan, label: str) -> None:
         raise WrongDevice(
             f"{label} has device profile {device_type & 0xFFFF}, not {plan.profile}. Are two node ids swapped?"
         )
-    for subindex, what in ((1, "vendor"), (2, "product")):
+    names = []
+    for subindex, what in ((1, "vendor"), (2, "product"), (4, "serial number")):
+        if not sdo.has(cia301.IDENTITY, subindex):
+            names.append(0)
+            continue
         expected = sdo.default(cia301.IDENTITY, subindex)
         found = sdo.read(cia301.IDENTITY, subindex)
+        names.append(found)
         if expected and found != expected:
             raise WrongDevice(f"{label} has {what} {found:X}h, its EDS file says {expected:X}h. Is it the right file?")
+    return "canopen:" + "-".join(f"{name:08X}" for name in names)
 
 
 def commission(sdo: SdoClient, plan: Plan, node: int) -> None:

@@ -75,15 +75,28 @@ class KindConfig(Section):
 
 
 class DeviceConfig(Section):
-    """One device on a bus: where it is, and which element of which signal it measures or moves."""
+    """One device on a bus: where it is, and which elements of which signals it measures or moves."""
 
     kind: str
     bus: str
-    node: Annotated[int, Field(ge=1, le=127)]
-    element: str
-    """`signal.element`, as in `muscle_length.biceps`."""
+    node: Annotated[int, Field(ge=0, le=2047)]
+    element: str | None = None
+    """`signal.element`, as in `muscle_length.biceps`, for the one quantity that it is there for."""
+    elements: dict[str, str] = {}
+    """In place of `element`: quantity of the driver -> `signal.element`, as in `velocity: joint_velocity.elbow`."""
     settings: dict[str, Any] = {}
     """Added to the kind's settings; a key given in both takes the device's value."""
+
+    @model_validator(mode="after")
+    def _serves_something(self) -> "DeviceConfig":
+        if (self.element is None) == (not self.elements):
+            raise ValueError("a device has either `element`, or `elements` with at least one quantity.")
+        return self
+
+    @property
+    def served(self) -> tuple[str, ...]:
+        """Every `signal.element` that it measures or moves."""
+        return tuple(self.elements.values()) if self.element is None else (self.element,)
 
 
 class RangeConfig(Section):
@@ -189,9 +202,10 @@ class RobotConfig(Section):
             taken = addresses.setdefault((device.bus, device.node), name)
             if taken != name:
                 raise ValueError(f"devices '{taken}' and '{name}' both claim node {device.node} on bus '{device.bus}'.")
-            taken = elements.setdefault(device.element, name)
-            if taken != name:
-                raise ValueError(f"devices '{taken}' and '{name}' both claim element '{device.element}'.")
+            for element in device.served:
+                if element in elements:
+                    raise ValueError(f"devices '{elements[element]}' and '{name}' both claim element '{element}'.")
+                elements[element] = name
         if self.devices:
             missing = [e for e in self.element_names(self.measured) if e not in elements]
             if missing:
@@ -225,11 +239,12 @@ class RobotConfig(Section):
         if device.bus not in self.buses:
             raise ValueError(f"device '{name}' is on bus '{device.bus}'. Known buses: {', '.join(self.buses)}.")
         known = self.element_names(self.measured)
-        if device.element not in known:
-            which = "a device cannot measure" if device.element in self.element_names() else "no signal has"
-            raise ValueError(
-                f"device '{name}' serves '{device.element}', which {which}. Known elements: {', '.join(known)}."
-            )
+        for element in device.served:
+            if element not in known:
+                which = "a device cannot measure" if element in self.element_names() else "no signal has"
+                raise ValueError(
+                    f"device '{name}' serves '{element}', which {which}. Known elements: {', '.join(known)}."
+                )
 
     @property
     def measured(self) -> tuple[str, ...]:

@@ -10,6 +10,8 @@ from enum import StrEnum
 
 import numpy as np
 
+from hal.errors import CommandRefused
+
 
 class DeviceState(StrEnum):
     """Where a device stands."""
@@ -20,6 +22,8 @@ class DeviceState(StrEnum):
     """Answers and measures, does not move."""
     ENABLED = "enabled"
     """Follows what is applied."""
+    HOMING = "homing"
+    """Moves by itself to find its zero."""
     FAULT = "fault"
     """Reports a fault of its own; leaves it only by `reset`."""
     SILENT = "silent"
@@ -50,14 +54,35 @@ class DeviceHealth:
     """Malformed frames, missed cycles, emergencies, reboots and the like, since opened."""
 
 
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One thing that was looked at, for a person who looks for what is wrong.
+
+    Attributes:
+        what: What was looked at, as in `PDO mapping`.
+        is_good: Whether it is as it should be.
+        text: What was found, and if it is not good, what to do.
+    """
+
+    what: str
+    is_good: bool
+    text: str
+
+
 class Device(abc.ABC):
     """One thing on the robot that measures or moves.
 
-    No method but `open` and `close` may block longer than it takes to put a frame on the bus: the rest is called from
-    the cycle. `enable`, `disable` and `reset` ask; `health` tells when it has happened.
+    No method but `open`, `close` and `inspect` may block longer than it takes to put a frame on the bus: the rest is
+    called from the cycle. `enable`, `disable`, `quick_stop`, `home`, `tare` and `reset` ask; `health` tells when it has
+    happened.
     """
 
     name: str
+    identity: str = ""
+    """What tells this very device from all others of its kind, as `canopen:<vendor>-<product>-<serial>`; empty before
+    it was opened, or if it cannot tell."""
+    can_damp: bool = False
+    """Whether `damp` does something."""
     measures: tuple[str, ...] = ()
     """Elements that `read` returns, in order."""
     commands: tuple[str, ...] = ()
@@ -91,12 +116,44 @@ class Device(abc.ABC):
     def disable(self) -> None:
         """Ask to stop following and to be safe without power."""
 
+    def quick_stop(self) -> None:
+        """Ask to come to rest as fast as the device itself can, and to be safe without power then."""
+        self.disable()
+
+    def home(self) -> None:
+        """Ask to find the zero, which moves the device; its state is `homing` until it has.
+
+        Raises:
+            CommandRefused: It cannot, or not now.
+        """
+        raise CommandRefused(f"'{self.name}' has no homing of its own.")
+
+    def tare(self) -> None:
+        """Ask to take what is measured now as zero.
+
+        Raises:
+            CommandRefused: It cannot, or not now.
+        """
+        raise CommandRefused(f"'{self.name}' cannot be tared.")
+
     def reset(self) -> None:
         """Ask to leave a fault; never enables."""
 
     def apply(self, values: np.ndarray) -> None:
         """Send set-points [the signal's unit], shape (len(commands),), already limited by `Robot`."""
         raise NotImplementedError(f"{self.name} takes no commands")
+
+    def damp(self) -> None:
+        """Called instead of `apply` in a cycle in which it shall resist motion without holding a place."""
+        raise NotImplementedError(f"{self.name} cannot damp")
+
+    def inspect(self) -> tuple[Check, ...]:
+        """Read back what the device was told. May block; never called while the robot cycles.
+
+        Raises:
+            DeviceSilent: It does not answer.
+        """
+        return ()
 
     def idle(self) -> None:
         """Called instead of `apply` in every cycle that has no set-point; may keep a state machine going."""

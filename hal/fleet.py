@@ -1,10 +1,13 @@
 """The buses and devices that a robot file names, built but not opened."""
 
+from typing import Any
+
 from hal import budget, registry
 from hal.bus import Bus, BusClock
-from hal.config import RobotConfig
+from hal.config import DeviceConfig, RobotConfig
 from hal.device import Device
-from hal.drivers.canopen_node import Place, read_settings
+from hal.drivers.can_device import Place
+from hal.errors import ConfigError
 
 
 def build(config: RobotConfig, clock: BusClock) -> tuple[list[Bus], list[Device]]:
@@ -17,7 +20,30 @@ def build(config: RobotConfig, clock: BusClock) -> tuple[list[Bus], list[Device]
     buses = {name: Bus(name, bus, clock) for name, bus in config.buses.items()}
     devices: list[Device] = []
     for name, entry in config.devices.items():
-        driver = registry.driver(config.kinds[entry.kind].driver)
-        place = Place(name, entry.element, buses[entry.bus], entry.node, config.folder, config.rates.hal)
-        devices.append(driver(place, read_settings(driver.Settings, config.settings_of(name), name)))
+        driver, settings = registry.equipment(config, name)
+        elements = _elements(driver, settings, entry, name)
+        place = Place(name, elements, buses[entry.bus], entry.node, config.folder, config.rates.hal)
+        devices.append(driver(place, settings))
     return list(buses.values()), devices
+
+
+def _elements(driver: Any, settings: Any, entry: DeviceConfig, name: str) -> dict[str, str]:
+    """Quantity of the driver -> `signal.element`, in the driver's order.
+
+    Raises:
+        ConfigError: A quantity that the driver does not have, or not the one that it commands.
+    """
+    known = driver.quantities(settings)
+    wanted = entry.elements if entry.element is None else {known[0]: entry.element}
+    unknown = sorted(set(wanted) - set(known))
+    if unknown:
+        raise ConfigError(
+            f"Device '{name}' has no quantity {', '.join(unknown)}. With these settings it has {', '.join(known)}."
+        )
+    commanded = driver.commanded(settings)
+    if commanded is not None and commanded not in wanted:
+        raise ConfigError(
+            f"Device '{name}' is commanded by its {commanded}, which `elements` does not name. "
+            f"Add `{commanded}: signal.element`, or set another mode."
+        )
+    return {quantity: wanted[quantity] for quantity in known if quantity in wanted}

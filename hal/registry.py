@@ -1,8 +1,12 @@
 """Names in a robot file -> what they stand for, imported when asked for."""
 
 import importlib
+from collections.abc import Mapping
 from typing import Any
 
+from pydantic import ValidationError
+
+from hal.config import RobotConfig, explain
 from hal.errors import ConfigError
 
 DRIVERS = {
@@ -43,3 +47,21 @@ def driver(name: str) -> Any:
     if name not in DRIVERS:
         raise ConfigError(f"There is no driver '{name}'. Known: {', '.join(DRIVERS)}, or 'module:name' of your own.")
     return load(DRIVERS[name])
+
+
+def equipment(config: RobotConfig, device: str, measured: Mapping[str, Any] | None = None) -> tuple[Any, Any]:
+    """The driver class of a device, and its settings.
+
+    Args:
+        config: The robot file.
+        device: Name of the device.
+        measured: Settings from a calibration; they take precedence over those of the robot file.
+
+    Raises:
+        ConfigError: No such driver, an unknown key among the settings, or a value that does not fit.
+    """
+    found = driver(config.kinds[config.devices[device].kind].driver)
+    try:
+        return found, found.Settings.model_validate({**config.settings_of(device), **(measured or {})})
+    except ValidationError as error:
+        raise ConfigError(f"Settings of device '{device}': {explain(error, found.Settings)}") from None

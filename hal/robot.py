@@ -216,6 +216,8 @@ class Robot:
 
     def cycle(self) -> tuple[Sample, Applied]:
         """One whole turn: limits, set-points, SYNC on all buses, the answers, the sample."""
+        for bus in self._buses:
+            bus.begin()
         with self._lock:
             start = self._clock.monotonic()
             stamp = self._clock.now_ns()

@@ -153,7 +153,7 @@ def _describe(config: RobotConfig) -> dict[str, Any]:
         "conditions": list(config.conditions),
         "limits": {name: limit.model_dump(exclude_none=True) for name, limit in config.limits.items()},
         "rates": config.rates.model_dump(),
-        "devices": {name: {"kind": device.kind, "element": device.element} for name, device in config.devices.items()},
+        "devices": {name: {"kind": one.kind, "elements": list(one.served)} for name, one in config.devices.items()},
     }
 
 

@@ -12,8 +12,7 @@ import numpy as np
 from hal.config import BusConfig, RobotConfig
 from simulators.faults import TOOL_CHANGED
 from simulators.hub import HubServer
-from simulators.nodes.canopen_node import CanopenNode
-from simulators.nodes.drive import ServoDrive
+from simulators.nodes.node import SimulatedDrive, SimulatedNode
 from simulators.nodes.plant import Plant, Snapshot
 from simulators.nodes.segment import Segment
 from simulators.nodes.spec import NodeSpec
@@ -65,7 +64,7 @@ class Rig:
                 self._servers[name] = HubServer(bus.channel, bus.bitrate if bus.options.get("bit_timing") else None)
             specs = [spec for spec in hardware if spec.bus == name]
             self._segments[name] = Segment(name, specs, self._plant, _opener(bus))
-        self._drives = [node for node in self._nodes().values() if isinstance(node, ServoDrive)]
+        self._drives = [node for node in self._nodes().values() if isinstance(node, SimulatedDrive)]
         self._threads: list[threading.Thread] = []
         self._running = threading.Event()
         self._is_open = False
@@ -152,10 +151,10 @@ class Rig:
             name: {**segment.counters, **({"hub": self._servers[name].stats()} if name in self._servers else {})}
             for name, segment in self._segments.items()
         }
-        nodes = {name: node.nmt.name.lower() if node.is_powered else "off" for name, node in self._nodes().items()}
+        nodes = {name: node.condition for name, node in self._nodes().items()}
         return {"physics": dict(self._ticks), "buses": buses, "nodes": nodes, "failure": self.failure}
 
-    def node(self, name: str) -> CanopenNode:
+    def node(self, name: str) -> SimulatedNode:
         """One node by its name.
 
         Raises:
@@ -166,7 +165,7 @@ class Rig:
             raise UnknownFault(f"There is no node '{name}'. Known nodes: {', '.join(nodes)}.")
         return nodes[name]
 
-    def _nodes(self) -> dict[str, CanopenNode]:
+    def _nodes(self) -> dict[str, SimulatedNode]:
         return {name: node for segment in self._segments.values() for name, node in segment.nodes.items()}
 
     def _open(self, now: float) -> None:
@@ -236,11 +235,11 @@ def _check(config: RobotConfig, hardware: Sequence[NodeSpec]) -> None:
                 raise ValueError(f"Node '{spec.name}' measures '{element}'. Known elements: {', '.join(elements)}.")
 
 
-def _mute(node: CanopenNode, now: float) -> None:
+def _mute(node: SimulatedNode, now: float) -> None:
     node.is_muted = True
 
 
-_NODE_FAULTS: dict[str, tuple[Callable[[CanopenNode, float], None], str]] = {
+_NODE_FAULTS: dict[str, tuple[Callable[[SimulatedNode, float], None], str]] = {
     "sensor_silent": (_mute, "sends no measurements any more; its heartbeat goes on"),
     "node_silent": (lambda node, now: node.power_down(), "has no power any more"),
     "node_back": (lambda node, now: node.power_up(now), "is back, as after power-on"),

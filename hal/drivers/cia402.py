@@ -10,7 +10,8 @@ from hal import calibration
 from hal.commissioning import Plan
 from hal.config import Finite, Positive
 from hal.device import DeviceState
-from hal.drivers.canopen_node import CanopenNode, NodeSettings, Place
+from hal.drivers.can_device import Place
+from hal.drivers.canopen_node import HEARTBEAT, CanopenNode, NodeSettings
 from hal.protocols import cia301, cia402
 from hal.protocols.cia402 import State
 
@@ -45,12 +46,25 @@ class DriveSettings(NodeSettings):
 class Cia402Drive(CanopenNode):
     """One drive. It is enabled only by `enable`, and stays disabled once it dropped out by itself."""
 
-    FRAMES = (cia402.COMMAND_LAYOUT.size, cia402.STATUS_LAYOUT.size)
     Settings = DriveSettings
+
+    @classmethod
+    def quantities(cls, settings: DriveSettings) -> tuple[str, ...]:
+        """See `CanDevice.quantities`."""
+        return ("position",)
+
+    @classmethod
+    def commanded(cls, settings: DriveSettings) -> str:
+        """See `CanDevice.commanded`."""
+        return "position"
+
+    @classmethod
+    def traffic(cls, settings: DriveSettings, rate: float) -> tuple[tuple[int, float], ...]:
+        """See `CanDevice.traffic`."""
+        return ((cia402.COMMAND_LAYOUT.size, rate), (cia402.STATUS_LAYOUT.size, rate), HEARTBEAT)
 
     def __init__(self, place: Place, settings: DriveSettings) -> None:
         super().__init__(place, settings)
-        self.commands = self.measures
         shape = (settings.counts_per_turn, settings.gear, settings.direction, settings.zero)
         radius = settings.spool_radius
         self._line = calibration.spool(*shape, radius) if radius else calibration.rotary(*shape)

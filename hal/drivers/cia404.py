@@ -5,7 +5,8 @@ import math
 from hal.commissioning import Plan
 from hal.config import Finite
 from hal.device import DeviceState
-from hal.drivers.canopen_node import CanopenNode, NodeSettings, Place
+from hal.drivers.can_device import Place
+from hal.drivers.canopen_node import HEARTBEAT, CanopenNode, NodeSettings
 from hal.errors import DeviceRefused
 from hal.protocols import cia404
 
@@ -20,8 +21,17 @@ class CellSettings(NodeSettings):
 class Cia404Cell(CanopenNode):
     """One load cell. A value whose status is not good, or during an emergency, is NaN."""
 
-    FRAMES = (cia404.VALUE_LAYOUT.size,)
     Settings = CellSettings
+
+    @classmethod
+    def quantities(cls, settings: CellSettings) -> tuple[str, ...]:
+        """See `CanDevice.quantities`."""
+        return ("force",)
+
+    @classmethod
+    def traffic(cls, settings: CellSettings, rate: float) -> tuple[tuple[int, float], ...]:
+        """See `CanDevice.traffic`."""
+        return ((cia404.VALUE_LAYOUT.size, rate), HEARTBEAT)
 
     def __init__(self, place: Place, settings: CellSettings) -> None:
         super().__init__(place, settings)

@@ -7,7 +7,8 @@ from hal import calibration
 from hal.commissioning import Plan
 from hal.config import Finite, Positive
 from hal.device import DeviceState
-from hal.drivers.canopen_node import CanopenNode, NodeSettings, Place
+from hal.drivers.can_device import Place
+from hal.drivers.canopen_node import HEARTBEAT, CanopenNode, NodeSettings
 from hal.errors import DeviceRefused
 from hal.protocols import cia406
 
@@ -26,8 +27,17 @@ class EncoderSettings(NodeSettings):
 class Cia406Encoder(CanopenNode):
     """One encoder. A position with an alarm, or during an emergency, is NaN."""
 
-    FRAMES = (cia406.VALUE_LAYOUT.size,)
     Settings = EncoderSettings
+
+    @classmethod
+    def quantities(cls, settings: EncoderSettings) -> tuple[str, ...]:
+        """See `CanDevice.quantities`."""
+        return ("position",)
+
+    @classmethod
+    def traffic(cls, settings: EncoderSettings, rate: float) -> tuple[tuple[int, float], ...]:
+        """See `CanDevice.traffic`."""
+        return ((cia406.VALUE_LAYOUT.size, rate), HEARTBEAT)
 
     def __init__(self, place: Place, settings: EncoderSettings) -> None:
         super().__init__(place, settings)

@@ -4,14 +4,12 @@ import struct
 from collections.abc import Callable
 from enum import IntEnum
 
+from simulators.nodes.node import Frame, Handler
 from simulators.nodes.objects import Abort, ObjectDictionary, Refused, Value, read_eds
 from simulators.nodes.pdo import Pdo, PdoTable
 from simulators.nodes.plant import Plant
 from simulators.nodes.sdo import SdoServer
 from simulators.nodes.spec import NodeSpec
-
-Frame = tuple[int, bytes]
-Handler = Callable[[bytes, float], None]
 
 HEARTBEAT_LOST = 0x8130
 PDO_TOO_SHORT = 0x8210
@@ -57,6 +55,11 @@ class CanopenNode:
         self._heartbeat_due = 0.0
         self._watched: dict[int, tuple[float, float | None]] = {}
         self._now = 0.0
+
+    @property
+    def condition(self) -> str:
+        """See `SimulatedNode.condition`."""
+        return self.nmt.name.lower() if self.is_powered else "off"
 
     def sample(self) -> None:
         """Bring the process values in the object dictionary up to date."""

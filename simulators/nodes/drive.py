@@ -2,8 +2,9 @@
 
 import math
 
-from simulators.nodes.canopen_node import GENERIC, HARDWARE, HEARTBEAT_LOST, CanopenNode, Frame
+from simulators.nodes.canopen_node import GENERIC, HARDWARE, HEARTBEAT_LOST, CanopenNode
 from simulators.nodes.drive_states import State, following
+from simulators.nodes.node import Frame
 from simulators.nodes.objects import Abort, Refused, Value
 from simulators.nodes.plant import Plant
 from simulators.nodes.spec import DriveConstants, NodeSpec

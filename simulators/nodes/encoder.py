@@ -2,7 +2,8 @@
 
 import math
 
-from simulators.nodes.canopen_node import CanopenNode, Frame
+from simulators.nodes.canopen_node import CanopenNode
+from simulators.nodes.node import Frame
 from simulators.nodes.objects import Value
 from simulators.nodes.plant import Plant
 from simulators.nodes.spec import EncoderConstants, NodeSpec

@@ -8,10 +8,8 @@ from collections.abc import Callable, Sequence
 import can
 
 from simulators.hub import HubBus
-from simulators.nodes.canopen_node import CanopenNode, Frame, Handler
-from simulators.nodes.drive import ServoDrive
-from simulators.nodes.encoder import JointEncoder
-from simulators.nodes.load_cell import LoadCell
+from simulators.nodes.kinds import make
+from simulators.nodes.node import EXTENDED, Frame, Handler
 from simulators.nodes.plant import Plant
 from simulators.nodes.spec import NodeSpec
 
@@ -22,8 +20,6 @@ TICK = 0.005
 """How often nodes look at the time [s]."""
 _REOPEN = 0.2
 """Pause [s] before a bus that failed is opened again."""
-
-_KINDS: dict[str, type[CanopenNode]] = {"servo_drive": ServoDrive, "load_cell": LoadCell, "joint_encoder": JointEncoder}
 
 
 class Segment:
@@ -42,7 +38,7 @@ class Segment:
         self.lock = threading.Lock()
         """Held by whoever uses the nodes."""
         self._outbox: list[Frame] = []
-        self.nodes = {spec.name: _KINDS[spec.kind](spec, plant, self._outbox) for spec in specs}
+        self.nodes = {spec.name: make(spec, plant, self._outbox) for spec in specs}
         self._listeners = list(self.nodes.values())
         self._open_bus = open_bus
         self._bus: can.BusABC | None = None
@@ -101,10 +97,10 @@ class Segment:
         return self._bus.recv(timeout)
 
     def _handle(self, message: can.Message, now: float) -> None:
-        if message.is_error_frame or message.is_remote_frame or message.is_extended_id:
+        if message.is_error_frame or message.is_remote_frame:
             return
         self.counters["received"] += 1
-        identifier = message.arbitration_id
+        identifier = message.arbitration_id | (EXTENDED if message.is_extended_id else 0)
         if identifier == SYNC:
             for node in self._listeners:
                 node.sync(now)
@@ -134,7 +130,9 @@ class Segment:
             self._bus.send_frames(frames)
         elif self._bus is not None:
             for identifier, data in frames:
-                self._send(self._bus, can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
+                is_extended = bool(identifier & EXTENDED)
+                plain = identifier & ~EXTENDED
+                self._send(self._bus, can.Message(arbitration_id=plain, data=data, is_extended_id=is_extended))
         self.counters["sent"] += len(frames)
 
     def _send(self, bus: can.BusABC, message: can.Message) -> None:

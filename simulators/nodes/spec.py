@@ -8,8 +8,16 @@ import math
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar, Protocol
 
 EDS_FOLDER = Path(__file__).resolve().parents[2] / "robots" / "eds"
+
+
+class Constants(Protocol):
+    """Electrical constants of a node; their type says what kind of node it is."""
+
+    kind: ClassVar[str]
+    """In words that a file name can have: `servo_drive`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +37,8 @@ class DriveConstants:
         load: `signal.element` of the wire's tension [N] or the joint's torque [N m] that the motor carries; None: no
             load is reported by 6077h.
     """
+
+    kind: ClassVar[str] = "servo_drive"
 
     counts_per_turn: int = 4096
     gear: float = 29.0
@@ -56,6 +66,8 @@ class CellConstants:
         decimal_digits: Of the integer process value: 2 means 0.01 N.
     """
 
+    kind: ClassVar[str] = "load_cell"
+
     capacity: float = 500.0
     counts_per_newton: float = 4000.0
     unbalance: float = 0.0
@@ -73,19 +85,12 @@ class EncoderConstants:
         zero: Angle at zero counts [rad]; half a turn away from the middle of the joint's range avoids the wrap.
     """
 
+    kind: ClassVar[str] = "joint_encoder"
+
     counts_per_turn: int = 262144
     turns: int = 1
     direction: int = 1
     zero: float = -math.pi
-
-
-Constants = DriveConstants | CellConstants | EncoderConstants
-
-_KINDS: dict[type, str] = {
-    DriveConstants: "servo_drive",
-    CellConstants: "load_cell",
-    EncoderConstants: "joint_encoder",
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +100,7 @@ class NodeSpec:
     Attributes:
         name: As a person calls it in a fault: `shoulder_roll_encoder`.
         bus: Key of the bus in the robot file.
-        node: CANopen node id, 1 to 127.
+        node: Node id; 1 to 127 on CANopen.
         element: `signal.element` of the world that it measures or moves.
         constants: Its electrical constants; their type says what kind of node it is.
     """
@@ -108,12 +113,12 @@ class NodeSpec:
 
     @property
     def kind(self) -> str:
-        """`servo_drive`, `load_cell` or `joint_encoder`."""
-        return _KINDS[type(self.constants)]
+        """What kind of node it is, as in `servo_drive`."""
+        return self.constants.kind
 
     @property
     def eds(self) -> Path:
-        """The electronic data sheet of this kind of node."""
+        """The electronic data sheet of this kind of node, if it speaks CANopen."""
         return EDS_FOLDER / f"{self.kind}.eds"
 
     @property

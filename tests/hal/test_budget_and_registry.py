@@ -74,7 +74,7 @@ def kinds(**drive):
 
 
 def test_settings_of_a_device_are_checked():
-    assert "unknown key 'gaer'. Known keys there: eds, silent_after, counts_per_turn, gear" in refused(
+    assert "unknown key 'gaer'. Known keys there: silent_after, eds, counts_per_turn, gear" in refused(
         kinds=kinds(gaer=29)
     )
     assert "Settings of device 'biceps_drive': gear" in refused(kinds=kinds(gear=0))
@@ -91,3 +91,26 @@ def test_a_missing_or_broken_data_sheet_is_told(tmp_path):
 def test_an_unknown_interface_is_told():
     buses = {name: {"interface": "telepathy", "channel": "x"} for name in ("can0", "can1")}
     assert "interface 'telepathy' is not known to python-can. Known: " in refused(buses=buses)
+
+
+def devices(**drive):
+    body = description()["devices"]
+    body["biceps_drive"] = {"kind": "drive", "bus": "can0", "node": 1, "element": "muscle_length.biceps", **drive}
+    return {name: {key: value for key, value in one.items() if value is not None} for name, one in body.items()}
+
+
+def test_a_device_may_name_the_quantities_that_it_measures():
+    by_name = devices(element=None, elements={"position": "muscle_length.biceps"})
+    robot = open_robot(RobotConfig.model_validate(description(devices=by_name)))
+    assert [device.measures for device in robot._devices][0] == ("muscle_length.biceps",)
+
+
+def test_a_quantity_that_a_driver_does_not_have_is_told():
+    told = refused(devices=devices(element=None, elements={"colour": "muscle_length.biceps"}))
+    assert "Device 'biceps_drive' has no quantity colour. With these settings it has position" in told
+
+
+def test_a_node_id_that_canopen_does_not_have_is_told():
+    assert "'biceps_drive' (node 200 on can0) has a node id that CANopen does not have" in refused(
+        devices=devices(node=200)
+    )

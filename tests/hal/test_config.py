@@ -86,7 +86,7 @@ def test_files_that_are_no_robot_are_refused(tmp_path, text):
             "Known elements: joint_position.elbow",
         ),
         (changed("devices", ["biceps_drive", "node"], 11), "both claim node 11"),
-        (changed("devices", ["biceps_drive", "node"], 128), "devices.biceps_drive.node"),
+        (changed("devices", ["biceps_drive", "node"], 2048), "devices.biceps_drive.node"),
         (changed("devices", ["biceps_cell", "element"], "muscle_length.biceps"), "both claim element"),
         ({"limits": {"muscle_length": {"low": 0.5, "high": 0.1}}}, "low must be below high"),
         ({"limits": {"muscle_length": {"low": [0.1, 0.1, 0.1]}}}, "has 3 values, the signal has 2"),

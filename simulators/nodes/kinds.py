@@ -1,0 +1,19 @@
+"""Which class plays which kind of node: one line per kind."""
+
+from simulators.nodes.drive import ServoDrive
+from simulators.nodes.encoder import JointEncoder
+from simulators.nodes.load_cell import LoadCell
+from simulators.nodes.node import Frame, SimulatedNode
+from simulators.nodes.plant import Plant
+from simulators.nodes.spec import CellConstants, DriveConstants, EncoderConstants, NodeSpec
+
+KINDS = {
+    DriveConstants: ServoDrive,
+    CellConstants: LoadCell,
+    EncoderConstants: JointEncoder,
+}
+
+
+def make(spec: NodeSpec, plant: Plant, outbox: list[Frame]) -> SimulatedNode:
+    """The node that a spec describes, not powered yet."""
+    return KINDS[type(spec.constants)](spec, plant, outbox)

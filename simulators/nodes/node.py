@@ -1,0 +1,68 @@
+"""What anything simulated on a bus is, whatever it speaks."""
+
+from collections.abc import Callable, Mapping
+from typing import Protocol, runtime_checkable
+
+from simulators.nodes.spec import NodeSpec
+
+Frame = tuple[int, bytes]
+"""Identifier and data of a frame; an identifier of 29 bits has `EXTENDED` set."""
+Handler = Callable[[bytes, float], None]
+"""Called with a frame's data and the time [s]."""
+EXTENDED = 1 << 31
+
+
+class SimulatedNode(Protocol):
+    """One node: frames in by `routes` and `sync`, time by `tick`, frames out into the outbox it was made with.
+
+    Its class is called with `NodeSpec`, `Plant` and the outbox, a list of frames. Times are seconds of one monotonic
+    clock. A node is used by one thread at a time.
+    """
+
+    spec: NodeSpec
+    is_powered: bool
+    is_muted: bool
+    """Sends no measurements any more: its sensor is dead, its electronics are not."""
+    routes_changed: Callable[[], None]
+    """Called by the node when `routes` would answer differently."""
+
+    @property
+    def condition(self) -> str:
+        """What it is doing, in a word or two, for a person."""
+        ...
+
+    def routes(self) -> Mapping[int, Handler]:
+        """Which identifiers it listens to, SYNC aside, and what takes the data."""
+        ...
+
+    def sync(self, now: float) -> None:
+        """A SYNC was on the bus."""
+        ...
+
+    def tick(self, now: float) -> None:
+        """Time passes; called every few milliseconds."""
+        ...
+
+    def power_up(self, now: float) -> None:
+        """Start anew, as after power-on."""
+        ...
+
+    def power_down(self) -> None:
+        """Fall silent at once."""
+        ...
+
+    def break_down(self) -> None:
+        """Report a fault of the device's own."""
+        ...
+
+
+@runtime_checkable
+class SimulatedDrive(Protocol):
+    """A node that moves something."""
+
+    spec: NodeSpec
+
+    @property
+    def servo(self) -> tuple[float, bool]:
+        """What the world's servo is to do: target [unit of `spec.element`], and whether it is enabled at all."""
+        ...
