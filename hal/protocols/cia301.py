@@ -1,11 +1,14 @@
 """CANopen application layer: identifiers, NMT, heartbeat, emergency, PDO parameters.
 
-Source: CiA 301, version 4.2: 7.2.8 (NMT), 7.2.7 (emergency), 7.2.2 (PDO), 7.3.3 (predefined connection set).
+Source: CiA 301, version 4.2: 7.2.8 (NMT), 7.2.7 (emergency), 7.2.2 (PDO), 7.3.3 (predefined connection set), 7.5.2
+(objects 1000h to 1FFFh).
 """
 
+import re
 import struct
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import Literal
 
 NMT = 0x000
 SYNC = 0x080
@@ -17,7 +20,10 @@ SDO_REQUEST = 0x600
 HEARTBEAT = 0x700
 
 SYNCHRONOUS = 1
-"""Transmission type: at every SYNC."""
+"""Transmission type: at every SYNC; n up to 240: at every n-th."""
+LAST_SYNCHRONOUS = 240
+EVENT_DRIVEN = (254, 255)
+"""Transmission types of PDOs that do not wait for a SYNC; the event timer (sub-index 5) sends them."""
 PDO_INVALID = 1 << 31
 """Bit of a PDO's COB-ID entry: the PDO does not exist."""
 
@@ -31,6 +37,12 @@ TPDO_PARAMETERS = 0x1800
 TPDO_MAPPING = 0x1A00
 PDO_PER_DIRECTION = 4
 """PDO that the predefined connection set gives an identifier per direction."""
+PDO_SIZE = 8
+"""Bytes that a PDO can carry."""
+ERROR_BEHAVIOUR = 0x1029
+"""Sub-index 1: what a node does when it misses a heartbeat."""
+BECOME_PRE_OPERATIONAL = 0
+"""Value of 1029h:1; in pre-operational a node takes no process data."""
 
 
 class NmtCommand(IntEnum):
@@ -69,19 +81,57 @@ class Emergency:
 
 @dataclass(frozen=True, slots=True)
 class Mapped:
-    """An object that a PDO carries: where it is in the object dictionary, and how many bits it has."""
+    """An object that a PDO carries: where it is in the object dictionary, how many bits it has, and what they mean."""
 
     index: int
     subindex: int
     bits: int
+    kind: Literal["unsigned", "signed", "float"] = "unsigned"
 
     @property
     def entry(self) -> int:
         """The UNSIGNED32 of a mapping parameter."""
         return self.index << 16 | self.subindex << 8 | self.bits
 
+    @property
+    def format(self) -> str:
+        """Its character in `struct`, little-endian as CANopen is (7.1.4)."""
+        return _FORMATS[self.kind, self.bits]
 
+    def __str__(self) -> str:
+        return f"{self.index:04X}h:{self.subindex}"
+
+
+_FORMATS = {
+    ("unsigned", 8): "B",
+    ("unsigned", 16): "H",
+    ("unsigned", 32): "I",
+    ("unsigned", 64): "Q",
+    ("signed", 8): "b",
+    ("signed", 16): "h",
+    ("signed", 32): "i",
+    ("signed", 64): "q",
+    ("float", 32): "f",
+    ("float", 64): "d",
+}
+_TYPES: dict[str, tuple[Literal["unsigned", "signed", "float"], int]] = {
+    **{f"uint{bits}": ("unsigned", bits) for bits in (8, 16, 32, 64)},
+    **{f"int{bits}": ("signed", bits) for bits in (8, 16, 32, 64)},
+    **{f"float{bits}": ("float", bits) for bits in (32, 64)},
+}
+_PLACE = re.compile(r"(?:0x)?([0-9A-Fa-f]{4})h?(?::([0-9]{1,3}))?")
 _EMERGENCY = struct.Struct("<HB5s")
+_REGISTER = (
+    "generic",
+    "current",
+    "voltage",
+    "temperature",
+    "communication",
+    "device profile",
+    "reserved",
+    "manufacturer",
+)
+"""Bits of the error register, object 1001h (CiA 301, 7.5.2.2)."""
 _FAMILIES = {
     0x10: "generic error",
     0x20: "current",
@@ -135,11 +185,33 @@ def emergency(data: bytes | bytearray) -> Emergency | None:
     return Emergency(*_EMERGENCY.unpack(data)) if len(data) == _EMERGENCY.size else None
 
 
-def describe_emergency(code: int) -> str:
-    """An emergency error code in words, as `communication: life guard or heartbeat error (8130h)`."""
+def describe_emergency(code: int, register: int = 0, detail: bytes = b"") -> str:
+    """An emergency in words, as `communication: life guard or heartbeat error (8130h)`.
+
+    The error register and the manufacturer's bytes are added where they say something: `(register: generic,
+    communication; manufacturer 01 00 00 00 00)`.
+    """
     family = _FAMILIES.get(code >> 8) or _FAMILIES.get(code >> 8 & 0xF0, "unknown family")
     exact = _CODES.get(code)
-    return f"{family}: {exact} ({code:04X}h)" if exact else f"{family} ({code:04X}h)"
+    text = f"{family}: {exact} ({code:04X}h)" if exact else f"{family} ({code:04X}h)"
+    bits = ", ".join(name for bit, name in enumerate(_REGISTER) if register >> bit & 1)
+    more = [f"register: {bits}"] if bits else []
+    more += [f"manufacturer {detail.hex(' ').upper()}"] if any(detail) else []
+    return f"{text} ({'; '.join(more)})" if more else text
+
+
+def mapped(place: str, kind: str) -> Mapped:
+    """The object that a person writes as `2200h:1` (or `2200h`, `0x2200:1`) of a type such as `int16`.
+
+    Raises:
+        ValueError: Neither an object nor a type.
+    """
+    found = _PLACE.fullmatch(place.strip())
+    if found is None or int(found[2] or 0) > 0xFF:
+        raise ValueError(f"'{place}' is not an object such as 6064h or 2200h:1.")
+    if kind not in _TYPES:
+        raise ValueError(f"'{kind}' is not a type of an object. Known: {', '.join(_TYPES)}.")
+    return Mapped(int(found[1], 16), int(found[2] or 0), _TYPES[kind][1], _TYPES[kind][0])
 
 
 def consumer_heartbeat(node: int, limit: float) -> int:
