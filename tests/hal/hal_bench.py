@@ -120,10 +120,10 @@ class BenchClock(ManualClock):
 class Bench:
     """Robot and rig on `virtual` buses, moved in lockstep, so that a test of time needs no time."""
 
-    def __init__(self, config=None, powered=True, nodes=None):
+    def __init__(self, config=None, powered=True, nodes=None, world=None, clock=None):
         self.config = config or RobotConfig.model_validate(description())
-        self.clock = BenchClock()
-        self.world = BenchWorld()
+        self.clock = clock or BenchClock()
+        self.world = world or BenchWorld()
         self.rig = Rig(self.config, self.world, nodes or hardware())
         self.robot: Robot = open_robot(self.config, self.clock)
         self.buses = {bus.name: bus for bus in self.robot._buses}

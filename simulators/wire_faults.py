@@ -1,0 +1,179 @@
+"""A wire between the HAL and its nodes that loses, repeats, cuts, delays and forges frames, as told and from a seed.
+
+It joins two python-can buses of any interface, one with the HAL on it and one with the nodes, and moves frames between
+them only when it is told to, so that on interface `virtual` a test of seconds takes no time and runs the same way each
+time.
+"""
+
+import random
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import can
+
+BUS_OFF, RESTARTED, NO_ACKNOWLEDGE, CONTROLLER = 0x40, 0x100, 0x20, 0x04
+"""Classes of error frames, and below details of `CONTROLLER` (linux/can/error.h)."""
+WARNING, PASSIVE = 0x0C, 0x30
+_LARGEST = 8
+_NODE = 0x7F
+_SHARED = (0x000, 0x080)
+"""NMT and SYNC carry no node id."""
+
+
+@dataclass(frozen=True, slots=True)
+class Chances:
+    """How probable it is that a frame meets each of these, 0 to 1.
+
+    Attributes:
+        loss: It does not arrive.
+        duplicate: It arrives twice.
+        short: Its last bytes are missing.
+        long: Bytes are added, eight together at most.
+        corrupt: One of its bytes is another one.
+        delay: It arrives `delayed_by` later, behind frames that were sent after it.
+        delayed_by: [s]
+    """
+
+    loss: float = 0.0
+    duplicate: float = 0.0
+    short: float = 0.0
+    long: float = 0.0
+    corrupt: float = 0.0
+    delay: float = 0.0
+    delayed_by: float = 0.0
+
+
+@dataclass(slots=True)
+class _Direction:
+    """Frames one way: where they come from, where they go, and those that are late."""
+
+    name: str
+    source: can.BusABC
+    target: can.BusABC
+    late: deque[tuple[float, can.Message]] = field(default_factory=deque)
+
+
+class FaultyWire:
+    """What lies between the HAL and the nodes of one bus; without any setting it only passes frames on.
+
+    Chance is drawn from one stream per direction and identifier, so that a request that comes at another moment does
+    not change what happens to everybody else.
+    """
+
+    def __init__(self, hal: can.BusABC, nodes: can.BusABC, seed: int = 0) -> None:
+        """Join two buses.
+
+        Args:
+            hal: On the channel that the HAL opens; used by nobody else.
+            nodes: On the channel that the nodes open; used by nobody else.
+            seed: Of all chance.
+        """
+        self._hal, self._nodes = hal, nodes
+        self._to_nodes = _Direction("to nodes", hal, nodes)
+        self._to_hal = _Direction("to hal", nodes, hal)
+        self._seed = seed
+        self._streams: dict[tuple[str, int], random.Random] = {}
+        self.chances = Chances()
+        self.is_cut = False
+        """Whether the wire is cut: nothing arrives, and nobody is told."""
+        self.lost: frozenset[int] = frozenset()
+        """Identifiers of which no frame arrives."""
+        self.readdressed: Mapping[int, int] = {}
+        """Node -> id under which it is on the bus instead of its own; of another node: both have it."""
+        self.babble: Callable[[random.Random], list[tuple[int, bytes]]] | None = None
+        """What one more node says each time the wire is looked at."""
+        self.counters = {"passed": 0, "lost": 0, "changed": 0}
+
+    def to_nodes(self, now: float) -> None:
+        """Pass on what the HAL has sent until time `now` [s]."""
+        self._move(self._to_nodes, now)
+
+    def to_hal(self, now: float) -> None:
+        """Pass on what the nodes have sent until time `now` [s]."""
+        self._move(self._to_hal, now)
+        if self.babble is not None and not self.is_cut:
+            for identifier, data in self.babble(self._stream("babble", 0)):
+                self.say(identifier, data)
+
+    def say(self, identifier: int, data: bytes) -> None:
+        """A frame to the HAL that no node has sent."""
+        _put(self._hal, can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
+
+    def error(self, kind: int, detail: int = 0) -> None:
+        """An error frame to the HAL, as a CAN controller reports its own state."""
+        data = bytes([0, detail, *bytes(6)])
+        self._hal.send(can.Message(arbitration_id=kind, is_error_frame=True, data=data))
+
+    def close(self) -> None:
+        """Leave both buses."""
+        self._hal.shutdown()
+        self._nodes.shutdown()
+
+    def _move(self, way: _Direction, now: float) -> None:
+        fresh = []
+        while (message := way.source.recv(0)) is not None:
+            fresh.append(message)
+        while way.late and way.late[0][0] <= now:
+            self._deliver(way, way.late.popleft()[1])
+        for message in fresh:
+            for readdressed in self._addressed(way, message):
+                self._pass(way, readdressed, now)
+
+    def _addressed(self, way: _Direction, message: can.Message) -> list[can.Message]:
+        """The frame as those see it who are not where they should be: once, twice, or not at all."""
+        node = message.arbitration_id & _NODE
+        if not self.readdressed or message.is_error_frame or message.arbitration_id in _SHARED:
+            return [message]
+        if way is self._to_hal:
+            return [_with_node(message, self.readdressed.get(node, node))]
+        listeners = [own for own, shown in self.readdressed.items() if shown == node]
+        if node not in self.readdressed:
+            listeners.append(node)
+        return [_with_node(message, listener) for listener in listeners]
+
+    def _pass(self, way: _Direction, message: can.Message, now: float) -> None:
+        chances, draw = self.chances, self._stream(way.name, message.arbitration_id)
+        if self.is_cut or message.arbitration_id in self.lost or draw.random() < chances.loss:
+            self.counters["lost"] += 1
+            return
+        message = self._changed(message, draw)
+        if draw.random() < chances.duplicate:
+            self._deliver(way, message)
+        if draw.random() < chances.delay:
+            way.late.append((now + chances.delayed_by, message))
+        else:
+            self._deliver(way, message)
+
+    def _changed(self, message: can.Message, draw: random.Random) -> can.Message:
+        data, chances = bytes(message.data), self.chances
+        if draw.random() < chances.short:
+            data = data[: draw.randrange(max(len(data), 1))]
+        if draw.random() < chances.long and len(data) < _LARGEST:
+            data += draw.randbytes(draw.randint(1, _LARGEST - len(data)))
+        if draw.random() < chances.corrupt and data:
+            place = draw.randrange(len(data))
+            data = data[:place] + bytes([data[place] ^ draw.randint(1, 255)]) + data[place + 1 :]
+        if data == message.data:
+            return message
+        self.counters["changed"] += 1
+        return can.Message(arbitration_id=message.arbitration_id, data=data, is_extended_id=message.is_extended_id)
+
+    def _deliver(self, way: _Direction, message: can.Message) -> None:
+        self.counters["passed"] += 1
+        _put(way.target, message)
+
+    def _stream(self, name: str, identifier: int) -> random.Random:
+        key = (name, identifier)
+        if key not in self._streams:
+            self._streams[key] = random.Random(f"{self._seed} {name} {identifier}")
+        return self._streams[key]
+
+
+def _with_node(message: can.Message, node: int) -> can.Message:
+    identifier = message.arbitration_id & ~_NODE | node
+    return can.Message(arbitration_id=identifier, data=message.data, is_extended_id=message.is_extended_id)
+
+
+def _put(bus: can.BusABC, message: can.Message) -> None:
+    bus.send(message, timeout=1.0)
