@@ -51,7 +51,10 @@ def simulator_of(robot: RobotConfig) -> Simulator:
         ConfigError: It names none, or one that is not there, or one that does not know the file's conditions.
     """
     if robot.simulator is None:
-        raise ConfigError(f"Robot '{robot.robot}' names no simulator; add `simulator: module:name` to its file.")
+        raise ConfigError(
+            f"Robot '{robot.robot}' names no simulator; add `simulator: module:name` to its file. "
+            "simulators.robots.bench:simulator stands in for the devices of any robot file."
+        )
     simulator: Simulator = registry.load(robot.simulator)
     strange = [condition for condition in robot.conditions if condition not in simulator.conditions]
     if strange:

@@ -1,0 +1,74 @@
+"""A world without a body: what is moved follows its servo, and everything else reads what it was set to."""
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from hal.config import RobotConfig
+from simulators.faults import UnknownPart
+
+SET = "set"
+BANDWIDTH = 30.0
+"""Of the servos [rad/s]: a twentieth of a second behind."""
+
+
+class BenchWorld:
+    """One number per measured element; commanded ones begin in the middle of their range, all others at zero."""
+
+    def __init__(self, config: RobotConfig) -> None:
+        """Take signals and limits from a robot file."""
+        self.time = 0.0
+        self._places: dict[str, tuple[str, int]] = {}
+        self._values: dict[str, np.ndarray] = {}
+        for name in config.measured:
+            low, high = config.bounds(name)
+            has_middle = np.isfinite(low) & np.isfinite(high)
+            self._values[name] = 0.5 * np.where(has_middle, low, 0.0) + 0.5 * np.where(has_middle, high, 0.0)
+            for index, element in enumerate(config.signals[name].elements):
+                self._places[f"{name}.{element}"] = (name, index)
+        self._servos: dict[str, tuple[float, bool]] = {}
+
+    def step(self, duration: float) -> None:
+        """See `World.step`."""
+        self.time += duration
+        share = 1.0 - math.exp(-BANDWIDTH * duration)
+        for element, (target, enabled) in self._servos.items():
+            if enabled:
+                signal, index = self._places[element]
+                values = self._values[signal]
+                values[index] += share * (target - values[index])
+
+    def measure(self) -> Mapping[str, np.ndarray]:
+        """See `World.measure`."""
+        return {name: values.copy() for name, values in self._values.items()}
+
+    def truth(self) -> Mapping[str, np.ndarray]:
+        """See `World.truth`."""
+        return self.measure()
+
+    def drive(self, element: str, target: float, enabled: bool) -> None:
+        """See `World.drive`."""
+        self._servos[element] = (target, enabled)
+
+    def break_part(self, part: str) -> None:
+        """`set:ELEMENT:VALUE` has an element read a value [its signal's unit], as in `set:muscle_tension.biceps:50`.
+
+        Raises:
+            UnknownPart: Anything else.
+        """
+        kind, _, rest = part.partition(":")
+        element, _, text = rest.partition(":")
+        if kind != SET or element not in self._places:
+            raise UnknownPart(f"A bench takes '{SET} ELEMENT VALUE'. Known elements: {', '.join(self._places)}.")
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise UnknownPart(f"'{text}' is no number that {element} can be set to.")
+        signal, index = self._places[element]
+        self._values[signal][index] = value
+
+    def close(self) -> None:
+        """See `World.close`."""
