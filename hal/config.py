@@ -6,19 +6,16 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from hal.errors import ConfigError
+from hal.limit_config import CommandConfig, LimitConfig, RangeConfig, StopConfig
+from hal.section import Finite, Positive, Section, explain
 
-
-class Section(BaseModel):
-    """A part of the robot file: frozen, and without room for a misspelt key."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
+__all__ = [
+    "BusConfig", "CommandConfig", "ComputedConfig", "DeviceConfig", "Finite", "KindConfig", "LimitConfig", "Positive",
+    "RangeConfig", "RatesConfig", "RobotConfig", "Section", "SignalConfig", "StopConfig", "explain", "load_robot",
+]  # fmt: skip
 
 
 class ComputedConfig(Section):
@@ -28,7 +25,7 @@ class ComputedConfig(Section):
     """`module:name` of a function: (values, **settings) -> the signal's values."""
     inputs: str = Field(alias="from")
     """The signal it is computed from."""
-    settings: dict[str, Any] = {}
+    settings: dict[str, Any] = Field(default_factory=dict)
     """Passed to the function; lists as arrays."""
 
 
@@ -63,7 +60,7 @@ class BusConfig(Section):
     bitrate: int = 1_000_000
     max_load: Annotated[float, Field(gt=0, le=0.8)] = 0.6
     """Share of the bit rate that the cyclic frames may take; more is refused at start."""
-    options: dict[str, Any] = {}
+    options: dict[str, Any] = Field(default_factory=dict)
     """Passed to python-can as they are."""
 
 
@@ -71,7 +68,7 @@ class KindConfig(Section):
     """What several devices share: the driver's name and its settings."""
 
     driver: str
-    settings: dict[str, Any] = {}
+    settings: dict[str, Any] = Field(default_factory=dict)
 
 
 class DeviceConfig(Section):
@@ -82,9 +79,9 @@ class DeviceConfig(Section):
     node: Annotated[int, Field(ge=0, le=2047)]
     element: str | None = None
     """`signal.element`, as in `muscle_length.biceps`, for the one quantity that it is there for."""
-    elements: dict[str, str] = {}
+    elements: dict[str, str] = Field(default_factory=dict)
     """In place of `element`: quantity of the driver -> `signal.element`, as in `velocity: joint_velocity.elbow`."""
-    settings: dict[str, Any] = {}
+    settings: dict[str, Any] = Field(default_factory=dict)
     """Added to the kind's settings; a key given in both takes the device's value."""
 
     @model_validator(mode="after")
@@ -97,54 +94,6 @@ class DeviceConfig(Section):
     def served(self) -> tuple[str, ...]:
         """Every `signal.element` that it measures or moves."""
         return tuple(self.elements.values()) if self.element is None else (self.element,)
-
-
-class RangeConfig(Section):
-    """Bounds of one signal, per element or one for all."""
-
-    low: Finite | tuple[Finite, ...] | None = None
-    high: Finite | tuple[Finite, ...] | None = None
-
-    def bounds(self, size: int, where: str) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest value, each of shape (size,); infinite where not stated.
-
-        Args:
-            size: How many elements the signal has.
-            where: Named in what is raised.
-
-        Raises:
-            ValueError: Another number of values, or low is not below high.
-        """
-        bounds = []
-        for label, value, default in (("low", self.low, -np.inf), ("high", self.high, np.inf)):
-            array = np.asarray(default if value is None else value, float)
-            if array.ndim and array.shape != (size,):
-                raise ValueError(f"{where}.{label} has {array.size} values, the signal has {size}.")
-            bounds.append(np.broadcast_to(array, (size,)).copy())
-        if np.any(bounds[0] >= bounds[1]):
-            raise ValueError(f"{where}: low must be below high in every element.")
-        return bounds[0], bounds[1]
-
-
-class LimitConfig(RangeConfig):
-    """What of a signal is allowed. For a command: what may be applied."""
-
-    rate: Positive | None = None
-    """Largest change of a command [unit/s]."""
-    soft_high: Positive | None = None
-    """Measured value above which the command is relaxed (muscle tension)."""
-    trip_high: Positive | None = None
-    """Measured value above which the robot stops and disables."""
-
-
-class CommandConfig(Section):
-    """Which signal is commanded, how long a command lives, and what happens when none comes."""
-
-    signal: str
-    time_to_live: Positive = 0.1
-    """Age [s] of a command beyond which it is not followed any more."""
-    hold: Annotated[float, Field(ge=0)] = 1.0
-    """How long [s] the last applied command is held before the drives are disabled."""
 
 
 class RatesConfig(Section):
@@ -164,18 +113,19 @@ class RobotConfig(Section):
     description: str = ""
     signals: dict[str, SignalConfig] = Field(min_length=1)
     command: CommandConfig
-    limits: dict[str, LimitConfig] = {}
+    limits: dict[str, LimitConfig] = Field(default_factory=dict)
+    stop: StopConfig = StopConfig()
     rates: RatesConfig = RatesConfig()
-    buses: dict[str, BusConfig] = {}
-    kinds: dict[str, KindConfig] = {}
-    devices: dict[str, DeviceConfig] = {}
+    buses: dict[str, BusConfig] = Field(default_factory=dict)
+    kinds: dict[str, KindConfig] = Field(default_factory=dict)
+    devices: dict[str, DeviceConfig] = Field(default_factory=dict)
     simulator: str | None = None
     """`module:name` of what stands in for the hardware."""
     conditions: tuple[str, ...] = ()
     """Ways the body is known to be, such as the tools it may hold; the first unless said otherwise."""
-    model: dict[str, Any] = {}
+    model: dict[str, Any] = Field(default_factory=dict)
     """What the body schema service reads; it checks this section itself."""
-    collect: dict[str, Any] = {}
+    collect: dict[str, Any] = Field(default_factory=dict)
     """How random safe motion is made; the collector checks this section itself."""
     folder: Path = Path()
     """Where the robot file lies; paths inside it are relative to this folder."""
@@ -193,6 +143,7 @@ class RobotConfig(Section):
             if name not in self.signals:
                 raise ValueError(f"limits.{name} is not a signal. Known: {signals}.")
             self._limits_fit(name, limit)
+        self._park_fits()
         if len(set(self.conditions)) < len(self.conditions) or not all(self.conditions):
             raise ValueError(f"conditions must be names that differ, not {', '.join(map(repr, self.conditions))}.")
         addresses: dict[tuple[str, int], str] = {}
@@ -227,11 +178,20 @@ class RobotConfig(Section):
             )
 
     def _limits_fit(self, name: str, limit: LimitConfig) -> None:
-        self.bounds(name)
-        if limit.soft_high and limit.trip_high and limit.soft_high >= limit.trip_high:
-            raise ValueError(f"limits.{name}: soft_high must be below trip_high.")
-        if self.signals[name].source != "hal" and (limit.soft_high or limit.trip_high):
-            raise ValueError(f"limits.{name}: soft_high and trip_high are the HAL's, which does not see this signal.")
+        limit.check(self.signals[name].size, f"limits.{name}", name == self.command.signal)
+        if self.signals[name].source != "hal" and limit.is_watched:
+            raise ValueError(f"limits.{name}: soft and trip limits are the HAL's, which does not see this signal.")
+
+    def _park_fits(self) -> None:
+        if self.stop.park is None:
+            return
+        signal = self.command.signal
+        if len(self.stop.park) != self.signals[signal].size:
+            raise ValueError(f"stop.park has {len(self.stop.park)} values, {signal} has {self.signals[signal].size}.")
+        low, high = self.bounds(signal)
+        for element, value, least, most in zip(self.signals[signal].elements, self.stop.park, low, high, strict=True):
+            if not least <= value <= most:
+                raise ValueError(f"stop.park: {element} {value:g} is outside of its limits, {least:g} to {most:g}.")
 
     def _device_fits(self, name: str, device: DeviceConfig) -> None:
         if device.kind not in self.kinds:
@@ -293,31 +253,6 @@ def load_robot(path: str | Path) -> RobotConfig:
         return RobotConfig.model_validate({**raw, "folder": path.resolve().parent})
     except ValidationError as error:
         raise ConfigError(f"Robot file '{path}': {explain(error, RobotConfig)}") from None
-
-
-def explain(error: ValidationError, model: type[BaseModel]) -> str:
-    """One problem in one sentence: an unknown key, with the keys that are known there, or else the first."""
-    problems = error.errors()
-    first = next((problem for problem in problems if problem["type"] == "extra_forbidden"), problems[0])
-    where = ".".join(str(part) for part in first["loc"])
-    if first["type"] == "extra_forbidden":
-        fields = _model_at(model, first["loc"][:-1]).model_fields
-        known = ", ".join(field.alias or name for name, field in fields.items())
-        return f"unknown key '{where}'. Known keys there: {known}."
-    message = first["msg"].removeprefix("Value error, ")
-    more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
-    return f"{where}: {message}{more}" if where else f"{message}{more}"
-
-
-def _model_at(model: type[BaseModel], location: tuple[int | str, ...]) -> type[BaseModel]:
-    for part in location:
-        field = model.model_fields.get(str(part))
-        if field is None:
-            continue  # a name inside a mapping, such as the device's
-        inner = [field.annotation, *getattr(field.annotation, "__args__", ())]
-        models = [kind for kind in inner if isinstance(kind, type) and issubclass(kind, BaseModel)]
-        model = models[0] if models else model
-    return model
 
 
 def _beside(path: Path) -> str:

@@ -169,7 +169,7 @@ def _next_posture(
 def speed_of(robot: RobotConfig, config: CollectConfig) -> float:
     """Highest speed on the way [unit/s]: never above the limit's rate, or the set-points would run away."""
     limit = robot.limits.get(robot.command.signal)
-    return config.speed if limit is None or limit.rate is None else min(config.speed, limit.rate)
+    return config.speed if limit is None or limit.rate is None else min(config.speed, float(np.min(limit.rate)))
 
 
 def step_of(robot: RobotConfig) -> float:
