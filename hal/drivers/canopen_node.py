@@ -1,18 +1,26 @@
-"""What every CANopen device has: identity, commissioning, heartbeat, emergencies, and an answer to each SYNC."""
+"""What every CANopen device has: identity, commissioning, heartbeat, emergencies, and PDOs that answer each SYNC."""
 
 import functools
 import logging
+import math
 import threading
+from collections.abc import Callable
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import canopen
 
-from hal.commissioning import HEARTBEAT_TIME, Plan, SdoClient, commission, identify, nmt, watch_us
+from hal.bus import Handler
+from hal.commissioning import HEARTBEAT_TIME, Plan, commission, identify, nmt, watch_us
+from hal.device import Check
 from hal.drivers.can_device import CanDevice, DeviceSettings, Place
+from hal.drivers.canopen_checks import inspect_node
 from hal.errors import ConfigError, DeviceRefused, HalError
+from hal.pdo_commissioning import cob_id
+from hal.pdo_map import Pdo, PdoMap, PdoSettings, check_map, describe
 from hal.protocols import cia301
-from hal.protocols.cia301 import NmtCommand, NmtState
+from hal.protocols.cia301 import Emergency, Mapped, NmtCommand, NmtState
+from hal.sdo_client import SdoClient
 
 log = logging.getLogger(__name__)
 
@@ -20,7 +28,18 @@ START_TIMEOUT = 0.5
 """How long [s] a node may take from NMT start to the heartbeat that says so; five heartbeats."""
 HEARTBEAT = (1, 1.0 / HEARTBEAT_TIME)
 """What a node's heartbeat adds to the traffic: data bytes, frames per second [Hz]."""
+BEATS_FORGIVEN = 2.5
+"""A node without a heartbeat for so many periods is not believed, whatever else it sends."""
 NODES = range(1, 128)
+
+Taker = Callable[[tuple[Any, ...], float], None]
+"""Takes the objects of one TPDO, in order, and when they arrived [monotonic s]; called in the receive thread."""
+
+_REPEAT, _LATE, _TWINS = 3, 3, 40
+"""An answer too many weighs 3, one that is explained by a late one -3, a cycle as it should be -1; at 40 there are two
+nodes. So two nodes are told after 20 cycles, and a bus that doubles a third of its frames is not mistaken for them."""
+_STRAYS = 3
+"""So many PDOs after a boot-up message come from another node: one that booted sends none."""
 
 
 class NodeSettings(DeviceSettings):
@@ -28,81 +47,187 @@ class NodeSettings(DeviceSettings):
 
     eds: Path
     """Electronic data sheet; relative to the folder of the robot file."""
+    pdo: PdoSettings | None = None
+    """A PDO layout of your own, in place of the one that follows from the quantities."""
 
 
 class CanopenNode(CanDevice):
-    """A device whose one TPDO answers every SYNC; what it carries is the subclass's business."""
+    """A device whose TPDOs answer every SYNC; what they carry is the subclass's business."""
 
     Settings: ClassVar[type[NodeSettings]] = NodeSettings
+    COUNTERS = (*CanDevice.COUNTERS, "doubled")
 
-    def __init__(self, place: Place, settings: NodeSettings) -> None:
+    def __init__(self, place: Place, settings: NodeSettings, profile: int, pdos: PdoMap) -> None:
+        """Prepare a node.
+
+        Args:
+            place: Where it is.
+            settings: Its settings; their `pdo` takes the place of `pdos`, if it carries the same objects and more.
+            profile: Device profile number, the low word of object 1000h.
+            pdos: What it shall receive and send.
+
+        Raises:
+            ConfigError: A node id, a data sheet or a PDO mapping that cannot be.
+        """
         if place.node not in NODES:
             raise ConfigError(f"Device {place} has a node id that CANopen does not have. It is 1 to 127.")
         super().__init__(place, settings)
-        self._emergency = 0
+        sheet = data_sheet(place.folder / settings.eds)
+        _check_profile(sheet, profile, f"The data sheet '{settings.eds}' of {place}")
+        self._profile = profile
+        self._pdos = pdos if settings.pdo is None else _forced(settings.pdo, pdos, str(place))
+        check_map(self._pdos, sheet, str(place))
+        self._sdo = SdoClient(place.bus, place.node, sheet, str(place))
+        self._emergency: Emergency | None = None
         self._started = threading.Event()
-        self._sdo = SdoClient(place.bus, place.node, data_sheet(place.folder / settings.eds), str(place))
+        self._beat_due = math.inf
+        self._all = sum(1 << pdo.number for pdo in self._pdos.sends if pdo.answers_sync)
+        self._pending, self._since = self._all, 0
+        self._doubt = 0
+        self._strays = -math.inf
+        self._twin = ""
         place.bus.needs_sync = True
-        place.bus.subscribe(cia301.TPDO1 + place.node, self._on_tpdo)
+        for pdo in self._pdos.sends:
+            place.bus.subscribe(cob_id(cia301.TPDO1, pdo.number, place.node), self._listener(pdo))
         place.bus.subscribe(cia301.HEARTBEAT + place.node, self._on_heartbeat)
         place.bus.subscribe(cia301.EMERGENCY + place.node, self._on_emergency)
 
-    def _plan(self) -> Plan:
-        """What the node shall be told."""
+    def _taker(self, pdo: Pdo) -> Taker:
+        """What takes the objects of one TPDO; asked for once, before anything comes."""
         raise NotImplementedError
+
+    def _writes(self) -> tuple[tuple[Mapped, int], ...]:
+        """Objects and values that the node shall be told, beside its PDOs and heartbeats."""
+        return ()
+
+    def _watch_time(self) -> float:
+        """How long [s] the node shall wait for the HAL's heartbeat before it stops; 0 if it has nothing to stop."""
+        return 0.0
 
     def _before_commissioning(self) -> None:
         """Make the node safe to be configured."""
 
     def _calibrate(self) -> None:
-        """Read what the conversion to SI units needs."""
+        """Read what the conversion to SI units needs; comes before `_writes` is asked for."""
 
-    def _on_tpdo(self, data: bytearray, received: float) -> None:
-        raise NotImplementedError
+    def _plan(self) -> Plan:
+        return Plan(self._profile, self._pdos, self._writes(), self._watch_time())
 
     def _identify(self) -> str:
-        return identify(self._sdo, self._plan(), str(self._place))
+        return identify(self._sdo, self._profile, str(self._place))
 
     def _commission(self) -> None:
         self._before_commissioning()
         nmt(self._bus, NmtCommand.PRE_OPERATIONAL, self.node)
-        commission(self._sdo, self._plan(), self.node)
         self._calibrate()
+        commission(self._sdo, self._plan(), self.node, str(self._place))
+        self._strays, self._doubt, self._pending = -math.inf, 0, self._all
         self._started.clear()
         nmt(self._bus, NmtCommand.START, self.node)
         if not self._started.wait(START_TIMEOUT):
             raise DeviceRefused(f"{self._place} does not become operational. Does it send heartbeats?")
-        self._emergency = 0
+        self._emergency = None
+
+    def inspect(self) -> tuple[Check, ...]:
+        """See `Device.inspect`."""
+        with self._opening:
+            return inspect_node(self._sdo, self._plan(), self.node, self.identity)
 
     def _fault(self) -> str:
-        if not self._emergency:
-            return ""
-        return f"{self._place} reports {cia301.describe_emergency(self._emergency)}."
+        if self._twin:
+            return self._twin
+        found = self._emergency
+        return f"{self._place} reports {_describe(found)}." if found else ""
 
     def reset(self) -> None:
         """See `Device.reset`; an emergency that persists is reported again by the device."""
-        self._emergency = 0
+        self._emergency, self._twin, self._doubt = None, "", 0
 
     def _release(self) -> None:
         """Leave the node pre-operational, and not looking for our heartbeat."""
         try:
-            if self._plan().watch_time and self.is_heard:
+            if self._watch_time() and self.is_heard:
                 watch_us(self._sdo, 0.0)
         except HalError as error:
             log.warning("closing: %s", error)
         nmt(self._bus, NmtCommand.PRE_OPERATIONAL, self.node)
 
+    def _keep(self, slot: int, value: float, received: float) -> None:
+        """Set one measured value: the value first, then its time, so that no value looks newer than it is."""
+        self._values[slot] = value
+        self._received[slot] = received
+
+    def _listener(self, pdo: Pdo) -> Handler:
+        """What handles the frames of one TPDO; the node has answered a cycle when every cyclic one has come."""
+        unpack, size, take, counters = pdo.layout.unpack, pdo.size, self._taker(pdo), self._counters
+        mine = self._all & 1 << pdo.number
+
+        def on_tpdo(data: bytearray, received: float) -> None:
+            if len(data) != size:
+                counters["malformed"] += 1
+            elif not self.is_commissioned:
+                self._on_stray()
+            else:
+                take(unpack(data), received)
+                if mine:
+                    self._on_answer(mine, received)
+
+        return on_tpdo
+
+    def _on_answer(self, mine: int, received: float) -> None:
+        missed = self.missed
+        if missed != self._since:  # another cycle: what came before does not complete this one
+            self._pending, self._since = self._all, missed
+        if not missed or not self._pending & mine:
+            self._on_double()
+        pending = self._pending & ~mine
+        if pending:
+            self._pending = pending
+            return
+        if self._doubt and missed == 1:
+            self._doubt -= 1 if self._doubt > 0 else -1
+        elif missed > 1:
+            self._doubt = max(self._doubt - _LATE * self._all.bit_count(), -_TWINS)
+        self._pending, self._since = self._all, 0
+        if received > self._beat_due:
+            self._beat_due = math.inf
+            self._lose(f"{self._place} goes on sending process data without a heartbeat. Does its firmware hang?")
+        else:
+            self._is_answered()
+
+    def _on_double(self) -> None:
+        """More than one answer to a SYNC; now and then it was a late one."""
+        self._counters["doubled"] += 1
+        self._doubt += _REPEAT
+        if self._doubt > _TWINS:
+            self._tell_twins("answers each SYNC twice")
+
+    def _on_stray(self) -> None:
+        """A PDO of a node that should send none: we have not started it since it booted."""
+        self._strays += 1
+        if self._strays == _STRAYS:
+            self._tell_twins("sent process data on after it had booted")
+
+    def _tell_twins(self, what: str) -> None:
+        if not self._twin:
+            self._twin = f"{self._place} {what}. Do two devices have this node id? Give each its own, then reset."
+            log.warning("%s", self._twin)
+
     def _on_heartbeat(self, data: bytearray, received: float) -> None:
         state = cia301.nmt_state(data)
         if state is None:
             self._counters["malformed"] += 1
-        elif state == NmtState.OPERATIONAL:
+            return
+        self._beat_due = received + BEATS_FORGIVEN * HEARTBEAT_TIME
+        if state == NmtState.OPERATIONAL:
             self._started.set()
         elif state == NmtState.BOOT_UP:
             self._counters["boots"] += 1
+            if self.is_commissioned:
+                self._strays = 0
             self._lose(f"{self._place} rebooted and waits to be commissioned.")
         elif self.is_commissioned:
-            why = f", after reporting {cia301.describe_emergency(self._emergency)}" if self._emergency else ""
+            why = f", after reporting {_describe(self._emergency)}" if self._emergency else ""
             self._lose(f"{self._place} left the operational state by itself{why}.")
 
     def _on_emergency(self, data: bytearray, received: float) -> None:
@@ -110,10 +235,38 @@ class CanopenNode(CanDevice):
         if found is None:
             self._counters["malformed"] += 1
             return
-        self._emergency = found.code
+        self._emergency = found if found.code else None
         if found.code:
             self._counters["emergencies"] += 1
-            log.warning("%s reports %s", self._place, cia301.describe_emergency(found.code))
+            log.warning("%s reports %s", self._place, _describe(found))
+
+
+def _describe(found: Emergency) -> str:
+    return cia301.describe_emergency(found.code, found.register, found.detail)
+
+
+def _forced(settings: PdoSettings, wanted: PdoMap, label: str) -> PdoMap:
+    """The robot file's layout.
+
+    Raises:
+        ConfigError: It does not carry all that is wanted.
+    """
+    forced = settings.map(label)
+    for side, verb in (("receives", "receive"), ("sends", "send")):
+        there = {item for pdo in getattr(forced, side) for item in pdo.objects}
+        asked = [item for pdo in getattr(wanted, side) for item in pdo.objects]
+        missing = [item for item in asked if item not in there]
+        if missing:
+            has = describe(sorted(there, key=lambda item: item.entry))
+            raise ConfigError(f"{label} needs to {verb} {describe(missing)}; its setting `pdo.{side}` has {has}.")
+    return forced
+
+
+def _check_profile(sheet: canopen.ObjectDictionary, profile: int, what: str) -> None:
+    entry = sheet.get_variable(cia301.DEVICE_TYPE, 0)
+    found = getattr(entry, "default", None)
+    if isinstance(found, int) and found & 0xFFFF and found & 0xFFFF != profile:
+        raise ConfigError(f"{what} is of device profile {found & 0xFFFF}, not {profile}. Is it another device's?")
 
 
 @functools.lru_cache(maxsize=32)

@@ -7,12 +7,13 @@ import numpy as np
 from pydantic import Field
 
 from hal import calibration
-from hal.commissioning import Plan
 from hal.config import Finite, Positive
 from hal.device import DeviceState
 from hal.drivers.can_device import Place
-from hal.drivers.canopen_node import HEARTBEAT, CanopenNode, NodeSettings
+from hal.drivers.canopen_node import HEARTBEAT, CanopenNode, NodeSettings, Taker
+from hal.pdo_map import Pdo, PdoMap, lay_out
 from hal.protocols import cia301, cia402
+from hal.protocols.cia301 import Mapped
 from hal.protocols.cia402 import State
 
 RESET_CYCLES = 200
@@ -64,14 +65,14 @@ class Cia402Drive(CanopenNode):
         return ((cia402.COMMAND_LAYOUT.size, rate), (cia402.STATUS_LAYOUT.size, rate), HEARTBEAT)
 
     def __init__(self, place: Place, settings: DriveSettings) -> None:
-        super().__init__(place, settings)
+        super().__init__(place, settings, cia402.PROFILE, PdoMap(lay_out(cia402.COMMAND), lay_out(cia402.STATUS)))
         shape = (settings.counts_per_turn, settings.gear, settings.direction, settings.zero)
         radius = settings.spool_radius
         self._line = calibration.spool(*shape, radius) if radius else calibration.rotary(*shape)
         self._scale, self._zero = self._line.scale, self._line.zero
         self._rated_torque = settings.rated_torque
         self._max_torque = settings.max_torque
-        self._watch_time = settings.watch_time
+        self._settings = settings
         self._state = State.NOT_READY
         self._counts = 0
         self._torque = 0
@@ -87,29 +88,30 @@ class Cia402Drive(CanopenNode):
         """Motor torque [N m] that the drive last reported; NaN without the setting `rated_torque`."""
         return self._torque / 1000 * (self._rated_torque or np.nan)
 
-    def _plan(self) -> Plan:
+    def _watch_time(self) -> float:
+        return self._settings.watch_time
+
+    def _writes(self) -> tuple[tuple[Mapped, int], ...]:
         writes = [(cia402.MODE_OF_OPERATION, cia402.CYCLIC_SYNCHRONOUS_POSITION)]
         if self._max_torque is not None:
             writes.append((cia402.MAX_TORQUE, self._max_torque))
         if self._sdo.has(cia402.ABORT_CONNECTION.index):
             writes.append((cia402.ABORT_CONNECTION, cia402.ABORT_QUICK_STOP))
-        return Plan(cia402.PROFILE, cia402.COMMAND, cia402.STATUS, tuple(writes), self._watch_time)
+        return tuple(writes)
 
     def _before_commissioning(self) -> None:
         self._state = State.NOT_READY
         self._is_wanted = False
         self._sdo.write(cia402.CONTROLWORD.index, 0, cia402.DISABLE_VOLTAGE, 2)
 
-    def _on_tpdo(self, data: bytearray, received: float) -> None:
-        if len(data) != 8:
-            self._counters["malformed"] += 1
-            return
-        if not self.is_commissioned:
-            return
-        statusword, counts, self._torque = cia402.STATUS_LAYOUT.unpack(data)
+    def _taker(self, pdo: Pdo) -> Taker:
+        return self._take
+
+    def _take(self, values: tuple[int, int, int], received: float) -> None:
+        statusword, counts, self._torque = values
         self._counts = counts
         self._state = cia402.STATE_OF[statusword & 0x6F]
-        self._answered(self._zero + self._scale * counts, received)
+        self._keep(0, self._zero + self._scale * counts, received)
 
     def _lose(self, text: str) -> None:
         super()._lose(text)

@@ -2,12 +2,12 @@
 
 import math
 
-from hal.commissioning import Plan
 from hal.config import Finite
 from hal.device import DeviceState
 from hal.drivers.can_device import Place
-from hal.drivers.canopen_node import HEARTBEAT, CanopenNode, NodeSettings
+from hal.drivers.canopen_node import HEARTBEAT, CanopenNode, NodeSettings, Taker
 from hal.errors import DeviceRefused
+from hal.pdo_map import Pdo, PdoMap, lay_out
 from hal.protocols import cia404
 
 
@@ -34,13 +34,10 @@ class Cia404Cell(CanopenNode):
         return ((cia404.VALUE_LAYOUT.size, rate), HEARTBEAT)
 
     def __init__(self, place: Place, settings: CellSettings) -> None:
-        super().__init__(place, settings)
+        super().__init__(place, settings, cia404.PROFILE, PdoMap(sends=lay_out(cia404.VALUE)))
         self._zero = settings.zero
         self._scale = math.nan
         self._status = 0
-
-    def _plan(self) -> Plan:
-        return Plan(cia404.PROFILE, (), cia404.VALUE)
 
     def _calibrate(self) -> None:
         unit = self._sdo.read(cia404.UNIT.index, cia404.UNIT.subindex)
@@ -50,15 +47,13 @@ class Cia404Cell(CanopenNode):
             raise DeviceRefused(f"{self._place} measures in unit {unit:08X}h (6131h), which is no force.")
         self._scale = scale
 
-    def _on_tpdo(self, data: bytearray, received: float) -> None:
-        if len(data) != 5:
-            self._counters["malformed"] += 1
-            return
-        if not self.is_commissioned:
-            return
-        digits, self._status = cia404.VALUE_LAYOUT.unpack(data)
+    def _taker(self, pdo: Pdo) -> Taker:
+        return self._take
+
+    def _take(self, values: tuple[int, int], received: float) -> None:
+        digits, self._status = values
         good = not self._status and not self._emergency
-        self._answered(self._zero + self._scale * digits if good else math.nan, received)
+        self._keep(0, self._zero + self._scale * digits if good else math.nan, received)
 
     def _running(self) -> tuple[DeviceState, str]:
         if self._status:

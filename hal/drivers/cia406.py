@@ -4,12 +4,12 @@ import math
 from typing import Literal
 
 from hal import calibration
-from hal.commissioning import Plan
 from hal.config import Finite, Positive
 from hal.device import DeviceState
 from hal.drivers.can_device import Place
-from hal.drivers.canopen_node import HEARTBEAT, CanopenNode, NodeSettings
+from hal.drivers.canopen_node import HEARTBEAT, CanopenNode, NodeSettings, Taker
 from hal.errors import DeviceRefused
+from hal.pdo_map import Pdo, PdoMap, lay_out
 from hal.protocols import cia406
 
 
@@ -40,14 +40,11 @@ class Cia406Encoder(CanopenNode):
         return ((cia406.VALUE_LAYOUT.size, rate), HEARTBEAT)
 
     def __init__(self, place: Place, settings: EncoderSettings) -> None:
-        super().__init__(place, settings)
+        super().__init__(place, settings, cia406.PROFILE, PdoMap(sends=lay_out(cia406.VALUE)))
         self._settings = settings
         self._zero = settings.zero
         self._scale = math.nan
         self._alarms = 0
-
-    def _plan(self) -> Plan:
-        return Plan(cia406.PROFILE, (), cia406.VALUE)
 
     def _calibrate(self) -> None:
         counts = self._settings.counts_per_turn
@@ -57,15 +54,13 @@ class Cia406Encoder(CanopenNode):
             raise DeviceRefused(f"{self._place} says that it has no counts per turn (6001h). Give counts_per_turn.")
         self._scale = calibration.rotary(counts, 1.0, self._settings.direction, self._zero).scale
 
-    def _on_tpdo(self, data: bytearray, received: float) -> None:
-        if len(data) != 6:
-            self._counters["malformed"] += 1
-            return
-        if not self.is_commissioned:
-            return
-        counts, self._alarms = cia406.VALUE_LAYOUT.unpack(data)
+    def _taker(self, pdo: Pdo) -> Taker:
+        return self._take
+
+    def _take(self, values: tuple[int, int], received: float) -> None:
+        counts, self._alarms = values
         good = not self._alarms and not self._emergency
-        self._answered(self._zero + self._scale * counts if good else math.nan, received)
+        self._keep(0, self._zero + self._scale * counts if good else math.nan, received)
 
     def _running(self) -> tuple[DeviceState, str]:
         if self._alarms:

@@ -15,7 +15,7 @@ CHANNEL = 1
 UNIT = Mapped(0x6131, CHANNEL, 32)
 DIGITS = Mapped(0x6132, CHANNEL, 8)
 STATUS = Mapped(0x6150, CHANNEL, 8)
-PROCESS_VALUE = Mapped(0x9130, CHANNEL, 32)
+PROCESS_VALUE = Mapped(0x9130, CHANNEL, 32, "signed")
 
 VALUE = (PROCESS_VALUE, STATUS)
 """What the cell's TPDO carries."""

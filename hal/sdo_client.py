@@ -1,0 +1,149 @@
+"""Read and write small objects of one CANopen node (CiA 301, 7.2.4: expedited SDO).
+
+canopen's SDO client carries the requests; its matching of answers is not relied upon, since a late answer to one
+request would be taken as the answer to the next (it compares the index when reading, and nothing when writing).
+"""
+
+import queue
+import struct
+import time
+
+import canopen
+from canopen.objectdictionary import ODVariable
+
+from hal.bus import Bus
+from hal.errors import DeviceRefused, DeviceSilent
+from hal.protocols import cia301
+
+ANSWER_TIME = 0.3
+"""How long [s] a node may take to answer a request."""
+TRIES = 3
+
+_REQUEST = struct.Struct("<BHB4s")
+_READ = 0x40
+_ABORT = 0x80
+_ABORTS = {
+    0x0601_0000: "access is not supported",
+    0x0601_0001: "it is write only",
+    0x0601_0002: "it is read only",
+    0x0602_0000: "there is no such object",
+    0x0604_0041: "it cannot be mapped",
+    0x0604_0042: "the mapping is too long",
+    0x0607_0010: "its length is another",
+    0x0609_0011: "there is no such sub-index",
+    0x0609_0030: "the value is out of range",
+    0x0609_0031: "the value is too high",
+    0x0609_0032: "the value is too low",
+    0x0800_0022: "not in this state of the device",
+}
+
+
+class SdoClient:
+    """Reads and writes small objects of one node; each answer is matched with its request."""
+
+    def __init__(self, bus: Bus, node: int, dictionary: canopen.ObjectDictionary, label: str) -> None:
+        self._remote = bus.network.add_node(canopen.RemoteNode(node, dictionary))
+        self._label = label
+        self._dictionary = dictionary
+        self._bus = bus
+        self._node = node
+        self._listening = False
+        bus.subscribe(cia301.SDO_ANSWER + node, self._on_answer)
+
+    def _on_answer(self, data: bytearray, received: float) -> None:
+        if self._listening and len(data) == 8:  # nobody asked: it would only fill canopen's queue
+            self._bus.network.notify(cia301.SDO_ANSWER + self._node, data, received)
+
+    def read(self, index: int, subindex: int, tries: int = TRIES) -> int:
+        """An unsigned value of up to 32 bits.
+
+        Raises:
+            DeviceSilent: No answer.
+            DeviceRefused: There is no such object, or it is longer.
+        """
+        answer = self._ask(_REQUEST.pack(_READ, index, subindex, bytes(4)), tries)
+        if not answer[0] & 0x02:
+            raise DeviceRefused(f"{self._label}: object {index:04X}h:{subindex} is longer than four bytes.")
+        size = 4 - (answer[0] >> 2 & 3) if answer[0] & 0x01 else 4
+        return int.from_bytes(answer[4 : 4 + size], "little")
+
+    def write(self, index: int, subindex: int, value: int, size: int) -> None:
+        """Write `value` in `size` bytes, two's complement if negative.
+
+        Raises:
+            DeviceSilent: No answer.
+            DeviceRefused: The node does not take it.
+        """
+        data = value.to_bytes(size, "little", signed=value < 0).ljust(4, b"\0")
+        self._ask(_REQUEST.pack(0x23 | (4 - size) << 2, index, subindex, data), TRIES)
+
+    def write_checked(self, index: int, subindex: int, value: int, size: int) -> None:
+        """Write, read back and compare.
+
+        Raises:
+            DeviceSilent: No answer.
+            DeviceRefused: The node does not take it, or answers another value.
+        """
+        self.write(index, subindex, value, size)
+        found = self.read(index, subindex)
+        if found != value % (1 << 8 * size):
+            raise DeviceRefused(
+                f"{self._label}: object {index:04X}h:{subindex} reads back {found:X}h after writing {value:X}h. "
+                "Is it writable in this firmware?"
+            )
+
+    def read_signed(self, index: int, subindex: int, bits: int) -> int:
+        """A signed value of `bits` bits.
+
+        Raises:
+            DeviceSilent: No answer.
+            DeviceRefused: There is no such object.
+        """
+        found = self.read(index, subindex) % (1 << bits)
+        return found - (1 << bits) if found >> (bits - 1) else found
+
+    def has(self, index: int, subindex: int = 0) -> bool:
+        """Whether the data sheet lists an object."""
+        return self._dictionary.get_variable(index, subindex) is not None
+
+    def default(self, index: int, subindex: int) -> int | None:
+        """What the data sheet gives as an object's value; None if it gives none."""
+        entry: ODVariable | None = self._dictionary.get_variable(index, subindex)
+        return entry.default if entry is not None and isinstance(entry.default, int) else None
+
+    def _ask(self, request: bytes, tries: int) -> bytes:
+        sdo = self._remote.sdo
+        self._listening = True
+        try:
+            for _ in range(tries):
+                sdo.responses = queue.Queue()
+                sdo.send_request(request)
+                answer = self._matching(request)
+                if answer is not None:
+                    return answer
+        finally:
+            self._listening = False
+        _, index, subindex, _ = _REQUEST.unpack(request)
+        raise DeviceSilent(
+            f"{self._label} did not answer within {ANSWER_TIME * 1e3:.0f} ms when asked for object "
+            f"{index:04X}h:{subindex} ({tries} tries). Is it powered, is the bus terminated, is its node id right?"
+        )
+
+    def _matching(self, request: bytes) -> bytes | None:
+        """The answer to a request, or None in time; answers to anything else are passed over."""
+        deadline = time.monotonic() + ANSWER_TIME
+        while (remaining := deadline - time.monotonic()) > 0:
+            try:
+                answer: bytes = self._remote.sdo.responses.get(timeout=remaining)
+            except queue.Empty:
+                return None
+            if answer[1:4] != request[1:4]:
+                continue
+            if answer[0] == _ABORT:
+                code = int.from_bytes(answer[4:8], "little")
+                index, subindex = struct.unpack("<HB", answer[1:4])
+                reason = _ABORTS.get(code, "see CiA 301, table 22")
+                raise DeviceRefused(f"{self._label} refused object {index:04X}h:{subindex}: {code:08X}h, {reason}.")
+            if (answer[0] & 0xE0 == 0x40) == (request[0] == _READ):
+                return answer
+        return None
