@@ -5,8 +5,10 @@ safety code: limits, command age and watchdogs wrap every device alike (see `hal
 """
 
 import abc
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
+from types import MappingProxyType
 
 import numpy as np
 
@@ -87,6 +89,10 @@ class Device(abc.ABC):
     """Elements that `read` returns, in order."""
     commands: tuple[str, ...] = ()
     """Elements that `apply` takes, in order; empty for a sensor."""
+    command_quantity: str = "position"
+    """What `apply` takes: `position`, `velocity` or `effort`."""
+    served: Mapping[str, str] = MappingProxyType({})
+    """Quantity -> `signal.element`, for those it measures and knows the nature of (`position`, `velocity`, `effort`)."""
 
     @abc.abstractmethod
     def open(self) -> None:

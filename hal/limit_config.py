@@ -97,8 +97,8 @@ class StopConfig(Section):
     """What the robot does when it is asked to stop, or when no command comes any more."""
 
     behaviour: Literal["hold", "damp", "park", "off"] = "hold"
-    """`hold` its place for `command.hold` and let go; `damp` its motion for as long and let go; `park`: move slowly to a
-    safe posture and let go; `off`: let go at once."""
+    """`hold` its place for `command.hold` and let go; `damp` its motion for as long and let go; `park`: move slowly to
+    a safe posture and let go; `off`: let go at once."""
     park: tuple[Finite, ...] | None = None
     """The safe posture [unit of the commanded signal]."""
     speed: Positive | None = None

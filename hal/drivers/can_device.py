@@ -82,6 +82,8 @@ class CanDevice(Device):
         self.measures = tuple(place.elements.values())
         quantity = self.commanded(settings)
         self.commands = () if quantity is None else (place.elements[quantity],)
+        self.command_quantity = quantity or ""
+        self.served = place.elements
         self.missed = 1
         self.is_commissioned = False
         self._place = place
