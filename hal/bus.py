@@ -132,6 +132,10 @@ class Bus:
             raise ConfigError(f"Two devices on bus '{self.name}' use the identifier {cob_id:03X}h.")
         self._handlers[cob_id] = handler
 
+    def subscriber(self, cob_id: int) -> Handler | None:
+        """Who is called with the frames of an identifier, so that drives which answer under one can share it."""
+        return self._handlers.get(cob_id)
+
     def expect(self, node: Answers) -> None:
         """Wait in every cycle for `answered(node)`."""
         self._nodes.append(node)
