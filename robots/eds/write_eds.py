@@ -1,7 +1,8 @@
 """Write the electronic data sheets of the simulated nodes: `python robots/eds/write_eds.py`.
 
-The tables below are the readable form of servo_drive.eds (CiA 402), load_cell.eds (CiA 404) and joint_encoder.eds
-(CiA 406). The vendor is invented: 0x47454D55 is "GEMU", and is not registered with CAN in Automation.
+The tables below are the readable form of servo_drive.eds (CiA 402), load_cell.eds (CiA 404), analog_input.eds (CiA 401)
+and joint_encoder.eds (CiA 406). The vendor is invented: 0x47454D55 is "GEMU", and is not registered with CAN in
+Automation.
 """
 
 from dataclasses import dataclass, replace
@@ -57,13 +58,13 @@ def record(index: int, name: str, *entries: Entry) -> Object:
     return Object(index, name, RECORD, (Entry("Highest sub-index supported", U8, "const", len(entries)), *entries))
 
 
-def pdo(direction: str, number: int, cob: int, mapping: tuple[int, ...] = ()) -> list[Object]:
+def pdo(direction: str, number: int, cob: int, mapping: tuple[int, ...] = (), transmission: int = 1) -> list[Object]:
     """Communication and mapping objects of one PDO; without a mapping it is switched off (bit 31)."""
     base, label = (0x1400, "RPDO") if direction == RPDO else (0x1800, "TPDO")
     flags = (0 if mapping else 1 << 31) | (1 << 30 if direction == TPDO else 0)
     timing = [
         Entry("COB-ID", U32, "rw", f"$NODEID+0x{flags | cob:08X}"),
-        Entry("Transmission type", U8, "rw", 1),
+        Entry("Transmission type", U8, "rw", transmission),
         Entry("Inhibit time", U16, "rw"),
         Entry("Compatibility entry", U8, "ro"),
         Entry("Event timer", U16, "rw"),
@@ -159,24 +160,46 @@ SERVO_DRIVE = [
     variable(0x6502, Entry("Supported drive modes", U32, "ro", 1 << 7)),
 ]
 
+CHANNELS = 4
+"""Of a measuring amplifier."""
+
 LOAD_CELL = [
     *communication(0x00020194, 0x404, "gemuco load cell"),
     *pdo(TPDO, 0, 0x180, (0x91300120, 0x61500108)),
-    *pdo(TPDO, 1, 0x280),
-    array(0x6110, Entry("AI sensor type", U16, "rw", 10_000)),
-    array(0x6112, Entry("AI operating mode", U8, "rw", 1, low=0, high=1)),
-    array(0x6114, Entry("AI ADC sample rate", U32, "ro", 500)),
-    array(0x6124, Entry("AI input offset", F32, "rw", 0.0)),
-    array(0x6125, Entry("AI autozero", U32, "wo")),
-    array(0x6126, Entry("AI input scaling factor", F32, "rw", 1.0)),
-    array(0x6127, Entry("AI input scaling offset", F32, "rw", 0.0)),
-    array(0x6130, Entry("AI input PV", F32, "ro", 0.0, pdo=True)),
-    array(0x6131, Entry("AI physical unit PV", U32, "ro", 0x00210000)),
-    array(0x6132, Entry("AI decimal digits PV", U8, "rw", 2, low=0, high=6)),
-    array(0x6150, Entry("AI status", U8, "ro", pdo=True)),
-    array(0x7130, Entry("AI input PV 16 bit", I16, "ro", pdo=True)),
-    array(0x9100, Entry("AI input FV 32 bit", I32, "ro", pdo=True)),
-    array(0x9130, Entry("AI input PV 32 bit", I32, "ro", pdo=True)),
+    *(entry for number in (1, 2, 3) for entry in pdo(TPDO, number, 0x180 + 0x100 * number)),
+    *(
+        array(index, entry, CHANNELS)
+        for index, entry in (
+            (0x6110, Entry("AI sensor type", U16, "rw", 10_000)),
+            (0x6112, Entry("AI operating mode", U8, "rw", 1, low=0, high=1)),
+            (0x6114, Entry("AI ADC sample rate", U32, "ro", 500)),
+            (0x6124, Entry("AI input offset", F32, "rw", 0.0)),
+            (0x6125, Entry("AI autozero", U32, "wo")),
+            (0x6126, Entry("AI input scaling factor", F32, "rw", 1.0)),
+            (0x6127, Entry("AI input scaling offset", F32, "rw", 0.0)),
+            (0x6130, Entry("AI input PV", F32, "ro", 0.0, pdo=True)),
+            (0x6131, Entry("AI physical unit PV", U32, "ro", 0x00210000)),
+            (0x6132, Entry("AI decimal digits PV", U8, "rw", 2, low=0, high=6)),
+            (0x6150, Entry("AI status", U8, "ro", pdo=True)),
+            (0x7100, Entry("AI input FV 16 bit", I16, "ro", pdo=True)),
+            (0x7130, Entry("AI input PV 16 bit", I16, "ro", pdo=True)),
+            (0x9100, Entry("AI input FV 32 bit", I32, "ro", pdo=True)),
+            (0x9130, Entry("AI input PV 32 bit", I32, "ro", pdo=True)),
+        )
+    ),
+]
+
+ANALOG_INPUT = [
+    *communication(0x00040191, 0x401, "gemuco analog input"),
+    *pdo(TPDO, 0, 0x180),
+    *pdo(TPDO, 1, 0x280, (0x64010110, 0x64010210, 0x64010310, 0x64010410), transmission=255),
+    *pdo(TPDO, 2, 0x380),
+    *pdo(TPDO, 3, 0x480),
+    variable(0x2120, Entry("Amplifier status", U16, "ro", pdo=True)),
+    array(0x6401, Entry("Read analog input 16 bit", I16, "ro", pdo=True), CHANNELS),
+    array(0x6402, Entry("Read analog input 32 bit", I32, "ro", pdo=True), CHANNELS),
+    array(0x6403, Entry("Read analog input float", F32, "ro", 0.0, pdo=True), CHANNELS),
+    variable(0x6423, Entry("Analog input global interrupt enable", BOOL, "rw", 0)),
 ]
 
 JOINT_ENCODER = [
@@ -189,13 +212,21 @@ JOINT_ENCODER = [
     variable(0x6003, Entry("Preset value", U32, "rw")),
     variable(0x6004, Entry("Position value", U32, "ro", pdo=True)),
     array(0x6030, Entry("Speed value", I16, "ro", pdo=True)),
+    record(
+        0x6031,
+        "Speed parameter",
+        Entry("Speed source selector", U8, "ro", 1),
+        Entry("Speed integration value", U16, "rw"),
+        Entry("Multiplier value", U16, "rw", 1, low=1),
+        Entry("Divider value", U16, "rw", 1, low=1),
+    ),
     variable(0x6500, Entry("Operating status", U16, "ro", pdo=True)),
     variable(0x6501, Entry("Single-turn resolution", U32, "ro", 262_144)),
     variable(0x6502, Entry("Number of distinguishable revolutions", U16, "ro", 1)),
     variable(0x6503, Entry("Alarms", U16, "ro", pdo=True)),
     variable(0x6504, Entry("Supported alarms", U16, "ro", 1)),
     variable(0x6505, Entry("Warnings", U16, "ro", pdo=True)),
-    variable(0x6506, Entry("Supported warnings", U16, "ro")),
+    variable(0x6506, Entry("Supported warnings", U16, "ro", 0x10)),
     variable(0x6507, Entry("Profile and software version", U32, "ro", 0x0100_0400)),
     variable(0x6509, Entry("Offset value", I32, "ro")),
     variable(0x650B, Entry("Serial number", U32, "ro")),
@@ -203,11 +234,12 @@ JOINT_ENCODER = [
 
 SHEETS = {
     "servo_drive": (SERVO_DRIVE, 0x402, "CiA 402 servo drive, cyclic synchronous position"),
-    "load_cell": (LOAD_CELL, 0x404, "CiA 404 load cell amplifier, one channel"),
+    "load_cell": (LOAD_CELL, 0x404, "CiA 404 load cell amplifier, four channels"),
+    "analog_input": (ANALOG_INPUT, 0x401, "CiA 401 analogue inputs, four channels"),
     "joint_encoder": (JOINT_ENCODER, 0x406, "CiA 406 absolute joint encoder"),
 }
 
-_BITS = {I8: 8, I16: 16, I32: 32, U8: 8, U16: 16, U32: 32}
+_BITS = {BOOL: 8, I8: 8, I16: 16, I32: 32, U8: 8, U16: 16, U32: 32}
 
 
 def sheet(name: str) -> str:
@@ -289,7 +321,7 @@ def _section(title: str, **keys: object) -> str:
 
 
 def main() -> None:
-    """Write the three files beside this one."""
+    """Write the files beside this one."""
     for name in SHEETS:
         (Path(__file__).parent / f"{name}.eds").write_text(sheet(name))
 

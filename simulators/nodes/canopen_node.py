@@ -70,6 +70,10 @@ class CanopenNode:
     def follow(self, now: float) -> None:
         """Act on new process outputs, and on time passing."""
 
+    def may_send(self, pdo: Pdo) -> bool:
+        """Whether a PDO may go out on an event."""
+        return True
+
     def connection_lost(self, code: int) -> None:
         """The master is silent (code 8130h), or took the node out of operation (code 0)."""
 
@@ -148,7 +152,7 @@ class CanopenNode:
         if any(pdo.period and not pdo.is_synchronous for pdo in self.pdos.transmit):
             self.sample()
             for pdo in self.pdos.transmit:
-                data = pdo.is_due_at(now, self.objects.values)
+                data = pdo.is_due_at(now, self.objects.values) if self.may_send(pdo) else None
                 if data is not None:
                     self._send(pdo.cob, data)
 

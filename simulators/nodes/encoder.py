@@ -24,8 +24,11 @@ class JointEncoder(CanopenNode):
         super().__init__(spec, plant, outbox)
         constants = self._constants
         self.objects.power_on |= {
-            (0x6001, 0): constants.counts_per_turn,
-            (0x6002, 0): constants.counts_per_turn * constants.turns,
+            (0x6000, 0): SCALED if constants.scaled_to else 0,
+            (0x6001, 0): constants.scaled_to or constants.counts_per_turn,
+            (0x6002, 0): (constants.scaled_to or constants.counts_per_turn) * constants.turns,
+            (0x6031, 3): constants.speed_unit[0],
+            (0x6031, 4): constants.speed_unit[1],
             (0x6501, 0): constants.counts_per_turn,
             (0x6502, 0): constants.turns,
             (0x650B, 0): spec.serial,
@@ -88,6 +91,8 @@ class JointEncoder(CanopenNode):
         if self._before is not None and time > self._before[0]:
             half = self._range() // 2
             moved = (position - self._before[1] + half) % self._range() - half
-            speed = round(moved / (time - self._before[0]))
-            self.objects.values[0x6030, 1] = min(max(speed, -(2**15)), 2**15 - 1)
+            values = self.objects.values
+            scale = int(values[0x6031, 3]) / int(values[0x6031, 4])
+            speed = round(moved / (time - self._before[0]) * scale)
+            values[0x6030, 1] = min(max(speed, -(2**15)), 2**15 - 1)
         self._before = (time, position)

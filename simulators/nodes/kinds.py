@@ -1,5 +1,6 @@
 """Which class plays which kind of node: one line per kind."""
 
+from simulators.nodes.analog_input import AnalogConstants, AnalogInput
 from simulators.nodes.drive import ServoDrive
 from simulators.nodes.encoder import JointEncoder
 from simulators.nodes.load_cell import LoadCell
@@ -10,6 +11,7 @@ from simulators.nodes.spec import CellConstants, DriveConstants, EncoderConstant
 KINDS = {
     DriveConstants: ServoDrive,
     CellConstants: LoadCell,
+    AnalogConstants: AnalogInput,
     EncoderConstants: JointEncoder,
 }
 

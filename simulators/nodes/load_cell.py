@@ -1,4 +1,4 @@
-"""A simulated load cell with a CiA 404 measuring amplifier."""
+"""A simulated load cell with a CiA 404 measuring amplifier of several channels."""
 
 import math
 
@@ -8,6 +8,7 @@ from simulators.nodes.objects import Abort, Refused, Value
 from simulators.nodes.plant import Plant
 from simulators.nodes.spec import CellConstants, NodeSpec
 
+CHANNELS = 4
 ZERO = int.from_bytes(b"zero", "little")
 """Signature that tares the input when written to 6125h."""
 
@@ -15,21 +16,26 @@ NOT_VALID, POSITIVE_OVERLOAD, NEGATIVE_OVERLOAD = 1, 2, 4
 """Bits of the status 6150h."""
 
 _LARGEST = 1e9
-"""Process value [N] beyond which the scaling that a master has set makes no sense."""
+"""Process value beyond which the scaling that a master has set makes no sense."""
 
 
 class LoadCell(CanopenNode):
-    """One channel: field value (counts) times scaling factor plus offsets is the process value [N]."""
+    """Per channel: field value (counts) times scaling factor plus offsets is the process value [the channel's unit]."""
 
     def __init__(self, spec: NodeSpec, plant: Plant, outbox: list[Frame]) -> None:
         assert isinstance(spec.constants, CellConstants)
         self._constants = spec.constants
+        self._elements = (spec.element, *spec.constants.more)
         self._is_broken = False
         super().__init__(spec, plant, outbox)
-        self.objects.power_on |= {
-            (0x6126, 1): 1.0 / self._constants.counts_per_newton,
-            (0x6132, 1): self._constants.decimal_digits,
-        }
+        constants = self._constants
+        for channel in range(1, CHANNELS + 1):
+            self.objects.power_on |= {
+                (0x6126, channel): 1.0 / (constants.counts_per_newton * constants.unit_size),
+                (0x6131, channel): constants.unit,
+                (0x6132, channel): constants.decimal_digits,
+                (0x6150, channel): NOT_VALID,
+            }
         self.objects.on_write[0x6125] = self._tare
 
     def restart(self) -> None:
@@ -42,32 +48,43 @@ class LoadCell(CanopenNode):
         self._is_broken = True
 
     def sample(self) -> None:
-        """Field value, process value in its three forms, and status."""
-        values = self.objects.values
-        force = self.plant.read(self.spec.element) + self._constants.unbalance
-        if math.isnan(force) or self._is_broken or not values[0x6112, 1]:
-            values[0x6150, 1] = NOT_VALID
-            return
-        capacity = self._constants.capacity
-        status = POSITIVE_OVERLOAD if force > capacity else NEGATIVE_OVERLOAD if force < -capacity else 0
-        field_value = round(min(max(force, -capacity), capacity) * self._constants.counts_per_newton)
-        process_value = field_value * float(values[0x6126, 1]) + float(values[0x6127, 1]) + float(values[0x6124, 1])
-        if not abs(process_value) < _LARGEST:
-            values[0x6150, 1] = NOT_VALID
-            return
-        whole = round(process_value * 10 ** int(values[0x6132, 1]))
-        values[0x9100, 1] = field_value
-        values[0x6130, 1] = process_value
-        values[0x7130, 1] = min(max(whole, -(2**15)), 2**15 - 1)
-        values[0x9130, 1] = min(max(whole, -(2**31)), 2**31 - 1)
-        values[0x6150, 1] = status
+        """See `CanopenNode.sample`; a channel without a cell stays as at power-on."""
+        for channel, element in enumerate(self._elements, 1):
+            self.objects.values[0x6150, channel] = self._convert(channel, element)
 
-    def _tare(self, sub: int, old: Value, new: Value) -> None:
-        if sub == 1:
-            if new != ZERO:
-                raise Refused(Abort.VALUE)
-            self.sample()
-            values = self.objects.values
-            if values[0x6150, 1] == NOT_VALID:
-                raise Refused(Abort.DEVICE_STATE)
-            values[0x6124, 1] = float(values[0x6124, 1]) - float(values[0x6130, 1])
+    def _convert(self, channel: int, element: str) -> int:
+        """Bring field value and process value of a channel up to date; its status."""
+        values = self.objects.values
+        force = self.plant.read(element) + self._constants.unbalance
+        if math.isnan(force) or self._is_broken or not values[0x6112, channel]:
+            return NOT_VALID
+        capacity = self._constants.capacity
+        field_value = round(min(max(force, -capacity), capacity) * self._constants.counts_per_newton)
+        offset = float(values[0x6127, channel]) + float(values[0x6124, channel])
+        process_value = field_value * float(values[0x6126, channel]) + offset
+        if not abs(process_value) < _LARGEST:
+            return NOT_VALID
+        whole = round(process_value * 10 ** int(values[0x6132, channel]))
+        values[0x7100, channel] = _fitting(field_value, 16)
+        values[0x9100, channel] = field_value
+        values[0x6130, channel] = process_value
+        values[0x7130, channel] = _fitting(whole, 16)
+        values[0x9130, channel] = _fitting(whole, 32)
+        return POSITIVE_OVERLOAD if force > capacity else NEGATIVE_OVERLOAD if force < -capacity else 0
+
+    def _tare(self, channel: int, old: Value, new: Value) -> None:
+        if not 1 <= channel <= CHANNELS:
+            return
+        if new != ZERO:
+            raise Refused(Abort.VALUE)
+        self.sample()
+        values = self.objects.values
+        if values[0x6150, channel] == NOT_VALID:
+            raise Refused(Abort.DEVICE_STATE)
+        values[0x6124, channel] = float(values[0x6124, channel]) - float(values[0x6130, channel])
+
+
+def _fitting(value: int, bits: int) -> int:
+    """The nearest number that a signed integer of so many bits can hold."""
+    half = 1 << bits - 1
+    return min(max(value, -half), half - 1)

@@ -14,7 +14,7 @@ Key = tuple[int, int]
 """Index and sub-index."""
 Value = int | float | str
 
-_FORMATS = {2: "b", 3: "h", 4: "i", 5: "B", 6: "H", 7: "I", 8: "f"}
+_FORMATS = {1: "?", 2: "b", 3: "h", 4: "i", 5: "B", 6: "H", 7: "I", 8: "f"}
 _STRING = 9
 STRING_LIMIT = 64
 """Bytes that a writable string holds."""

@@ -57,13 +57,16 @@ class DriveConstants:
 
 @dataclass(frozen=True, slots=True)
 class CellConstants:
-    """A load cell with a CiA 404 measuring amplifier.
+    """Load cells, all alike, with a CiA 404 measuring amplifier.
 
     Attributes:
         capacity: Force [N] beyond which the status tells overload.
         counts_per_newton: Of the analogue-digital converter.
         unbalance: What the unloaded cell reads before a tare [N].
-        decimal_digits: Of the integer process value: 2 means 0.01 N.
+        decimal_digits: Of the integer process values: 2 means 0.01 of the unit.
+        unit: What the process value is in, as CiA 303-2 codes it.
+        unit_size: How much one of that unit is [N].
+        more: `signal.element` of the forces on channels 2 and up; the first is the node's own.
     """
 
     kind: ClassVar[str] = "load_cell"
@@ -72,6 +75,9 @@ class CellConstants:
     counts_per_newton: float = 4000.0
     unbalance: float = 0.0
     decimal_digits: int = 2
+    unit: int = 0x00210000
+    unit_size: float = 1.0
+    more: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +89,9 @@ class EncoderConstants:
         turns: Turns that the encoder tells apart.
         direction: +1 if counts grow with the angle, else -1.
         zero: Angle at zero counts [rad]; half a turn away from the middle of the joint's range avoids the wrap.
+        scaled_to: Units per turn that scaling was set to before delivery (6000h bit 2 and 6001h, kept without power);
+            None: no scaling.
+        speed_unit: Multiplier and divider of the speed value (6031h).
     """
 
     kind: ClassVar[str] = "joint_encoder"
@@ -91,6 +100,8 @@ class EncoderConstants:
     turns: int = 1
     direction: int = 1
     zero: float = -math.pi
+    scaled_to: int | None = None
+    speed_unit: tuple[int, int] = (1, 1)
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,7 +6,7 @@ from canopen.objectdictionary import ODVariable
 
 from simulators.nodes.spec import EDS_FOLDER
 
-KINDS = ("servo_drive", "load_cell", "joint_encoder")
+KINDS = ("servo_drive", "load_cell", "analog_input", "joint_encoder")
 
 DEFAULT_PDOS = {
     "servo_drive": {
@@ -14,6 +14,7 @@ DEFAULT_PDOS = {
         "tpdo": [("Statusword", 16), ("Position actual value", 32), ("Torque actual value", 16)],
     },
     "load_cell": {"tpdo": [("AI input PV 32 bit.AI input PV 32 bit 1", 32), ("AI status.AI status 1", 8)]},
+    "analog_input": {"tpdo": []},
     "joint_encoder": {"tpdo": [("Position value", 32), ("Alarms", 16)]},
 }
 
@@ -40,7 +41,7 @@ def test_identifiers_follow_the_node_id(kind):
     assert dictionary[0x1014].default == 0x89
     assert dictionary[0x1200][1].default == 0x609
     assert dictionary[0x1200][2].default == 0x589
-    assert dictionary[0x1800][1].default == 0x4000_0189
+    assert dictionary[0x1800][1].default & 0x7FFF_FFFF == 0x4000_0189
 
 
 def test_every_default_fits_its_type_and_its_limits(kind):
@@ -54,13 +55,13 @@ def test_every_default_fits_its_type_and_its_limits(kind):
 
 def test_mandatory_objects_and_device_information_are_there(kind):
     dictionary = canopen.import_od(str(EDS_FOLDER / f"{kind}.eds"), node_id=9)
-    profile = {"servo_drive": 402, "load_cell": 404, "joint_encoder": 406}[kind]
+    profile = {"servo_drive": 402, "load_cell": 404, "analog_input": 401, "joint_encoder": 406}[kind]
     assert dictionary[0x1000].default & 0xFFFF == profile
     assert 0x1001 in dictionary
     assert dictionary[0x1018][1].default == dictionary.device_information.vendor_number == 0x47454D55
     assert dictionary[0x1018][2].default == dictionary.device_information.product_number
     assert dictionary.device_information.allowed_baudrates == {1_000_000}
-    assert dictionary.device_information.nr_of_TXPDO == 2
+    assert dictionary.device_information.nr_of_TXPDO == sum(0x1800 <= index < 0x1A00 for index in dictionary)
 
 
 def test_default_pdos_are_those_of_the_cycle(kind):

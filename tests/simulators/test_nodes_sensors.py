@@ -171,3 +171,21 @@ def test_constants_fit_what_the_objects_can_hold():
     assert spec.kind == "load_cell"
     assert spec.eds.exists()
     assert 0 <= spec.serial < 2**32
+
+
+def test_an_encoder_that_was_scaled_before_delivery():
+    constants = EncoderConstants(counts_per_turn=4096, turns=16, zero=0.0, scaled_to=3600)
+    with bench([NodeSpec("hinge_encoder", "can0", ENCODER, "joint_position.hinge", constants)]) as b:
+        b.nmt(1)
+        assert encoder_at(b, math.pi + 4 * math.pi)[0] == 2 * 3600 + 1800
+        assert b.read(ENCODER, 0x6000, 0, "H") == 4
+        assert b.read(ENCODER, 0x6002, 0, "I") == 16 * 3600
+
+
+def test_a_speed_in_another_unit():
+    constants = EncoderConstants(speed_unit=(60, TURN))
+    with bench([NodeSpec("hinge_encoder", "can0", ENCODER, "joint_position.hinge", constants)]) as b:
+        b.nmt(1)
+        encoder_at(b, 0.0)
+        encoder_at(b, 0.005 * 10.0)
+        assert b.read(ENCODER, 0x6030, 1, "h") == pytest.approx(10.0 * 60 / (2 * math.pi), abs=1.0)  # turns per minute
