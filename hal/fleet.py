@@ -1,5 +1,6 @@
 """The buses and devices that a robot file names, built but not opened."""
 
+import math
 from typing import Any
 
 from hal import budget, registry
@@ -22,7 +23,8 @@ def build(config: RobotConfig, clock: BusClock) -> tuple[list[Bus], list[Device]
     for name, entry in config.devices.items():
         driver, settings = registry.equipment(config, name)
         elements = _elements(driver, settings, entry, name)
-        place = Place(name, elements, buses[entry.bus], entry.node, config.folder, config.rates.hal)
+        bounds = _bounds(config, elements.get(driver.commanded(settings)))
+        place = Place(name, elements, buses[entry.bus], entry.node, config.folder, config.rates.hal, bounds=bounds)
         devices.append(driver(place, settings))
     return list(buses.values()), devices
 
@@ -47,3 +49,13 @@ def _elements(driver: Any, settings: Any, entry: DeviceConfig, name: str) -> dic
             f"Add `{commanded}: signal.element`, or set another mode."
         )
     return {quantity: wanted[quantity] for quantity in known if quantity in wanted}
+
+
+def _bounds(config: RobotConfig, element: str | None) -> tuple[float, float]:
+    """Lowest and highest set-point of a commanded element [its unit]; infinite where not stated."""
+    if element is None:
+        return -math.inf, math.inf
+    signal, _, name = element.partition(".")
+    low, high = config.bounds(signal)
+    index = config.signals[signal].elements.index(name)
+    return float(low[index]), float(high[index])

@@ -1,6 +1,7 @@
 """What every device on a bus has: a place, a slot per quantity, commissioning, silence and an identity."""
 
 import logging
+import math
 import threading
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -38,6 +39,8 @@ class Place:
         folder: Folder of the robot file.
         rate: Cycles per second [Hz].
         calibration: What was measured of the device that shall be here; None if nothing was.
+        bounds: Lowest and highest set-point by the robot file's limits [unit of the commanded element]; infinite where
+            not stated, and for a sensor.
     """
 
     name: str
@@ -47,6 +50,7 @@ class Place:
     folder: Path
     rate: float
     calibration: Calibration | None = None
+    bounds: tuple[float, float] = (-math.inf, math.inf)
 
     def __str__(self) -> str:
         return f"'{self.name}' (node {self.node} on {self.bus.name})"
