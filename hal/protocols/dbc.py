@@ -1,0 +1,284 @@
+"""DBC files: messages and signals found by name, and compiled to what is fast enough for a cycle.
+
+A message whose signals lie on whole bytes is read by `struct`, one with whole numbers elsewhere by shift and mask, any
+other, such as a multiplexed one, by cantools (benchmarks/dbc.py). What is called raw is the number in the frame, before
+the file's factor and offset.
+"""
+
+import difflib
+import functools
+import math
+import struct
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import cantools
+from cantools.database import Database, Message
+from cantools.database.can.signal import Signal
+
+from hal.errors import ConfigError
+
+Value = float | str
+"""A number in the unit of the DBC file, or the name that it gives to a raw value (VAL_)."""
+Read = Callable[[bytes | bytearray], tuple[float, ...] | None]
+LISTED = 40
+"""So many names are listed in an error."""
+
+_INTEGERS = {8: "b", 16: "h", 32: "i", 64: "q"}
+_FLOATS = {16: "e", 32: "f", 64: "d"}
+
+
+class Dbc:
+    """A DBC file; every name that it does not have is a `ConfigError` with the names that it has."""
+
+    def __init__(self, path: Path, database: Database) -> None:
+        self.path = path
+        self.messages = tuple(database.messages)
+        self._messages = {message.name: message for message in self.messages}
+
+    def message(self, name: str) -> Message:
+        """A message.
+
+        Raises:
+            ConfigError: There is none of that name.
+        """
+        if name not in self._messages:
+            raise ConfigError(f"DBC file '{self.path}' has no message '{name}'. {_near(name, self._messages)}")
+        return self._messages[name]
+
+    def signal(self, name: str) -> tuple[Message, Signal]:
+        """A signal and the message that carries it, from `Message.Signal`.
+
+        Raises:
+            ConfigError: The name is of another form, or there is no such message or signal.
+        """
+        message_name, dot, signal_name = name.partition(".")
+        if not dot:
+            raise ConfigError(f"'{name}' is not of the form `Message.Signal`, with names of '{self.path}'.")
+        message = self.message(message_name)
+        return message, self.signal_of(message, signal_name)
+
+    def signal_of(self, message: Message, name: str) -> Signal:
+        """A signal of a message.
+
+        Raises:
+            ConfigError: The message has none of that name.
+        """
+        signals = {signal.name: signal for signal in message.signals}
+        if name not in signals:
+            raise ConfigError(
+                f"Message '{message.name}' of DBC file '{self.path}' has no signal '{name}'. {_near(name, signals)}"
+            )
+        return signals[name]
+
+    def raw(self, signal: Signal, value: Value) -> float:
+        """The raw value of what is asked for; whole for a signal that is no float.
+
+        Raises:
+            ConfigError: The file does not name such a value, or it does not fit into the signal.
+        """
+        if isinstance(value, str):
+            named = {str(choice): raw for raw, choice in (signal.choices or {}).items()}
+            if value not in named:
+                raise ConfigError(
+                    f"Signal '{signal.name}' of '{self.path}' has no value '{value}'. {_near(value, named)}"
+                )
+            return named[value]
+        raw = (value - signal.offset) / signal.scale
+        low, high = raw_bounds(signal)
+        if not signal.is_float:
+            raw = round(raw)
+        if not low <= raw <= high:
+            raise ConfigError(f"{value:g} does not fit into signal '{signal.name}' of '{self.path}'.")
+        return raw
+
+
+@functools.lru_cache(maxsize=32)
+def load(path: Path) -> Dbc:
+    """Read a DBC file, once per file.
+
+    Raises:
+        ConfigError: It is missing or not a DBC file.
+    """
+    if not path.is_file():
+        raise ConfigError(f"There is no DBC file '{path}'. The path is relative to the folder of the robot file.")
+    try:
+        database = cantools.database.load_file(path, database_format="dbc")
+    except Exception as error:  # cantools passes on whatever its parser meets
+        raise ConfigError(f"'{path}' is not a DBC file that cantools can read: {error}.") from error
+    assert isinstance(database, Database)
+    return Dbc(path, database)
+
+
+def describe(signal: Signal, raw: float, is_bits: bool = False) -> str:
+    """A raw value in the file's words, in lower case; of a bit field the names of all bits that are set."""
+    choices = {value: str(choice).replace("_", " ").lower() for value, choice in (signal.choices or {}).items()}
+    if raw in choices or not is_bits:
+        return choices.get(int(raw), f"{raw:g}") if math.isfinite(raw) else "unknown"
+    bits = [1 << bit for bit in range(signal.length) if int(raw) >> bit & 1]
+    return ", ".join(choices.get(bit, f"bit {bit.bit_length() - 1}") for bit in bits)
+
+
+def raw_bounds(signal: Signal) -> tuple[float, float]:
+    """Smallest and largest raw value that a signal can hold and the file allows."""
+    low, high = -math.inf, math.inf
+    if not signal.is_float:
+        low, high = (
+            (-(1 << signal.length - 1), (1 << signal.length - 1) - 1)
+            if signal.is_signed
+            else (0, (1 << signal.length) - 1)
+        )
+    elif signal.length == 32:
+        low, high = -3.4e38, 3.4e38
+    stated = [(bound - signal.offset) / signal.scale for bound in (signal.minimum, signal.maximum) if bound is not None]
+    return (max(low, min(stated)), min(high, max(stated))) if len(stated) == 2 else (low, high)
+
+
+class Reader:
+    """Takes some signals out of a message's data.
+
+    Attributes:
+        message: The message.
+        names: The signals, in the order in which `read` gives them.
+        size: Data bytes of the message.
+        is_compiled: Whether it is read without cantools.
+        read: Data of `size` bytes -> raw values, NaN where a multiplexed message does not carry a signal now; None if
+            it carries something that the file does not have.
+    """
+
+    def __init__(self, message: Message, names: Iterable[str]) -> None:
+        wanted = set(names)
+        signals = sorted((s for s in message.signals if s.name in wanted), key=_first_byte)
+        self.message = message
+        self.names = tuple(signal.name for signal in signals)
+        self.size = message.length
+        layout = _layout(message, signals)
+        fast = layout.unpack if layout is not None else _shifts(message, signals)
+        self.is_compiled = fast is not None
+        self.read: Read = fast or self._decode
+
+    def _decode(self, data: bytes | bytearray) -> tuple[float, ...] | None:
+        try:
+            found: Any = self.message.decode(bytes(data), decode_choices=False, scaling=False)
+        except cantools.Error:
+            return None
+        return tuple(found.get(name, math.nan) for name in self.names)
+
+
+class Writer:
+    """Makes a message's data: signals that stay as they are, and one that changes from cycle to cycle.
+
+    Attributes:
+        data: The data, with the raw value last written.
+        bounds: Smallest and largest raw value of the signal that changes.
+    """
+
+    def __init__(self, dbc: Dbc, message: Message, values: Mapping[str, Value], varying: str | None = None) -> None:
+        """Signals without a value get the file's start value, or else a raw 0.
+
+        Raises:
+            ConfigError: The message does not have such a signal or value.
+        """
+        self._message = message
+        self._raws: dict[str, float] = {}
+        for signal in message.signals:
+            self._raws[signal.name] = signal.raw_initial if isinstance(signal.raw_initial, int | float) else 0
+        for name, value in values.items():
+            self._raws[name] = dbc.raw(dbc.signal_of(message, name), value)
+        self._varying = varying
+        self._packed: tuple[struct.Struct, int] | None = None
+        self._is_whole = False
+        if varying is not None:
+            signal = dbc.signal_of(message, varying)
+            self._is_whole = not signal.is_float
+            self.bounds = raw_bounds(signal)
+            code = _code(signal)
+            if code is not None and signal.multiplexer_ids is None:
+                self._packed = struct.Struct(_order(signal) + code), _first_byte(signal)
+        try:
+            self.data = self._encode()
+        except (cantools.Error, struct.error, KeyError) as error:
+            raise ConfigError(
+                f"Message '{message.name}' of '{dbc.path}' cannot be made of {dict(values)}: {error}."
+            ) from None
+
+    def write(self, raw: float) -> None:
+        """Put a raw value into the signal that changes, as near as it can hold it."""
+        low, high = self.bounds
+        held = min(max(raw, low), high)
+        if self._is_whole:
+            held = round(held)
+        if self._packed is not None:
+            layout, place = self._packed
+            layout.pack_into(self.data, place, held)
+            return
+        assert self._varying is not None
+        self._raws[self._varying] = held
+        self.data[:] = self._encode()
+
+    def _encode(self) -> bytearray:
+        if not self._message.signals:
+            return bytearray(self._message.length)
+        return bytearray(self._message.encode(self._raws, scaling=False, strict=False))
+
+
+def _layout(message: Message, signals: Sequence[Signal]) -> struct.Struct | None:
+    """The layout of some signals of a message, or None if it cannot be told to `struct`."""
+    order = {_order(signal) for signal in signals if signal.length > 8} or {"<"}
+    if len(order) > 1:
+        return None
+    layout, end = order.pop(), 0
+    for signal in signals:
+        code, start = _code(signal), _first_byte(signal)
+        if code is None or start < end or signal.multiplexer_ids is not None:
+            return None
+        layout += f"{start - end}x{code}"
+        end = start + signal.length // 8
+    return struct.Struct(f"{layout}{message.length - end}x") if end <= message.length else None
+
+
+def _shifts(message: Message, signals: Sequence[Signal]) -> Read | None:
+    """Reads whole numbers anywhere in a message; None if not all are whole, plain, and of one byte order."""
+    order = {signal.byte_order for signal in signals}
+    if len(order) != 1 or any(signal.is_float or signal.multiplexer_ids is not None for signal in signals):
+        return None
+    byte_order: Literal["little", "big"] = "little" if order == {"little_endian"} else "big"
+    fields = []
+    for signal in signals:
+        shift = signal.start
+        if byte_order == "big":  # the start bit is the highest, and bits count down within a byte, up from byte to byte
+            shift = 8 * message.length - 8 * (signal.start // 8) - (7 - signal.start % 8) - signal.length
+        fields.append((shift, (1 << signal.length) - 1, 1 << signal.length - 1 if signal.is_signed else 0))
+
+    def read(data: bytes | bytearray) -> tuple[float, ...]:
+        whole = int.from_bytes(data, byte_order)
+        return tuple([((whole >> shift & mask) ^ sign) - sign for shift, mask, sign in fields])
+
+    return read
+
+
+def _code(signal: Signal) -> str | None:
+    """What `struct` calls such a signal; None if it does not begin and end with a byte, or has no such length."""
+    if signal.start % 8 != (0 if signal.byte_order == "little_endian" else 7):
+        return None
+    if signal.is_float:
+        return _FLOATS.get(signal.length)
+    code = _INTEGERS.get(signal.length)
+    return code if code is None or signal.is_signed else code.upper()
+
+
+def _order(signal: Signal) -> str:
+    return "<" if signal.byte_order == "little_endian" else ">"
+
+
+def _first_byte(signal: Signal) -> int:
+    """The byte in which a signal begins: DBC counts the start bit of both byte orders upwards from byte 0."""
+    return signal.start // 8
+
+
+def _near(name: str, known: Iterable[str]) -> str:
+    names = sorted(known)
+    close = difflib.get_close_matches(name, names, 3)
+    listed = ", ".join(names[:LISTED]) + (f" and {len(names) - LISTED} more" if len(names) > LISTED else "")
+    return (f"Did you mean {' or '.join(close)}? " if close else "") + f"It has: {listed or 'none'}."
