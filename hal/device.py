@@ -92,7 +92,7 @@ class Device(abc.ABC):
     command_quantity: str = "position"
     """What `apply` takes: `position`, `velocity` or `effort`."""
     served: Mapping[str, str] = MappingProxyType({})
-    """Quantity -> `signal.element`, for those it measures and knows the nature of (`position`, `velocity`, `effort`)."""
+    """Quantity (`position`, `velocity`, `effort`, ...) -> `signal.element`, for the elements whose nature it knows."""
 
     @abc.abstractmethod
     def open(self) -> None:
