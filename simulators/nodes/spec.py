@@ -36,6 +36,14 @@ class DriveConstants:
         rated_torque: Motor rated torque [N m], a multiple of 1e-3 as object 6076h has it.
         load: `signal.element` of the wire's tension [N] or the joint's torque [N m] that the motor carries; None: no
             load is reported by 6077h.
+        modes: Modes of operation that it has (6502h): 1 profile position, 6 homing, 8, 9, 10 cyclic synchronous
+            position, velocity, torque.
+        velocity_unit: Object 60A9h; 00B50300h is encoder increments per second, 00B44700h revolutions per minute.
+        inertia: Of motor, gear and what hangs on them, seen at the output [kg m2], or [kg] for a wire.
+        friction: Viscous, seen at the output [N m s/rad], or [N s/m] for a wire.
+        switches: Lowest and highest position [m or rad] at which no limit switch is active.
+        heating: How much warmer than its surroundings (25 degC) the winding is at rated torque, in the end [K].
+        thermal_time: Time constant of that [s].
     """
 
     kind: ClassVar[str] = "servo_drive"
@@ -47,6 +55,13 @@ class DriveConstants:
     zero: float = 0.0
     rated_torque: float = 0.1
     load: str | None = None
+    modes: tuple[int, ...] = (1, 6, 8, 9, 10)
+    velocity_unit: int = 0x00B50300
+    inertia: float = 0.05
+    friction: float = 0.5
+    switches: tuple[float, float] = (-math.inf, math.inf)
+    heating: float = 40.0
+    thermal_time: float = 60.0
 
     @property
     def counts_per_unit(self) -> float:
