@@ -1,0 +1,194 @@
+"""What a CAN frame says, in words: CANopen by object dictionaries and mappings, anything else by what the book knows.
+
+Source: CiA 301, version 4.2: 7.2.2 (PDO), 7.2.4 (SDO), 7.2.5 (SYNC), 7.2.6 (time), 7.2.7 (EMCY), 7.2.8 (NMT).
+"""
+
+import struct
+from dataclasses import dataclass
+
+import canopen
+from canopen.objectdictionary import ODVariable
+
+from hal.decode_book import EXTENDED, Book, Frame, Pdo
+from hal.protocols import cia301, cia402, sdo
+from hal.protocols.cia301 import NmtCommand, NmtState
+from hal.protocols.error_frames import error_frame
+
+TIME = 0x100
+_INTEGERS = {2: True, 3: True, 4: True, 0x15: True, 5: False, 6: False, 7: False, 0x1B: False}
+"""Data type -> whether it is signed."""
+_REAL32, _TEXTS = 8, (9, 0xA, 0xB)
+_NMT_WORDS = {
+    NmtCommand.START: "start",
+    NmtCommand.STOP: "stop",
+    NmtCommand.PRE_OPERATIONAL: "enter pre-operational",
+    NmtCommand.RESET_NODE: "reset",
+    NmtCommand.RESET_COMMUNICATION: "reset communication",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """What a frame says.
+
+    Attributes:
+        kind: `SYNC`, `NMT`, `heartbeat`, `EMCY`, `SDO`, `TPDO1`, ...; `?` if nobody knows.
+        node: The node that sent it or is asked, if one is meant.
+        text: In words.
+    """
+
+    kind: str
+    node: int | None
+    text: str
+
+
+def describe(frame: Frame, book: Book) -> Line:
+    """What a frame says, as far as the book knows the node."""
+    if frame.is_error:
+        return Line("error", None, _error(frame))
+    key = frame.identifier | (EXTENDED if frame.is_extended else 0)
+    if frame.is_remote:
+        return Line("remote", None, "asks for the data of this identifier")
+    if key in book.explained:
+        node, kind, explain = book.explained[key]
+        return Line(kind, node, explain(frame.data))
+    if frame.is_extended:
+        return Line("?", None, "")
+    if frame.identifier in book.pdos:
+        return _pdo(book.pdos[frame.identifier], frame.data, book)
+    return _predefined(frame, book)
+
+
+def _predefined(frame: Frame, book: Book) -> Line:
+    """By the predefined connection set (CiA 301, table 79)."""
+    identifier, data = frame.identifier, frame.data
+    function, node = identifier & 0x780, identifier & 0x7F
+    if identifier == cia301.NMT:
+        return _nmt(data)
+    if identifier == cia301.SYNC:
+        return Line("SYNC", None, f"counter {data[0]}" if len(data) == 1 else "")
+    if identifier == TIME:
+        return Line("TIME", None, "")
+    if not node:
+        return Line("?", None, "")
+    if function == cia301.EMERGENCY:
+        return Line("EMCY", node, _emergency(data))
+    if function == cia301.HEARTBEAT:
+        state = cia301.nmt_state(data)
+        return Line("heartbeat", node, "malformed" if state is None else nmt_words(state))
+    if function in (cia301.SDO_REQUEST, cia301.SDO_ANSWER):
+        return Line("SDO", node, _sdo(data, function == cia301.SDO_ANSWER, book.dictionaries.get(node)))
+    if cia301.TPDO1 <= identifier < cia301.SDO_ANSWER:
+        number = (function - cia301.TPDO1) // 0x100 + 1
+        label = "RPDO" if function & 0x80 == 0 else "TPDO"
+        return Line(f"{label}{number}", node, "its mapping is not known")
+    return Line("?", None, "")
+
+
+def nmt_words(state: int) -> str:
+    """An NMT state in words."""
+    known = {NmtState.BOOT_UP: "boot-up", NmtState.PRE_OPERATIONAL: "pre-operational"}
+    try:
+        return known.get(NmtState(state), NmtState(state).name.lower())
+    except ValueError:
+        return f"unknown state {state:02X}h"
+
+
+def _nmt(data: bytes) -> Line:
+    if len(data) != 2:
+        return Line("NMT", None, "malformed")
+    try:
+        words = _NMT_WORDS[NmtCommand(data[0])]
+    except ValueError:
+        words = f"unknown command {data[0]:02X}h"
+    return Line("NMT", data[1] or None, f"{words}: {f'node {data[1]}' if data[1] else 'all nodes'}")
+
+
+def _emergency(data: bytes) -> str:
+    found = cia301.emergency(data)
+    if found is None:
+        return "malformed"
+    if not found.code:
+        return "all errors are gone"
+    more = f", detail {found.detail.hex(' ').upper()}" if any(found.detail) else ""
+    return f"{cia301.describe_emergency(found.code)}, error register {found.register:02X}h{more}"
+
+
+def _pdo(pdo: Pdo, data: bytes, book: Book) -> Line:
+    wanted = sum(item.bits for item in pdo.objects)
+    if len(data) * 8 < wanted:
+        return Line(pdo.label, pdo.node, f"malformed: {len(data)} bytes in place of {(wanted + 7) // 8}")
+    whole, place, parts = int.from_bytes(data, "little"), 0, []
+    dictionary = book.dictionaries.get(pdo.node)
+    for item in pdo.objects:
+        bits = whole >> place & (1 << item.bits) - 1
+        place += item.bits
+        if item.index > 7:  # below are the dummies of CiA 301, 7.4.7
+            entry = _entry(dictionary, item.index, item.subindex)
+            raw = bits.to_bytes((item.bits + 7) // 8, "little")
+            parts.append(f"{_name(entry, item.index, item.subindex)} {_value(entry, raw, item.index)}")
+    return Line(pdo.label, pdo.node, ", ".join(parts))
+
+
+def _sdo(data: bytes, is_answer: bool, dictionary: canopen.ObjectDictionary | None) -> str:
+    if len(data) != 8:
+        return "malformed"
+    command, index, subindex = sdo.HEAD.unpack_from(data)
+    entry = _entry(dictionary, index, subindex)
+    name = f"{index:04X}h:{subindex} {entry.qualname if entry is not None else ''}".rstrip()
+    kind, is_expedited, is_sized = command >> 5, command & 2, command & 1
+    if kind == 4:
+        who = "answers" if is_answer else "gives up"
+        return f"{who}: abort {name}: {sdo.describe_abort(int.from_bytes(data[4:], 'little'))}"
+    if kind == 0:
+        part = data[1 : 8 - (command >> 1 & 7)]
+        return f"segment {part.hex(' ').upper()} {_printable(part)}".rstrip() + (", the last" if command & 1 else "")
+    if is_answer and kind in (1, 3):
+        return f"took {name}" if kind == 3 else "took a segment"
+    if not is_answer and kind in (2, 3):
+        return f"read {name}" if kind == 2 else "next segment"
+    if kind in (1, 2):
+        verb = "is" if is_answer else "write"
+        if not is_expedited:
+            size = f" of {int.from_bytes(data[4:], 'little')} bytes" if is_sized else ""
+            return f"{verb} {name}: segments{size} follow"
+        return f"{verb} {name} = {_value(entry, sdo.expedited(data), index)}"
+    return f"block transfer, command {command:02X}h"
+
+
+def _entry(dictionary: canopen.ObjectDictionary | None, index: int, subindex: int) -> ODVariable | None:
+    entry = dictionary.get_variable(index, subindex) if dictionary is not None else None
+    return entry if entry is not None and entry.subindex == subindex else None
+
+
+def _name(entry: ODVariable | None, index: int, subindex: int) -> str:
+    return f"{index:04X}h:{subindex}" if entry is None else str(entry.qualname)
+
+
+def _value(entry: ODVariable | None, raw: bytes, index: int) -> str:
+    """A value as its data type says; bytes where no data sheet tells the type."""
+    kind = entry.data_type if entry is not None else None
+    if kind == _REAL32 and len(raw) == 4:
+        return f"{struct.unpack('<f', raw)[0]:.7g}"
+    if kind in _TEXTS:
+        return _printable(raw)
+    if kind not in _INTEGERS:
+        return f"{raw.hex(' ').upper()}"
+    number = int.from_bytes(raw, "little", signed=_INTEGERS[kind])
+    if index == cia402.STATUSWORD.index:
+        return f"{number:04X}h ({cia402.STATE_OF[number & 0x6F]})"
+    if index == cia402.CONTROLWORD.index:
+        return f"{number:04X}h"
+    is_code = 0x1000 <= index < 0x2000 and len(raw) == 4
+    return f"{number:08X}h" if is_code else str(number)
+
+
+def _printable(raw: bytes) -> str:
+    text = raw.rstrip(b"\0").decode("latin-1")
+    return f"'{text}'" if text and text.isprintable() else ""
+
+
+def _error(frame: Frame) -> str:
+    found = error_frame(frame.identifier, frame.data)
+    counted = f" (errors sending {found.counters[0]}, receiving {found.counters[1]})" if found.counters else ""
+    return (found.text or "The controller has recovered.") + counted

@@ -1,0 +1,146 @@
+"""What is known of the nodes of a bus, for whoever wants to say what its frames mean.
+
+A book begins with the robot file's data sheets and mappings, and learns those that an SDO client writes or reads while
+one listens.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import canopen
+from canopen.objectdictionary import ODVariable
+
+from hal.protocols import cia301, sdo
+from hal.protocols.cia301 import Mapped
+
+Explain = Callable[[bytes], str]
+"""Data of a frame that is not CANopen -> what it says."""
+
+EXTENDED = 1 << 29
+"""Set in an identifier that has 29 bits."""
+_PDO_AREAS = ((0x1400, 0x1600, "RPDO"), (0x1800, 0x1A00, "TPDO"))
+_PDO_COUNT = 0x200
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """A frame as it was on the bus.
+
+    Attributes:
+        stamp: When, as the interface says it [s since 1970].
+        identifier: 11 bits, or 29 if extended; of an error frame its class.
+        data: Up to 8 bytes.
+        is_extended: Whether the identifier has 29 bits.
+        is_remote: Whether it asks for data.
+        is_error: Whether the controller reports an error with it.
+    """
+
+    stamp: float
+    identifier: int
+    data: bytes
+    is_extended: bool = False
+    is_remote: bool = False
+    is_error: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Pdo:
+    """A process data object: what it is called, whose it is, and what it carries."""
+
+    label: str
+    node: int
+    objects: tuple[Mapped, ...]
+
+
+class Book:
+    """What is known of the nodes of one bus.
+
+    Attributes:
+        names: Node id -> name in the robot file.
+        dictionaries: Node id -> what its data sheet says.
+        pdos: Identifier -> what it carries.
+        explained: Identifier (with bit 29 set if extended) -> node and what explains a frame that is not CANopen.
+    """
+
+    def __init__(self) -> None:
+        self.names: dict[int, str] = {}
+        self.dictionaries: dict[int, canopen.ObjectDictionary] = {}
+        self.pdos: dict[int, Pdo] = {}
+        self.explained: dict[int, tuple[int, str, Explain]] = {}
+        self._entries: dict[tuple[int, int, int], int] = {}
+        self._asked: dict[int, tuple[int, int, int]] = {}
+
+    def add(self, node: int, name: str, dictionary: canopen.ObjectDictionary) -> None:
+        """A CANopen node with a data sheet; its PDO are at first as the data sheet has them."""
+        self.names[node] = name
+        self.dictionaries[node] = dictionary
+        for parameters, mapping, _ in _PDO_AREAS:
+            for number in range(_PDO_COUNT):
+                if parameters + number not in dictionary:
+                    break
+                for index in (parameters + number, mapping + number):
+                    for subindex in range(9):
+                        self._note_default(node, dictionary, index, subindex)
+        self._map(node)
+
+    def explain(self, node: int, name: str, kind: str, identifiers: Iterable[int], explain: Explain) -> None:
+        """A node that is not CANopen: these identifiers (bit 29 set if extended) are explained by a function."""
+        self.names[node] = name
+        for identifier in identifiers:
+            self.explained[identifier] = (node, kind, explain)
+
+    def carry(self, node: int, label: str, identifier: int, objects: tuple[Mapped, ...]) -> None:
+        """A PDO is known to carry something else than the data sheet says."""
+        for known in [key for key, pdo in self.pdos.items() if (pdo.node, pdo.label) == (node, label)]:
+            del self.pdos[known]
+        self.pdos[identifier] = Pdo(label, node, objects)
+
+    def learn(self, frame: Frame) -> None:
+        """Take note of a mapping that an SDO client writes or reads; anything else is passed over."""
+        if frame.is_extended or frame.is_remote or frame.is_error or len(frame.data) != 8:
+            return
+        function, node = frame.identifier & 0x780, frame.identifier & 0x7F
+        if function not in (cia301.SDO_REQUEST, cia301.SDO_ANSWER) or not node:
+            return
+        command, index, subindex = sdo.HEAD.unpack_from(frame.data)
+        if not any(0 <= index - base < _PDO_COUNT for area in _PDO_AREAS for base in area[:2]):
+            return
+        value = int.from_bytes(sdo.expedited(frame.data), "little")
+        if function == cia301.SDO_REQUEST:
+            self._asked.pop(node, None)
+            if command & 0xE2 == 0x22:
+                self._asked[node] = (index, subindex, value)
+            return
+        asked = self._asked.pop(node, None)
+        if command & 0xE2 == 0x42:
+            self._entries[node, index, subindex] = value
+        elif command == 0x60 and asked is not None and asked[:2] == (index, subindex):
+            self._entries[node, index, subindex] = asked[2]
+        else:
+            return
+        self._map(node)
+
+    def _note_default(self, node: int, dictionary: canopen.ObjectDictionary, index: int, subindex: int) -> None:
+        entry: ODVariable | None = dictionary.get_variable(index, subindex)
+        if entry is None:
+            return
+        if entry.relative:  # read without a node id, canopen leaves such a default as `$NODEID+0x180`
+            raw: str = entry.default_raw  # type: ignore[attr-defined]
+            added = raw.upper().replace("$NODEID", "").strip(" +")
+            self._entries[node, index, subindex] = node + int(added or "0", 0)
+        elif isinstance(entry.default, int):
+            self._entries[node, index, subindex] = entry.default
+
+    def _map(self, node: int) -> None:
+        """Put together the PDO of a node whose identifier, count and entries are all known."""
+        entries = self._entries
+        numbers = {index & 0x1FF for known, index, _ in entries if known == node}
+        for parameters, mapping, label in _PDO_AREAS:
+            for number in numbers:
+                identifier = entries.get((node, parameters + number, 1))
+                count = entries.get((node, mapping + number, 0), 0)
+                parts = [entries.get((node, mapping + number, place)) for place in range(1, count + 1)]
+                if identifier is None or not parts or None in parts or identifier & cia301.PDO_INVALID:
+                    continue
+                objects = tuple(Mapped(part >> 16, part >> 8 & 0xFF, part & 0xFF) for part in parts if part is not None)
+                self.carry(node, f"{label}{number + 1}", identifier & 0x7FF, objects)

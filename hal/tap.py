@@ -1,0 +1,142 @@
+"""A bus looked at from the side: every frame, with the interface's own time stamp; sends only what it is told to.
+
+Beside a running HAL it needs an interface that more than one program can open: socketcan, hub, udp_multicast.
+"""
+
+import math
+import queue
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from types import TracebackType
+from typing import Self
+
+import can
+
+from hal.config import BusConfig
+from hal.decode_book import Frame
+from hal.errors import BusGone, ConfigError
+
+POLL = 0.1
+"""How long [s] a reader waits before it looks whether it shall end."""
+
+
+class Tap:
+    """One interface, opened for as long as the context lasts.
+
+    Args:
+        name: What messages call the bus.
+        config: Where it is.
+    """
+
+    def __init__(self, name: str, config: BusConfig) -> None:
+        if config.interface not in can.VALID_INTERFACES:
+            known = ", ".join(sorted(can.VALID_INTERFACES))
+            raise ConfigError(f"Interface '{config.interface}' is not known to python-can. Known: {known}.")
+        self.name = name
+        self.config = config
+        self._can: can.BusABC | None = None
+
+    def __enter__(self) -> Self:
+        config = self.config
+        try:
+            self._can = can.Bus(
+                config.channel, config.interface, ignore_config=True, bitrate=config.bitrate, **config.options
+            )
+        except Exception as error:  # an interface plugin may raise anything
+            advice = "Is `gemuco simulate` running?" if config.interface == "hub" else "Is it there, is it up?"
+            raise BusGone(
+                f"Bus '{self.name}' ({config.interface} {config.channel}) does not open: {error} {advice}"
+            ) from (error)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._can is not None:
+            self._can.shutdown()
+            self._can = None
+
+    def receive(self, timeout: float) -> Frame | None:
+        """The next frame, or None if none comes within `timeout` [s].
+
+        Raises:
+            BusGone: The interface failed.
+        """
+        assert self._can is not None, "the tap is not open"
+        try:
+            message = self._can.recv(timeout)
+        except (can.CanError, OSError) as error:
+            raise BusGone(f"Bus '{self.name}' failed: {error}. Is the interface up?") from error
+        if message is None:
+            return None
+        return Frame(
+            message.timestamp,
+            message.arbitration_id,
+            bytes(message.data),
+            message.is_extended_id,
+            message.is_remote_frame,
+            message.is_error_frame,
+        )
+
+    def send(self, identifier: int, data: bytes) -> None:
+        """Put a frame with an 11-bit identifier on the bus.
+
+        Raises:
+            BusGone: The interface does not take it; on socketcan that is how a bus looks on which nobody acknowledges.
+        """
+        assert self._can is not None, "the tap is not open"
+        try:
+            self._can.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False), timeout=0.05)
+        except (can.CanError, OSError) as error:
+            raise BusGone(
+                f"Bus '{self.name}' takes no frames: {error}. Is another node powered, is the bus terminated, is the "
+                "bit rate right?"
+            ) from error
+
+
+def frames(buses: Mapping[str, BusConfig], seconds: float = math.inf) -> Iterator[tuple[str, Frame]]:
+    """What passes on some buses, in the order in which it is received here: (name of the bus, frame).
+
+    Args:
+        buses: Names and where they are.
+        seconds: How long to listen [s].
+
+    Raises:
+        BusGone: One of them cannot be opened, or failed.
+    """
+    found: queue.Queue[tuple[str, Frame | BusGone]] = queue.Queue()
+    over = threading.Event()
+    threads = [
+        threading.Thread(target=_listen, args=(name, config, found, over), name=f"tap {name}", daemon=True)
+        for name, config in buses.items()
+    ]
+    for thread in threads:
+        thread.start()
+    deadline = time.monotonic() + seconds
+    try:
+        while (remaining := deadline - time.monotonic()) > 0:
+            try:
+                name, frame = found.get(timeout=min(remaining, POLL))
+            except queue.Empty:
+                continue
+            if isinstance(frame, BusGone):
+                raise frame
+            yield name, frame
+    finally:
+        over.set()
+        for thread in threads:
+            thread.join()
+
+
+def _listen(
+    name: str, config: BusConfig, found: queue.Queue[tuple[str, Frame | BusGone]], over: threading.Event
+) -> None:
+    try:
+        with Tap(name, config) as tap:
+            while not over.is_set():
+                frame = tap.receive(POLL)
+                if frame is not None:
+                    found.put((name, frame))
+    except BusGone as error:
+        found.put((name, error))
