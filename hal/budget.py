@@ -14,9 +14,10 @@ OWN_HEARTBEAT_RATE = 50.0
 """Of the HAL [Hz]; a drive stops after 0.15 s without one, of which a machine under load may sleep most."""
 
 
-def frame_bits(size: int) -> int:
+def frame_bits(size: int, is_extended: bool = False) -> int:
     """Longest a classic frame with `size` data bytes can be on the wire [bit], stuffing and space included."""
-    return 47 + 8 * size + (34 + 8 * size - 1) // 4
+    stuffed = (54 if is_extended else 34) + 8 * size
+    return 13 + stuffed + (stuffed - 1) // 4
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,16 +21,21 @@ class Clock(Protocol):
         ...
 
 
+class BusClock(Clock, Protocol):
+    """A clock by which one can also wait for an answer."""
+
+    def wait(self, event: threading.Event, deadline: float) -> bool:
+        """Sleep until the event is set, at most until the deadline [s]; whether it was set."""
+        ...
+
+
 class SystemClock:
     """The machine's own clocks."""
 
-    def monotonic(self) -> float:
-        """See `Clock.monotonic`."""
-        return time.monotonic()
-
-    def now_ns(self) -> int:
-        """See `Clock.now_ns`."""
-        return time.time_ns()
+    monotonic = staticmethod(time.monotonic)
+    """See `Clock.monotonic`; read once per received frame."""
+    now_ns = staticmethod(time.time_ns)
+    """See `Clock.now_ns`."""
 
     def sleep_until(self, deadline: float) -> None:
         """See `Clock.sleep_until`."""
@@ -48,6 +53,7 @@ class ManualClock:
 
     def __init__(self, start: float = 1000.0) -> None:
         self._now = start
+        self._wall = 0.0
         self._moved = threading.Condition()
 
     def monotonic(self) -> float:
@@ -56,7 +62,11 @@ class ManualClock:
 
     def now_ns(self) -> int:
         """See `Clock.now_ns`."""
-        return round(self._now * 1e9)
+        return round((self._now + self._wall) * 1e9)
+
+    def set_wall(self, ahead: float) -> None:
+        """Set the wall clock to so much [s] ahead of the monotonic one, as somebody does who sets a machine's time."""
+        self._wall = ahead
 
     def advance(self, duration: float) -> None:
         """Move time forward by `duration` [s] and wake whoever sleeps."""

@@ -91,15 +91,23 @@ def test_an_interface_that_does_not_send_is_opened_again(channel):
     bus.close()
 
 
-def test_load_is_what_went_over_the_wire_since_it_was_asked_last(channel):
+def test_load_is_what_went_over_the_wire_both_ways(channel):
     clock = ManualClock()
     bus = Bus("can0", BusConfig(interface="virtual", channel=channel), clock)
     bus.open()
-    bus.health()
-    for _ in range(100):
-        bus.send(frame())
-    clock.advance(0.1)
-    assert bus.health()["load"] == pytest.approx(100 * 135 / (0.1 * 1e6))
+    with can.Bus(interface="virtual", channel=channel) as peer:
+        wait_for(lambda: bus.counters["opened"], "the interface")
+        clock.advance(1.0)
+        peer.send(frame())
+        wait_for(lambda: bus.counters["received"] == 1, "the frame that ends the first second")
+        for _ in range(100):
+            bus.send(frame())
+            peer.send(frame(0x181, b"1"))
+        wait_for(lambda: bus.counters["received"] == 101, "the frames")
+        clock.advance(1.0)
+        peer.send(frame(0x181, b""))
+        wait_for(lambda: bus.health()["load"] > 0, "the load")
+        assert bus.health()["load"] == pytest.approx((100 * 135 + 100 * 65 + 55) / 1e6, abs=1e-4)
     bus.close()
 
 

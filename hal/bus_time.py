@@ -1,0 +1,86 @@
+"""When a frame was received, on the monotonic clock that every age and deadline goes by."""
+
+from hal.clock import BusClock
+
+STAMPED = {"socketcan": "kernel", "udp_multicast": "kernel", "hub": "sender"}
+"""Interfaces whose frames bear wall-clock time of this machine, and whose clock that is; all others bear some time or
+other, and what counts is when the frame was read."""
+PLAUSIBLE = 0.005
+"""A frame that seems to have waited longer [s] has, or the wall clock was set: it is looked at again."""
+STEP = 0.001
+"""A wall clock that moved by more than this [s] between two looks was set,"""
+SLEW = 0.001
+"""beside what it may be slewed [s/s]; Linux does at most half of that."""
+EARLY = 0.0002
+"""What clocks that are not read at the same instant may differ [s]."""
+DOUBT = 0.1
+"""For so long [s] after the wall clock was set, frames stamped before may still be read."""
+LOOK_EVERY = 0.1
+"""How often [s] the offset between the clocks is measured."""
+_READ_WITHIN = 5e-5
+_READS = 4
+
+
+class FrameClock:
+    """Turns wall-clock stamps into monotonic times.
+
+    A frame that waited while this process was frozen is told as old as it is. A wall clock that is set makes no frame
+    newer or older: the offset before and the one after are both tried. A stamp that fits neither is not believed.
+    """
+
+    def __init__(self, clock: BusClock) -> None:
+        self.counters = {"waited": 0, "clock_steps": 0, "bad_stamps": 0}
+        """Frames that lay in the interface for long, times that the wall clock was set, stamps in the future."""
+        self._clock = clock
+        self._offset = self._before = self._measure(0.0)
+        self._set_at = -DOUBT
+        self._look_at = clock.monotonic() + LOOK_EVERY
+
+    def received(self, stamp: float, now: float) -> float:
+        """Monotonic time [s] at which a frame came, never after `now`.
+
+        Args:
+            stamp: Wall-clock time that the frame bears [s since 1970].
+            now: Monotonic time at which it was read [s].
+        """
+        if now >= self._look_at:
+            self._look(now)
+        received = stamp - self._offset
+        if now - PLAUSIBLE < received <= now:
+            return received
+        return self._doubtful(stamp, now)
+
+    def _doubtful(self, stamp: float, now: float) -> float:
+        self._look(now)
+        received = stamp - self._offset
+        if now - self._set_at < DOUBT:
+            other = stamp - self._before
+            if received > now + EARLY or received < other <= now + EARLY:
+                received = other
+        if received > now + EARLY:
+            self.counters["bad_stamps"] += 1
+            return now
+        if received < now - PLAUSIBLE:
+            self.counters["waited"] += 1
+        return min(received, now)
+
+    def _look(self, now: float) -> None:
+        """Measure the offset; notice when the wall clock was set."""
+        passed = now - self._look_at + LOOK_EVERY
+        self._look_at = now + LOOK_EVERY
+        found = self._measure(self._offset)
+        if abs(found - self._offset) > STEP + SLEW * passed:
+            self.counters["clock_steps"] += 1
+            self._before, self._set_at = self._offset, now
+        self._offset = found
+
+    def _measure(self, otherwise: float) -> float:
+        """Wall-clock minus monotonic time [s]; the value before if this thread is interrupted at every try."""
+        clock = self._clock
+        for _ in range(_READS):
+            before = clock.monotonic()
+            wall = clock.now_ns()
+            after = clock.monotonic()
+            if after - before < _READ_WITHIN:
+                return wall * 1e-9 - 0.5 * (before + after)
+        return otherwise
