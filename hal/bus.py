@@ -24,7 +24,7 @@ from hal.config import BusConfig
 from hal.errors import ConfigError
 from hal.protocols import cia301
 
-__all__ = ["OWN_NODE", "Answers", "Bus", "BusState", "Handler"]
+__all__ = ["OWN_NODE", "PATIENCE", "Answers", "Bus", "BusState", "Handler"]
 
 log = logging.getLogger(__name__)
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import can
 
-from hal.bus import OWN_NODE, Bus
+from hal.bus import OWN_NODE, PATIENCE, Bus
 from hal.errors import WrongDevice
 from hal.pdo_commissioning import configure_pdos
 from hal.pdo_map import PdoMap
@@ -36,7 +36,7 @@ class Plan:
 def nmt(bus: Bus, command: NmtCommand, node: int) -> None:
     """Send an NMT command; nobody answers it, the node's heartbeat tells."""
     data = cia301.nmt_command(command, node)
-    bus.send(can.Message(arbitration_id=cia301.NMT, is_extended_id=False, data=data))
+    bus.send(can.Message(arbitration_id=cia301.NMT, is_extended_id=False, data=data), PATIENCE)
 
 
 def identify(sdo: SdoClient, profile: int, label: str) -> str:

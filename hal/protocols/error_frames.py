@@ -1,8 +1,8 @@
 """Error frames: what a CAN controller tells of itself and of the bus, in the format of Linux.
 
-Source: include/uapi/linux/can/error.h (classes in the identifier, details in eight data bytes). Error counters go up by 8
-per bad frame and down by 1 per good one; from 96 the controller warns, from 128 it is error passive, and beyond 255 bad
-frames of its own it leaves the bus (ISO 11898-1, fault confinement).
+Source: include/uapi/linux/can/error.h (classes in the identifier, details in eight data bytes). Error counters go up by
+8 per bad frame and down by 1 per good one; from 96 the controller warns, from 128 it is error passive, and beyond 255
+bad frames of its own it leaves the bus (ISO 11898-1, fault confinement).
 """
 
 from dataclasses import dataclass

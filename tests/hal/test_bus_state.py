@@ -1,5 +1,7 @@
 """The state machine of a bus by itself, and the error frames that feed it."""
 
+import itertools
+
 import pytest
 
 from hal.bus_state import RECOVERY, WORRY, BusState, BusWatch
@@ -125,7 +127,7 @@ def test_every_way_through_the_states(events, state, losses):
     assert watch.losses == losses
     assert bool(watch.text) == (watch.state is not BusState.OK)
     assert (told or ["gone"])[-1] == state
-    assert all(one is not two for one, two in zip(told, told[1:], strict=False)), "a change to the same state"
+    assert all(one is not two for one, two in itertools.pairwise(told)), "a change to the same state"
 
 
 def test_the_last_loss_is_told_after_the_bus_is_back():
