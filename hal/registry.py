@@ -11,8 +11,10 @@ from hal.errors import ConfigError
 
 DRIVERS = {
     "cia402": "hal.drivers.cia402:Cia402Drive",
+    "cia401": "hal.drivers.cia401:Cia401Input",
     "cia404": "hal.drivers.cia404:Cia404Cell",
     "cia406": "hal.drivers.cia406:Cia406Encoder",
+    "mit": "hal.drivers.mit:MitDrive",
 }
 
 

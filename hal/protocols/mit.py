@@ -203,7 +203,9 @@ def special(code: Special) -> bytes:
 
 def command(asked: Command, ranges: Ranges) -> bytes:
     """The frame that asks a drive."""
-    return COMMAND_LAYOUT.pack(pack(asked.position, asked.velocity, asked.stiffness, asked.damping, asked.effort, ranges))
+    return COMMAND_LAYOUT.pack(
+        pack(asked.position, asked.velocity, asked.stiffness, asked.damping, asked.effort, ranges)
+    )
 
 
 def pack(position: float, velocity: float, stiffness: float, damping: float, effort: float, ranges: Ranges) -> int:

@@ -56,7 +56,7 @@ MOTORS: dict[str, Motor] = {
         Ranges(12.5, 65.0, 18.0),
         Layout.MINI_CHEETAH,
         MINI_CHEETAH,
-        "The firmware keeps its ranges in flash, and torque is I_MAX * KT * GR of that flash: read them on its console.",
+        "The firmware keeps its ranges in flash, and its torque is I_MAX * KT * GR of there: read them on its console.",
     ),
     "AK10-9": _t_motor(50.0, 65.0),
     "AK60-6": _t_motor(45.0, 15.0, f"50 rad/s in {_TMOTORCANCONTROL}; the maker's manual was taken."),

@@ -4,6 +4,7 @@ from simulators.nodes.analog_input import AnalogConstants, AnalogInput
 from simulators.nodes.drive import ServoDrive
 from simulators.nodes.encoder import JointEncoder
 from simulators.nodes.load_cell import LoadCell
+from simulators.nodes.mit_drive import MitConstants, MitDriveNode
 from simulators.nodes.node import Frame, SimulatedNode
 from simulators.nodes.plant import Plant
 from simulators.nodes.spec import CellConstants, DriveConstants, EncoderConstants, NodeSpec
@@ -13,6 +14,7 @@ KINDS = {
     CellConstants: LoadCell,
     AnalogConstants: AnalogInput,
     EncoderConstants: JointEncoder,
+    MitConstants: MitDriveNode,
 }
 
 

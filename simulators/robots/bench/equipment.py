@@ -6,6 +6,7 @@ from typing import Any
 from hal import registry
 from hal.config import RobotConfig
 from hal.errors import ConfigError
+from simulators.nodes.mit_drive import MitConstants
 from simulators.nodes.spec import CellConstants, Constants, DriveConstants, EncoderConstants, NodeSpec
 
 
@@ -29,10 +30,28 @@ def _cia406(settings: Any) -> Constants:
     return EncoderConstants(counts_per_turn=round(counts), direction=settings.direction, zero=settings.zero)
 
 
+def _mit(settings: Any) -> Constants:
+    layout, ranges = settings.actuator
+    return MitConstants(
+        make=layout.value,
+        master_id=settings.master_id,
+        position=ranges.position,
+        velocity=ranges.velocity,
+        torque=ranges.effort,
+        stiffness=ranges.stiffness,
+        damping=ranges.damping,
+        gear=settings.gear,
+        spool_radius=settings.spool_radius,
+        direction=settings.direction,
+        zero=settings.zero,
+    )
+
+
 CONSTANTS: dict[str, Callable[[Any], Constants]] = {
     "cia402": _cia402,
     "cia404": _cia404,
     "cia406": _cia406,
+    "mit": _mit,
 }
 """What a driver of `hal.registry` has at the other end of the wire: one line per kind."""
 

@@ -1,0 +1,328 @@
+"""A servo drive in MIT mode (T-Motor AK, Damiao DM, mini-cheetah) that turns a joint [rad] or winds a wire [m].
+
+It speaks only when spoken to: in every cycle it is sent a frame; without power that is a request to stay without.
+"""
+
+import contextlib
+import math
+import threading
+
+import can
+import numpy as np
+
+from hal.device import Check, DeviceState
+from hal.drivers.can_device import CanDevice, Place
+from hal.drivers.mit_law import Asked, Law
+from hal.drivers.mit_registers import RegisterClient
+from hal.drivers.mit_replies import Replies
+from hal.drivers.mit_settings import MitSettings
+from hal.errors import ConfigError, DeviceRefused, DeviceSilent
+from hal.protocols import mit
+from hal.protocols.mit import Layout, Register, Special
+
+ANSWER_TIMEOUT = 0.05
+"""How long [s] an answer may take while the drive is opened."""
+TRIES = 4
+CONFIRMATIONS = 3
+"""So many answers after `ENTER` or `EXIT`, and a drive that does not tell its state is taken to have obeyed."""
+QUICK_STOP_TIME = 0.3
+"""For so long [s] a quick stop brakes before the power goes."""
+CLEARING_CYCLES = 40
+"""For so many cycles a fault is tried to be cleared."""
+FEWEST_FRAMES = 3
+"""So many frames must fit into `watch_time`, or one lost frame would stop the drive."""
+QUANTITIES = ("position", "velocity", "effort", "temperature", "temperature_driver")
+_TELLS = {Layout.MINI_CHEETAH: 2, Layout.T_MOTOR: 4, Layout.DAMIAO: 5}
+"""How many of these are in an answer; the third of a mini-cheetah is a current or a torque, depending on its flash."""
+
+
+class MitDrive(CanDevice):
+    """One drive. It is enabled only by `enable`, and stays disabled once it dropped out by itself."""
+
+    Settings = MitSettings
+    COUNTERS = (*CanDevice.COUNTERS, "saturated", "wrapped")
+    can_damp = True
+
+    @classmethod
+    def quantities(cls, settings: MitSettings) -> tuple[str, ...]:
+        """See `CanDevice.quantities`; what is commanded comes first."""
+        known = QUANTITIES[: _TELLS[settings.actuator[0]]]
+        return (settings.mode, *(name for name in known if name != settings.mode))
+
+    @classmethod
+    def commanded(cls, settings: MitSettings) -> str:
+        """See `CanDevice.commanded`."""
+        return settings.mode
+
+    @classmethod
+    def traffic(cls, settings: MitSettings, rate: float) -> tuple[tuple[int, float], ...]:
+        """See `CanDevice.traffic`."""
+        return ((mit.COMMAND_LAYOUT.size, rate), (max(mit.SIZES[settings.actuator[0]]), rate))
+
+    def __init__(self, place: Place, settings: MitSettings) -> None:
+        super().__init__(place, settings)
+        node = place.node
+        self._model = settings.motor
+        self._layout, self._ranges = settings.actuator
+        self._law = Law(place, settings)
+        damiao = self._layout is Layout.DAMIAO
+        self._reply_id = settings.master_id if settings.master_id is not None else node + 16 if damiao else 0
+        self._check_place(settings.watch_time)
+        self._places = tuple((slot, QUANTITIES.index(quantity)) for quantity, slot in self._slots.items())
+        self._registers = RegisterClient(node, str(place), place.bus.send, settings.watch_time) if damiao else None
+        self._heard = threading.Event()
+        self._asked: Special | None = None
+        self._confirmations = 0
+        self._error = self._latched = 0
+        self._last_counts = -1
+        self._is_wrapped = False
+        self._position = self._velocity = 0.0
+        self._is_powered = self._is_wanted = self._was_reached = self._is_watched = self._is_neutral = False
+        self._dropped = ""
+        self._braking = self._clearing = 0
+        self._frame = can.Message(arbitration_id=node, is_extended_id=False, data=bytearray(mit.COMMAND_LAYOUT.size))
+        self._specials = {
+            code: can.Message(arbitration_id=node, is_extended_id=False, data=mit.special(code))
+            for code in (Special.ENTER, Special.EXIT, Special.CLEAR)
+        }
+        Replies.join(place.bus, self._reply_id, self._layout, node, self._on_reply)
+
+    def _check_place(self, watch_time: float) -> None:
+        place = self._place
+        highest = 0xFF if self._layout is Layout.T_MOTOR else mit.NODES - 1
+        if not 1 <= place.node <= highest:
+            raise ConfigError(f"{place}: the id of such a drive is between 1 and {highest}.")
+        if self._layout is Layout.DAMIAO and watch_time * place.rate < FEWEST_FRAMES:
+            raise ConfigError(
+                f"{place}: within watch_time {watch_time:g} s it gets {watch_time * place.rate:.1f} frames at "
+                f"{place.rate:g} Hz, so that one lost frame would stop it. Give it time for {FEWEST_FRAMES}."
+            )
+
+    def _identify(self) -> str:
+        if self._reply_id == 0 and self._bus.needs_sync:
+            raise DeviceRefused(
+                f"{self._place} answers under identifier 0, which CANopen nodes on the same bus take for NMT commands. "
+                "Give it another master id, or another bus."
+            )
+        self._rest()
+        self._knock()
+        serial = self._registers.read(Register.SERIAL).integer if self._registers else 0
+        if 0 < serial < 0xFFFFFFFF:
+            return f"damiao:{serial:08x}"
+        return f"mit:{self._bus.name}:{self.node}:{self._model}"
+
+    def _knock(self) -> None:
+        """Ask to stay without power until there is an answer; may block.
+
+        Raises:
+            DeviceSilent: No answer.
+        """
+        for _ in range(TRIES):
+            self._heard.clear()
+            self._ask(Special.EXIT)
+            if self._heard.wait(ANSWER_TIMEOUT):
+                return
+        raise DeviceSilent(
+            f"{self._place} does not answer under {self._reply_id:03X}h. Is it powered, are its id and master id right?"
+        )
+
+    def _commission(self) -> None:
+        self._is_wanted = False
+        self._last_counts = -1
+        for _ in range(CONFIRMATIONS):
+            self._knock()
+        if self._is_powered:
+            raise DeviceRefused(f"{self._place} stays enabled when it is told to power off. Cut its power.")
+        if self._registers:
+            self._registers.commission(self._ranges)
+
+    def _release(self) -> None:
+        with contextlib.suppress(DeviceSilent, DeviceRefused):  # nothing more can be done for it
+            for _ in range(CONFIRMATIONS):
+                self._knock()
+            if self._registers and not self._is_powered:
+                self._registers.release()
+
+    def _on_reply(self, data: bytearray, received: float) -> None:
+        layout, registers = self._layout, self._registers
+        if registers is not None and registers.wanted is not None:
+            found = mit.register_answer(data, self.node)
+            if found is not None:
+                registers.take(found)
+                return
+        if len(data) not in mit.SIZES[layout]:
+            self._counters["malformed"] += 1
+            return
+        rotor = driver = math.nan
+        if layout is Layout.DAMIAO:
+            state, rotor, driver = data[0] >> 4, data[7], data[6]
+            self._is_powered = state == mit.ENABLED
+            self._error = state if state > mit.ENABLED else 0
+        else:
+            if layout is Layout.T_MOTOR and len(data) == 8:
+                rotor, self._error = data[6] + mit.T_MOTOR_COLDEST, data[7]
+            if self._confirmations:
+                self._confirmations -= 1
+                if not self._confirmations:
+                    self._is_powered = self._asked is Special.ENTER
+        if self._error and not self._clearing:
+            self._latched = self._error
+        self._heard.set()
+        if self.is_commissioned:
+            self._store(mit.counts(data), rotor, driver, received)
+
+    def _store(self, counts: tuple[int, int, int], rotor: float, driver: float, received: float) -> None:
+        """Bring the slots up to date; a value at the end of its range may be anything beyond, and is NaN."""
+        ranges, scale = self._ranges, self._law.scale
+        position, velocity, effort = counts
+        if self._last_counts >= 0 and abs(position - self._last_counts) > mit.POSITION_TOP // 2:
+            self._is_wrapped = True
+            self._counters["wrapped"] += 1
+        self._last_counts = position
+        angle = speed = torque = math.nan
+        if 0 < position < mit.POSITION_TOP and not self._is_wrapped:
+            self._position = angle = position * 2 * ranges.position / mit.POSITION_TOP - ranges.position
+        if 0 < velocity < mit.TOP:
+            self._velocity = speed = velocity * 2 * ranges.velocity / mit.TOP - ranges.velocity
+        if 0 < effort < mit.TOP:
+            torque = effort * 2 * ranges.effort / mit.TOP - ranges.effort
+        if angle != angle or speed != speed or torque != torque:
+            self._counters["saturated"] += 1
+        measured = (self._law.zero + scale * angle, scale * speed, torque / scale, rotor, driver)
+        values = self._values
+        for slot, index in self._places:
+            values[slot] = measured[index]
+        self._received.fill(received)
+        self._is_answered()
+
+    def _lose(self, text: str) -> None:
+        super()._lose(text)
+        self._is_wanted = False
+
+    def _fault(self) -> str:
+        if self._is_wrapped:
+            return (
+                f"{self._place} turned beyond {self._ranges.position:g} rad, where its position starts again at the "
+                "other end, so its place is not known. Turn it back, restart the drive, then reset."
+            )
+        error = self._latched or self._error
+        if not error:
+            return ""
+        told = mit.describe_error(error, self._layout)
+        return f"{self._place} reports {told}. Reset it when the cause is gone; if it stays, cut its power once."
+
+    def _running(self) -> tuple[DeviceState, str]:
+        text = self._dropped
+        if not text and self._registers is None:
+            text = f"{self._place} has no watchdog: should the HAL die while it is enabled, it keeps to its last frame."
+        return DeviceState.ENABLED if self._is_powered else DeviceState.READY, text
+
+    def enable(self) -> None:
+        """See `Device.enable`; the stiffness grows from 0 within `ramp`, about the first set-point."""
+        self._is_watched = self._is_neutral = self._was_reached = False
+        self._braking = 0
+        self._dropped = ""
+        self._law.restart()
+        if self._registers:
+            self._registers.found = None
+        self._is_wanted = True
+
+    def disable(self) -> None:
+        """See `Device.disable`."""
+        self._is_wanted = False
+        self._braking = 0
+
+    def quick_stop(self) -> None:
+        """See `Device.quick_stop`: damping alone for `QUICK_STOP_TIME`, then no power."""
+        self._is_wanted = False
+        self._braking = round(QUICK_STOP_TIME * self._place.rate) if self._is_powered else 0
+
+    def reset(self) -> None:
+        """See `Device.reset`; only Damiao has a frame for it, T-Motor forgets a fault whose cause is gone."""
+        self._latched = 0
+        self._is_wrapped = False
+        self._clearing = CLEARING_CYCLES
+
+    def apply(self, values: np.ndarray) -> None:
+        """See `Device.apply`; until the drive has power it is asked to power on, with no torque."""
+        if self._may_move():
+            self._command(self._law.set_point(float(values[0]), self._position, self._velocity))
+
+    def damp(self) -> None:
+        """See `Device.damp`."""
+        if self._may_move():
+            self._command(self._law.braking())
+
+    def idle(self) -> None:
+        """See `Device.idle`; the drive is asked to stay without power, and answers where it is."""
+        if not self.is_commissioned:
+            return
+        if self._is_powered and self._braking:
+            self._braking -= 1
+            self._command(self._law.braking())
+        elif self._is_powered and not self._is_neutral:
+            self._rest()
+        elif self._clearing and self._error:
+            self._clearing -= 1
+            self._ask(Special.CLEAR if self._layout is Layout.DAMIAO else Special.EXIT)
+        else:
+            self._clearing = 0
+            self._ask(Special.EXIT)
+
+    def _may_move(self) -> bool:
+        """Whether the drive has power and may be sent a set-point; if not, it was sent what it needs in this cycle."""
+        if self._latched or self._is_wrapped:
+            self._is_wanted = False
+        if self._is_wanted and self._was_reached and not self._is_powered:
+            self._is_wanted = False
+            self._dropped = f"{self._place} powered off by itself. Was it restarted, was its supply interrupted?"
+        if not self._is_wanted or not self.is_commissioned:
+            self.idle()
+        elif self._is_powered and self._asked is Special.ENTER:
+            self._was_reached = True
+            return True
+        else:
+            self._power_on()
+        return False
+
+    def _power_on(self) -> None:
+        """One step: look at its watchdog, take back what it was told before, then ask it to power on."""
+        if self._registers and not self._is_watched:
+            watching = self._registers.is_watching
+            if watching is None:
+                self._registers.ask(Register.TIMEOUT)
+                self._rest()
+                return
+            if not watching:
+                self._lose(f"{self._place} forgot its watchdog, so it was restarted, and waits to be commissioned.")
+                return
+            self._is_watched = True
+        if self._is_neutral:
+            self._ask(Special.ENTER)
+        else:
+            self._rest()
+
+    def _rest(self) -> None:
+        """No torque. Some firmware follows its last frame again as soon as it has power, so this is to be the last."""
+        self._command((self._position, 0.0, 0.0, 0.0, 0.0))
+        self._is_neutral = True
+
+    def _command(self, asked: Asked) -> None:
+        self._is_neutral = False
+        mit.COMMAND_LAYOUT.pack_into(self._frame.data, 0, mit.pack(*asked, self._ranges))
+        self._bus.send(self._frame)
+
+    def _ask(self, code: Special) -> None:
+        if code is not self._asked:
+            self._asked, self._confirmations = code, CONFIRMATIONS
+        self._bus.send(self._specials[code])
+
+    def inspect(self) -> tuple[Check, ...]:
+        """See `Device.inspect`."""
+        self._knock()
+        if self._registers is not None:
+            return self._registers.inspect(self._ranges)
+        return (
+            Check("watchdog", False, "It has none that can be set or read over CAN. Have its power cut otherwise."),
+            Check("ranges", True, "They cannot be read over CAN. Compare them with the manual of this firmware."),
+        )
