@@ -1,118 +1,150 @@
-"""What a command may become before it is applied: range, rate, and the tension of the muscle it pulls."""
+"""All limits of a robot's command, one after the other: what a command may become before it is applied."""
+
+from collections.abc import Sequence
 
 import numpy as np
 
 from hal.config import LimitConfig, RobotConfig
-from hal.sample import Arrays
-
-SOFT_BAND = 0.1
-"""Part of `soft_high` below it within which shortening is slowed down, so that a muscle comes to rest at the limit
-instead of chattering about it."""
-
-MISPLACED = 0.1
-"""A position further out of range than this part of the range is not believed."""
+from hal.device import Device
+from hal.limit_config import per_element
+from hal.safety import roles
+from hal.safety.ends import RESPONSE, EndsOfEffort, EndsOfVelocity
+from hal.safety.limit import Arrays, Limit, Turn
+from hal.safety.motion import Acceleration, Range, Rate
+from hal.safety.soft_effort import Load, SoftEffort, SoftEffortOfEffort, SoftEffortOfVelocity
+from hal.safety.trips import Trips
 
 
 class Limiter:
-    """Turns a desired set-point into one that may be applied.
+    """Keeps the set-point, and moves it towards what is desired as far as every limit allows.
 
-    Every change of the set-point is a step from the one applied before, so that no command, however it jumps, moves a
-    drive faster than `rate`. A muscle (an element of the commanded signal that has a namesake in a signal with
-    `soft_high`) is shortened more slowly as its tension nears `soft_high` [N], not at all at it, and paid out above
-    it, in proportion, at the full rate where the tension reaches `trip_high`.
+    Every new set-point is a step from the one before, so that no command, however it jumps, moves a drive faster than
+    the robot file says. A limit that depends on what is measured comes after those that do not, and wins.
+
+    Attributes:
+        set_point: Of the newest cycle [unit of the commanded signal], shape (n,).
     """
 
-    def __init__(self, config: RobotConfig, period: float) -> None:
-        """Prepare the limits of `config` for steps of `period` [s]."""
+    def __init__(self, config: RobotConfig, period: float, devices: Sequence[Device] = (), quantity: str = "position"):
+        """Prepare the limits of `config` for cycles of `period` [s] and commands of a `quantity`.
+
+        Raises:
+            ConfigError: A limit that cannot act.
+        """
+        self._config, self._period, self._quantity = config, period, quantity
         name = config.command.signal
-        limit = config.limits.get(name, LimitConfig())
+        self._size = config.signals[name].size
         self._low, self._high = config.bounds(name)
-        self._step = np.inf if limit.rate is None else limit.rate * period
+        limit = config.limits.get(name, LimitConfig())
+        self._rate = None if limit.rate is None else per_element(limit.rate, self._size, name)
+        self._acceleration = None if limit.acceleration is None else per_element(limit.acceleration, self._size, name)
+        nature = roles.natures(config, devices)
+        self._positions = [roles.own_way(config)] if quantity == "position" else roles.ways(config, nature, "position")
+        self._velocities = roles.ways(config, nature, "velocity")
+        self._trips = Trips(config, self._positions)
+        self._parking: list[Limit] = []
+        make = {"position": self._of_position, "velocity": self._of_velocity, "effort": self._of_effort}[quantity]
+        self._limits = make(roles.loads(config, nature, quantity))
+        self.set_point = np.full(self._size, np.nan)
+        self._speed = np.zeros(self._size)
+
+    def _of_position(self, loads: Sequence[Load]) -> list[Limit]:
+        free: list[Limit] = [Range(self._low, self._high)]
+        if self._acceleration is not None:
+            free.append(Acceleration(self._acceleration, self._period))
+        if self._rate is not None:
+            free.append(Rate(self._rate, self._period))
         span = np.where(np.isfinite(self._high - self._low), self._high - self._low, 1.0)
-        self._pay_out = np.minimum(self._step, span * period)
-        self._tension: str | None = None
-        self._trips = {signal: one.trip_high for signal, one in config.limits.items() if one.trip_high}
-        self._elements = {signal: one.elements for signal, one in config.signals.items()}
-        elements = config.signals[name].elements
-        for signal, other in config.limits.items():
-            if other.soft_high and signal != name:
-                self._watch_tension(signal, other, elements)
+        relief = span if self._rate is None else np.minimum(self._rate, span)
+        loaded: list[Limit] = []
+        for load in loads:
+            at = load.commanded
+            braking = None if self._acceleration is None else self._acceleration[at]
+            loaded.append(SoftEffort(load, relief[at], self._low[at], self._high[at], self._period, braking))
+        if self._config.stop.speed is not None:
+            self._parking = [*free, Rate(self._config.stop.speed, self._period), *loaded]
+        return [*free, *loaded]
 
-    def _watch_tension(self, signal: str, limit: LimitConfig, commanded: tuple[str, ...]) -> None:
-        names = self._elements[signal]
-        pairs = [(index, names.index(element)) for index, element in enumerate(commanded) if element in names]
-        if not pairs or limit.soft_high is None:
-            return
-        self._tension = signal
-        self._muscle, self._cell = (np.array(part) for part in zip(*pairs, strict=True))
-        self._soft = limit.soft_high
-        self._over = (limit.trip_high or 2 * limit.soft_high) - limit.soft_high
+    def _of_velocity(self, loads: Sequence[Load]) -> list[Limit]:
+        limits: list[Limit] = [Range(self._low, self._high)]
+        most = np.minimum(np.abs(self._low), np.abs(self._high))
+        relief = np.where(np.isfinite(most), most, 1.0)
+        limits += [SoftEffortOfVelocity(load, relief[load.commanded]) for load in loads]
+        if self._rate is not None:
+            limits.append(Rate(self._rate, self._period))
+        for way in self._positions:
+            braking = None if self._rate is None else self._rate[way.commanded]
+            limits.append(EndsOfVelocity(way, braking, self._ahead(way.signal), self._period))
+        return limits
 
-    def step(
-        self, desired: np.ndarray, before: np.ndarray, measured: Arrays, commanded: bool = True
-    ) -> tuple[np.ndarray, list[str]]:
-        """The set-point to apply, and which limits shaped it.
+    def _of_effort(self, loads: Sequence[Load]) -> list[Limit]:
+        limits: list[Limit] = [Range(self._low, self._high)]
+        if self._rate is not None:
+            limits.append(Rate(self._rate, self._period))
+        limits += [SoftEffortOfEffort(load) for load in loads]
+        limits += [EndsOfEffort("range", way) for way in self._positions]
+        limits += [EndsOfEffort("velocity", way) for way in self._velocities]
+        return limits
+
+    def _ahead(self, signal: str) -> float:
+        """How old [s] a measurement may be by the time at which a drive has followed what was made of it."""
+        return self._config.signals[signal].stale_after + 2 * self._period + RESPONSE
+
+    def start(self, measured: Arrays) -> np.ndarray:
+        """Begin where the robot is: at its position, or without velocity or effort. Shape (n,)."""
+        self._speed = np.zeros(self._size)
+        if self._quantity == "position":
+            value = measured[self._config.command.signal]
+            self.set_point = np.where(np.isfinite(value), value, self.set_point)
+        else:
+            self.set_point = np.zeros(self._size)
+        return self.set_point
+
+    def forget(self) -> None:
+        """There is no set-point any more."""
+        self.set_point = np.full(self._size, np.nan)
+        self._speed = np.zeros(self._size)
+
+    def step(self, desired: np.ndarray | None, measured: Arrays, is_parking: bool = False) -> list[str]:
+        """Take `set_point` one cycle further.
 
         Args:
-            desired: What is asked for [unit of the commanded signal], shape (n,).
-            before: What was applied in the cycle before, shape (n,).
-            measured: The newest valid values; an element that is NaN limits nothing.
-            commanded: Whether `desired` comes from outside; a set-point that is merely held is not pulled into range.
+            desired: What is asked for [unit of the commanded signal], shape (n,); None: hold, which of a velocity or
+                effort is 0.
+            measured: The newest valid values; an element that is NaN limits nothing, or everything, as the limit says.
+            is_parking: Whether to move no faster than `stop.speed`.
 
         Returns:
-            Applied set-points, shape (n,), and a sorted subset of `range`, `rate`, `tension`.
+            A sorted subset of `range`, `rate`, `acceleration`, `tension`, `effort`, `velocity`: which limits acted.
         """
-        limited = []
-        if commanded:
-            inside = np.minimum(np.maximum(desired, self._low), self._high)
-            if (inside != desired).any():
-                limited.append("range")
-            desired = inside
-        wanted = desired - before
-        step = np.minimum(np.maximum(wanted, -self._step), self._step)
-        if (step != wanted).any():
-            limited.append("rate")
-        if self._tension is not None and self._relax(step, before, measured[self._tension]):
-            limited.append("tension")
-        return before + step, limited
+        before = self.set_point
+        wanted = desired
+        if wanted is None:
+            wanted = before if self._quantity == "position" else np.zeros(self._size)
+        turn = Turn(before, self._speed, measured, desired is not None)
+        acted = set()
+        for limit in self._parking if is_parking else self._limits:
+            limited = limit.limit(wanted, turn)
+            if limited is not wanted:
+                acted.add(limit.name)
+                wanted = limited
+        self._speed = (wanted - before) / self._period
+        self.set_point = wanted
+        return sorted(acted)
 
-    def _relax(self, step: np.ndarray, before: np.ndarray, tension: np.ndarray) -> bool:
-        """Raise the steps [unit] of tense muscles in place; whether any was raised."""
-        tension = tension[self._cell]
-        tense = tension > self._soft * (1 - SOFT_BAND)
-        if not tense.any():
-            return False
-        headroom = (self._soft - tension) / (SOFT_BAND * self._soft)
-        excess = np.minimum((tension - self._soft) / self._over, 1.0)
-        least = self._pay_out[self._muscle] * np.where(tension > self._soft, excess, -headroom)
-        room = np.maximum(self._high - before, 0.0)[self._muscle]
-        mine = step[self._muscle]
-        raised = np.where(tense, np.maximum(mine, np.minimum(least, room)), mine)
-        step[self._muscle] = raised
-        return bool((raised != mine).any())
+    def trip(self, measured: Arrays) -> str:
+        """Why the robot must stop, in a sentence; empty if it need not. Values that are not valid trip nothing."""
+        return self._trips.trip(measured)
 
-    def misplaced(self, measured: np.ndarray) -> list[int]:
-        """Which measured elements of the commanded signal, shape (n,), are so far out of range that they must be wrong.
+    def excluded(self, measured: Arrays) -> str:
+        """Why the robot must not be enabled where it is, in a sentence; empty if it may."""
+        return self._trips.excluded(measured)
 
-        A drive that is pulled into range from there would pull for long, on the word of a calibration that is off.
-        """
-        margin = MISPLACED * (self._high - self._low)
-        wrong = (measured < self._low - margin) | (measured > self._high + margin)
-        return [int(index) for index in np.flatnonzero(wrong)]
-
-    def trip(self, measured: Arrays) -> str | None:
-        """A sentence if a measured value is over its `trip_high`, else None; invalid values trip nothing."""
-        for signal, high in self._trips.items():
-            over = measured[signal] > high
-            if over.any():
-                index = int(np.argmax(over))
-                name, value = self._elements[signal][index], measured[signal][index]
-                return f"{signal}.{name} is {value:.4g}, over its trip limit of {high:g}. What is the robot caught on?"
-        return None
-
-    def blind(self, measured: Arrays) -> list[str]:
-        """Commanded elements whose tension is not known, so that its soft limit cannot act."""
-        if self._tension is None:
-            return []
-        names = self._elements[self._tension]
-        return [names[cell] for cell in self._cell if not np.isfinite(measured[self._tension][cell])]
+    def blind(self, measured: Arrays) -> str:
+        """Which limits cannot act for want of a measurement, in a sentence; empty if all can."""
+        told = []
+        for limit in self._limits:
+            names = limit.blind(measured)
+            if names:
+                told.append(f"The {limit.name} limit cannot act without a valid {limit.needs} of {', '.join(names)}.")
+        return " ".join(told)

@@ -1,16 +1,23 @@
-"""What the robot is doing, and what may happen next: off, enabling, hold, follow, stopping, fault."""
+"""What the robot is doing, and what may happen next."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from enum import StrEnum
 
-from hal.config import CommandConfig
+from hal.actuators import Actuators
+from hal.config import RobotConfig
 from hal.device import Device, DeviceState
 from hal.errors import CommandRefused
 
 ENABLE_TIMEOUT = 2.0
 """How long [s] all drives together may take to enable; a brake needs some 0.1 s."""
 DISABLE_TIMEOUT = 1.0
-"""How long [s] they may take to let go."""
+"""How long [s] they may take to let go, a quick stop included."""
+HOMING_TIMEOUT = 60.0
+"""How long [s] a device may look for its zero."""
+QUICK_STOPS = 5
+"""In so many cycles a quick stop is asked for: a frame may be lost."""
+PARK_SETTLE = 0.3
+"""How long [s] the robot rests in its safe posture before it lets go."""
 
 
 class Mode(StrEnum):
@@ -19,32 +26,59 @@ class Mode(StrEnum):
     OFF = "off"
     ENABLING = "enabling"
     HOLD = "hold"
-    """Enabled; the set-point stays where it is."""
+    """Enabled; the set-point stays where it is, which of a velocity or an effort is 0."""
     FOLLOW = "follow"
     """Enabled; a command younger than its time to live is followed."""
+    HOMING = "homing"
+    """One device looks for its zero, all others are off."""
     STOPPING = "stopping"
-    """Holding for the last time, or waiting for the drives to let go; takes no commands."""
+    """Does what the robot file's `stop` says, or waits for the drives to let go; takes no commands."""
     FAULT = "fault"
-    """Disabled because something is wrong; left by `reset` only."""
+    """Stopped and without power because something is wrong; left by `reset` only."""
+
+
+class Act(StrEnum):
+    """What the drives are to do in a cycle."""
+
+    IDLE = "idle"
+    START = "start"
+    """Be enabled where they are."""
+    HOLD = "hold"
+    FOLLOW = "follow"
+    DAMP = "damp"
+    PARK = "park"
+
+
+_ACTS = {Mode.ENABLING: Act.START, Mode.HOLD: Act.HOLD, Mode.FOLLOW: Act.FOLLOW}
+_STOPS = {"hold": Act.HOLD, "damp": Act.DAMP, "park": Act.PARK, "off": Act.IDLE}
 
 
 class ModeMachine:
     """The mode, its deadlines, and the one sentence that says why there is a fault. Not thread safe."""
 
-    def __init__(self, actuators: Sequence[Device], command: CommandConfig) -> None:
-        self._actuators = tuple(actuators)
-        self._hold = command.hold
+    def __init__(self, actuators: Actuators, config: RobotConfig) -> None:
+        self._actuators = actuators
+        self._hold = config.command.hold
+        self._stop_act = _STOPS[config.stop.behaviour]
+        self._park_time = _park_time(config)
         self._deadline = 0.0
-        self._letting_go = False
+        self._act = Act.IDLE
+        self._quick_stops = 0
+        self._homing: Device | None = None
+        self._homing_seen = False
+        self._parked_at: float | None = None
         self.mode = Mode.OFF
         self.fault_text = ""
 
     @property
-    def powered(self) -> bool:
+    def act(self) -> Act:
+        """What the drives are to do in this cycle."""
+        return self._act if self.mode is Mode.STOPPING else _ACTS.get(self.mode, Act.IDLE)
+
+    @property
+    def is_powered(self) -> bool:
         """Whether set-points are sent."""
-        return self.mode in (Mode.FOLLOW, Mode.HOLD, Mode.ENABLING) or (
-            self.mode is Mode.STOPPING and not self._letting_go
-        )
+        return self.act is not Act.IDLE
 
     @property
     def takes_commands(self) -> bool:
@@ -52,112 +86,215 @@ class ModeMachine:
         return self.mode is Mode.FOLLOW or self.mode is Mode.HOLD
 
     def enable(self, now: float) -> None:
-        """Ask all drives to hold where they are.
+        """Ask all drives to start from where they are.
 
         Raises:
-            CommandRefused: In fault, stopping, or a drive is not ready.
+            CommandRefused: In fault, homing, stopping, or a drive is not ready.
         """
         if self.mode in (Mode.HOLD, Mode.FOLLOW, Mode.ENABLING):
             return
-        if self.mode is Mode.FAULT:
-            raise CommandRefused(f"The robot is in fault: {self.fault_text} Reset it first.")
-        if self.mode is Mode.STOPPING:
-            raise CommandRefused("The robot is still stopping. Enable it when its mode is 'off'.")
-        if not self._actuators:
+        self._check_off("enable")
+        if not self._actuators.devices:
             raise CommandRefused("The robot has no device that can be commanded.")
-        for device in self._actuators:
+        for device in self._actuators.devices:
             health = device.health()
             if health.state is not DeviceState.READY:
                 raise CommandRefused(
                     f"'{device.name}' is {health.state}, not ready, so nothing was enabled. {health.text}".rstrip()
                 )
-        for device in self._actuators:
-            device.enable()
+        self._actuators.enable()
         self.mode = Mode.ENABLING
         self._deadline = now + ENABLE_TIMEOUT
 
+    def home(self, device: Device, now: float) -> None:
+        """Ask one device to find its zero.
+
+        Raises:
+            CommandRefused: The robot is not off, or the device is not ready or has no homing.
+        """
+        self._check_off("home")
+        health = device.health()
+        if health.state is not DeviceState.READY:
+            raise CommandRefused(f"'{device.name}' is {health.state}, not ready. {health.text}".rstrip())
+        device.home()
+        self._homing, self._homing_seen = device, False
+        self.mode, self._deadline = Mode.HOMING, now + HOMING_TIMEOUT
+
+    def _check_off(self, verb: str) -> None:
+        if self.mode is Mode.FAULT:
+            raise CommandRefused(f"The robot is in fault: {self.fault_text} Reset it first.")
+        if self.mode is Mode.STOPPING:
+            raise CommandRefused(f"The robot is still stopping. Ask to {verb} when its mode is 'off'.")
+        if self.mode is not Mode.OFF:
+            raise CommandRefused(f"The robot is in mode '{self.mode}'. Ask to {verb} when it is 'off'.")
+
     def disable(self, now: float) -> None:
-        """Let go at once."""
+        """Let go at once; a device that homes stops first."""
         if self.mode in (Mode.OFF, Mode.FAULT):
             return
-        for device in self._actuators:
-            device.disable()
-        self.mode, self._letting_go, self._deadline = Mode.STOPPING, True, now + DISABLE_TIMEOUT
+        self._let_go(now, self._actuators.quick_stop if self.mode is Mode.HOMING else self._actuators.disable)
+
+    def halt(self, now: float) -> None:
+        """Stop as fast as the drives can, and let go."""
+        if self.mode not in (Mode.OFF, Mode.FAULT):
+            self._let_go(now, self._actuators.quick_stop)
 
     def stop(self, now: float) -> None:
-        """Hold at once, and let go when the robot file's `command.hold` is over."""
+        """Do what the robot file's `stop` says, then let go."""
         if self.mode in (Mode.HOLD, Mode.FOLLOW):
-            self.mode, self._letting_go, self._deadline = Mode.STOPPING, False, now + self._hold
-        elif self.mode is Mode.ENABLING:
+            self._begin_stop(now)
+        elif self.mode in (Mode.ENABLING, Mode.HOMING):
             self.disable(now)
 
+    def _begin_stop(self, now: float) -> None:
+        if self._stop_act is Act.IDLE:
+            self._let_go(now, self._actuators.disable)
+            return
+        self.mode, self._act, self._parked_at = Mode.STOPPING, self._stop_act, None
+        self._deadline = now + (self._park_time if self._stop_act is Act.PARK else self._hold)
+
+    def _let_go(self, now: float, act: Callable[[], None]) -> None:
+        self.mode, self._act, self._deadline = Mode.STOPPING, Act.IDLE, now + DISABLE_TIMEOUT
+        act()
+
     def fault(self, text: str) -> None:
-        """Disable everything and stay so until `reset`; the first cause is the one that is told."""
-        for device in self._actuators:
-            device.disable()
+        """Stop everything as fast as the drives can, and stay so until `reset`; the first cause is the one told."""
         if self.mode is not Mode.FAULT:
-            self.mode, self.fault_text = Mode.FAULT, text
+            self.mode, self.fault_text, self._quick_stops = Mode.FAULT, text, QUICK_STOPS
+        self._actuators.quick_stop()
+
+    def emergency(self, text: str) -> None:
+        """`fault` in any mode, also in `off` and `fault`, without asking the drives: whoever calls does."""
+        if self.mode is Mode.FAULT and text not in self.fault_text:
+            text = f"{text} Before that: {self.fault_text}"
+        self.mode, self.fault_text, self._quick_stops = Mode.FAULT, text, QUICK_STOPS
 
     def reset(self) -> None:
         """Leave the fault; enables nothing.
 
         Raises:
-            CommandRefused: The robot is enabled.
+            CommandRefused: The robot is enabled, or a drive does not let go.
         """
         if self.mode not in (Mode.OFF, Mode.FAULT):
             raise CommandRefused(f"The robot is in mode '{self.mode}', there is no fault to reset.")
+        powered = [d.name for d in self._actuators.devices if d.health().state in _POWERED]
+        if powered:
+            raise CommandRefused(f"Still enabled: {', '.join(powered)}. If they do not let go, cut the power.")
         self.mode, self.fault_text = Mode.OFF, ""
 
-    def step(self, now: float, has_command: bool) -> None:
-        """Move on to the mode of this cycle; `has_command` says whether an accepted command is still alive."""
-        if self.mode in (Mode.OFF, Mode.FAULT):
+    def step(self, now: float, has_command: bool, is_parked: bool = False) -> None:
+        """Move on to the mode of this cycle.
+
+        Args:
+            now: Monotonic time [s].
+            has_command: Whether an accepted command is still alive.
+            is_parked: Whether the set-point is the safe posture.
+        """
+        if self.mode is Mode.FAULT:
+            if self._quick_stops:
+                self._quick_stops -= 1
+                self._actuators.quick_stop()
             return
-        states = [device.health().state for device in self._actuators]
+        states = self._actuators.states()
         problem = self._problem(states)
         if problem:
             self.fault(problem)
-            return
-        _STEPS[self.mode](self, now, states, has_command)
+        elif self.mode is not Mode.OFF:
+            _STEPS[self.mode](self, now, states, has_command, is_parked)
 
     def _problem(self, states: list[DeviceState]) -> str:
         """Why the group must stop, given the drives' states; empty if it need not."""
-        may_be_ready = self.mode is Mode.ENABLING or (self.mode is Mode.STOPPING and self._letting_go)
-        for device, state in zip(self._actuators, states, strict=True):
-            if state is not DeviceState.ENABLED and not (may_be_ready and state is DeviceState.READY):
+        if self.mode is Mode.OFF or self.mode is Mode.HOMING:
+            for device, state in zip(self._actuators.devices, states, strict=True):
+                if state in _POWERED and device is not self._homing:
+                    return f"'{device.name}' is {state}, which nobody asked for. {device.health().text}".rstrip()
+            return ""
+        fits = _FIT[self.mode] if self.act is not Act.IDLE else _LETTING_GO
+        for device, state in zip(self._actuators.devices, states, strict=True):
+            if state not in fits:
                 return f"'{device.name}' is {state} while the robot is in mode '{self.mode}'. {device.health().text}"
         return ""
 
-    def _enabling(self, now: float, states: list[DeviceState], has_command: bool) -> None:
+    def _enabling(self, now: float, states: list[DeviceState], has_command: bool, is_parked: bool) -> None:
         if all(state is DeviceState.ENABLED for state in states):
             self.mode, self._deadline = Mode.HOLD, now + self._hold
         elif now > self._deadline:
-            late = [d.name for d, s in zip(self._actuators, states, strict=True) if s is not DeviceState.ENABLED]
-            self.fault(f"Not enabled within {ENABLE_TIMEOUT:g} s: {', '.join(late)}. Is the motor supply on?")
+            late = self._actuators.named(states, DeviceState.ENABLED)
+            self.fault(f"Not enabled within {ENABLE_TIMEOUT:g} s: {late}. Is the motor supply on?")
 
-    def _holding(self, now: float, states: list[DeviceState], has_command: bool) -> None:
+    def _holding(self, now: float, states: list[DeviceState], has_command: bool, is_parked: bool) -> None:
         if has_command:
             self.mode = Mode.FOLLOW
         elif now > self._deadline:
-            self.disable(now)
+            if self._stop_act is Act.HOLD:
+                self._let_go(now, self._actuators.disable)
+            else:
+                self._begin_stop(now)
 
-    def _following(self, now: float, states: list[DeviceState], has_command: bool) -> None:
+    def _following(self, now: float, states: list[DeviceState], has_command: bool, is_parked: bool) -> None:
         if not has_command:
             self.mode, self._deadline = Mode.HOLD, now + self._hold
 
-    def _stopping(self, now: float, states: list[DeviceState], has_command: bool) -> None:
-        if not self._letting_go:
+    def _stopping(self, now: float, states: list[DeviceState], has_command: bool, is_parked: bool) -> None:
+        if self._act is Act.PARK:
+            self._park(now, is_parked)
+        elif self._act is not Act.IDLE:
             if now > self._deadline:
-                self.disable(now)
+                self._let_go(now, self._actuators.disable)
         elif all(state is DeviceState.READY for state in states):
-            self.mode = Mode.OFF
+            self.mode, self._homing = Mode.OFF, None
         elif now > self._deadline:
-            held = [d.name for d, s in zip(self._actuators, states, strict=True) if s is not DeviceState.READY]
-            self.fault(f"Still enabled {DISABLE_TIMEOUT:g} s after being disabled: {', '.join(held)}. Cut the power.")
+            held = self._actuators.named(states, DeviceState.READY)
+            self.fault(f"Still enabled {DISABLE_TIMEOUT:g} s after being disabled: {held}. Cut the power.")
+
+    def _park(self, now: float, is_parked: bool) -> None:
+        if not is_parked:
+            self._parked_at = None
+            if now > self._deadline:
+                self.fault(f"The robot was not parked within {self._park_time:g} s. What holds it back?")
+            return
+        if self._parked_at is None:
+            self._parked_at = now
+        if now >= self._parked_at + PARK_SETTLE:
+            self._let_go(now, self._actuators.disable)
+
+    def _find_zero(self, now: float, states: list[DeviceState], has_command: bool, is_parked: bool) -> None:
+        device = self._homing
+        assert device is not None
+        health = device.health()
+        if health.state is DeviceState.HOMING and now <= self._deadline:
+            self._homing_seen = True
+        elif health.state is DeviceState.HOMING:
+            self.fault(f"'{device.name}' has not found its zero within {HOMING_TIMEOUT:g} s.")
+        elif health.state is DeviceState.READY and self._homing_seen and not health.text:
+            self.mode, self._homing = Mode.OFF, None
+        elif health.state is not DeviceState.READY or self._homing_seen:
+            self.fault(f"'{device.name}' is {health.state} without having found its zero. {health.text}".rstrip())
+        elif now > self._deadline - HOMING_TIMEOUT + ENABLE_TIMEOUT:
+            self.fault(f"'{device.name}' has not begun to look for its zero. {health.text}".rstrip())
 
 
-_STEPS: dict[Mode, Callable[[ModeMachine, float, list[DeviceState], bool], None]] = {
+_POWERED = (DeviceState.ENABLED, DeviceState.HOMING)
+_LETTING_GO = (DeviceState.ENABLED, DeviceState.HOMING, DeviceState.READY)
+_FIT = {
+    Mode.ENABLING: (DeviceState.ENABLED, DeviceState.READY),
+    Mode.HOLD: (DeviceState.ENABLED,),
+    Mode.FOLLOW: (DeviceState.ENABLED,),
+    Mode.STOPPING: (DeviceState.ENABLED,),
+}
+_STEPS: dict[Mode, Callable[[ModeMachine, float, list[DeviceState], bool, bool], None]] = {
     Mode.ENABLING: ModeMachine._enabling,
     Mode.HOLD: ModeMachine._holding,
     Mode.FOLLOW: ModeMachine._following,
+    Mode.HOMING: ModeMachine._find_zero,
     Mode.STOPPING: ModeMachine._stopping,
 }
+
+
+def _park_time(config: RobotConfig) -> float:
+    """How long [s] parking may take: twice the longest way that the ranges allow, and 5 s."""
+    if config.stop.park is None or config.stop.speed is None:
+        return 0.0
+    low, high = config.bounds(config.command.signal)
+    longest = float((high - low).max())
+    return 60.0 if longest == float("inf") else 5.0 + 2.0 * longest / config.stop.speed

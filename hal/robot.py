@@ -1,32 +1,33 @@
 """Named devices read and commanded together: one coherent sample per cycle, and one mode for all drives."""
 
-import threading
 from collections.abc import Sequence
 from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
 
-from hal.bus import Bus, BusClock, BusState
+from hal.actuators import Actuators
+from hal.bus import Bus
 from hal.caretaker import Caretaker
-from hal.clock import Clock, SystemClock
+from hal.clock import BusClock, Clock, SystemClock
 from hal.config import RobotConfig
-from hal.device import Device
-from hal.errors import CommandRefused, ConfigError
+from hal.device import Device, DeviceState
+from hal.errors import CommandRefused
 from hal.fleet import build
 from hal.limits import Limiter
-from hal.modes import Mode, ModeMachine
+from hal.modes import Act, Mode, ModeMachine
+from hal.safety.emergency import Emergency, EmergencyStop
+from hal.safety.start import Start
+from hal.safety.turns import PATIENCE, Turns
 from hal.sample import Applied, Assembler, Sample
-from hal.watchdog import CommandWatchdog
+from hal.watchdog import CommandWatchdog, CycleWatchdog, checked
 
 __all__ = ["Applied", "Robot", "Sample", "open_robot"]
 
 ANSWER_SHARE = 0.6
 """Part of the period that the cycle waits for the answers to its SYNC."""
-START_MEMORY = 0.25
-"""The robot may be enabled where all its drives were seen not longer ago [s]: a lost frame is no obstacle."""
-CLOSING_CYCLES = 20
-"""How many cycles `close` spends on letting the drives go."""
+CLOSING_TIME = 1.5
+"""How long [s] `close` waits for the drives to come to rest and let go."""
 
 
 class Robot:
@@ -47,7 +48,8 @@ class Robot:
         """Put a robot together; nothing is opened yet.
 
         Raises:
-            ConfigError: The devices do not measure each element once, or do not command each element once.
+            ConfigError: The devices do not measure each element once, do not command each element once, or cannot do
+                what the limits and the stop behaviour need.
         """
         self.config = config
         self.period = 1.0 / config.rates.hal
@@ -55,20 +57,20 @@ class Robot:
         self._devices = tuple(devices)
         self._buses = tuple(buses)
         self._clock: Clock = clock or SystemClock()
-        self._lock = threading.RLock()
+        self._turns = Turns()
         self._assembler = Assembler(config, devices)
-        self._limiter = Limiter(config, self.period)
+        self._actuators = Actuators(config, devices)
+        self._limiter = Limiter(config, self.period, devices, self._actuators.quantity)
         self._watchdog = CommandWatchdog(config.command.time_to_live, self.period)
-        actuators = [device for device in devices if device.commands]
-        self._modes = ModeMachine(actuators, config.command)
-        self._commanded = tuple(zip(actuators, _places(config, actuators), strict=True))
+        self._cycle_watchdog = CycleWatchdog()
+        self._modes = ModeMachine(self._actuators, config)
+        self._emergency = EmergencyStop(config, self._actuators.devices, self._buses, self._clock, self.period)
         self._caretaker = Caretaker(devices) if self._buses else None
-        size = config.signals[config.command.signal].size
-        self._nothing = np.full(size, np.nan)
+        self._park = None if config.stop.park is None else np.array(config.stop.park)
+        commanded = config.signals[config.command.signal]
+        self._start = Start(config.command.signal, commanded.elements)
+        self._nothing = np.full(commanded.size, np.nan)
         self._nothing.flags.writeable = False
-        self._set_point = self._nothing
-        self._position = self._nothing
-        self._position_known = -np.inf
         self._desired: tuple[np.ndarray, float] | None = None
         self._measured = {name: np.full(config.signals[name].size, np.nan) for name in self._assembler.signals}
         self._number = 0
@@ -118,15 +120,17 @@ class Robot:
             device.open()
 
     def close(self) -> None:
-        """Let the drives go and give everything back. Safe to call twice."""
+        """Stop the drives as fast as they can, and give everything back. Safe to call twice."""
         if not self._is_open:
             return
         self._is_open = False
-        self.disable()
-        for _ in range(CLOSING_CYCLES):
-            if self._modes.mode in (Mode.OFF, Mode.FAULT):
-                break
-            self.cycle()
+        with self._turns.within(PATIENCE) as is_free:
+            if is_free:
+                self._modes.halt(self._clock.monotonic())
+        if is_free:
+            self._settle()
+        else:
+            self.estop("The HAL ends while its cycle is stuck.")
         if self._caretaker:
             self._caretaker.stop()
         else:
@@ -135,46 +139,72 @@ class Robot:
         for bus in self._buses:
             bus.close()
 
+    def _settle(self) -> None:
+        """Cycle until no drive has power, or it is clear that one does not let go."""
+        due = self._clock.monotonic()
+        for _ in range(round(CLOSING_TIME / self.period)):
+            self.cycle()
+            if not {DeviceState.ENABLED, DeviceState.HOMING} & set(self._actuators.states()):
+                return
+            due += self.period
+            if self._buses:
+                self._clock.sleep_until(due)
+
     def enable(self) -> None:
         """Ask the drives to hold where the robot is; `mode` becomes `hold` when all do.
 
         Raises:
-            CommandRefused: In fault or stopping, a drive is not ready, or its position is not known.
+            CommandRefused: In fault or stopping, a drive is not ready, its position is not known, or the limits exclude
+                where the robot is.
         """
-        with self._lock:
+        with self._turns.question():
             if self._modes.mode is Mode.OFF:
-                self._check_start()
+                self._start.check(self._clock.monotonic(), self._limiter)
                 self._desired = None
-                self._set_point = self._position.copy()
+                self._limiter.start(self._start.known)
             self._modes.enable(self._clock.monotonic())
 
-    def _check_start(self) -> None:
-        """Whether the robot is where it may be enabled."""
-        signal = self.config.command.signal
-        names = self.config.signals[signal].elements
-        if self._clock.monotonic() - self._position_known > START_MEMORY:
-            unknown = [
-                name for name, value in zip(names, self._measured[signal], strict=True) if not np.isfinite(value)
-            ]
-            raise CommandRefused(
-                f"No valid {signal} of {', '.join(unknown or names)}, so there is nothing to start from. "
-                "Is the cycle running, does the drive answer?"
-            )
-        misplaced = self._limiter.misplaced(self._position)
-        if misplaced:
-            told = ", ".join(f"{names[index]} {self._position[index]:.4g}" for index in misplaced)
-            raise CommandRefused(f"Far outside limits.{signal}: {told}. Are zero and direction of these drives right?")
+    def home(self, device: str) -> None:
+        """Ask one device to find its zero, which moves it; the robot's mode is `homing` until it has.
+
+        Raises:
+            CommandRefused: The robot is not off, there is no such device, or it is not ready or has no homing.
+        """
+        named = {one.name: one for one in self._actuators.devices}
+        if device not in named:
+            raise CommandRefused(f"There is no drive '{device}' to home. Drives: {', '.join(named)}.")
+        with self._turns.question():
+            self._modes.home(named[device], self._clock.monotonic())
 
     def disable(self) -> None:
         """Let go at once."""
-        with self._lock:
+        with self._turns.question():
             self._modes.disable(self._clock.monotonic())
 
     def stop(self, reason: str) -> None:
-        """Hold at once, take no more commands, and let go after the robot file's `command.hold`."""
-        with self._lock:
+        """Take no more commands, do what the robot file's `stop` says, and let go."""
+        with self._turns.question():
             self._stop_reason = reason
             self._modes.stop(self._clock.monotonic())
+
+    def estop(self, reason: str) -> Emergency:
+        """Stop every drive as fast as it can, whatever the robot is doing, and stay in fault until `reset`.
+
+        Works in every mode, from several threads at once, and when the cycle is stuck. Blocks until every drive has
+        said that it is without power, about a second at most. This is no safety-rated emergency stop.
+
+        Args:
+            reason: Told as the cause of the fault.
+
+        Returns:
+            What every drive did, and whether all of them stopped.
+        """
+        text = f"Emergency stop: {reason}"
+        self._emergency.latch(text)
+        with self._turns.within(self._emergency.LOCK_TIMEOUT):
+            self._modes.emergency(text)
+            asked = self._emergency.ask()
+        return self._emergency.watch(asked, lambda: self._number)
 
     def reset(self) -> None:
         """Leave the fault, here and in the drives; enables nothing.
@@ -182,8 +212,9 @@ class Robot:
         Raises:
             CommandRefused: The robot is enabled.
         """
-        with self._lock:
+        with self._turns.question():
             self._modes.reset()
+            self._emergency.unlatch()
             for device in self._devices:
                 device.reset()
 
@@ -197,15 +228,9 @@ class Robot:
         Raises:
             CommandRefused: A wrong size, not finite, the robot is not enabled, the cycle unknown or too long ago.
         """
-        desired = np.array(desired, float)
         signal = self.config.command.signal
-        if desired.shape != self._nothing.shape:
-            raise CommandRefused(f"A command of {signal} has {self._nothing.size} values, not shape {desired.shape}.")
-        finite = np.isfinite(desired)
-        if not finite.all():
-            name = self.config.signals[signal].elements[int(np.argmin(finite))]
-            raise CommandRefused(f"The command's {signal}.{name} is {desired[np.argmin(finite)]}; it must be finite.")
-        with self._lock:
+        desired = checked(desired, signal, self.config.signals[signal].elements)
+        with self._turns.question():
             expires = self._watchdog.expiry(cycle, self._clock.monotonic())
             if not self._modes.takes_commands:
                 raise CommandRefused(
@@ -215,10 +240,21 @@ class Robot:
             self._desired = (desired, expires)
 
     def cycle(self) -> tuple[Sample, Applied]:
-        """One whole turn: limits, set-points, SYNC on all buses, the answers, the sample."""
+        """One whole turn: limits, set-points, SYNC on all buses, the answers, the sample.
+
+        What a driver raises is a fault of the robot, and passed on.
+        """
+        try:
+            return self._cycle()
+        except Exception as error:
+            with self._turns.cycle():
+                self._modes.fault(f"The cycle failed: {type(error).__name__}: {error}")
+            raise
+
+    def _cycle(self) -> tuple[Sample, Applied]:
         for bus in self._buses:
             bus.begin()
-        with self._lock:
+        with self._turns.cycle():
             start = self._clock.monotonic()
             stamp = self._clock.now_ns()
             self._number += 1
@@ -231,93 +267,74 @@ class Robot:
             complete &= bus.wait(start + ANSWER_SHARE * self.period)
         values, age, valid = self._assembler.assemble(self._clock.monotonic())
         self._measured = values
-        position = values[self.config.command.signal]
-        if np.isfinite(position).all():
-            self._position, self._position_known = position, start
+        self._start.note(values, start)
         self._incomplete += not complete
         return Sample(self._number, stamp, self.source, complete, values, age, valid), applied
 
     def _act(self, now: float, stamp: int) -> Applied:
         """Move on to this cycle's mode and send its set-points."""
-        modes = self._modes
-        if modes.mode is not Mode.OFF and modes.mode is not Mode.FAULT:
-            problem = self._limiter.trip(self._measured) or self._bus_problem()
-            if problem:
-                modes.fault(problem)
+        modes, limiter = self._modes, self._limiter
+        problem = self._cycle_watchdog.problem(now) or self._bus_problem() or limiter.trip(self._measured)
+        if self._emergency.latched and modes.mode is not Mode.FAULT:
+            modes.emergency(self._emergency.latched)
+        elif problem and modes.mode is not Mode.OFF and modes.mode is not Mode.FAULT:
+            modes.fault(problem)
         desired = self._desired
         if desired is not None and (now > desired[1] or not modes.takes_commands):
             self._desired = desired = None
-        modes.step(now, desired is not None)
-        limited: list[str] = []
-        if modes.powered:
-            limited = self._move(desired[0] if desired else None)
-            for device, places in self._commanded:
-                device.apply(self._set_point[places])
-        else:
-            self._set_point = self._nothing
-            for device, _ in self._commanded:
-                device.idle()
+        modes.step(now, desired is not None, self._park is not None and np.array_equal(limiter.set_point, self._park))
+        limited = self._move(modes.act, desired)
         return Applied(
             self._number,
             stamp,
             modes.mode.value,
             self.config.command.signal,
             desired[0] if desired else self._nothing,
-            self._set_point,
+            limiter.set_point,
             limited,
         )
 
-    def _move(self, desired: np.ndarray | None) -> list[str]:
-        """Take the set-point one step on; while enabling it is where the robot is, so that nothing jumps."""
-        if self._modes.mode is Mode.ENABLING:
-            measured = self._measured[self.config.command.signal]
-            self._set_point = np.where(np.isfinite(measured), measured, self._set_point)
-            return []
-        wanted = self._set_point if desired is None else desired
-        self._set_point, limited = self._limiter.step(wanted, self._set_point, self._measured, desired is not None)
+    def _move(self, act: Act, desired: tuple[np.ndarray, float] | None) -> list[str]:
+        """Take the set-point one step on and send it; which limits acted."""
+        limiter, actuators = self._limiter, self._actuators
+        limited: list[str] = []
+        if act is Act.IDLE or act is Act.DAMP:
+            limiter.forget()
+            if act is Act.DAMP:
+                actuators.damp()
+            else:
+                actuators.idle()
+            return limited
+        if act is Act.START:  # the set-point is where the robot is, so that nothing jumps
+            limiter.start(self._measured)
+        elif act is Act.PARK:
+            limited = limiter.step(self._park, self._measured, is_parking=True)
+        else:
+            limited = limiter.step(desired[0] if desired else None, self._measured)
+        actuators.apply(limiter.set_point, lambda: self._modes.is_powered)
         return limited
 
     def _bus_problem(self) -> str:
-        for bus in self._buses:
-            if bus.state in (BusState.GONE, BusState.BUS_OFF):
-                return f"Bus '{bus.name}' is {bus.state}. {bus.text}"
-        return ""
+        """What made a bus unusable since the cycle before; asked in every cycle, for it is told once."""
+        troubles = [(bus.name, bus.trouble()) for bus in self._buses]
+        return next((f"Bus '{name}' {trouble}" for name, trouble in troubles if trouble), "")
 
     def health(self) -> dict[str, Any]:
         """Mode, buses and devices in plain values: for status messages, not for control."""
-        devices = {}
-        for device in self._devices:
-            health = device.health()
-            devices[device.name] = {
-                "state": health.state.value,
-                "text": health.text,
-                "counters": dict(health.counters),
-            }
-        blind = self._limiter.blind(self._measured)
         return {
             "mode": self.mode,
             "fault": self.fault_text,
             "stop_reason": self._stop_reason,
             "cycles": self._number,
             "incomplete": self._incomplete,
-            "limits": f"The tension limit cannot act without a valid tension of {', '.join(blind)}." if blind else "",
+            "limits": self._limiter.blind(self._measured),
             "buses": {bus.name: bus.health() for bus in self._buses},
-            "devices": devices,
+            "devices": {
+                device.name: {"state": health.state.value, "text": health.text, "counters": dict(health.counters)}
+                for device in self._devices
+                if (health := device.health())
+            },
         }
-
-
-def _places(config: RobotConfig, actuators: Sequence[Device]) -> list[np.ndarray]:
-    """For each actuator, where its commanded elements lie in the commanded signal."""
-    signal = config.command.signal
-    names = [f"{signal}.{element}" for element in config.signals[signal].elements]
-    commanded = [element for device in actuators for element in device.commands]
-    if sorted(commanded) != sorted(names):
-        wrong = sorted(set(names) ^ set(commanded)) or sorted({e for e in commanded if commanded.count(e) > 1})
-        raise ConfigError(
-            f"The devices of '{config.robot}' must command each element of '{signal}' once; "
-            f"that fails for {', '.join(wrong)}."
-        )
-    return [np.array([names.index(element) for element in device.commands]) for device in actuators]
 
 
 def open_robot(config: RobotConfig, clock: BusClock | None = None) -> Robot:

@@ -1,8 +1,27 @@
-"""The age of a command, taken from the cycle whose sample it answers."""
+"""Who watches the clock: the age of a command, taken from the cycle whose sample it answers, and the cycle itself."""
 
 import math
+from collections.abc import Sequence
+
+import numpy as np
 
 from hal.errors import CommandRefused
+
+
+def checked(desired: np.ndarray, signal: str, elements: Sequence[str]) -> np.ndarray:
+    """A copy of a command of a signal [its unit], shape (n,).
+
+    Raises:
+        CommandRefused: A wrong size, or not finite.
+    """
+    desired = np.array(desired, float)
+    if desired.shape != (len(elements),):
+        raise CommandRefused(f"A command of {signal} has {len(elements)} values, not shape {desired.shape}.")
+    finite = np.isfinite(desired)
+    if not finite.all():
+        place = int(np.argmin(finite))
+        raise CommandRefused(f"The command's {signal}.{elements[place]} is {desired[place]}; it must be finite.")
+    return desired
 
 
 class CommandWatchdog:
@@ -39,3 +58,22 @@ class CommandWatchdog:
                 "Is the sender too slow, or reading old samples?"
             )
         return now - age + self.time_to_live
+
+
+LONGEST_GAP = 0.2
+"""A cycle of an enabled robot that comes so long [s] after the one before stops it: nobody looked after the robot
+meanwhile, and drives that miss the HAL's heartbeat for 0.15 s have stopped by themselves."""
+
+
+class CycleWatchdog:
+    """Notices that the cycle itself did not turn: a frozen process, a machine that was suspended."""
+
+    def __init__(self) -> None:
+        self._before = math.inf
+
+    def problem(self, now: float) -> str:
+        """A cycle begins at monotonic time `now` [s]: why the robot must stop, in a sentence; empty if it need not."""
+        gap, self._before = now - self._before, now
+        if gap <= LONGEST_GAP:
+            return ""
+        return f"The cycle did not turn for {gap:.2f} s, longest allowed is {LONGEST_GAP:g} s. Was the HAL frozen?"

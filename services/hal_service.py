@@ -67,11 +67,7 @@ class HalService:
     def tick(self) -> None:
         """Take the commands that came, turn the robot once, publish."""
         self._intake.take()
-        try:
-            sample, applied = self._robot.cycle()
-        except Exception as error:
-            self._robot.stop(f"The cycle failed: {error}")
-            raise
+        sample, applied = self._robot.cycle()
         self._samples.put(
             messages.Sample(
                 stamp_ns=sample.stamp_ns,

@@ -50,13 +50,14 @@ class EndsOfVelocity:
     """
 
     name = "range"
+    needs = "position"
 
-    def __init__(self, position: Way, deceleration: float | None, ahead: float, period: float) -> None:
+    def __init__(self, position: Way, deceleration: np.ndarray | None, ahead: float, period: float) -> None:
         """Prepare.
 
         Args:
             position: Of the commanded elements.
-            deceleration: How fast the command may brake [unit of the command/s]; at once if None.
+            deceleration: How fast the command may brake [unit of the command/s], shape (k,); at once if None.
             ahead: How old [s] a position may be by the time at which the drive has followed a command.
             period: Of a cycle [s].
         """
@@ -92,17 +93,11 @@ class EndsOfEffort:
     Towards the other side it acts in full. Where position or velocity is not known the command is 0.
     """
 
-    def __init__(self, name: str, way: Way, ahead: float = 0.0, velocity: Way | None = None) -> None:
-        """Prepare.
-
-        Args:
-            name: As told in `Applied.limited_by`.
-            way: Positions or velocities of the commanded elements, and their bounds.
-            ahead: How far [s] a position is foretold by its velocity.
-            velocity: Velocities of the same elements; without it nothing is foretold.
-        """
+    def __init__(self, name: str, way: Way) -> None:
+        """`name` is told in `Applied.limited_by`; `way` are positions or velocities, and their bounds."""
         self.name = name
-        self._way, self._ahead, self._velocity = way, ahead, velocity
+        self.needs = "position" if name == "range" else name
+        self._way = way
         span = way.high - way.low
         scale = np.where(np.isfinite(span), span, np.maximum(np.abs(way.low), np.abs(way.high)))
         self._band = FADE_BAND * np.where(np.isfinite(scale), scale, 1.0)
@@ -111,8 +106,6 @@ class EndsOfEffort:
         """See `Limit.limit`."""
         way = self._way
         value = way.read(turn.measured)
-        if self._velocity is not None:
-            value = value + self._velocity.read(turn.measured) * self._ahead
         mine = wanted[way.commanded]
         left = np.where(mine > 0, way.high - value, value - way.low)
         share = np.minimum(np.maximum(left / self._band, 0.0), 1.0)

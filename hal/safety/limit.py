@@ -30,6 +30,8 @@ class Limit(Protocol):
 
     name: str
     """As told in `Applied.limited_by`."""
+    needs: str
+    """What must be measured for it, in a word; empty if nothing."""
 
     def limit(self, wanted: np.ndarray, turn: Turn) -> np.ndarray:
         """The set-point that may be applied [unit of the commanded signal], shape (n,).

@@ -30,6 +30,7 @@ class Range:
     """A command stays between the lowest and the highest value."""
 
     name = "range"
+    needs = ""
 
     def __init__(self, low: np.ndarray, high: np.ndarray) -> None:
         """Bounds [unit of the commanded signal], shapes (n,); infinite where there is none."""
@@ -50,9 +51,10 @@ class Rate:
     """A set-point changes by at most so much per second: of a position that is a velocity, of a velocity a ramp."""
 
     name = "rate"
+    needs = ""
 
-    def __init__(self, rate: float, period: float) -> None:
-        """`rate` [unit/s] for cycles of `period` [s]."""
+    def __init__(self, rate: np.ndarray | float, period: float) -> None:
+        """`rate` [unit/s], shape (n,) or one for all, for cycles of `period` [s]."""
         self._step = rate * period
 
     def limit(self, wanted: np.ndarray, turn: Turn) -> np.ndarray:
@@ -74,9 +76,10 @@ class Acceleration:
     """
 
     name = "acceleration"
+    needs = ""
 
-    def __init__(self, acceleration: float, period: float) -> None:
-        """`acceleration` [unit/s^2] for cycles of `period` [s]."""
+    def __init__(self, acceleration: np.ndarray | float, period: float) -> None:
+        """`acceleration` [unit/s^2], shape (n,) or one for all, for cycles of `period` [s]."""
         self._acceleration, self._period = acceleration, period
         self._change = acceleration * period
 

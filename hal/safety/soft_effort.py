@@ -24,8 +24,8 @@ class Load:
         elements: Names of the measured elements that count, as many as places.
         commanded: Places in the commanded signal, shape (k,).
         measured: Places in the measured signal, shape (k,).
-        soft: Load at which the command gives way [unit of the measured signal].
-        hard: Load at which it does so as fast as it may.
+        soft: Load at which the command gives way [unit of the measured signal], shape (k,).
+        hard: Load at which it does so as fast as it may, shape (k,).
         is_signed: Whether the load is a drive's own effort, which is relieved by moving against its sign. Otherwise
             it is the tension of a wire, which is relieved by letting the wire out.
     """
@@ -34,8 +34,8 @@ class Load:
     elements: Sequence[str]
     commanded: np.ndarray
     measured: np.ndarray
-    soft: float
-    hard: float
+    soft: np.ndarray
+    hard: np.ndarray
     is_signed: bool = False
 
     def read(self, measured: Arrays) -> np.ndarray:
@@ -61,7 +61,7 @@ class SoftEffort:
         low: np.ndarray,
         high: np.ndarray,
         period: float,
-        deceleration: float | None = None,
+        deceleration: np.ndarray | None = None,
     ) -> None:
         """Prepare.
 
@@ -71,9 +71,9 @@ class SoftEffort:
             low: Where relief ends [unit], shape (k,).
             high: Where relief ends on the other side [unit], shape (k,).
             period: Of a cycle [s].
-            deceleration: How fast a set-point may come to rest there [unit/s^2]; at once if None.
+            deceleration: How fast a set-point may come to rest there [unit/s^2], shape (k,); at once if None.
         """
-        self.name = "effort" if load.is_signed else "tension"
+        self.name = self.needs = "effort" if load.is_signed else "tension"
         self._load, self._relief, self._low, self._high = load, relief, low, high
         self._period, self._deceleration = period, deceleration
         self._watched = (1 - SOFT_BAND) * load.soft
@@ -111,7 +111,7 @@ class SoftEffortOfVelocity:
 
     def __init__(self, load: Load, relief: np.ndarray) -> None:
         """`relief` is the highest velocity towards relief [unit of the commanded signal], shape (k,)."""
-        self.name = "effort" if load.is_signed else "tension"
+        self.name = self.needs = "effort" if load.is_signed else "tension"
         self._load, self._relief = load, relief
         self._watched = (1 - SOFT_BAND) * load.soft
         self._over = load.hard - load.soft
@@ -143,7 +143,7 @@ class SoftEffortOfEffort:
     """
 
     def __init__(self, load: Load) -> None:
-        self.name = "effort" if load.is_signed else "tension"
+        self.name = self.needs = "effort" if load.is_signed else "tension"
         self._load = load
         self._watched = (1 - SOFT_BAND) * load.soft
 
@@ -166,7 +166,7 @@ class SoftEffortOfEffort:
         return self._load.unknown(measured)
 
 
-def towards_relief(size: np.ndarray, soft: float, over: float) -> np.ndarray:
+def towards_relief(size: np.ndarray, soft: np.ndarray, over: np.ndarray) -> np.ndarray:
     """How fast to move towards relief, as a part of the highest speed, shape (k,); negative: may load further."""
     below = (size - soft) / (SOFT_BAND * soft)
     return np.where(size > soft, np.minimum((size - soft) / over, 1.0), below)

@@ -154,6 +154,6 @@ def test_a_cycle_that_fails_stops_the_robot_and_the_service_goes_on(robot: str) 
         wires.is_broken = False
         clock.advance(body.period)
         hal.tick()
-        assert body.mode == "stopping"
-        assert hal.status().facts["stop_reason"] == "The cycle failed: a bug in a driver"
+        assert body.mode == "fault"
+        assert hal.status().text == "The cycle failed: ZeroDivisionError: a bug in a driver"
         body.close()
