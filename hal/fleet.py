@@ -1,30 +1,46 @@
 """The buses and devices that a robot file names, built but not opened."""
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
-from hal import budget, registry
-from hal.bus import Bus, BusClock
+from hal import budget, calibration_store, registry
+from hal.bus import Bus
+from hal.calibration import Calibration
+from hal.clock import BusClock
 from hal.config import DeviceConfig, RobotConfig
 from hal.device import Device
 from hal.drivers.can_device import Place
 from hal.errors import ConfigError
 
 
-def build(config: RobotConfig, clock: BusClock) -> tuple[list[Bus], list[Device]]:
+def build(
+    config: RobotConfig, clock: BusClock, calibrations: Mapping[str, Calibration] | None = None
+) -> tuple[list[Bus], list[Device]]:
     """Make every bus and every device of a robot.
 
+    Args:
+        config: The robot file.
+        clock: What the devices go by.
+        calibrations: Device -> what was measured of it; those that are stored beside the robot file if not given.
+
     Raises:
-        ConfigError: An unknown driver or interface, settings that do not fit, or a bus that would carry too much.
+        ConfigError: An unknown driver or interface, settings that do not fit, a bus that would carry too much, or a
+            stored calibration that is refused.
     """
+    if calibrations is None:
+        calibrations = calibration_store.load(config)
     budget.check(config)
     buses = {name: Bus(name, bus, clock) for name, bus in config.buses.items()}
     devices: list[Device] = []
     for name, entry in config.devices.items():
-        driver, settings = registry.equipment(config, name)
+        calibration = calibrations.get(name)
+        driver, settings = registry.equipment(config, name, calibration.settings if calibration else None)
         elements = _elements(driver, settings, entry, name)
         bounds = _bounds(config, elements.get(driver.commanded(settings)))
-        place = Place(name, elements, buses[entry.bus], entry.node, config.folder, config.rates.hal, bounds=bounds)
+        place = Place(
+            name, elements, buses[entry.bus], entry.node, config.folder, config.rates.hal, calibration, bounds
+        )
         devices.append(driver(place, settings))
     return list(buses.values()), devices
 

@@ -1,0 +1,238 @@
+"""One device of a robot, opened by itself with the motors off, and read while somebody knows the truth."""
+
+import contextlib
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+
+from hal import calibration_store, registry
+from hal.calibration_fit import CalibrationRefused, Line
+from hal.calibration_store import Point, Record
+from hal.clock import SystemClock
+from hal.config import RobotConfig
+from hal.errors import ConfigError, DeviceSilent
+from hal.fleet import build
+
+TRIES = 3
+SETTLE = 10
+"""Cycles before values count."""
+LEAST_VALID = 0.9
+"""Share of the cycles that must bring a value."""
+
+
+@dataclass(frozen=True, slots=True)
+class Subject:
+    """What is to be calibrated.
+
+    Attributes:
+        config: The robot file.
+        device: Name of the device.
+        element: `signal.element` that it measures.
+        place: Which of the channels of the device that is, from 0, of how many.
+        factor: Name of the setting beside `zero`: `direction` or `gain`.
+    """
+
+    config: RobotConfig
+    device: str
+    element: str
+    place: tuple[int, int]
+    factor: str
+
+    @property
+    def unit(self) -> str:
+        """Of the element."""
+        return self.config.signals[self.element.partition(".")[0]].unit
+
+    def in_force(self, identity: str) -> Line:
+        """Zero and direction or gain now: those of an earlier calibration of this very device, or the robot file's."""
+        settings = self._in_force(identity)
+        return Line(self._at(settings.zero, 0.0), self._at(getattr(settings, self.factor), 1.0), 0.0)
+
+    def settings(self, line: Line, identity: str) -> dict[str, Any]:
+        """What to lay over the robot file's settings, so that the element follows a line.
+
+        Raises:
+            ConfigError: The driver does not take it.
+        """
+        now = self._in_force(identity)
+        factor = round(line.factor) if self.factor == "direction" else line.factor
+        measured = {
+            "zero": self._with(now.zero, line.zero, 0.0),
+            self.factor: factor if self.factor == "direction" else self._with(getattr(now, self.factor), factor, 1.0),
+        }
+        registry.equipment(self.config, self.device, measured)
+        return measured
+
+    def _in_force(self, identity: str) -> Any:
+        measured: Mapping[str, Any] = {}
+        for record in calibration_store.records(self.config):
+            if record.device == self.device and record.identity == identity:
+                with contextlib.suppress(ConfigError):  # one that is refused is not in force
+                    measured = calibration_store.checked(self.config, record).settings
+        return registry.equipment(self.config, self.device, measured)[1]
+
+    def _at(self, given: Any, default: float) -> float:
+        chosen = given[self.place[0]] if isinstance(given, list | tuple) else given
+        return float(default if chosen is None else chosen)
+
+    def _with(self, given: Any, value: float, default: float) -> Any:
+        """The value, or where there are several channels a list in which the others keep theirs."""
+        position, count = self.place
+        if count == 1:
+            return [value] if isinstance(given, list | tuple) else value
+        values = list(given) if isinstance(given, list | tuple) else [given] * count
+        values[position] = value
+        return [default if one is None else one for one in values]
+
+
+def subject(config: RobotConfig, what: str, factor: str) -> Subject:
+    """Find what a person wants calibrated.
+
+    Args:
+        config: The robot file.
+        what: A device, or an element that it measures.
+        factor: `direction` or `gain`.
+
+    Raises:
+        ConfigError: There is no such device or element, or its driver has no such setting.
+    """
+    serving = [name for name, entry in config.devices.items() if what == name or what in entry.served]
+    if not serving:
+        raise ConfigError(f"'{what}' is neither a device nor an element of one. Devices: {', '.join(config.devices)}.")
+    device = serving[0]
+    driver, settings = registry.equipment(config, device)
+    missing = [name for name in ("zero", factor) if name not in driver.Settings.model_fields]
+    if missing:
+        other = "joint" if factor == "gain" else "cell"
+        raise ConfigError(
+            f"Device '{device}' has no setting '{missing[0]}' that could be measured. Is it `gemuco calibrate {other}`?"
+        )
+    entry, known = config.devices[device], driver.quantities(settings)
+    wanted = dict(entry.elements) if entry.element is None else {known[0]: entry.element}
+    named = [quantity for quantity, element in wanted.items() if element == what]
+    quantity = (named or [quantity for quantity in known if quantity in wanted])[0]
+    if factor == "direction" and quantity != known[0]:
+        raise ConfigError(f"'{what}' is the {quantity} of '{device}'; zero and direction are of its {known[0]}.")
+    channels = len(getattr(settings, "channels", (1,)))
+    return Subject(config, device, wanted[quantity], (known.index(quantity) if channels > 1 else 0, channels), factor)
+
+
+class Measuring:
+    """The device of a subject, open for as long as the context lasts; nothing is ever enabled.
+
+    It is read with a zero of 0 and a direction or gain of 1, so that what was stored before has no part in it.
+
+    Args:
+        what: What is to be calibrated.
+
+    Attributes:
+        identity: Of the device that answered.
+    """
+
+    identity: str
+
+    def __init__(self, what: Subject) -> None:
+        self._what = what
+        config = what.config
+        entry = config.devices[what.device]
+        plain = {**entry.settings, "zero": 0.0, what.factor: 1 if what.factor == "direction" else 1.0}
+        devices = {**config.devices, what.device: entry.model_copy(update={"settings": plain})}
+        self._clock = SystemClock()
+        self._period = 1.0 / config.rates.hal
+        alone = config.model_copy(update={"devices": devices, "limits": {}})  # limits are of calibrated values
+        buses, built = build(alone, self._clock, calibrations={})
+        self._bus = next(bus for bus in buses if bus.name == entry.bus)
+        self._device = next(device for device in built if device.name == what.device)
+        self._slot = self._device.measures.index(what.element)
+
+    def __enter__(self) -> Self:
+        self._bus.open()
+        try:
+            for left in reversed(range(TRIES)):
+                try:
+                    self._device.open()
+                    break
+                except DeviceSilent:
+                    if not left:
+                        raise
+            self.identity = self._device.identity
+        except BaseException:
+            self.__exit__(None, None, None)
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._device.close()
+        self._bus.close()
+
+    def look(self, known: float, duration: float, noise: float) -> Point:
+        """Average what the device reads for a while.
+
+        Args:
+            known: What it is in truth [the signal's unit].
+            duration: How long [s].
+            noise: Largest standard deviation and largest drift [the signal's unit] of what stands still.
+
+        Raises:
+            CalibrationRefused: It brings no values, or they do not stand still.
+        """
+        cycles = max(20, round(duration / self._period))
+        for _ in range(SETTLE):
+            self._cycle()
+        values = np.array([self._cycle() for _ in range(cycles)])
+        fresh = values[np.isfinite(values)]
+        if len(fresh) < LEAST_VALID * cycles:
+            why = self._device.health().text or "Is the rate of the robot file more than it can do?"
+            raise CalibrationRefused(f"'{self._device.name}' brought {len(fresh)} values in {cycles} cycles. {why}")
+        std, half = float(fresh.std()), len(fresh) // 2
+        drift = abs(float(fresh[half:].mean() - fresh[:half].mean()))
+        if max(std, drift) > noise:
+            unit = self._what.unit
+            raise CalibrationRefused(
+                f"'{self._device.name}' does not stand still: standard deviation {std:.3g} {unit}, drift {drift:.3g} "
+                f"{unit}, and at most {noise:g} {unit} is taken. Wait until it hangs still, or allow more with --noise."
+            )
+        return Point(known=known, read=float(fresh.mean()), std=std, samples=len(fresh))
+
+    def _cycle(self) -> float:
+        """One cycle; the value [the signal's unit] if a fresh one came in it, else NaN."""
+        start = self._clock.monotonic()
+        self._bus.begin()
+        self._device.idle()
+        self._bus.sync(start)
+        self._bus.wait(start + 0.8 * self._period)
+        reading = self._device.read()
+        value = float(reading.values[self._slot]) if reading.received[self._slot] >= start else math.nan
+        self._clock.sleep_until(start + self._period)
+        return value
+
+    @property
+    def now(self) -> Line:
+        """Zero and direction or gain that are in force for the device that answered."""
+        return self._what.in_force(self.identity)
+
+    def record(self, line: Line, points: tuple[Point, ...]) -> Record:
+        """What is to be stored; sealed.
+
+        Raises:
+            ConfigError: The driver does not take the settings.
+        """
+        what = self._what
+        settings = what.settings(line, self.identity)
+        return calibration_store.sealed(
+            Record(
+                device=what.device,
+                identity=self.identity,
+                settings=settings,
+                measured_with=calibration_store.measured_with(what.config, what.device, settings),
+                unit=what.unit,
+                points=points,
+                residual=line.residual,
+            )
+        )
