@@ -1,7 +1,7 @@
 """Whether the frames of a cycle fit on the bus, before anything is sent.
 
-Source: CiA 301 frames on classic CAN with 11-bit identifiers (ISO 11898-1): 44 bits beside the data, of which 34 and
-the data may be stuffed once in four after the first, and 3 bits of space between frames.
+Source: classic CAN (ISO 11898-1): with an 11-bit identifier 44 bits beside the data, with a 29-bit one 64, of which 34
+or 54 and the data may be stuffed once in four after the first, and 3 bits of space between frames.
 """
 
 from dataclasses import dataclass
@@ -26,9 +26,9 @@ class BusBudget:
 
     Attributes:
         bus: Name in the robot file.
-        frames: Frames per cycle, the SYNC included.
+        frames: Frames per cycle, the SYNC included if there is one.
         bits: Their longest length together [bit].
-        heartbeats: What heartbeats add [bit/s].
+        beside: What heartbeats and whatever else has a rate of its own add [bit/s].
         rate: Cycles per second [Hz].
         bitrate: Of the bus [bit/s].
     """
@@ -36,40 +36,48 @@ class BusBudget:
     bus: str
     frames: int
     bits: int
-    heartbeats: float
+    beside: float
     rate: float
     bitrate: int
 
     @property
     def load(self) -> float:
         """Share of the bit rate, 0 to 1 and beyond."""
-        return (self.bits * self.rate + self.heartbeats) / self.bitrate
+        return (self.bits * self.rate + self.beside) / self.bitrate
 
     def __str__(self) -> str:
         return (
-            f"{self.frames} frames of together {self.bits} bits at {self.rate:g} Hz and {self.heartbeats / 1e3:.1f} "
-            f"kbit/s of heartbeats are {self.load:.0%} of {self.bitrate / 1e6:g} Mbit/s"
+            f"{self.frames} frames of together {self.bits} bits at {self.rate:g} Hz and {self.beside / 1e3:.1f} "
+            f"kbit/s beside the cycle are {self.load:.0%} of {self.bitrate / 1e6:g} Mbit/s"
         )
 
 
 def budgets(config: RobotConfig) -> list[BusBudget]:
     """The budget of every bus of a robot."""
-    found = []
-    for name, bus in config.buses.items():
-        sizes = [0]
-        beats = OWN_HEARTBEAT_RATE * frame_bits(1)
-        for device, entry in config.devices.items():
-            if entry.bus != name:
-                continue
-            driver, settings = registry.equipment(config, device)
-            for size, rate in driver.traffic(settings, config.rates.hal):
-                if rate == config.rates.hal:
-                    sizes.append(size)
-                else:
-                    beats += rate * frame_bits(size)
-        bits = sum(frame_bits(size) for size in sizes)
-        found.append(BusBudget(name, len(sizes), bits, beats, config.rates.hal, bus.bitrate))
-    return found
+    return [_budget(config, name) for name in config.buses]
+
+
+def _budget(config: RobotConfig, bus: str) -> BusBudget:
+    rate = config.rates.hal
+    cyclic: list[int] = []
+    beside = 0.0
+    has_sync = False
+    for device, entry in config.devices.items():
+        if entry.bus != bus:
+            continue
+        driver, settings = registry.equipment(config, device)
+        has_sync |= driver.NEEDS_SYNC
+        wanted = tuple(entry.elements) or driver.quantities(settings)[:1]
+        for size, times, *extended in driver.traffic_of(settings, rate, wanted):
+            bits = frame_bits(size, any(extended))
+            if times == rate:
+                cyclic.append(bits)
+            else:
+                beside += times * bits
+    if has_sync:
+        cyclic.append(frame_bits(0))
+        beside += OWN_HEARTBEAT_RATE * frame_bits(1)
+    return BusBudget(bus, len(cyclic), sum(cyclic), beside, rate, config.buses[bus].bitrate)
 
 
 def check(config: RobotConfig) -> None:
@@ -81,8 +89,9 @@ def check(config: RobotConfig) -> None:
     for budget in budgets(config):
         allowed = config.buses[budget.bus].max_load
         if budget.load > allowed:
-            fits = (allowed * budget.bitrate - budget.heartbeats) / budget.bits
+            room = allowed * budget.bitrate - budget.beside
+            slower = f"Lower rates.hal to {room / budget.bits:.0f} Hz, or move" if room > 0 and budget.bits else "Move"
             raise ConfigError(
                 f"Bus '{budget.bus}' would carry too much: {budget}, and buses.{budget.bus}.max_load is {allowed:.0%}. "
-                f"Lower rates.hal to {max(fits, 0):.0f} Hz, or move devices to another bus."
+                f"{slower} devices to another bus."
             )

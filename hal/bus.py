@@ -47,10 +47,12 @@ ECHOING = ("udp_multicast",)
 
 
 class Answers(Protocol):
-    """A device that answers once in every cycle."""
+    """A device that answers once in every cycle, or sends by itself."""
 
     missed: int
     """Cycles in a row without its answer."""
+    patience: int
+    """Cycles within which it answers. It is waited for if that is 1; more for a device that goes by its own clock."""
     is_commissioned: bool
 
 
@@ -183,7 +185,9 @@ class Bus:
     def begin(self) -> None:
         """Begin a cycle, before anything is sent: some devices answer their set-point, others the SYNC."""
         self._sender.begin()
-        self._waiting = {n for n in self._nodes if n.is_commissioned and n.missed < MISSES_FORGIVEN}
+        self._waiting = {
+            n for n in self._nodes if n.patience == 1 and n.is_commissioned and n.missed < MISSES_FORGIVEN
+        }
         self._answered.clear()
         self._look_after_thread()
 
@@ -205,7 +209,7 @@ class Bus:
         for node in self._nodes:
             # The receive thread sets it to 0 at an answer, so that it never looks fresher than it is.
             node.missed += 1
-            complete &= node.missed == 1
+            complete &= node.missed <= node.patience
         return complete
 
     def trouble(self) -> str:

@@ -65,6 +65,9 @@ class CanDevice(Device):
     Settings: ClassVar[type[DeviceSettings]] = DeviceSettings
     COUNTERS: ClassVar[tuple[str, ...]] = ("malformed", "boots", "emergencies", "commissioned", "failed_openings")
 
+    NEEDS_SYNC: ClassVar[bool] = False
+    """Whether it waits for the SYNC and the HAL's heartbeat, which are sent on its bus then."""
+
     @classmethod
     def quantities(cls, settings: Any) -> tuple[str, ...]:
         """What a device with these settings can measure; the quantity it is there for comes first."""
@@ -76,8 +79,11 @@ class CanDevice(Device):
         return None
 
     @classmethod
-    def traffic(cls, settings: Any, rate: float) -> tuple[tuple[int, float], ...]:
-        """Data bytes and frames per second [Hz] of all that is sent because of it, at `rate` cycles per second."""
+    def traffic(cls, settings: Any, rate: float) -> tuple[tuple[int, float] | tuple[int, float, bool], ...]:
+        """Data bytes and frames per second [Hz] of all that is sent because of it, at `rate` cycles per second.
+
+        A third value says whether the identifier has 29 bits.
+        """
         raise NotImplementedError
 
     def __init__(self, place: Place, settings: DeviceSettings) -> None:
@@ -89,6 +95,7 @@ class CanDevice(Device):
         self.command_quantity = quantity or ""
         self.served = place.elements
         self.missed = 1
+        self.patience = 1
         self.is_commissioned = False
         self._place = place
         self._bus = place.bus
@@ -101,6 +108,7 @@ class CanDevice(Device):
         self._counters = self._health.counters
         self._trouble: tuple[DeviceState, str] = (DeviceState.CLOSED, "Not opened yet.")
         self._opening = threading.Lock()
+        place.bus.needs_sync |= self.NEEDS_SYNC
         place.bus.expect(self)
 
     def _identify(self) -> str:

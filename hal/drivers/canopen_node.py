@@ -55,6 +55,7 @@ class CanopenNode(CanDevice):
     """A device whose TPDOs answer every SYNC; what they carry is the subclass's business."""
 
     Settings: ClassVar[type[NodeSettings]] = NodeSettings
+    NEEDS_SYNC = True
     COUNTERS = (*CanDevice.COUNTERS, "doubled")
 
     def __init__(self, place: Place, settings: NodeSettings, profile: int, pdos: PdoMap) -> None:
@@ -86,7 +87,6 @@ class CanopenNode(CanDevice):
         self._doubt = 0
         self._strays = -math.inf
         self._twin = ""
-        place.bus.needs_sync = True
         for pdo in self._pdos.sends:
             place.bus.subscribe(cob_id(cia301.TPDO1, pdo.number, place.node), self._listener(pdo))
         place.bus.subscribe(cia301.HEARTBEAT + place.node, self._on_heartbeat)
