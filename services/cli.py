@@ -229,13 +229,32 @@ def query(
 
     [bold]normal[/] learn anew what is normal
 
-    [bold]enable[/], [bold]disable[/], [bold]stop[/], [bold]reset[/] the HAL's motors    [bold]describe [SERVICE][/]
+    [bold]enable[/], [bold]disable[/], [bold]stop[/], [bold]reset[/], [bold]home DRIVE[/] the HAL's motors
+
+    [bold]describe [SERVICE][/] who a service is
 
     [bold]fault TEXT[/] break something in the simulator
     """
     from services.ask import ask_robot
 
     return ask_robot(_name(robot), verb, tuple(words or ()), tuple(hide or ()), watch, connect or ())
+
+
+@app.command()
+@speaks_plainly
+def estop(
+    robot: RobotFile,
+    reason: Annotated[str, typer.Option(help="Told as the cause of the fault.")] = "gemuco estop",
+    connect: Connect = None,
+) -> int:
+    """Stop every drive of a running robot as fast as it can, from any process, whatever the robot does.
+
+    Prints what each drive did. Exit code 1 and a loud line if one did not stop or nobody answered: then cut the power.
+    This is no safety-rated emergency stop.
+    """
+    from services.estop import estop_robot
+
+    return estop_robot(_name(robot), reason, connect or ())
 
 
 @app.command()

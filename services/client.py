@@ -186,6 +186,20 @@ class Client:
         """Leave a fault; never enables."""
         return self.ask("hal", "reset")
 
+    def home(self, device: str) -> dict[str, Any]:
+        """Ask one drive to find its zero, which moves it; the robot must be off, and its mode is then `homing`."""
+        return self.ask("hal", "home", {"device": device})
+
+    def estop(self, reason: str = "") -> dict[str, Any]:
+        """Stop every drive as fast as it can, whatever the robot does; leave the fault with `reset`.
+
+        Returns:
+            `complete`: whether every drive stopped; `devices`: what each did (`device`, `stopped`, `text`); `text`:
+            what else is wrong; `mode`. If it is not complete, or nobody answers, cut the power: this is no safety-rated
+            emergency stop.
+        """
+        return self.ask("hal", "estop", {"reason": reason}, SLOW_TIMEOUT)
+
     def engage(self) -> dict[str, Any]:
         """Let the controller command the drives."""
         return self.ask("model", "engage")

@@ -19,7 +19,7 @@ BUMP = 0.3
 LONGEST_STEP = 0.1
 """A tick that comes later than this [s] moves the reference no further than one that comes in time."""
 LIVE_MODES = ("hold", "follow")
-DEAD_MODES = ("off", "stopping", "fault")
+DEAD_MODES = ("off", "homing", "stopping", "fault")
 
 
 class Solver(Protocol):

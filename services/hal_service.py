@@ -10,9 +10,11 @@ from collections.abc import Iterable
 from typing import Any
 
 from hal.config import RobotConfig
+from hal.errors import CommandRefused
 from hal.robot import Robot, open_robot
 from services import keys, messages, realtime
 from services.command_intake import CommandIntake
+from services.errors import BadArguments
 from services.loop import Loop
 from services.messages import Status
 from services.service import Service, until_told
@@ -23,7 +25,9 @@ CYCLE_PRIORITY = 50
 RECEIVE_PRIORITY = 51
 """Above the cycle, which waits for what the receive threads bring."""
 NETWORK_PRIORITY = 45
-POWERED = ("enabling", "hold", "follow", "stopping")
+TOLD_TO_END = "The HAL was told to end."
+AT_REST_WITHIN = 60.0
+"""How long [s] the robot may take to come to rest when the HAL is told to end; parking takes longest."""
 
 
 class HalService:
@@ -48,6 +52,8 @@ class HalService:
         service.verb("disable", lambda _: self._do(robot.disable))
         service.verb("stop", lambda _: self._do(lambda: robot.stop("A client asked to stop.")))
         service.verb("reset", lambda _: self._do(robot.reset))
+        service.verb("home", lambda given: self._do(lambda: robot.home(_named(given))))
+        service.verb("estop", self._estop)
 
     def run(self, stop: threading.Event) -> None:
         """Cycle the robot until `stop` is set, then let the drives go; commissioning comes first."""
@@ -60,9 +66,20 @@ class HalService:
             self._loop.start()
             realtime.promote_rest(NETWORK_PRIORITY)
             self._service.run(self.status, stop)
+            self._come_to_rest()
         finally:
             self._loop.stop()
             self._robot.close()
+
+    def _come_to_rest(self) -> None:
+        """Stop as the robot file says, and go on cycling meanwhile; a fault or `AT_REST_WITHIN` ends it too."""
+        try:
+            self._robot.stop(TOLD_TO_END)
+        except CommandRefused:  # a stuck cycle; whoever told us to end may have to kill us
+            self._robot.estop(TOLD_TO_END)
+        deadline = time.monotonic() + AT_REST_WITHIN
+        while self._robot.mode not in ("off", "fault") and time.monotonic() < deadline:
+            time.sleep(0.01)
 
     def tick(self) -> None:
         """Take the commands that came, turn the robot once, publish."""
@@ -115,10 +132,22 @@ class HalService:
             },
         )
 
+    def _estop(self, given: dict[str, Any]) -> dict[str, Any]:
+        """Stop everything; what every drive did, in the order of the robot file."""
+        found = self._robot.estop(str(given.get("reason", "")) or "A client asked for it.")
+        devices = [{"device": one.device, "stopped": one.has_stopped, "text": one.text} for one in found.devices]
+        return {"complete": found.is_complete, "devices": devices, "text": found.text, "mode": self._robot.mode}
+
     def _do(self, act: Any) -> dict[str, str]:
         """Ask the robot; the answer tells where it stands, which may be on the way."""
         act()
         return {"mode": self._robot.mode, "fault": self._robot.fault_text}
+
+
+def _named(given: dict[str, Any]) -> str:
+    if set(given) != {"device"}:
+        raise BadArguments(f"home takes {{device: name}}, not {{{', '.join(given)}}}.")
+    return str(given["device"])
 
 
 def _problem(health: dict[str, Any]) -> str:
