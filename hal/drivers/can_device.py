@@ -86,6 +86,13 @@ class CanDevice(Device):
         """
         raise NotImplementedError
 
+    @classmethod
+    def traffic_of(
+        cls, settings: Any, rate: float, quantities: tuple[str, ...]
+    ) -> tuple[tuple[int, float] | tuple[int, float, bool], ...]:
+        """`traffic` of a device of which a robot file names only some quantities."""
+        return cls.traffic(settings, rate)
+
     def __init__(self, place: Place, settings: DeviceSettings) -> None:
         self.name = place.name
         self.node = place.node

@@ -1,35 +1,75 @@
-"""Servo drives: the state machine, and the process data of cyclic synchronous position mode.
+"""Servo drives: objects, modes of operation, the state machine, and the bits of controlword and statusword.
 
-Source: CiA 402-2 (IEC 61800-7-201): statusword 6041h and its state coding, controlword 6040h and its commands.
+Source: CiA 402-2 (IEC 61800-7-201): statusword 6041h and its state coding, controlword 6040h and its commands, modes of
+operation 6060h and 6502h, profile position and homing mode. Units: 6076h in thousandths of N m, 6071h, 6072h and 6077h
+in thousandths of the rated torque, 6080h in revolutions per minute; positions in counts, velocities by 60A9h.
 """
 
-import struct
 from dataclasses import dataclass
-from enum import StrEnum
+from enum import IntEnum, StrEnum
 
 from hal.protocols.cia301 import Mapped
 
 PROFILE = 402
 
+ABORT_CONNECTION = Mapped(0x6007, 0, 16, "signed")
 CONTROLWORD = Mapped(0x6040, 0, 16)
 STATUSWORD = Mapped(0x6041, 0, 16)
+QUICK_STOP_OPTION = Mapped(0x605A, 0, 16, "signed")
 MODE_OF_OPERATION = Mapped(0x6060, 0, 8, "signed")
+MODE_DISPLAY = Mapped(0x6061, 0, 8, "signed")
 POSITION = Mapped(0x6064, 0, 32, "signed")
+FOLLOWING_ERROR_WINDOW = Mapped(0x6065, 0, 32)
+VELOCITY = Mapped(0x606C, 0, 32, "signed")
+TARGET_TORQUE = Mapped(0x6071, 0, 16, "signed")
 MAX_TORQUE = Mapped(0x6072, 0, 16)
+RATED_TORQUE = Mapped(0x6076, 0, 32)
 TORQUE = Mapped(0x6077, 0, 16, "signed")
 TARGET_POSITION = Mapped(0x607A, 0, 32, "signed")
-ABORT_CONNECTION = Mapped(0x6007, 0, 16, "signed")
+HOME_OFFSET = Mapped(0x607C, 0, 32, "signed")
+LOWEST_POSITION = Mapped(0x607D, 1, 32, "signed")
+HIGHEST_POSITION = Mapped(0x607D, 2, 32, "signed")
+MAX_PROFILE_VELOCITY = Mapped(0x607F, 0, 32)
+MAX_MOTOR_SPEED = Mapped(0x6080, 0, 32)
+PROFILE_VELOCITY = Mapped(0x6081, 0, 32)
+PROFILE_ACCELERATION = Mapped(0x6083, 0, 32)
+PROFILE_DECELERATION = Mapped(0x6084, 0, 32)
+HOMING_METHOD = Mapped(0x6098, 0, 8, "signed")
+HOMING_SPEED_SWITCH = Mapped(0x6099, 1, 32)
+HOMING_SPEED_ZERO = Mapped(0x6099, 2, 32)
+HOMING_ACCELERATION = Mapped(0x609A, 0, 32)
+VELOCITY_UNIT = Mapped(0x60A9, 0, 32)
+FOLLOWING_ERROR = Mapped(0x60F4, 0, 32, "signed")
+TARGET_VELOCITY = Mapped(0x60FF, 0, 32, "signed")
+SUPPORTED_MODES = Mapped(0x6502, 0, 32)
 
-CYCLIC_SYNCHRONOUS_POSITION = 8
 ABORT_QUICK_STOP = 3
 """Value of 6007h: a lost connection is a quick stop."""
+QUICK_STOP_AND_OFF = 2
+"""Value of 605Ah: slow down on the quick stop ramp, then switch on disabled."""
 
-COMMAND = (CONTROLWORD, TARGET_POSITION)
-"""What the drive's RPDO carries."""
-STATUS = (STATUSWORD, POSITION, TORQUE)
-"""What the drive's TPDO carries."""
-COMMAND_LAYOUT = struct.Struct("<Hi")
-STATUS_LAYOUT = struct.Struct("<Hih")
+
+class Mode(IntEnum):
+    """Modes of operation that we use."""
+
+    PROFILE_POSITION = 1
+    HOMING = 6
+    CYCLIC_SYNCHRONOUS_POSITION = 8
+    CYCLIC_SYNCHRONOUS_VELOCITY = 9
+    CYCLIC_SYNCHRONOUS_TORQUE = 10
+
+
+_MODE_NAMES = {
+    1: "profile position",
+    2: "velocity",
+    3: "profile velocity",
+    4: "profile torque",
+    6: "homing",
+    7: "interpolated position",
+    8: "cyclic synchronous position",
+    9: "cyclic synchronous velocity",
+    10: "cyclic synchronous torque",
+}
 
 
 class State(StrEnum):
@@ -53,7 +93,18 @@ ENABLE_OPERATION = 0x000F
 FAULT_RESET = 0x0080
 """Acts on its rising edge."""
 
-WARNING_BIT = 1 << 7
+NEW_SET_POINT = 1 << 4
+"""Profile position: on its rising edge the target position is taken."""
+CHANGE_AT_ONCE = 1 << 5
+"""Profile position: go to it at once, not after the one before."""
+START_HOMING = 1 << 4
+"""Homing: begin, and go on while it is set."""
+
+TARGET_REACHED = 1 << 10
+SET_POINT_TAKEN = 1 << 12
+"""Profile position: the answer to `NEW_SET_POINT`."""
+HOMING_ATTAINED = 1 << 12
+HOMING_ERROR = 1 << 13
 
 _CODING = (  # mask, value, state
     (0x4F, 0x00, State.NOT_READY),
@@ -83,32 +134,66 @@ _TOWARDS_ENABLED = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class Status:
-    """What a drive's TPDO says.
-
-    Attributes:
-        state: State of the drive.
-        position: Position actual value [counts].
-        torque: Torque actual value [thousandths of the rated torque].
-    """
-
-    state: State
-    position: int
-    torque: int
-
-
 def state(statusword: int) -> State:
     """The state that a statusword codes."""
     return STATE_OF[statusword & 0x6F]
 
 
-def status(data: bytes | bytearray) -> Status | None:
-    """What a TPDO says; None if its length is wrong."""
-    if len(data) != STATUS_LAYOUT.size:
+def supports(modes: int, mode: Mode) -> bool:
+    """Whether object 6502h says that the drive has a mode."""
+    return bool(modes >> (mode - 1) & 1)
+
+
+def describe_modes(modes: int) -> str:
+    """Object 6502h in words."""
+    return ", ".join(name for mode, name in _MODE_NAMES.items() if modes >> (mode - 1) & 1) or "none"
+
+
+def describe_mode(mode: int) -> str:
+    """A value of 6060h or 6061h in words."""
+    return _MODE_NAMES.get(mode, f"mode {mode}")
+
+
+@dataclass(frozen=True, slots=True)
+class VelocityUnit:
+    """What one unit of a velocity object is.
+
+    Attributes:
+        per_second: Counts, or motor turns, in a second at a velocity of 1.
+        is_turns: Whether it is turns.
+    """
+
+    per_second: float
+    is_turns: bool
+
+    def counts_per_second(self, counts_per_turn: float) -> float:
+        """Counts per second at a velocity of 1, with so many counts per motor turn."""
+        return self.per_second * counts_per_turn if self.is_turns else self.per_second
+
+
+VELOCITY_UNITS = {
+    "counts/s": VelocityUnit(1.0, is_turns=False),
+    "rps": VelocityUnit(1.0, is_turns=True),
+    "rpm": VelocityUnit(1 / 60, is_turns=True),
+    "0.1 rpm": VelocityUnit(0.1 / 60, is_turns=True),
+    "mrpm": VelocityUnit(1e-3 / 60, is_turns=True),
+}
+"""Units as a robot file names them."""
+
+_TURN, _INCREMENT, _SECOND, _MINUTE = 0xB4, 0xB5, 0x03, 0x47
+
+
+def velocity_unit(code: int) -> VelocityUnit | None:
+    """What object 60A9h says: power of ten, numerator and denominator (CiA 303-2); None if it is no speed of a motor.
+
+    00B44700h is revolutions per minute, FDB44700h a thousandth of that, 00B50300h increments per second.
+    """
+    exponent = (code >> 24 ^ 0x80) - 0x80
+    numerator, denominator = code >> 16 & 0xFF, code >> 8 & 0xFF
+    if numerator not in (_TURN, _INCREMENT) or denominator not in (_SECOND, _MINUTE) or not -12 <= exponent <= 12:
         return None
-    statusword, position, torque = STATUS_LAYOUT.unpack(data)
-    return Status(state(statusword), position, torque)
+    per_second = 10.0**exponent / (60 if denominator == _MINUTE else 1)
+    return VelocityUnit(per_second, is_turns=numerator == _TURN)
 
 
 def towards_enabled(now: State) -> int:
@@ -116,8 +201,15 @@ def towards_enabled(now: State) -> int:
     return _TOWARDS_ENABLED.get(now, DISABLE_VOLTAGE)
 
 
-def towards_disabled(now: State) -> int:
-    """The controlword that lets a drive in state `now` go, in a controlled way, to ready to switch on."""
+def towards_disabled(now: State, slow_down: bool = False) -> int:
+    """The controlword that lets a drive in state `now` go, in a controlled way, to ready to switch on.
+
+    Args:
+        now: Its state.
+        slow_down: Disable the operation first, which lets the drive come to rest on its slow down ramp (605Ch).
+    """
+    if now is State.OPERATION_ENABLED and slow_down:
+        return SWITCH_ON
     return (
         SHUTDOWN if now in (State.OPERATION_ENABLED, State.SWITCHED_ON, State.READY_TO_SWITCH_ON) else DISABLE_VOLTAGE
     )

@@ -14,9 +14,9 @@ def test_nodes_are_configured_as_the_contract_says(bench):
         bench.rig.node(f"{name}").objects.values for name in ("biceps_drive", "biceps_cell", "elbow_encoder")
     )
     assert [drive[0x1600, sub] for sub in range(3)] == [2, 0x60400010, 0x607A0020]
-    assert [drive[0x1A00, sub] for sub in range(4)] == [3, 0x60410010, 0x60640020, 0x60770010]
+    assert [drive[0x1A00, sub] for sub in range(3)] == [2, 0x60410010, 0x60640020]
     assert [cell[0x1A00, sub] for sub in range(3)] == [2, 0x91300120, 0x61500108]
-    assert [encoder[0x1A00, sub] for sub in range(3)] == [2, 0x60040020, 0x65030010]
+    assert [encoder[0x1A00, sub] for sub in range(4)] == [3, 0x60040020, 0x65030010, 0x65050010]
     assert drive[0x1400, 1] == 0x201
     assert drive[0x1800, 1] & 0x800007FF == 0x181
     assert drive[0x1800, 2] == cell[0x1800, 2] == encoder[0x1800, 2] == 1

@@ -197,5 +197,5 @@ def test_closing_disables_and_leaves_no_drive_in_fault(bench):
     for _ in range(100):
         bench.pass_time()
     assert not any(enabled for _, enabled in bench.world.drives.values())
-    assert bench.rig.node("biceps_drive").state.name == "READY_TO_SWITCH_ON"
+    assert bench.rig.node("biceps_drive").state.name == "SWITCH_ON_DISABLED"
     assert bench.device("biceps_drive")["state"] == "closed"
