@@ -1,4 +1,4 @@
-"""Opens devices, and opens them again when they come back; enables nothing."""
+"""Opens devices, opens them again when they come back, and runs what they were asked for; enables nothing."""
 
 import logging
 import threading
@@ -26,6 +26,7 @@ class Caretaker:
         self._not_before = dict.fromkeys(self._devices, 0)
         self._seen = dict.fromkeys(self._devices, DeviceState.CLOSED)
         self._running: dict[Device, Future[None]] = {}
+        self._errands: set[Device] = set()
         self._passes = 0
         self._stopping = threading.Event()
         self._pool: ThreadPoolExecutor | None = None
@@ -63,8 +64,14 @@ class Caretaker:
             if running is not None:
                 if not running.done():
                     continue
-                del self._running[device]  # it has one pause to give its first answer in, before it counts as silent
-                self._not_before[device] = self._passes + self._pause(device)
+                del self._running[device]
+                if device not in self._errands:  # one pause to give its first answer in, before it counts as silent
+                    self._not_before[device] = self._passes + self._pause(device)
+                self._errands.discard(device)
+            if device.errand is not None and self._pool:
+                self._errands.add(device)
+                self._running[device] = self._pool.submit(self._do, device)
+                continue
             state = device.health().state
             if state is not self._seen[device]:
                 self._seen[device] = state
@@ -77,6 +84,15 @@ class Caretaker:
     def _pause(self, device: Device) -> int:
         """Passes between two tries."""
         return round(BACK_OFF[min(self._tries[device], len(BACK_OFF)) - 1] / PASS_PERIOD)
+
+    @staticmethod
+    def _do(device: Device) -> None:
+        errand, device.errand = device.errand, None
+        try:
+            if errand is not None:
+                errand()
+        except Exception:
+            log.exception("'%s' cannot do what it was asked for", device.name)
 
     @staticmethod
     def _open(device: Device) -> None:

@@ -5,7 +5,7 @@ safety code: limits, command age and watchdogs wrap every device alike (see `hal
 """
 
 import abc
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from types import MappingProxyType
@@ -83,6 +83,8 @@ class Device(abc.ABC):
     identity: str = ""
     """What tells this very device from all others of its kind, as `canopen:<vendor>-<product>-<serial>`; empty before
     it was opened, or if it cannot tell."""
+    errand: Callable[[], None] | None = None
+    """What was asked for and takes longer than a cycle; whoever looks after the devices takes it and runs it."""
     can_damp: bool = False
     """Whether `damp` does something."""
     measures: tuple[str, ...] = ()

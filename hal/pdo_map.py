@@ -141,23 +141,28 @@ class PdoSettings(Section):
 
 
 def lay_out(
-    objects: Iterable[Mapped], first: int = 1, transmission: int = cia301.SYNCHRONOUS, event_time: float = 0.0
+    objects: Iterable[Mapped | tuple[Mapped, ...]],
+    first: int = 1,
+    transmission: int = cia301.SYNCHRONOUS,
+    event_time: float = 0.0,
 ) -> tuple[Pdo, ...]:
     """PDOs that carry some objects: each in the first that has room, so that those named first travel together.
 
     Args:
-        objects: What is to be carried; an object that is named twice is carried once.
+        objects: What is to be carried; an object that is named twice is carried once, those of a tuple travel together.
         first: Number of the first PDO.
         transmission: Of all these PDOs.
         event_time: Of all these PDOs [s].
     """
     places: list[list[Mapped]] = []
     for item in dict.fromkeys(objects):
-        room = (place for place in places if sum(other.bits for other in place) + item.bits <= 8 * cia301.PDO_SIZE)
+        together = item if isinstance(item, tuple) else (item,)
+        bits = sum(other.bits for other in together)
+        room = (place for place in places if sum(other.bits for other in place) + bits <= 8 * cia301.PDO_SIZE)
         place = next(room, None)
         if place is None:
             places.append(place := [])
-        place.append(item)
+        place.extend(together)
     return tuple(Pdo(number, tuple(place), transmission, event_time) for number, place in enumerate(places, first))
 
 

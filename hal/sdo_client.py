@@ -6,6 +6,7 @@ request would be taken as the answer to the next (it compares the index when rea
 
 import queue
 import struct
+import threading
 import time
 
 import canopen
@@ -48,6 +49,7 @@ class SdoClient:
         self._bus = bus
         self._node = node
         self._listening = False
+        self._asking = threading.Lock()
         bus.subscribe(cia301.SDO_ANSWER + node, self._on_answer)
 
     def _on_answer(self, data: bytearray, received: float) -> None:
@@ -113,16 +115,17 @@ class SdoClient:
 
     def _ask(self, request: bytes, tries: int) -> bytes:
         sdo = self._remote.sdo
-        self._listening = True
-        try:
-            for _ in range(tries):
-                sdo.responses = queue.Queue()
-                sdo.send_request(request)
-                answer = self._matching(request)
-                if answer is not None:
-                    return answer
-        finally:
-            self._listening = False
+        with self._asking:
+            self._listening = True
+            try:
+                for _ in range(tries):
+                    sdo.responses = queue.Queue()
+                    sdo.send_request(request)
+                    answer = self._matching(request)
+                    if answer is not None:
+                        return answer
+            finally:
+                self._listening = False
         _, index, subindex, _ = _REQUEST.unpack(request)
         raise DeviceSilent(
             f"{self._label} did not answer within {ANSWER_TIME * 1e3:.0f} ms when asked for object "

@@ -1,62 +1,55 @@
-"""Measuring devices: the process value of an analogue input, its unit, digits and status.
+"""Measuring devices: the value of an analogue input in its several forms, its unit, digits, status and tare.
 
-Source: CiA 404 as far as makers' manuals quote it (9130h, 6131h, 6132h, 6150h), CiA 303-2 for units.
+Source: CiA 404 as far as makers' manuals quote it (7100h, 6125h, 6130h, 6131h, 6132h, 6150h); the sub-index is the
+channel. The first digit of an index tells the type: 6 the type of the device (here REAL32), 7 INTEGER16, 9 INTEGER32.
 """
 
-import struct
 from dataclasses import dataclass
 
 from hal.protocols.cia301 import Mapped
 
 PROFILE = 404
-CHANNEL = 1
-"""The sub-index of the first, and here only, measuring channel."""
 
-UNIT = Mapped(0x6131, CHANNEL, 32)
-DIGITS = Mapped(0x6132, CHANNEL, 8)
-STATUS = Mapped(0x6150, CHANNEL, 8)
-PROCESS_VALUE = Mapped(0x9130, CHANNEL, 32, "signed")
-
-VALUE = (PROCESS_VALUE, STATUS)
-"""What the cell's TPDO carries."""
-VALUE_LAYOUT = struct.Struct("<iB")
+OFFSET = 0x6124
+"""REAL32, writable: what a tare has added to the value, in the unit of the process value."""
+AUTOZERO = 0x6125
+ZERO = int.from_bytes(b"zero", "little")
+"""Signature that tares a channel when it is written to 6125h."""
+UNIT = 0x6131
+DIGITS = 0x6132
+STATUS = Mapped(0x6150, 0, 8)
+"""Without its channel."""
 
 INVALID = 0x01
 OVERLOAD = 0x02
 UNDERLOAD = 0x04
 
-_NEWTON = 0x21
-_PREFIXES = {0x00: 0, 0x01: 1, 0x02: 2, 0x03: 3, 0x06: 6, 0xFD: -3, 0xFA: -6}
-
 
 @dataclass(frozen=True, slots=True)
-class Value:
-    """What a cell's TPDO says.
+class Form:
+    """One form in which a device offers what it measures; the sub-index of its objects is still the channel's to fill.
 
     Attributes:
-        digits: Process value [the cell's unit times 10^-decimal digits].
-        status: Bits of 6150h; 0 if the value is good.
+        value: The object that is mapped.
+        has_unit: Its unit is 6131h; if not, it is raw counts.
+        has_digits: It is a whole number of 10^-n units, where n is 6132h.
+        status: The object beside it that tells whether the value is good; 0 is good. None if there is none.
     """
 
-    digits: int
-    status: int
+    value: Mapped
+    has_unit: bool = True
+    has_digits: bool = False
+    status: Mapped | None = STATUS
 
 
-def value(data: bytes | bytearray) -> Value | None:
-    """What a TPDO says; None if its length is wrong."""
-    return Value(*VALUE_LAYOUT.unpack(data)) if len(data) == VALUE_LAYOUT.size else None
-
-
-def newtons_per_digit(unit: int, digits: int) -> float | None:
-    """Scale of the process value [N]: from unit 6131h and decimal digits 6132h; None if the unit is no force.
-
-    The unit is a CiA 303-2 code: prefix in the highest byte (a power of ten), numerator in the next, as 00210000h for
-    newton and 03210000h for kilonewton.
-    """
-    prefix, numerator, rest = unit >> 24, unit >> 16 & 0xFF, unit & 0xFFFF
-    if numerator != _NEWTON or rest or prefix not in _PREFIXES:
-        return None
-    return 10.0 ** (_PREFIXES[prefix] - digits)
+FORMS = {
+    "float32": Form(Mapped(0x6130, 0, 32, "float")),
+    "int16": Form(Mapped(0x7130, 0, 16, "signed"), has_digits=True),
+    "int32": Form(Mapped(0x9130, 0, 32, "signed"), has_digits=True),
+    "counts16": Form(Mapped(0x7100, 0, 16, "signed"), has_unit=False),
+    "counts32": Form(Mapped(0x9100, 0, 32, "signed"), has_unit=False),
+}
+"""The process value in three types, and the field value: what the converter counted, before any scaling."""
 
 
 def describe_status(status: int) -> str:

@@ -1,48 +1,52 @@
-"""Absolute encoders: position value and alarms.
+"""Absolute encoders: position, speed, alarms and warnings, and what one turn is.
 
-Source: CiA 406, version 4.0: 6004h (position value), 6503h (alarms).
+Source: CiA 406, version 3.2: 6000h to 6004h, 6030h, 6031h, 6501h to 6506h. The preset 6003h is never written: the zero
+is the robot file's, so that an encoder that forgets its preset does not move the joint's zero.
 """
-
-import struct
-from dataclasses import dataclass
 
 from hal.protocols.cia301 import Mapped
 
 PROFILE = 406
 
-MEASURING_UNITS = Mapped(0x6001, 0, 32)
+OPERATING_PARAMETERS = Mapped(0x6000, 0, 16)
+SCALING_ON = 1 << 2
+"""Bit of 6000h: the position counts in the units of 6001h and 6002h, else in those of 6501h and 6502h."""
+UNITS_PER_TURN = Mapped(0x6001, 0, 32)
+TOTAL_UNITS = Mapped(0x6002, 0, 32)
 POSITION = Mapped(0x6004, 0, 32)
+SPEED = Mapped(0x6030, 1, 16, "signed")
+"""Position units per second, unless 6031h says otherwise."""
+SPEED_MULTIPLIER = Mapped(0x6031, 3, 16)
+SPEED_DIVIDER = Mapped(0x6031, 4, 16)
+PHYSICAL_PER_TURN = Mapped(0x6501, 0, 32)
+PHYSICAL_TURNS = Mapped(0x6502, 0, 16)
 ALARMS = Mapped(0x6503, 0, 16)
-
-VALUE = (POSITION, ALARMS)
-"""What the encoder's TPDO carries."""
-VALUE_LAYOUT = struct.Struct("<IH")
+WARNINGS = Mapped(0x6505, 0, 16)
 
 POSITION_ERROR = 0x0001
 COMMISSIONING_DIAGNOSTIC = 0x0002
-
-
-@dataclass(frozen=True, slots=True)
-class Value:
-    """What an encoder's TPDO says.
-
-    Attributes:
-        counts: Position value [counts].
-        alarms: Bits of 6503h; with any set the position is not to be used.
-    """
-
-    counts: int
-    alarms: int
-
-
-def value(data: bytes | bytearray) -> Value | None:
-    """What a TPDO says; None if its length is wrong."""
-    return Value(*VALUE_LAYOUT.unpack(data)) if len(data) == VALUE_LAYOUT.size else None
+_ALARMS = ((POSITION_ERROR, "position error"), (COMMISSIONING_DIAGNOSTIC, "commissioning diagnostic failed"))
+_WARNINGS = (
+    (0x0001, "frequency exceeded"),
+    (0x0002, "light control reserve reached"),
+    (0x0004, "watchdog status not good"),
+    (0x0008, "operating time limit exceeded"),
+    (0x0010, "battery charge too low"),
+    (0x0020, "reference point not reached"),
+)
 
 
 def describe_alarms(alarms: int) -> str:
-    """Alarm bits in words; empty if there is none."""
-    bits = ((POSITION_ERROR, "position error"), (COMMISSIONING_DIAGNOSTIC, "commissioning diagnostic failed"))
-    known = [text for bit, text in bits if alarms & bit]
-    other = alarms & ~(POSITION_ERROR | COMMISSIONING_DIAGNOSTIC)
-    return ", ".join([*known, f"alarms {other:04X}h"] if other else known)
+    """Alarm bits (6503h) in words; empty if there is none. With any of them the position is not to be used."""
+    return _describe(alarms, _ALARMS, "alarms")
+
+
+def describe_warnings(warnings: int) -> str:
+    """Warning bits (6505h) in words; empty if there is none. The position is still good."""
+    return _describe(warnings, _WARNINGS, "warnings")
+
+
+def _describe(bits: int, names: tuple[tuple[int, str], ...], rest: str) -> str:
+    known = [text for bit, text in names if bits & bit]
+    other = bits & ~sum(bit for bit, _ in names)
+    return ", ".join([*known, f"{rest} {other:04X}h"] if other else known)
