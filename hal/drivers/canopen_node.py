@@ -92,6 +92,11 @@ class CanopenNode(CanDevice):
         place.bus.subscribe(cia301.HEARTBEAT + place.node, self._on_heartbeat)
         place.bus.subscribe(cia301.EMERGENCY + place.node, self._on_emergency)
 
+    @property
+    def pdos(self) -> PdoMap:
+        """What it receives and sends."""
+        return self._pdos
+
     def _taker(self, pdo: Pdo) -> Taker:
         """What takes the objects of one TPDO; asked for once, before anything comes."""
         raise NotImplementedError
