@@ -26,7 +26,8 @@ class AnalogConstants:
         full_scale: Force [N] at full scale of the converter.
         bits: Of the converter; what it reads lies in the highest bits of 6401h and 6402h.
         unbalance: What an unloaded cell reads [N].
-        more: `signal.element` of the forces on channels 2 and up; the first is the node's own.
+        more: `signal.element` of the forces on channels 2 and up, empty where there is no cell; the first is the
+            node's own.
     """
 
     kind: ClassVar[str] = "analog_input"
@@ -43,7 +44,8 @@ class AnalogInput(CanopenNode):
     def __init__(self, spec: NodeSpec, plant: Plant, outbox: list[Frame]) -> None:
         assert isinstance(spec.constants, AnalogConstants)
         self._constants = spec.constants
-        self._elements = (spec.element, *spec.constants.more)
+        elements = enumerate((spec.element, *spec.constants.more), 1)
+        self._cells = [(channel, element) for channel, element in elements if element]
         self._is_broken = False
         super().__init__(spec, plant, outbox)
 
@@ -61,7 +63,7 @@ class AnalogInput(CanopenNode):
         values = self.objects.values
         status = _BROKEN if self._is_broken else 0
         half = 1 << self._constants.bits - 1
-        for channel, element in enumerate(self._elements, 1):
+        for channel, element in self._cells:
             share = (self.plant.read(element) + self._constants.unbalance) / self._constants.full_scale
             if self._is_broken or math.isnan(share):
                 share = -math.inf

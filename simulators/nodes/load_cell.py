@@ -25,7 +25,8 @@ class LoadCell(CanopenNode):
     def __init__(self, spec: NodeSpec, plant: Plant, outbox: list[Frame]) -> None:
         assert isinstance(spec.constants, CellConstants)
         self._constants = spec.constants
-        self._elements = (spec.element, *spec.constants.more)
+        elements = enumerate((spec.element, *spec.constants.more), 1)
+        self._cells = [(channel, element) for channel, element in elements if element]
         self._is_broken = False
         super().__init__(spec, plant, outbox)
         constants = self._constants
@@ -49,7 +50,7 @@ class LoadCell(CanopenNode):
 
     def sample(self) -> None:
         """See `CanopenNode.sample`; a channel without a cell stays as at power-on."""
-        for channel, element in enumerate(self._elements, 1):
+        for channel, element in self._cells:
             self.objects.values[0x6150, channel] = self._convert(channel, element)
 
     def _convert(self, channel: int, element: str) -> int:

@@ -81,7 +81,8 @@ class CellConstants:
         decimal_digits: Of the integer process values: 2 means 0.01 of the unit.
         unit: What the process value is in, as CiA 303-2 codes it.
         unit_size: How much one of that unit is [N].
-        more: `signal.element` of the forces on channels 2 and up; the first is the node's own.
+        more: `signal.element` of the forces on channels 2 and up, empty where there is no cell; the first is the
+            node's own.
     """
 
     kind: ClassVar[str] = "load_cell"

@@ -1,13 +1,25 @@
 """For each device of a robot file the node that answers in its place, with the constants that the file claims."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 from hal import registry
 from hal.config import RobotConfig
 from hal.errors import ConfigError
+from hal.protocols.cia303 import UNITS
+from simulators.nodes.analog_input import AnalogConstants
 from simulators.nodes.mit_drive import MitConstants
 from simulators.nodes.spec import CellConstants, Constants, DriveConstants, EncoderConstants, NodeSpec
+
+FULL_SCALE = {"int16": 2**15, "int32": 2**31, "float32": 10.0, "zc_sg": 10.0}
+"""What an analogue input tells at its end, by preset."""
+
+
+def _cia401(settings: Any) -> Constants:
+    gain, zero = _first(settings.gain), _first(settings.zero)
+    bits = settings.resolution or (24 if settings.preset == "int32" else 16)
+    return AnalogConstants(full_scale=gain * FULL_SCALE[settings.preset], bits=bits, unbalance=-zero)
 
 
 def _cia402(settings: Any) -> Constants:
@@ -17,17 +29,35 @@ def _cia402(settings: Any) -> Constants:
         spool_radius=settings.spool_radius,
         direction=settings.direction,
         zero=settings.zero,
-        rated_torque=settings.rated_torque or DriveConstants.rated_torque,
+        rated_torque=settings.rated_torque or DriveConstants().rated_torque,
     )
 
 
 def _cia404(settings: Any) -> Constants:
-    return CellConstants()
+    gain, zero = _first(settings.gain) or 1.0, _first(settings.zero)
+    if settings.preset in ("counts16", "counts32"):
+        return CellConstants(counts_per_newton=1.0 / gain, unbalance=-zero)
+    size = gain * (UNITS[settings.unit].scale if settings.unit in UNITS else 1.0)
+    digits = 2 if settings.digits is None else settings.digits
+    if settings.measures == "pressure":
+        return CellConstants(1e7, 100.0, -zero, digits, unit=0x00220000, unit_size=size)
+    return CellConstants(unbalance=-zero, decimal_digits=digits, unit_size=size)
 
 
 def _cia406(settings: Any) -> Constants:
-    counts = settings.counts_per_turn or EncoderConstants.counts_per_turn
+    counts = settings.counts_per_turn or EncoderConstants().counts_per_turn
     return EncoderConstants(counts_per_turn=round(counts), direction=settings.direction, zero=settings.zero)
+
+
+def _first(given: Any) -> float:
+    """What all channels have, or the first of them."""
+    return float(given[0] if isinstance(given, tuple) else given or 0.0)
+
+
+def _more(settings: Any, elements: dict[str, str]) -> tuple[str, ...]:
+    """`signal.element` of channels 2 and up; empty where there is no cell."""
+    by_number = {number: elements.get(f"{settings.measures}_{number}", "") for number in settings.channels}
+    return tuple(by_number.get(number, "") for number in range(2, max(by_number) + 1))
 
 
 def _mit(settings: Any) -> Constants:
@@ -48,6 +78,7 @@ def _mit(settings: Any) -> Constants:
 
 
 CONSTANTS: dict[str, Callable[[Any], Constants]] = {
+    "cia401": _cia401,
     "cia402": _cia402,
     "cia404": _cia404,
     "cia406": _cia406,
@@ -73,5 +104,8 @@ def hardware(config: RobotConfig) -> list[NodeSpec]:
             )
         _, settings = registry.equipment(config, name)
         element = device.elements.get(MAIN, device.served[0])
-        nodes.append(NodeSpec(name, device.bus, device.node, element, CONSTANTS[kind](settings)))
+        constants: Any = CONSTANTS[kind](settings)
+        if hasattr(settings, "channels"):
+            constants = replace(constants, more=_more(settings, device.elements))
+        nodes.append(NodeSpec(name, device.bus, device.node, element, constants))
     return nodes
