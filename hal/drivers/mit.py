@@ -135,6 +135,7 @@ class MitDrive(CanDevice):
             raise DeviceRefused(f"{self._place} stays enabled when it is told to power off. Cut its power.")
         if self._registers:
             self._registers.commission(self._ranges)
+        self.missed = 0
 
     def _release(self) -> None:
         with contextlib.suppress(DeviceSilent, DeviceRefused):  # nothing more can be done for it
@@ -168,7 +169,9 @@ class MitDrive(CanDevice):
         if self._error and not self._clearing:
             self._latched = self._error
         self._heard.set()
-        if self.is_commissioned:
+        if self.is_commissioned and not self.is_heard:
+            self._lose(f"{self._place} was silent and answers again. It may have been restarted, and is commissioned.")
+        elif self.is_commissioned:
             self._store(mit.counts(data), rotor, driver, received)
 
     def _store(self, counts: tuple[int, int, int], rotor: float, driver: float, received: float) -> None:
@@ -212,6 +215,7 @@ class MitDrive(CanDevice):
         return f"{self._place} reports {told}. Reset it when the cause is gone; if it stays, cut its power once."
 
     def _running(self) -> tuple[DeviceState, str]:
+        self._look_for_drop()
         text = self._dropped
         if not text and self._registers is None:
             text = f"{self._place} has no watchdog: should the HAL die while it is enabled, it keeps to its last frame."
@@ -238,7 +242,7 @@ class MitDrive(CanDevice):
         self._braking = round(QUICK_STOP_TIME * self._place.rate) if self._is_powered else 0
 
     def reset(self) -> None:
-        """See `Device.reset`; only Damiao has a frame for it, T-Motor forgets a fault whose cause is gone."""
+        """See `Device.reset`."""
         self._latched = 0
         self._is_wrapped = False
         self._clearing = CLEARING_CYCLES
@@ -263,19 +267,26 @@ class MitDrive(CanDevice):
         elif self._is_powered and not self._is_neutral:
             self._rest()
         elif self._clearing and self._error:
-            self._clearing -= 1
-            self._ask(Special.CLEAR if self._layout is Layout.DAMIAO else Special.EXIT)
+            self._clear()
         else:
             self._clearing = 0
+            self._ask(Special.EXIT)
+
+    def _clear(self) -> None:
+        """Ask to forget a fault; T-Motor has no frame for that but to be entered, which here lasts two frames."""
+        self._clearing -= 1
+        if self._layout is Layout.DAMIAO:
+            self._bus.send(self._specials[Special.CLEAR])
+        else:
+            self._bus.send(self._specials[Special.ENTER])
+            self._rest()
             self._ask(Special.EXIT)
 
     def _may_move(self) -> bool:
         """Whether the drive has power and may be sent a set-point; if not, it was sent what it needs in this cycle."""
         if self._latched or self._is_wrapped:
             self._is_wanted = False
-        if self._is_wanted and self._was_reached and not self._is_powered:
-            self._is_wanted = False
-            self._dropped = f"{self._place} powered off by itself. Was it restarted, was its supply interrupted?"
+        self._look_for_drop()
         if not self._is_wanted or not self.is_commissioned:
             self.idle()
         elif self._is_powered and self._asked is Special.ENTER:
@@ -285,8 +296,13 @@ class MitDrive(CanDevice):
             self._power_on()
         return False
 
+    def _look_for_drop(self) -> None:
+        if self._is_wanted and self._was_reached and not self._is_powered:
+            self._is_wanted = False
+            self._dropped = f"{self._place} powered off by itself. Was it restarted, was its supply interrupted?"
+
     def _power_on(self) -> None:
-        """One step: look at its watchdog, take back what it was told before, then ask it to power on."""
+        """One step: look at its watchdog, take back what it was told before, then ask it for power without torque."""
         if self._registers and not self._is_watched:
             watching = self._registers.is_watching
             if watching is None:
@@ -299,11 +315,14 @@ class MitDrive(CanDevice):
             self._is_watched = True
         if self._is_neutral:
             self._ask(Special.ENTER)
-        else:
-            self._rest()
+        self._rest()
 
     def _rest(self) -> None:
-        """No torque. Some firmware follows its last frame again as soon as it has power, so this is to be the last."""
+        """No torque: the last frame before the power goes and the first after it came, as some follow their last again.
+
+        Seen of T-Motor: github.com/dfki-ric-underactuated-lab/mini-cheetah-tmotor-python-can at 0ef9f89,
+        src/motor_driver/canmotorlib.py, comments in `enable_motor` and `disable_motor`.
+        """
         self._command((self._position, 0.0, 0.0, 0.0, 0.0))
         self._is_neutral = True
 

@@ -85,7 +85,7 @@ class MitConstants:
 
 
 @dataclass(frozen=True, slots=True)
-class _Wanted:
+class Wanted:
     """The frame that is followed: position [rad], velocity [rad/s], gains, torque [N m]."""
 
     position: float = 0.0
@@ -117,7 +117,8 @@ class MitDriveNode:
         self.torque = 0.0
         """[N m]"""
         self._rotor = Rotor(self._constants.inertia, self._constants.friction)
-        self._wanted = _Wanted()
+        self.wanted = Wanted()
+        """The frame that it follows."""
         self._heard = self._now = self._before = 0.0
 
     @property
@@ -149,7 +150,7 @@ class MitDriveNode:
         self._switch_off()
         self.error = 0
         self.temperature = _AMBIENT
-        self._wanted = _Wanted()
+        self.wanted = Wanted()
         self._heard = self._now = now
         self._before = self._angle()
         master_id = constants.master_id
@@ -196,7 +197,7 @@ class MitDriveNode:
         self._heat(duration)
 
     def _turn(self, duration: float) -> None:
-        wanted, rotor, constants = self._wanted, self._rotor, self._constants
+        wanted, rotor, constants = self.wanted, self._rotor, self._constants
         load = self.plant.read(constants.load) * constants.unit if constants.load else 0.0
         steps = max(1, math.ceil(duration / _SUBSTEP))
         for _ in range(steps):
@@ -248,7 +249,7 @@ class MitDriveNode:
         stiffness = data[3] % 16 * 256 + data[4]
         damping = data[5] * 16 + data[6] // 16
         torque = data[6] % 16 * 256 + data[7]
-        self._wanted = _Wanted(
+        self.wanted = Wanted(
             (position / 65535 * 2 - 1) * constants.position,
             (velocity / 4095 * 2 - 1) * constants.velocity,
             stiffness / 4095 * constants.stiffness,
@@ -308,7 +309,7 @@ class MitDriveNode:
         self.is_on = False
         self.torque = 0.0
         if self._constants.make != "t_motor":
-            self._wanted = _Wanted()
+            self.wanted = Wanted()
 
     @staticmethod
     def _twelve_bits(value: float, end: float) -> int:
