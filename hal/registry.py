@@ -15,6 +15,9 @@ DRIVERS = {
     "cia404": "hal.drivers.cia404:Cia404Cell",
     "cia406": "hal.drivers.cia406:Cia406Encoder",
     "mit": "hal.drivers.mit:MitDrive",
+    "dbc": "hal.drivers.dbc:DbcNode",
+    "dbc_servo": "hal.drivers.dbc_servo:DbcServo",
+    "odrive": "hal.drivers.odrive:Odrive",
 }
 
 

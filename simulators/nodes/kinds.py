@@ -1,20 +1,26 @@
 """Which class plays which kind of node: one line per kind."""
 
+from collections.abc import Callable
+
 from simulators.nodes.analog_input import AnalogConstants, AnalogInput
+from simulators.nodes.dbc_cell import DbcCell, DbcCellConstants
 from simulators.nodes.drive import ServoDrive
 from simulators.nodes.encoder import JointEncoder
 from simulators.nodes.load_cell import LoadCell
 from simulators.nodes.mit_drive import MitConstants, MitDriveNode
 from simulators.nodes.node import Frame, SimulatedNode
+from simulators.nodes.odrive import OdriveAxis, OdriveConstants
 from simulators.nodes.plant import Plant
 from simulators.nodes.spec import CellConstants, DriveConstants, EncoderConstants, NodeSpec
 
-KINDS = {
+KINDS: dict[type, Callable[[NodeSpec, Plant, list[Frame]], SimulatedNode]] = {
     DriveConstants: ServoDrive,
     CellConstants: LoadCell,
     AnalogConstants: AnalogInput,
     EncoderConstants: JointEncoder,
     MitConstants: MitDriveNode,
+    OdriveConstants: OdriveAxis,
+    DbcCellConstants: DbcCell,
 }
 
 

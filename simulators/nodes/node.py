@@ -10,6 +10,8 @@ Frame = tuple[int, bytes]
 Handler = Callable[[bytes, float], None]
 """Called with a frame's data and the time [s]."""
 EXTENDED = 1 << 31
+REMOTE = 1 << 30
+"""Set in the identifier of a route that is asked by a remote frame; its handler gets no data."""
 
 
 class SimulatedNode(Protocol):

@@ -9,7 +9,7 @@ import can
 
 from simulators.hub import HubBus
 from simulators.nodes.kinds import make
-from simulators.nodes.node import EXTENDED, Frame, Handler
+from simulators.nodes.node import EXTENDED, REMOTE, Frame, Handler
 from simulators.nodes.plant import Plant
 from simulators.nodes.spec import NodeSpec
 
@@ -97,10 +97,11 @@ class Segment:
         return self._bus.recv(timeout)
 
     def _handle(self, message: can.Message, now: float) -> None:
-        if message.is_error_frame or message.is_remote_frame:
+        if message.is_error_frame:
             return
         self.counters["received"] += 1
         identifier = message.arbitration_id | (EXTENDED if message.is_extended_id else 0)
+        identifier |= REMOTE if message.is_remote_frame else 0
         if identifier == SYNC:
             for node in self._listeners:
                 node.sync(now)

@@ -1,0 +1,144 @@
+"""An ODrive axis over CANSimple: the settings of a servo with a DBC file, most of them written down here once.
+
+Source: the maker's documentation (docs.odriverobotics.com, CAN Protocol and CAN Guide, firmware 0.6) and, for what
+feeds the watchdog, the public firmware 0.5 (Firmware/communication/can/can_simple.cpp: every frame for the axis does).
+"""
+
+import math
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import Field, model_validator
+
+from hal.drivers.dbc_servo import DbcServo
+from hal.drivers.dbc_settings import ServoSettings
+from hal.section import Positive
+
+COMMAND_BITS = 5
+"""An identifier is the node id before so many bits of the command."""
+STANDSTILL = 0.05
+"""Turns of the motor per second below which it counts as standing."""
+
+_MODES: dict[str, dict[str, Any]] = {
+    "position": {"control": "POSITION_CONTROL", "send": "Set_Input_Pos", "signal": "Input_Pos"},
+    "velocity": {"control": "VELOCITY_CONTROL", "send": "Set_Input_Vel", "signal": "Input_Vel"},
+    "effort": {"control": "TORQUE_CONTROL", "send": "Set_Input_Torque", "signal": "Input_Torque"},
+}
+_IDLE = {"signal": "Heartbeat.Axis_State", "equals": "IDLE", "within": 0.5}
+
+
+def _state(wanted: str, until: dict[str, Any]) -> dict[str, Any]:
+    return {"send": "Set_Axis_State", "values": {"Axis_Requested_State": wanted}, "until": until}
+
+
+def _control(mode: str) -> dict[str, Any]:
+    return {"send": "Set_Controller_Mode", "values": {"Control_Mode": mode, "Input_Mode": "PASSTHROUGH"}}
+
+
+COMMON: dict[str, Any] = {
+    "node_offset": 1 << COMMAND_BITS,
+    "periods": {"Heartbeat": 0.1, "Get_Encoder_Estimates": 0.01},
+    "heartbeat": {"message": "Heartbeat", "timeout": 0.35},
+    "error": {"signal": "Heartbeat.Axis_Error", "good": "NONE", "bits": True},
+    "state": {
+        "signal": "Heartbeat.Axis_State",
+        "ready": ["IDLE"],
+        "enabled": ["CLOSED_LOOP_CONTROL"],
+        "busy": [
+            *("FULL_CALIBRATION_SEQUENCE", "MOTOR_CALIBRATION", "ENCODER_INDEX_SEARCH", "ENCODER_OFFSET_CALIBRATION"),
+            *("LOCKIN_SPIN", "ENCODER_DIR_FIND", "HOMING", "ENCODER_HALL_POLARITY_CALIBRATION"),
+            *("ENCODER_HALL_PHASE_CALIBRATION", "ANTICOGGING_CALIBRATION"),
+        ],
+        "booting": ["UNDEFINED", "STARTUP_SEQUENCE"],
+        "reason": "Heartbeat.Procedure_Result",
+    },
+    # All axes hear a question to node 63, and each answers under its own id.
+    "identity": {
+        "ask": {"frame": {"id": 63 << COMMAND_BITS | 0x06, "remote": True, "broadcast": True}},
+        "signals": ["Address.Serial_Number"],
+    },
+    "disable": [_state("IDLE", _IDLE)],
+    # To rest by the drive's own velocity control, then without power; an axis that does not say so is sent an Estop.
+    "quick_stop": [
+        _control("VELOCITY_CONTROL"),
+        {
+            "send": "Set_Input_Vel",
+            "until": {"signal": "Get_Encoder_Estimates.Vel_Estimate", "below": STANDSTILL, "within": 0.3},
+        },
+        _state("IDLE", {**_IDLE, "within": 0.3}),
+        {"send": "Estop", "unless": {"signal": "Heartbeat.Axis_State", "equals": "IDLE"}, "until": _IDLE},
+    ],
+    "reset": [{"send": "Clear_Errors", "until": {"signal": "Heartbeat.Axis_Error", "equals": "NONE", "within": 0.5}}],
+}
+"""What holds for every axis in every mode."""
+
+
+def profile(mode: str, gear: float, watchdog_timeout: float) -> dict[str, Any]:
+    """Settings of a servo with a DBC file for one axis.
+
+    Args:
+        mode: `position`, `velocity` or `effort`.
+        gear: Motor turns per turn of the output.
+        watchdog_timeout: axis.config.watchdog_timeout [s].
+    """
+    turn = 2.0 * math.pi / gear
+    chosen = _MODES[mode]
+    return {
+        **COMMON,
+        "quantities": {
+            "position": {"signal": "Get_Encoder_Estimates.Pos_Estimate", "scale": turn},
+            "velocity": {"signal": "Get_Encoder_Estimates.Vel_Estimate", "scale": turn},
+            "effort": {"signal": "Get_Torques.Torque_Estimate", "scale": gear},
+            "temperature": {"signal": "Get_Temperature.FET_Temperature"},
+            "motor_temperature": {"signal": "Get_Temperature.Motor_Temperature"},
+            "current": {"signal": "Get_Iq.Iq_Measured"},
+            "voltage": {"signal": "Get_Bus_Voltage_Current.Bus_Voltage"},
+        },
+        # Sent while disabled too: it feeds the watchdog, and the axis begins where it is.
+        "command": {
+            "quantity": mode,
+            "send": chosen["send"],
+            "signal": chosen["signal"],
+            "scale": gear if mode == "effort" else turn,
+            "while_disabled": True,
+        },
+        "enable": [
+            _control(chosen["control"]),
+            _state(
+                "CLOSED_LOOP_CONTROL",
+                {"signal": "Heartbeat.Axis_State", "equals": "CLOSED_LOOP_CONTROL", "within": 1.0},
+            ),
+        ],
+        "watchdog": {
+            "timeout": watchdog_timeout,
+            "fed_by": [chosen["send"]],
+            "expired": {"signal": "Heartbeat.Axis_Error", "equals": "WATCHDOG_TIMER_EXPIRED"},
+        },
+    }
+
+
+class OdriveSettings(ServoSettings):
+    """Settings of an axis; any other setting of a servo with a DBC file has the profile's value if not given."""
+
+    mode: Literal["position", "velocity", "effort"] = "position"
+    """What is commanded."""
+    gear: Positive = 1.0
+    """Motor turns per turn of the output."""
+    watchdog_timeout: Annotated[float, Field(ge=0.05, le=5.0)] = 0.2
+    """What axis.config.watchdog_timeout is set to [s], with axis.config.enable_watchdog."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _filled_in(cls, given: dict[str, Any]) -> dict[str, Any]:
+        mode, gear = given.get("mode", "position"), given.get("gear", 1.0)
+        if mode not in _MODES or not isinstance(gear, int | float) or not gear > 0:
+            mode, gear = "position", 1.0  # the field's own check tells what is wrong with it
+        timeout = given.get("watchdog_timeout", 0.2)
+        filled = {**profile(mode, gear, timeout), **given}
+        filled["periods"] = {**COMMON["periods"], **given.get("periods", {})}
+        return filled
+
+
+class Odrive(DbcServo):
+    """One axis of an ODrive."""
+
+    Settings: ClassVar[type[OdriveSettings]] = OdriveSettings
