@@ -35,6 +35,8 @@ class ServoDrive(CanopenNode):
         self._constants = spec.constants
         self.state = State.SWITCH_ON_DISABLED
         self._controlword = 0
+        self._words: list[tuple[int, int]] = []
+        """Control words that have come since `follow`, each with the one before it."""
         self._stop_ends = 0.0
         self._after_stop = State.SWITCH_ON_DISABLED
         self._deviates_since: float | None = None
@@ -50,7 +52,6 @@ class ServoDrive(CanopenNode):
         self.objects.on_write[0x6060] = self._check_mode
         self.objects.on_write[0x605A] = self._check_quick_stop
         self.objects.after_write[0x6040] = lambda sub: self._obey()
-        self.objects.after_write[0x6060] = lambda sub: self._change_mode()
 
     @property
     def servo(self) -> tuple[float, bool]:
@@ -79,9 +80,13 @@ class ServoDrive(CanopenNode):
         """Take the newest set-point, and carry on a stop."""
         if self.state is State.OPERATION_ENABLED:
             self.sample()
-            self._mechanics.move(now, int(self.objects.values[0x6060, 0]), self._controlword)
+            mode = int(self.objects.values[0x6060, 0])
+            for word, before in self._words:
+                self._mechanics.command(mode, word, before)
+            self._mechanics.move(now, mode, self._controlword)
             self._watch_deviation(now)
-        elif self._is_stopping():
+        self._words.clear()
+        if self._is_stopping():
             self.sample()
             slow = self._constants.counts_per_turn * self._constants.gear * _STANDSTILL
             if now >= self._stop_ends or abs(self._mechanics.velocity) < slow:
@@ -110,8 +115,8 @@ class ServoDrive(CanopenNode):
         before, self._controlword = self._controlword, word
         state = following(self.state, word, before)
         if state is self.state:
-            if state is State.OPERATION_ENABLED:
-                self._mechanics.command(int(self.objects.values[0x6060, 0]), word, before)
+            if state is State.OPERATION_ENABLED:  # acted on in `follow`: a target may stand behind it in the same PDO
+                self._words.append((word, before))
             return
         if self.state is State.FAULT:
             self.objects.values[0x603F, 0] = 0
@@ -180,9 +185,7 @@ class ServoDrive(CanopenNode):
     def _check_mode(self, sub: int, old: Value, new: Value) -> None:
         if new not in (0, *self._constants.modes):
             raise Refused(Abort.VALUE)
-
-    def _change_mode(self) -> None:
-        if self.state is State.OPERATION_ENABLED:
+        if new != old and self.state is State.OPERATION_ENABLED:
             self.sample()
             self._mechanics.start(self._now)
 
