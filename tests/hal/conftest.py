@@ -1,5 +1,6 @@
 import pytest
 from hal_bench import Bench
+from mit_bench import mit_bench
 
 
 @pytest.fixture
@@ -7,3 +8,17 @@ def bench():
     bench = Bench().open()
     yield bench
     bench.close()
+
+
+@pytest.fixture
+def open_mit():
+    """Opens benches with drives in MIT mode, and closes them."""
+    benches = []
+
+    def open_bench(config=None, nodes=None, world=None):
+        benches.append(mit_bench(config, nodes, world).open())
+        return benches[-1]
+
+    yield open_bench
+    for bench in benches:
+        bench.close()

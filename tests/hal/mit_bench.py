@@ -96,3 +96,50 @@ def mit_bench(config=None, nodes=None, world=None):
     """Robot and nodes in lockstep, not opened yet."""
     model = RobotConfig.model_validate(config or description())
     return Bench(model, nodes=nodes or hardware(), world=world or JointWorld())
+
+
+def only(joint, settings, constants, **changes):
+    """A robot with one of the joints, its drive with these settings, and its hardware."""
+    body = description(**changes)
+    signals = {name: {**signal, "elements": [joint]} for name, signal in body["signals"].items()}
+    if settings["motor"].startswith("AK"):
+        del signals["driver_temperature"]
+    body["signals"] = signals
+    device = {"kind": "one", "bus": "can0", "node": 1, "elements": elements(joint, "driver_temperature" in signals)}
+    body["kinds"] = {"one": {"driver": "mit", "settings": settings}}
+    body["devices"] = {f"{joint}_drive": device}
+    return body, [NodeSpec(f"{joint}_drive", "can0", 1, f"joint_position.{joint}", constants)]
+
+
+class OneJoint:
+    """A joint that carries a load [N m]."""
+
+    def __init__(self, joint="elbow", position=0.0, load=0.0):
+        self.time = 0.0
+        self.joint = joint
+        self.position = np.array([position])
+        self.load = np.array([load])
+
+    def step(self, duration):
+        self.time += duration
+
+    def measure(self):
+        names = ("joint_velocity", "motor_temperature", "driver_temperature")
+        values = {name: np.zeros(1) for name in names}
+        return {"joint_position": self.position.copy(), "joint_effort": self.load.copy(), **values}
+
+    truth = measure
+
+    def drive(self, element, target, enabled):
+        if enabled:
+            self.position[0] = target
+
+    def break_part(self, part):
+        raise ValueError(part)
+
+    def close(self):
+        pass
+
+
+def node(bench, joint):
+    return bench.rig.node(f"{joint}_drive")
