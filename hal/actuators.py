@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from hal.config import RobotConfig
-from hal.device import Device, DeviceState
+from hal.device import UNDER_POWER, Device, DeviceState
 from hal.errors import ConfigError
 
 
@@ -69,6 +69,11 @@ class Actuators:
     def states(self) -> list[DeviceState]:
         """Where each stands."""
         return [device.health().state for device in self.devices]
+
+    @property
+    def are_powered(self) -> bool:
+        """Whether any has power, as far as it tells."""
+        return any(state in UNDER_POWER for state in self.states())
 
     def named(self, states: Sequence[DeviceState], wanted: DeviceState) -> str:
         """Names of those that are not in the wanted state."""

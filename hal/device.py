@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -26,10 +27,15 @@ class DeviceState(StrEnum):
     """Follows what is applied."""
     HOMING = "homing"
     """Moves by itself to find its zero."""
+    STOPPING = "stopping"
+    """Comes to rest by itself and lets go then; still under power."""
     FAULT = "fault"
     """Reports a fault of its own; leaves it only by `reset`."""
     SILENT = "silent"
     """Was heard, and is not heard any more."""
+
+
+UNDER_POWER = (DeviceState.ENABLED, DeviceState.HOMING, DeviceState.STOPPING)
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +60,10 @@ class DeviceHealth:
     """One sentence a person can act on; empty when all is well."""
     counters: dict[str, int] = field(default_factory=dict)
     """Malformed frames, missed cycles, emergencies, reboots and the like, since opened."""
+
+    def plain(self) -> dict[str, Any]:
+        """The same in plain values."""
+        return {"state": self.state.value, "text": self.text, "counters": dict(self.counters)}
 
 
 @dataclass(frozen=True, slots=True)

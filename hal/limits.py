@@ -74,7 +74,7 @@ class Limiter:
             limits.append(Rate(self._rate, self._period))
         for way in self._positions:
             braking = None if self._rate is None else self._rate[way.commanded]
-            limits.append(EndsOfVelocity(way, braking, self._ahead(way.signal), self._period))
+            limits.append(EndsOfVelocity(way, braking, self._ahead(way.signal)))
         return limits
 
     def _of_effort(self, loads: Sequence[Load]) -> list[Limit]:
@@ -99,11 +99,6 @@ class Limiter:
         else:
             self.set_point = np.zeros(self._size)
         return self.set_point
-
-    def forget(self) -> None:
-        """There is no set-point any more."""
-        self.set_point = np.full(self._size, np.nan)
-        self._speed = np.zeros(self._size)
 
     def step(self, desired: np.ndarray | None, measured: Arrays, is_parking: bool = False) -> list[str]:
         """Take `set_point` one cycle further.

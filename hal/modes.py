@@ -26,7 +26,7 @@ class Mode(StrEnum):
     OFF = "off"
     ENABLING = "enabling"
     HOLD = "hold"
-    """Enabled; the set-point stays where it is, which of a velocity or an effort is 0."""
+    """Enabled; the set-point stays where it is. A velocity is 0, and so is an effort unless the drives damp."""
     FOLLOW = "follow"
     """Enabled; a command younger than its time to live is followed."""
     HOMING = "homing"
@@ -49,7 +49,6 @@ class Act(StrEnum):
     PARK = "park"
 
 
-_ACTS = {Mode.ENABLING: Act.START, Mode.HOLD: Act.HOLD, Mode.FOLLOW: Act.FOLLOW}
 _STOPS = {"hold": Act.HOLD, "damp": Act.DAMP, "park": Act.PARK, "off": Act.IDLE}
 
 
@@ -60,6 +59,8 @@ class ModeMachine:
         self._actuators = actuators
         self._hold = config.command.hold
         self._stop_act = _STOPS[config.stop.behaviour]
+        held = Act.DAMP if actuators.quantity == "effort" and self._stop_act is Act.DAMP else Act.HOLD
+        self._acts = {Mode.ENABLING: Act.START, Mode.HOLD: held, Mode.FOLLOW: Act.FOLLOW}
         self._park_time = _park_time(config)
         self._deadline = 0.0
         self._act = Act.IDLE
@@ -73,7 +74,7 @@ class ModeMachine:
     @property
     def act(self) -> Act:
         """What the drives are to do in this cycle."""
-        return self._act if self.mode is Mode.STOPPING else _ACTS.get(self.mode, Act.IDLE)
+        return self._act if self.mode is Mode.STOPPING else self._acts.get(self.mode, Act.IDLE)
 
     @property
     def is_powered(self) -> bool:
@@ -275,7 +276,7 @@ class ModeMachine:
 
 
 _POWERED = (DeviceState.ENABLED, DeviceState.HOMING)
-_LETTING_GO = (DeviceState.ENABLED, DeviceState.HOMING, DeviceState.READY)
+_LETTING_GO = (DeviceState.ENABLED, DeviceState.HOMING, DeviceState.STOPPING, DeviceState.READY)
 _FIT = {
     Mode.ENABLING: (DeviceState.ENABLED, DeviceState.READY),
     Mode.HOLD: (DeviceState.ENABLED,),

@@ -11,7 +11,7 @@ from hal.bus import Bus
 from hal.caretaker import Caretaker
 from hal.clock import BusClock, Clock, SystemClock
 from hal.config import RobotConfig
-from hal.device import Device, DeviceState
+from hal.device import Device
 from hal.errors import CommandRefused
 from hal.fleet import build
 from hal.limits import Limiter
@@ -144,7 +144,7 @@ class Robot:
         due = self._clock.monotonic()
         for _ in range(round(CLOSING_TIME / self.period)):
             self.cycle()
-            if not {DeviceState.ENABLED, DeviceState.HOMING} & set(self._actuators.states()):
+            if not self._actuators.are_powered:
                 return
             due += self.period
             if self._buses:
@@ -283,14 +283,15 @@ class Robot:
         if desired is not None and (now > desired[1] or not modes.takes_commands):
             self._desired = desired = None
         modes.step(now, desired is not None, self._park is not None and np.array_equal(limiter.set_point, self._park))
-        limited = self._move(modes.act, desired)
+        act = modes.act
+        limited = self._move(act, desired)
         return Applied(
             self._number,
             stamp,
             modes.mode.value,
             self.config.command.signal,
             desired[0] if desired else self._nothing,
-            limiter.set_point,
+            self._nothing if act in (Act.IDLE, Act.DAMP) else limiter.set_point,
             limited,
         )
 
@@ -298,12 +299,12 @@ class Robot:
         """Take the set-point one step on and send it; which limits acted."""
         limiter, actuators = self._limiter, self._actuators
         limited: list[str] = []
-        if act is Act.IDLE or act is Act.DAMP:
-            limiter.forget()
-            if act is Act.DAMP:
-                actuators.damp()
-            else:
-                actuators.idle()
+        if act is Act.IDLE:
+            actuators.idle()
+            return limited
+        if act is Act.DAMP:
+            limiter.start(self._measured)
+            actuators.damp()
             return limited
         if act is Act.START:  # the set-point is where the robot is, so that nothing jumps
             limiter.start(self._measured)
@@ -329,11 +330,7 @@ class Robot:
             "incomplete": self._incomplete,
             "limits": self._limiter.blind(self._measured),
             "buses": {bus.name: bus.health() for bus in self._buses},
-            "devices": {
-                device.name: {"state": health.state.value, "text": health.text, "counters": dict(health.counters)}
-                for device in self._devices
-                if (health := device.health())
-            },
+            "devices": {device.name: device.health().plain() for device in self._devices},
         }
 
 

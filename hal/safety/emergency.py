@@ -10,7 +10,7 @@ from hal.bus import Bus
 from hal.bus_state import UNUSABLE
 from hal.clock import Clock
 from hal.config import RobotConfig
-from hal.device import Device, DeviceState
+from hal.device import UNDER_POWER, Device, DeviceState
 
 log = logging.getLogger(__name__)
 
@@ -141,8 +141,8 @@ class EmergencyStop:
         if bus is not None and bus.state in UNUSABLE:
             return Stopped(name, False, f"cannot be reached, bus '{bus.name}' is {bus.state}; cut the power")
         health = device.health()
-        if health.state in (DeviceState.ENABLED, DeviceState.HOMING):
-            return Stopped(name, False, "is still enabled; cut the power")
+        if health.state in UNDER_POWER:
+            return Stopped(name, False, f"is still {health.state}; cut the power")
         return Stopped(name, False, f"did not answer ({health.state}); cut the power")
 
 

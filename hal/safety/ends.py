@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from hal.safety.limit import Arrays, Turn, changed
-from hal.safety.motion import fastest
 
 RESPONSE = 0.02
 """How long [s] a drive may lag behind its command."""
@@ -45,29 +44,28 @@ class Way:
 class EndsOfVelocity:
     """A velocity command is braked so that the position comes to rest inside of its range.
 
-    Beyond an end only the way back is open. Where the position is not known the command is 0: nobody can tell how far
-    it would go.
+    A velocity v that is seen `ahead` too late and is braked then goes on for `v * ahead + v^2 / (2 deceleration)`.
+    Solved for v, that is never braked harder than `deceleration`. Beyond an end only the way back is open. Where the
+    position is not known the command is 0: nobody can tell how far it would go.
     """
 
     name = "range"
     needs = "position"
 
-    def __init__(self, position: Way, deceleration: np.ndarray | None, ahead: float, period: float) -> None:
+    def __init__(self, position: Way, deceleration: np.ndarray | None, ahead: float) -> None:
         """Prepare.
 
         Args:
             position: Of the commanded elements.
             deceleration: How fast the command may brake [unit of the command/s], shape (k,); at once if None.
             ahead: How old [s] a position may be by the time at which the drive has followed a command.
-            period: Of a cycle [s].
         """
-        self._position, self._ahead = position, ahead
-        self._deceleration, self._period = deceleration, period
+        self._position, self._deceleration, self._ahead = position, deceleration, ahead
 
     def limit(self, wanted: np.ndarray, turn: Turn) -> np.ndarray:
         """See `Limit.limit`."""
         way = self._position
-        position = way.read(turn.measured) + turn.before[way.commanded] * self._ahead
+        position = way.read(turn.measured)
         up, down = self._fastest(way.high - position), self._fastest(position - way.low)
         mine = wanted[way.commanded]
         bounded = np.where(np.isfinite(position), np.minimum(np.maximum(mine, -down), up), 0.0)
@@ -78,9 +76,10 @@ class EndsOfVelocity:
         return limited
 
     def _fastest(self, left: np.ndarray) -> np.ndarray:
+        left = np.maximum(left, 0.0)
         if self._deceleration is None:
-            return np.maximum(left, 0.0) / (self._ahead + self._period)
-        return fastest(left, self._deceleration, self._period)
+            return left / self._ahead
+        return self._deceleration * (np.sqrt(self._ahead**2 + 2.0 / self._deceleration * left) - self._ahead)
 
     def blind(self, measured: Arrays) -> list[str]:
         """See `Limit.blind`."""
