@@ -50,8 +50,8 @@ def describe(frame: Frame, book: Book) -> Line:
     if frame.is_remote:
         return Line("remote", None, "asks for the data of this identifier")
     if key in book.explained:
-        node, kind, explain = book.explained[key]
-        return Line(kind, node, explain(frame.data))
+        kind, explain = book.explained[key]
+        return Line(kind, *explain(frame.data))
     if frame.is_extended:
         return Line("?", None, "")
     if frame.identifier in book.pdos:

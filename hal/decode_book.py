@@ -4,7 +4,7 @@ A book begins with the robot file's data sheets and mappings, and learns those t
 one listens.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import canopen
@@ -13,8 +13,8 @@ from canopen.objectdictionary import ODVariable
 from hal.protocols import cia301, sdo
 from hal.protocols.cia301 import Mapped
 
-Explain = Callable[[bytes], str]
-"""Data of a frame that is not CANopen -> what it says."""
+Explain = Callable[[bytes], tuple[int | None, str]]
+"""Data of a frame that is not CANopen -> whose it is, and what it says."""
 
 EXTENDED = 1 << 29
 """Set in an identifier that has 29 bits."""
@@ -59,14 +59,14 @@ class Book:
         names: Node id -> name in the robot file.
         dictionaries: Node id -> what its data sheet says.
         pdos: Identifier -> what it carries.
-        explained: Identifier (with bit 29 set if extended) -> node and what explains a frame that is not CANopen.
+        explained: Identifier (with bit 29 set if extended) -> kind, and what explains a frame that is not CANopen.
     """
 
     def __init__(self) -> None:
         self.names: dict[int, str] = {}
         self.dictionaries: dict[int, canopen.ObjectDictionary] = {}
         self.pdos: dict[int, Pdo] = {}
-        self.explained: dict[int, tuple[int, str, Explain]] = {}
+        self.explained: dict[int, tuple[str, Explain]] = {}
         self._entries: dict[tuple[int, int, int], int] = {}
         self._asked: dict[int, tuple[int, int, int]] = {}
 
@@ -83,11 +83,9 @@ class Book:
                         self._note_default(node, dictionary, index, subindex)
         self._map(node)
 
-    def explain(self, node: int, name: str, kind: str, identifiers: Iterable[int], explain: Explain) -> None:
-        """A node that is not CANopen: these identifiers (bit 29 set if extended) are explained by a function."""
-        self.names[node] = name
-        for identifier in identifiers:
-            self.explained[identifier] = (node, kind, explain)
+    def explain(self, identifier: int, kind: str, explain: Explain) -> None:
+        """An identifier (with bit 29 set if extended) that is not CANopen, and what explains its frames."""
+        self.explained[identifier] = (kind, explain)
 
     def carry(self, node: int, label: str, identifier: int, objects: tuple[Mapped, ...]) -> None:
         """A PDO is known to carry something else than the data sheet says."""

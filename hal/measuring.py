@@ -115,8 +115,10 @@ def subject(config: RobotConfig, what: str, factor: str) -> Subject:
     wanted = dict(entry.elements) if entry.element is None else {known[0]: entry.element}
     named = [quantity for quantity, element in wanted.items() if element == what]
     quantity = (named or [quantity for quantity in known if quantity in wanted])[0]
-    if factor == "direction" and quantity != known[0]:
-        raise ConfigError(f"'{what}' is the {quantity} of '{device}'; zero and direction are of its {known[0]}.")
+    if factor == "direction" and "position" in known and quantity != "position":
+        if what != device or "position" not in wanted:
+            raise ConfigError(f"'{what}' is the {quantity} of '{device}'; zero and direction are of its position.")
+        quantity = "position"
     channels = len(getattr(settings, "channels", (1,)))
     return Subject(config, device, wanted[quantity], (known.index(quantity) if channels > 1 else 0, channels), factor)
 
@@ -140,6 +142,8 @@ class Measuring:
         config = what.config
         entry = config.devices[what.device]
         plain = {**entry.settings, "zero": 0.0, what.factor: 1 if what.factor == "direction" else 1.0}
+        if config.settings_of(what.device).get("around") is not None:  # which is of calibrated angles
+            plain["around"] = None
         devices = {**config.devices, what.device: entry.model_copy(update={"settings": plain})}
         self._clock = SystemClock()
         self._period = 1.0 / config.rates.hal

@@ -1,13 +1,13 @@
 """The command line: every verb of gemuco, each ending in a sentence when something is wrong."""
 
-import os
 import sys
-from collections.abc import Callable
-from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
+
+from services import hardware_verbs
+from services.verb import Connect, RobotFile, load, robot_name, robot_path, speaks_plainly
 
 app = typer.Typer(
     name="gemuco",
@@ -22,11 +22,6 @@ app = typer.Typer(
     "it in a minute.",
 )
 
-RobotFile = Annotated[str, typer.Argument(metavar="ROBOT", help="A robot file, or the name of one in robots/.")]
-Connect = Annotated[
-    list[str] | None,
-    typer.Option("--connect", metavar="ENDPOINT", help="Another zenoh endpoint to connect to (tcp/192.168.0.5:7447)."),
-]
 Seed = Annotated[int, typer.Option(help="Seed of all that is random.")]
 Variant = Annotated[
     str | None,
@@ -34,33 +29,6 @@ Variant = Annotated[
         help="Which variant of the robot to simulate; the designer's model, which is the first, if not given."
     ),
 ]
-
-
-def speaks_plainly(verb: Callable[..., Any]) -> Callable[..., Any]:
-    """Make what we raise on purpose one sentence on stderr: exit code 2 for a wrong robot file, 1 for the rest."""
-
-    @wraps(verb)
-    def plain(*arguments: Any, **options: Any) -> Any:
-        # numpy reads this when it is first imported: one thread is faster on layers this small.
-        for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-            os.environ.setdefault(name, "1")
-        from gemuco.errors import SchemaError
-        from hal.errors import ConfigError, HalError
-        from services.errors import ServiceError
-
-        try:
-            code = verb(*arguments, **options)
-        except ConfigError as error:
-            typer.echo(f"gemuco: {error}", err=True)
-            raise typer.Exit(2) from None
-        except (SchemaError, HalError, ServiceError) as error:
-            typer.echo(f"gemuco: {error}", err=True)
-            raise typer.Exit(1) from None
-        except KeyboardInterrupt:
-            raise typer.Exit(130) from None
-        raise typer.Exit(code or 0)
-
-    return plain
 
 
 @app.callback()
@@ -93,7 +61,7 @@ def simulate(
     """
     from services.simulator_service import run_simulator
 
-    return run_simulator(_load(robot), variant, seed, condition, connect or ())
+    return run_simulator(load(robot), variant, seed, condition, connect or ())
 
 
 @app.command()
@@ -105,7 +73,7 @@ def hal(robot: RobotFile, connect: Connect = None) -> int:
     """
     from services.hal_service import run_hal
 
-    return run_hal(_load(robot), connect or ())
+    return run_hal(load(robot), connect or ())
 
 
 @app.command()
@@ -117,7 +85,7 @@ def vision(robot: RobotFile, variant: Variant = None, seed: Seed = 0, connect: C
     """
     from services.vision_service import run_vision
 
-    run_vision(_load(robot), variant, seed, connect or ())
+    run_vision(load(robot), variant, seed, connect or ())
 
 
 @app.command()
@@ -131,7 +99,7 @@ def serve(
     from services import artifacts
     from services.gemuco_service import serve as run_model
 
-    config = _load(robot)
+    config = load(robot)
     run_model(config, model or artifacts.model_folder(config.robot), connect or ())
 
 
@@ -160,7 +128,7 @@ def collect(
     from services import artifacts, collector
     from services.show import progress
 
-    config, wanted = _load(robot), collector.Wanted(tuple(condition or ()), samples, postures)
+    config, wanted = load(robot), collector.Wanted(tuple(condition or ()), samples, postures)
     with progress("collecting") as tell:
         if bus:
             found = collector.collect_bus(config, seed, wanted, tell)
@@ -202,7 +170,7 @@ def train(
     """
     from services.train_verb import run_training
 
-    run_training(_file(robot), data, out, base, seed)
+    run_training(robot_path(robot), data, out, base, seed)
 
 
 @app.command(context_settings={"ignore_unknown_options": True})  # a target may be negative
@@ -237,7 +205,7 @@ def query(
     """
     from services.ask import ask_robot
 
-    return ask_robot(_name(robot), verb, tuple(words or ()), tuple(hide or ()), watch, connect or ())
+    return ask_robot(robot_name(robot), verb, tuple(words or ()), tuple(hide or ()), watch, connect or ())
 
 
 @app.command()
@@ -254,7 +222,7 @@ def estop(
     """
     from services.estop import estop_robot
 
-    return estop_robot(_name(robot), reason, connect or ())
+    return estop_robot(robot_name(robot), reason, connect or ())
 
 
 @app.command()
@@ -267,7 +235,7 @@ def top(
     """Watch a running robot: rates, lateness, ages of signals, estimates, anomaly, mode of the motors."""
     from services.top import watch
 
-    return watch(_name(robot), once, connect or ())
+    return watch(robot_name(robot), once, connect or ())
 
 
 @app.command()
@@ -280,7 +248,7 @@ def record(
     """Write down all that a robot's services publish, as MCAP, until Ctrl-C."""
     from services.recorder import run_recorder
 
-    return run_recorder(_name(robot), out, connect or ())
+    return run_recorder(robot_name(robot), out, connect or ())
 
 
 @app.command()
@@ -298,7 +266,7 @@ def demo(
     """
     from services.demo import play
 
-    return play(_load(robot), _file(robot), seed, out)
+    return play(load(robot), robot_path(robot), seed, out)
 
 
 @app.command()
@@ -325,21 +293,7 @@ def reproduce(
     typer.echo(f"Figures and tables are in {out / robot}.")
 
 
-def _file(text: str) -> Path:
-    from services.artifacts import robot_file
-
-    return robot_file(text)
-
-
-def _load(text: str) -> Any:
-    from hal.config import load_robot
-
-    return load_robot(_file(text))
-
-
-def _name(text: str) -> str:
-    """The robot's name; a client needs no robot file."""
-    return str(_load(text).robot) if Path(text).suffix in (".yaml", ".yml") else text
+hardware_verbs.register(app)
 
 
 if __name__ == "__main__":

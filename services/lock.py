@@ -1,8 +1,10 @@
 """One service of a kind per robot: a file lock on this machine, a liveliness token on the network."""
 
+import contextlib
 import fcntl
 import os
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TextIO
 
@@ -79,3 +81,18 @@ class ServiceLock:
 
     def _sentence(self, holder: str) -> str:
         return f"Robot '{self.robot}' already has a '{self.service}' service: {holder}. Stop that one first."
+
+
+@contextlib.contextmanager
+def instead_of(robot: str, service: str) -> Iterator[None]:
+    """Do what a service would do: it must not run on this machine, and cannot start, for as long as the context lasts.
+
+    Raises:
+        AlreadyRunning: It runs.
+    """
+    lock = ServiceLock(robot, service)
+    lock.acquire()
+    try:
+        yield
+    finally:
+        lock.release()

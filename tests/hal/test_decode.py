@@ -110,7 +110,8 @@ def test_what_the_driver_maps_takes_precedence(book):
 
 
 def test_frames_that_are_not_canopen_are_told_by_who_knows_them(book):
-    book.explain(5, "wrist", "MIT", [0x005, EXTENDED | 0x1F005], lambda data: f"{len(data)} bytes")
+    for identifier in (0x005, EXTENDED | 0x1F005):
+        book.explain(identifier, "MIT", lambda data: (5, f"{len(data)} bytes"))
     assert describe(frame(0x005, "00 01"), book).text == "2 bytes"
     assert describe(frame(0x1F005, "00", is_extended=True), book).node == 5
     assert describe(frame(0x1F006, "00", is_extended=True), book).kind == "?"

@@ -1,0 +1,211 @@
+"""What is wrong with a robot's buses and devices, and what to do: one finding per thing that was looked at.
+
+Nothing is enabled: the devices are opened, turned for a second with their motors off, read back, and let go.
+"""
+
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+from hal import budget, calibration_store, registry
+from hal.bus import Bus
+from hal.bus_state import BusState
+from hal.clock import SystemClock
+from hal.config import RobotConfig
+from hal.device import Device
+from hal.errors import ConfigError, HalError
+from hal.findings import Finding, bad, ok, warning
+from hal.fleet import build
+
+DURATION = 1.0
+"""How long [s] the devices are turned to see whether they answer every cycle."""
+COMPLETE = 0.98
+"""Share of the cycles in which every device should answer."""
+SIMULATED = ("hub", "virtual")
+
+
+def described(config: RobotConfig) -> Iterator[Finding]:
+    """The robot file, the budget of its buses, and its calibrations: nothing is opened."""
+    try:
+        build(config, SystemClock(), {})
+    except ConfigError as error:
+        yield bad("robot file", str(error))
+        return
+    counts = f"{len(config.buses)} buses, {len(config.devices)} devices, {len(config.signals)} signals"
+    yield ok("robot file", f"'{config.robot}': {counts}.")
+    for found in budget.budgets(config):
+        yield ok(f"budget {found.bus}", f"{found}.")
+    yield calibrated(config)
+
+
+def calibrated(config: RobotConfig) -> Finding:
+    """Whether the calibrations hold, and which devices have none though their driver takes one."""
+    try:
+        stored = calibration_store.load(config)
+        dates = [record.date[:10] for record in calibration_store.records(config) if record.device in stored]
+    except ConfigError as error:
+        return bad("calibration", str(error))
+    takers = [name for name in config.devices if "zero" in registry.equipment(config, name)[0].Settings.model_fields]
+    without = [name for name in takers if name not in stored]
+    has = f"{len(stored)} of {len(takers)} devices, the oldest of {min(dates)}" if stored else "none"
+    nameless = [name for name, one in stored.items() if not one.identity]
+    if nameless:
+        return warning(
+            "calibration",
+            f"{has}. {_listed(nameless)} cannot tell who they are: when you replace one, calibrate it again.",
+        )
+    if not without:
+        return ok("calibration", f"{has}.")
+    text = f"{has}; zero and scale of {_listed(without)} are the robot file's."
+    if all(bus.interface in SIMULATED for bus in config.buses.values()):
+        return ok("calibration", f"{text} The hardware is simulated.")
+    return warning("calibration", f"{text} If these are not measured, use `gemuco calibrate`.")
+
+
+def examine(config: RobotConfig, duration: float = DURATION) -> Iterator[Finding]:
+    """Open buses and devices, turn them with their motors off, and read back what they were told.
+
+    Raises:
+        ConfigError: The robot file cannot be built.
+    """
+    clock = SystemClock()
+    buses, devices = build(config, clock)
+    pool = ThreadPoolExecutor(max(1, len(devices)))
+    for bus in buses:
+        bus.open()
+    try:
+        there = {bus.name for bus in buses if bus.counters["opened"]}
+        asked = [device for device in devices if config.devices[device.name].bus in there]
+        errors = dict(zip(asked, pool.map(_opened, asked), strict=True))
+        answering = [device for device, error in errors.items() if not error]
+        share, missed = _turn(config, buses, answering, clock, duration)
+        yield from _buses(buses, there, config)
+        yield from _answers(devices, errors, there, config)
+        if answering:
+            yield _complete(share, missed, config.rates.hal)
+        yield from _inspected(dict(zip(answering, pool.map(_checks, answering), strict=True)))
+    finally:
+        list(pool.map(lambda device: device.close(), devices))
+        pool.shutdown()
+        for bus in buses:
+            bus.close()
+
+
+def _opened(device: Device) -> str:
+    """Open a device; why it cannot be, empty if it could."""
+    try:
+        device.open()
+    except HalError as error:
+        return str(error)
+    return ""
+
+
+def _turn(
+    config: RobotConfig, buses: Sequence[Bus], devices: Iterable[Device], clock: SystemClock, duration: float
+) -> tuple[float, dict[str, int]]:
+    """Cycle with the motors off: share of cycles in which all answered, and how often each did not."""
+    period, devices = 1.0 / config.rates.hal, list(devices)
+    cycles = max(10, round(duration * config.rates.hal))
+    missed = dict.fromkeys((device.name for device in devices), 0)
+    whole = 0
+    due = clock.monotonic()
+    for _ in range(cycles):
+        for bus in buses:
+            bus.begin()
+        start = clock.monotonic()
+        for device in devices:
+            if device.commands:
+                device.idle()
+        for bus in buses:
+            bus.sync(start)
+        for bus in buses:
+            bus.wait(start + 0.8 * period)
+        late = [device for device in devices if getattr(device, "missed", 1) > 1]
+        for device in late:
+            missed[device.name] += 1
+        whole += not late
+        due = max(due + period, clock.monotonic())
+        clock.sleep_until(due)
+    return whole / cycles, {name: count for name, count in missed.items() if count > (1 - COMPLETE) * cycles}
+
+
+def _buses(buses: Sequence[Bus], there: set[str], config: RobotConfig) -> Iterator[Finding]:
+    planned = {found.bus: found.load for found in budget.budgets(config)}
+    for bus in buses:
+        what, settings = f"bus {bus.name}", config.buses[bus.name]
+        if bus.name not in there:
+            advice = " Start `gemuco simulate`, or name real interfaces." if settings.interface in SIMULATED else ""
+            yield bad(what, f"It does not open: {bus.text}{advice}")
+            continue
+        health = bus.health()
+        load = f"load {health['load']:.0%} of at most {settings.max_load:.0%}, {planned[bus.name]:.0%} computed"
+        if bus.state is BusState.OK:
+            over = health["load"] > settings.max_load
+            yield (warning if over else ok)(what, f"{load}.")
+        elif bus.state is BusState.WARNING:
+            yield warning(what, f"{bus.text} ({load})")
+        else:
+            yield bad(what, f"It is {bus.state}. {bus.text}")
+        if health["unknown"]:
+            strangers = ", ".join(str(stranger) for stranger in health["unknown"])
+            yield warning(
+                f"strangers {bus.name}", f"Frames of nobody in the robot file: {strangers}. `gemuco scan` tells more."
+            )
+
+
+def _answers(
+    devices: Sequence[Device], errors: dict[Device, str], there: set[str], config: RobotConfig
+) -> Iterator[Finding]:
+    silent = [device.name for device in devices if device not in errors]
+    for device, error in errors.items():
+        if error:
+            yield bad(f"node {device.name}", error)
+    good = len([error for error in errors.values() if not error])
+    if good == len(devices):
+        yield ok("nodes", f"All {good} answer.")
+    elif silent:
+        yield bad("nodes", f"{good} of {len(devices)} answer; {_listed(silent)}: the bus does not open.")
+    else:
+        yield bad("nodes", f"{good} of {len(devices)} answer.")
+
+
+def _complete(share: float, missed: dict[str, int], rate: float) -> Finding:
+    if share >= COMPLETE:
+        return ok("cycles", f"All of them answered in {share:.1%} of the cycles at {rate:g} Hz.")
+    often = ", ".join(sorted(missed, key=lambda name: -missed[name])[:5]) or "no device more than others"
+    return warning(
+        "cycles",
+        f"All of them answered in only {share:.1%} of the cycles at {rate:g} Hz ({often} missed). Is this machine "
+        "busy, is rates.hal too much for the bus?",
+    )
+
+
+def _checks(device: Device) -> tuple[tuple[str, bool, str], ...]:
+    try:
+        return tuple((check.what, check.is_good, check.text) for check in device.inspect())
+    except HalError as error:
+        return (("inspection", False, str(error)),)
+
+
+def _inspected(checks: dict[Device, tuple[tuple[str, bool, str], ...]]) -> Iterator[Finding]:
+    """One line per kind of check if all devices pass it, and one per device that does not."""
+    kinds = list(
+        dict.fromkeys(what for found in checks.values() for what, _, _ in found if not what.startswith("object"))
+    )
+    for kind in kinds:
+        passed = [device.name for device, found in checks.items() if any(w == kind for w, _, _ in found)]
+        wrong = [
+            (d.name, text) for d, found in checks.items() for w, is_good, text in found if w == kind and not is_good
+        ]
+        for name, text in wrong:
+            yield bad(f"{kind} {name}", text)
+        if not wrong:
+            yield ok(kind, f"As it should be in {len(passed)} devices.")
+    for device, found in checks.items():
+        for what, is_good, text in found:
+            if what.startswith("object") and not is_good:
+                yield bad(f"{what} {device.name}", text)
+
+
+def _listed(names: Sequence[str], most: int = 4) -> str:
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more

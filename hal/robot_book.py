@@ -1,0 +1,107 @@
+"""What a robot file tells of the frames on its buses: data sheets, PDO mappings, DBC files, ranges of MIT drives."""
+
+import math
+from typing import Any
+
+from hal import registry
+from hal.clock import SystemClock
+from hal.config import RobotConfig
+from hal.decode_book import EXTENDED, Book, Explain
+from hal.device import Device
+from hal.drivers.canopen_node import CanopenNode, data_sheet
+from hal.drivers.dbc_sequence import Address
+from hal.fleet import build
+from hal.pdo_commissioning import cob_id
+from hal.protocols import cia301, dbc, mit
+from hal.protocols.mit import Layout, Ranges
+
+
+def books(config: RobotConfig) -> dict[str, Book]:
+    """Bus -> what is known of its nodes.
+
+    Raises:
+        ConfigError: The robot file cannot be built.
+    """
+    found = {name: Book() for name in config.buses}
+    _, devices = build(config, SystemClock(), {})
+    for device in devices:
+        entry = config.devices[device.name]
+        book = found[entry.bus]
+        book.names[entry.node] = device.name
+        settings = registry.equipment(config, device.name)[1]
+        _note(book, config, device, entry.node, settings)
+    return found
+
+
+def _note(book: Book, config: RobotConfig, device: Device, node: int, settings: Any) -> None:
+    if isinstance(device, CanopenNode):
+        book.add(node, device.name, data_sheet(config.folder / settings.eds))
+        for label, first, pdos in (
+            ("RPDO", cia301.RPDO1, device.pdos.receives),
+            ("TPDO", cia301.TPDO1, device.pdos.sends),
+        ):
+            for pdo in pdos:
+                book.carry(node, f"{label}{pdo.number}", cob_id(first, pdo.number, node), pdo.objects)
+    elif hasattr(settings, "dbc"):
+        _note_dbc(book, dbc.load(config.folder / settings.dbc), Address(node, settings.node_offset, settings.extended))
+    elif hasattr(settings, "actuator"):
+        _note_mit(book, node, settings)
+
+
+def _note_dbc(book: Book, file: dbc.Dbc, address: Address) -> None:
+    for message in file.messages:
+        base, extended = address.identifier(message.frame_id, message.is_extended_frame, message.name)
+
+        def explain(data: bytes, message: Any = message) -> tuple[int | None, str]:
+            try:
+                values = message.decode(data, allow_truncated=True)
+            except Exception as error:  # a decoder of cantools passes on whatever it meets in a frame
+                return address.node, f"{message.name}: {error}"
+            parts = (
+                f"{name} {value:.6g}" if isinstance(value, float) else f"{name} {value}"
+                for name, value in values.items()
+            )
+            return address.node, f"{message.name}: {', '.join(parts)}"
+
+        book.explain(base | (EXTENDED if extended else 0), "DBC", explain)
+
+
+def _note_mit(book: Book, node: int, settings: Any) -> None:
+    layout, ranges = settings.actuator
+    reply = settings.master_id
+    if reply is None:
+        reply = node + 16 if layout is Layout.DAMIAO else 0
+    book.explain(node, "MIT", lambda data: (node, _asked(data, ranges)))
+    others = book.explained[reply][1] if reply in book.explained else None
+    book.explain(reply, "MIT", _answers(node, layout, ranges, others))
+
+
+def _asked(data: bytes, ranges: Ranges) -> str:
+    asked = mit.asked(data, ranges)
+    if asked is None:
+        return "malformed"
+    if isinstance(asked, mit.Special):
+        return asked.name.lower()
+    return (
+        f"go to {asked.position:.4g} rad at {asked.velocity:.4g} rad/s with {asked.stiffness:.4g} N m/rad, "
+        f"{asked.damping:.4g} N m s/rad, and {asked.effort:.4g} N m"
+    )
+
+
+def _answers(node: int, layout: Layout, ranges: Ranges, others: Explain | None) -> Explain:
+    """What explains the answers of one drive, and passes on those of the others under the same identifier."""
+    mask = 0x0F if layout is Layout.DAMIAO else 0xFF
+
+    def explain(data: bytes) -> tuple[int | None, str]:
+        if (not data or data[0] & mask != node & mask) and others is not None:
+            return others(data)
+        found = mit.answer(data, layout, ranges)
+        if found is None:
+            return node, "malformed"
+        if found.node != node & mask:
+            return None, f"of drive {found.node}, which the robot file does not have"
+        warmth = "" if math.isnan(found.temperature) else f", {found.temperature:g} degrees Celsius"
+        state = f", state {found.state:X}h" if found.state else ""
+        return node, (f"at {found.position:.4g} rad, {found.velocity:.4g} rad/s, {found.effort:.4g} N m{warmth}{state}")
+
+    return explain
