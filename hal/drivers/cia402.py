@@ -59,8 +59,6 @@ class Cia402Drive(CanopenNode):
     def __init__(self, place: Place, settings: DriveSettings) -> None:
         self._settings = settings
         self._sheet = data_sheet(place.folder / settings.eds)
-        wants_effort = "effort" in place.elements
-        check_objects(settings, wants_effort, self._sheet, str(place))
         self._units: DriveUnits | None = None
         self._state = State.NOT_READY
         self._statusword = -1
@@ -71,6 +69,7 @@ class Cia402Drive(CanopenNode):
         count = len(place.elements)
         self._zeros, self._scales = np.zeros(count).tolist(), np.full(count, math.nan).tolist()
         super().__init__(place, settings, cia402.PROFILE, settings.pdos(tuple(place.elements)))
+        check_objects(settings, "effort" in place.elements, self._sheet, str(place))
         self.can_damp = settings.damping is not None
         self._mode = MODES[settings.mode]
         self._is_watched = self._sdo.has(cia301.CONSUMER_HEARTBEAT, 1)

@@ -91,7 +91,7 @@ def drive_writes(
 def _limits(settings: DriveSettings, units: DriveUnits, bounds: tuple[float, float]) -> Iterator[Write]:
     largest = max(abs(bound) for bound in bounds)
     velocity, torque = settings.max_velocity, settings.max_torque
-    if settings.commanded == "position":
+    if settings.commanded == "position" and min(abs(bound) for bound in bounds) < math.inf:
         yield from _positions(units, bounds)
     elif settings.commanded == "velocity" and velocity is None and math.isfinite(largest):
         velocity = largest * (1 + POSITION_MARGIN)

@@ -1,0 +1,368 @@
+"""What is told of a CANopen node that is not what it should be: twins, no heartbeat, other layouts, wrong files."""
+
+import struct
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from drive_bench import RATE, SETTINGS, JointBench, joint_description
+from hal_bench import ROBOTS
+
+from hal.config import RobotConfig
+from hal.device import DeviceState
+from hal.errors import ConfigError
+from hal.robot import open_robot
+
+NODE = 5
+
+
+@pytest.fixture
+def joint():
+    benches = []
+
+    def made(*args, **how):
+        benches.append(JointBench(*args, **how))
+        return benches[-1]
+
+    yield made
+    for bench in benches:
+        bench.close()
+
+
+def text(bench):
+    return bench.device("elbow")["text"]
+
+
+def test_a_cycle_needs_every_frame_of_it(joint):
+    bench = joint("csp").open()
+    assert bench.cycle(25)[0].complete
+    before = bench.drive.read().received.copy()
+    second = bench.node.pdos.transmit[1]
+    second.type = 254
+    sample, _ = bench.cycle()
+    assert not sample.complete
+    ages = bench.drive.read().received - before
+    position, velocity = (bench.drive.measures.index(f"joint_{q}.elbow") for q in ("position", "velocity"))
+    assert ages[position] > 0
+    assert ages[velocity] == 0
+    second.type = 1
+    assert bench.cycle(2)[0].complete
+
+
+def test_halves_of_two_cycles_are_not_one_answer(joint):
+    bench = joint("csp").open()
+    bench.cycle(3)
+    pdos = bench.node.pdos.transmit
+    for cycle in range(8):
+        pdos[0].type, pdos[1].type = (1, 254) if cycle % 2 else (254, 1)
+        assert not bench.cycle()[0].complete
+
+
+def test_a_short_or_long_frame_is_counted_and_not_used(joint):
+    bench = joint("csp").open()
+    bench.cycle(3)
+    before = bench.drive.read().values.copy()
+    for size in (0, 1, 7):
+        bench.send("can0", 0x180 + NODE, bytes(size))
+    bench.send("can0", 0x280 + NODE, bytes(4))
+    bench.flush()
+    assert bench.device("elbow")["counters"]["malformed"] == 4
+    np.testing.assert_array_equal(bench.drive.read().values, before)
+
+
+def test_two_nodes_that_answer_under_one_id_are_told(joint):
+    bench = joint("csp", quantities=("position",)).open()
+    bench.cycle(3)
+    frame = struct.pack("<Hi", 0x0250, 1234)
+    for _ in range(40):
+        bench.cycle()
+        bench.send("can0", 0x180 + NODE, frame)
+        bench.flush()
+        if bench.device("elbow")["state"] == "fault":
+            break
+    assert "answers each SYNC twice. Do two devices have this node id?" in text(bench)
+    bench.cycle(20)
+    assert bench.device("elbow")["state"] == "fault"
+    bench.robot.reset()
+    bench.cycle(20)
+    assert bench.device("elbow")["state"] == "ready"
+
+
+def test_a_frame_now_and_then_that_comes_twice_is_no_twin(joint):
+    bench = joint("csp").open()
+    bench.cycle(3)
+    for cycle in range(200):
+        bench.cycle()
+        if cycle % 5 == 0:
+            bench.send("can0", 0x180 + NODE, struct.pack("<Hih", 0x0250, 0, 0))
+            bench.flush()
+    assert bench.device("elbow")["counters"]["doubled"] == 40
+    assert bench.device("elbow")["state"] == "ready"
+
+
+def test_late_answers_are_no_twin(joint):
+    bench = joint("csp").open()
+    bench.cycle(3)
+    turn = bench.clock.turn
+    for cycle in range(120):
+        bench.clock.turn = (lambda: None) if cycle % 2 else turn
+        bench.cycle()
+        turn()
+    assert bench.device("elbow")["state"] == "ready"
+
+
+def test_a_boot_up_message_while_process_data_goes_on_is_another_node(joint):
+    bench = joint("csp", quantities=("position",)).open()
+    bench.cycle(3)
+    with bench.drive._opening:  # nobody commissions it meanwhile
+        bench.send("can0", 0x700 + NODE, b"\0")
+        bench.cycle(6)
+    bench.until(lambda: bench.device("elbow")["state"] == "fault", "telling twins", 2000)
+    assert "sent process data on after it had booted. Do two devices have this node id?" in text(bench)
+
+
+def test_a_node_without_a_heartbeat_is_lost_though_it_answers(joint):
+    bench = joint("csp").open()
+    bench.cycle(3)
+    bench.objects[0x1017, 0] = 0
+    with bench.drive._opening:
+        passed = 0
+        while bench.drive.is_commissioned and passed < 80:
+            bench.cycle()
+            passed += 1
+        assert bench.drive.health().state is DeviceState.OPENING
+        assert "goes on sending process data without a heartbeat" in bench.drive.health().text
+    assert 0.2 < passed / RATE < 0.4
+    bench.until(lambda: bench.device("elbow")["state"] == "ready", "commissioning again", 2000)
+    assert bench.objects[0x1017, 0] == 100
+
+
+def test_process_data_that_fails_is_silence_though_the_heart_beats(joint):
+    bench = joint("csp").open()
+    bench.cycle(3)
+    bench.rig.fault("sensor_silent elbow")
+    bench.cycle(31)
+    assert "has not answered for 32 cycles" in text(bench)
+
+
+def test_a_node_that_came_back_is_told_everything_again_and_not_enabled(joint):
+    bench = joint("csp", max_torque=700).open()
+    bench.enable()
+    bench.follow([0.31], 5)
+    bench.rig.fault("node_reboot elbow")
+    bench.cycle(3)
+    assert bench.robot.mode == "fault"
+    bench.until(lambda: bench.device("elbow")["state"] == "ready", "coming back", 2000)
+    assert bench.objects[0x6072, 0] == 700
+    assert bench.device("elbow")["counters"]["boots"] >= 1
+    bench.cycle(20)
+    assert not bench.world.enabled
+
+
+def test_identity_is_vendor_product_and_serial(joint):
+    bench = joint("csp").open()
+    assert bench.drive.identity == f"canopen:47454D55-00000402-{bench.node.spec.serial:08X}"
+
+
+def inspected(bench):
+    found = []
+    bench.while_time_passes(lambda: found.extend(bench.drive.inspect()))
+    return found
+
+
+def test_inspection_finds_all_well_on_a_drive_that_was_opened(joint):
+    checks = inspected(joint("csp", limits={"low": -1, "high": 1}).open())
+    assert all(check.is_good for check in checks), [check for check in checks if not check.is_good]
+    found = {check.what: check.text for check in checks}
+    assert found["device type"] == "00020192h, device profile 402."
+    assert found["heartbeat"] == "100 ms (1017h:0)."
+    assert found["watchdog"] == "stops 150 ms after the last heartbeat of node 127 (1016h:1)."
+    assert found["mode"] == "The drive is in mode cyclic synchronous position."
+    assert sum(check.what == "PDO mapping" for check in checks) == 4
+
+
+def test_inspection_finds_what_somebody_changed(joint):
+    bench = joint("csp", max_torque=700).open()
+    bench.objects[0x1A00, 2] = 0x60620020
+    bench.objects[0x1801, 2] = 5
+    bench.objects[0x1017, 0] = 0
+    bench.objects[0x1016, 1] = 0
+    bench.objects[0x6072, 0] = 3000
+    bench.objects[0x6060, 0] = 9
+    wrong = [f"{check.what}: {check.text}" for check in inspected(bench) if not check.is_good]
+    told = "\n".join(wrong)
+    assert "TPDO1 carries 6041h:0 (16 bit), 6062h:0 (32 bit), 6077h:0 (16 bit), and should carry 6041h:0" in told
+    assert "TPDO2 has transmission type 5, and should have 1." in told
+    assert "heartbeat: 0 ms (1017h:0), and should be 100 ms." in told
+    assert "watchdog: watches nobody (1016h:1)" in told
+    assert "object 6072h:0: 3000 (6072h:0), and should be 700." in told
+    assert "mode: The drive is in mode cyclic synchronous velocity. Open it again" in told
+    assert all(line[-1] == "." for line in wrong)
+
+
+FIXED = {
+    "fixed": True,
+    "receives": [{"number": 1, "objects": ["6040h uint16", "607Ah int32"]}],
+    "sends": [{"number": 1, "objects": ["6041h uint16", "6064h int32", "6077h int16"]}],
+}
+
+
+def write_protected(bench):
+    """Make the drive one whose mapping cannot be changed."""
+    entries = bench.node.objects.entries
+    for key in list(entries):
+        if 0x1600 <= key[0] <= 0x17FF or 0x1A00 <= key[0] <= 0x1BFF:
+            entries[key] = replace(entries[key], access="ro")
+    return bench
+
+
+def test_a_fixed_mapping_is_compared_and_used(joint):
+    bench = write_protected(joint("csp", quantities=("position", "effort"), pdo=FIXED)).open()
+    bench.cycle(2)
+    assert bench.device("elbow")["state"] == "ready"
+    assert bench.value("position") == pytest.approx(0.3, abs=1e-4)
+
+
+def test_another_fixed_mapping_is_refused_with_both_layouts(joint):
+    forced = {**FIXED, "sends": [{"number": 1, "objects": ["6041h uint16", "6064h int32", "6061h int8"]}]}
+    bench = write_protected(joint("csp", quantities=("position",), pdo=forced)).open()
+    assert bench.device("elbow")["state"] == "opening"
+    assert "TPDO1 carries 6041h:0 (16 bit), 6064h:0 (32 bit), 6077h:0 (16 bit), and should carry" in text(bench)
+    assert "6061h:0 (8 bit)." in text(bench)
+
+
+def test_a_mapping_that_is_not_taken_is_told_with_both_layouts(joint):
+    bench = write_protected(joint("csv", quantities=("velocity",))).open()
+    assert "does not take RPDO1 as 6040h:0 (16 bit), 60FFh:0 (32 bit); it has 6040h:0 (16 bit), 607Ah:0" in text(bench)
+    assert "with `fixed: true`" in text(bench)
+
+
+def test_a_forced_layout_is_written(joint):
+    forced = {
+        "receives": [
+            {"number": 2, "objects": ["607Ah int32"]},
+            {"number": 3, "objects": ["6040h uint16", "6060h int8"]},
+        ],
+        "sends": [
+            {"number": 2, "objects": ["6064h int32"]},
+            {"number": 4, "objects": ["6041h uint16", "60FDh uint32"]},
+            {"number": 1, "objects": ["2200h:1 int16"], "transmission": 254, "event_time": 0.05},
+        ],
+    }
+    bench = joint("csp", quantities=("position", "temperature"), pdo=forced).open()
+    bench.cycle(20)
+    assert bench.objects[0x1801, 1] & 0x7FF == 0x285
+    assert bench.objects[0x1800, 5] == 50
+    assert bench.value("temperature") == pytest.approx(25.0)
+    bench.enable()
+    bench.follow([0.35], 20)
+    assert bench.world.position == pytest.approx(0.35, abs=1e-3)
+
+
+def refused(mode="csp", sheet=None, node=NODE, quantities=("position",), **settings):
+    """What is said of a robot file before anything is opened."""
+    body = joint_description(mode, quantities, **settings)
+    if sheet is not None:
+        body["kinds"]["drive"]["settings"]["eds"] = str(sheet)
+    body["devices"]["elbow"]["node"] = node
+    with pytest.raises(ConfigError) as caught:
+        open_robot(RobotConfig.model_validate(body))
+    told = str(caught.value)
+    assert "'elbow'" in told
+    return told
+
+
+def without(tmp_path, *indices):
+    """The drive's data sheet without some objects."""
+    kept, is_dropped = [], False
+    for line in (ROBOTS / SETTINGS["eds"]).read_text().splitlines():
+        if line.startswith("["):
+            is_dropped = any(line[1:].upper().startswith(index) for index in indices)
+        if not is_dropped:
+            kept.append(line)
+    path = tmp_path / "less.eds"
+    path.write_text("\n".join(kept))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("gone", "how", "told"),
+    [
+        ("60FF", {"mode": "csv", "quantities": ("velocity",)}, "cannot receive 60FFh:0 by PDO: its data sheet has no"),
+        ("606C", {"quantities": ("position", "velocity")}, "cannot send 606Ch:0 by PDO: its data sheet has no such"),
+        ("6098", {"homing": {"method": 1, "speed": 1, "slow_speed": 1}}, "needs object 6098h:0 for homing"),
+        ("6065", {"following_error": 0.1}, "needs object 6065h:0 for following_error"),
+        ("6081", {"mode": "profile_position", "profile": {"velocity": 1}}, "6081h:0 for profile.velocity"),
+        ("6076", {"mode": "cst", "quantities": ("effort",)}, "6076h:0 for the rated torque (or the setting rated_to"),
+        ("1016", {}, "has no object 1016h by its data sheet, so that it would go on when the HAL is gone"),
+        ("1802", {"quantities": ("position", "velocity", "temperature")}, "would need TPDO3 to send 2200h:1 (16 bit)"),
+    ],
+)
+def test_a_data_sheet_that_lacks_something_is_told_before_anything_is_opened(tmp_path, gone, how, told):
+    assert told in refused(sheet=without(tmp_path, gone), **how)
+
+
+def test_another_devices_data_sheet_is_told():
+    assert "is of device profile 404, not 402" in refused(sheet=ROBOTS / "eds" / "load_cell.eds")
+
+
+@pytest.mark.parametrize(
+    ("how", "told"),
+    [
+        ({"gear": 0}, "gear: Input should be greater than 0"),
+        ({"counts_per_turn": 0}, "counts_per_turn: Input should be greater than 0"),
+        ({"counts_per_turn": float("nan")}, "counts_per_turn: Input should be"),
+        ({"damping": 1.0}, "damping needs the mode cst, not csp."),
+        ({"profile": {"velocity": 1.0}}, "profile needs the mode profile_position, not csp."),
+        ({"temperature": {"object": "hot", "type": "int16"}}, "'hot' is not an object such as 6064h or 2200h:1."),
+        ({"temperature": {"object": "2200h:1", "scale": 0}}, "a scale of 0 makes every temperature the same."),
+        ({"mode": "jog"}, "mode: Input should be 'profile_position', 'csp', 'csv' or 'cst'"),
+        ({"node": 0}, "has a node id that CANopen does not have. It is 1 to 127."),
+        ({"node": 128}, "has a node id that CANopen does not have. It is 1 to 127."),
+        (
+            {"pdo": {**FIXED, "sends": FIXED["sends"][:0]}},
+            "needs to send 6041h:0 (16 bit), 6064h:0 (32 bit); its setting",
+        ),
+        (
+            {"pdo": {**FIXED, "receives": [{"number": 1, "objects": ["6040h uint16", "607Ah int32", "6072h uint16"]}]}},
+            "pdo.receives has 6072h:0 (16 bit), which would be sent as 0.",
+        ),
+    ],
+)
+def test_settings_that_cannot_be_are_told_in_a_sentence(how, told):
+    how = dict(how)
+    mode = how.pop("mode", "csp")
+    if mode == "jog":
+        body = joint_description()
+        body["kinds"]["drive"]["settings"]["mode"] = mode
+        with pytest.raises(ConfigError, match="mode: Input should be"):
+            open_robot(RobotConfig.model_validate(body))
+        return
+    assert told in refused(mode, **how)
+
+
+def test_a_mode_that_the_drive_does_not_have_is_told(joint):
+    bench = joint("cst", hardware={"modes": (1, 8)}).open()
+    assert (
+        "does not have the mode cyclic synchronous torque. By its object 6502h it has profile position, cyclic"
+        in text(bench)
+    )
+    assert not bench.world.enabled
+
+
+def test_a_drive_without_a_watchdog_is_used_only_on_demand_and_told(joint, tmp_path):
+    sheet = without(tmp_path, "1016")
+    bench = joint("csp", quantities=("position",), eds=str(sheet), allow_no_watchdog=True).open()
+    bench.cycle(3)
+    assert bench.device("elbow")["state"] == "ready"
+    assert "does not notice when the HAL is gone (no 1016h)" in text(bench)
+    assert bench.objects[0x1016, 1] == 0
+    bad = [check for check in inspected(bench) if not check.is_good]
+    assert [check.what for check in bad] == ["watchdog"]
+
+
+def test_a_velocity_unit_that_is_not_known_is_told(joint):
+    bench = joint("csv", hardware={"velocity_unit": 0x00410300}).open()
+    assert "has velocities in unit 00410300h (60A9h), which is not known here. Give velocity_unit: counts/s" in text(
+        bench
+    )
