@@ -176,7 +176,7 @@ class DbcServo(DbcNode):
     @property
     def _is_rested(self) -> bool:
         """Whether the watchdog ran out while nobody wanted the servo to move: nobody fed it, and it stopped nothing."""
-        return self._has_expired and not self._is_wanted and not self._ran_out
+        return self._has_expired and not self._ran_out
 
     def _fault(self) -> str:
         if self._is_rested:

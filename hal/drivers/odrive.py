@@ -9,12 +9,16 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
+from hal.drivers.can_device import Place
 from hal.drivers.dbc_servo import DbcServo
 from hal.drivers.dbc_settings import ServoSettings
+from hal.errors import ConfigError
 from hal.section import Positive
 
 COMMAND_BITS = 5
 """An identifier is the node id before so many bits of the command."""
+BROADCAST = 63
+"""All axes hear this node id, and those without one of their own answer under it."""
 STANDSTILL = 0.05
 """Turns of the motor per second below which it counts as standing."""
 
@@ -51,9 +55,8 @@ COMMON: dict[str, Any] = {
         "booting": ["UNDEFINED", "STARTUP_SEQUENCE"],
         "reason": "Heartbeat.Procedure_Result",
     },
-    # All axes hear a question to node 63, and each answers under its own id.
     "identity": {
-        "ask": {"frame": {"id": 63 << COMMAND_BITS | 0x06, "remote": True, "broadcast": True}},
+        "ask": {"frame": {"id": BROADCAST << COMMAND_BITS | 0x06, "remote": True, "broadcast": True}},
         "signals": ["Address.Serial_Number"],
     },
     "disable": [_state("IDLE", _IDLE)],
@@ -142,3 +145,10 @@ class Odrive(DbcServo):
     """One axis of an ODrive."""
 
     Settings: ClassVar[type[OdriveSettings]] = OdriveSettings
+
+    def __init__(self, place: Place, settings: OdriveSettings) -> None:
+        if place.node == BROADCAST:
+            raise ConfigError(
+                f"Device {place}: node id {BROADCAST} is that of axes which have none yet; it is 0 to 62."
+            )
+        super().__init__(place, settings)

@@ -52,6 +52,7 @@ def description(mode="position", odrive=None, cell=None, driver="odrive", **chan
             **({"joint_velocity": {"low": -3.0, "high": 3.0}} if mode == "velocity" else {}),
             **({"joint_effort": {"low": -8.0, "high": 8.0}} if mode == "effort" else {}),
         },
+        **({"stop": {"behaviour": "off"}} if mode == "effort" else {}),
         "rates": {"hal": 200},
         "buses": {"can0": {"interface": "virtual", "channel": f"dbc_bench_{number}"}},
         "kinds": {
@@ -70,14 +71,21 @@ def description(mode="position", odrive=None, cell=None, driver="odrive", **chan
 class FreeBench(Bench):
     """Devices that send by themselves are not waited for in a cycle: what they sent is taken in before it."""
 
+    is_closing = False
+
     def pass_time(self, duration=0.005):
         super().pass_time(duration)
-        self.flush()
+        if not self.is_closing:
+            self.flush()
+
+    def close(self):
+        self.is_closing = True
+        super().close()
 
 
-def dbc_bench(mode="position", constants=None, cell=None, **changes):
-    """The bench of such a robot; `constants` are those of the axis."""
-    config = RobotConfig.model_validate(description(mode, **changes))
+def dbc_bench(mode="position", constants=None, cell=None, cell_settings=None, **changes):
+    """The bench of such a robot; `constants` are those of the axis, `cell` those of the cell."""
+    config = RobotConfig.model_validate(description(mode, cell=cell_settings, **changes))
     axis = {"zero": 0.25, "torques": 0.01 if mode == "effort" else 0.0, **(constants or {})}
     nodes = [
         NodeSpec("elbow_axis", "can0", 3, "joint_position.elbow", OdriveConstants(**axis)),
