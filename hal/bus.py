@@ -185,9 +185,7 @@ class Bus:
     def begin(self) -> None:
         """Begin a cycle, before anything is sent: some devices answer their set-point, others the SYNC."""
         self._sender.begin()
-        self._waiting = {
-            n for n in self._nodes if n.patience == 1 and n.is_commissioned and n.missed < MISSES_FORGIVEN
-        }
+        self._waiting = {n for n in self._nodes if n.patience == 1 and n.is_commissioned and n.missed < MISSES_FORGIVEN}
         self._answered.clear()
         self._look_after_thread()
 
@@ -303,8 +301,9 @@ class Bus:
         self._hung_cycles = 0 if self._turned != self._seen_turned else self._hung_cycles + 1
         self._seen_turned = self._turned
         if self._hung_cycles > HUNG_CYCLES and not self.is_receiving and self.state is not BusState.GONE:
-            self._watch.lost("Its interface does not come back from receiving. Is the adapter still plugged in?")
+            self._watch.lost("Its receive thread hangs. Is the adapter still plugged in?")
 
     def _changed(self, state: BusState, text: str) -> None:
         self._sender.is_barred = state is BusState.BUS_OFF
-        log.log(logging.INFO if state is BusState.OK else logging.WARNING, "bus %s is %s. %s", self.name, state, text)
+        is_expected = state is BusState.OK or self._closing.is_set()
+        log.log(logging.INFO if is_expected else logging.WARNING, "bus %s is %s. %s", self.name, state, text)

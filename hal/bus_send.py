@@ -92,7 +92,8 @@ class Sender:
             self._counters["send_failures"] += 1
             self._failed(f"Frame {message.arbitration_id:03X}h has {size} data bytes; a classic frame has at most 8.")
             return False
-        error = self._try(message)
+        limit = patience or self._pauses * PAUSE
+        error = self._try(message, limit)
         pauses = round(patience / PAUSE)
         while error is not None and _is_full(error):
             if pauses:
@@ -102,7 +103,7 @@ class Sender:
             else:
                 break
             time.sleep(PAUSE)
-            error = self._try(message)
+            error = self._try(message, limit)
         if error is not None:
             self._note(message, error)
             return False
@@ -112,10 +113,9 @@ class Sender:
         self.bits += _BITS[size]
         return True
 
-    def _try(self, message: can.Message) -> Exception | None:
-        """What came of handing a frame to the interface without waiting."""
-        if not self._lock.acquire(timeout=self._pauses * PAUSE):
-            self._pauses = 0
+    def _try(self, message: can.Message, limit: float) -> Exception | None:
+        """What came of handing a frame to the interface; waits up to `limit` [s] for another thread that does so."""
+        if not self._lock.acquire(timeout=limit):
             return can.CanOperationError("the interface is still busy with another frame", errno.EBUSY)
         try:
             interface = self._interface
