@@ -34,13 +34,14 @@ FEWEST_FRAMES = 3
 QUANTITIES = ("position", "velocity", "effort", "temperature", "temperature_driver")
 _TELLS = {Layout.MINI_CHEETAH: 2, Layout.T_MOTOR: 4, Layout.DAMIAO: 5}
 """How many of these are in an answer; the third of a mini-cheetah is a current or a torque, depending on its flash."""
+_POSITION_TOP, _TOP = mit.POSITION_TOP, mit.TOP
 
 
 class MitDrive(CanDevice):
     """One drive. It is enabled only by `enable`, and stays disabled once it dropped out by itself."""
 
     Settings = MitSettings
-    COUNTERS = (*CanDevice.COUNTERS, "saturated", "wrapped")
+    COUNTERS = (*CanDevice.COUNTERS, "wrapped")
     can_damp = True
 
     @classmethod
@@ -64,6 +65,7 @@ class MitDrive(CanDevice):
         node = place.node
         self._model = settings.motor
         self._layout, self._ranges = settings.actuator
+        self._sizes = mit.SIZES[self._layout]
         self._law = Law(place, settings)
         damiao = self._layout is Layout.DAMIAO
         self._reply_id = settings.master_id if settings.master_id is not None else node + 16 if damiao else 0
@@ -74,9 +76,8 @@ class MitDrive(CanDevice):
         self._asked: Special | None = None
         self._confirmations = 0
         self._error = self._latched = 0
-        self._last_counts = -1
+        self._counts: tuple[int, int, int] | None = None
         self._is_wrapped = False
-        self._position = self._velocity = 0.0
         self._is_powered = self._is_wanted = self._was_reached = self._is_watched = self._is_neutral = False
         self._dropped = ""
         self._braking = self._clearing = 0
@@ -128,7 +129,7 @@ class MitDrive(CanDevice):
 
     def _commission(self) -> None:
         self._is_wanted = False
-        self._last_counts = -1
+        self._counts = None
         for _ in range(CONFIRMATIONS):
             self._knock()
         if self._is_powered:
@@ -145,22 +146,21 @@ class MitDrive(CanDevice):
                 self._registers.release()
 
     def _on_reply(self, data: bytearray, received: float) -> None:
-        layout, registers = self._layout, self._registers
-        if registers is not None and registers.wanted is not None:
+        if self._registers is not None and self._registers.wanted is not None:
             found = mit.register_answer(data, self.node)
             if found is not None:
-                registers.take(found)
+                self._registers.take(found)
                 return
-        if len(data) not in mit.SIZES[layout]:
+        if len(data) not in self._sizes:
             self._counters["malformed"] += 1
             return
         rotor = driver = math.nan
-        if layout is Layout.DAMIAO:
+        if self._registers is not None:
             state, rotor, driver = data[0] >> 4, data[7], data[6]
             self._is_powered = state == mit.ENABLED
             self._error = state if state > mit.ENABLED else 0
         else:
-            if layout is Layout.T_MOTOR and len(data) == 8:
+            if len(data) == 8:
                 rotor, self._error = data[6] + mit.T_MOTOR_COLDEST, data[7]
             if self._confirmations:
                 self._confirmations -= 1
@@ -168,30 +168,29 @@ class MitDrive(CanDevice):
                     self._is_powered = self._asked is Special.ENTER
         if self._error and not self._clearing:
             self._latched = self._error
-        self._heard.set()
-        if self.is_commissioned and not self.is_heard:
-            self._lose(f"{self._place} was silent and answers again. It may have been restarted, and is commissioned.")
-        elif self.is_commissioned:
-            self._store(mit.counts(data), rotor, driver, received)
+        if not self._heard.is_set():
+            self._heard.set()
+        if self.is_commissioned:
+            if self.missed > self._silent_cycles:
+                self._lose(f"{self._place} was silent and answers again, perhaps restarted. It is commissioned anew.")
+            else:
+                self._store(mit.counts(data), rotor, driver, received)
 
     def _store(self, counts: tuple[int, int, int], rotor: float, driver: float, received: float) -> None:
         """Bring the slots up to date; a value at the end of its range may be anything beyond, and is NaN."""
-        ranges, scale = self._ranges, self._law.scale
         position, velocity, effort = counts
-        if self._last_counts >= 0 and abs(position - self._last_counts) > mit.POSITION_TOP // 2:
+        before, self._counts = self._counts, counts
+        if before is not None and abs(position - before[0]) > _POSITION_TOP // 2:
             self._is_wrapped = True
             self._counters["wrapped"] += 1
-        self._last_counts = position
-        angle = speed = torque = math.nan
-        if 0 < position < mit.POSITION_TOP and not self._is_wrapped:
-            self._position = angle = position * 2 * ranges.position / mit.POSITION_TOP - ranges.position
-        if 0 < velocity < mit.TOP:
-            self._velocity = speed = velocity * 2 * ranges.velocity / mit.TOP - ranges.velocity
-        if 0 < effort < mit.TOP:
-            torque = effort * 2 * ranges.effort / mit.TOP - ranges.effort
-        if angle != angle or speed != speed or torque != torque:
-            self._counters["saturated"] += 1
-        measured = (self._law.zero + scale * angle, scale * speed, torque / scale, rotor, driver)
+        lines = self._law.lines
+        measured = (
+            lines[0][0] * position + lines[0][1] if 0 < position < _POSITION_TOP and not self._is_wrapped else math.nan,
+            lines[1][0] * velocity + lines[1][1] if 0 < velocity < _TOP else math.nan,
+            lines[2][0] * effort + lines[2][1] if 0 < effort < _TOP else math.nan,
+            rotor,
+            driver,
+        )
         values = self._values
         for slot, index in self._places:
             values[slot] = measured[index]
@@ -250,7 +249,7 @@ class MitDrive(CanDevice):
     def apply(self, values: np.ndarray) -> None:
         """See `Device.apply`; until the drive has power it is asked to power on, with no torque."""
         if self._may_move():
-            self._command(self._law.set_point(float(values[0]), self._position, self._velocity))
+            self._command(self._law.set_point(float(values[0]), self._counts))
 
     def damp(self) -> None:
         """See `Device.damp`."""
@@ -323,7 +322,7 @@ class MitDrive(CanDevice):
         Seen of T-Motor: github.com/dfki-ric-underactuated-lab/mini-cheetah-tmotor-python-can at 0ef9f89,
         src/motor_driver/canmotorlib.py, comments in `enable_motor` and `disable_motor`.
         """
-        self._command((self._position, 0.0, 0.0, 0.0, 0.0))
+        self._command(self._law.resting(self._counts))
         self._is_neutral = True
 
     def _command(self, asked: Asked) -> None:

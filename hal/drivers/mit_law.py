@@ -5,7 +5,10 @@ import math
 from hal.drivers.can_device import Place
 from hal.drivers.mit_settings import MitSettings
 from hal.errors import ConfigError
+from hal.protocols.mit import POSITION_TOP, TOP
 
+Counts = tuple[int, int, int]
+"""Position, velocity and torque of the motor as its answer has them."""
 Asked = tuple[float, float, float, float, float]
 """Position [rad], velocity [rad/s], stiffness [N m/rad], damping [N m s/rad] and torque [N m] of the motor."""
 
@@ -20,7 +23,13 @@ class Law:
             ConfigError: The robot file's limits do not fit into the range of the motor's frames.
         """
         self.scale, self.zero = settings.scale, settings.zero
-        self.ranges = settings.actuator[1]
+        self.ranges = ranges = settings.actuator[1]
+        self.lines = (
+            (2 * self.scale * ranges.position / POSITION_TOP, self.zero - self.scale * ranges.position),
+            (2 * self.scale * ranges.velocity / TOP, -self.scale * ranges.velocity),
+            (2 / self.scale * ranges.effort / TOP, -ranges.effort / self.scale),
+        )
+        """Slope and offset of position, velocity and effort [unit of the element] over counts."""
         self.damping = settings.damping * self.scale**2
         self._mode = settings.mode
         self._stiffness = settings.stiffness * self.scale**2
@@ -52,17 +61,20 @@ class Law:
         """Let the stiffness grow from 0 again."""
         self._ramped = 0
 
+    def resting(self, counts: Counts | None) -> Asked:
+        """No torque, and the position where the motor is, in case it looks at it."""
+        return self._motor(counts)[0], 0.0, 0.0, 0.0, 0.0
+
     def braking(self) -> Asked:
         """Resist motion, without holding a place."""
         return 0.0, 0.0, 0.0, self.damping, 0.0
 
-    def set_point(self, value: float, position: float, velocity: float) -> Asked:
+    def set_point(self, value: float, counts: Counts | None) -> Asked:
         """What brings the motor to a set-point.
 
         Args:
             value: Set-point [unit of the commanded element].
-            position: Where the motor is [rad]; the pull of the stiffness from there is kept below `max_effort`.
-            velocity: How fast it turns [rad/s].
+            counts: Its newest answer; the pull of stiffness or damping from there is kept below `max_effort`.
         """
         most = self._most
         if self._mode == "effort":
@@ -70,13 +82,23 @@ class Law:
         if self._mode == "velocity":
             speed = value / self.scale
             if self._is_limited:
-                reach = most / self.damping
-                speed = min(max(speed, velocity - reach), velocity + reach)
+                now, reach = self._motor(counts)[1], most / self.damping
+                speed = min(max(speed, now - reach), now + reach)
             return 0.0, speed, 0.0, self.damping, 0.0
         self._ramped = min(self._ramped + 1, self._ramp_cycles)
         stiffness = self._stiffness * self._ramped / self._ramp_cycles
         angle = (value - self.zero) / self.scale
         if self._is_limited:
-            reach = most / stiffness
-            angle = min(max(angle, position - reach), position + reach)
+            now, reach = self._motor(counts)[0], most / stiffness
+            angle = min(max(angle, now - reach), now + reach)
         return angle, 0.0, stiffness, self.damping, 0.0
+
+    def _motor(self, counts: Counts | None) -> tuple[float, float]:
+        """Position [rad] and velocity [rad/s] of the motor; zero before its first answer."""
+        if counts is None:
+            return 0.0, 0.0
+        ranges = self.ranges
+        return (
+            counts[0] * 2 * ranges.position / POSITION_TOP - ranges.position,
+            counts[1] * 2 * ranges.velocity / TOP - ranges.velocity,
+        )
