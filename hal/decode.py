@@ -126,7 +126,8 @@ def _pdo(pdo: Pdo, data: bytes, book: Book) -> Line:
         if item.index > 7:  # below are the dummies of CiA 301, 7.4.7
             entry = _entry(dictionary, item.index, item.subindex)
             raw = bits.to_bytes((item.bits + 7) // 8, "little")
-            parts.append(f"{_name(entry, item.index, item.subindex)} {_value(entry, raw, item.index)}")
+            name = _name(entry) or f"{item.index:04X}h:{item.subindex}"
+            parts.append(f"{name} {_value(entry, raw, item.index)}")
     return Line(pdo.label, pdo.node, ", ".join(parts))
 
 
@@ -135,7 +136,7 @@ def _sdo(data: bytes, is_answer: bool, dictionary: canopen.ObjectDictionary | No
         return "malformed"
     command, index, subindex = sdo.HEAD.unpack_from(data)
     entry = _entry(dictionary, index, subindex)
-    name = f"{index:04X}h:{subindex} {entry.qualname if entry is not None else ''}".rstrip()
+    name = f"{index:04X}h:{subindex} {_name(entry)}".rstrip()
     kind, is_expedited, is_sized = command >> 5, command & 2, command & 1
     if kind == 4:
         who = "answers" if is_answer else "gives up"
@@ -161,8 +162,12 @@ def _entry(dictionary: canopen.ObjectDictionary | None, index: int, subindex: in
     return entry if entry is not None and entry.subindex == subindex else None
 
 
-def _name(entry: ODVariable | None, index: int, subindex: int) -> str:
-    return f"{index:04X}h:{subindex}" if entry is None else str(entry.qualname)
+def _name(entry: ODVariable | None) -> str:
+    """An object's name, and that of the array or record around it unless it says that itself."""
+    if entry is None:
+        return ""
+    around = getattr(entry.parent, "name", None) or ""
+    return str(entry.name) if str(entry.name).startswith(around) else f"{around}.{entry.name}"
 
 
 def _value(entry: ODVariable | None, raw: bytes, index: int) -> str:

@@ -20,6 +20,8 @@ DURATION = 1.0
 """How long [s] the devices are turned to see whether they answer every cycle."""
 COMPLETE = 0.98
 """Share of the cycles in which every device should answer."""
+MUTE = 0.5
+"""A device that misses more of the cycles is told by itself."""
 SIMULATED = ("hub", "virtual")
 
 
@@ -81,7 +83,7 @@ def examine(config: RobotConfig, duration: float = DURATION) -> Iterator[Finding
         yield from _buses(buses, there, config)
         yield from _answers(devices, errors, there, config)
         if answering:
-            yield _complete(share, missed, config.rates.hal)
+            yield from _complete(share, missed, answering, config.rates.hal)
         yield from _inspected(dict(zip(answering, pool.map(_checks, answering), strict=True)))
     finally:
         list(pool.map(lambda device: device.close(), devices))
@@ -101,8 +103,8 @@ def _opened(device: Device) -> str:
 
 def _turn(
     config: RobotConfig, buses: Sequence[Bus], devices: Iterable[Device], clock: SystemClock, duration: float
-) -> tuple[float, dict[str, int]]:
-    """Cycle with the motors off: share of cycles in which all answered, and how often each did not."""
+) -> tuple[float, dict[str, float]]:
+    """Cycle with the motors off: share of cycles in which all answered, and in which each did not."""
     period, devices = 1.0 / config.rates.hal, list(devices)
     cycles = max(10, round(duration * config.rates.hal))
     missed = dict.fromkeys((device.name for device in devices), 0)
@@ -125,7 +127,7 @@ def _turn(
         whole += not late
         due = max(due + period, clock.monotonic())
         clock.sleep_until(due)
-    return whole / cycles, {name: count for name, count in missed.items() if count > (1 - COMPLETE) * cycles}
+    return whole / cycles, {name: count / cycles for name, count in missed.items()}
 
 
 def _buses(buses: Sequence[Bus], there: set[str], config: RobotConfig) -> Iterator[Finding]:
@@ -168,15 +170,23 @@ def _answers(
         yield bad("nodes", f"{good} of {len(devices)} answer.")
 
 
-def _complete(share: float, missed: dict[str, int], rate: float) -> Finding:
+def _complete(share: float, missed: dict[str, float], devices: Sequence[Device], rate: float) -> Iterator[Finding]:
+    mute = [device for device in devices if missed[device.name] > MUTE]
+    for device in mute:
+        yield bad(
+            f"node {device.name}",
+            f"It answers when asked, and sends no process data in {missed[device.name]:.0%} of the cycles. "
+            f"{device.health().text}",
+        )
     if share >= COMPLETE:
-        return ok("cycles", f"All of them answered in {share:.1%} of the cycles at {rate:g} Hz.")
-    often = ", ".join(sorted(missed, key=lambda name: -missed[name])[:5]) or "no device more than others"
-    return warning(
-        "cycles",
-        f"All of them answered in only {share:.1%} of the cycles at {rate:g} Hz ({often} missed). Is this machine "
-        "busy, is rates.hal too much for the bus?",
-    )
+        yield ok("cycles", f"All of them answered in {share:.1%} of the cycles at {rate:g} Hz.")
+    elif not mute:
+        often = [name for name in sorted(missed, key=lambda name: -missed[name]) if missed[name] > 1 - COMPLETE]
+        yield warning(
+            "cycles",
+            f"All of them answered in only {share:.1%} of the cycles at {rate:g} Hz; late: {_listed(often) or 'any'}. Is "
+            "this machine busy, is rates.hal too much for the bus?",
+        )
 
 
 def _checks(device: Device) -> tuple[tuple[str, bool, str], ...]:

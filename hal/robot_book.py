@@ -4,6 +4,7 @@ import math
 from typing import Any
 
 from hal import registry
+from hal.bus import OWN_NODE
 from hal.clock import SystemClock
 from hal.config import RobotConfig
 from hal.decode_book import EXTENDED, Book, Explain
@@ -23,6 +24,8 @@ def books(config: RobotConfig) -> dict[str, Book]:
         ConfigError: The robot file cannot be built.
     """
     found = {name: Book() for name in config.buses}
+    for book in found.values():
+        book.names[OWN_NODE] = "HAL"
     _, devices = build(config, SystemClock(), {})
     for device in devices:
         entry = config.devices[device.name]

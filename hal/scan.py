@@ -13,6 +13,7 @@ from collections import Counter, deque
 from dataclasses import dataclass, field
 
 from hal.budget import frame_bits
+from hal.bus import OWN_NODE
 from hal.config import RobotConfig
 from hal.decode import nmt_words
 from hal.decode_book import Frame
@@ -170,6 +171,8 @@ class _Heard:
         function, node = identifier & 0x780, identifier & 0x7F
         if identifier == cia301.SYNC and len(data) <= 1:
             self._masters.add("its SYNC")
+        elif identifier == cia301.HEARTBEAT + OWN_NODE:
+            self._masters.add("a HAL's heartbeat")
         elif function == cia301.HEARTBEAT and node and len(data) == 1:
             self.found("CANopen", node).state = nmt_words(data[0] & 0x7F)
         elif function == cia301.SDO_REQUEST and node and len(data) == sdo.LENGTH and data[0] >> 5 in _BEGINS:
@@ -211,9 +214,11 @@ class _Heard:
 
     def _explained(self, identifier: int) -> bool:
         node = identifier & 0x7F
-        if identifier in (cia301.NMT, cia301.SYNC) or ("MIT", identifier) in self.nodes:
+        if identifier in (cia301.NMT, cia301.SYNC, cia301.HEARTBEAT + OWN_NODE) or ("MIT", identifier) in self.nodes:
             return True
         if ("ODrive", identifier >> 5) in self.nodes:
+            return True
+        if identifier & 0x780 == cia301.SDO_REQUEST and self._masters:
             return True
         return ("CANopen", node) in self.nodes and identifier >= cia301.EMERGENCY
 

@@ -12,6 +12,7 @@ from hal.calibration_fit import CalibrationRefused, Line, cell_line, joint_line
 from hal.calibration_store import Point
 from hal.config import RobotConfig
 from hal.measuring import Measuring, Subject, subject
+from services import show
 from services.errors import BadArguments
 from services.lock import instead_of
 
@@ -73,7 +74,7 @@ def _calibrate(
     found: Subject, wanted: Wanted, noise: float, ask: str, fit: Callable[[Sequence[Point], Line], Line]
 ) -> int:
     """Measure at each point, fit, show, store."""
-    console = Console(highlight=False)
+    console = show.console()
     with instead_of(found.config.robot, "hal"), Measuring(found) as device:
         console.print(f"{found.device}: {device.identity or 'it does not tell who it is'}. Its motors are off.")
         points = [device.look(known, wanted.seconds, noise) for known in _known(found, wanted, ask)]

@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
@@ -16,7 +15,7 @@ from hal.config import RobotConfig, load_robot
 from hal.errors import ConfigError
 from hal.findings import Finding, Verdict, bad, ok, warning
 from hal.interface_check import interfaces
-from services import host_checks, keys
+from services import host_checks, keys, show
 from services.artifacts import robot_file
 from services.client import Client
 from services.errors import AlreadyRunning, ServiceError
@@ -38,7 +37,7 @@ _LISTEN = "0A"
 def run_doctor(robot: str) -> int:
     """Look at everything, print it, return the exit code: 1 if anything is bad."""
     worst = dict.fromkeys(Verdict, 0)
-    console = Console(highlight=False)
+    console = show.console()
     for finding in _findings(robot):
         worst[finding.verdict] += 1
         if console.is_terminal:

@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
@@ -15,6 +14,7 @@ from hal.decode import Line, describe
 from hal.decode_book import Book, Frame
 from hal.robot_book import books
 from hal.tap import frames
+from services import show
 
 
 @dataclass(slots=True)
@@ -105,4 +105,4 @@ def _summarise(seen: dict[tuple[str, int, bool], _Seen], known: Mapping[str, Boo
         name = f"{identifier:08X}" if extended else f"{identifier:03X}"
         kinds = ", ".join(one.kinds)
         table.add_row(*(escape(cell) for cell in (bus, name, str(one.count), rate, kinds, who, last)))
-    Console(highlight=False).print(table)
+    show.console().print(table)

@@ -11,6 +11,7 @@ from hal.config import BusConfig, RobotConfig
 from hal.errors import BusGone
 from hal.scan import Found, Scan, compare, scan
 from hal.tap import Tap
+from services import show
 from services.errors import AlreadyRunning
 from services.lock import instead_of
 
@@ -20,7 +21,7 @@ MOST_UNKNOWN = 20
 
 def run_scan(buses: Mapping[str, BusConfig], config: RobotConfig | None, listen: float, ask: bool, mit: bool) -> int:
     """Scan some buses at the same time and print what was found; 1 if a robot's bus is not as its file says."""
-    console = Console(highlight=False)
+    console = show.console()
     try:
         if config is None:
             found = _scan_all(buses, listen, ask, mit)

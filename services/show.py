@@ -6,7 +6,15 @@ from contextlib import contextmanager
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
+WIDE = 200
+"""Columns where no terminal says how many there are, so that a line of a table stays a line in a file or a pipe."""
 Tell = Callable[[float, str], None]
+
+
+def console() -> Console:
+    """Where tables go: standard output, as wide as the terminal."""
+    found = Console(highlight=False)
+    return found if found.is_terminal else Console(highlight=False, width=WIDE)
 
 
 @contextmanager
