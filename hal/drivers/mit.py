@@ -23,8 +23,8 @@ from hal.protocols.mit import Layout, Register, Special
 ANSWER_TIMEOUT = 0.05
 """How long [s] an answer may take while the drive is opened."""
 TRIES = 4
-CONFIRMATIONS = 3
-"""So many answers after `ENTER` or `EXIT`, and a drive that does not tell its state is taken to have obeyed."""
+CONFIRMATIONS = 6
+"""After so many answers, one or two a cycle, a drive that does not tell its state is taken to have obeyed."""
 QUICK_STOP_TIME = 0.3
 """For so long [s] a quick stop brakes before the power goes."""
 CLEARING_CYCLES = 40
@@ -139,6 +139,7 @@ class MitDrive(CanDevice):
         self.missed = 0
 
     def _release(self) -> None:
+        self._rest()
         with contextlib.suppress(DeviceSilent, DeviceRefused):  # nothing more can be done for it
             for _ in range(CONFIRMATIONS):
                 self._knock()
