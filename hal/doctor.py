@@ -184,8 +184,8 @@ def _complete(share: float, missed: dict[str, float], devices: Sequence[Device],
         often = [name for name in sorted(missed, key=lambda name: -missed[name]) if missed[name] > 1 - COMPLETE]
         yield warning(
             "cycles",
-            f"All of them answered in only {share:.1%} of the cycles at {rate:g} Hz; late: {_listed(often) or 'any'}. Is "
-            "this machine busy, is rates.hal too much for the bus?",
+            f"All of them answered in only {share:.1%} of the cycles at {rate:g} Hz; late: {_listed(often) or 'any'}. "
+            "Is this machine busy, is rates.hal too much for the bus?",
         )
 
 
