@@ -14,6 +14,7 @@ INERTIA, FRICTION = 0.2, 0.1
 BRAKING = 20.0
 """Of a quick stop [rad/s^2]."""
 UNITS = {"position": "rad", "velocity": "rad/s", "effort": "N m", "temperature": "degC"}
+PARK = {"behaviour": "park", "park": [0.0, 1.0], "speed": 0.4}
 LIMITS = {
     "position": {"joint_position": {"low": -1, "high": 2, "rate": 1.0, "acceleration": 10.0}},
     "velocity": {

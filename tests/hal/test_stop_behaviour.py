@@ -2,13 +2,11 @@
 
 import numpy as np
 import pytest
-from safety_bench import LIMITS, PERIOD, SafetyBench
+from safety_bench import LIMITS, PARK, PERIOD, SafetyBench
 
 from hal.clock import ManualClock
 from hal.device import DeviceState
 from hal.errors import CommandRefused
-
-PARK = {"behaviour": "park", "park": [0.0, 1.0], "speed": 0.4}
 
 
 def moving(quantity="position", **stop):
