@@ -189,6 +189,8 @@ class Cia402Drive(CanopenNode):
             return DeviceState.HOMING, f"{self._place} is {homing.phase}."
         if state is State.OPERATION_ENABLED:
             return DeviceState.ENABLED, self._warning()
+        if state is State.QUICK_STOP_ACTIVE:
+            return DeviceState.STOPPING, self._told or f"{self._place} comes to rest by a quick stop."
         return DeviceState.READY, self._told or self._warning()
 
     def _warning(self) -> str:
