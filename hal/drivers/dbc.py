@@ -126,6 +126,7 @@ class DbcNode(CanDevice):
         error, good = self._error if self.doubts_in_error else None, self._good
         note, has_pages = self._note(letter), letter.message.is_multiplexed()
         is_main, is_awaited = letter is self._main, self.patience == 1
+        beside = error.place if error is not None and error.letter is letter and not has_pages else -1
 
         def handle(data: bytearray, received: float) -> None:
             raws = read(data) if len(data) == size else None
@@ -138,11 +139,12 @@ class DbcNode(CanDevice):
                 note(raws)
             if not self.is_commissioned:
                 return
+            is_good = error is None or (raws[beside] if beside >= 0 else error.raw) == good
             for place, slot, scale, offset in measures:
                 raw = raws[place]
                 if has_pages and math.isnan(raw):
                     continue  # on another page of the message
-                values[slot] = offset + scale * raw if error is None or error.raw == good else math.nan
+                values[slot] = offset + scale * raw if is_good else math.nan
                 times[slot] = received
             if is_main:
                 self.missed = 0
