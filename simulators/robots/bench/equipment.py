@@ -9,7 +9,9 @@ from hal.config import RobotConfig
 from hal.errors import ConfigError
 from hal.protocols.cia303 import UNITS
 from simulators.nodes.analog_input import AnalogConstants
+from simulators.nodes.dbc_cell import DbcCellConstants
 from simulators.nodes.mit_drive import MitConstants
+from simulators.nodes.odrive import OdriveConstants
 from simulators.nodes.spec import CellConstants, Constants, DriveConstants, EncoderConstants, NodeSpec
 
 FULL_SCALE = {"int16": 2**15, "int32": 2**31, "float32": 10.0, "zc_sg": 10.0}
@@ -77,12 +79,37 @@ def _mit(settings: Any) -> Constants:
     )
 
 
+def _dbc(settings: Any) -> Constants:
+    if settings.dbc.name != "load_cell.dbc":
+        raise ConfigError(f"The bench has no other end for '{settings.dbc}'. It has one for load_cell.dbc.")
+    return DbcCellConstants(unbalance=-settings.zero)
+
+
+def _odrive(settings: Any) -> Constants:
+    def period(message: str) -> float:
+        return float(settings.periods.get(message, 0.0))
+
+    return OdriveConstants(
+        gear=settings.gear,
+        direction=settings.direction,
+        zero=settings.zero,
+        watchdog=settings.watchdog.timeout if settings.watchdog else None,
+        heartbeat=period("Heartbeat"),
+        encoder=period("Get_Encoder_Estimates"),
+        torques=period("Get_Torques"),
+        temperatures=period("Get_Temperature"),
+        is_extended=bool(settings.extended),
+    )
+
+
 CONSTANTS: dict[str, Callable[[Any], Constants]] = {
     "cia401": _cia401,
     "cia402": _cia402,
     "cia404": _cia404,
     "cia406": _cia406,
     "mit": _mit,
+    "dbc": _dbc,
+    "odrive": _odrive,
 }
 """What a driver of `hal.registry` has at the other end of the wire: one line per kind."""
 
