@@ -46,21 +46,33 @@ def calibrated(config: RobotConfig) -> Finding:
         dates = [record.date[:10] for record in calibration_store.records(config) if record.device in stored]
     except ConfigError as error:
         return bad("calibration", str(error))
-    takers = [name for name in config.devices if "zero" in registry.equipment(config, name)[0].Settings.model_fields]
-    without = [name for name in takers if name not in stored]
-    has = f"{len(stored)} of {len(takers)} devices, the oldest of {min(dates)}" if stored else "none"
+    has = f"{len(stored)} devices, the oldest of {min(dates)}" if stored else "None"
     nameless = [name for name, one in stored.items() if not one.identity]
     if nameless:
         return warning(
             "calibration",
             f"{has}. {_listed(nameless)} cannot tell who they are: when you replace one, calibrate it again.",
         )
-    if not without:
-        return ok("calibration", f"{has}.")
-    text = f"{has}; zero and scale of {_listed(without)} are the robot file's."
-    if all(bus.interface in SIMULATED for bus in config.buses.values()):
-        return ok("calibration", f"{text} The hardware is simulated.")
-    return warning("calibration", f"{text} If these are not measured, use `gemuco calibrate`.")
+    missing = uncalibrated(config, stored)
+    if missing:
+        return warning(
+            "calibration",
+            f"{has}; zero and scale of {_listed(missing)} are the robot file's. If these are "
+            "not measured, use `gemuco calibrate`.",
+        )
+    return ok("calibration", f"{has}; whatever else the robot has goes by the robot file.")
+
+
+def uncalibrated(config: RobotConfig, stored: Iterable[str]) -> list[str]:
+    """Devices that go by the zero of the robot file though they could be calibrated; simulated ones need not be."""
+    done = set(stored)
+    return [
+        name
+        for name, entry in config.devices.items()
+        if name not in done
+        and config.buses[entry.bus].interface not in SIMULATED
+        and "zero" in registry.equipment(config, name)[0].Settings.model_fields
+    ]
 
 
 def examine(config: RobotConfig, duration: float = DURATION) -> Iterator[Finding]:
@@ -70,7 +82,11 @@ def examine(config: RobotConfig, duration: float = DURATION) -> Iterator[Finding
         ConfigError: The robot file cannot be built.
     """
     clock = SystemClock()
-    buses, devices = build(config, clock)
+    try:
+        calibrations = calibration_store.load(config)
+    except ConfigError:  # `calibrated` tells it, and the devices can be looked at all the same
+        calibrations = {}
+    buses, devices = build(config, clock, calibrations)
     pool = ThreadPoolExecutor(max(1, len(devices)))
     for bus in buses:
         bus.open()

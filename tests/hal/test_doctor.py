@@ -1,0 +1,209 @@
+"""What is wrong, found by looking: robot files, calibrations, interfaces, nodes; all without hardware."""
+
+from contextlib import contextmanager
+from dataclasses import replace
+
+import pytest
+from hal_bench import ROBOTS, BenchWorld, description, hardware
+
+from hal import calibration_store, doctor
+from hal.calibration_store import Point, Record
+from hal.config import BusConfig, RobotConfig
+from hal.findings import Verdict
+from hal.interface_check import interfaces, socketcan
+from hal.link import Link, look_up, parse
+from simulators.rig import Rig
+
+SHOWN = {
+    "ifname": "can0",
+    "flags": ["NOARP", "UP", "LOWER_UP", "ECHO"],
+    "txqlen": 10,
+    "link_type": "can",
+    "linkinfo": {
+        "info_kind": "can",
+        "info_data": {"state": "ERROR-ACTIVE", "restart_ms": 100, "bittiming": {"bitrate": 500000}},
+    },
+}
+CAN0 = BusConfig(interface="socketcan", channel="can0")
+
+
+@contextmanager
+def running(nodes=None, **changes):
+    config = RobotConfig.model_validate(description(**changes))
+    rig = Rig(config, BenchWorld(), nodes or hardware())
+    rig.start()
+    try:
+        yield config, rig
+    finally:
+        rig.stop()
+
+
+def by_what(findings):
+    return {finding.what: finding for finding in findings}
+
+
+def verdicts(findings):
+    return {finding.what: finding.verdict for finding in findings}
+
+
+def test_a_robot_that_is_well():
+    with running() as (config, _):
+        found = by_what([*doctor.described(config), *doctor.examine(config, 0.2)])
+    bad = [finding for finding in found.values() if finding.verdict is Verdict.BAD]
+    assert not bad
+    assert found["nodes"].text == "All 5 answer."
+    assert found["PDO mapping"].text == "As it should be in 5 devices."
+    assert {"heartbeat", "watchdog", "identity", "bus can0", "budget can1", "calibration"} <= set(found)
+    assert "computed" in found["bus can0"].text
+
+
+def test_nothing_is_enabled_and_everything_is_let_go():
+    with running() as (config, rig):
+        list(doctor.examine(config, 0.1))
+        assert {rig.node(spec.name).nmt.name for spec in hardware()} == {"PRE_OPERATIONAL"}
+        assert not any(rig.node(name).servo[1] for name in ("biceps_drive", "triceps_drive"))
+
+
+def test_a_node_without_power_is_told_and_the_others_are_looked_at():
+    with running() as (config, rig):
+        rig.fault("node_silent triceps_cell")
+        found = by_what(doctor.examine(config, 0.1))
+    assert found["node triceps_cell"].verdict is Verdict.BAD
+    assert "Is it powered" in found["node triceps_cell"].text
+    assert found["nodes"].text == "4 of 5 answer."
+    assert found["PDO mapping"].text == "As it should be in 4 devices."
+
+
+def test_a_node_that_answers_but_measures_nothing_is_told():
+    with running() as (config, rig):
+        rig.fault("sensor_silent triceps_cell")
+        found = by_what(doctor.examine(config, 0.3))
+    assert "sends no process data in 100% of the cycles" in found["node triceps_cell"].text
+
+
+def test_what_somebody_else_changed_in_a_node_is_told():
+    with running() as (config, rig):
+        found = {}
+        for finding in doctor.examine(config, 0.1):
+            found[finding.what] = finding
+            if finding.what == "nodes":
+                rig.node("elbow_encoder").objects.values[0x1017, 0] = 1000
+    assert found["heartbeat elbow_encoder"].verdict is Verdict.BAD
+    assert "1000 ms" in found["heartbeat elbow_encoder"].text
+
+
+def test_a_simulator_that_does_not_run():
+    config = RobotConfig.model_validate(description(interface="hub"))
+    found = by_what(doctor.examine(config, 0.1))
+    assert found["bus can0"].verdict is Verdict.BAD
+    assert "Start `gemuco simulate`" in found["bus can0"].text
+    assert found["nodes"].text.startswith("0 of 5 answer")
+
+
+def test_a_robot_file_that_cannot_be_built():
+    body = description()
+    body["kinds"]["drive"]["settings"] = {**body["kinds"]["drive"]["settings"], "gear": 0}
+    found = list(doctor.described(RobotConfig.model_validate(body)))
+    assert [(finding.what, finding.verdict) for finding in found] == [("robot file", Verdict.BAD)]
+    assert "gear" in found[0].text
+
+
+def with_a_record(folder, **changes):
+    """A robot in a folder of its own, with one calibration."""
+    (folder / "eds").symlink_to(ROBOTS / "eds")
+    config = RobotConfig.model_validate(description(folder=folder))
+    settings = {"zero": 0.1, "direction": 1}
+    body = {
+        "device": "elbow_encoder",
+        "identity": "canopen:1-2-3",
+        "settings": settings,
+        "measured_with": calibration_store.measured_with(config, "elbow_encoder", settings),
+        "unit": "rad",
+        "points": (Point(known=0.0, read=1.0, std=0.0, samples=9),),
+        "residual": 0.0,
+    }
+    calibration_store.save(config, calibration_store.sealed(Record(**{**body, **changes})))
+    return config
+
+
+def test_a_calibration_that_holds(tmp_path):
+    found = doctor.calibrated(with_a_record(tmp_path))
+    assert found.verdict is Verdict.OK
+    assert "1 devices, the oldest of 20" in found.text
+
+
+def test_a_calibration_that_does_not_hold_is_told_and_the_devices_are_looked_at(tmp_path):
+    config = with_a_record(tmp_path, measured_with={"driver": "cia406", "counts_per_turn": 4096})
+    assert "was measured with counts_per_turn 4096" in doctor.calibrated(config).text
+    rig = Rig(config, BenchWorld(), hardware())
+    rig.start()
+    try:
+        assert by_what(doctor.examine(config, 0.1))["nodes"].verdict is Verdict.OK
+    finally:
+        rig.stop()
+
+
+def test_a_device_that_cannot_tell_who_it_is(tmp_path):
+    found = doctor.calibrated(with_a_record(tmp_path, identity=""))
+    assert found.verdict is Verdict.WARNING
+    assert "elbow_encoder cannot tell who they are" in found.text
+
+
+def test_devices_on_real_buses_without_a_calibration_are_told():
+    found = doctor.calibrated(RobotConfig.model_validate(description(interface="socketcan")))
+    assert found.verdict is Verdict.WARNING
+    assert "biceps_drive, triceps_drive" in found.text and "gemuco calibrate" in found.text
+
+
+def test_a_replaced_device_is_told(tmp_path):
+    config = with_a_record(tmp_path)
+    rig = Rig(config, BenchWorld(), hardware())
+    rig.start()
+    try:
+        found = by_what(doctor.examine(config, 0.1))
+    finally:
+        rig.stop()
+    assert "Was it replaced?" in found["node elbow_encoder"].text
+
+
+def test_what_ip_prints_is_read():
+    assert parse([{}, SHOWN]) == Link("can0", True, True, "can", 500000, 0.1, "ERROR-ACTIVE", 10)
+    virtual = {**SHOWN, "ifname": "vcan0", "linkinfo": {"info_kind": "vcan"}}
+    assert parse([virtual]) == Link("vcan0", True, True, "vcan", None, None, "", 10)
+    with pytest.raises(LookupError):
+        parse([])
+
+
+@pytest.mark.parametrize(
+    ("changes", "what", "verdict", "said"),
+    [
+        ({}, "interface can0", Verdict.OK, "is up"),
+        ({"is_up": False}, "interface can0", Verdict.BAD, "type can bitrate 1000000 restart-ms 100"),
+        ({"is_can": False}, "interface can0", Verdict.BAD, "no CAN interface"),
+        ({"bitrate": 500000}, "bit rate can0", Verdict.BAD, "500000 bit/s, and the robot file says 1000000"),
+        ({"restart": 0.0}, "restart can0", Verdict.WARNING, "stays off after bus-off"),
+        ({"state": "ERROR-PASSIVE"}, "controller can0", Verdict.WARNING, "terminations"),
+        ({"state": "BUS-OFF"}, "controller can0", Verdict.BAD, "terminations"),
+        ({"queue": 3}, "queue can0", Verdict.WARNING, "txqueuelen"),
+        ({"kind": "vcan", "bitrate": None, "restart": None}, "interface can0", Verdict.OK, "vcan"),
+    ],
+)
+def test_a_linux_interface(changes, what, verdict, said):
+    sound = Link("can0", True, True, "can", 1_000_000, 0.1, "ERROR-ACTIVE", 100)
+    found = by_what(socketcan("interface can0", CAN0, replace(sound, **changes), 5))
+    assert found[what].verdict is verdict
+    assert said in found[what].text
+
+
+def test_an_interface_that_is_not_there():
+    assert look_up("can_that_is_not") is None
+    (found,) = socketcan("interface can0", CAN0, None, 5)
+    assert found.verdict is Verdict.BAD
+    assert "CAN interfaces here:" in found.text
+
+
+def test_interfaces_that_are_no_hardware_say_so():
+    told = verdicts(interfaces(RobotConfig.model_validate(description())))
+    assert told == {"interface can0": Verdict.WARNING, "interface can1": Verdict.WARNING}
+    told = verdicts(interfaces(RobotConfig.model_validate(description(interface="hub"))))
+    assert set(told.values()) == {Verdict.OK}
