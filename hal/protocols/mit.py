@@ -8,7 +8,8 @@ Sources, besides those of the motors (`hal.protocols.mit_motors`):
         github.com/neurobionics/TMotorCANControl at bb8d071, src/TMotorCANControl/mit_can.py (`MIT_Params`);
     Damiao's answers, FBh and registers: github.com/jia-xie/python-damiao-driver at 3c6773a,
         docs/concept/communication-protocol.md and registers.md; github.com/enactic/openarm_can at 9866604,
-        src/openarm/damiao_motor/dm_motor_control.cpp and include/openarm/damiao_motor/dm_motor_constants.hpp.
+        src/openarm/damiao_motor/dm_motor_control.cpp and include/openarm/damiao_motor/dm_motor_constants.hpp; the
+        unit of the timeout also in wiki.seeedstudio.com/damiao_series, "CAN Timeout".
 
 Numbers are fractions of a range -r..r (gains 0..r) in 16 or 12 bits: value = low + counts * span / (2^bits - 1). The
 firmware and all published hosts make counts by cutting off (`math_ops.c: float_to_uint` casts to int). We take the
