@@ -106,6 +106,7 @@ class DbcServo(DbcNode):
 
     def _prepare_watchdog(self, settings: ServoSettings) -> None:
         watchdog = settings.watchdog
+        self._no_watchdog = "" if watchdog else f"{self._place} goes on with its last set-point when the host dies."
         self._configuring: tuple[Step, ...] = self._steps(watchdog.configure) if watchdog else ()
         self._expired = self._inbox.condition(watchdog.expired) if watchdog and watchdog.expired else None
         if watchdog is None:
@@ -193,7 +194,7 @@ class DbcServo(DbcNode):
             return DeviceState.ENABLED, ""
         if meaning is DeviceState.HOMING:
             return DeviceState.HOMING, f"{self._place} is in its state '{self._state.words()}'."
-        return DeviceState.READY, self._dropped
+        return DeviceState.READY, self._dropped or self._no_watchdog
 
     def enable(self) -> None:
         """See `Device.enable`."""

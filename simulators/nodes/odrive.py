@@ -55,7 +55,8 @@ class OdriveConstants:
         velocity_gain: [N m s per motor turn].
         integrator_gain: [N m per motor turn].
         velocity_limit: [motor turns/s].
-        torque_limit: Of the motor [N m].
+        torque_limit: Of the motor [N m], unless a current limit is set.
+        torque_constant: [N m/A].
         watchdog: axis.config.watchdog_timeout [s]; None: not enabled.
         heartbeat: Period of the heartbeat [s].
         encoder: Period of the estimates [s].
@@ -77,6 +78,7 @@ class OdriveConstants:
     integrator_gain: float = 2.0
     velocity_limit: float = 20.0
     torque_limit: float = 2.0
+    torque_constant: float = 0.1
     watchdog: float | None = 0.2
     heartbeat: float = 0.1
     encoder: float = 0.01
@@ -284,7 +286,8 @@ class OdriveAxis:
 
     def _limit(self, data: bytes) -> None:
         if len(data) == 8:
-            self._limits = struct.unpack("<ff", data)
+            speed, current = struct.unpack("<ff", data)
+            self._limits = (speed, current * self.constants.torque_constant)
 
     def _clear(self, data: bytes) -> None:
         if self.state is not AxisState.UNDEFINED:
