@@ -256,5 +256,6 @@ def load_robot(path: str | Path) -> RobotConfig:
 
 
 def _beside(path: Path) -> str:
-    found = sorted(str(other) for other in path.parent.glob("*.yaml")) if path.parent.is_dir() else []
+    beside = path.parent.glob("*.yaml") if path.parent.is_dir() else ()
+    found = sorted(str(other) for other in beside if "." not in other.stem)  # x.calibration.yaml is no robot file
     return f"Robot files there: {', '.join(found)}." if found else f"Is '{path.parent}' the right folder?"

@@ -15,6 +15,7 @@ from canopen.objectdictionary import ODVariable
 from hal.bus import Bus
 from hal.errors import DeviceRefused, DeviceSilent
 from hal.protocols import cia301
+from hal.protocols.sdo import describe_abort
 
 ANSWER_TIME = 0.3
 """How long [s] a node may take to answer a request."""
@@ -23,20 +24,6 @@ TRIES = 3
 _REQUEST = struct.Struct("<BHB4s")
 _READ = 0x40
 _ABORT = 0x80
-_ABORTS = {
-    0x0601_0000: "access is not supported",
-    0x0601_0001: "it is write only",
-    0x0601_0002: "it is read only",
-    0x0602_0000: "there is no such object",
-    0x0604_0041: "it cannot be mapped",
-    0x0604_0042: "the mapping is too long",
-    0x0607_0010: "its length is another",
-    0x0609_0011: "there is no such sub-index",
-    0x0609_0030: "the value is out of range",
-    0x0609_0031: "the value is too high",
-    0x0609_0032: "the value is too low",
-    0x0800_0022: "not in this state of the device",
-}
 
 
 class SdoClient:
@@ -145,8 +132,7 @@ class SdoClient:
             if answer[0] == _ABORT:
                 code = int.from_bytes(answer[4:8], "little")
                 index, subindex = struct.unpack("<HB", answer[1:4])
-                reason = _ABORTS.get(code, "see CiA 301, table 22")
-                raise DeviceRefused(f"{self._label} refused object {index:04X}h:{subindex}: {code:08X}h, {reason}.")
+                raise DeviceRefused(f"{self._label} refused object {index:04X}h:{subindex}: {describe_abort(code)}.")
             if (answer[0] & 0xE0 == 0x40) == (request[0] == _READ):
                 return answer
         return None

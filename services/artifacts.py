@@ -46,5 +46,5 @@ def robot_file(text: str) -> Path:
     named = ROBOTS / f"{text}.yaml"
     if named.exists():
         return named
-    known = ", ".join(sorted(file.stem for file in ROBOTS.glob("*.yaml"))) or "none"
+    known = ", ".join(sorted(file.stem for file in ROBOTS.glob("*.yaml") if "." not in file.stem)) or "none"
     raise ConfigError(f"There is no robot '{text}'. Known in {ROBOTS}/: {known}; or give the path of a robot file.")
