@@ -3,9 +3,10 @@ PYTHON ?= python3
 BIN := .venv/bin
 VMCAN ?= ../shared/tools/vmcan.sh
 STAMP := .venv/installed
+SOCKETCAN := $(addprefix tests/system/test_socketcan,.py _drivers.py _states.py)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo reproduce test check format bench test-socketcan results clean
+.PHONY: help setup demo reproduce test check format bench test-socketcan test-controllers results clean
 
 help:            ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 18
@@ -36,10 +37,15 @@ format: $(STAMP) ## apply formatting and the safe lint fixes
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-test-socketcan: $(STAMP)  ## the stack on vcan0 and vcan1 of a real Linux kernel, booted with $(VMCAN) if need be
-	@if [ -e /sys/class/net/vcan0 ]; then $(BIN)/python -m pytest tests/system/test_socketcan.py; \
-	elif [ -x "$(VMCAN)" ] && command -v insmod >/dev/null; then "$(VMCAN)" -t 280 "$(CURDIR)" $(BIN)/python -m pytest -p no:cacheprovider tests/system/test_socketcan.py; \
+test-socketcan: $(STAMP)  ## stack and drivers on vcan0 and vcan1 of a real Linux kernel, booted with $(VMCAN) if need be
+	@if [ -e /sys/class/net/vcan0 ]; then $(BIN)/python -m pytest $(SOCKETCAN); \
+	elif [ -x "$(VMCAN)" ] && command -v insmod >/dev/null; then "$(VMCAN)" -t 580 "$(CURDIR)" $(BIN)/python -m pytest -p no:cacheprovider $(SOCKETCAN); \
 	else echo "skipped: no vcan0 here (modprobe vcan; ip link add vcan0 type vcan), and no '$(VMCAN)' with insmod (package kmod) to boot a kernel that has one"; fi
+
+test-controllers: $(STAMP)  ## drivers on two CAN controllers at 1 Mbit/s: can0 and can1 on one wire, or QEMU's SJA1000 by $(VMCAN)
+	@if [ -e /sys/class/net/can0/device ]; then $(BIN)/python -m pytest tests/system/test_socketcan_states.py; \
+	elif [ -x "$(VMCAN)" ] && command -v qemu-system-x86_64 >/dev/null; then VMCAN_HW=1 "$(VMCAN)" -b qemu -t 580 "$(CURDIR)" $(BIN)/python -m pytest -p no:cacheprovider tests/system/test_socketcan_states.py; \
+	else echo "skipped: no controllers can0 and can1 here, and no '$(VMCAN)' with qemu-system-x86_64 to boot a machine that has them"; fi
 
 bench: $(STAMP)   ## the loops' punctuality beside bare timers, 10 minutes
 	$(BIN)/python -m benchmarks.loops

@@ -6,7 +6,19 @@ import numpy as np
 
 from hal.config import RobotConfig
 from hal.device import UNDER_POWER, Device, DeviceState
-from hal.errors import ConfigError
+from hal.errors import CommandRefused, ConfigError
+
+
+def find(name: str, devices: Sequence[Device]) -> Device:
+    """The device of a name.
+
+    Raises:
+        CommandRefused: There is none.
+    """
+    found = next((device for device in devices if device.name == name), None)
+    if found is None:
+        raise CommandRefused(f"There is no device '{name}'. Known: {', '.join(device.name for device in devices)}.")
+    return found
 
 
 class Actuators:

@@ -121,6 +121,15 @@ class ModeMachine:
         self._homing, self._homing_seen = device, False
         self.mode, self._deadline = Mode.HOMING, now + HOMING_TIMEOUT
 
+    def tare(self, device: Device) -> None:
+        """Ask a sensor to take what it measures as zero.
+
+        Raises:
+            CommandRefused: The robot is not off, or the device has no tare.
+        """
+        self._check_off("tare")
+        device.tare()
+
     def _check_off(self, verb: str) -> None:
         if self.mode is Mode.FAULT:
             raise CommandRefused(f"The robot is in fault: {self.fault_text} Reset it first.")

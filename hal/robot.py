@@ -6,7 +6,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from hal.actuators import Actuators
+from hal.actuators import Actuators, find
 from hal.bus import Bus
 from hal.caretaker import Caretaker
 from hal.clock import BusClock, Clock, SystemClock
@@ -73,8 +73,7 @@ class Robot:
         self._nothing.flags.writeable = False
         self._desired: tuple[np.ndarray, float] | None = None
         self._measured = {name: np.full(config.signals[name].size, np.nan) for name in self._assembler.signals}
-        self._number = 0
-        self._incomplete = 0
+        self._number = self._incomplete = 0
         self._is_open = False
         self._stop_reason = ""
 
@@ -170,11 +169,17 @@ class Robot:
         Raises:
             CommandRefused: The robot is not off, there is no such device, or it is not ready or has no homing.
         """
-        named = {one.name: one for one in self._actuators.devices}
-        if device not in named:
-            raise CommandRefused(f"There is no drive '{device}' to home. Drives: {', '.join(named)}.")
         with self._turns.question():
-            self._modes.home(named[device], self._clock.monotonic())
+            self._modes.home(find(device, self._actuators.devices), self._clock.monotonic())
+
+    def tare(self, device: str) -> None:
+        """Ask one sensor to take what it measures as zero; its health tells what came of it.
+
+        Raises:
+            CommandRefused: The robot is not off, there is no such device, or it has no tare.
+        """
+        with self._turns.question():
+            self._modes.tare(find(device, self._devices))
 
     def disable(self) -> None:
         """Let go at once."""
@@ -340,7 +345,6 @@ def open_robot(config: RobotConfig, clock: BusClock | None = None) -> Robot:
     Raises:
         ConfigError: An unknown driver or interface, settings that do not fit, or a bus that would carry too much.
     """
-    clock = clock or SystemClock()
-    buses, devices = build(config, clock)
+    buses, devices = build(config, clock := clock or SystemClock())
     simulated = bool(config.buses) and all(bus.interface in ("hub", "virtual") for bus in config.buses.values())
     return Robot(config, devices, buses, clock, "simulated" if simulated else "can")

@@ -192,8 +192,12 @@ class AnalogNode(CanopenNode):
         """Bad status bits in words."""
         return f"status {bad:X}h"
 
+    def _troubles(self) -> list[str]:
+        """What is wrong though the device answers and reports no fault."""
+        return [f"{channel.quantity}: {channel.trouble}" for channel in self._channels if channel.trouble]
+
     def _running(self) -> tuple[DeviceState, str]:
-        troubles = [f"{channel.quantity}: {channel.trouble}" for channel in self._channels if channel.trouble]
+        troubles = self._troubles()
         return DeviceState.READY, f"{self._place}: {'; '.join(troubles)}." if troubles else ""
 
 

@@ -6,7 +6,6 @@ import struct
 from dataclasses import dataclass
 from typing import Literal
 
-from hal.device import DeviceState
 from hal.drivers.analog_node import AnalogNode, AnalogSettings, Channel, parse
 from hal.drivers.can_device import Place
 from hal.errors import CommandRefused, ConfigError, DeviceRefused, HalError
@@ -135,7 +134,7 @@ class Cia404Cell(AnalogNode):
                 if self._sdo.has(cia404.OFFSET, channel.number):
                     self._offsets[channel.number] = self._offset(channel.number)
         except HalError as error:
-            self._tare_text = f"not tared: {error}"
+            self._tare_text = f"not tared: {str(error).rstrip('.')}"
             return
         self._tare_text = ""
         self._counters["tared"] += 1
@@ -151,6 +150,5 @@ class Cia404Cell(AnalogNode):
     def _describe(self, bad: int) -> str:
         return cia404.describe_status(bad) if self._cell.status is None else super()._describe(bad)
 
-    def _running(self) -> tuple[DeviceState, str]:
-        state, text = super()._running()
-        return state, text or (f"{self._place}: {self._tare_text}" if self._tare_text else "")
+    def _troubles(self) -> list[str]:
+        return [*super()._troubles(), *([self._tare_text] if self._tare_text else [])]
