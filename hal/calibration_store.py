@@ -23,7 +23,13 @@ from hal.section import Section, explain
 KEPT = ".before"
 """Added to the name of the file as it was before the last change."""
 WITHOUT_EFFECT = frozenset(
-    ("eds", "pdo", "silent_after", "frozen_after", "watch_time", "rated_torque", "max_torque", "torque_unit")
+    (
+        *("eds", "pdo", "master_id", "silent_after", "frozen_after", "periods", "heartbeat", "identity", "around"),
+        *("mode", "command", "cyclic", "stiffness", "damping", "ramp", "profile", "velocity_unit", "temperature"),
+        *("rated_torque", "max_torque", "max_velocity", "max_effort", "following_error"),
+        *("watch_time", "watchdog", "watchdog_timeout", "allow_no_watchdog", "status", "bad_status", "error", "state"),
+        *("open", "tare", "enable", "disable", "quick_stop", "reset"),
+    )
 )
 """Settings that do not change what a number of the device means; any other one makes a calibration void."""
 _AGAIN = "Delete the record, or measure again with `gemuco calibrate`."
