@@ -16,7 +16,7 @@ from hal.drivers.mit_law import Asked, Law
 from hal.drivers.mit_registers import RegisterClient
 from hal.drivers.mit_replies import Replies
 from hal.drivers.mit_settings import MitSettings
-from hal.errors import ConfigError, DeviceRefused, DeviceSilent
+from hal.errors import DeviceRefused, DeviceSilent
 from hal.protocols import mit
 from hal.protocols.mit import Layout, Register, Special
 
@@ -29,8 +29,6 @@ QUICK_STOP_TIME = 0.3
 """For so long [s] a quick stop brakes before the power goes."""
 CLEARING_CYCLES = 40
 """For so many cycles a fault is tried to be cleared."""
-FEWEST_FRAMES = 3
-"""So many frames must fit into `watch_time`, or one lost frame would stop the drive."""
 QUANTITIES = ("position", "velocity", "effort", "temperature", "temperature_driver")
 _TELLS = {Layout.MINI_CHEETAH: 2, Layout.T_MOTOR: 4, Layout.DAMIAO: 5}
 """How many of these are in an answer; the third of a mini-cheetah is a current or a torque, depending on its flash."""
@@ -41,7 +39,7 @@ class MitDrive(CanDevice):
     """One drive. It is enabled only by `enable`, and stays disabled once it dropped out by itself."""
 
     Settings = MitSettings
-    COUNTERS = (*CanDevice.COUNTERS, "wrapped")
+    COUNTERS = (*CanDevice.COUNTERS, "wrapped", "foreign")
     can_damp = True
 
     @classmethod
@@ -69,9 +67,8 @@ class MitDrive(CanDevice):
         self._law = Law(place, settings)
         damiao = self._layout is Layout.DAMIAO
         self._reply_id = settings.master_id if settings.master_id is not None else node + 16 if damiao else 0
-        self._check_place(settings.watch_time)
         self._places = tuple((slot, QUANTITIES.index(quantity)) for quantity, slot in self._slots.items())
-        self._registers = RegisterClient(node, str(place), place.bus.send, settings.watch_time) if damiao else None
+        self._registers = RegisterClient(place, settings.watch_time) if damiao else None
         self._heard = threading.Event()
         self._asked: Special | None = None
         self._confirmations = 0
@@ -86,18 +83,13 @@ class MitDrive(CanDevice):
             code: can.Message(arbitration_id=node, is_extended_id=False, data=mit.special(code))
             for code in (Special.ENTER, Special.EXIT, Special.CLEAR)
         }
-        Replies.join(place.bus, self._reply_id, self._layout, node, self._on_reply)
+        Replies.join(place, self._reply_id, self._layout, self._on_reply)
+        if self._reply_id != node:  # nobody may answer under its id either: it would take the answer for a command
+            place.bus.subscribe(node, self._on_foreign)
 
-    def _check_place(self, watch_time: float) -> None:
-        place = self._place
-        highest = 0xFF if self._layout is Layout.T_MOTOR else mit.NODES - 1
-        if not 1 <= place.node <= highest:
-            raise ConfigError(f"{place}: the id of such a drive is between 1 and {highest}.")
-        if self._layout is Layout.DAMIAO and watch_time * place.rate < FEWEST_FRAMES:
-            raise ConfigError(
-                f"{place}: within watch_time {watch_time:g} s it gets {watch_time * place.rate:.1f} frames at "
-                f"{place.rate:g} Hz, so that one lost frame would stop it. Give it time for {FEWEST_FRAMES}."
-            )
+    def _on_foreign(self, data: bytearray, received: float) -> None:
+        """Somebody else sends frames to the drive."""
+        self._counters["foreign"] += 1
 
     def _identify(self) -> str:
         if self._reply_id == 0 and self._bus.needs_sync:

@@ -2,18 +2,20 @@
 
 import math
 import threading
-from collections.abc import Callable
 
 import can
 
 from hal.device import Check
-from hal.errors import DeviceRefused, DeviceSilent, WrongDevice
+from hal.drivers.can_device import Place
+from hal.errors import ConfigError, DeviceRefused, DeviceSilent, WrongDevice
 from hal.protocols import mit
 from hal.protocols.mit import Ranges, Register
 
 ANSWER_TIMEOUT = 0.05
 """How long [s] a register may take to be answered."""
 TRIES = 4
+FEWEST_FRAMES = 3
+"""So many frames must fit into `watch_time`."""
 RANGES = (
     (Register.POSITION_RANGE, "position"),
     (Register.VELOCITY_RANGE, "velocity"),
@@ -24,10 +26,21 @@ RANGES = (
 class RegisterClient:
     """Reads and writes registers of one Damiao drive; each answer is matched with its request."""
 
-    def __init__(self, node: int, label: str, send: Callable[[can.Message], bool], watch_time: float) -> None:
-        self._node = node
-        self._label = label
-        self._send = send
+    def __init__(self, place: Place, watch_time: float) -> None:
+        """Prepare for one drive, which is to power off after `watch_time` [s] without a frame.
+
+        Raises:
+            ConfigError: One lost frame would make it power off.
+        """
+        frames = watch_time * place.rate
+        if frames < FEWEST_FRAMES:
+            raise ConfigError(
+                f"{place}: in watch_time {watch_time:g} s it gets {frames:.1f} frames at {place.rate:g} Hz, so that "
+                f"one lost frame would stop it. Give it time for {FEWEST_FRAMES}."
+            )
+        self._node = place.node
+        self._label = str(place)
+        self._bus = place.bus
         self._timeout = round(watch_time / mit.TIMEOUT_UNIT)
         self._answered = threading.Event()
         self.wanted: Register | None = None
@@ -46,7 +59,7 @@ class RegisterClient:
         self.wanted, self.found = register, None
         node = self._node
         data = mit.read_register(node, register) if value is None else mit.write_register(node, register, value)
-        self._send(can.Message(arbitration_id=mit.REGISTERS, is_extended_id=False, data=data))
+        self._bus.send(can.Message(arbitration_id=mit.REGISTERS, is_extended_id=False, data=data))
 
     def commission(self, ranges: Ranges) -> None:
         """Check that the drive has these ranges; set its mode and its watchdog.

@@ -1,7 +1,9 @@
 """Answers of several drives under one identifier, sorted by the id inside."""
 
 from hal.bus import Bus, Handler
+from hal.drivers.can_device import Place
 from hal.errors import ConfigError
+from hal.protocols import mit
 from hal.protocols.mit import Layout
 
 
@@ -15,17 +17,21 @@ class Replies:
         self._handlers: dict[int, Handler] = {}
 
     @classmethod
-    def join(cls, bus: Bus, identifier: int, layout: Layout, node: int, handler: Handler) -> None:
-        """Have `handler` called with the answers of drive `node` under `identifier`.
+    def join(cls, place: Place, identifier: int, layout: Layout, handler: Handler) -> None:
+        """Have `handler` called with the answers of the drive at `place` under `identifier`.
 
         Raises:
-            ConfigError: The answers of two devices could not be told apart.
+            ConfigError: It can have no such id, or the answers of two devices could not be told apart.
         """
+        highest = 0xFF if layout is Layout.T_MOTOR else mit.NODES - 1
+        if not 1 <= place.node <= highest:
+            raise ConfigError(f"{place}: the id of such a drive is between 1 and {highest}.")
+        bus = place.bus
         replies = bus.subscriber(identifier)
         if not isinstance(replies, cls) or replies.layout is not layout:
             replies = cls(bus, layout)
             bus.subscribe(identifier, replies)
-        key = node & replies._mask
+        key = place.node & replies._mask
         if key in replies._handlers:
             raise ConfigError(
                 f"Two drives on bus '{bus.name}' answer under {identifier:03X}h with the id {key:X}h, and cannot be "

@@ -4,6 +4,8 @@ import pytest
 from hal_bench import ROBOTS
 from mit_bench import DAMIAO, OneJoint, description, mit_bench, node, only
 
+from hal.protocols import mit
+from hal.protocols.mit import Special
 from simulators.nodes.mit_drive import MitConstants
 
 
@@ -122,6 +124,13 @@ def test_frames_that_are_none_of_ours(bench):
     assert bench.buses["can0"].counters["broken_handlers"] == 0
     bench.cycle()
     assert bench.sample.values["joint_position"] == pytest.approx([0.4, -0.3, 1.2], abs=1e-3)
+
+
+def test_another_master_is_counted(bench):
+    bench.send("can0", 2, mit.special(Special.EXIT))
+    bench.flush()
+    assert bench.device("wrist_drive")["counters"]["foreign"] == 1
+    assert bench.device("elbow_drive")["counters"]["foreign"] == 0
 
 
 def test_a_position_beyond_the_range_is_never_believed(bench):

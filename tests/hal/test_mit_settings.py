@@ -69,6 +69,15 @@ def test_drives_that_cannot_be_told_apart():
     assert "told apart" in text
 
 
+def test_answers_that_another_drive_would_take_for_commands():
+    devices = description()["devices"]
+    devices["wrist_drive"] = {**devices["wrist_drive"], "node": 17}  # the elbow answers under 11h
+    assert "011h" in refused(devices=devices)
+    assert "011h" in refused(devices=dict(reversed(devices.items())))
+    devices["wrist_drive"] = {**devices["wrist_drive"], "node": 2, "settings": {"master_id": 2}}
+    mit_bench(description(devices=devices))  # under its own id it harms nobody
+
+
 def test_makes_that_share_an_identifier():
     devices = description()["devices"]
     devices["elbow_drive"] = {**devices["elbow_drive"], "settings": {"master_id": 0}}
