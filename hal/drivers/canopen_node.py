@@ -197,6 +197,7 @@ class CanopenNode(CanDevice):
         if received > self._beat_due:
             self._beat_due = math.inf
             self._lose(f"{self._place} goes on sending process data without a heartbeat. Does its firmware hang?")
+            self._halt()
         else:
             self._is_answered()
 
@@ -212,6 +213,16 @@ class CanopenNode(CanDevice):
         self._strays += 1
         if self._strays == _STRAYS:
             self._tell_twins("sent process data on after it had booted")
+            self._halt()
+
+    def _is_astray(self) -> bool:
+        """Whether it runs though we lost it, and do not count what it sends after a boot-up message either."""
+        was_ours = self._counters["commissioned"] > 0 and not self.is_commissioned
+        return was_ours and not self._opening.locked() and not 0 <= self._strays < _STRAYS
+
+    def _halt(self) -> None:
+        """Take a node out of operation that is not ours to command any more; a drive under power stops by that."""
+        nmt(self._bus, NmtCommand.PRE_OPERATIONAL, self.node)
 
     def _tell_twins(self, what: str) -> None:
         if not self._twin:
@@ -226,6 +237,8 @@ class CanopenNode(CanDevice):
         self._beat_due = received + BEATS_FORGIVEN * HEARTBEAT_TIME
         if state == NmtState.OPERATIONAL:
             self._started.set()
+            if self._is_astray():
+                self._halt()
         elif state == NmtState.BOOT_UP:
             self._counters["boots"] += 1
             if self.is_commissioned:
@@ -234,6 +247,7 @@ class CanopenNode(CanDevice):
         elif self.is_commissioned:
             why = f", after reporting {_describe(self._emergency)}" if self._emergency else ""
             self._lose(f"{self._place} left the operational state by itself{why}.")
+            self._halt()
 
     def _on_emergency(self, data: bytearray, received: float) -> None:
         found = cia301.emergency(data)
@@ -264,6 +278,8 @@ def _forced(settings: PdoSettings, wanted: PdoMap, label: str) -> PdoMap:
         if missing:
             has = describe(sorted(there, key=lambda item: item.entry))
             raise ConfigError(f"{label} needs to {verb} {describe(missing)}; its setting `pdo.{side}` has {has}.")
+    if not any(pdo.answers_sync for pdo in forced.sends):
+        raise ConfigError(f"{label}: of pdo.sends none has transmission 1, so that nothing answers a cycle.")
     return forced
 
 

@@ -24,6 +24,8 @@ RESET_PERIOD = 4
 """as a rising edge in every fourth."""
 STOPPING = 0.8
 """How long [s] a quick stop, or slowing down, may take before the power is taken off."""
+RAMPED = (Mode.PROFILE_POSITION, Mode.CYCLIC_SYNCHRONOUS_VELOCITY)
+"""Modes in which a drive that is let go may be moving, and slows down first."""
 ANSWER_TIME = 1.0
 """How long [s] a drive may take to acknowledge a set-point."""
 
@@ -78,7 +80,7 @@ class Cia402Drive(CanopenNode):
         self._is_wanted = False
         self._was_reached = False
         self._told = ""
-        self._resetting = self._letting_go = 0
+        self._resetting = self._letting_go = self._slowing = 0
         self._stopping_cycles = round(STOPPING * place.rate)
         target = TARGETS[settings.commanded]
         self._frames = CommandFrames(self._pdos.receives, place.node, target, str(place))
@@ -145,7 +147,7 @@ class Cia402Drive(CanopenNode):
 
     def _writes(self) -> tuple[Write, ...]:
         assert self._units is not None
-        return drive_writes(self._settings, self._units, self._place.bounds, self._sheet)
+        return drive_writes(self._settings, self._units, self._place.bounds, 1.0 / self._place.rate, self._sheet)
 
     def _taker(self, pdo: Pdo) -> Taker:
         places = {item: place for place, item in enumerate(pdo.objects)}
@@ -179,7 +181,7 @@ class Cia402Drive(CanopenNode):
     def _forget(self) -> None:
         """Nothing that was asked before holds any more."""
         self._state, self._statusword, self._counts = State.NOT_READY, -1, None
-        self._is_wanted, self._letting_go, self._homing = False, 0, None
+        self._is_wanted, self._letting_go, self._slowing, self._homing = False, 0, 0, None
 
     def _running(self) -> tuple[DeviceState, str]:
         state, homing = self._state, self._homing
@@ -204,6 +206,8 @@ class Cia402Drive(CanopenNode):
 
     def disable(self) -> None:
         """See `Device.disable`."""
+        if self._is_wanted and self._mode in RAMPED:
+            self._slowing = self._stopping_cycles
         self._is_wanted = False
         if self._homing is not None:
             self._homing.give_up("was stopped")
@@ -269,7 +273,8 @@ class Cia402Drive(CanopenNode):
             self._send(word, self._rest(), mode)
             self._end_homing()
             return
-        word = cia402.towards_disabled(state)
+        self._slowing = max(self._slowing - 1, 0) if state is State.OPERATION_ENABLED else 0
+        word = cia402.towards_disabled(state, slow_down=self._slowing > 0)
         if self._resetting:
             if state is State.FAULT and self._resetting % RESET_PERIOD == 0:
                 word = cia402.FAULT_RESET
@@ -278,6 +283,8 @@ class Cia402Drive(CanopenNode):
 
     def inspect(self) -> tuple[Check, ...]:
         """See `Device.inspect`."""
+        if self._units is None:  # never opened, but asked
+            self._calibrate()
         checks = list(super().inspect())
         if not self._is_watched:
             checks.append(Check("watchdog", False, f"{self._warning()} A person must be able to cut its power."))

@@ -64,7 +64,11 @@ def _needed(settings: DriveSettings, wants_effort: bool) -> Iterator[tuple[str, 
 
 
 def drive_writes(
-    settings: DriveSettings, units: DriveUnits, bounds: tuple[float, float], sheet: canopen.ObjectDictionary
+    settings: DriveSettings,
+    units: DriveUnits,
+    bounds: tuple[float, float],
+    period: float,
+    sheet: canopen.ObjectDictionary,
 ) -> tuple[Write, ...]:
     """Objects and their values, in the order in which they are written.
 
@@ -72,9 +76,13 @@ def drive_writes(
         settings: The drive's settings.
         units: What its numbers are worth.
         bounds: Lowest and highest set-point by the robot file [its unit]; infinite where not stated.
+        period: Of the set-points [s], between which a drive interpolates.
         sheet: Its data sheet; a limit or reaction that it has no object for is left to the HAL.
     """
+    value, index = cia402.interpolation(period)
     optional = (
+        (cia402.INTERPOLATION_PERIOD, value),
+        (cia402.INTERPOLATION_INDEX, index),
         (cia402.ABORT_CONNECTION, cia402.ABORT_QUICK_STOP),
         (ERROR_BEHAVIOUR, cia301.BECOME_PRE_OPERATIONAL),
         (cia402.QUICK_STOP_OPTION, cia402.QUICK_STOP_AND_OFF),

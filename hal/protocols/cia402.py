@@ -39,6 +39,8 @@ HOMING_SPEED_SWITCH = Mapped(0x6099, 1, 32)
 HOMING_SPEED_ZERO = Mapped(0x6099, 2, 32)
 HOMING_ACCELERATION = Mapped(0x609A, 0, 32)
 VELOCITY_UNIT = Mapped(0x60A9, 0, 32)
+INTERPOLATION_PERIOD = Mapped(0x60C2, 1, 8)
+INTERPOLATION_INDEX = Mapped(0x60C2, 2, 8, "signed")
 FOLLOWING_ERROR = Mapped(0x60F4, 0, 32, "signed")
 TARGET_VELOCITY = Mapped(0x60FF, 0, 32, "signed")
 SUPPORTED_MODES = Mapped(0x6502, 0, 32)
@@ -152,6 +154,16 @@ def describe_modes(modes: int) -> str:
 def describe_mode(mode: int) -> str:
     """A value of 6060h or 6061h in words."""
     return _MODE_NAMES.get(mode, f"mode {mode}")
+
+
+def interpolation(period: float) -> tuple[int, int]:
+    """Value and power of ten of object 60C2h that come nearest to a period [s]: 5 and -3 for 5 ms.
+
+    Milliseconds (-3), which every drive knows, are preferred.
+    """
+    found = [(round(period * 10**-index), index) for index in range(-1, -7, -1)]
+    fitting = [(value, index) for value, index in found if 1 <= value <= 255]
+    return min(fitting, key=lambda pair: (round(abs(pair[0] * 10.0 ** pair[1] / period - 1), 4), abs(pair[1] + 3)))
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,5 +1,6 @@
 """One joint with a servo drive in any mode, on a `virtual` bus, moved in lockstep."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +10,7 @@ from hal.config import RobotConfig
 from simulators.nodes.spec import DriveConstants, NodeSpec
 
 RATE = 200.0
+_numbers = itertools.count()
 UNITS = {
     "position": "rad",
     "velocity": "rad/s",
@@ -71,7 +73,7 @@ def joint_description(mode="csp", quantities=tuple(ELBOW), limits=None, **settin
         "stop": {"behaviour": "off"} if mode == "cst" else {},
         "limits": {commanded: limits} if limits else {},
         "rates": {"hal": RATE},
-        "buses": {"can0": {"interface": "virtual", "channel": "drive_bench"}},
+        "buses": {"can0": {"interface": "virtual", "channel": f"drive_bench_{next(_numbers)}"}},
         "kinds": {"drive": {"driver": "cia402", "settings": {**SETTINGS, "mode": mode, **settings}}},
         "devices": {"elbow": {"kind": "drive", "bus": "can0", "node": 5, "elements": elements}},
         "folder": ROBOTS,

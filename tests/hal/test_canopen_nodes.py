@@ -324,6 +324,10 @@ def test_another_devices_data_sheet_is_told():
             "needs to send 6041h:0 (16 bit), 6064h:0 (32 bit); its setting",
         ),
         (
+            {"pdo": {**FIXED, "sends": [{**FIXED["sends"][0], "transmission": 2}]}},
+            "of pdo.sends none has transmission 1, so that nothing answers a cycle.",
+        ),
+        (
             {"pdo": {**FIXED, "receives": [{"number": 1, "objects": ["6040h uint16", "607Ah int32", "6072h uint16"]}]}},
             "pdo.receives has 6072h:0 (16 bit), which would be sent as 0.",
         ),

@@ -105,6 +105,34 @@ def test_velocity_starts_from_rest_whatever_was_asked_before(joint):
     assert bench.world.position == pytest.approx(still, abs=1e-4)
 
 
+@pytest.mark.parametrize(
+    ("mode", "words"), [("csv", [0x07, 0x06]), ("profile_position", [0x07, 0x06]), ("csp", [0x06])]
+)
+def test_a_drive_that_may_be_moving_slows_down_before_it_is_let_go(joint, mode, words):
+    bench = joint(mode)
+    bench.enable()
+    told = []
+    bench.robot.disable()
+    for _ in range(20):
+        bench.cycle()
+        told.append(bench.objects[0x6040, 0])
+    assert list(dict.fromkeys(told)) == words
+    assert bench.device("elbow")["state"] == "ready"
+
+
+def test_a_drive_that_does_not_slow_down_is_let_go_all_the_same(joint):
+    bench = joint("csv")
+    bench.enable()
+    bench.node._obey = lambda: None  # deaf to controlwords
+    bench.robot.disable()
+    told = []
+    for _ in range(180):
+        bench.cycle()
+        told.append(bench.objects[0x6040, 0])
+    assert list(dict.fromkeys(told)) == [0x07, 0x06]
+    assert told.count(0x07) / RATE == pytest.approx(0.8, abs=0.02)
+
+
 def test_torque_pushes_the_joint_and_ends_with_its_commands(joint):
     bench = joint("cst", limits={"low": -5, "high": 5})
     assert bench.objects[0x6072, 0] == 500  # 5 N m of 0.2 N m times 50, in thousandths

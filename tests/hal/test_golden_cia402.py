@@ -82,6 +82,8 @@ COMMISSIONING = """
     2B 17 10 00 64 00 00 00   heartbeat every 100 ms
     23 16 10 01 96 00 7F 00   watch node 127, 150 ms
     2F 60 60 00 08 00 00 00   cyclic synchronous position
+    2F C2 60 01 05 00 00 00   set-points every 5
+    2F C2 60 02 FD 00 00 00   thousandths of a second
     2B 07 60 00 03 00 00 00   quick stop when the connection is lost
     2F 29 10 01 00 00 00 00   pre-operational when the heartbeat is lost
     2B 5A 60 00 02 00 00 00   quick stop, then without power
@@ -317,3 +319,10 @@ def test_velocity_units(code, per_turn, counts_per_second):
     unit = cia402.velocity_unit(code)
     found = unit.counts_per_second(per_turn) if unit else None
     assert found == (counts_per_second if counts_per_second is None else pytest.approx(counts_per_second))
+
+
+@pytest.mark.parametrize(
+    ("rate", "value", "index"), [(200, 5, -3), (100, 10, -3), (1000, 1, -3), (400, 25, -4), (300, 33, -4), (2000, 5, -4)]
+)
+def test_interpolation_periods(rate, value, index):
+    assert cia402.interpolation(1 / rate) == (value, index)
