@@ -83,8 +83,9 @@ class DbcNode(CanDevice):
         self._taring = self._steps(settings.tare)
         for name in settings.periods:
             inbox.dbc.message(name)
-        for source in self._sources.values():
-            self._period_of(source.letter)
+        relied = [source.letter for source in (*self._sources.values(), self._error) if source]
+        for letter in (*relied, *([self._beat] if self._beat else [])):
+            self._period_of(letter)
         self._period = self._period_of(self._main)
         self.patience = 1 if self._period == 0.0 else math.ceil(round(self._period * self._rate, 6)) + 1
         if self._silent_cycles <= self.patience:

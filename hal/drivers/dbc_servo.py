@@ -64,6 +64,7 @@ class DbcServo(DbcNode):
         assert isinstance(settings, ServoSettings)
         state = settings.state
         self._state = self._inbox.signal(state.signal)
+        self._period_of(self._state.letter)
         self._reason = self._inbox.signal(state.reason) if state.reason else None
         self._meaning: dict[float, DeviceState | str] = {}
         meanings: tuple[tuple[DeviceState | str, tuple[Value, ...]], ...] = (

@@ -1,0 +1,286 @@
+"""What the DBC drivers make of files of all kinds: pages, byte orders, answers in the cycle, steps and raw frames."""
+
+import math
+
+import can
+import pytest
+from dbc_bench import axis, dbc_bench
+
+from hal.bus import Bus
+from hal.clock import SystemClock
+from hal.config import BusConfig
+from hal.device import DeviceState
+from hal.drivers.can_device import Place
+from hal.drivers.dbc import DbcNode
+from hal.drivers.dbc_inbox import Inbox
+from hal.drivers.dbc_sequence import Address, Run, compile_steps
+from hal.drivers.dbc_servo import DbcServo
+from hal.drivers.dbc_settings import DbcSettings, ServoSettings, StepConfig
+from hal.errors import CommandRefused, ConfigError
+from hal.protocols import dbc
+
+FILE = """VERSION ""
+
+NS_ :
+
+BS_:
+
+BU_: Host Node
+
+BO_ 256 Motion: 8 Node
+ SG_ Page M : 0|8@1+ (1,0) [0|0] "" Host
+ SG_ Angle m0 : 8|32@1- (0.01,0) [0|0] "deg" Host
+ SG_ Speed m1 : 8|16@1- (0.1,0) [0|0] "rpm" Host
+
+BO_ 257 Status: 2 Node
+ SG_ Mode : 0|4@1+ (1,0) [0|0] "" Host
+ SG_ Fault : 8|8@1+ (1,0) [0|0] "" Host
+
+BO_ 258 Angle: 4 Node
+ SG_ Angle : 7|32@0- (0.01,0) [0|0] "deg" Host
+
+BO_ 512 Go: 6 Host
+ SG_ Mode : 0|8@1+ (1,0) [0|0] "" Node
+ SG_ Angle : 15|32@0- (0.01,0) [-9000|9000] "deg" Node
+
+VAL_ 257 Mode 0 "OFF" 1 "ON" 2 "BUSY" ;
+VAL_ 512 Mode 0 "OFF" 1 "ON" ;
+"""
+DEGREE = math.pi / 180.0
+SENSOR = {
+    "node_offset": 4,
+    "periods": {"Motion": 0.005, "Status": 0.1},
+    "quantities": {
+        "position": {"signal": "Motion.Angle", "scale": DEGREE},
+        "velocity": {"signal": "Motion.Speed", "scale": 6 * DEGREE},
+    },
+    "error": {"signal": "Status.Fault", "good": 0},
+}
+SERVO = {
+    "node_offset": 4,
+    "periods": {"Angle": "cycle", "Status": 0.05},
+    "quantities": {"position": {"signal": "Angle.Angle", "scale": DEGREE}},
+    "command": {"quantity": "position", "send": "Go", "signal": "Angle", "values": {"Mode": "ON"}},
+    "state": {"signal": "Status.Mode", "ready": ["OFF"], "enabled": ["ON"]},
+    "enable": [{"send": "Go", "values": {"Mode": "ON"}, "until": {"signal": "Status.Mode", "equals": "ON"}}],
+    "disable": [{"send": "Go", "values": {"Mode": "OFF"}, "until": {"signal": "Status.Mode", "equals": "OFF"}}],
+    "allow_no_watchdog": True,
+}
+
+
+@pytest.fixture
+def place(tmp_path):
+    (tmp_path / "node.dbc").write_text(FILE)
+    bus = Bus("can0", BusConfig(interface="virtual", channel="dbc_devices"), SystemClock())
+
+    def where(*quantities, node=2):
+        return Place("one", {quantity: f"{quantity}.one" for quantity in quantities}, bus, node, tmp_path, 200.0)
+
+    return where
+
+
+@pytest.fixture
+def inbox(tmp_path):
+    (tmp_path / "node.dbc").write_text(FILE)
+    return Inbox(dbc.load(tmp_path / "node.dbc"))
+
+
+def settings(kind, given, **changes):
+    return kind.model_validate({"dbc": "node.dbc", **given, **changes})
+
+
+def test_pages_of_a_message_are_read_one_by_one(place):
+    device = DbcNode(place("position", "velocity"), settings(DbcSettings, SENSOR))
+    device.is_commissioned = True
+    hear = device._bus.subscriber(256 + 8)
+    device._bus.subscriber(257 + 8)(bytearray.fromhex("01 00"), 1.0)
+    hear(bytearray.fromhex("00 28 23 00 00 00 00 00"), 1.0)  # 90 degrees
+    hear(bytearray.fromhex("01 64 00 00 00 00 00 00"), 2.0)  # 10 rpm
+    reading = device.read()
+    assert reading.values == pytest.approx([math.pi / 2, math.pi / 3])  # rad, rad/s
+    assert reading.received.tolist() == [1.0, 2.0]
+    hear(bytearray.fromhex("07 64 00 00 00 00 00 00"), 3.0)
+    assert device.health().counters["malformed"] == 1
+    assert reading.received.tolist() == [1.0, 2.0]
+
+
+def test_an_error_in_another_message_makes_values_doubtful(place):
+    device = DbcNode(place("position"), settings(DbcSettings, SENSOR))
+    device.is_commissioned = True
+    hear, tell = device._bus.subscriber(256 + 8), device._bus.subscriber(257 + 8)
+    tell(bytearray.fromhex("01 00"), 1.0)
+    hear(bytearray.fromhex("00 28 23 00 00 00 00 00"), 1.0)
+    assert device.read().values[0] == pytest.approx(math.pi / 2)
+    tell(bytearray.fromhex("01 05"), 1.1)
+    hear(bytearray.fromhex("00 28 23 00 00 00 00 00"), 1.1)
+    assert math.isnan(device.read().values[0])
+    assert "reports 5 (Status.Fault)" in device.health().text
+
+
+def test_a_servo_that_answers_in_the_cycle_is_waited_for(place):
+    device = DbcServo(place("position"), settings(ServoSettings, SERVO))
+    bus = device._bus
+    device.is_commissioned = True
+    bus.begin()
+    assert device in bus._waiting
+    bus.subscriber(258 + 8)(bytearray.fromhex("FF FF DC D8"), 1.0)  # -90 degrees, highest byte first
+    assert device not in bus._waiting
+    assert device.read().values[0] == pytest.approx(-math.pi / 2)  # rad
+    free = DbcServo(place("position", node=3), settings(ServoSettings, SERVO, periods={"Angle": 0.01, "Status": 0.05}))
+    free.is_commissioned = True
+    bus.begin()
+    assert (device in bus._waiting, free in bus._waiting) == (True, False)
+
+
+def test_set_points_with_the_highest_byte_first_and_within_the_files_range(place):
+    device = DbcServo(place("position"), settings(ServoSettings, SERVO, direction=-1, zero=0.5))
+    for value, data in (
+        (0.5 - math.pi / 2, "01 00 00 23 28 00"),  # 90 degrees
+        (0.5 + math.pi, "01 FF FF B9 B0 00"),
+        (-1e9, "01 00 0D BB A0 00"),  # 9000 degrees
+    ):
+        device._writer.write((value - device._offset) / device._scale)
+        assert device._frame.data == bytes.fromhex(data)
+    assert device._frame.arbitration_id == 512 + 8
+
+
+def test_states_that_the_robot_file_does_not_name_are_faults(place):
+    device = DbcServo(place("position"), settings(ServoSettings, SERVO))
+    device.is_commissioned, device.missed = True, 0
+    tell = device._bus.subscriber(257 + 8)
+    for data, state in (("00 00", DeviceState.READY), ("01 00", DeviceState.ENABLED), ("02 00", DeviceState.FAULT)):
+        tell(bytearray.fromhex(data), 1.0)
+        assert device.health().state is state
+    assert "its state 'busy' (Status.Mode)" in device.health().text
+    tell(bytearray.fromhex("00 00"), 1.0)
+    assert "goes on with its last set-point when the host dies" in device.health().text
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"state": {"signal": "Status.Mode", "ready": ["OFF"], "enabled": ["OFF"]}}, "has two meanings"),
+        ({"command": {**SERVO["command"], "signal": "Angl"}}, "no signal 'Angl'. Did you mean Angle"),
+        ({"command": {**SERVO["command"], "quantity": "effort"}}, "'effort' is not measured"),
+        ({"cyclic": [SERVO["enable"][0]]}, "drop the `until`"),
+        ({"enable": [{"frame": {"id": 1}, "send": "Go"}]}, "either `send` or `frame`"),
+        ({"enable": [{"frame": {"id": 1, "data": [256]}}]}, "enable.0.frame.data"),
+        ({"enable": [{"until": {"signal": "Go.Mode", "equals": "AN"}}]}, "no value 'AN'"),
+        ({"tare": [SERVO["enable"][0]]}, "waits for nothing"),
+        ({"quantities": {"position": {"signal": "Angle.Angle", "scale": 0}}}, "scale must not be 0"),
+        ({"periods": {"Status": 0.05}}, "does not say how often 'Angle' is sent"),
+        ({"periods": {"Angle": 0.01}}, "does not say how often 'Status' is sent"),
+    ],
+)
+def test_settings_that_do_not_fit_are_told(place, changes, sentence):
+    with pytest.raises((ConfigError, ValueError), match=sentence):
+        DbcServo(place("position"), settings(ServoSettings, SERVO, **changes))
+
+
+def test_a_cell_without_a_tare_says_so(place):
+    with pytest.raises(CommandRefused, match="cannot be tared"):
+        DbcNode(place("position"), settings(DbcSettings, SENSOR)).tare()
+
+
+def steps(inbox, *given):
+    address = Address(2, 4, None)
+    compiled = compile_steps([StepConfig.model_validate(one) for one in given], inbox, address, 200.0)
+    inbox.seal()
+    return compiled
+
+
+def hear(inbox, *raws):
+    inbox.letters["Status"].raws = tuple(raws)
+
+
+def test_raw_frames(inbox):
+    found = steps(
+        inbox,
+        {"frame": {"id": 0x10, "data": [1, 2]}},
+        {"frame": {"id": 0x7DF, "broadcast": True, "remote": True}},
+        {"frame": {"id": 0x12345, "data": [3]}},
+    )
+    told = [
+        (s.frame.arbitration_id, bytes(s.frame.data), s.frame.is_remote_frame, s.frame.is_extended_id) for s in found
+    ]
+    assert told == [
+        (0x18, b"\1\2", False, False),
+        (0x7DF, b"", True, False),
+        (0x1234D, b"\3", False, True),
+    ]
+
+
+def test_steps_go_on_when_they_are_confirmed_by_something_new(inbox):
+    on = {"signal": "Status.Mode", "equals": "ON", "within": 1.0}
+    run = Run("test", steps(inbox, {"send": "Go", "until": on}, {"frame": {"id": 1}}), 200.0)
+    sent: list[can.Message] = []
+    hear(inbox, 1)
+    for _ in range(10):
+        run.advance(sent.append)
+    assert len(sent) == 1  # it said so before it was asked
+    assert not run.has_sent_last
+    hear(inbox, 1)
+    run.advance(sent.append)
+    run.advance(sent.append)
+    assert [frame.arbitration_id for frame in sent] == [512 + 8, 1 + 8]
+    assert run.is_over
+    assert not run.failure
+
+
+def test_a_step_that_is_not_confirmed_is_sent_again_and_then_given_up(inbox):
+    on = {"signal": "Status.Mode", "one_of": ["ON", "BUSY"], "within": 0.5}
+    compiled = steps(inbox, {"send": "Go", "values": {"Mode": "ON"}, "until": on}, {"frame": {"id": 1}})
+    for goes_on, frames in ((False, 3), (True, 4)):
+        run = Run("test", compiled, 200.0, goes_on)
+        sent: list[can.Message] = []
+        for _ in range(110):
+            hear(inbox, 0)
+            run.advance(sent.append)
+        assert len(sent) == frames
+        assert run.is_over
+    failed = Run("test", compiled, 200.0)
+    while not failed.is_over:
+        failed.advance(lambda frame: True)
+    assert failed.failure == "after Go ON it does not say Status.Mode ON or BUSY, but off"
+
+
+def test_a_step_that_is_not_needed_is_left_out(inbox):
+    off = {"signal": "Status.Mode", "equals": "OFF"}
+    run = Run("test", steps(inbox, {"send": "Go", "unless": off}), 200.0)
+    sent: list[can.Message] = []
+    hear(inbox, 0)
+    run.advance(sent.append)
+    assert run.is_over
+    assert not sent
+
+
+def test_the_set_point_stays_from_the_moment_the_loop_is_asked_to_close():
+    """The state is told up to a heartbeat later; meanwhile the drive must hold, not follow what it is pushed to."""
+    bench = dbc_bench().open()
+    try:
+        bench.cycle(4)
+        bench.robot.enable()
+        node = axis(bench)
+        while node.condition != "closed loop control":
+            bench.cycle()
+        asked = node.input[3]
+        bench.world.break_part("set:joint_position.elbow:0.62")
+        while bench.device("elbow_axis")["state"] != "enabled":
+            assert node.input[3] == asked
+            bench.cycle()
+    finally:
+        bench.close()
+
+
+def test_an_axis_that_refuses_is_told_with_its_reason():
+    bench = dbc_bench().open()
+    try:
+        bench.cycle(4)
+        node = axis(bench)
+        node._request = lambda data: setattr(node, "result", 14)
+        node.routes_changed()
+        bench.robot.enable()
+        bench.until(lambda: "cannot be enabled" in bench.device("elbow_axis")["text"], "refused", 400)
+        assert "its state is 'idle', not calibrated" in bench.device("elbow_axis")["text"]
+    finally:
+        bench.close()
