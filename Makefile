@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 VMCAN ?= ../shared/tools/vmcan.sh
 STAMP := .venv/installed
-SOCKETCAN := $(addprefix tests/system/test_socketcan,.py _drivers.py _states.py)
+SOCKETCAN := $(addprefix tests/system/test_socketcan,.py _bus.py _drivers.py _states.py)
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo reproduce test check format bench test-socketcan test-controllers results clean
