@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from hal.drivers.can_device import DeviceSettings
 from hal.section import Finite, Positive, Section
@@ -19,7 +19,15 @@ Value = Annotated[float | str, BeforeValidator(_no_switch)]
 
 Byte = Annotated[int, Field(ge=0, le=255)]
 Identifier = Annotated[int, Field(ge=0, lt=1 << 29)]
-Factor = Annotated[float, Field(allow_inf_nan=False)]
+
+
+def _not_zero(value: float) -> float:
+    if value == 0.0:
+        raise ValueError("a factor must not be 0.")
+    return value
+
+
+Factor = Annotated[float, Field(allow_inf_nan=False), AfterValidator(_not_zero)]
 
 MOTION = ("position", "velocity", "effort")
 """Quantities whose sign `direction` turns, and which can be commanded."""
@@ -34,12 +42,6 @@ class QuantityConfig(Section):
     """SI units per unit of the DBC file."""
     offset: Finite = 0.0
     """SI units at zero."""
-
-    @model_validator(mode="after")
-    def _can_be_undone(self) -> Self:
-        if self.scale == 0.0:
-            raise ValueError("scale must not be 0.")
-        return self
 
 
 class FrameConfig(Section):
@@ -197,7 +199,7 @@ class DbcSettings(DeviceSettings):
     """-1 if position, velocity and effort grow the other way."""
     zero: Finite = 0.0
     """Added to the position, or to what a sensor is there for [SI unit]."""
-    gain: Positive = 1.0
+    gain: Factor = 1.0
     """What a sensor is there for is multiplied by it before `zero` is added."""
     heartbeat: HeartbeatConfig | None = None
     error: ErrorConfig | None = None

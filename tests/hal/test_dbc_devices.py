@@ -167,7 +167,7 @@ def test_states_that_the_robot_file_does_not_name_are_faults(place):
         ({"enable": [{"frame": {"id": 1, "data": [256]}}]}, "enable.0.frame.data"),
         ({"enable": [{"until": {"signal": "Go.Mode", "equals": "AN"}}]}, "no value 'AN'"),
         ({"tare": [SERVO["enable"][0]]}, "waits for nothing"),
-        ({"quantities": {"position": {"signal": "Angle.Angle", "scale": 0}}}, "scale must not be 0"),
+        ({"quantities": {"position": {"signal": "Angle.Angle", "scale": 0}}}, "a factor must not be 0"),
         ({"periods": {"Status": 0.05}}, "does not say how often 'Angle' is sent"),
         ({"periods": {"Angle": 0.01}}, "does not say how often 'Status' is sent"),
     ],
