@@ -6,7 +6,7 @@ STAMP := .venv/installed
 SOCKETCAN := $(addprefix tests/system/test_socketcan,.py _bus.py _drivers.py _states.py)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo reproduce test check format bench test-socketcan test-controllers results clean
+.PHONY: help setup demo reproduce test check format faults bench test-socketcan test-controllers results clean
 
 help:            ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 18
@@ -46,6 +46,9 @@ test-controllers: $(STAMP)  ## drivers on two CAN controllers at 1 Mbit/s: can0 
 	@if [ -e /sys/class/net/can0/device ]; then $(BIN)/python -m pytest tests/system/test_socketcan_states.py; \
 	elif [ -x "$(VMCAN)" ] && command -v qemu-system-x86_64 >/dev/null; then VMCAN_HW=1 "$(VMCAN)" -b qemu -t 580 "$(CURDIR)" $(BIN)/python -m pytest -p no:cacheprovider tests/system/test_socketcan_states.py; \
 	else echo "skipped: no controllers can0 and can1 here, and no '$(VMCAN)' with qemu-system-x86_64 to boot a machine that has them"; fi
+
+faults: $(STAMP)  ## the robot broken in every way, with many seeds: result table of docs/safety.md
+	$(BIN)/python tests/hal/campaign.py --seeds 7 --json runs/faults.json
 
 bench: $(STAMP)   ## the loops' punctuality beside bare timers, 10 minutes
 	$(BIN)/python -m benchmarks.loops

@@ -30,7 +30,7 @@ class Chances:
         duplicate: It arrives twice.
         short: Its last bytes are missing.
         long: Bytes are added, eight together at most.
-        corrupt: One of its bytes is another one.
+        corrupt: One of its bytes is another one; only from a node, since a checksum protects what is on the wire.
         delay: It arrives `delayed_by` later, behind frames that were sent after it.
         delayed_by: [s]
     """
@@ -137,7 +137,7 @@ class FaultyWire:
         if self.is_cut or message.arbitration_id in self.lost or draw.random() < chances.loss:
             self.counters["lost"] += 1
             return
-        message = self._changed(message, draw)
+        message = self._changed(message, draw, way is self._to_hal)
         if draw.random() < chances.duplicate:
             self._deliver(way, message)
         if draw.random() < chances.delay:
@@ -145,13 +145,13 @@ class FaultyWire:
         else:
             self._deliver(way, message)
 
-    def _changed(self, message: can.Message, draw: random.Random) -> can.Message:
+    def _changed(self, message: can.Message, draw: random.Random, is_from_node: bool) -> can.Message:
         data, chances = bytes(message.data), self.chances
         if draw.random() < chances.short:
             data = data[: draw.randrange(max(len(data), 1))]
         if draw.random() < chances.long and len(data) < _LARGEST:
             data += draw.randbytes(draw.randint(1, _LARGEST - len(data)))
-        if draw.random() < chances.corrupt and data:
+        if is_from_node and draw.random() < chances.corrupt and data:
             place = draw.randrange(len(data))
             data = data[:place] + bytes([data[place] ^ draw.randint(1, 255)]) + data[place + 1 :]
         if data == message.data:

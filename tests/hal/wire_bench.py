@@ -2,11 +2,12 @@
 
 import logging
 import threading
+import time
 from collections import deque
 
 import can
 import numpy as np
-from hal_bench import DRIVE, Bench, BenchClock, BenchWorld, description
+from hal_bench import Bench, BenchClock, BenchWorld, description
 
 from hal.config import RobotConfig
 from hal.errors import CommandRefused
@@ -26,14 +27,20 @@ STRAY = "stray_length.stray"
 LET_GO = 0.8
 """A drive may take so long [s] to be without power after the robot went into fault: 0.15 s until it misses the HAL's
 heartbeat, 0.5 s for the longest quick stop, and the cycles until it is told where it is."""
-WINDOW = 20
-"""Steps of the world over which speed is averaged: a lost set-point is caught up within them."""
+WINDOW = 60
+"""Steps of the world over which speed is averaged: lost set-points are caught up within them,"""
 CATCH_UP = 1.5
+"""at this multiple of the limit."""
+REACH = 40
+"""A drive is where a set-point of the last so many cycles was, or between two of them,"""
+BEYOND = 0.002
+"""or further by what it needs to stop [m]."""
 
 
 def wire_description():
     """Two drives and a cell on one bus, a cell and an encoder on the other, at 100 Hz."""
     body = description(rates={"hal": RATE})
+    body["limits"]["muscle_length"]["acceleration"] = 2.0
     body["devices"]["triceps_drive"]["bus"] = "can0"
     body["signals"]["stray_length"] = {"unit": "m", "elements": ["stray"], "source": "vision"}
     return body
@@ -89,9 +96,9 @@ class WitnessWorld(BenchWorld):
             return abs(self.time - (value - (20.0, 30.0)[index]) / TENSION_RAMP)
         if signal == "joint_position":
             return abs(self.time - (value + 0.7) / ANGLE_RAMP)
-        for time, *lengths in reversed(self.history):
+        for when, *lengths in reversed(self.history):
             if abs(lengths[index] - value) < 2e-6:
-                return self.time - time
+                return self.time - when
         return np.inf
 
 
@@ -126,7 +133,6 @@ class WireBench(Bench):
 
     def turn(self):
         self._exchange(0.0)
-        self.flush()
 
     def pass_time(self, duration=PERIOD):
         self.clock.advance(duration)
@@ -140,6 +146,7 @@ class WireBench(Bench):
         self.rig.step(duration)
         for wire in self.faulty.values():
             wire.to_hal(now)
+        self.flush()
 
     def cycle(self, count=1):
         for _ in range(count):
@@ -161,6 +168,15 @@ class WireBench(Bench):
             except CommandRefused:
                 return False
         return True
+
+    def unplug(self, bus):
+        """Take away the interface that the HAL has open, and wait until it has seen that."""
+        opened = self.buses[bus].counters["opened"]
+        self.buses[bus]._can.shutdown()
+        deadline = time.monotonic() + 5.0
+        while self.buses[bus].counters["opened"] == opened:
+            assert time.monotonic() < deadline, f"{bus} is not opened again"
+            time.sleep(0.001)
 
     def close(self):
         super().close()
@@ -186,9 +202,11 @@ class Referee(logging.Handler):
         """Whether frames carry wrong values, which nobody could tell from right ones."""
         self._rises = 0
         self._fault_since = None
+        self._applied = deque(maxlen=REACH)
         limits = bench.config.limits["muscle_length"]
         self._low, self._high = bench.config.bounds("muscle_length")
         self._speed = limits.rate * CATCH_UP
+        self._acceleration = limits.acceleration * 1.01
 
     def __enter__(self):
         self._hook, threading.excepthook = threading.excepthook, self._on_exception
@@ -214,6 +232,7 @@ class Referee(logging.Handler):
         if any(bus.counters["broken_handlers"] for bus in bench.buses.values()):
             self._note("exception", "a handler raised")
         self._look_at_motion(world)
+        self._look_at_set_points(bench.applied.values, world)
         if not self.lies:
             self._look_at_values(bench.sample, world)
         self._look_at_power(bench.robot.mode, world)
@@ -227,6 +246,21 @@ class Referee(logging.Handler):
             speed = np.abs(now[1:] - before[1:]) / (now[0] - before[0])
             if (speed > self._speed + 1e-3).any():
                 self._note("motion", f"speeds {speed.round(3)} m/s, allowed {self._speed:g}")
+
+    def _look_at_set_points(self, applied, world):
+        if np.isnan(applied).any():
+            self._applied.clear()
+            return
+        self._applied.append(applied.copy())
+        if len(self._applied) < 3:
+            return
+        points = np.array(self._applied)
+        low, high = points.min(axis=0) - BEYOND, points.max(axis=0) + BEYOND
+        if (world.length < low).any() or (world.length > high).any():
+            self._note("motion", f"lengths {world.length} beyond the set-points {low}..{high}")
+        change = np.diff(points[-3:], n=2, axis=0)[0] / PERIOD**2
+        if (np.abs(change) > self._acceleration).any():
+            self._note("motion", f"set-points accelerate by {change.round(2)} m/s^2")
 
     def _look_at_values(self, sample, world):
         for signal, valid in sample.valid.items():
@@ -250,6 +284,3 @@ class Referee(logging.Handler):
             self._fault_since = None
         if rises and not self.was_asked:
             self._note("enabled", f"{rises[0][1]} was enabled by itself at {rises[0][0]:.3f} s")
-
-
-__all__ = ["DRIVE", "PERIOD", "RATE", "Referee", "WireBench", "WitnessWorld", "wire_description", "wire_hardware"]
