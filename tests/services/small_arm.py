@@ -192,8 +192,12 @@ class Processes:
 
     def terminate(self, service: str) -> tuple[int, str]:
         """As SIGTERM; exit code and what was written to stderr."""
+        self._running[service].terminate()
+        return self.ended(service)
+
+    def ended(self, service: str) -> tuple[int, str]:
+        """Wait for one that was told to end; exit code and what was written to stderr."""
         process = self._running.pop(service)
-        process.terminate()
         said = process.communicate(timeout=20.0)[1]
         time.sleep(FRESH)
         return process.returncode, said
