@@ -22,7 +22,7 @@ import yaml
 
 from hal import registry
 from hal.bus import Bus
-from hal.bus_time import FrameClock
+from hal.bus_time import ArrivalClock, FrameClock
 from hal.clock import SystemClock
 from hal.config import RobotConfig
 from hal.device import Device
@@ -97,7 +97,7 @@ def record(config: RobotConfig) -> tuple[list[Bus], list[Device], dict[str, list
 def ours(bus: Bus, devices: Sequence[Device], cycle: Sequence[can.Message], has_stamps: bool) -> float:
     """CPU time per frame [us] of some cycles' frames, as the receive thread handles them."""
     receiver = bus._receiver
-    receiver._frame_clock = FrameClock(SystemClock()) if has_stamps else None
+    receiver._frame_clock = FrameClock(SystemClock()) if has_stamps else ArrivalClock()
     handle, monotonic = receiver.handle, time.monotonic
     receiver.routes.open_window(monotonic())
     stamp = time.time() - WAIT

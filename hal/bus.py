@@ -18,7 +18,8 @@ from hal.bus_receive import OWN_NODE, Receiver
 from hal.bus_routes import Handler
 from hal.bus_send import PATIENCE, Sender, set_buffers
 from hal.bus_state import UNUSABLE, BusState, BusWatch
-from hal.bus_time import STAMPED, FrameClock
+from hal.bus_thread import ThreadWatch
+from hal.bus_time import STAMPED, WAITED, ArrivalClock, FrameClock
 from hal.clock import BusClock
 from hal.config import BusConfig
 from hal.errors import ConfigError
@@ -35,10 +36,6 @@ SILENCE = 1.0
 BACK_OFF = (0.05, 0.5)
 """First and longest pause [s] between tries to open; the first again once a frame was heard."""
 RECEIVE_TIMEOUT = 0.1
-HANGS = 1.0
-"""An interface that does not come back from receiving for so long [s], ten timeouts, has hung,"""
-HUNG_CYCLES = 3
-"""provided that the cycle went on meanwhile: a process that was frozen as a whole has not."""
 MISSES_FORGIVEN = 4
 """A node that missed so many cycles in a row is not waited for any more, until it is heard."""
 TOLD_STRANGERS = 8
@@ -96,7 +93,8 @@ class Bus:
         self._losses = 0
         self._sender = Sender(self.counters, lambda text: self._watch.worry(text, clock.monotonic()))
         self.network = canopen.Network(_Network(self._sender))  # type: ignore[arg-type]
-        self._frame_clock = FrameClock(clock) if config.interface in STAMPED else None
+        self._arrival = ArrivalClock()
+        self._frame_clock = FrameClock(clock) if config.interface in STAMPED else self._arrival
         self._receiver = Receiver(name, config.bitrate, self._watch, self.counters, self._frame_clock)
         self._handle = self._receiver.handle
         self._can: can.BusABC | None = None
@@ -106,8 +104,7 @@ class Bus:
         self._tried = threading.Event()
         self._closing = threading.Event()
         self._beat = -math.inf
-        self._turned = self._seen_turned = 0.0
-        self._hung_cycles = 0
+        self._thread_watch = ThreadWatch()
         self._thread: threading.Thread | None = None
         self._sync = can.Message(arbitration_id=cia301.SYNC, is_extended_id=False)
         self._heartbeat = can.Message(
@@ -128,7 +125,7 @@ class Bus:
     def is_receiving(self) -> bool:
         """Whether the receive thread is alive and came back from the interface lately, frames or none."""
         thread = self._thread
-        return thread is not None and thread.is_alive() and time.monotonic() - self._turned < HANGS
+        return thread is not None and thread.is_alive() and self._thread_watch.is_turning
 
     def subscribe(self, identifier: int, handler: Handler, extended: bool = False) -> None:
         """Have `handler` called with every data frame of an identifier; one handler each.
@@ -161,7 +158,7 @@ class Bus:
         """Start receiving; returns when the interface was tried once, also if that failed."""
         self._closing.clear()
         self._tried.clear()
-        self._turned = time.monotonic()
+        self._thread_watch.start()
         self._thread = threading.Thread(target=self._run, name=f"bus {self.name}", daemon=True)
         self._thread.start()
         self._tried.wait(5.0)
@@ -187,7 +184,8 @@ class Bus:
         self._sender.begin()
         self._waiting = {n for n in self._nodes if n.patience == 1 and n.is_commissioned and n.missed < MISSES_FORGIVEN}
         self._answered.clear()
-        self._look_after_thread()
+        if self._thread_watch.hangs() and self.state is not BusState.GONE:
+            self._watch.lost("Its receive thread hangs. Is the adapter still plugged in?")
 
     def sync(self, now: float) -> None:
         """Send the SYNC, and now and then the HAL's own heartbeat, if anybody waits for them."""
@@ -218,16 +216,15 @@ class Bus:
 
     def health(self) -> dict[str, Any]:
         """State, a sentence, share of the bit rate that is used, counters, and whose clock stamps the frames."""
-        frame_clock = self._frame_clock
         return {
             "state": self.state.value,
             "text": self.text,
             "load": round(self._receiver.load, 4),
             "is_receiving": self.is_receiving,
-            "stamps": "arrival" if frame_clock is None else STAMPED[self._config.interface],
+            "stamps": STAMPED.get(self._config.interface, "arrival"),
             "error_counters": self._watch.error_counters,
             "unknown": self._receiver.strangers()[:TOLD_STRANGERS],
-            "counters": {**self.counters, **(frame_clock.counters if frame_clock else {})},
+            "counters": {**self.counters, **self._frame_clock.counters},
         }
 
     def _run(self) -> None:
@@ -277,10 +274,9 @@ class Bus:
     def _receive(self, interface: can.BusABC) -> None:
         """Handle frames until the bus is closed, silent, or not able to send."""
         receiver, sender, monotonic = self._receiver, self._sender, self._clock.monotonic
-        opened = monotonic()
+        opened = now = monotonic()
         while not self._closing.is_set():
-            message = interface.recv(RECEIVE_TIMEOUT)
-            self._turned = time.monotonic()
+            message = self._next(interface, now)
             now = monotonic()
             if message is not None:
                 receiver.handle(message, now)
@@ -296,12 +292,16 @@ class Bus:
                 raise ConnectionError(f"Nothing was heard for {silent:.1f} s. Is a node powered?")
             self._closing.wait(0.001)  # some interfaces return at once when their peer is dead
 
-    def _look_after_thread(self) -> None:
-        """Tell when the receive thread has not turned for long, though the cycle has."""
-        self._hung_cycles = 0 if self._turned != self._seen_turned else self._hung_cycles + 1
-        self._seen_turned = self._turned
-        if self._hung_cycles > HUNG_CYCLES and not self.is_receiving and self.state is not BusState.GONE:
-            self._watch.lost("Its receive thread hangs. Is the adapter still plugged in?")
+    def _next(self, interface: can.BusABC, before: float) -> can.Message | None:
+        """The next frame, or None after a while; `before` is when the last one was read [s]."""
+        arrival = self._arrival
+        asked = 0.0 if arrival.since is None else time.monotonic()
+        message = interface.recv(RECEIVE_TIMEOUT)
+        if self._thread_watch.turn():
+            arrival.since = before
+        elif asked and (message is None or time.monotonic() - asked > WAITED):
+            arrival.since = None
+        return message
 
     def _changed(self, state: BusState, text: str) -> None:
         self._sender.is_barred = state is BusState.BUS_OFF

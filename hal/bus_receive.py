@@ -8,7 +8,7 @@ import can
 from hal.budget import frame_bits
 from hal.bus_routes import EXTENDED, Routes, name_of
 from hal.bus_state import BusState, BusWatch
-from hal.bus_time import FrameClock
+from hal.bus_time import ArrivalClock, FrameClock
 from hal.protocols import cia301
 from hal.protocols.error_frames import error_frame
 
@@ -31,7 +31,7 @@ class Receiver:
     """Handles the frames of one bus, all in its receive thread."""
 
     def __init__(
-        self, name: str, bitrate: int, watch: BusWatch, counters: dict[str, int], frame_clock: FrameClock | None
+        self, name: str, bitrate: int, watch: BusWatch, counters: dict[str, int], frame_clock: FrameClock | ArrivalClock
     ) -> None:
         """Prepare.
 
@@ -40,7 +40,7 @@ class Receiver:
             bitrate: Of the bus [bit/s].
             watch: Is told what is seen.
             counters: Counted in place.
-            frame_clock: What to make of the stamps of frames; None if they are worth nothing.
+            frame_clock: What to make of the stamps of frames.
         """
         self.routes = Routes(name)
         self.heard = -math.inf
@@ -80,7 +80,7 @@ class Receiver:
             self._bits += _BITS[size]
         if self._watch.state is not BusState.OK:
             self._watch.heard(now)
-        received = now if self._frame_clock is None else self._frame_clock.received(message.timestamp, now)
+        received = self._frame_clock.received(message.timestamp, now)
         routes = self.routes
         if received >= routes.window_end:
             routes.open_window(received)

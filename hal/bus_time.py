@@ -21,6 +21,31 @@ _READ_WITHIN = 5e-5
 _READS = 4
 
 
+WAITED = 0.0005
+"""An interface that takes so long [s] to hand over a frame had none waiting."""
+
+
+class ArrivalClock:
+    """For stamps that are worth nothing: a frame came when it was read.
+
+    Frames that were read after this process was frozen may have come at any time since; they are told as old as they
+    can be.
+    """
+
+    def __init__(self) -> None:
+        self.counters = {"waited": 0}
+        """Frames that lay in the interface while this process was frozen."""
+        self.since: float | None = None
+        """Frames that are read now may have come since then [monotonic s]; None: they come as they are read."""
+
+    def received(self, stamp: float, now: float) -> float:
+        """See `FrameClock.received`."""
+        if self.since is None:
+            return now
+        self.counters["waited"] += 1
+        return self.since
+
+
 class FrameClock:
     """Turns wall-clock stamps into monotonic times.
 

@@ -1,13 +1,20 @@
 """When a frame came, told from wall-clock stamps, whatever becomes of the wall clock."""
 
 import random
+import threading
+import time
 
+import can
 import pytest
 
+from hal.bus import Bus
+from hal.bus_thread import FROZEN
 from hal.bus_time import DOUBT, FrameClock
-from hal.clock import ManualClock
+from hal.clock import ManualClock, SystemClock
+from hal.config import BusConfig
 
 DELAY = 0.0003
+LIMIT = 10.0
 
 
 @pytest.fixture
@@ -98,3 +105,40 @@ def test_no_frame_is_ever_newer_than_now(clock):
             clock.set_wall(1.7e9 + chance.uniform(-10, 10))
         now = clock.monotonic()
         assert frames.received(stamp(clock, chance.choice((0.0, DELAY, 0.01, -0.01, -3.0, 1e9))), now) <= now
+
+
+def test_frames_without_stamps_that_waited_are_told_as_old_as_they_can_be(tmp_path):
+    bus = Bus("can0", BusConfig(interface="virtual", channel=str(tmp_path)), SystemClock())
+    hold, ages = threading.Event(), []
+
+    def handler(data, received):
+        if data == b"first":
+            hold.wait(LIMIT)
+        else:
+            ages.append((bytes(data), time.monotonic() - received))
+
+    def send(data, count):
+        peer.send(can.Message(arbitration_id=0x181, data=data, is_extended_id=False))
+        deadline = time.monotonic() + LIMIT
+        while len(ages) < count:
+            assert time.monotonic() < deadline
+            time.sleep(0.001)
+
+    bus.subscribe(0x181, handler)
+    bus.open()
+    with can.Bus(interface="virtual", channel=str(tmp_path)) as peer:
+        send(b"fresh", 1)
+        send(b"first", 1)
+        for _ in range(5):
+            send(b"waits", 1)
+        time.sleep(1.5 * FROZEN)
+        hold.set()
+        time.sleep(0.1)
+        send(b"new", 7)
+    bus.close()
+    told = dict(ages)
+    assert told[b"fresh"] < FROZEN
+    assert all(age > FROZEN for data, age in ages if data == b"waits")
+    assert told[b"new"] < FROZEN
+    assert bus.health()["counters"]["waited"] == 5
+    assert bus.health()["stamps"] == "arrival"
