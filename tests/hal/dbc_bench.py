@@ -68,21 +68,6 @@ def description(mode="position", odrive=None, cell=None, driver="odrive", **chan
     return {**body, **changes}
 
 
-class FreeBench(Bench):
-    """Devices that send by themselves are not waited for in a cycle: what they sent is taken in before it."""
-
-    is_closing = False
-
-    def pass_time(self, duration=0.005):
-        super().pass_time(duration)
-        if not self.is_closing:
-            self.flush()
-
-    def close(self):
-        self.is_closing = True
-        super().close()
-
-
 def dbc_bench(mode="position", constants=None, cell=None, cell_settings=None, **changes):
     """The bench of such a robot; `constants` are those of the axis, `cell` those of the cell."""
     config = RobotConfig.model_validate(description(mode, cell=cell_settings, **changes))
@@ -93,7 +78,7 @@ def dbc_bench(mode="position", constants=None, cell=None, cell_settings=None, **
     ]
     world = BenchWorld(config)
     world.break_part("set:joint_position.elbow:0.6")
-    return FreeBench(config, nodes=nodes, world=world)
+    return Bench(config, nodes=nodes, world=world)
 
 
 def axis(bench):

@@ -135,6 +135,8 @@ class Bench:
             bus.subscribe(SENTINEL, lambda data, received, name=name: self._passed[name].set())
         self.clock.turn = self.turn
         self.powered = powered
+        self.goes_by_itself = any(device.patience > 1 for device in self.robot._devices)
+        """Whether a device sends by its own clock, for which a cycle does not wait."""
         self.sample = self.applied = None
 
     def turn(self):
@@ -167,6 +169,8 @@ class Bench:
         """`count` cycles; the newest sample and what was applied are kept."""
         for _ in range(count):
             self.pass_time()
+            if self.goes_by_itself:
+                self.flush()
             self.sample, self.applied = self.robot.cycle()
         return self.sample, self.applied
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from dbc_bench import FreeBench
+from hal_bench import Bench
 
 from hal.config import RobotConfig
 from hal.drivers.dbc_settings import DbcSettings, ServoSettings
@@ -49,7 +49,7 @@ def test_a_servo_and_a_cell_of_the_example_work():
         NodeSpec("left_cell", "can0", 7, "wire_force.left", DbcCellConstants()),
         NodeSpec("winch_axis", "can0", 3, "joint_position.winch", OdriveConstants()),
     ]
-    bench = FreeBench(config, nodes=nodes, world=BenchWorld(config)).open()
+    bench = Bench(config, nodes=nodes, world=BenchWorld(config)).open()
     try:
         bench.until(lambda: bench.device("winch_axis")["state"] == "ready", "ready", 400)
         bench.world.break_part("set:wire_force.left:42")
@@ -66,7 +66,7 @@ def test_a_servo_and_a_cell_of_the_example_work():
 
 def test_an_axis_of_the_example_works_on_the_bench():
     config = robot_file(ODRIVE)
-    bench = FreeBench(config, nodes=hardware(config), world=BenchWorld(config)).open()
+    bench = Bench(config, nodes=hardware(config), world=BenchWorld(config)).open()
     try:
         bench.until(lambda: bench.device("elbow_axis")["state"] == "ready", "ready", 400)
         assert bench.rig.node("elbow_axis")._limits == pytest.approx((8.0, 1.2))  # turns/s, N m
