@@ -10,6 +10,8 @@ from hal.protocols.cia301 import Mapped
 from hal.sdo_client import SdoClient
 
 _COB_ID = 0x7FF
+_NO_REQUESTS = 1 << 30
+"""Bit of a TPDO's COB-ID entry: it is not sent on request; a node that has it set may refuse to have it cleared."""
 _TIMER = 5
 """Sub-index of the event timer [ms]."""
 
@@ -103,6 +105,7 @@ def _describe(entries: list[int]) -> str:
 def _map(sdo: SdoClient, side: _Side, pdo: Pdo, cob: int) -> None:
     """Map one PDO in the order that CiA 301 (7.5.2.36) asks for: off, empty, fill, count, on."""
     parameters, mapping = side.parameters + pdo.number - 1, side.mapping + pdo.number - 1
+    cob |= sdo.read(parameters, 1) & _NO_REQUESTS
     sdo.write(parameters, 1, cia301.PDO_INVALID | cob, 4)
     sdo.write_checked(parameters, 2, pdo.transmission, 1)
     if pdo.event_time:
@@ -113,7 +116,7 @@ def _map(sdo: SdoClient, side: _Side, pdo: Pdo, cob: int) -> None:
     sdo.write_checked(mapping, 0, len(pdo.objects), 1)
     sdo.write(parameters, 1, cob, 4)
     found = sdo.read(parameters, 1)
-    if found & (cia301.PDO_INVALID | _COB_ID) != cob:
+    if found & (cia301.PDO_INVALID | _COB_ID) != cob & _COB_ID:
         raise DeviceRefused(f"PDO parameter {parameters:04X}h:1 reads back {found:08X}h after writing {cob:08X}h.")
 
 
@@ -123,5 +126,5 @@ def _silence_others(sdo: SdoClient, pdos: PdoMap, node: int) -> None:
         used = {pdo.number for pdo in of_side}
         for number in range(1, cia301.PDO_PER_DIRECTION + 1):
             if number not in used and sdo.has(side.parameters + number - 1, 1):
-                off = cia301.PDO_INVALID | cob_id(side.cob_id, number, node)
-                sdo.write(side.parameters + number - 1, 1, off, 4)
+                index, cob = side.parameters + number - 1, cob_id(side.cob_id, number, node)
+                sdo.write(index, 1, cia301.PDO_INVALID | cob | (sdo.read(index, 1) & _NO_REQUESTS), 4)

@@ -198,6 +198,10 @@ class Cia402Drive(CanopenNode):
     def _warning(self) -> str:
         if self._handshake.waited > ANSWER_TIME * self._place.rate:
             return f"{self._place} does not acknowledge set-points (bit 12 of its statusword)."
+        if self._statusword >= 0 and not self._statusword & cia402.REMOTE:
+            return f"{self._place} is led from its own panel and takes no commands (bit 9 of its statusword)."
+        if self._statusword >= 0 and self._statusword & cia402.WARNING:
+            return f"{self._place} warns (bit 7 of its statusword). Look at its display."
         return "" if self._is_watched else f"{self._place} does not notice when the HAL is gone (no 1016h)."
 
     def enable(self) -> None:

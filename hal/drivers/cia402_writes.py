@@ -90,10 +90,16 @@ def drive_writes(
     )
     return (
         (cia402.MODE_OF_OPERATION, MODES[settings.mode]),
-        *(write for write in optional if sheet.get_variable(write[0].index, write[0].subindex) is not None),
+        *(write for write in optional if _takes(sheet, write[0])),
         *_profile(settings, units),
         *_homing(settings, units),
     )
+
+
+def _takes(sheet: canopen.ObjectDictionary, item: Mapped) -> bool:
+    """Whether the data sheet has an object that can be written."""
+    entry = sheet.get_variable(item.index, item.subindex)
+    return entry is not None and "w" in entry.access_type
 
 
 def _limits(settings: DriveSettings, units: DriveUnits, bounds: tuple[float, float]) -> Iterator[Write]:

@@ -102,6 +102,9 @@ CHANGE_AT_ONCE = 1 << 5
 START_HOMING = 1 << 4
 """Homing: begin, and go on while it is set."""
 
+WARNING = 1 << 7
+REMOTE = 1 << 9
+"""The controlword is followed; without it, the drive is led from its own panel."""
 TARGET_REACHED = 1 << 10
 SET_POINT_TAKEN = 1 << 12
 """Profile position: the answer to `NEW_SET_POINT`."""

@@ -36,7 +36,8 @@ class Profile:
             duration: [s].
         """
         way = target - self.position
-        allowed = min(speed, math.sqrt(2.0 * fall * abs(way)))
+        stoppable = fall * (math.sqrt(duration**2 + 2.0 * abs(way) / fall) - duration)  # after this step too
+        allowed = min(speed, stoppable)
         wanted = math.copysign(allowed, way)
         is_braking = abs(wanted) < abs(self.velocity) or wanted * self.velocity < 0.0
         change = (fall if is_braking else rise) * duration

@@ -70,6 +70,32 @@ def test_a_short_or_long_frame_is_counted_and_not_used(joint):
     np.testing.assert_array_equal(bench.drive.read().values, before)
 
 
+@pytest.mark.parametrize(
+    ("statusword", "told"), [(0x0050, "is led from its own panel"), (0x02D0, "warns (bit 7"), (0x0250, "")]
+)
+def test_bits_of_the_statusword_that_a_person_should_know(joint, statusword, told):
+    bench = joint("csp", quantities=("position",)).open()
+    bench.cycle(3)
+    bench.rig.fault("sensor_silent elbow")
+    bench.send("can0", 0x180 + NODE, struct.pack("<Hi", statusword, 0))
+    bench.flush()
+    assert told in text(bench) if told else not text(bench)
+
+
+@pytest.mark.parametrize("timing", [{"every": 10}, {"event_time": 0.05}])
+def test_a_slow_value_comes_as_often_as_it_was_asked_for(joint, timing):
+    where = {"object": "2200h:1", "type": "int16", "scale": 0.1, **timing}
+    bench = joint("csp", quantities=("position", "temperature"), temperature=where).open()
+    bench.cycle(15)
+    slot = bench.drive.measures.index("joint_temperature.elbow")
+    stamps = []
+    for _ in range(100):
+        bench.cycle()
+        stamps.append(float(bench.drive.read().received[slot]))
+    assert len(set(stamps)) == pytest.approx(10, abs=1)
+    assert bench.sample.complete
+
+
 def test_two_nodes_that_answer_under_one_id_are_told(joint):
     bench = joint("csp", quantities=("position",)).open()
     bench.cycle(3)

@@ -62,9 +62,9 @@ COMMISSIONING = """
     23 01 14 01 05 03 00 80   RPDO2 to 4 off
     23 02 14 01 05 04 00 80
     23 03 14 01 05 05 00 80
-    23 01 18 01 85 02 00 80   TPDO2 to 4 off
-    23 02 18 01 85 03 00 80
-    23 03 18 01 85 04 00 80
+    23 01 18 01 85 02 00 C0   TPDO2 to 4 off, no requests as before
+    23 02 18 01 85 03 00 C0
+    23 03 18 01 85 04 00 C0
     23 00 14 01 05 02 00 80   RPDO1 off
     2F 00 14 02 01 00 00 00   at every SYNC
     2F 00 16 00 00 00 00 00   empty
@@ -72,13 +72,13 @@ COMMISSIONING = """
     23 00 16 02 20 00 7A 60   target position
     2F 00 16 00 02 00 00 00   two objects
     23 00 14 01 05 02 00 00   on
-    23 00 18 01 85 01 00 80   TPDO1 off
+    23 00 18 01 85 01 00 C0   TPDO1 off
     2F 00 18 02 01 00 00 00   at every SYNC
     2F 00 1A 00 00 00 00 00   empty
     23 00 1A 01 10 00 41 60   statusword
     23 00 1A 02 20 00 64 60   position actual value
     2F 00 1A 00 02 00 00 00   two objects
-    23 00 18 01 85 01 00 00   on
+    23 00 18 01 85 01 00 40   on
     2B 17 10 00 64 00 00 00   heartbeat every 100 ms
     23 16 10 01 96 00 7F 00   watch node 127, 150 ms
     2F 60 60 00 08 00 00 00   cyclic synchronous position
@@ -322,7 +322,8 @@ def test_velocity_units(code, per_turn, counts_per_second):
 
 
 @pytest.mark.parametrize(
-    ("rate", "value", "index"), [(200, 5, -3), (100, 10, -3), (1000, 1, -3), (400, 25, -4), (300, 33, -4), (2000, 5, -4)]
+    ("rate", "value", "index"),
+    [(200, 5, -3), (100, 10, -3), (1000, 1, -3), (400, 25, -4), (300, 33, -4), (2000, 5, -4)],
 )
 def test_interpolation_periods(rate, value, index):
     assert cia402.interpolation(1 / rate) == (value, index)
