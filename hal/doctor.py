@@ -12,12 +12,16 @@ from hal.bus_state import BusState
 from hal.clock import SystemClock
 from hal.config import RobotConfig
 from hal.device import Device
+from hal.drivers.can_device import CanDevice
 from hal.errors import ConfigError, HalError
 from hal.findings import Finding, bad, ok, warning
 from hal.fleet import build
+from hal.pulse import pulse
 
 DURATION = 1.0
 """How long [s] the devices are turned to see whether they answer every cycle."""
+SETTLE = 10
+"""Cycles before they are counted."""
 COMPLETE = 0.98
 """Share of the cycles in which every device should answer."""
 MUTE = 0.5
@@ -100,7 +104,9 @@ def examine(config: RobotConfig, duration: float = DURATION) -> Iterator[Finding
         yield from _answers(devices, errors, there, config)
         if answering:
             yield from _complete(share, missed, answering, config.rates.hal)
-        yield from _inspected(dict(zip(answering, pool.map(_checks, answering), strict=True)))
+        with pulse(buses):
+            checks = dict(zip(answering, pool.map(_checks, answering), strict=True))
+        yield from _inspected(checks)
     finally:
         list(pool.map(lambda device: device.close(), devices))
         pool.shutdown()
@@ -126,7 +132,7 @@ def _turn(
     missed = dict.fromkeys((device.name for device in devices), 0)
     whole = 0
     due = clock.monotonic()
-    for _ in range(cycles):
+    for number in range(-SETTLE, cycles):
         for bus in buses:
             bus.begin()
         start = clock.monotonic()
@@ -137,10 +143,11 @@ def _turn(
             bus.sync(start)
         for bus in buses:
             bus.wait(start + 0.8 * period)
-        late = [device for device in devices if getattr(device, "missed", 1) > 1]
-        for device in late:
-            missed[device.name] += 1
-        whole += not late
+        if number >= 0:
+            late = [one for one in devices if isinstance(one, CanDevice) and one.missed > one.patience]
+            for device in late:
+                missed[device.name] += 1
+            whole += not late
         due = max(due + period, clock.monotonic())
         clock.sleep_until(due)
     return whole / cycles, {name: count / cycles for name, count in missed.items()}

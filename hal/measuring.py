@@ -16,6 +16,7 @@ from hal.clock import SystemClock
 from hal.config import RobotConfig
 from hal.errors import ConfigError, DeviceSilent
 from hal.fleet import build
+from hal.pulse import pulse
 
 TRIES = 3
 SETTLE = 10
@@ -155,7 +156,11 @@ class Measuring:
 
     def __enter__(self) -> Self:
         self._bus.open()
+        self._open = contextlib.ExitStack()
+        self._open.callback(self._bus.close)
+        self._open.callback(self._device.close)
         try:
+            self._turn = self._open.enter_context(pulse([self._bus]))
             for left in reversed(range(TRIES)):
                 try:
                     self._device.open()
@@ -165,15 +170,14 @@ class Measuring:
                         raise
             self.identity = self._device.identity
         except BaseException:
-            self.__exit__(None, None, None)
+            self._open.close()
             raise
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._device.close()
-        self._bus.close()
+        self._open.close()
 
     def look(self, known: float, duration: float, noise: float) -> Point:
         """Average what the device reads for a while.
@@ -187,9 +191,8 @@ class Measuring:
             CalibrationRefused: It brings no values, or they do not stand still.
         """
         cycles = max(20, round(duration / self._period))
-        for _ in range(SETTLE):
-            self._cycle()
-        values = np.array([self._cycle() for _ in range(cycles)])
+        with self._turn:
+            values = np.array([self._cycle() for _ in range(SETTLE + cycles)][SETTLE:])
         fresh = values[np.isfinite(values)]
         if len(fresh) < LEAST_VALID * cycles:
             why = self._device.health().text or "Is the rate of the robot file more than it can do?"

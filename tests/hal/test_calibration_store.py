@@ -28,13 +28,18 @@ def config(tmp_path):
 
 
 @pytest.fixture
-def world(config):
-    """The world behind a rig in real time."""
-    world = BenchWorld()
-    rig = Rig(config, world, hardware())
+def rig(config):
+    """The nodes, in real time."""
+    rig = Rig(config, BenchWorld(), hardware())
     rig.start()
-    yield world
+    yield rig
     rig.stop()
+
+
+@pytest.fixture
+def world(rig):
+    """What the nodes measure."""
+    return rig._world
 
 
 def point(known, read, std=0.001):
@@ -225,6 +230,17 @@ def test_a_cell_tells_the_truth_after_three_weights_and_keeps_its_gain_at_a_tare
         tared = cell_line([bare], device.now.factor, 0.1)
     assert tared.factor == line.factor
     assert tared.value(points[2].read) == pytest.approx(18.0, abs=0.05)  # N
+
+
+def test_a_drive_waits_for_the_next_position_without_a_fault_and_without_power(config, rig, world):
+    with Measuring(subject(config, "biceps_drive", "direction")) as device:
+        first = device.look(0.3, 0.1, 0.001)
+        time.sleep(0.4)  # a person moves the joint; the drive's watchdog is shorter
+        settle(world, length=0.34)
+        second = device.look(0.34, 0.1, 0.001)
+        assert rig.node("biceps_drive").objects.values[0x1001, 0] == 0
+        assert not rig.node("biceps_drive").servo[1]
+    assert joint_line([first, second], -1, 0.01).factor == 1
 
 
 def test_a_device_that_moves_or_brings_nothing_is_refused(config, world):

@@ -4,11 +4,13 @@ from pathlib import Path
 
 import pytest
 
+from hal.config import RobotConfig
 from hal.decode import describe
 from hal.decode_book import EXTENDED, Book, Frame
 from hal.drivers.canopen_node import data_sheet
 from hal.protocols.cia301 import Mapped
 from hal.protocols.sdo import Upload
+from hal.robot_book import books
 
 EDS = Path(__file__).parents[2] / "robots" / "eds"
 
@@ -115,6 +117,59 @@ def test_frames_that_are_not_canopen_are_told_by_who_knows_them(book):
     assert describe(frame(0x005, "00 01"), book).text == "2 bytes"
     assert describe(frame(0x1F005, "00", is_extended=True), book).node == 5
     assert describe(frame(0x1F006, "00", is_extended=True), book).kind == "?"
+
+
+MIXED = {
+    "robot": "mixed",
+    "signals": {"joint_position": {"unit": "rad", "elements": ["elbow", "wrist", "knee", "hip"]}},
+    "command": {"signal": "joint_position"},
+    "limits": {"joint_position": {"low": -1.5, "high": 1.5, "rate": 2}},
+    "buses": {"can0": {"interface": "virtual", "channel": "decode_mixed"}},
+    "rates": {"hal": 100},
+    "kinds": {
+        "damiao": {"driver": "mit", "settings": {"motor": "DM4340", "stiffness": 40, "damping": 1.5}},
+        "odrive": {"driver": "odrive", "settings": {"dbc": "dbc/odrive_cansimple.dbc", "gear": 8}},
+        "servo": {
+            "driver": "cia402",
+            "settings": {"eds": "eds/servo_drive.eds", "counts_per_turn": 4096, "gear": 50},
+        },
+    },
+    "devices": {
+        "elbow": {"kind": "damiao", "bus": "can0", "node": 4, "element": "joint_position.elbow"},
+        "knee": {
+            "kind": "damiao", "bus": "can0", "node": 6, "element": "joint_position.knee",
+            "settings": {"master_id": 0x14},
+        },
+        "wrist": {"kind": "odrive", "bus": "can0", "node": 9, "element": "joint_position.wrist"},
+        "hip": {"kind": "servo", "bus": "can0", "node": 5, "element": "joint_position.hip"},
+    },
+    "folder": EDS.parent,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("identifier", "data", "kind", "node", "text"),
+    [
+        (0x004, "FF FF FF FF FF FF FF FC", "MIT", 4, "enter"),
+        (0x004, "7F FF 7F F0 00 00 07 FF", "MIT", 4, "go to -0.0001907 rad at -0.002442 rad/s with 0 N m/rad"),
+        (0x004, "7F FF", "MIT", 4, "malformed"),
+        (0x014, "14 80 00 7F F7 FF 1E 1E", "MIT", 4, "at 0.0001907 rad, -0.002442 rad/s"),
+        (0x014, "D6 80 00 7F F7 FF 1E 1E", "MIT", 6, "30 degrees Celsius, state Dh"),
+        (0x014, "17 80 00 7F F7 FF 1E 1E", "MIT", None, "of drive 7, which the robot file does not have"),
+        (0x121, "00 00 00 00 08 00 00 01", "DBC", 9, "Heartbeat: Axis_Error NONE, Axis_State CLOSED_LOOP_CONTROL"),
+        (0x129, "00 00 80 3F 00 00 00 BF", "DBC", 9, "Get_Encoder_Estimates: Pos_Estimate 1, Vel_Estimate -0.5"),
+        (0x129, "00 00", "DBC", 9, "Get_Encoder_Estimates"),
+        (0x185, "37 02 00 10 00 00", "TPDO1", 5, "Statusword 0237h (operation enabled), Position actual value 4096"),
+        (0x205, "0F 00 FF FF FF FF", "RPDO1", 5, "Controlword 000Fh, Target position -1"),
+        (0x77F, "05", "heartbeat", 127, "operational"),
+    ],
+)
+def test_a_robot_file_tells_what_the_frames_of_its_devices_mean(identifier, data, kind, node, text):
+    book = books(RobotConfig.model_validate(MIXED))["can0"]
+    line = describe(frame(identifier, data), book)
+    assert (line.kind, line.node) == (kind, node)
+    assert text in line.text
+    assert book.names[127] == "HAL"
 
 
 def test_remote_and_error_frames():

@@ -149,6 +149,36 @@ def test_mit_drives_are_looked_for_only_when_asked():
     assert [(one.protocol, one.node) for one in found.nodes] == [("MIT", 3)]
 
 
+def test_a_search_for_mit_drives_takes_no_other_frame_for_an_answer_and_leaves_odrives_alone():
+    with bus() as (tap, wire):
+        over = threading.Event()
+        sent = []
+
+        def babble():
+            while not over.is_set():
+                message = wire.recv(0.002)
+                sent.extend([message.arbitration_id] if message is not None else [])
+                send(wire, 0x129, "10 00 00 00 00 00 00 00")
+                send(wire, 0x021, "00 00 00 00 01 00 00 00")
+
+        thread = threading.Thread(target=babble)
+        thread.start()
+        found = scan(tap, listen=0.1, ask=False, mit=True)
+        over.set()
+        thread.join()
+    assert [(one.protocol, one.node) for one in found.nodes] == [("ODrive", 1)]
+    assert 31 in sent and 32 not in sent
+
+
+def test_mit_frames_are_recognised_by_listening():
+    with bus() as (tap, wire):
+        send(wire, 0x004, "FF FF FF FF FF FF FF FC")
+        send(wire, 0x014, "14 80 00 7F F7 FF 1E 1E")
+        found = scan(tap, listen=0.1, ask=False)
+    assert [(one.protocol, one.node, one.state) for one in found.nodes] == [("MIT", 4, "was told to enter motor mode")]
+    assert not found.unknown
+
+
 def test_unknown_frames_are_told_with_their_rate():
     with bus() as (tap, wire):
         for _ in range(5):

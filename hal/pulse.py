@@ -1,0 +1,30 @@
+"""SYNC and the HAL's heartbeat while nobody cycles, so that drives which watch for them do not report a lost master."""
+
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+from hal.budget import OWN_HEARTBEAT_RATE
+from hal.bus import Bus
+from hal.clock import SystemClock
+
+
+@contextmanager
+def pulse(buses: Sequence[Bus]) -> Iterator[threading.Lock]:
+    """Keep the nodes of some open buses awake for as long as the context lasts; hold the lock to cycle oneself."""
+    lock, over, clock = threading.Lock(), threading.Event(), SystemClock()
+
+    def beat() -> None:
+        while not over.wait(1.0 / OWN_HEARTBEAT_RATE):
+            with lock:
+                for bus in buses:
+                    bus.begin()
+                    bus.sync(clock.monotonic())
+
+    thread = threading.Thread(target=beat, name="pulse", daemon=True)
+    thread.start()
+    try:
+        yield lock
+    finally:
+        over.set()
+        thread.join()
