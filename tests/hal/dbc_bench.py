@@ -81,6 +81,17 @@ def dbc_bench(mode="position", constants=None, cell=None, cell_settings=None, **
     return Bench(config, nodes=nodes, world=world)
 
 
+def opened(bench):
+    """The bench, open and with both devices ready; a machine under load may need more than one try.
+
+    A watchdog that ran out meanwhile is reset in the first cycles, and the heartbeat says so 20 cycles later.
+    """
+    bench.open()
+    bench.until(lambda: bench.states() == {"ready"}, "ready")
+    bench.cycle(45)
+    return bench
+
+
 def axis(bench):
     """The simulated axis."""
     return bench.rig.node("elbow_axis")

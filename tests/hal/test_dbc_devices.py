@@ -4,7 +4,7 @@ import math
 
 import can
 import pytest
-from dbc_bench import axis, dbc_bench
+from dbc_bench import axis, dbc_bench, opened
 
 from hal.bus import Bus
 from hal.clock import SystemClock
@@ -256,9 +256,8 @@ def test_a_step_that_is_not_needed_is_left_out(inbox):
 
 def test_the_set_point_stays_from_the_moment_the_loop_is_asked_to_close():
     """The state is told up to a heartbeat later; meanwhile the drive must hold, not follow what it is pushed to."""
-    bench = dbc_bench().open()
+    bench = opened(dbc_bench())
     try:
-        bench.cycle(4)
         bench.robot.enable()
         node = axis(bench)
         while node.condition != "closed loop control":
@@ -273,9 +272,8 @@ def test_the_set_point_stays_from_the_moment_the_loop_is_asked_to_close():
 
 
 def test_an_axis_that_refuses_is_told_with_its_reason():
-    bench = dbc_bench().open()
+    bench = opened(dbc_bench())
     try:
-        bench.cycle(4)
         node = axis(bench)
         node._request = lambda data: setattr(node, "result", 14)
         node.routes_changed()

@@ -5,7 +5,7 @@ import struct
 
 import numpy as np
 import pytest
-from dbc_bench import axis, dbc_bench, description, follow, position, turns
+from dbc_bench import axis, dbc_bench, description, follow, opened, position, turns
 
 from hal.config import RobotConfig
 from hal.errors import CommandRefused, ConfigError
@@ -18,8 +18,7 @@ HEARTBEAT, ESTIMATES, INPUT_POSITION, SET_STATE = AXIS | 0x01, AXIS | 0x09, AXIS
 
 @pytest.fixture
 def bench():
-    bench = dbc_bench().open()
-    bench.cycle(4)
+    bench = opened(dbc_bench())
     yield bench
     bench.close()
 
@@ -29,10 +28,9 @@ def make():
     made = []
 
     def one(*arguments, **settings):
-        bench = dbc_bench(*arguments, **settings).open()
+        bench = dbc_bench(*arguments, **settings)
         made.append(bench)
-        bench.cycle(4)
-        return bench
+        return opened(bench)
 
     yield one
     for bench in made:
@@ -178,7 +176,7 @@ def test_a_silent_axis_stops_the_robot_and_is_found_again(bench):
     assert not bench.sample.valid["joint_position"].any()
     bench.rig.fault("node_back elbow_axis")
     bench.until(lambda: ready(bench), "back", 4000)
-    assert bench.device("elbow_axis")["counters"]["commissioned"] == 2
+    assert bench.device("elbow_axis")["counters"]["commissioned"] >= 2
     bench.robot.reset()
     bench.cycle(60)
     assert (bench.robot.mode, axis(bench).condition) == ("off", "idle")
