@@ -14,9 +14,10 @@ import can
 import canopen
 
 from hal.budget import OWN_HEARTBEAT_RATE
+from hal.bus_kernel import Kernel, set_buffers
 from hal.bus_receive import OWN_NODE, Receiver
 from hal.bus_routes import Handler
-from hal.bus_send import PATIENCE, Sender, set_buffers
+from hal.bus_send import PATIENCE, Sender
 from hal.bus_state import UNUSABLE, BusState, BusWatch
 from hal.bus_thread import ThreadWatch
 from hal.bus_time import STAMPED, WAITED, ArrivalClock, FrameClock
@@ -97,6 +98,7 @@ class Bus:
         self._frame_clock = FrameClock(clock) if config.interface in STAMPED else self._arrival
         self._receiver = Receiver(name, config.bitrate, self._watch, self.counters, self._frame_clock)
         self._handle = self._receiver.handle
+        self._kernel = Kernel(config.interface, config.channel)
         self._can: can.BusABC | None = None
         self._nodes: list[Answers] = []
         self._waiting: set[Answers] = set()
@@ -136,7 +138,7 @@ class Bus:
         self._receiver.routes.add(identifier, handler, extended)
         interface = self._can
         if interface is not None:
-            self._filter(interface)
+            self._kernel.filter(interface, self._receiver.routes)
 
     def subscriber(self, identifier: int) -> Handler | None:
         """Who is called with the frames of an identifier, so that drives which answer under one can share it."""
@@ -251,16 +253,12 @@ class Bus:
             config.channel, config.interface, ignore_config=True, bitrate=config.bitrate, **config.options
         )
         set_buffers(interface)
-        self._filter(interface)
+        self._kernel = Kernel(config.interface, config.channel)
+        self._kernel.filter(interface, self._receiver.routes)
         self._watch.opened("Open, but nothing was heard yet. Is a node powered, is the bus terminated?")
         self._sender.use(interface)
         self.counters["opened"] += 1
         return interface
-
-    def _filter(self, interface: can.BusABC) -> None:
-        """Have the kernel keep away what nobody wants; python-can's own filters cost more than they save."""
-        if self._config.interface == "socketcan":
-            interface.set_filters(self._receiver.routes.filters())  # type: ignore[arg-type]
 
     def _let_go(self) -> None:
         self._sender.use(None)
@@ -282,7 +280,7 @@ class Bus:
                 receiver.handle(message, now)
             if now >= receiver.stock_due:
                 receiver.has_master = self.needs_sync and self._config.interface not in ECHOING
-                receiver.take_stock(now, sender.bits)
+                receiver.take_stock(now, sender.bits, self._kernel.received())
             if sender.problem:
                 raise ConnectionError(sender.problem)
             if message is not None:

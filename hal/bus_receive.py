@@ -56,7 +56,7 @@ class Receiver:
         self._counters = counters
         self._frame_clock = frame_clock
         self._bits = 0
-        self._stock = (0.0, 0)
+        self._stock: tuple[float, int, int | None] = (0.0, 0, None)
         self._logged = -math.inf
 
     def handle(self, message: can.Message, now: float) -> None:
@@ -99,21 +99,24 @@ class Receiver:
             except BaseException as error:  # whatever a frame does to its handler, the next frame must be handled
                 self._on_broken_handler(identifier, error, now)
 
-    def take_stock(self, now: float, sent_bits: int) -> None:
+    def take_stock(self, now: float, sent_bits: int, passed_kernel: int | None = None) -> None:
         """Work out the load, and complain of what should not be on the bus.
 
         Args:
             now: Monotonic time [s].
             sent_bits: Longest length of all frames that we ever sent [bit].
+            passed_kernel: Frames that the kernel ever received, those included that it kept away; None: not known.
         """
         self.stock_due = now + STOCK_PERIOD
-        since, before = self._stock
+        since, before, unseen_before = self._stock
+        unseen = None if passed_kernel is None else passed_kernel - self._counters["received"]
         bits = self._bits + sent_bits
-        self._stock = (now, bits)
+        self._stock = (now, bits, unseen)
         passed = now - since
         if not 0 < passed < 10 * STOCK_PERIOD:
             return
-        self.load = (bits - before) / (passed * self._bitrate)
+        kept_away = 0 if unseen is None or unseen_before is None else max(unseen - unseen_before, 0)
+        self.load = (bits - before + kept_away * _BITS[8]) / (passed * self._bitrate)
         complaint = ""
         if self.load > HIGH_LOAD:
             complaint = f"The bus is loaded to {self.load:.0%}. Is a node sending more than it was told to?"

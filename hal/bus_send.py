@@ -6,9 +6,6 @@ given longer, outside of the cycle, and asked again by whoever misses the answer
 """
 
 import errno
-import os
-import socket
-import struct
 import threading
 import time
 from collections.abc import Callable
@@ -27,17 +24,9 @@ FAILED_SENDS = 3
 """So many frames of one identifier in a row, and the interface is opened again."""
 STUCK = 0.2
 """An interface that keeps a frame for so long [s] has hung."""
-IN_FLIGHT = 64
-"""Frames that a socket may have taken and not yet sent: these cannot be taken back."""
-FRAME_MEMORY = 768
-"""What Linux counts for one frame in a socket's buffer [byte]."""
-RECEIVE_MEMORY = 4 << 20
-"""For frames that wait to be read [byte]: 5000, half a second of a full bus; the kernel may grant less."""
 
 _BITS = tuple(frame_bits(size) for size in range(9))
 _FULL = (None, errno.ENOBUFS, errno.EAGAIN)
-_SO_RCVBUFFORCE = 33
-_TIMEVAL = struct.Struct("@ll")
 
 
 class Sender:
@@ -145,22 +134,3 @@ def _is_full(error: Exception) -> bool:
     if isinstance(error, can.CanOperationError):
         return error.error_code in _FULL
     return isinstance(error, BlockingIOError)
-
-
-def set_buffers(interface: can.BusABC) -> None:
-    """Give an interface's socket, if it has one, much room for what is received and little for what is sent.
-
-    A TCP socket that takes nothing gives up after the pauses of one cycle.
-    """
-    try:
-        link = socket.socket(fileno=os.dup(interface.fileno()))
-    except (NotImplementedError, OSError):
-        return
-    with link:
-        try:
-            link.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, RECEIVE_MEMORY)
-        except OSError:  # without CAP_NET_ADMIN the kernel grants up to net.core.rmem_max
-            link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_MEMORY)
-        link.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, IN_FLIGHT * FRAME_MEMORY // 2)  # the kernel doubles it
-        seconds, fraction = divmod(round(PAUSES * PAUSE * 1e6), 1_000_000)
-        link.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _TIMEVAL.pack(seconds, fraction))

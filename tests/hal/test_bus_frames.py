@@ -7,6 +7,7 @@ import can
 import pytest
 
 from hal.bus import Bus
+from hal.bus_kernel import Kernel
 from hal.bus_receive import STOCK_PERIOD
 from hal.bus_routes import BABBLE, STRANGERS, WINDOW, Routes
 from hal.clock import ManualClock
@@ -110,7 +111,7 @@ def test_a_babbling_node_is_cut_off_and_told_and_the_others_are_not(bus):
     assert heard[0x182] == windows + 1
     assert heard[0x181] == windows * ALLOWED
     assert bus.counters["babbled"] == windows * (1000 - ALLOWED)
-    bus._receiver._stock = (bus._clock.monotonic() - STOCK_PERIOD, 0)
+    bus._receiver._stock = (bus._clock.monotonic() - STOCK_PERIOD, 0, None)
     bus._receiver.take_stock(bus._clock.monotonic(), 0)
     assert bus.state == "warning"
     assert bus.text == "Identifier 181h babbles: 20000 frames/s. What is beyond the limit is not handled."
@@ -119,7 +120,7 @@ def test_a_babbling_node_is_cut_off_and_told_and_the_others_are_not(bus):
 def test_a_stranger_that_babbles_is_told_too(bus):
     for _ in range(20_000):
         bus.receive(frame(0x001))
-    bus._receiver._stock = (bus._clock.monotonic() - STOCK_PERIOD, 0)
+    bus._receiver._stock = (bus._clock.monotonic() - STOCK_PERIOD, 0, None)
     bus._receiver.take_stock(bus._clock.monotonic(), 0)
     assert "Identifier 001h babbles: 20000 frames/s" in bus.text
 
@@ -133,6 +134,25 @@ def test_a_bus_that_is_nearly_full_is_told(bus):
     assert bus.health()["load"] == pytest.approx(0.945)
     assert bus.state == "warning"
     assert bus.text.startswith("The bus is loaded to 94%.") or bus.text.startswith("Identifier 181h babbles")
+
+
+def test_frames_that_the_kernel_keeps_away_load_the_bus_all_the_same(bus, tmp_path):
+    (tmp_path / "can0" / "statistics").mkdir(parents=True)
+    (tmp_path / "can0" / "device").mkdir()
+    count = tmp_path / "can0" / "statistics" / "rx_packets"
+    kernel = Kernel("socketcan", "can0", tmp_path)
+    assert kernel.received() is None
+    count.write_text("1000\n")
+    bus._receiver.take_stock(bus._clock.monotonic(), 0, kernel.received())
+    for _ in range(1000):
+        bus.receive(frame())
+    count.write_text("8000\n")
+    bus._clock.advance(STOCK_PERIOD)
+    bus._receiver.take_stock(bus._clock.monotonic(), 0, kernel.received())
+    assert bus.health()["load"] == pytest.approx(7000 * 135e-6)
+    assert bus.text.startswith("The bus is loaded to 94%.")
+    assert Kernel("hub", "can0", tmp_path).received() is None
+    assert Kernel("socketcan", "vcan0", tmp_path).received() is None
 
 
 def test_nodes_that_the_robot_file_does_not_name_are_told_until_they_are_gone(bus):
