@@ -37,6 +37,8 @@ class ServoDrive(CanopenNode):
         self._controlword = 0
         self._words: list[tuple[int, int]] = []
         """Control words that have come since `follow`, each with the one before it."""
+        self._sampled = -1.0
+        """Time [s] of what the object dictionary has as measured."""
         self._stop_ends = 0.0
         self._after_stop = State.SWITCH_ON_DISABLED
         self._deviates_since: float | None = None
@@ -75,11 +77,13 @@ class ServoDrive(CanopenNode):
         )
         values[0x6061, 0] = values[0x6060, 0]
         values[0x6041, 0] = self._statusword()
+        self._sampled = self._now
 
     def follow(self, now: float) -> None:
         """Take the newest set-point, and carry on a stop."""
         if self.state is State.OPERATION_ENABLED:
-            self.sample()
+            if now != self._sampled:
+                self.sample()
             mode = int(self.objects.values[0x6060, 0])
             for word, before in self._words:
                 self._mechanics.command(mode, word, before)
