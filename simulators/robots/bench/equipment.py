@@ -17,6 +17,9 @@ from simulators.nodes.spec import CellConstants, Constants, DriveConstants, Enco
 FULL_SCALE = {"int16": 2**15, "int32": 2**31, "float32": 10.0, "zc_sg": 10.0}
 """What an analogue input tells at its end, by preset."""
 
+SPEEDS = {"counts/s": 0x00B50300, "rps": 0x00B40300, "rpm": 0x00B44700, "0.1 rpm": 0xFFB44700, "mrpm": 0xFDB44700}
+"""Object 60A9h of a drive, by the unit that a robot file gives."""
+
 
 def _cia401(settings: Any) -> Constants:
     gain, zero = _first(settings.gain), _first(settings.zero)
@@ -32,6 +35,7 @@ def _cia402(settings: Any) -> Constants:
         direction=settings.direction,
         zero=settings.zero,
         rated_torque=settings.rated_torque or DriveConstants().rated_torque,
+        velocity_unit=SPEEDS[settings.velocity_unit or "counts/s"],
     )
 
 
