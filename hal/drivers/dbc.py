@@ -78,6 +78,8 @@ class DbcNode(CanDevice):
         self._good = inbox.dbc.raw(self._error.signal, settings.error.good) if self._error and settings.error else 0.0
         self._beat = inbox.letter(settings.heartbeat.message) if settings.heartbeat else None
         self._who = [inbox.signal(name) for name in settings.identity.signals] if settings.identity else []
+        if any(seen.signal.is_float for seen in self._who):
+            raise ConfigError("identity.signals must be whole numbers.")
         self._asking = self._steps((settings.identity.ask,) if settings.identity and settings.identity.ask else ())
         self._opening_steps = self._steps(settings.open)
         self._taring = self._steps(settings.tare)

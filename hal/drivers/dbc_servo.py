@@ -104,6 +104,9 @@ class DbcServo(DbcNode):
         scale, offset = self._line(command.quantity, config)
         self._scale, self._offset = scale * signal.scale, offset + scale * signal.offset
         self._is_position = command.quantity == "position"
+        self.can_damp = settings.damping is not None
+        if self.can_damp and "velocity" not in self._slots:
+            raise ConfigError("damping needs the velocity, which `elements` does not name.")
 
     def _prepare_watchdog(self, settings: ServoSettings) -> None:
         watchdog = settings.watchdog
@@ -230,6 +233,14 @@ class DbcServo(DbcNode):
 
     def apply(self, values: np.ndarray) -> None:
         """See `Device.apply`; until the servo is enabled its target is where it is, or nothing."""
+        self._follow(float(values[0]))
+
+    def damp(self) -> None:
+        """See `Device.damp`; the effort is against the velocity, and none while that is not known."""
+        velocity = float(self._values[self._slots["velocity"]])
+        self._follow(-(self._settings.damping or 0.0) * velocity if np.isfinite(velocity) else 0.0)
+
+    def _follow(self, target: float) -> None:
         if not self._is_wanted:
             self.idle()
             return
@@ -240,7 +251,7 @@ class DbcServo(DbcNode):
             return
         if is_enabled and activity.is_over:
             self._was_reached = True
-            self._send(float(values[0]))
+            self._send(target)
             return
         if not activity.has_sent_last:
             self._hold = self._rest

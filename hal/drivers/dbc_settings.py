@@ -221,6 +221,8 @@ class ServoSettings(DbcSettings):
     """Settings of a servo with a DBC file. No frame of it enables but those of `enable`."""
 
     command: CommandConfig
+    damping: Positive | None = None
+    """Of an effort command: what `damp` resists with [N m s/rad or N s/m]."""
     cyclic: Steps = ()
     """Sent in every cycle beside the set-point."""
     state: StateConfig
@@ -242,6 +244,8 @@ class ServoSettings(DbcSettings):
                 f"command.quantity '{self.command.quantity}' is not measured. Add it to quantities: "
                 "a servo starts from where it is."
             )
+        if self.damping is not None and self.command.quantity != "effort":
+            raise ValueError(f"damping needs an effort to be commanded, not a {self.command.quantity}.")
         if self.watchdog is None:
             if not self.allow_no_watchdog:
                 raise ValueError(

@@ -115,6 +115,19 @@ def test_other_modes_start_from_nothing_and_follow(make, mode):
     assert bench.sample.values[f"joint_{mode}"] == pytest.approx(0.5, abs=0.02)
 
 
+def test_an_effort_is_damped_when_the_robot_stops(make):
+    bench = make("effort", odrive={"damping": 2.0}, stop={"behaviour": "damp"})
+    bench.enable()
+    follow(bench, 2.0, 40)
+    speed = axis(bench)._rotor.velocity
+    assert speed > 0.5  # rad/s
+    bench.robot.stop("a test")
+    bench.cycle(30)
+    assert 0.0 < axis(bench)._rotor.velocity < 0.3 * speed
+    assert axis(bench).torque < 0.0
+    bench.until(lambda: bench.robot.mode == "off", "off", 200)
+
+
 def test_a_fault_of_the_axis_stops_the_robot_and_is_told_in_words(bench):
     bench.enable()
     follow(bench, 0.8, 10)
@@ -347,6 +360,7 @@ def test_what_the_doctor_sees(bench):
         ({"gear": 0.0}, "gear"),
         ({"mode": "torque"}, "mode"),
         ({"enable": []}, "enable"),
+        ({"damping": 1.0}, "damping needs an effort to be commanded"),
         ({"reset": [{"send": "Clear_Errors", "until": {"signal": "Heartbeat.Axis_Error"}}]}, "either `equals`"),
         ({"reset": [{}]}, "a step needs `send`"),
         ({"error": {"signal": "Heartbeat.Axis_Error", "good": False}}, "put the name in quotes"),
