@@ -4,7 +4,7 @@ Without a robot file: ten drives and ten load cells of the muscle-driven arm, fi
 200 Hz. The simulated nodes run in another process behind the hub, as in the demo; this process is the HAL alone,
 enabled and following a small motion. Both are scheduled as `gemuco hal` and `gemuco simulate` are. Bars: 25 % of a
 core, 99.9 % of cycles complete, and 1 ms for a turn of the cycle beside the wait for answers. CPU is the process's own,
-so other load on the machine counts only in what it delays.
+so other load on the machine counts only in what it delays; what it delays a bare timer is told beside.
 """
 
 import argparse
@@ -14,6 +14,7 @@ import tempfile
 import threading
 import time
 from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
 from multiprocessing.synchronize import Event
 from pathlib import Path
 
@@ -24,7 +25,7 @@ from hal import registry
 from hal.budget import budgets
 from hal.clock import SystemClock
 from hal.config import RobotConfig, load_robot
-from hal.robot import Robot, open_robot
+from hal.robot import ANSWER_SHARE, Robot, open_robot
 from services import realtime
 from services.hal_service import CYCLE_PRIORITY, RECEIVE_PRIORITY
 from services.simulator_service import PRIORITY, THREADS
@@ -82,6 +83,17 @@ def simulate(config: RobotConfig, ready: Event, stop: Event) -> None:
     ready.set()
     stop.wait()
     rig.stop()
+
+
+def tick(rate: float, stop: Event, late: Connection) -> None:
+    """A bare timer at the cycle's rate and priority: how late [s] the machine alone wakes a thread."""
+    realtime.prepare_thread(CYCLE_PRIORITY)
+    found = []
+    while not stop.is_set():
+        due = time.monotonic() + 1 / rate
+        time.sleep(1 / rate)
+        found.append(time.monotonic() - due)
+    late.send(found)
 
 
 def on_hub(config: RobotConfig, folder: str) -> RobotConfig:
@@ -167,7 +179,10 @@ def main() -> None:
             print(f"bus {budget.bus:11}{budget}")
         ready, stop = context.Event(), context.Event()
         nodes = context.Process(target=simulate, args=(config, ready, stop))
+        here, there = context.Pipe(False)
+        timer = context.Process(target=tick, args=(config.rates.hal, stop, there))
         nodes.start()
+        timer.start()
         ready.wait()
         clock = WaitMeter()
         try:
@@ -180,7 +195,11 @@ def main() -> None:
         finally:
             gc.unfreeze()
             stop.set()
+            late = np.array(here.recv())
+            timer.join()
             nodes.join()
+        share = np.mean(late > ANSWER_SHARE / config.rates.hal)
+        print(f"bare timer     later than the cycle waits in {share:.3%} of ticks, {late.max() * 1e3:.1f} ms at most")
 
 
 if __name__ == "__main__":
