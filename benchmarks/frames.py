@@ -101,9 +101,12 @@ def ours(bus: Bus, devices: Sequence[CanDevice], cycle: Sequence[can.Message], h
     receiver._frame_clock = FrameClock(SystemClock()) if has_stamps else ArrivalClock()
     handle, monotonic = receiver.handle, time.monotonic
     receiver.routes.open_window(monotonic())
+    beats = [can.Message(arbitration_id=0x700 + device.node, data=b"\5", is_extended_id=False) for device in devices]
     stamp = time.time() - WAIT
-    for message in cycle:
+    for message in (*beats, *cycle):
         message.timestamp = stamp
+    for message in beats:
+        handle(message, monotonic())
 
     def job() -> None:
         for _ in range(ROUNDS):
@@ -112,7 +115,9 @@ def ours(bus: Bus, devices: Sequence[CanDevice], cycle: Sequence[can.Message], h
             for device in devices:
                 device.missed = 1
 
-    return microseconds(job, ROUNDS * len(cycle))
+    found = microseconds(job, ROUNDS * len(cycle))
+    assert all(device.is_commissioned for device in devices), "some frames were not taken"
+    return found
 
 
 def canopen_raw(frames: Sequence[can.Message]) -> Callable[[], float]:
