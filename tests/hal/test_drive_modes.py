@@ -358,3 +358,59 @@ def test_the_main_quantity_is_the_commanded_one():
         bench = JointBench(mode)
         assert next(iter(bench.drive.served)) == first
         assert bench.drive.commands == (ELBOW[first],)
+
+
+MODES = ("profile_position", "csp", "csv", "cst")
+
+
+def moving(bench):
+    """Bring the joint into motion."""
+    bench.enable()
+    for cycle in range(40):
+        wanted = 0.3 + 0.01 * cycle if bench.drive.command_quantity == "position" else 2.0
+        bench.follow([wanted])
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_drive_whose_hal_died_stops_by_itself(joint, mode):
+    bench = joint(mode)
+    moving(bench)
+    for _ in range(160):
+        bench.rig.step(0.005)
+    assert bench.node.state.name == "FAULT"
+    assert not bench.world.enabled
+    still = bench.world.position
+    bench.clock.advance(0.8)
+    bench.cycle(40)
+    assert bench.robot.mode == "fault"
+    assert bench.world.position == still
+    bench.until(lambda: bench.device("elbow")["state"] == "fault", "commissioning again", 2000)
+    bench.robot.reset()
+    bench.until(lambda: bench.device("elbow")["state"] == "ready", "leaving the fault", 2000)
+    bench.cycle(20)
+    assert bench.world.position == still
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_drive_that_drops_out_by_itself_stays_off(joint, mode):
+    bench = joint(mode)
+    moving(bench)
+    bench.node.state = bench.node.state.SWITCH_ON_DISABLED  # as safe torque off does
+    bench.cycle(3)
+    assert bench.robot.mode == "fault"
+    bench.cycle(100)
+    assert not bench.world.enabled
+    assert bench.node.state.name != "OPERATION_ENABLED"
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_commands_of_before_a_fault_are_forgotten(joint, mode):
+    bench = joint(mode)
+    moving(bench)
+    bench.robot.stop("test")
+    bench.until(lambda: bench.robot.mode == "off", "stopping", 400)
+    bench.cycle(20)
+    still = bench.world.position
+    bench.enable()
+    bench.cycle(10)
+    assert bench.world.position == pytest.approx(still, abs=1e-3)
