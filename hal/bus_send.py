@@ -22,8 +22,8 @@ PATIENCE = 0.05
 """What is asked once may wait so long [s], and not in the cycle."""
 FAILED_SENDS = 3
 """So many frames of one identifier in a row, and the interface is opened again."""
-STUCK = 0.2
-"""An interface that keeps a frame for so long [s] has hung."""
+STUCK = 1.0
+"""An interface that keeps a frame for so long [s] has hung; less, and the machine may have been busy."""
 
 _BITS = tuple(frame_bits(size) for size in range(9))
 _FULL = (None, errno.ENOBUFS, errno.EAGAIN)

@@ -29,7 +29,7 @@ START_TIMEOUT = 0.5
 HEARTBEAT = (1, 1.0 / HEARTBEAT_TIME)
 """What a node's heartbeat adds to the traffic: data bytes, frames per second [Hz]."""
 BEATS_FORGIVEN = 2.5
-"""A node without a heartbeat for so many periods is not believed, whatever else it sends."""
+"""A node without a heartbeat for so many periods, or `silent_after`, is not believed, whatever else it sends."""
 NODES = range(1, 128)
 
 Taker = Callable[[tuple[Any, ...], float], None]
@@ -82,6 +82,7 @@ class CanopenNode(CanDevice):
         self._emergency: Emergency | None = None
         self._started = threading.Event()
         self._beat_due = math.inf
+        self._beat_patience = max(BEATS_FORGIVEN * HEARTBEAT_TIME, settings.silent_after)
         self._all = sum(1 << pdo.number for pdo in self._pdos.sends if pdo.answers_sync)
         self._pending, self._since = self._all, 0
         self._doubt = 0
@@ -234,7 +235,7 @@ class CanopenNode(CanDevice):
         if state is None:
             self._counters["malformed"] += 1
             return
-        self._beat_due = received + BEATS_FORGIVEN * HEARTBEAT_TIME
+        self._beat_due = received + self._beat_patience
         if state == NmtState.OPERATIONAL:
             self._started.set()
             if self._is_astray():
