@@ -53,6 +53,7 @@ class DbcServo(DbcNode):
         self._ran_out = False
         self._is_booting = False
         self._has_expired = False
+        self._was_on = False
         self._dropped = ""
         self._hold = 0.0
         super().__init__(place, settings)
@@ -136,12 +137,13 @@ class DbcServo(DbcNode):
             self._counters["boots"] += 1
             self._lose(f"{self._place} rebooted.")
         self._is_booting = is_booting
+        self._was_on = self._is_enabled
 
     def _on_watchdog(self, raws: Raws) -> None:
         has_expired = self._expired is not None and self._expired.is_met()
         if has_expired and not self._has_expired:
             self._counters["watchdog_expired"] += 1
-            self._ran_out = self._is_wanted
+            self._ran_out = self._is_wanted or self._was_on
         self._has_expired = has_expired
 
     def _lose(self, text: str) -> None:

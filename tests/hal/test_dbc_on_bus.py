@@ -227,6 +227,20 @@ def test_the_watchdog_stops_the_axis_when_the_host_dies(bench):
     bench.until(lambda: ready(bench), "reset", 80)
 
 
+def test_what_a_watchdog_stopped_while_the_host_was_frozen_is_not_cleared_by_itself(bench):
+    """The robot finds out by itself that it was frozen, and lets go before it hears what its drives say."""
+    bench.enable()
+    for _ in range(60):
+        bench.rig.step(0.005)
+    bench.robot.disable()
+    bench.flush()
+    bench.cycle(100)
+    assert axis(bench).error == WATCHDOG_TIMER_EXPIRED
+    bench.until(lambda: bench.robot.mode == "fault", "fault", 400)
+    bench.robot.reset()
+    bench.until(lambda: ready(bench), "reset", 80)
+
+
 def test_a_watchdog_that_ran_out_at_rest_is_no_fault(bench):
     for _ in range(60):
         bench.rig.step(0.005)
