@@ -88,7 +88,7 @@ class Robot:
 
     @property
     def mode(self) -> str:
-        """`off`, `enabling`, `hold`, `follow`, `stopping` or `fault`."""
+        """`off`, `enabling`, `hold`, `follow`, `homing`, `stopping` or `fault`."""
         return self._modes.mode.value
 
     @property

@@ -43,11 +43,11 @@ class Applied:
     Attributes:
         cycle: Number of the cycle, from 1.
         stamp_ns: Wall clock at the SYNC of the cycle [ns since 1970].
-        mode: `off`, `enabling`, `hold`, `follow`, `stopping` or `fault`.
+        mode: `off`, `enabling`, `hold`, `follow`, `homing`, `stopping` or `fault`.
         signal: The commanded signal.
         desired: Newest accepted command [its unit], shape (n,); NaN if none is alive.
         values: Applied set-points [its unit], shape (n,); NaN while nothing is applied.
-        limited_by: Which limits changed the command (`range`, `rate`, `tension`), sorted.
+        limited_by: Which limits acted (`acceleration`, `effort`, `range`, `rate`, `tension`, `velocity`), sorted.
     """
 
     cycle: int

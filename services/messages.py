@@ -90,11 +90,11 @@ class Applied(Message):
 
     Attributes:
         cycle: The HAL's cycle number.
-        mode: `off`, `enabling`, `hold`, `follow`, `stopping` or `fault`.
+        mode: `off`, `enabling`, `hold`, `follow`, `homing`, `stopping` or `fault`.
         signal: The commanded signal.
         desired: Newest accepted command [its unit], shape (n,); NaN if none is alive.
         values: Applied set-points [its unit], shape (n,); NaN while off.
-        limited_by: Which limits changed the command (`range`, `rate`, `tension`), sorted.
+        limited_by: Which limits acted (`acceleration`, `effort`, `range`, `rate`, `tension`, `velocity`), sorted.
         sender: `Command.boot` of the command that was followed; 0 if none.
     """
 
