@@ -36,23 +36,23 @@ def cob_id(first: int, number: int, node: int) -> int:
 
 
 def configure_pdos(sdo: SdoClient, pdos: PdoMap, node: int, label: str) -> None:
-    """Make a node send and receive these PDOs and no others; of a fixed mapping only check that it is this one.
+    """Make a node send and receive these PDOs and no others; a fixed mapping is only compared.
 
     Raises:
         DeviceSilent: The node stopped answering.
         DeviceRefused: It does not take the mapping, or its fixed one is another; the message has both.
     """
-    if pdos.is_fixed:
-        wrong = [text for is_good, text in compare_pdos(sdo, pdos, node) if not is_good]
-        if wrong:
-            raise DeviceRefused(f"{label} has another PDO mapping than the robot file says: {' '.join(wrong)}")
-        return
     _silence_others(sdo, pdos, node)
     for side, pdo in _each(pdos):
+        found = _mapped(sdo, side, pdo.number)
+        if pdos.is_fixed and found != [item.entry for item in pdo.objects]:
+            raise DeviceRefused(
+                f"{label} has another PDO mapping than it should: {side.name}{pdo.number} carries {_describe(found)}, "
+                f"and should carry {pdo}. Is it the right data sheet, the right `pdo` in the robot file?"
+            )
         try:
-            _map(sdo, side, pdo, cob_id(side.cob_id, pdo.number, node))
+            _map(sdo, side, pdo, cob_id(side.cob_id, pdo.number, node), pdos.is_fixed)
         except DeviceRefused as error:
-            found = _mapped(sdo, side, pdo.number)
             raise DeviceRefused(
                 f"{label} does not take {side.name}{pdo.number} as {pdo}; it has {_describe(found)}. {error} If its "
                 "mapping cannot be changed, give it in the robot file as `pdo` with `fixed: true`."
@@ -102,18 +102,19 @@ def _describe(entries: list[int]) -> str:
     return describe([Mapped(entry >> 16, entry >> 8 & 0xFF, entry & 0xFF) for entry in entries])
 
 
-def _map(sdo: SdoClient, side: _Side, pdo: Pdo, cob: int) -> None:
-    """Map one PDO in the order that CiA 301 (7.5.2.36) asks for: off, empty, fill, count, on."""
+def _map(sdo: SdoClient, side: _Side, pdo: Pdo, cob: int, is_fixed: bool) -> None:
+    """Set one PDO up in the order that CiA 301 (7.5.2.36) asks for: off, empty, fill, count, on."""
     parameters, mapping = side.parameters + pdo.number - 1, side.mapping + pdo.number - 1
     cob |= sdo.read(parameters, 1) & _NO_REQUESTS
     sdo.write(parameters, 1, cia301.PDO_INVALID | cob, 4)
     sdo.write_checked(parameters, 2, pdo.transmission, 1)
     if pdo.event_time:
         sdo.write_checked(parameters, _TIMER, round(pdo.event_time * 1000), 2)
-    sdo.write(mapping, 0, 0, 1)
-    for place, item in enumerate(pdo.objects, 1):
-        sdo.write_checked(mapping, place, item.entry, 4)
-    sdo.write_checked(mapping, 0, len(pdo.objects), 1)
+    if not is_fixed:
+        sdo.write(mapping, 0, 0, 1)
+        for place, item in enumerate(pdo.objects, 1):
+            sdo.write_checked(mapping, place, item.entry, 4)
+        sdo.write_checked(mapping, 0, len(pdo.objects), 1)
     sdo.write(parameters, 1, cob, 4)
     found = sdo.read(parameters, 1)
     if found & (cia301.PDO_INVALID | _COB_ID) != cob & _COB_ID:
@@ -125,6 +126,6 @@ def _silence_others(sdo: SdoClient, pdos: PdoMap, node: int) -> None:
     for side, of_side in ((_RECEIVES, pdos.receives), (_SENDS, pdos.sends)):
         used = {pdo.number for pdo in of_side}
         for number in range(1, cia301.PDO_PER_DIRECTION + 1):
-            if number not in used and sdo.has(side.parameters + number - 1, 1):
+            if number not in used and sdo.can_write(side.parameters + number - 1, 1):
                 index, cob = side.parameters + number - 1, cob_id(side.cob_id, number, node)
                 sdo.write(index, 1, cia301.PDO_INVALID | cob | (sdo.read(index, 1) & _NO_REQUESTS), 4)

@@ -95,6 +95,11 @@ class SdoClient:
         """Whether the data sheet lists an object."""
         return self._dictionary.get_variable(index, subindex) is not None
 
+    def can_write(self, index: int, subindex: int) -> bool:
+        """Whether the data sheet lists an object that can be written."""
+        entry: ODVariable | None = self._dictionary.get_variable(index, subindex)
+        return entry is not None and "w" in entry.access_type
+
     def default(self, index: int, subindex: int) -> int | None:
         """What the data sheet gives as an object's value; None if it gives none."""
         entry: ODVariable | None = self._dictionary.get_variable(index, subindex)

@@ -17,6 +17,7 @@ from hal.drivers.can_device import CanDevice, DeviceSettings, Place
 from hal.drivers.canopen_checks import inspect_node
 from hal.errors import ConfigError, DeviceRefused, HalError
 from hal.pdo_commissioning import cob_id
+from hal.pdo_fixed import chosen_pdos, is_fixed
 from hal.pdo_map import Pdo, PdoMap, PdoSettings, check_map, describe
 from hal.protocols import cia301
 from hal.protocols.cia301 import Emergency, Mapped, NmtCommand, NmtState
@@ -57,6 +58,8 @@ class CanopenNode(CanDevice):
     Settings: ClassVar[type[NodeSettings]] = NodeSettings
     NEEDS_SYNC = True
     COUNTERS = (*CanDevice.COUNTERS, "doubled")
+    MAY_RECEIVE: ClassVar[tuple[Mapped, ...]] = ()
+    """What a fixed RPDO may carry beside what is wanted, because there is a value for it."""
 
     def __init__(self, place: Place, settings: NodeSettings, profile: int, pdos: PdoMap) -> None:
         """Prepare a node.
@@ -76,7 +79,11 @@ class CanopenNode(CanDevice):
         sheet = data_sheet(place.folder / settings.eds)
         _check_profile(sheet, profile, f"The data sheet '{settings.eds}' of {place}")
         self._profile = profile
-        self._pdos = pdos if settings.pdo is None else _forced(settings.pdo, pdos, str(place))
+        if settings.pdo is not None:
+            pdos = _forced(settings.pdo, pdos, str(place))
+        elif is_fixed(sheet):
+            pdos = chosen_pdos(sheet, pdos, self.MAY_RECEIVE, str(place))
+        self._pdos = pdos
         check_map(self._pdos, sheet, str(place))
         self._sdo = SdoClient(place.bus, place.node, sheet, str(place))
         self._emergency: Emergency | None = None

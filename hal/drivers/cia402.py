@@ -35,6 +35,7 @@ class Cia402Drive(CanopenNode):
 
     Settings = DriveSettings
     COUNTERS = (*CanopenNode.COUNTERS, "homed")
+    MAY_RECEIVE = (cia402.MODE_OF_OPERATION,)
 
     @classmethod
     def quantities(cls, settings: DriveSettings) -> tuple[str, ...]:
@@ -56,7 +57,8 @@ class Cia402Drive(CanopenNode):
         cls, settings: DriveSettings, rate: float, quantities: tuple[str, ...]
     ) -> tuple[tuple[int, float], ...]:
         """See `CanDevice.traffic_of`."""
-        return (*settings.pdos(quantities).frames(rate), HEARTBEAT)
+        pdos = settings.pdo.map("pdo") if settings.pdo else settings.pdos(quantities)
+        return (*pdos.frames(rate), HEARTBEAT)
 
     def __init__(self, place: Place, settings: DriveSettings) -> None:
         self._settings = settings

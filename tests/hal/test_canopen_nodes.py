@@ -1,5 +1,6 @@
 """What is told of a CANopen node that is not what it should be: twins, no heartbeat, other layouts, wrong files."""
 
+import re
 import struct
 from dataclasses import replace
 
@@ -255,6 +256,57 @@ def test_another_fixed_mapping_is_refused_with_both_layouts(joint):
     assert bench.device("elbow")["state"] == "opening"
     assert "TPDO1 carries 6041h:0 (16 bit), 6064h:0 (32 bit), 6077h:0 (16 bit), and should carry" in text(bench)
     assert "6061h:0 (8 bit)." in text(bench)
+
+
+def fixed_sheet(tmp_path, bench=None):
+    """A data sheet of a drive with fixed PDOs, as many simple drives have them; `bench`: its drive is that one."""
+    fixed = {
+        "1600": (0x60400010,),
+        "1601": (0x60400010, 0x60600008),
+        "1602": (0x60400010, 0x607A0020),
+        "1603": (0x60400010, 0x60FF0020),
+        "1A00": (0x60410010,),
+        "1A01": (0x60410010, 0x60610008),
+        "1A02": (0x60410010, 0x60640020),
+        "1A03": (0x60410010, 0x606C0020),
+    }
+    text = (ROBOTS / SETTINGS["eds"]).read_text()
+    for index, entries in fixed.items():
+        for place, value in enumerate((len(entries), *entries, *(0,) * (8 - len(entries)))):
+            head, section, rest = text.partition(f"[{index}sub{place:X}]")
+            section_text, gap, rest = rest.partition("\n\n")
+            section_text = re.sub("DefaultValue=.*", f"DefaultValue={value}", section_text)
+            text = head + section + section_text.replace("AccessType=rw", "AccessType=ro") + gap + rest
+            if bench is not None:
+                bench.node.objects.power_on[int(index, 16), place] = value
+    if bench is not None:
+        write_protected(bench).rig.fault("node_reboot elbow")
+    path = tmp_path / "fixed.eds"
+    path.write_text(text)
+    return path
+
+
+def test_of_pdos_that_are_fixed_by_the_data_sheet_the_right_ones_are_used(joint, tmp_path):
+    sheet = fixed_sheet(tmp_path)
+    bench = joint("csp", quantities=("position", "velocity"), eds=str(sheet))
+    fixed_sheet(tmp_path, bench)
+    bench.open()
+    bench.cycle(3)
+    assert text(bench) == ""
+    assert [pdo.number for pdo in bench.drive.pdos.receives] == [3]
+    assert [pdo.number for pdo in bench.drive.pdos.sends] == [3, 4]
+    assert [bench.objects[0x1800 + n, 1] >> 31 for n in range(4)] == [1, 1, 0, 0]
+    bench.enable()
+    bench.follow([0.35], 20)
+    assert bench.world.position == pytest.approx(0.35, abs=1e-3)
+
+
+def test_what_fixed_pdos_do_not_carry_is_told(tmp_path):
+    sheet = fixed_sheet(tmp_path)
+    told = refused(sheet=sheet, quantities=("position", "effort"))
+    assert "cannot send 6077h:0 (16 bit): its mapping is fixed by its data sheet. Its PDOs: 1: 6041h:0" in told
+    told = refused("cst", sheet=sheet, quantities=("effort",))
+    assert "cannot receive 6071h:0 (16 bit): its mapping is fixed" in told
 
 
 def test_a_mapping_that_is_not_taken_is_told_with_both_layouts(joint):
