@@ -227,9 +227,6 @@ def main(arguments: list[str]) -> int:
     console = Console(width=140)
     console.print(table(outcomes))
     broken = [outcome for outcome in outcomes if outcome.violated or not outcome.recovered]
-    for outcome in outcomes:
-        if outcome.reason and not outcome.fault.startswith("drive"):
-            console.print(f"{outcome.fault}, seed {outcome.seed}: {outcome.reason}", markup=False)
     for outcome in broken:
         console.print(f"{outcome.fault}, seed {outcome.seed}: {outcome.violated}", markup=False)
     console.print(f"{len(broken)} of {len(outcomes)} runs broke a rule; {time.monotonic() - start:.0f} s.")
