@@ -18,7 +18,7 @@ OTHER_BUSES = [kind for kind in BUS_KINDS if kind.name != "virtual"]
 
 def is_sentence(text):
     """Empty, or words that begin and end as a sentence does."""
-    return not text or (text[0] in "'\"" or text[0].isupper() or text[0].isdigit()) and text.endswith((".", "?"))
+    return not text or ((text[0] in "'\"" or text[0].isupper() or text[0].isdigit()) and text.endswith((".", "?")))
 
 
 @pytest.fixture
