@@ -223,7 +223,7 @@ class Cia402Drive(CanopenNode):
         self.disable()
         if self._state in (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE):
             self._letting_go = self._stopping_cycles
-            self._send(cia402.QUICK_STOP, self._rest(), self._homing_mode())
+            self._frames.send_anew(self._bus, cia402.QUICK_STOP, self._homing_mode(), self._rest())
 
     def home(self) -> None:
         """See `Device.home`.

@@ -42,8 +42,15 @@ class CommandFrames:
             self._frames.append((message, pdo.layout, places))
 
     def send(self, bus: Bus, word: int, mode: int, target: int) -> None:
-        """Put them on the bus."""
+        """Put them on the bus; for the cycle's thread, which fills the same frames again and again."""
         values = (word, mode, target)
         for message, layout, places in self._frames:
             layout.pack_into(message.data, 0, *[values[place] for place in places])
             bus.send(message)
+
+    def send_anew(self, bus: Bus, word: int, mode: int, target: int) -> None:
+        """Put them on the bus from any thread, in frames that no other thread fills meanwhile."""
+        values = (word, mode, target)
+        for message, layout, places in self._frames:
+            data = layout.pack(*[values[place] for place in places])
+            bus.send(can.Message(arbitration_id=message.arbitration_id, is_extended_id=False, data=data))
