@@ -1,6 +1,5 @@
 """Whatever measures and has a DBC file: signals become quantities by the robot file alone."""
 
-import logging
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -11,22 +10,28 @@ from hal.device import Check, DeviceState
 from hal.drivers.can_device import CanDevice, Place
 from hal.drivers.dbc_inbox import Inbox, Letter, Raws
 from hal.drivers.dbc_sequence import Address, Run, Step, compile_steps
-from hal.drivers.dbc_settings import MOTION, DbcSettings, QuantityConfig
+from hal.drivers.dbc_settings import MOTION, DbcSettings, QuantityConfig, StepConfig
 from hal.errors import ConfigError, DeviceRefused, DeviceSilent
 from hal.protocols import dbc
-
-log = logging.getLogger(__name__)
 
 PERIODS_WAITED = 3.0
 """A device is there if its message comes within so many of its periods,"""
 SHORTEST_WAIT = 0.5
 """and at least so long [s] is waited for it."""
 ANSWER_TIME = 0.3
-"""How long [s] a device may take to tell who it is."""
+"""How long [s] a device may take to tell who it is,"""
+TRIES = 2
+"""and how often it is asked."""
 FRAME_BYTES = 8
 """What a frame counts in the bus budget, which does not open the DBC file."""
 LATE = 1.5
 """A message that comes at more than so many times its stated period is told by `inspect`."""
+PACE = 50
+"""The pace of what a device sends is looked at once in so many messages;"""
+TOO_FAST = 0.6
+"""if they took less than this part of their periods,"""
+TWICE_FAST = 2
+"""so many times in a row, the node id is that of two devices, or the device is set otherwise."""
 POLL = 0.002
 """How often [s] `open` looks whether something has come."""
 
@@ -54,6 +59,8 @@ class DbcNode(CanDevice):
         super().__init__(place, settings)
         self._settings = settings
         self._rate = place.rate
+        self._paced = -math.inf
+        self._fast = 0
         self._address = Address(place.node, settings.node_offset, settings.extended)
         try:
             self._inbox = Inbox(dbc.load(place.folder / settings.dbc))
@@ -110,7 +117,7 @@ class DbcNode(CanDevice):
             )
         return 0.0 if period == "cycle" else period
 
-    def _steps(self, steps: Sequence) -> tuple[Step, ...]:
+    def _steps(self, steps: Sequence[StepConfig]) -> tuple[Step, ...]:
         return compile_steps(steps, self._inbox, self._address, self._rate)
 
     def _subscribe(self) -> None:
@@ -153,8 +160,16 @@ class DbcNode(CanDevice):
                 self.missed = 0
                 if is_awaited:
                     self._bus.answered(self)
+                letter.count += 1
+                if letter.count == PACE:
+                    self._look_at_pace(letter)
 
         return handle
+
+    def _look_at_pace(self, letter: Letter) -> None:
+        is_fast = letter.received - self._paced < TOO_FAST * PACE * self._period
+        self._fast = self._fast + 1 if is_fast else 0
+        self._paced, letter.count = letter.received, 0
 
     def _measures(self, letter: Letter) -> list[tuple[int, int, float, float]]:
         """Place in the message, slot, scale and offset [SI] of every quantity that the robot takes from it."""
@@ -191,11 +206,12 @@ class DbcNode(CanDevice):
             return ""
         letter = self._who[0].letter
         since = letter.raws
-        self._run("identity", self._asking)
-        if not self._comes(letter, since, ANSWER_TIME):
-            return ""
-        numbers = "-".join(f"{int(seen.raw):X}" for seen in self._who)
-        return f"dbc:{self._settings.dbc.stem}-{numbers}"
+        for _ in range(TRIES):
+            self._run("identity", self._asking)
+            if self._comes(letter, since, ANSWER_TIME):
+                numbers = "-".join(f"{int(seen.raw):X}" for seen in self._who)
+                return f"dbc:{self._settings.dbc.stem}-{numbers}"
+        return ""
 
     def _commission(self) -> None:
         self._run("opening", self._opening_steps)
@@ -231,6 +247,14 @@ class DbcNode(CanDevice):
             time.sleep(1.0 / self._rate)
         if run.failure:
             raise DeviceRefused(f"{self._place}, {name}: {run.failure}.")
+
+    def _fault(self) -> str:
+        if self._fast < TWICE_FAST:
+            return ""
+        return (
+            f"{self._place} sends '{self._main.message.name}' more often than every {self._period:g} s. Do two devices "
+            "have this node id, or is it told to?"
+        )
 
     def _error_text(self) -> str:
         """What the device says is wrong; empty if nothing is."""

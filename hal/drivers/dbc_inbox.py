@@ -26,6 +26,7 @@ class Letter:
         reader: Takes them out of a frame.
         raws: What came last, in the order of `reader.names`; empty before the first. Another tuple for each frame.
         received: When that was, monotonic [s].
+        count: How many came since its pace was looked at.
     """
 
     message: Message
@@ -33,6 +34,7 @@ class Letter:
     reader: Reader | None = None
     raws: Raws = ()
     received: float = -math.inf
+    count: int = 0
 
 
 @dataclass(slots=True)

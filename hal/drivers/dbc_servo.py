@@ -132,7 +132,7 @@ class DbcServo(DbcNode):
     def _on_state(self, raws: Raws) -> None:
         if self._expired and self._expired.seen.letter is self._state.letter:
             self._on_watchdog(raws)
-        is_booting = self._meaning.get(raws[self._state.place]) == BOOTING
+        is_booting = self._meaning.get(self._state.raw) == BOOTING
         if is_booting and not self._is_booting:
             self._counters["boots"] += 1
             self._lose(f"{self._place} rebooted.")
@@ -186,6 +186,8 @@ class DbcServo(DbcNode):
         return self._has_expired and not self._ran_out
 
     def _fault(self) -> str:
+        if text := super()._fault():
+            return text
         if self._is_rested:
             return ""
         if text := self._error_text():
@@ -265,7 +267,7 @@ class DbcServo(DbcNode):
         if not self.is_commissioned:
             return
         activity = self._activity
-        if activity.is_over and self._is_enabled:
+        if self._is_enabled if activity.is_over else activity.name == ENABLE:
             self._begin(DISABLE)
         elif activity.is_over and self._is_rested:
             self._begin(RESET)

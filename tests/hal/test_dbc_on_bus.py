@@ -287,6 +287,17 @@ def test_frames_of_another_length_are_dropped_and_counted(bench, size):
     assert bench.robot.mode == "hold"
 
 
+def test_two_axes_under_one_node_id_are_told(bench):
+    bench.enable()
+    for _ in range(240):
+        if bench.robot.mode == "fault":
+            break
+        bench.send("can0", ESTIMATES, struct.pack("<ff", turns(0.6), 0.0))
+        follow(bench, 0.6, 1)
+        bench.cycle()
+    assert "Do two devices have this node id" in bench.robot.fault_text
+
+
 def test_no_number_is_no_value(bench):
     bench.send("can0", ESTIMATES, struct.pack("<ff", math.nan, math.inf))
     bench.flush()
