@@ -152,8 +152,7 @@ def test_the_drives_of_a_killed_hal_stop_by_themselves(arm: Processes) -> None:
         eventually(lambda: _rests(arm))
         assert (np.abs(_length(arm) - before) < RATE * 0.5 + SLACK).all()
     arm.start("hal")
-    eventually(lambda: arm.all_valid())
-    assert arm.mode() == "off"
+    eventually(lambda: arm.mode() == "off")
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
