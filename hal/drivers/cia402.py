@@ -26,6 +26,7 @@ STOPPING = 0.8
 """How long [s] a quick stop, or slowing down, may take before the power is taken off."""
 RAMPED = (Mode.PROFILE_POSITION, Mode.CYCLIC_SYNCHRONOUS_VELOCITY)
 """Modes in which a drive that is let go may be moving, and slows down first."""
+UNWATCHED = "{} does not notice when the HAL is gone (no 1016h)."
 ANSWER_TIME = 1.0
 """How long [s] a drive may take to acknowledge a set-point."""
 
@@ -204,7 +205,7 @@ class Cia402Drive(CanopenNode):
             return f"{self._place} is led from its own panel and takes no commands (bit 9 of its statusword)."
         if self._statusword >= 0 and self._statusword & cia402.WARNING:
             return f"{self._place} warns (bit 7 of its statusword). Look at its display."
-        return "" if self._is_watched else f"{self._place} does not notice when the HAL is gone (no 1016h)."
+        return "" if self._is_watched else UNWATCHED.format(self._place)
 
     def enable(self) -> None:
         """See `Device.enable`."""
@@ -215,8 +216,8 @@ class Cia402Drive(CanopenNode):
         if self._is_wanted and self._mode in RAMPED:
             self._slowing = self._stopping_cycles
         self._is_wanted = False
-        if self._homing is not None:
-            self._homing.give_up("was stopped")
+        if (homing := self._homing) is not None:
+            homing.give_up("was stopped")
 
     def quick_stop(self) -> None:
         """See `Device.quick_stop`; the word goes out at once, and in every cycle until the drive stands."""
@@ -274,10 +275,12 @@ class Cia402Drive(CanopenNode):
                 self._send(word, self._rest(), self._homing_mode())
                 return
             self._letting_go = 0
-        if self._homing is not None:
-            word, mode = self._homing.step(state, self._statusword, self._shown_mode)
+        homing = self._homing
+        if homing is not None:
+            word, mode = homing.step(state, self._statusword, self._shown_mode)
             self._send(word, self._rest(), mode)
-            self._end_homing()
+            if homing.is_over:
+                self._end_homing(homing)
             return
         self._slowing = max(self._slowing - 1, 0) if state is State.OPERATION_ENABLED else 0
         word = cia402.towards_disabled(state, slow_down=self._slowing > 0)
@@ -293,7 +296,9 @@ class Cia402Drive(CanopenNode):
             self._calibrate()
         checks = list(super().inspect())
         if not self._is_watched:
-            checks.append(Check("watchdog", False, f"{self._warning()} A person must be able to cut its power."))
+            checks.append(
+                Check("watchdog", False, f"{UNWATCHED.format(self._place)} Let something else cut its power.")
+            )
         if not self._sdo.has(cia402.ABORT_CONNECTION.index):
             text = "There is no object 6007h. Look up in its manual what the drive does when the heartbeat fails."
             checks.append(Check("abort option", False, text))
@@ -321,13 +326,11 @@ class Cia402Drive(CanopenNode):
             self._handshake.start(self._rest())
         return True
 
-    def _end_homing(self) -> None:
-        homing = self._homing
-        if homing is not None and homing.is_over:
-            self._homing = None
-            self._told = f"{self._place}: homing {homing.problem}." if homing.problem else ""
-            if not homing.problem:
-                self._counters["homed"] += 1
+    def _end_homing(self, homing: HomingRun) -> None:
+        self._homing = None
+        self._told = f"{self._place}: homing {homing.problem}." if homing.problem else ""
+        if not homing.problem:
+            self._counters["homed"] += 1
 
     def _homing_mode(self) -> Mode:
         return self._mode if self._homing is None else Mode.HOMING

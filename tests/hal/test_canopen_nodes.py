@@ -441,6 +441,18 @@ def test_a_drive_without_a_watchdog_is_used_only_on_demand_and_told(joint, tmp_p
     assert bench.objects[0x1016, 1] == 0
     bad = [check for check in inspected(bench) if not check.is_good]
     assert [check.what for check in bad] == ["watchdog"]
+    assert "when the HAL is gone (no 1016h). Let something else cut its power." in bad[0].text
+
+
+def test_a_drive_that_was_never_opened_can_be_inspected(joint):
+    bench = joint("csp", quantities=("position",))
+    bench.rig.step(0.0)
+    for bus in bench.buses.values():
+        bus.open()
+    bad = [check.what for check in inspected(bench) if not check.is_good]
+    for bus in bench.buses.values():
+        bus.close()
+    assert {"identity", "PDO mapping", "heartbeat", "watchdog", "mode"} <= {*bad}
 
 
 def test_a_velocity_unit_that_is_not_known_is_told(joint):
