@@ -21,25 +21,28 @@ from hal.robot import open_robot
 
 ROOT = Path(__file__).parents[2]
 EDS = ROOT / "robots" / "eds"
+DBC = ROOT / "robots" / "dbc"
 RATE = 20.0
 """Cycles per second [Hz]; a kernel in user mode on a shared machine stands still for 0.1 s now and then."""
-PATIENCE = 60.0
+PATIENCE = 120.0
 """How long [s] anything may take; no test depends on being faster."""
 
 
 def description(near: str = "vcan0", far: str = "vcan1") -> dict:
-    """A muscle and a joint on two interfaces: a drive, a cell, an input module and an encoder."""
+    """Two muscles and a joint on two interfaces, with a device of every kind that has a protocol of its own."""
     patient = {"silent_after": 0.5}
+    cell = {"force": {"signal": "Force.Force"}}
+    quick = {"stiffness": 300_000, "damping": 10_000, "watch_time": 2.0}  # N/m, N s/m: 19 N m/rad and 0.6 N m s/rad
     drive = {"counts_per_turn": 4096, "gear": 29, "spool_radius": 0.008, "rated_torque": 0.1, "watch_time": 2.0}
     return {
         "robot": "kernel",
         "signals": {
-            "muscle_length": {"unit": "m", "elements": ["biceps"], "stale_after": 0.25},
-            "muscle_tension": {"unit": "N", "elements": ["biceps", "triceps"], "stale_after": 0.25},
+            "muscle_length": {"unit": "m", "elements": ["biceps", "triceps"], "stale_after": 0.25},
+            "muscle_tension": {"unit": "N", "elements": ["biceps", "triceps", "deltoid"], "stale_after": 0.25},
             "joint_position": {"unit": "rad", "elements": ["elbow"], "stale_after": 0.25},
         },
         "command": {"signal": "muscle_length", "time_to_live": 1.0, "hold": 5.0},
-        "limits": {"muscle_length": {"low": 0.1, "high": 0.5, "rate": 0.25}},
+        "limits": {"muscle_length": {"low": 0.25, "high": 0.35, "rate": 0.25}},
         "rates": {"hal": RATE},
         "buses": {
             "can0": {"interface": "socketcan", "channel": near},
@@ -52,15 +55,42 @@ def description(near: str = "vcan0", far: str = "vcan1") -> dict:
                 "driver": "cia401",
                 "settings": {**patient, "eds": str(EDS / "analog_input.eds"), "gain": 0.02},
             },
+            "quick": {
+                "driver": "mit",
+                "settings": {**patient, "motor": "DM4340", "spool_radius": 0.008, "zero": 0.3, **quick},
+            },
+            "messages": {
+                "driver": "dbc",
+                "settings": {
+                    **patient,
+                    "dbc": str(DBC / "load_cell.dbc"),
+                    "node_offset": 1,
+                    "periods": {"Force": 1.0 / RATE},
+                    "quantities": cell,
+                    "error": {"signal": "Force.Status", "good": "GOOD"},
+                },
+            },
             "encoder": {"driver": "cia406", "settings": {**patient, "eds": str(EDS / "joint_encoder.eds")}},
         },
         "devices": {
             "biceps_drive": {"kind": "drive", "bus": "can0", "node": 1, "element": "muscle_length.biceps"},
             "biceps_cell": {"kind": "cell", "bus": "can0", "node": 11, "element": "muscle_tension.biceps"},
             "triceps_cell": {"kind": "input", "bus": "can1", "node": 12, "element": "muscle_tension.triceps"},
+            "triceps_drive": {"kind": "quick", "bus": "can1", "node": 5, "element": "muscle_length.triceps"},
+            "deltoid_cell": {"kind": "messages", "bus": "can1", "node": 3, "element": "muscle_tension.deltoid"},
             "elbow_encoder": {"kind": "encoder", "bus": "can1", "node": 21, "element": "joint_position.elbow"},
         },
     }
+
+
+def one_muscle(channel: str) -> dict:
+    """The biceps alone, on one interface."""
+    raw = description(channel)
+    del raw["buses"]["can1"], raw["signals"]["joint_position"]
+    for name in ("muscle_length", "muscle_tension"):
+        raw["signals"][name]["elements"] = ["biceps"]
+    raw["devices"] = {name: device for name, device in raw["devices"].items() if device["bus"] == "can0"}
+    return raw
 
 
 def write(folder: Path, raw: dict) -> Path:

@@ -12,7 +12,7 @@ from pathlib import Path
 import canopen
 import numpy as np
 import pytest
-from kernel_robot import EDS, RATE, Master, Nodes, description, ip, running, send_error_frame, write
+from kernel_robot import EDS, RATE, Master, Nodes, description, ip, one_muscle, running, send_error_frame, write
 
 pytestmark = [
     pytest.mark.skipif(
@@ -25,8 +25,8 @@ pytestmark = [
 
 @pytest.fixture(scope="module")
 def started(tmp_path_factory):
-    faults = ("set muscle_tension.biceps 40", "set muscle_tension.triceps 25", "set joint_position.elbow 0.5")
-    with running(tmp_path_factory.mktemp("robot"), description(), *faults) as both:
+    forces = ("set muscle_tension.biceps 40", "set muscle_tension.triceps 25", "set muscle_tension.deltoid 15")
+    with running(tmp_path_factory.mktemp("robot"), description(), *forces, "set joint_position.elbow 0.5") as both:
         yield both
 
 
@@ -38,7 +38,8 @@ def master(started) -> Master:
     if master.robot.mode in ("hold", "follow"):
         master.robot.disable()
     master.until_whole("whole again after the test")
-    master.until(lambda: master.device("biceps_drive")["state"] == "ready", "let go after the test")
+    drives = ("biceps_drive", "triceps_drive")
+    master.until(lambda: all(master.device(name)["state"] == "ready" for name in drives), "let go after the test")
     if master.robot.mode == "fault":
         master.robot.reset()
     master.until(lambda: master.robot.mode == "off", "off after the test")
@@ -51,16 +52,16 @@ def nodes(started) -> Nodes:
 
 def test_values_come_through_the_kernel_and_bear_its_stamps(master):
     values = master.sample.values
-    assert values["muscle_length"] == pytest.approx([0.3], abs=1e-4)  # m
-    assert values["muscle_tension"] == pytest.approx([40.0, 25.0], abs=0.05)  # N
+    assert values["muscle_length"] == pytest.approx([0.3, 0.3], abs=1e-4)  # m
+    assert values["muscle_tension"] == pytest.approx([40.0, 25.0, 15.0], abs=0.05)  # N
     assert values["joint_position"] == pytest.approx([0.5], abs=1e-4)  # rad
     assert {master.bus(name)["stamps"] for name in ("can0", "can1")} == {"kernel"}
 
 
-def test_the_drive_follows_and_lets_go(master):
+def test_the_drives_follow_and_let_go(master):
     master.enable()
-    master.target = np.array([0.33])
-    master.until(lambda: abs(master.sample.values["muscle_length"][0] - 0.33) < 1e-3, "there")
+    master.target = np.array([0.33, 0.28])
+    master.until(lambda: np.allclose(master.sample.values["muscle_length"], master.target, atol=1e-3), "there")
     master.robot.disable()
     master.until(lambda: master.robot.mode == "off", "off")
 
@@ -192,14 +193,7 @@ def test_a_wire_that_loses_doubles_and_shuffles(tmp_path, trouble):
     try:
         ip("link", "set", "vx0", "up")
         ip("link", "set", "vx1", "up")
-        raw, node_raw = description("vx0", "vcan1"), description("vx1", "vcan1")
-        for body in (raw, node_raw):
-            body["buses"] = {"can0": body["buses"]["can0"]}
-            del body["devices"]["triceps_cell"], body["devices"]["elbow_encoder"]
-            body["signals"] = {
-                "muscle_length": body["signals"]["muscle_length"],
-                "muscle_tension": {**body["signals"]["muscle_tension"], "elements": ["biceps"]},
-            }
+        raw, node_raw = one_muscle("vx0"), one_muscle("vx1")
         folder = tmp_path / "nodes"
         folder.mkdir()
         node_file = write(folder, node_raw)

@@ -14,26 +14,17 @@ from pathlib import Path
 import can
 import numpy as np
 import pytest
-from kernel_robot import Master, description, ip, running, write
+from kernel_robot import Master, ip, one_muscle, running, write
 from serial_adapter import SerialAdapter
 
 NET = Path("/sys/class/net")
-
-
-def one_bus(channel: str) -> dict:
-    """The muscle alone, on one interface."""
-    raw = description(channel)
-    del raw["buses"]["can1"], raw["devices"]["triceps_cell"], raw["devices"]["elbow_encoder"]
-    del raw["signals"]["joint_position"]
-    raw["signals"]["muscle_tension"]["elements"] = ["biceps"]
-    return raw
 
 
 def pair(folder: Path, near: str, far: str):
     """Master on one interface, nodes on another."""
     there = folder / "nodes"
     there.mkdir()
-    return running(folder, one_bus(near), "set muscle_tension.biceps 40", node_file=write(there, one_bus(far)))
+    return running(folder, one_muscle(near), "set muscle_tension.biceps 40", node_file=write(there, one_muscle(far)))
 
 
 def facts(channel: str) -> dict:
