@@ -37,8 +37,10 @@ Taker = Callable[[tuple[Any, ...], float], None]
 """Takes the objects of one TPDO, in order, and when they arrived [monotonic s]; called in the receive thread."""
 
 _REPEAT, _LATE, _TWINS = 3, 3, 40
-"""An answer too many weighs 3, one that is explained by a late one -3, a cycle as it should be -1; at 40 there are two
-nodes. So two nodes are told after 20 cycles, and a bus that doubles a third of its frames is not mistaken for them."""
+"""A frame too many weighs 3, one that is explained by a late one -3, one as it should be -1; at 40 there are two nodes
+(times the frames of a cycle). So two nodes are told after 20 cycles, and a bus that doubles a third of its frames is not mistaken for them."""
+_BACKLOG = 200
+"""So many cycles may be answered all at once, when whoever answers was held up."""
 _STRAYS = 3
 """So many PDOs after a boot-up message come from another node: one that booted sends none."""
 
@@ -91,6 +93,7 @@ class CanopenNode(CanDevice):
         self._beat_due = math.inf
         self._beat_patience = max(BEATS_FORGIVEN * HEARTBEAT_TIME, settings.silent_after)
         self._all = sum(1 << pdo.number for pdo in self._pdos.sends if pdo.answers_sync)
+        self._count = self._all.bit_count()
         self._pending, self._since = self._all, 0
         self._doubt = 0
         self._strays = -math.inf
@@ -198,9 +201,10 @@ class CanopenNode(CanDevice):
             self._pending = pending
             return
         if self._doubt and missed == 1:
-            self._doubt -= 1 if self._doubt > 0 else -1
+            self._doubt -= self._count if self._doubt > 0 else -self._count
         elif missed > 1:
-            self._doubt = max(self._doubt - _LATE * self._all.bit_count(), -_TWINS)
+            late = min(missed - 1, _BACKLOG) * self._count
+            self._doubt = max(self._doubt - _LATE * late, -_LATE * _BACKLOG)
         self._pending, self._since = self._all, 0
         if received > self._beat_due:
             self._beat_due = math.inf
@@ -213,7 +217,7 @@ class CanopenNode(CanDevice):
         """More than one answer to a SYNC; now and then it was a late one."""
         self._counters["doubled"] += 1
         self._doubt += _REPEAT
-        if self._doubt > _TWINS:
+        if self._doubt > _TWINS * self._count:
             self._tell_twins("answers each SYNC twice")
 
     def _on_stray(self) -> None:

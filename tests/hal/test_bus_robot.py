@@ -170,3 +170,16 @@ def test_values_of_a_bus_that_is_gone_only_get_older(bench):
         assert age > before
         before = age
     assert not bench.sample.valid["joint_position"][0]
+
+
+@pytest.mark.parametrize("cycles", [10, 25, 60])
+def test_answers_that_were_held_up_for_long_are_no_second_node(bench, cycles):
+    bench.cycle(5)
+    bench.powered = False  # the SYNCs pile up in front of the nodes, which answer them all at once
+    bench.cycle(cycles)
+    bench.powered = True
+    bench.until(lambda: bench.sample.complete, "the nodes")
+    bench.cycle(30)
+    bench.until(lambda: bench.states() <= {"ready", "fault"}, "the nodes")
+    texts = [device["text"] for device in bench.robot.health()["devices"].values()]
+    assert not any("twice" in text for text in texts), texts
