@@ -37,8 +37,9 @@ Taker = Callable[[tuple[Any, ...], float], None]
 """Takes the objects of one TPDO, in order, and when they arrived [monotonic s]; called in the receive thread."""
 
 _REPEAT, _LATE, _TWINS = 3, 3, 40
-"""A frame too many weighs 3, one that is explained by a late one -3, one as it should be -1; at 40 there are two nodes
-(times the frames of a cycle). So two nodes are told after 20 cycles, and a bus that doubles a third of its frames is not mistaken for them."""
+"""A frame too many weighs 3, one that is explained by a late one -3, one as it should be -1; at 40 (times the frames of
+a cycle) there are two nodes. So two nodes are told after 20 cycles, and a bus that doubles a quarter of its frames is
+not mistaken for them."""
 _BACKLOG = 200
 """So many cycles may be answered all at once, when whoever answers was held up."""
 _STRAYS = 3
