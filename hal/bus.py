@@ -39,6 +39,8 @@ BACK_OFF = (0.05, 0.5)
 RECEIVE_TIMEOUT = 0.1
 MISSES_FORGIVEN = 4
 """A node that missed so many cycles in a row is not waited for any more, until it is heard."""
+_FRAMES = ("received", "sent", "send_failures", "unknown", "ignored", "babbled", "broken_handlers", "error_frames")
+COUNTERS = (*_FRAMES, "opened", "failures")
 TOLD_STRANGERS = 8
 ECHOING = ("udp_multicast",)
 """Interfaces that return to us what we send."""
@@ -79,13 +81,7 @@ class Bus:
                 f"buses.{name}.interface '{config.interface}' is not known to python-can. Known: {known}."
             )
         self.name = name
-        self.counters = dict.fromkeys(
-            (
-                *("received", "sent", "opened", "unknown", "ignored", "error_frames", "broken_handlers"),
-                *("send_failures", "babbled", "failures"),
-            ),
-            0,
-        )
+        self.counters = dict.fromkeys(COUNTERS, 0)
         self.needs_sync = False
         """Whether there are CANopen nodes, which wait for the SYNC and for the HAL's heartbeat."""
         self._config = config

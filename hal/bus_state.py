@@ -1,5 +1,9 @@
-"""What can be said of a bus: a state machine that is told what was seen and knows neither interface nor clock."""
+"""What can be said of a bus: a state machine that is told what was seen and knows neither interface nor clock.
 
+Receive thread and cycle both tell it; whoever only looks at the state needs no lock.
+"""
+
+import threading
 from collections.abc import Callable
 from enum import StrEnum
 
@@ -50,6 +54,7 @@ class BusWatch:
         self.error_counters: tuple[int, int] | None = None
         """Transmit and receive error counters that the controller last told."""
         self._changed = changed
+        self._lock = threading.RLock()
         self._is_there = False
         self._controller = Controller.ACTIVE
         self._controller_text = ""
@@ -60,39 +65,44 @@ class BusWatch:
 
     def opened(self, text: str) -> None:
         """The interface was opened, which says nothing of the bus yet; `text` says what to wait for."""
-        self.error_counters = None
-        self.lost(text)
+        with self._lock:
+            self.error_counters = None
+            self.lost(text)
 
     def lost(self, text: str) -> None:
         """The interface failed, was closed, or nothing was heard for too long."""
-        self._is_there = False
-        self._controller, self._worry = Controller.ACTIVE, ""
-        self._gone = text
-        self._settle()
+        with self._lock:
+            self._is_there = False
+            self._controller, self._worry = Controller.ACTIVE, ""
+            self._gone = text
+            self._settle()
 
     def heard(self, now: float) -> None:
         """A frame of another node has come at `now` [s]; need not be told while the state is ok."""
-        self._is_there = True
-        if self._controller is Controller.OFF or now - self._controller_at > RECOVERY:
-            self._controller = Controller.ACTIVE  # a controller that is off the bus hears nothing
-        if now - self._worry_at > WORRY:
-            self._worry = ""
-        self._settle()
+        with self._lock:
+            self._is_there = True
+            if self._controller is Controller.OFF or now - self._controller_at > RECOVERY:
+                self._controller = Controller.ACTIVE  # a controller that is off the bus hears nothing
+            if now - self._worry_at > WORRY:
+                self._worry = ""
+            self._settle()
 
     def error(self, frame: ErrorFrame, now: float) -> None:
         """An error frame has come at `now` [s]."""
-        if frame.counters is not None:
-            self.error_counters = frame.counters
-        if frame.controller is not None:
-            self._controller, self._controller_text, self._controller_at = frame.controller, frame.text, now
-        if frame.text and self._controller is Controller.ACTIVE:
-            self._worry, self._worry_at = frame.text, now
-        self._settle()
+        with self._lock:
+            if frame.counters is not None:
+                self.error_counters = frame.counters
+            if frame.controller is not None:
+                self._controller, self._controller_text, self._controller_at = frame.controller, frame.text, now
+            if frame.text and self._controller is Controller.ACTIVE:
+                self._worry, self._worry_at = frame.text, now
+            self._settle()
 
     def worry(self, text: str, now: float) -> None:
         """Something is not as it should be, though frames come and go."""
-        self._worry, self._worry_at = text, now
-        self._settle()
+        with self._lock:
+            self._worry, self._worry_at = text, now
+            self._settle()
 
     def _settle(self) -> None:
         before = self.state
