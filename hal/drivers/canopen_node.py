@@ -267,10 +267,11 @@ class CanopenNode(CanDevice):
         if found is None:
             self._counters["malformed"] += 1
             return
-        self._emergency = found if found.code else None
+        before, self._emergency = self._emergency, found if found.code else None
         if found.code:
             self._counters["emergencies"] += 1
-            log.warning("%s reports %s", self._place, _describe(found))
+            if before != found:
+                log.warning("%s reports %s", self._place, _describe(found))
 
 
 def _describe(found: Emergency) -> str:
