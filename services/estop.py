@@ -5,7 +5,6 @@ from collections.abc import Iterable
 import typer
 
 from services.client import Client
-from services.errors import ServiceError
 
 
 def estop_robot(robot: str, reason: str, connect: Iterable[str]) -> int:
@@ -13,7 +12,7 @@ def estop_robot(robot: str, reason: str, connect: Iterable[str]) -> int:
     try:
         with Client(robot, connect) as client:
             answer = client.estop(reason)
-    except ServiceError as error:
+    except Exception as error:  # whatever it is, it must be loud
         typer.echo(f"gemuco: {error}", err=True)
         return _shout(f"NOBODY ANSWERED for '{robot}', so nothing may have stopped. CUT THE POWER.")
     for one in answer["devices"]:
