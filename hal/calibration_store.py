@@ -7,7 +7,7 @@ moves a joint. A record is refused when what it was measured with has changed si
 import hashlib
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -15,11 +15,14 @@ from typing import Any
 import yaml
 from pydantic import ValidationError
 
+from hal import registry
 from hal.calibration import Calibration
 from hal.config import RobotConfig
 from hal.errors import ConfigError
 from hal.section import Section, explain
 
+SIMULATED = ("hub", "virtual")
+"""Interfaces behind which there is nothing to be calibrated."""
 KEPT = ".before"
 """Added to the name of the file as it was before the last change."""
 WITHOUT_EFFECT = frozenset(
@@ -112,6 +115,18 @@ def load(config: RobotConfig) -> dict[str, Calibration]:
         ConfigError: The file cannot be read, a record was edited, or what it was measured with has changed.
     """
     return {one.device: checked(config, one) for one in records(config) if one.device in config.devices}
+
+
+def uncalibrated(config: RobotConfig, stored: Iterable[str]) -> list[str]:
+    """Devices that go by the zero of the robot file though they could be calibrated; simulated ones need not be."""
+    done = set(stored)
+    return [
+        name
+        for name, entry in config.devices.items()
+        if name not in done
+        and config.buses[entry.bus].interface not in SIMULATED
+        and "zero" in registry.equipment(config, name)[0].Settings.model_fields
+    ]
 
 
 def checked(config: RobotConfig, record: Record) -> Calibration:

@@ -6,7 +6,7 @@ Nothing is enabled: the devices are opened, turned for a second with their motor
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
-from hal import budget, calibration_store, registry
+from hal import budget, calibration_store
 from hal.bus import Bus
 from hal.bus_state import BusState
 from hal.clock import SystemClock
@@ -26,7 +26,6 @@ COMPLETE = 0.98
 """Share of the cycles in which every device should answer."""
 MUTE = 0.5
 """A device that misses more of the cycles is told by itself."""
-SIMULATED = ("hub", "virtual")
 
 
 def described(config: RobotConfig) -> Iterator[Finding]:
@@ -57,7 +56,7 @@ def calibrated(config: RobotConfig) -> Finding:
             "calibration",
             f"{has}. {_listed(nameless)} cannot tell who they are: when you replace one, calibrate it again.",
         )
-    missing = uncalibrated(config, stored)
+    missing = calibration_store.uncalibrated(config, stored)
     if missing:
         return warning(
             "calibration",
@@ -65,18 +64,6 @@ def calibrated(config: RobotConfig) -> Finding:
             "not measured, use `gemuco calibrate`.",
         )
     return ok("calibration", f"{has}; whatever else the robot has goes by the robot file.")
-
-
-def uncalibrated(config: RobotConfig, stored: Iterable[str]) -> list[str]:
-    """Devices that go by the zero of the robot file though they could be calibrated; simulated ones need not be."""
-    done = set(stored)
-    return [
-        name
-        for name, entry in config.devices.items()
-        if name not in done
-        and config.buses[entry.bus].interface not in SIMULATED
-        and "zero" in registry.equipment(config, name)[0].Settings.model_fields
-    ]
 
 
 def examine(config: RobotConfig, duration: float = DURATION) -> Iterator[Finding]:
@@ -158,7 +145,11 @@ def _buses(buses: Sequence[Bus], there: set[str], config: RobotConfig) -> Iterat
     for bus in buses:
         what, settings = f"bus {bus.name}", config.buses[bus.name]
         if bus.name not in there:
-            advice = " Start `gemuco simulate`, or name real interfaces." if settings.interface in SIMULATED else ""
+            advice = (
+                " Start `gemuco simulate`, or name real interfaces."
+                if settings.interface in calibration_store.SIMULATED
+                else ""
+            )
             yield bad(what, f"It does not open: {bus.text}{advice}")
             continue
         health = bus.health()

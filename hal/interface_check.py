@@ -37,7 +37,8 @@ def socketcan(what: str, bus: BusConfig, found: link.Link | None, commands: int)
         yield bad(what, f"'{bus.channel}' is no CAN interface. Those here: {', '.join(link.known_links()) or 'none'}.")
         return
     if not found.is_up:
-        yield bad(what, f"'{bus.channel}' is down. Set it up with `{up}`.")
+        command = up if found.kind in ("can", "") else f"sudo ip link set {bus.channel} up"
+        yield bad(what, f"'{bus.channel}' is down. Set it up with `{command}`.")
         return
     yield ok(what, f"'{bus.channel}' ({found.kind or 'CAN'}) is up.")
     if found.kind == "can":

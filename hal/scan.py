@@ -64,7 +64,7 @@ def scan(tap: Tap, listen: float = LISTEN, ask: bool = True, mit: bool = False, 
     if not silence:
         ask_all(tap, heard, patience)
     if mit and not heard.master():
-        look_for_mit(tap, heard)
+        look_for_mit(tap, heard, patience)
     heard.attribute()
     nodes = sorted(heard.nodes.values(), key=lambda found: (found.protocol, found.node))
     return Scan(tap.name, nodes, {key: rates.get(key, 0.0) for key in heard.unexplained()}, load, silence)

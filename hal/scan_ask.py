@@ -103,18 +103,31 @@ def _take(tap: Tap, heard: Heard, talks: dict[int, _Talk], frame: Frame) -> None
     tap.send(cia301.SDO_REQUEST + node, talk.uploads[0].request)
 
 
-def look_for_mit(tap: Tap, heard: Heard) -> None:
+def look_for_mit(tap: Tap, heard: Heard, patience: float) -> None:
     """End the motor mode of every possible MIT drive; one that is there answers with its id in the first byte."""
     before = set(heard.counts)
     odrives = heard.odrives()  # an identifier below 33 is a command to ODrive 0 or 1
+    asked: list[int] = []
     for node in MIT_IDS:
         if node >> 5 in odrives:
             continue
         tap.send(node, special(Special.EXIT))
-        deadline = time.monotonic() + MIT_ANSWER_TIME
-        while (remaining := deadline - time.monotonic()) > 0:
-            frame = tap.receive(remaining)
-            if frame is None or frame.is_extended or frame.is_error or frame.identifier in before:
-                continue
-            if len(frame.data) in (6, 7, 8) and frame.data[0] in (node, node & 0x0F | frame.data[0] & 0xF0):
-                heard.found("MIT", node).state = f"answers on {frame.identifier:03X}h"
+        asked.append(node)
+        _take_mit(tap, heard, asked, before, MIT_ANSWER_TIME)
+    _take_mit(tap, heard, asked, before, patience)
+
+
+def _take_mit(tap: Tap, heard: Heard, asked: list[int], before: set[int], duration: float) -> None:
+    """Whose answers come within `duration` [s]; a late one may be of any drive that was asked."""
+    deadline = time.monotonic() + duration
+    while (remaining := deadline - time.monotonic()) > 0:
+        frame = tap.receive(remaining)
+        if frame is None or frame.is_extended or frame.is_error or frame.identifier in before:
+            continue
+        if len(frame.data) not in (6, 7, 8):
+            continue
+        first = frame.data[0]  # the id, or with Damiao's state above its lower four bits
+        likely = [node for node in reversed(asked) if first == node or first & 0x0F == node & 0x0F]
+        if likely:
+            node = first if first in likely else likely[0]
+            heard.found("MIT", node).state = f"answers on {frame.identifier:03X}h"

@@ -46,7 +46,7 @@ class Tap:
         except Exception as error:  # an interface plugin may raise anything
             advice = "Is `gemuco simulate` running?" if config.interface == "hub" else "Is it there, is it up?"
             raise BusGone(
-                f"Bus '{self.name}' ({config.interface} {config.channel}) does not open: {error} {advice}"
+                f"Bus '{self.name}' ({config.interface} {config.channel}) does not open: {str(error).rstrip('.')}. {advice}"
             ) from (error)
         return self
 

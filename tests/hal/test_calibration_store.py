@@ -36,12 +36,6 @@ def rig(config):
     rig.stop()
 
 
-@pytest.fixture
-def world(rig):
-    """What the nodes measure."""
-    return rig._world
-
-
 def point(known, read, std=0.001):
     return Point(known=known, read=read, std=std, samples=100)
 
@@ -62,11 +56,15 @@ def a_record(config, device="elbow_encoder", identity="canopen:1-2-3"):
     )
 
 
-def settle(world, **values):
-    """Set what the world is, and give the rig time to take it up."""
+def settle(rig, **values):
+    """Set what the world is, and wait until the nodes have taken it up."""
     for name, value in values.items():
-        getattr(world, name)[0] = value
-    time.sleep(0.05)
+        getattr(rig._world, name)[0] = value
+    steps = rig.stats()["physics"]["steps"]
+    deadline = time.monotonic() + 20.0
+    while rig.stats()["physics"]["steps"] < steps + 2:
+        assert time.monotonic() < deadline
+        time.sleep(0.002)
 
 
 def test_one_position_gives_the_zero_and_keeps_the_direction():
@@ -198,9 +196,9 @@ def test_a_record_of_a_device_that_is_gone_is_passed_over(config):
     assert calibration_store.load(config) == {}
 
 
-def test_an_encoder_tells_the_truth_after_one_position(config, world):
+def test_an_encoder_tells_the_truth_after_one_position(config, rig):
     what = subject(config, "elbow_encoder", "direction")
-    settle(world, angle=-0.7)
+    settle(rig, angle=-0.7)
     with Measuring(what) as device:
         seen = device.look(0.3, 0.2, 0.005)
         calibration_store.save(config, device.record(joint_line([seen], device.now.factor, 0.1), (seen,)))
@@ -213,58 +211,58 @@ def test_an_encoder_tells_the_truth_after_one_position(config, world):
         assert robot.mode == "off"
 
 
-def test_a_cell_tells_the_truth_after_three_weights_and_keeps_its_gain_at_a_tare(config, world):
+def test_a_cell_tells_the_truth_after_three_weights_and_keeps_its_gain_at_a_tare(config, rig):
     what = subject(config, "muscle_tension.biceps", "gain")
     assert (what.device, what.unit) == ("biceps_cell", "N")
     points = []
     with Measuring(what) as device:
         for known, told in ((0.0, 2.0), (10.0, 14.5), (20.0, 27.0)):  # N
-            settle(world, tension=told)
+            settle(rig, tension=told)
             points.append(device.look(known, 0.2, 0.1))
         line = cell_line(points, device.now.factor, 0.1)
         calibration_store.save(config, device.record(line, tuple(points)))
         assert line.factor == pytest.approx(0.8, rel=1e-3)
         assert device.now.factor == pytest.approx(0.8, rel=1e-3)
-        settle(world, tension=4.5)
+        settle(rig, tension=4.5)
         bare = device.look(0.0, 0.2, 0.1)
         tared = cell_line([bare], device.now.factor, 0.1)
     assert tared.factor == line.factor
     assert tared.value(points[2].read) == pytest.approx(18.0, abs=0.05)  # N
 
 
-def test_a_drive_waits_for_the_next_position_without_a_fault_and_without_power(config, rig, world):
+def test_a_drive_waits_for_the_next_position_without_a_fault_and_without_power(config, rig):
     with Measuring(subject(config, "biceps_drive", "direction")) as device:
         first = device.look(0.3, 0.1, 0.001)
         time.sleep(0.4)  # a person moves the joint; the drive's watchdog is shorter
-        settle(world, length=0.34)
+        settle(rig, length=0.34)
         second = device.look(0.34, 0.1, 0.001)
         assert rig.node("biceps_drive").objects.values[0x1001, 0] == 0
         assert not rig.node("biceps_drive").servo[1]
     assert joint_line([first, second], -1, 0.01).factor == 1
 
 
-def test_a_device_that_moves_or_brings_nothing_is_refused(config, world):
+def test_a_device_that_moves_or_brings_nothing_is_refused(config, rig):
     with Measuring(subject(config, "biceps_cell", "gain")) as device:
-        noise = np.random.default_rng(0)
-        over = False
+        noise, over = np.random.default_rng(0), threading.Event()
 
         def shake():
-            while not over:
-                world.tension[0] = noise.normal(20.0, 2.0)
-                time.sleep(0.005)
+            while not over.wait(0.005):
+                rig._world.tension[0] = noise.normal(20.0, 2.0)
 
         thread = threading.Thread(target=shake)
         thread.start()
-        with pytest.raises(CalibrationRefused, match="does not stand still"):
-            device.look(0.0, 0.3, 0.1)
-        over = True
-        thread.join()
-        settle(world, tension=900.0)
+        try:
+            with pytest.raises(CalibrationRefused, match="does not stand still"):
+                device.look(0.0, 0.3, 0.1)
+        finally:
+            over.set()
+            thread.join()
+        settle(rig, tension=900.0)
         with pytest.raises(CalibrationRefused, match=r"brought 0 values .*overload"):
             device.look(0.0, 0.1, 0.1)
 
 
-def test_another_device_in_the_place_of_the_one_that_was_calibrated_is_refused(config, world):
+def test_another_device_in_the_place_of_the_one_that_was_calibrated_is_refused(config, rig):
     calibration_store.save(config, a_record(config))
     _, devices = build(config, SystemClock())
     encoder = next(device for device in devices if device.name == "elbow_encoder")

@@ -32,6 +32,24 @@ def running(nodes=None):
 
 
 @contextmanager
+def beside(job):
+    """Something that goes on meanwhile: `job` is called again and again."""
+    over = threading.Event()
+
+    def run():
+        while not over.is_set():
+            job()
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+
+
+@contextmanager
 def bus(config=None):
     """A tap and a wire on one virtual bus."""
     config = config or BusConfig(interface="virtual", channel=f"scan_{next(_numbers)}")
@@ -95,21 +113,15 @@ def test_missing_unexpected_and_wrong_nodes_are_told():
 
 def test_two_nodes_with_one_id_are_told():
     with running() as config, bus(config.buses["can1"]) as (tap, wire):
-        over = threading.Event()
 
         def answer():
-            while not over.is_set():
-                message = wire.recv(0.01)
-                if message is not None and message.arbitration_id == 0x602 and message.data[0] == 0x40:
-                    value = bytes.fromhex("92010200")
-                    data = bytes([0x43]) + bytes(message.data[1:4]) + value
-                    wire.send(can.Message(arbitration_id=0x582, data=data, is_extended_id=False))
+            message = wire.recv(0.01)
+            if message is not None and message.arbitration_id == 0x602 and message.data[0] == 0x40:
+                data = bytes([0x43]) + bytes(message.data[1:4]) + bytes.fromhex("92010200")
+                wire.send(can.Message(arbitration_id=0x582, data=data, is_extended_id=False))
 
-        thread = threading.Thread(target=answer)
-        thread.start()
-        found = scan(tap, listen=0.1, patience=PATIENCE)
-        over.set()
-        thread.join()
+        with beside(answer):
+            found = scan(tap, listen=0.1, patience=PATIENCE)
     assert [one.node for one in found.nodes if one.is_doubled] == [2]
     assert any("more than one node answers as node 2" in text for text in compare(found, config))
 
@@ -128,44 +140,34 @@ def test_an_odrive_is_recognised_and_never_sent_what_it_would_take_for_a_command
 
 def test_mit_drives_are_looked_for_only_when_asked():
     with bus() as (tap, wire):
-        over = threading.Event()
         asked = []
 
         def answer():
-            while not over.is_set():
-                message = wire.recv(0.01)
-                if message is not None and message.data == b"\xff" * 7 + b"\xfd":
-                    asked.append(message.arbitration_id)
-                    if message.arbitration_id == 3:
-                        send(wire, 0x000, "03 80 00 7F F7 FF 1E 1E")
+            message = wire.recv(0.01)
+            if message is not None and message.data == b"\xff" * 7 + b"\xfd":
+                asked.append(message.arbitration_id)
+                if message.arbitration_id == 3:
+                    send(wire, 0x000, "03 80 00 7F F7 FF 1E 1E")
 
-        thread = threading.Thread(target=answer)
-        thread.start()
-        assert scan(tap, listen=0.0, ask=False).nodes == []
-        assert not asked
-        found = scan(tap, listen=0.0, ask=False, mit=True)
-        over.set()
-        thread.join()
+        with beside(answer):
+            assert scan(tap, listen=0.0, ask=False).nodes == []
+            assert not asked
+            found = scan(tap, listen=0.0, ask=False, mit=True, patience=PATIENCE)
     assert [(one.protocol, one.node) for one in found.nodes] == [("MIT", 3)]
 
 
 def test_a_search_for_mit_drives_takes_no_other_frame_for_an_answer_and_leaves_odrives_alone():
     with bus() as (tap, wire):
-        over = threading.Event()
         sent = []
 
         def babble():
-            while not over.is_set():
-                message = wire.recv(0.002)
-                sent.extend([message.arbitration_id] if message is not None else [])
-                send(wire, 0x129, "10 00 00 00 00 00 00 00")
-                send(wire, 0x021, "00 00 00 00 01 00 00 00")
+            message = wire.recv(0.002)
+            sent.extend([message.arbitration_id] if message is not None else [])
+            send(wire, 0x129, "10 00 00 00 00 00 00 00")
+            send(wire, 0x021, "00 00 00 00 01 00 00 00")
 
-        thread = threading.Thread(target=babble)
-        thread.start()
-        found = scan(tap, listen=0.1, ask=False, mit=True)
-        over.set()
-        thread.join()
+        with beside(babble):
+            found = scan(tap, listen=0.3, ask=False, mit=True, patience=PATIENCE)
     assert [(one.protocol, one.node) for one in found.nodes] == [("ODrive", 1)]
     assert 31 in sent and 32 not in sent
 

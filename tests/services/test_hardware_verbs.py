@@ -44,7 +44,15 @@ class Stage:
     def set(self, element: str, value: float) -> None:
         """Have an element be something, and give the nodes time to notice."""
         self.rig.fault(f"set {element} {value}")
-        time.sleep(0.05)
+        steps, deadline = self._steps(), time.monotonic() + 20.0
+        while self._steps() < steps + 2:
+            assert time.monotonic() < deadline
+            time.sleep(0.002)
+
+    def _steps(self) -> int:
+        physics = self.rig.stats()["physics"]
+        assert isinstance(physics, dict)
+        return int(physics["steps"])
 
     def stored(self, device: str) -> dict[str, float]:
         raw = yaml.safe_load((self.path.parent / f"{self.config.robot}.calibration.yaml").read_text())
