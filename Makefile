@@ -47,8 +47,9 @@ test-controllers: $(STAMP)  ## drivers on two CAN controllers at 1 Mbit/s: can0 
 	elif [ -x "$(VMCAN)" ] && command -v qemu-system-x86_64 >/dev/null; then VMCAN_HW=1 "$(VMCAN)" -b qemu -t 580 "$(CURDIR)" $(BIN)/python -m pytest -p no:cacheprovider tests/system/test_socketcan_states.py; \
 	else echo "skipped: no controllers can0 and can1 here, and no '$(VMCAN)' with qemu-system-x86_64 to boot a machine that has them"; fi
 
-faults: $(STAMP)  ## the robot broken in every way, with many seeds: result table of docs/safety.md
+faults: $(STAMP)  ## the robot broken in every way with many seeds (docs/safety.md), and a million random frames
 	$(BIN)/python tests/hal/campaign.py --seeds 7 --json runs/faults.json
+	$(BIN)/python tests/hal/fuzz.py --frames 1000000
 
 bench: $(STAMP)   ## the loops' punctuality beside bare timers, 10 minutes
 	$(BIN)/python -m benchmarks.loops

@@ -97,8 +97,12 @@ class FaultyWire:
                 self.say(identifier, data)
 
     def say(self, identifier: int, data: bytes) -> None:
-        """A frame to the HAL that no node has sent."""
-        _put(self._hal, can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
+        """A data frame to the HAL that no node has sent."""
+        self.pass_on(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
+
+    def pass_on(self, message: can.Message) -> None:
+        """Any frame to the HAL that no node has sent."""
+        _put(self._hal, message)
 
     def error(self, kind: int, detail: int = 0) -> None:
         """An error frame to the HAL, as a CAN controller reports its own state."""

@@ -84,13 +84,21 @@ class _Stage:
     def enable_again(self, tries=3):
         """Reset and enable, as a person does it: again if the device only now tells that it had to be configured."""
         for _ in range(tries):
-            self.robot.reset()
+            self.until(self.is_reset, "being reset")
             self.until(lambda: self.is_ready, "being ready again")
             self.robot.enable()
             self.until(lambda: self.robot.mode in ("hold", "fault"), "enabling")
             if self.robot.mode == "hold":
                 return
         raise AssertionError(self.robot.fault_text)
+
+    def is_reset(self):
+        """Reset; whether that was taken."""
+        try:
+            self.robot.reset()
+        except CommandRefused:
+            return False
+        return True
 
     def follow(self, value, cycles):
         """Command the same set-point [SI unit] in every cycle."""
