@@ -1,4 +1,4 @@
-"""100 000 random frames at the HAL with every kind of device, random bytes at every parser; `make faults` sends more."""
+"""Random frames at the HAL with every kind of device, random bytes at every parser; `make faults` sends more."""
 
 import itertools
 import random
