@@ -1,6 +1,8 @@
 """Sending: bounded, never queued, and told."""
 
 import errno
+import os
+import socket
 import threading
 import time
 
@@ -10,6 +12,7 @@ from can.interfaces import BACKENDS
 from can.interfaces.virtual import VirtualBus
 
 from hal.bus import Bus
+from hal.bus_kernel import IN_FLIGHT, set_buffers
 from hal.bus_send import FAILED_SENDS, PAUSE, PAUSES, Sender
 from hal.bus_state import BusState
 from hal.clock import SystemClock
@@ -180,3 +183,39 @@ def test_what_canopen_sends_raises_nothing_and_may_wait(bus, interface):
     assert [identifier for identifier, _ in interface.taken] == [0x601]
     bus.close()
     bus.network.send_message(0x601, bytes(8))
+
+
+class OfFile:
+    """As much of an interface as tells which file it uses."""
+
+    def __init__(self, handle):
+        self._handle = handle
+
+    def fileno(self):
+        if self._handle is None:
+            raise NotImplementedError
+        return self._handle
+
+
+def test_a_socket_has_room_for_what_comes_and_little_for_what_goes():
+    here, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with here, there:
+        small = here.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
+        set_buffers(OfFile(here.fileno()))
+        assert here.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) > small
+        taken, before = 0, time.monotonic()
+        with pytest.raises(BlockingIOError):  # though the socket is a blocking one
+            while time.monotonic() - before < LIMIT:
+                here.send(bytes(16))
+                taken += 1
+        assert 0.5 * IN_FLIGHT <= taken <= 2 * IN_FLIGHT
+
+
+@pytest.mark.parametrize("handle", [None, -1, "pipe"])
+def test_what_is_no_socket_is_left_alone_and_nothing_leaks(handle):
+    ends = os.pipe()
+    before = len(os.listdir("/proc/self/fd"))
+    set_buffers(OfFile(ends[0] if handle == "pipe" else handle))
+    assert len(os.listdir("/proc/self/fd")) == before
+    for end in ends:
+        os.close(end)
