@@ -21,8 +21,8 @@ from hal.pulse import pulse
 TRIES = 3
 SETTLE = 10
 """Cycles before values count."""
-LEAST_VALID = 0.9
-"""Share of the cycles that must bring a value."""
+LEAST_VALID = 0.5
+"""Share of the cycles that must bring a new value."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,6 +153,7 @@ class Measuring:
         self._bus = next(bus for bus in buses if bus.name == entry.bus)
         self._device = next(device for device in built if device.name == what.device)
         self._slot = self._device.measures.index(what.element)
+        self._newest = -math.inf
 
     def __enter__(self) -> Self:
         self._bus.open()
@@ -208,14 +209,15 @@ class Measuring:
         return Point(known=known, read=float(fresh.mean()), std=std, samples=len(fresh))
 
     def _cycle(self) -> float:
-        """One cycle; the value [the signal's unit] if a fresh one came in it, else NaN."""
+        """One cycle; the value [the signal's unit] if a new one has come, else NaN."""
         start = self._clock.monotonic()
         self._bus.begin()
         self._device.idle()
         self._bus.sync(start)
         self._bus.wait(start + 0.8 * self._period)
-        reading = self._device.read()
-        value = float(reading.values[self._slot]) if reading.received[self._slot] >= start else math.nan
+        reading, slot = self._device.read(), self._slot
+        value = float(reading.values[slot]) if reading.received[slot] > self._newest else math.nan
+        self._newest = reading.received[slot]
         self._clock.sleep_until(start + self._period)
         return value
 

@@ -45,9 +45,8 @@ class Tap:
             )
         except Exception as error:  # an interface plugin may raise anything
             advice = "Is `gemuco simulate` running?" if config.interface == "hub" else "Is it there, is it up?"
-            raise BusGone(
-                f"Bus '{self.name}' ({config.interface} {config.channel}) does not open: {str(error).rstrip('.')}. {advice}"
-            ) from (error)
+            where, why = f"'{self.name}' ({config.interface} {config.channel})", str(error).rstrip(".")
+            raise BusGone(f"Bus {where} does not open: {why}. {advice}") from error
         return self
 
     def __exit__(
