@@ -8,6 +8,9 @@ from hal.safety.limit import Arrays, Turn, changed
 
 RESPONSE = 0.02
 """How long [s] a drive may lag behind its command."""
+CALM = 2.0
+"""How many times longer the last of the way takes than what is measured is old: with 1 the drive would swing about the
+end, as any loop does whose dead time is as long as its time constant."""
 FADE_BAND = 0.1
 """Part of the range, at each end of it, within which an effort towards the end fades out."""
 
@@ -60,7 +63,8 @@ class EndsOfVelocity:
             deceleration: How fast the command may brake [unit of the command/s], shape (k,); at once if None.
             ahead: How old [s] a position may be by the time at which the drive has followed a command.
         """
-        self._position, self._deceleration, self._ahead = position, deceleration, ahead
+        self._position, self._deceleration = position, deceleration
+        self._ahead = CALM * ahead
 
     def limit(self, wanted: np.ndarray, turn: Turn) -> np.ndarray:
         """See `Limit.limit`."""

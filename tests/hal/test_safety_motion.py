@@ -13,7 +13,7 @@ from hal.robot import Robot
 wishes = st.lists(st.tuples(st.floats(-50, 50), st.floats(-50, 50)), min_size=1, max_size=12)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(wishes, st.integers(1, 40))
 def test_position_commands_keep_range_velocity_and_acceleration(wanted, each):
     bench = SafetyBench("position").enable()
@@ -32,7 +32,7 @@ def test_position_commands_keep_range_velocity_and_acceleration(wanted, each):
     assert ((bench.positions >= -1) & (bench.positions <= 2)).all()
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(wishes, st.integers(10, 90))
 def test_velocity_commands_keep_velocity_acceleration_and_the_range_of_the_position(wanted, each):
     bench = SafetyBench("velocity").enable()
@@ -47,7 +47,7 @@ def test_velocity_commands_keep_velocity_acceleration_and_the_range_of_the_posit
     assert bench.robot.mode == "follow"
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(wishes, st.integers(10, 90))
 def test_effort_commands_never_push_beyond_an_end_and_stop_before_it_is_far(wanted, each):
     bench = SafetyBench("effort").enable()

@@ -257,7 +257,7 @@ class TestHoming:
         bench.until("off")
         with pytest.raises(CommandRefused, match="no homing of its own"):
             bench.robot.home("elbow_drive")
-        with pytest.raises(CommandRefused, match="no drive 'knee' to home"):
+        with pytest.raises(CommandRefused, match="no device 'knee'"):
             bench.robot.home("knee")
         assert bench.robot.mode == "off"
 
