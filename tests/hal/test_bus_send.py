@@ -5,6 +5,7 @@ import os
 import socket
 import threading
 import time
+from pathlib import Path
 
 import can
 import pytest
@@ -214,8 +215,8 @@ def test_a_socket_has_room_for_what_comes_and_little_for_what_goes():
 @pytest.mark.parametrize("handle", [None, -1, "pipe"])
 def test_what_is_no_socket_is_left_alone_and_nothing_leaks(handle):
     ends = os.pipe()
-    before = len(os.listdir("/proc/self/fd"))
+    before = len(list(Path("/proc/self/fd").iterdir()))
     set_buffers(OfFile(ends[0] if handle == "pipe" else handle))
-    assert len(os.listdir("/proc/self/fd")) == before
+    assert len(list(Path("/proc/self/fd").iterdir())) == before
     for end in ends:
         os.close(end)
