@@ -65,6 +65,7 @@ class ModeMachine:
         self._deadline = 0.0
         self._act = Act.IDLE
         self._quick_stops = 0
+        self._is_emergency = False
         self._homing: Device | None = None
         self._homing_seen = False
         self._parked_at: float | None = None
@@ -175,8 +176,11 @@ class ModeMachine:
 
     def emergency(self, text: str) -> None:
         """`fault` in any mode, also in `off` and `fault`, without asking the drives: whoever calls does."""
-        if self.mode is Mode.FAULT and text not in self.fault_text:
+        if self._is_emergency:
+            text = self.fault_text
+        elif self.mode is Mode.FAULT:
             text = f"{text} Before that: {self.fault_text}"
+        self._is_emergency = True
         self.mode, self.fault_text, self._quick_stops = Mode.FAULT, text, QUICK_STOPS
 
     def reset(self) -> None:
@@ -190,7 +194,7 @@ class ModeMachine:
         powered = [d.name for d in self._actuators.devices if d.health().state in _POWERED]
         if powered:
             raise CommandRefused(f"Still enabled: {', '.join(powered)}. If they do not let go, cut the power.")
-        self.mode, self.fault_text = Mode.OFF, ""
+        self.mode, self.fault_text, self._is_emergency = Mode.OFF, "", False
 
     def step(self, now: float, has_command: bool, is_parked: bool = False) -> None:
         """Move on to the mode of this cycle.

@@ -27,6 +27,8 @@ RECEIVE_PRIORITY = 51
 """Above the cycle, which waits for what the receive threads bring."""
 NETWORK_PRIORITY = 45
 TOLD_TO_END = "The HAL was told to end."
+STUCK_AFTER = 2.0
+"""A cycle that did not end for so long [s] will not end any more; the HAL goes without it."""
 AT_REST_WITHIN = 60.0
 """How long [s] the robot may take to come to rest when the HAL is told to end; parking takes longest."""
 
@@ -70,7 +72,7 @@ class HalService:
             self._service.run(self.status, stop)
             self._come_to_rest()
         finally:
-            self._loop.stop()
+            self._loop.stop(STUCK_AFTER)
             self._robot.close()
 
     def _come_to_rest(self) -> None:

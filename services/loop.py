@@ -86,11 +86,15 @@ class Loop:
         self._thread = threading.Thread(target=self._run, name=f"loop {self.name}", daemon=True)
         self._thread.start()
 
-    def stop(self) -> None:
-        """Finish the tick in progress, if any, and end. Safe to call twice, and before `start`."""
+    def stop(self, patience: float | None = None) -> None:
+        """Finish the tick in progress, if any, and end. Safe to call twice, and before `start`.
+
+        Args:
+            patience: How long [s] to wait for a tick that does not end; for ever if None.
+        """
         self._stop.set()
         if self._thread is not None and self._thread is not threading.current_thread():
-            self._thread.join()
+            self._thread.join(patience)
 
     def statistics(self) -> dict[str, float]:
         """How the loop keeps time, for `Status.loops`.

@@ -1,11 +1,12 @@
+import threading
 from collections.abc import Iterator
 
 import numpy as np
 import pytest
 from bad_commands import bad_commands
-from small_arm import description
+from small_arm import description, eventually
 
-from hal.clock import ManualClock
+from hal.clock import Clock, ManualClock, SystemClock
 from hal.config import RobotConfig
 from hal.device import Device, DeviceHealth, DeviceState, Reading
 from hal.robot import Robot
@@ -22,7 +23,7 @@ BOOT = 77
 class Wires(Device):
     """All elements of the small arm in one device; each muscle is at once where it is asked to be."""
 
-    def __init__(self, config: RobotConfig, clock: ManualClock) -> None:
+    def __init__(self, config: RobotConfig, clock: Clock) -> None:
         self.name = "wires"
         self.measures = tuple(config.element_names())
         self.commands = tuple(name for name in self.measures if name.startswith("muscle_length."))
@@ -157,3 +158,35 @@ def test_a_cycle_that_fails_stops_the_robot_and_the_service_goes_on(robot: str) 
         assert body.mode == "fault"
         assert hal.status().text == "The cycle failed: ZeroDivisionError: a bug in a driver"
         body.close()
+
+
+class StuckWires(Wires):
+    """Wires whose driver hangs."""
+
+    def __init__(self, config: RobotConfig, clock: Clock) -> None:
+        super().__init__(config, clock)
+        self.hangs, self.never = threading.Event(), threading.Event()
+
+    def apply(self, values: np.ndarray) -> None:
+        self.hangs.set()
+        self.never.wait(60.0)
+
+
+def test_a_hal_whose_cycle_is_stuck_stops_its_drives_and_ends_when_told(robot: str) -> None:
+    config = RobotConfig.model_validate(description(robot))
+    wires = StuckWires(config, SystemClock())
+    stop = threading.Event()
+    with Service(robot, "hal") as service:
+        body = Robot(config, [wires])
+        hal = HalService(config, body, service)
+        thread = threading.Thread(target=hal.run, args=(stop,))
+        thread.start()
+        eventually(lambda: body.health()["cycles"] > 1)
+        body.enable()
+        assert wires.hangs.wait(5.0)
+        stop.set()
+        thread.join(30.0)
+        assert not thread.is_alive()
+    assert wires.health().state is DeviceState.CLOSED
+    wires.never.set()
+    assert body.fault_text == "Emergency stop: The HAL was told to end."
