@@ -14,6 +14,7 @@ from hal.calibration_fit import CalibrationRefused, Line
 from hal.calibration_store import Point, Record
 from hal.clock import SystemClock
 from hal.config import RobotConfig
+from hal.device import DeviceState
 from hal.errors import ConfigError, DeviceSilent
 from hal.fleet import build
 from hal.pulse import pulse
@@ -21,8 +22,8 @@ from hal.pulse import pulse
 TRIES = 3
 SETTLE = 10
 """Cycles before values count."""
-LEAST_VALID = 0.5
-"""Share of the cycles that must bring a new value."""
+LONGEST = 400
+"""After so many cycles, or four times what is wanted if that is more, a device has had its chance."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,18 +163,23 @@ class Measuring:
         self._open.callback(self._device.close)
         try:
             self._turn = self._open.enter_context(pulse([self._bus]))
-            for left in reversed(range(TRIES)):
-                try:
-                    self._device.open()
-                    break
-                except DeviceSilent:
-                    if not left:
-                        raise
+            self._revive()
             self.identity = self._device.identity
         except BaseException:
             self._open.close()
             raise
         return self
+
+    def _revive(self) -> None:
+        """Open the device, also if it was lost in between, as by a cable that was pulled."""
+        for left in reversed(range(TRIES)):
+            if self._device.health().state is DeviceState.READY:
+                return
+            try:
+                self._device.open()
+            except DeviceSilent:
+                if not left:
+                    raise
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -192,12 +198,15 @@ class Measuring:
             CalibrationRefused: It brings no values, or they do not stand still.
         """
         cycles = max(20, round(duration / self._period))
-        with self._turn:
-            values = np.array([self._cycle() for _ in range(SETTLE + cycles)][SETTLE:])
-        fresh = values[np.isfinite(values)]
-        if len(fresh) < LEAST_VALID * cycles:
-            why = self._device.health().text or "Is the rate of the robot file more than it can do?"
-            raise CalibrationRefused(f"'{self._device.name}' brought {len(fresh)} values in {cycles} cycles. {why}")
+        for left in reversed(range(TRIES)):
+            self._revive()
+            fresh, turns = self._gather(cycles)
+            if len(fresh) == cycles:
+                break
+            health = self._device.health()
+            if health.state is DeviceState.READY or not left:
+                why = health.text or "Is the rate of the robot file more than it can do?"
+                raise CalibrationRefused(f"'{self._device.name}' brought {len(fresh)} values in {turns} cycles. {why}")
         std, half = float(fresh.std()), len(fresh) // 2
         drift = abs(float(fresh[half:].mean() - fresh[:half].mean()))
         if max(std, drift) > noise:
@@ -207,6 +216,18 @@ class Measuring:
                 f"{unit}, and at most {noise:g} {unit} is taken. Wait until it hangs still, or allow more with --noise."
             )
         return Point(known=known, read=float(fresh.mean()), std=std, samples=len(fresh))
+
+    def _gather(self, wanted: int) -> tuple[np.ndarray, int]:
+        """So many new values [the signal's unit], shape (n,), or fewer if they do not come; in how many cycles."""
+        fresh: list[float] = []
+        turns = 0
+        with self._turn:
+            for _ in range(SETTLE):
+                self._cycle()
+            while len(fresh) < wanted and turns < max(4 * wanted, LONGEST):
+                value, turns = self._cycle(), turns + 1
+                fresh += [value] if math.isfinite(value) else []
+        return np.array(fresh), turns
 
     def _cycle(self) -> float:
         """One cycle; the value [the signal's unit] if a new one has come, else NaN."""

@@ -8,6 +8,9 @@ from hal.budget import OWN_HEARTBEAT_RATE
 from hal.bus import Bus
 from hal.clock import SystemClock
 
+PATIENCE = 0.01
+"""How long [s] to wait for the nodes' answers, so that those of one SYNC are not taken for a second node's."""
+
 
 @contextmanager
 def pulse(buses: Sequence[Bus]) -> Iterator[threading.Lock]:
@@ -17,9 +20,12 @@ def pulse(buses: Sequence[Bus]) -> Iterator[threading.Lock]:
     def beat() -> None:
         while not over.wait(1.0 / OWN_HEARTBEAT_RATE):
             with lock:
+                start = clock.monotonic()
                 for bus in buses:
                     bus.begin()
-                    bus.sync(clock.monotonic())
+                    bus.sync(start)
+                for bus in buses:
+                    bus.wait(start + PATIENCE)
 
     thread = threading.Thread(target=beat, name="pulse", daemon=True)
     thread.start()

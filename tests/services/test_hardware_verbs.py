@@ -37,6 +37,14 @@ class Stage:
     def gemuco(self, *words: str, robot: bool = True) -> Result:
         return CliRunner().invoke(app, [*words, *([str(self.path)] if robot else [])], catch_exceptions=False)
 
+    def doctor(self, wanted: str) -> Result:
+        """What the doctor says; asked again if this machine was too busy for the nodes to answer in time."""
+        for _ in range(5):
+            told = self.gemuco("doctor")
+            if wanted in told.output:
+                break
+        return told
+
     def calibrate(self, kind: str, device: str, *words: str) -> Result:
         command = ["calibrate", kind, str(self.path), device, *words, "--seconds", "0.2"]
         return CliRunner().invoke(app, command, catch_exceptions=False)
@@ -60,7 +68,13 @@ class Stage:
 
 
 def description(robot: str) -> dict[str, object]:
-    drive = {"eds": "eds/servo_drive.eds", "counts_per_turn": 4096, "gear": 29, "spool_radius": 0.008}
+    drive = {
+        "eds": "eds/servo_drive.eds",
+        "counts_per_turn": 4096,
+        "gear": 29,
+        "spool_radius": 0.008,
+        "watch_time": 5.0,
+    }
     return {
         "robot": robot,
         "signals": {
@@ -139,7 +153,7 @@ def test_what_is_asked_wrongly_is_one_sentence(words: tuple[str, ...], said: str
 
 
 def test_doctor_finds_what_is_wrong(stage: Stage) -> None:
-    told = stage.gemuco("doctor")
+    told = stage.doctor(", 0 bad.")
     assert told.exit_code == 0, told.output
     assert "ok       nodes                    All 3 answer." in told.output
     assert all(line.split()[0] in ("ok", "warning", "bad") for line in told.output.splitlines()[:-1])
