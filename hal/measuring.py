@@ -69,6 +69,21 @@ class Subject:
         registry.equipment(self.config, self.device, measured)
         return measured
 
+    def wrap(self, line: Line) -> str:
+        """Why an encoder of one turn would jump within the joint's limits, in a sentence; empty if it would not."""
+        _, settings = registry.equipment(self.config, self.device)
+        signal, _, element = self.element.partition(".")
+        if getattr(settings, "around", 0.0) is not None:
+            return ""
+        low, high = (bound[self.config.signals[signal].elements.index(element)] for bound in self.config.bounds(signal))
+        first, last = sorted((line.zero, line.zero + line.factor * 2.0 * math.pi))
+        if not math.isfinite(low + high) or first <= low <= high <= last:
+            return ""
+        return (
+            f"If this encoder tells only one turn, its counts begin again at {line.zero:.4g} rad, within the limits "
+            f"{low:.4g} to {high:.4g} rad: give it `around: {(low + high) / 2:.3g}` in the robot file."
+        )
+
     def _in_force(self, identity: str) -> Any:
         measured: Mapping[str, Any] = {}
         for record in calibration_store.records(self.config):

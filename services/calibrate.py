@@ -83,6 +83,8 @@ def _calibrate(
         now = device.now
         line = fit(points, now)
         _show(console, found, points, now, line)
+        if found.factor == "direction" and (told := found.wrap(line)):
+            console.print(f"[yellow]{told}[/]")
         if not (wanted.yes or typer.confirm("Store it?")):
             console.print("Not stored.")
             return 1

@@ -9,7 +9,7 @@ import yaml
 from hal_bench import ROBOTS, BenchWorld, description, hardware
 
 from hal import calibration_store
-from hal.calibration_fit import CalibrationRefused, cell_line, joint_line
+from hal.calibration_fit import CalibrationRefused, Line, cell_line, joint_line
 from hal.calibration_store import Point, Record
 from hal.clock import SystemClock
 from hal.config import RobotConfig
@@ -279,6 +279,15 @@ def test_another_device_in_the_place_of_the_one_that_was_calibrated_is_refused(c
     with pytest.raises(WrongDevice, match=r"its calibration is of canopen:1-2-3. Was it replaced\?"):
         encoder.open()
     encoder._bus.close()
+
+
+def test_an_encoder_that_would_begin_again_within_the_limits_is_told(config):
+    limits = {**description()["limits"], "joint_position": {"low": -1.0, "high": 1.0}}
+    what = subject(RobotConfig.model_validate(description(limits=limits)), "elbow_encoder", "direction")
+    assert "begin again at 0.5 rad" in what.wrap(Line(0.5, 1, 0.0))
+    assert "`around: 0`" in what.wrap(Line(0.5, -1, 0.0))
+    assert not what.wrap(Line(-3.0, 1, 0.0))
+    assert not subject(config, "elbow_encoder", "direction").wrap(Line(0.5, 1, 0.0))  # it has no limits
 
 
 def test_what_cannot_be_calibrated_is_told(config):

@@ -152,6 +152,15 @@ def test_what_is_asked_wrongly_is_one_sentence(words: tuple[str, ...], said: str
     assert said in " ".join(told.output.replace("│", " ").split())
 
 
+@pytest.mark.parametrize(
+    "words", [("scan",), ("doctor",), ("calibrate", "joint"), ("calibrate", "cell"), ("can", "dump")]
+)
+def test_every_verb_explains_itself(words: tuple[str, ...]) -> None:
+    told = CliRunner().invoke(app, [*words, "--help"])
+    assert told.exit_code == 0
+    assert "ROBOT" in told.output
+
+
 def test_doctor_finds_what_is_wrong(stage: Stage) -> None:
     told = stage.doctor(", 0 bad.")
     assert told.exit_code == 0, told.output
