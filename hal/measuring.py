@@ -77,7 +77,7 @@ class Subject:
             return ""
         low, high = (bound[self.config.signals[signal].elements.index(element)] for bound in self.config.bounds(signal))
         first, last = sorted((line.zero, line.zero + line.factor * 2.0 * math.pi))
-        if not math.isfinite(low + high) or first <= low <= high <= last:
+        if not (math.isfinite(low) and math.isfinite(high)) or first <= low <= high <= last:
             return ""
         return (
             f"If this encoder tells only one turn, its counts begin again at {line.zero:.4g} rad, within the limits "
