@@ -26,7 +26,8 @@ def explain(error: ValidationError, model: type[BaseModel]) -> str:
         return f"unknown key '{where}'. Known keys there: {known}."
     message = first["msg"].removeprefix("Value error, ")
     more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
-    return f"{where}: {message}{more}" if where else f"{message}{more}"
+    sentence = f"{message.removesuffix('.')}{more}"
+    return f"{where + ': ' if where else ''}{sentence}{'' if sentence.endswith('?') else '.'}"
 
 
 def _model_at(model: type[BaseModel], location: tuple[int | str, ...]) -> type[BaseModel]:
