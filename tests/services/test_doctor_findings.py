@@ -1,0 +1,68 @@
+"""What the doctor makes of this machine, of open ports, and of a HAL's status."""
+
+import socket
+
+import pytest
+
+from hal.findings import Verdict
+from services import doctor, host_checks
+from services.messages import Status
+
+BUS = {"state": "ok", "text": "", "load": 0.41, "unknown": []}
+DEVICE = {"state": "ready", "text": "", "counters": {}}
+FACTS = {
+    "mode": "hold",
+    "fault": "",
+    "buses": {"can0": BUS},
+    "devices": {"elbow": DEVICE, "wrist": DEVICE},
+    "cycles": 1000,
+    "incomplete": 1,
+    "limits": "",
+}
+LOOP = {"rate": 200.0, "rate_wanted": 200.0, "late_p99": 0.0002}
+
+
+def told(**changes: object) -> dict[str, tuple[Verdict, str]]:
+    loops = {"hal": {**LOOP, **changes.pop("loop", {})}}  # type: ignore[dict-item]
+    status = Status(service="hal", state="running", loops=loops, facts={**FACTS, **changes})
+    return {found.what: (found.verdict, found.text) for found in doctor.from_status(status)}
+
+
+def test_a_hal_that_is_well() -> None:
+    found = told()
+    assert {verdict for verdict, _ in found.values()} == {Verdict.OK}
+    assert "All 2 answer" in found["nodes"][1]
+
+
+@pytest.mark.parametrize(
+    ("changes", "what", "verdict", "said"),
+    [
+        ({"fault": "The elbow is stuck."}, "fault", Verdict.BAD, "stuck"),
+        ({"buses": {"can0": {**BUS, "state": "passive", "text": "Check wiring."}}}, "bus can0", Verdict.BAD, "wiring"),
+        ({"buses": {"can0": {**BUS, "state": "warning", "text": "Hm."}}}, "bus can0", Verdict.WARNING, "Hm."),
+        ({"buses": {"can0": {**BUS, "unknown": ["node 33"]}}}, "strangers can0", Verdict.WARNING, "node 33"),
+        ({"devices": {"elbow": {**DEVICE, "state": "silent", "text": "Gone."}}}, "node elbow", Verdict.BAD, "Gone."),
+        ({"devices": {"elbow": {**DEVICE, "text": "Warm."}}}, "node elbow", Verdict.WARNING, "Warm."),
+        ({"incomplete": 100}, "cycles", Verdict.WARNING, "90.0% of 1000 cycles"),
+        ({"loop": {"late_p99": 0.02}}, "cycle time", Verdict.WARNING, "Is this machine busy?"),
+        ({"limits": "Blind."}, "limits", Verdict.WARNING, "Blind."),
+    ],
+)
+def test_a_hal_that_is_not(changes: dict[str, object], what: str, verdict: Verdict, said: str) -> None:
+    found = told(**changes)
+    assert found[what][0] is verdict
+    assert said in found[what][1]
+
+
+def test_open_ports_are_seen_with_their_addresses() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as inside, socket.create_server(("0.0.0.0", 0)) as outside:
+        ports = {number: address for address, number in doctor.listening()}
+        assert doctor._is_loopback(ports[inside.getsockname()[1]])
+        assert not doctor._is_loopback(ports[outside.getsockname()[1]])
+
+
+def test_every_check_of_this_machine_says_something() -> None:
+    found = [*host_checks.clocks(), *host_checks.real_time()]
+    names = ["wall clock", "clock steps", "clock source", "scheduling", "memory", "processor"]
+    assert [finding.what for finding in found] == names
+    assert all(finding.text for finding in found)
