@@ -217,10 +217,11 @@ class DbcServo(DbcNode):
             self._begin(DISABLE)
 
     def quick_stop(self) -> None:
-        """See `Device.quick_stop`; one that is under way goes on."""
+        """See `Device.quick_stop`; its first frame goes out at once, for the cycle may be stuck."""
         self._is_wanted = False
         if not self._is_stopping:
             self._begin(QUICK_STOP)
+            self._activity.advance(self._bus.send)
 
     @property
     def _is_stopping(self) -> bool:

@@ -2,6 +2,7 @@
 
 import math
 import struct
+import threading
 
 import numpy as np
 import pytest
@@ -257,11 +258,12 @@ def test_an_emergency_stop_brakes_before_it_lets_go(bench):
     follow(bench, 2.0, 60)
     speed = axis(bench)._rotor.velocity
     assert speed > 1.0  # rad/s
-    result = {}
-    bench.while_time_passes(lambda: result.update(report=bench.robot.estop("a test")))
-    bench.cycle(60)
-    assert bench.robot.mode == "fault"
+    stopping = threading.Thread(target=bench.robot.estop, args=("a test",))
+    stopping.start()
+    bench.until(lambda: not stopping.is_alive(), "stopped")
     assert axis(bench).condition == "idle"
+    assert abs(axis(bench)._rotor.velocity) < 0.1  # rad/s
+    assert bench.robot.mode == "fault"
     assert axis(bench).error == 0
 
 
