@@ -44,8 +44,7 @@ def configure_pdos(sdo: SdoClient, pdos: PdoMap, node: int, label: str) -> None:
     """
     _silence_others(sdo, pdos, node)
     for side, pdo in _each(pdos):
-        found = _mapped(sdo, side, pdo.number)
-        if pdos.is_fixed and found != [item.entry for item in pdo.objects]:
+        if pdos.is_fixed and (found := _mapped(sdo, side, pdo.number)) != [item.entry for item in pdo.objects]:
             raise DeviceRefused(
                 f"{label} has another PDO mapping than it should: {side.name}{pdo.number} carries {_describe(found)}, "
                 f"and should carry {pdo}. Is it the right data sheet, the right `pdo` in the robot file?"
@@ -53,9 +52,10 @@ def configure_pdos(sdo: SdoClient, pdos: PdoMap, node: int, label: str) -> None:
         try:
             _map(sdo, side, pdo, cob_id(side.cob_id, pdo.number, node), pdos.is_fixed)
         except DeviceRefused as error:
+            has = _describe(_mapped(sdo, side, pdo.number))
             raise DeviceRefused(
-                f"{label} does not take {side.name}{pdo.number} as {pdo}; it has {_describe(found)}. {error} If its "
-                "mapping cannot be changed, give it in the robot file as `pdo` with `fixed: true`."
+                f"{label} does not take {side.name}{pdo.number} as {pdo}; it has {has}. {error} If its mapping cannot be "
+                "changed, give it in the robot file as `pdo` with `fixed: true`."
             ) from error
 
 
@@ -105,7 +105,7 @@ def _describe(entries: list[int]) -> str:
 def _map(sdo: SdoClient, side: _Side, pdo: Pdo, cob: int, is_fixed: bool) -> None:
     """Set one PDO up in the order that CiA 301 (7.5.2.36) asks for: off, empty, fill, count, on."""
     parameters, mapping = side.parameters + pdo.number - 1, side.mapping + pdo.number - 1
-    cob |= sdo.read(parameters, 1) & _NO_REQUESTS
+    cob |= _no_requests(sdo, parameters)
     sdo.write(parameters, 1, cia301.PDO_INVALID | cob, 4)
     sdo.write_checked(parameters, 2, pdo.transmission, 1)
     if pdo.event_time:
@@ -121,6 +121,14 @@ def _map(sdo: SdoClient, side: _Side, pdo: Pdo, cob: int, is_fixed: bool) -> Non
         raise DeviceRefused(f"PDO parameter {parameters:04X}h:1 reads back {found:08X}h after writing {cob:08X}h.")
 
 
+def _no_requests(sdo: SdoClient, parameters: int) -> int:
+    """The bit as the node has it; not set in one that does not tell."""
+    try:
+        return sdo.read(parameters, 1) & _NO_REQUESTS
+    except DeviceRefused:
+        return 0
+
+
 def _silence_others(sdo: SdoClient, pdos: PdoMap, node: int) -> None:
     """Switch off what would load the bus unasked."""
     for side, of_side in ((_RECEIVES, pdos.receives), (_SENDS, pdos.sends)):
@@ -128,4 +136,4 @@ def _silence_others(sdo: SdoClient, pdos: PdoMap, node: int) -> None:
         for number in range(1, cia301.PDO_PER_DIRECTION + 1):
             if number not in used and sdo.can_write(side.parameters + number - 1, 1):
                 index, cob = side.parameters + number - 1, cob_id(side.cob_id, number, node)
-                sdo.write(index, 1, cia301.PDO_INVALID | cob | (sdo.read(index, 1) & _NO_REQUESTS), 4)
+                sdo.write(index, 1, cia301.PDO_INVALID | cob | _no_requests(sdo, index), 4)
