@@ -54,8 +54,8 @@ def configure_pdos(sdo: SdoClient, pdos: PdoMap, node: int, label: str) -> None:
         except DeviceRefused as error:
             has = _describe(_mapped(sdo, side, pdo.number))
             raise DeviceRefused(
-                f"{label} does not take {side.name}{pdo.number} as {pdo}; it has {has}. {error} If its mapping cannot be "
-                "changed, give it in the robot file as `pdo` with `fixed: true`."
+                f"{label} does not take {side.name}{pdo.number} as {pdo}; it has {has}. {error} If its mapping cannot "
+                "be changed, give it in the robot file as `pdo` with `fixed: true`."
             ) from error
 
 
