@@ -44,12 +44,14 @@ def one(limit, wanted, before=0.5, **measured):
     return float(limit.limit(np.array([wanted]), turn)[0])
 
 
+@settings(deadline=None)
 @given(wishes)
 def test_a_range_is_never_left(wanted):
     found = along([Range(np.array([LOW]), np.array([HIGH]))], wanted, 0.0)
     assert ((found >= LOW) & (found <= HIGH)).all()
 
 
+@settings(deadline=None)
 @given(wishes, st.floats(-1, 2), st.floats(0.01, 100.0), periods)
 def test_no_step_is_larger_than_the_rate_allows(wanted, start, rate, period):
     found = along([Rate(rate, period)], wanted, start)
@@ -57,6 +59,7 @@ def test_no_step_is_larger_than_the_rate_allows(wanted, start, rate, period):
     assert (steps <= rate * period * (1 + 1e-9) + 1e-9 * np.abs(found).max()).all()
 
 
+@settings(deadline=None)
 @given(st.floats(1e-6, 10.0), st.floats(0.1, 100.0), periods)
 def test_the_fastest_speed_is_braked_within_the_distance_and_no_slower_than_need_be(distance, deceleration, period):
     speed = float(fastest(np.array([distance]), deceleration, period)[0])
@@ -69,7 +72,7 @@ def test_the_fastest_speed_is_braked_within_the_distance_and_no_slower_than_need
     assert speed >= min(ideal - deceleration * period, distance / period) * (1 - 1e-9)
 
 
-@settings(max_examples=60)
+@settings(max_examples=60, deadline=None)
 @given(wishes, st.floats(LOW, HIGH), st.floats(0.5, 50.0), st.floats(0.1, 10.0), periods)
 def test_a_ramp_keeps_acceleration_rate_and_range_whatever_is_commanded(wanted, start, acceleration, rate, period):
     limits = [Range(np.array([LOW]), np.array([HIGH])), Acceleration(acceleration, period), Rate(rate, period)]
@@ -81,7 +84,7 @@ def test_a_ramp_keeps_acceleration_rate_and_range_whatever_is_commanded(wanted, 
     assert np.abs(change).max() <= acceleration * (1 + 1e-6) + 1e-5
 
 
-@settings(max_examples=25)
+@settings(max_examples=25, deadline=None)
 @given(st.floats(LOW, HIGH), st.floats(LOW, HIGH), st.floats(2.0, 50.0))
 def test_a_ramp_arrives_without_overshoot_and_stays(start, goal, acceleration):
     limits = [Acceleration(acceleration, PERIOD), Rate(3.0, PERIOD)]
@@ -141,6 +144,7 @@ def test_without_a_position_there_is_no_velocity_and_no_effort_and_it_is_told():
         assert ends.blind({"p": np.zeros(1)}) == []
 
 
+@settings(deadline=None)
 @given(st.floats(-50, 50), st.floats(-3, 4))
 def test_an_effort_towards_an_end_fades_out_and_back_it_acts_in_full(wanted, position):
     found = one(EndsOfEffort("range", way()), wanted, 0.0, p=position)
@@ -162,6 +166,7 @@ def test_an_effort_fades_out_towards_the_highest_velocity():
     assert one(fade, -5.0, 0.0, v=2.5) == -5.0
 
 
+@settings(deadline=None)
 @given(st.floats(-2, 3), st.floats(0, 500))
 def test_a_tense_wire_only_moves_towards_relief(wanted, tension):
     limit = SoftEffort(load(), np.array([0.2]), np.array([LOW]), np.array([HIGH]), PERIOD)
@@ -173,6 +178,7 @@ def test_a_tense_wire_only_moves_towards_relief(wanted, tension):
     assert found >= min(wanted, 0.5)
 
 
+@settings(deadline=None)
 @given(st.floats(-2, 3), st.floats(-500, 500))
 def test_a_loaded_joint_only_moves_against_its_effort(wanted, effort):
     limit = SoftEffort(load(is_signed=True), np.array([0.2]), np.array([LOW]), np.array([HIGH]), PERIOD)
@@ -186,6 +192,7 @@ def test_a_loaded_joint_only_moves_against_its_effort(wanted, effort):
         assert found == wanted
 
 
+@settings(deadline=None)
 @given(st.floats(-5, 5), st.floats(-500, 500), st.booleans())
 def test_a_loaded_velocity_only_relieves(wanted, effort, is_signed):
     found = one(SoftEffortOfVelocity(load(is_signed=is_signed), np.array([1.0])), wanted, 0.0, f=effort)

@@ -10,6 +10,7 @@ from hal.config import RobotConfig
 from hal.errors import CommandRefused, ConfigError
 from hal.robot import Robot
 
+ROUNDING = 1e-9
 wishes = st.lists(st.tuples(st.floats(-50, 50), st.floats(-50, 50)), min_size=1, max_size=12)
 
 
@@ -22,14 +23,14 @@ def test_position_commands_keep_range_velocity_and_acceleration(wanted, each):
         for _ in range(each):
             bench.follow(wish)
             now = (bench.positions - before) / PERIOD
-            assert ((bench.positions >= -1) & (bench.positions <= 2)).all()
+            assert ((bench.positions >= -1 - ROUNDING) & (bench.positions <= 2 + ROUNDING)).all()
             assert (np.abs(now) <= 1.0 + 1e-9).all()
             assert (np.abs(now - speed) <= 10.0 * PERIOD + 1e-9).all()
             before, speed = bench.positions, now
     bench.cycle(60)
     assert bench.robot.mode == "hold"
     assert (bench.velocities == 0).all()
-    assert ((bench.positions >= -1) & (bench.positions <= 2)).all()
+    assert ((bench.positions >= -1 - ROUNDING) & (bench.positions <= 2 + ROUNDING)).all()
 
 
 @settings(max_examples=25, deadline=None)
@@ -40,7 +41,7 @@ def test_velocity_commands_keep_velocity_acceleration_and_the_range_of_the_posit
     for wish in wanted:
         for _ in range(each):
             bench.follow(wish)
-            assert ((bench.positions >= -1) & (bench.positions <= 2)).all()
+            assert ((bench.positions >= -1 - ROUNDING) & (bench.positions <= 2 + ROUNDING)).all()
             assert (np.abs(bench.velocities) <= 1.0).all()
             assert (np.abs(bench.velocities - before) <= 5.0 * PERIOD + 1e-9).all()
             before = bench.velocities
