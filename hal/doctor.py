@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from hal import budget, calibration_store
 from hal.bus import Bus
 from hal.bus_state import BusState
+from hal.calibration import Calibration
 from hal.clock import SystemClock
 from hal.config import RobotConfig
 from hal.device import Device
@@ -31,7 +32,7 @@ MUTE = 0.5
 def described(config: RobotConfig) -> Iterator[Finding]:
     """The robot file, the budget of its buses, and its calibrations: nothing is opened."""
     try:
-        build(config, SystemClock(), {})
+        build(config, SystemClock(), _calibrations(config))
     except ConfigError as error:
         yield bad("robot file", str(error))
         return
@@ -40,6 +41,14 @@ def described(config: RobotConfig) -> Iterator[Finding]:
     for found in budget.budgets(config):
         yield ok(f"budget {found.bus}", f"{found}.")
     yield calibrated(config)
+
+
+def _calibrations(config: RobotConfig) -> dict[str, Calibration]:
+    """Those that are stored; none if one is refused, which `calibrated` tells: the rest can be looked at all the same."""
+    try:
+        return calibration_store.load(config)
+    except ConfigError:
+        return {}
 
 
 def calibrated(config: RobotConfig) -> Finding:
@@ -73,11 +82,7 @@ def examine(config: RobotConfig, duration: float = DURATION) -> Iterator[Finding
         ConfigError: The robot file cannot be built.
     """
     clock = SystemClock()
-    try:
-        calibrations = calibration_store.load(config)
-    except ConfigError:  # `calibrated` tells it, and the devices can be looked at all the same
-        calibrations = {}
-    buses, devices = build(config, clock, calibrations)
+    buses, devices = build(config, clock, _calibrations(config))
     pool = ThreadPoolExecutor(max(1, len(devices)))
     for bus in buses:
         bus.open()

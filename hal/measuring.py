@@ -17,6 +17,7 @@ from hal.config import RobotConfig
 from hal.device import DeviceState
 from hal.errors import ConfigError, DeviceSilent
 from hal.fleet import build
+from hal.limit_config import LimitConfig
 from hal.pulse import pulse
 
 TRIES = 3
@@ -51,7 +52,10 @@ class Subject:
 
     def in_force(self, identity: str) -> Line:
         """Zero and direction or gain now: those of an earlier calibration of this very device, or the robot file's."""
-        settings = self._in_force(identity)
+        return self._line(self._measured(identity))
+
+    def _line(self, measured: Mapping[str, Any]) -> Line:
+        _, settings = registry.equipment(self.config, self.device, measured)
         return Line(self._at(settings.zero, 0.0), self._at(getattr(settings, self.factor), 1.0), 0.0)
 
     def settings(self, line: Line, identity: str) -> dict[str, Any]:
@@ -60,7 +64,7 @@ class Subject:
         Raises:
             ConfigError: The driver does not take it.
         """
-        now = self._in_force(identity)
+        _, now = registry.equipment(self.config, self.device, self._measured(identity))
         factor = round(line.factor) if self.factor == "direction" else line.factor
         measured = {
             "zero": self._with(now.zero, line.zero, 0.0),
@@ -68,6 +72,19 @@ class Subject:
         }
         registry.equipment(self.config, self.device, measured)
         return measured
+
+    def limits(self) -> dict[str, LimitConfig]:
+        """The robot file's limits, those of the element turned into what it reads without zero, direction and gain."""
+        signal, _, element = self.element.partition(".")
+        limit = self.config.limits.get(signal)
+        if limit is None:
+            return dict(self.config.limits)
+        line, place = self._line({}), self.config.signals[signal].elements.index(element)
+        low, high = self.config.bounds(signal)
+        ends = sorted((bound[place] - line.zero) / line.factor for bound in (low, high))
+        low[place], high[place] = ends
+        moved = limit.model_copy(update={"low": tuple(low.tolist()), "high": tuple(high.tolist())})
+        return {**self.config.limits, signal: moved}
 
     def wrap(self, line: Line) -> str:
         """Why an encoder of one turn would jump within the joint's limits, in a sentence; empty if it would not."""
@@ -84,13 +101,13 @@ class Subject:
             f"{low:.4g} to {high:.4g} rad: give it `around: {(low + high) / 2:.3g}` in the robot file."
         )
 
-    def _in_force(self, identity: str) -> Any:
-        measured: Mapping[str, Any] = {}
+    def _measured(self, identity: str) -> Mapping[str, Any]:
+        """The settings of an earlier calibration of this very device, if there is one that holds."""
         for record in calibration_store.records(self.config):
             if record.device == self.device and record.identity == identity:
                 with contextlib.suppress(ConfigError):  # one that is refused is not in force
-                    measured = calibration_store.checked(self.config, record).settings
-        return registry.equipment(self.config, self.device, measured)[1]
+                    return calibration_store.checked(self.config, record).settings
+        return {}
 
     def _at(self, given: Any, default: float) -> float:
         chosen = given[self.place[0]] if isinstance(given, list | tuple) else given
@@ -161,10 +178,10 @@ class Measuring:
         plain = {**entry.settings, "zero": 0.0, what.factor: 1 if what.factor == "direction" else 1.0}
         if config.settings_of(what.device).get("around") is not None:  # which is of calibrated angles
             plain["around"] = None
-        devices = {**config.devices, what.device: entry.model_copy(update={"settings": plain})}
         self._clock = SystemClock()
         self._period = 1.0 / config.rates.hal
-        alone = config.model_copy(update={"devices": devices, "limits": {}})  # limits are of calibrated values
+        device = {what.device: entry.model_copy(update={"settings": plain})}
+        alone = config.model_copy(update={"devices": device, "limits": what.limits()})
         buses, built = build(alone, self._clock, calibrations={})
         self._bus = next(bus for bus in buses if bus.name == entry.bus)
         self._device = next(device for device in built if device.name == what.device)

@@ -290,6 +290,16 @@ def test_an_encoder_that_would_begin_again_within_the_limits_is_told(config):
     assert not subject(config, "elbow_encoder", "direction").wrap(Line(0.5, 1, 0.0))  # it has no limits
 
 
+def test_limits_are_turned_into_what_the_device_reads():
+    body = description()
+    body["devices"]["triceps_drive"]["settings"] = {"zero": 0.2, "direction": -1}
+    what = subject(RobotConfig.model_validate(body), "triceps_drive", "direction")
+    limit = what.limits()["muscle_length"]
+    assert limit.low == pytest.approx((0.1, -0.3))
+    assert limit.high == pytest.approx((0.5, 0.1))
+    assert limit.rate == 0.25
+
+
 def test_what_cannot_be_calibrated_is_told(config):
     with pytest.raises(ConfigError, match=r"'knee' is neither a device nor an element of one\. Devices: biceps_drive"):
         subject(config, "knee", "direction")
