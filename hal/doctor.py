@@ -44,7 +44,7 @@ def described(config: RobotConfig) -> Iterator[Finding]:
 
 
 def _calibrations(config: RobotConfig) -> dict[str, Calibration]:
-    """Those that are stored; none if one is refused, which `calibrated` tells: the rest can be looked at all the same."""
+    """Those that are stored; none if one is refused, which `calibrated` tells: the rest can be looked at even so."""
     try:
         return calibration_store.load(config)
     except ConfigError:
