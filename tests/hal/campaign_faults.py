@@ -1,7 +1,7 @@
 """The faults of the campaign: how each begins, how it is noticed, what the robot is to do, and how it ends."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 from wire_bench import PERIOD
@@ -97,7 +97,7 @@ def _chances(**chances):
     def begin(run):
         run.before = run.counts()
         for wire in run.bench.faulty.values():
-            wire.chances = replace(Chances(), **chances)
+            wire.chances = Chances(**chances)
         run.bench.referee.extra_age = chances.get("delayed_by", 0.0)
         run.bench.referee.lies = "corrupt" in chances
 
@@ -177,11 +177,6 @@ def _vanishes(run):
     run.bench.unplug("can0")
 
 
-def _is_reopened(run):
-    """The adapter is there again; the HAL finds it by itself."""
-    _clears(run)
-
-
 def _cut(run):
     run.victim = DRIVES["biceps_drive"]
     run.bench.faulty["can0"].is_cut = True
@@ -214,7 +209,7 @@ SILENT = (
     Fault("drive measures no more", _breaks("sensor_silent", DRIVES), _is_invalid, STOPS, _comes_back, BAR),
     Fault("sensor measures no more", _breaks("sensor_silent", SENSORS), _is_invalid, GOES_ON, _comes_back, BAR),
     Fault("wire cut", _cut, _is_invalid, STOPS, _clears, BAR),
-    Fault("interface vanishes and returns", _vanishes, _is_invalid, STOPS, _is_reopened, BAR),
+    Fault("interface vanishes and returns", _vanishes, _is_invalid, STOPS, _clears, BAR),
 )
 SELF_TOLD = (
     Fault("drive reboots", _breaks("node_reboot", DRIVES), _has_stopped, STOPS, bar=BAR),

@@ -1,7 +1,7 @@
 """What hangs on the arm's bus: every drive with its own electrical constants.
 
 Kept apart from the robot file on purpose: a robot file that disagrees with the hardware must read wrong values here as
-it would on a bench. tests/simulators/test_pr2_hardware.py checks that ours agrees.
+it would on a bench. tests/simulators/test_robots_hardware.py checks that ours agrees.
 """
 
 from simulators.nodes.spec import DriveConstants, NodeSpec
