@@ -39,6 +39,8 @@ class Limiter:
         self._rate = None if limit.rate is None else per_element(limit.rate, self._size, name)
         self._acceleration = None if limit.acceleration is None else per_element(limit.acceleration, self._size, name)
         nature = roles.natures(config, devices)
+        if quantity != "position":
+            roles.check_known(config, nature)
         self._positions = [roles.own_way(config)] if quantity == "position" else roles.ways(config, nature, "position")
         self._velocities = roles.ways(config, nature, "velocity")
         self._trips = Trips(config, self._positions)

@@ -34,6 +34,22 @@ def ways(config: RobotConfig, nature: Mapping[str, str], quantity: str) -> list[
     return found
 
 
+def check_known(config: RobotConfig, nature: Mapping[str, str]) -> None:
+    """Whether every range that may be meant to end a motion is of something known.
+
+    Raises:
+        ConfigError: Nobody can tell whether a range is of a position, a velocity or something else.
+    """
+    for signal in config.measured:
+        if signal != config.command.signal and np.isfinite(config.bounds(signal)).any():
+            unknown = [name for name, _, _ in _namesakes(config, signal) if f"{signal}.{name}" not in nature]
+            if unknown:
+                raise ConfigError(
+                    f"limits.{signal}: no device says what {', '.join(unknown)} is of the commanded "
+                    f"{config.command.signal}, so its range cannot act. Name it in the device's `elements`."
+                )
+
+
 def own_way(config: RobotConfig) -> Way:
     """The commanded signal itself, where it is a position."""
     name = config.command.signal

@@ -171,3 +171,11 @@ def test_drives_of_different_quantities_are_refused():
     bench.joints[0].command_quantity = "velocity"
     with pytest.raises(ConfigError, match="must be commanded in the same quantity"):
         Robot(RobotConfig.model_validate(description("position")), bench.joints, clock=bench.clock)
+
+
+def test_a_range_of_nobody_knows_what_is_refused():
+    bench = SafetyBench("velocity")
+    for joint in bench.joints:
+        joint.served = {}
+    with pytest.raises(ConfigError, match="no device says what shoulder, elbow is of the commanded joint_velocity"):
+        Robot(bench.config, bench.joints, clock=bench.clock)
