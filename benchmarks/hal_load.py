@@ -25,6 +25,7 @@ from hal import registry
 from hal.budget import budgets
 from hal.clock import SystemClock
 from hal.config import RobotConfig, load_robot
+from hal.errors import CommandRefused
 from hal.robot import ANSWER_SHARE, Robot, open_robot
 from services import realtime
 from services.hal_service import CYCLE_PRIORITY, RECEIVE_PRIORITY
@@ -52,7 +53,7 @@ class WaitMeter(SystemClock):
 
 @dataclass
 class Turns:
-    """What every turn of the cycle took [s], and how many were incomplete or skipped."""
+    """What every turn of the cycle took [s], and how many were incomplete, skipped, or came too late for a command."""
 
     wall: list[float] = field(default_factory=list)
     waited: list[float] = field(default_factory=list)
@@ -60,6 +61,7 @@ class Turns:
     late: list[float] = field(default_factory=list)
     incomplete: int = 0
     skipped: int = 0
+    refused: int = 0
 
 
 def drives_and_cells() -> RobotConfig:
@@ -126,7 +128,10 @@ def turn(robot: Robot, clock: WaitMeter, cycles: int, turns: Turns) -> None:
         if applied.mode == "hold" and middle is None:
             middle = applied.values
         if middle is not None:
-            robot.command(middle + 0.001 * np.sin(0.02 * number), sample.cycle)
+            try:
+                robot.command(middle + 0.001 * np.sin(0.02 * number), sample.cycle)
+            except CommandRefused:  # this machine stood still for longer than a command lives
+                turns.refused += 1
 
 
 def received(robot: Robot) -> int:
@@ -152,7 +157,9 @@ def run(robot: Robot, clock: WaitMeter, seconds: float) -> None:
     print(
         f"rate           {cycles / wall:.1f} Hz of {1 / robot.period:.0f}, {turns.skipped} cycles skipped; {scheduling}"
     )
-    print(f"complete       {1 - turns.incomplete / cycles:.3%} of {cycles} cycles (bar 99.9 %); mode {robot.mode}")
+    print(
+        f"complete       {1 - turns.incomplete / cycles:.3%} of {cycles} cycles (bar 99.9 %); {turns.refused} commands refused"
+    )
     print(f"whole process  {process / wall:.1%} of a core (bar 25 %), {process / cycles * 1e6:.0f} us per cycle")
     print(
         f"receiving      {(process - thread) / frames * 1e6:.1f} us per frame, {frames / cycles:.1f} frames per cycle"
