@@ -6,6 +6,7 @@ from mit_bench import mit_bench
 @pytest.fixture
 def bench():
     bench = Bench().open()
+    bench.until(lambda: bench.states() == {"ready"}, "on a busy machine a node may need a second try")
     yield bench
     bench.close()
 
