@@ -67,9 +67,8 @@ class Robot:
         self._emergency = EmergencyStop(config, self._actuators.devices, self._buses, self._clock, self.period)
         self._caretaker = Caretaker(devices) if self._buses else None
         self._park = None if config.stop.park is None else np.array(config.stop.park)
-        commanded = config.signals[config.command.signal]
-        self._start = Start(config.command.signal, commanded.elements)
-        self._nothing = np.full(commanded.size, np.nan)
+        self._start = Start(config, self._actuators.quantity)
+        self._nothing = np.full(config.signals[config.command.signal].size, np.nan)
         self._nothing.flags.writeable = False
         self._desired: tuple[np.ndarray, float] | None = None
         self._measured = {name: np.full(config.signals[name].size, np.nan) for name in self._assembler.signals}
@@ -280,6 +279,7 @@ class Robot:
         """Move on to this cycle's mode and send its set-points."""
         modes, limiter = self._modes, self._limiter
         problem = self._cycle_watchdog.problem(now) or self._bus_problem() or limiter.trip(self._measured)
+        problem = problem or (self._start.moved(self._measured) if modes.mode is Mode.ENABLING else "")
         if self._emergency.latched and modes.mode is not Mode.FAULT:
             modes.emergency(self._emergency.latched)
         elif problem and modes.mode is not Mode.OFF and modes.mode is not Mode.FAULT:

@@ -8,6 +8,7 @@ import numpy as np
 from hal.device import Check, DeviceState
 from hal.drivers.can_device import Place
 from hal.drivers.canopen_node import HEARTBEAT, CanopenNode, Taker, data_sheet
+from hal.drivers.cia402_checks import UNWATCHED, drive_checks
 from hal.drivers.cia402_frames import CommandFrames
 from hal.drivers.cia402_modes import HomingRun, SetPointHandshake
 from hal.drivers.cia402_settings import MODES, OBJECTS, TARGETS, DriveSettings
@@ -26,7 +27,6 @@ STOPPING = 0.8
 """How long [s] a quick stop, or slowing down, may take before the power is taken off."""
 RAMPED = (Mode.PROFILE_POSITION, Mode.CYCLIC_SYNCHRONOUS_VELOCITY)
 """Modes in which a drive that is let go may be moving, and slows down first."""
-UNWATCHED = "{} does not notice when the HAL is gone (no 1016h)."
 ANSWER_TIME = 1.0
 """How long [s] a drive may take to acknowledge a set-point."""
 
@@ -247,12 +247,18 @@ class Cia402Drive(CanopenNode):
         self._resetting = RESET_CYCLES
 
     def apply(self, values: np.ndarray) -> None:
-        """See `Device.apply`; until the drive is enabled its target is where it is, or rest."""
+        """See `Device.apply`; until the drive is enabled a velocity or torque is 0.
+
+        A position is what `Robot` asks for from the beginning, which looks whether it can be believed: a single wrong
+        frame of ours or of another node must not become the place to start from.
+        """
         units = self._units
-        if not self._is_followed() or units is None:
+        if units is None:
             return
         convert = {"position": units.counts, "velocity": units.speed, "effort": units.torque}[self.command_quantity]
         target = convert(float(values[0]))
+        if not self._is_followed(target if self.command_quantity == "position" else 0):
+            return
         bits = 0
         if self._mode is Mode.PROFILE_POSITION:
             bits, target = self._handshake.step(target, self._statusword)
@@ -260,7 +266,7 @@ class Cia402Drive(CanopenNode):
 
     def damp(self) -> None:
         """See `Device.damp`; the effort is against the velocity, and none while that is not known."""
-        if not self._is_followed() or self._units is None or self._settings.damping is None:
+        if not self._is_followed(self._rest()) or self._units is None or self._settings.damping is None:
             return
         effort = -self._settings.damping * self._velocity * self._units.velocity
         self._send(cia402.ENABLE_OPERATION, self._units.torque(effort) if effort == effort else 0, self._mode)
@@ -294,23 +300,15 @@ class Cia402Drive(CanopenNode):
         """See `Device.inspect`."""
         if self._units is None:  # never opened, but asked
             self._calibrate()
-        checks = list(super().inspect())
-        if not self._is_watched:
-            checks.append(
-                Check("watchdog", False, f"{UNWATCHED.format(self._place)} Let something else cut its power.")
-            )
-        if not self._sdo.has(cia402.ABORT_CONNECTION.index):
-            text = "There is no object 6007h. Look up in its manual what the drive does when the heartbeat fails."
-            checks.append(Check("abort option", False, text))
-        if self._sdo.has(cia402.MODE_DISPLAY.index):
-            shown = self._sdo.read_signed(cia402.MODE_DISPLAY.index, 0, cia402.MODE_DISPLAY.bits)
-            text = f"The drive is in mode {cia402.describe_mode(shown)}."
-            is_good = shown == self._mode
-            checks.append(Check("mode", is_good, text if is_good else f"{text} Open it again, or look at its display."))
-        return tuple(checks)
+        own = drive_checks(self._sdo, self._mode, self._is_watched, str(self._place))
+        return (*super().inspect(), *own)
 
-    def _is_followed(self) -> bool:
-        """Whether the drive takes set-points; if not, it is led there, or let go when it has dropped out by itself."""
+    def _is_followed(self, rest: int) -> bool:
+        """Whether the drive takes set-points; if not, it is led there, or let go when it has dropped out by itself.
+
+        Args:
+            rest: The target that moves nothing, as far as can be known.
+        """
         state = self._state
         if self._is_wanted and self._was_reached and state is not State.OPERATION_ENABLED:
             self._is_wanted = False
@@ -319,11 +317,11 @@ class Cia402Drive(CanopenNode):
             self.idle()
             return False
         if state is not State.OPERATION_ENABLED:
-            self._send(cia402.towards_enabled(state), self._rest(), self._mode)
+            self._send(cia402.towards_enabled(state), rest, self._mode)
             return False
         if not self._was_reached:
             self._was_reached = True
-            self._handshake.start(self._rest())
+            self._handshake.start(rest)
         return True
 
     def _end_homing(self, homing: HomingRun) -> None:

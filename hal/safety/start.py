@@ -1,15 +1,18 @@
 """Whether a robot may be enabled where it is."""
 
-from collections.abc import Sequence
-
 import numpy as np
 
+from hal.config import RobotConfig
 from hal.errors import CommandRefused
 from hal.limits import Limiter
 from hal.safety.limit import Arrays
 
 MEMORY = 0.25
 """The robot may be enabled where all its drives were seen not longer ago [s]: a lost frame is no obstacle."""
+
+
+MOVED = 0.05
+"""Part of its range that an element may move while the drives are being enabled: brakes open, nothing pushes yet."""
 
 
 class Start:
@@ -19,11 +22,20 @@ class Start:
         known: Signal -> values of that cycle [its unit].
     """
 
-    def __init__(self, signal: str, elements: Sequence[str]) -> None:
+    def __init__(self, config: RobotConfig, quantity: str) -> None:
+        """Know of nothing yet.
+
+        Args:
+            config: The robot file.
+            quantity: What the drives are commanded in; only positions have a place to start from.
+        """
         self.known: Arrays = {}
-        self._signal, self._elements = signal, tuple(elements)
+        self._signal = config.command.signal
+        self._elements = config.signals[self._signal].elements
         self._seen = -np.inf
-        self._newest = np.full(len(self._elements), np.nan)
+        self._newest = self._asked = np.full(len(self._elements), np.nan)
+        low, high = config.bounds(self._signal)
+        self._may_move = MOVED * (high - low) if quantity == "position" else np.full(len(self._elements), np.inf)
 
     def note(self, measured: Arrays, now: float) -> None:
         """What the cycle at monotonic time `now` [s] measured."""
@@ -46,3 +58,16 @@ class Start:
         excluded = limiter.excluded(self.known)
         if excluded:
             raise CommandRefused(excluded)
+        self._asked = self.known[self._signal]
+
+    def moved(self, measured: Arrays) -> str:
+        """What has moved further since `check` than can be while the drives are being enabled; empty if nothing has."""
+        wrong = np.flatnonzero(np.abs(measured[self._signal] - self._asked) > self._may_move)
+        if not wrong.size:
+            return ""
+        index = int(wrong[0])
+        return (
+            f"{self._signal}.{self._elements[index]} went from {self._asked[index]:.4g} to "
+            f"{measured[self._signal][index]:.4g} while the drives were being enabled. Does it move by itself, or does "
+            "another node send in its name?"
+        )

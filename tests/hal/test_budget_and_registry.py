@@ -102,7 +102,7 @@ def devices(**drive):
 def test_a_device_may_name_the_quantities_that_it_measures():
     by_name = devices(element=None, elements={"position": "muscle_length.biceps"})
     robot = open_robot(RobotConfig.model_validate(description(devices=by_name)))
-    assert [device.measures for device in robot._devices][0] == ("muscle_length.biceps",)
+    assert next(device.measures for device in robot._devices) == ("muscle_length.biceps",)
 
 
 def test_a_quantity_that_a_driver_does_not_have_is_told():
