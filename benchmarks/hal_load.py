@@ -158,7 +158,7 @@ def run(robot: Robot, clock: WaitMeter, seconds: float) -> None:
         f"rate           {cycles / wall:.1f} Hz of {1 / robot.period:.0f}, {turns.skipped} cycles skipped; {scheduling}"
     )
     print(
-        f"complete       {1 - turns.incomplete / cycles:.3%} of {cycles} cycles (bar 99.9 %); {turns.refused} commands refused"
+        f"complete       {1 - turns.incomplete / cycles:.3%} of {cycles} (bar 99.9 %); {turns.refused} commands refused"
     )
     print(f"whole process  {process / wall:.1%} of a core (bar 25 %), {process / cycles * 1e6:.0f} us per cycle")
     print(
