@@ -15,13 +15,13 @@ from pathlib import Path
 
 import numpy as np
 
-from hal.bus import Bus
 from hal.clock import SystemClock
 from hal.config import BusConfig
 from hal.drivers.can_device import CanDevice, DeviceSettings, Place
 from hal.drivers.dbc import DbcNode
 from hal.drivers.dbc_settings import DbcSettings
 from hal.protocols import dbc
+from hal.wire.bus import Bus
 
 ROBOTS = Path(__file__).parents[1] / "robots"
 FRAMES = 20_000

@@ -21,14 +21,14 @@ import canopen
 import yaml
 
 from hal import registry
-from hal.bus import Bus
-from hal.bus_time import ArrivalClock, FrameClock
 from hal.clock import SystemClock
 from hal.config import RobotConfig
 from hal.device import Device
 from hal.drivers.can_device import CanDevice
 from hal.fleet import build
 from hal.robot import Robot
+from hal.wire.bus import Bus
+from hal.wire.stamps import ArrivalClock, FrameClock
 from simulators.hub import HubServer
 
 ROBOTS = Path(__file__).parents[1] / "robots"

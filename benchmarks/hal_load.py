@@ -22,11 +22,11 @@ import numpy as np
 import yaml
 
 from hal import registry
-from hal.budget import budgets
 from hal.clock import SystemClock
 from hal.config import RobotConfig, load_robot
 from hal.errors import CommandRefused
 from hal.robot import ANSWER_SHARE, Robot, open_robot
+from hal.wire.budget import budgets
 from services import realtime
 from services.hal_service import CYCLE_PRIORITY, RECEIVE_PRIORITY
 from services.simulator_service import PRIORITY, THREADS

@@ -4,14 +4,16 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from hal import budget, calibration_store, registry
-from hal.bus import Bus
-from hal.calibration import Calibration
+from hal import registry
+from hal.calibration import store
+from hal.calibration.line import Calibration
 from hal.clock import BusClock
 from hal.config import DeviceConfig, RobotConfig
 from hal.device import Device
 from hal.drivers.can_device import Place
 from hal.errors import ConfigError
+from hal.wire import budget
+from hal.wire.bus import Bus
 
 
 def build(
@@ -29,7 +31,7 @@ def build(
             stored calibration that is refused.
     """
     if calibrations is None:
-        calibrations = calibration_store.load(config)
+        calibrations = store.load(config)
     budget.check(config)
     buses = {name: Bus(name, bus, clock) for name, bus in config.buses.items()}
     devices: list[Device] = []

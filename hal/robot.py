@@ -7,20 +7,20 @@ from typing import Any, Self
 import numpy as np
 
 from hal.actuators import Actuators, find
-from hal.bus import Bus
 from hal.caretaker import Caretaker
 from hal.clock import BusClock, Clock, SystemClock
 from hal.config import RobotConfig
 from hal.device import Device
 from hal.errors import CommandRefused
 from hal.fleet import build
-from hal.limits import Limiter
 from hal.modes import Act, Mode, ModeMachine
 from hal.safety.emergency import Emergency, EmergencyStop
+from hal.safety.limiter import Limiter
 from hal.safety.start import Start
 from hal.safety.turns import PATIENCE, Turns
+from hal.safety.watchdog import CommandWatchdog, CycleWatchdog, checked
 from hal.sample import Applied, Assembler, Sample
-from hal.watchdog import CommandWatchdog, CycleWatchdog, checked
+from hal.wire.bus import Bus
 
 __all__ = ["Applied", "Robot", "Sample", "open_robot"]
 

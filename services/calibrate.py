@@ -7,11 +7,11 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from hal import calibration_store
-from hal.calibration_fit import CalibrationRefused, Line, cell_line, joint_line
-from hal.calibration_store import Point
+from hal.calibration import store
+from hal.calibration.fit import CalibrationRefused, Line, cell_line, joint_line
+from hal.calibration.store import Point
 from hal.config import RobotConfig
-from hal.measuring import Measuring, Subject, subject
+from hal.finding.measuring import Measuring, Subject, subject
 from services import show
 from services.errors import BadArguments
 from services.lock import instead_of
@@ -88,7 +88,7 @@ def _calibrate(
         if not (wanted.yes or typer.confirm("Store it?")):
             console.print("Not stored.")
             return 1
-        path = calibration_store.save(found.config, device.record(line, tuple(points)))
+        path = store.save(found.config, device.record(line, tuple(points)))
     console.print(f"Stored in {path}; the HAL takes it when it starts.")
     return 0
 

@@ -10,11 +10,11 @@ from typing import Any
 from rich.markup import escape
 from rich.table import Table
 
-from hal import doctor
 from hal.config import RobotConfig, load_robot
 from hal.errors import ConfigError
-from hal.findings import Finding, Verdict, bad, ok, warning
-from hal.interface_check import interfaces
+from hal.finding import doctor
+from hal.finding.findings import Finding, Verdict, bad, ok, warning
+from hal.finding.interface import interfaces
 from services import host_checks, keys, show
 from services.artifacts import robot_file
 from services.client import Client

@@ -10,10 +10,10 @@ from rich.markup import escape
 from rich.table import Table
 
 from hal.config import BusConfig, RobotConfig
-from hal.decode import Line, describe
-from hal.decode_book import Book, Frame
-from hal.robot_book import books
-from hal.tap import frames
+from hal.finding.book import Book, Frame
+from hal.finding.decode import Line, describe
+from hal.finding.robot_book import books
+from hal.finding.tap import frames
 from services import show
 
 

@@ -9,7 +9,7 @@ import time
 from collections.abc import Iterable
 from typing import Any
 
-from hal import calibration_store
+from hal.calibration import store
 from hal.config import RobotConfig
 from hal.errors import CommandRefused
 from hal.robot import Robot, open_robot
@@ -51,7 +51,7 @@ class HalService:
         self._loop = Loop("hal", config.rates.hal, self.tick, robot.clock, CYCLE_PRIORITY)
         self._is_open = False
         self._has_camera = bool(config.seen)
-        self._uncalibrated = calibration_store.uncalibrated(config, calibration_store.load(config))
+        self._uncalibrated = store.uncalibrated(config, store.load(config))
         service.verb("enable", lambda _: self._do(robot.enable))
         service.verb("disable", lambda _: self._do(robot.disable))
         service.verb("stop", lambda _: self._do(lambda: robot.stop("A client asked to stop.")))

@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from hal.findings import Finding, ok, warning
+from hal.finding.findings import Finding, ok, warning
 from services.hal_service import CYCLE_PRIORITY
 
 STEADY = 1e-3

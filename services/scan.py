@@ -9,8 +9,8 @@ from rich.table import Table
 
 from hal.config import BusConfig, RobotConfig
 from hal.errors import BusGone
-from hal.scan import Found, Scan, compare, scan
-from hal.tap import Tap
+from hal.finding.scan import Found, Scan, compare, scan
+from hal.finding.tap import Tap
 from services import show
 from services.errors import AlreadyRunning
 from services.lock import instead_of

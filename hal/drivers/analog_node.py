@@ -7,11 +7,11 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field
 
+from hal.commissioning.pdo_map import Pdo, PdoMap, lay_out
 from hal.device import DeviceState
 from hal.drivers.can_device import Place
 from hal.drivers.canopen_node import HEARTBEAT, CanopenNode, NodeSettings, Taker, data_sheet
 from hal.errors import ConfigError
-from hal.pdo_map import Pdo, PdoMap, lay_out
 from hal.protocols import cia301
 from hal.protocols.cia301 import Mapped
 from hal.section import Finite, Positive

@@ -10,11 +10,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from hal.bus import Bus
-from hal.calibration import Calibration
+from hal.calibration.line import Calibration
 from hal.config import Positive, Section
 from hal.device import Device, DeviceHealth, DeviceState, Reading
 from hal.errors import DeviceSilent, HalError, WrongDevice
+from hal.wire.bus import Bus
 
 log = logging.getLogger(__name__)
 

@@ -2,14 +2,14 @@
 
 from collections.abc import Callable
 
-from hal.bus import OWN_NODE
-from hal.commissioning import HEARTBEAT_TIME, Plan
+from hal.commissioning.node import HEARTBEAT_TIME, Plan
+from hal.commissioning.pdos import compare_pdos
+from hal.commissioning.sdo_client import SdoClient
 from hal.device import Check
 from hal.errors import DeviceRefused
-from hal.pdo_commissioning import compare_pdos
 from hal.protocols import cia301
 from hal.protocols.cia301 import Mapped
-from hal.sdo_client import SdoClient
+from hal.wire.bus import OWN_NODE
 
 _AGAIN = "Something else configures the node; end it, and let the HAL open the device again."
 

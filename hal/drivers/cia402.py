@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from hal.commissioning.pdo_map import Pdo
 from hal.device import Check, DeviceState
 from hal.drivers.can_device import Place
 from hal.drivers.canopen_node import HEARTBEAT, CanopenNode, Taker, data_sheet
@@ -15,7 +16,6 @@ from hal.drivers.cia402_settings import MODES, OBJECTS, TARGETS, DriveSettings
 from hal.drivers.cia402_units import DriveUnits, drive_units
 from hal.drivers.cia402_writes import Write, check_objects, drive_writes
 from hal.errors import CommandRefused, DeviceRefused
-from hal.pdo_map import Pdo
 from hal.protocols import cia301, cia402
 from hal.protocols.cia402 import Mode, State, VelocityUnit
 

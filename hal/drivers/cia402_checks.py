@@ -2,10 +2,10 @@
 
 from collections.abc import Iterator
 
+from hal.commissioning.sdo_client import SdoClient
 from hal.device import Check
 from hal.protocols import cia402
 from hal.protocols.cia402 import Mode
-from hal.sdo_client import SdoClient
 
 UNWATCHED = "{} does not notice when the HAL is gone (no 1016h)."
 

@@ -4,12 +4,12 @@ from collections.abc import Sequence
 
 import can
 
-from hal.bus import Bus
+from hal.commissioning.pdo_map import Pdo, describe
+from hal.commissioning.pdos import cob_id
 from hal.errors import ConfigError
-from hal.pdo_commissioning import cob_id
-from hal.pdo_map import Pdo, describe
 from hal.protocols import cia301, cia402
 from hal.protocols.cia301 import Mapped
+from hal.wire.bus import Bus
 
 
 class CommandFrames:

@@ -4,9 +4,9 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from hal.commissioning.pdo_map import Pdo, PdoMap, lay_out
 from hal.config import Finite, Positive, Section
 from hal.drivers.canopen_node import NodeSettings
-from hal.pdo_map import Pdo, PdoMap, lay_out
 from hal.protocols import cia301, cia402
 from hal.protocols.cia301 import Mapped
 from hal.protocols.cia402 import Mode

@@ -3,8 +3,7 @@
 import math
 from dataclasses import dataclass
 
-from hal import calibration
-from hal.calibration import Linear
+from hal.calibration.line import Linear, rotary, spool
 from hal.drivers.cia402_settings import DriveSettings
 from hal.protocols.cia402 import VelocityUnit
 
@@ -57,7 +56,7 @@ def drive_units(settings: DriveSettings, unit: VelocityUnit, rated_torque: float
     """
     shape = (settings.counts_per_turn, settings.gear, settings.direction, settings.zero)
     radius = settings.spool_radius
-    line = calibration.spool(*shape, radius) if radius else calibration.rotary(*shape)
+    line = spool(*shape, radius) if radius else rotary(*shape)
     return DriveUnits(
         position=line,
         velocity=line.scale * unit.counts_per_second(settings.counts_per_turn),

@@ -5,7 +5,6 @@ import time
 from collections.abc import Callable, Sequence
 from typing import ClassVar
 
-from hal.bus import Handler
 from hal.device import Check, DeviceState
 from hal.drivers.can_device import CanDevice, Place
 from hal.drivers.dbc_inbox import Inbox, Letter, Raws
@@ -13,6 +12,7 @@ from hal.drivers.dbc_sequence import Address, Run, Step, compile_steps
 from hal.drivers.dbc_settings import MOTION, DbcSettings, QuantityConfig, StepConfig
 from hal.errors import ConfigError, DeviceRefused, DeviceSilent
 from hal.protocols import dbc
+from hal.wire.bus import Handler
 
 PERIODS_WAITED = 3.0
 """A device is there if its message comes within so many of its periods,"""

@@ -1,10 +1,10 @@
 """Answers of several drives under one identifier, sorted by the id inside."""
 
-from hal.bus import Bus, Handler
 from hal.drivers.can_device import Place
 from hal.errors import ConfigError
 from hal.protocols import mit
 from hal.protocols.mit import Layout
+from hal.wire.bus import Bus, Handler
 
 
 class Replies:

@@ -6,11 +6,11 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from hal.bus import Bus
-from hal.bus_state import UNUSABLE
 from hal.clock import Clock
 from hal.config import RobotConfig
 from hal.device import UNDER_POWER, Device, DeviceState
+from hal.wire.bus import Bus
+from hal.wire.state import UNUSABLE
 
 log = logging.getLogger(__name__)
 

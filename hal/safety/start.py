@@ -4,8 +4,8 @@ import numpy as np
 
 from hal.config import RobotConfig
 from hal.errors import CommandRefused
-from hal.limits import Limiter
 from hal.safety.limit import Arrays
+from hal.safety.limiter import Limiter
 
 MEMORY = 0.25
 """The robot may be enabled where all its drives were seen not longer ago [s]: a lost frame is no obstacle."""

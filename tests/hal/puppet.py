@@ -11,10 +11,10 @@ from pathlib import Path
 
 import can
 
-from hal.bus import Bus
 from hal.clock import SystemClock
 from hal.config import BusConfig
 from hal.drivers.can_device import Place
+from hal.wire.bus import Bus
 
 ROBOTS = Path(__file__).resolve().parents[2] / "robots"
 NODE = 5

@@ -3,11 +3,12 @@ from pathlib import Path
 import pytest
 from hal_bench import description
 
-from hal import budget, registry
+from hal import registry
 from hal.config import RobotConfig, load_robot
 from hal.drivers.cia402 import Cia402Drive
 from hal.errors import ConfigError
 from hal.robot import open_robot
+from hal.wire import budget
 
 MUSASHI = Path(__file__).parents[2] / "robots" / "musashi_arm.yaml"
 

@@ -6,10 +6,10 @@ import time
 import can
 import pytest
 
-from hal.bus import Bus, BusState
 from hal.clock import ManualClock, SystemClock
 from hal.config import BusConfig
 from hal.errors import ConfigError
+from hal.wire.bus import Bus, BusState
 from simulators.hub import HubServer
 
 LIMIT = 10.0

@@ -3,10 +3,10 @@
 import pytest
 from hal_bench import description
 
-from hal import budget
 from hal.config import RobotConfig
 from hal.drivers.can_device import CanDevice
 from hal.errors import ConfigError
+from hal.wire import budget
 
 RATE = 200.0
 

@@ -6,13 +6,13 @@ import time
 import can
 import pytest
 
-from hal.bus import Bus
-from hal.bus_kernel import Kernel
-from hal.bus_receive import STOCK_PERIOD
-from hal.bus_routes import BABBLE, STRANGERS, WINDOW, Routes
 from hal.clock import ManualClock
 from hal.config import BusConfig
 from hal.errors import ConfigError
+from hal.wire.bus import Bus
+from hal.wire.kernel import Kernel
+from hal.wire.receive import STOCK_PERIOD
+from hal.wire.routes import BABBLE, STRANGERS, WINDOW, Routes
 
 ALLOWED = round(BABBLE * WINDOW)
 
@@ -212,7 +212,7 @@ def test_filters_let_in_what_is_wanted_and_what_tells_of_strangers():
 
 
 def test_a_stuck_interface_makes_the_bus_gone_though_nothing_is_raised(tmp_path, monkeypatch):
-    monkeypatch.setattr("hal.bus_thread.HANGS", 0.2)
+    monkeypatch.setattr("hal.wire.thread.HANGS", 0.2)
     bus = Bus("can0", BusConfig(interface="virtual", channel=str(tmp_path)), ManualClock())
     release = threading.Event()
     bus.subscribe(0x181, lambda data, received: release.wait(10.0))

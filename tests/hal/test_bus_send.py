@@ -12,12 +12,12 @@ import pytest
 from can.interfaces import BACKENDS
 from can.interfaces.virtual import VirtualBus
 
-from hal.bus import Bus
-from hal.bus_kernel import IN_FLIGHT, set_buffers
-from hal.bus_send import FAILED_SENDS, PAUSE, PAUSES, Sender
-from hal.bus_state import BusState
 from hal.clock import SystemClock
 from hal.config import BusConfig
+from hal.wire.bus import Bus
+from hal.wire.kernel import IN_FLIGHT, set_buffers
+from hal.wire.send import FAILED_SENDS, PAUSE, PAUSES, Sender
+from hal.wire.state import BusState
 
 LIMIT = 10.0
 

@@ -4,8 +4,8 @@ import itertools
 
 import pytest
 
-from hal.bus_state import RECOVERY, WORRY, BusState, BusWatch
 from hal.protocols.error_frames import Controller, ErrorFrame, error_frame
+from hal.wire.state import RECOVERY, WORRY, BusState, BusWatch
 
 OPENED = "Open, but nothing was heard yet."
 

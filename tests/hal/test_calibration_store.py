@@ -8,14 +8,14 @@ import pytest
 import yaml
 from hal_bench import ROBOTS, BenchWorld, description, hardware
 
-from hal import calibration_store
-from hal.calibration_fit import CalibrationRefused, Line, cell_line, joint_line
-from hal.calibration_store import Point, Record
+from hal.calibration import store
+from hal.calibration.fit import CalibrationRefused, Line, cell_line, joint_line
+from hal.calibration.store import Point, Record
 from hal.clock import SystemClock
 from hal.config import RobotConfig
 from hal.errors import ConfigError, DeviceSilent, WrongDevice
+from hal.finding.measuring import Measuring, subject
 from hal.fleet import build
-from hal.measuring import Measuring, subject
 from hal.robot import open_robot
 from simulators.rig import Rig
 
@@ -43,12 +43,12 @@ def point(known, read, std=0.001):
 def a_record(config, device="elbow_encoder", identity="canopen:1-2-3"):
     settings = {"zero": 0.25, "direction": -1}
     known = device in config.devices
-    return calibration_store.sealed(
+    return store.sealed(
         Record(
             device=device,
             identity=identity,
             settings=settings,
-            measured_with=calibration_store.measured_with(config, device, settings) if known else {},
+            measured_with=store.measured_with(config, device, settings) if known else {},
             unit="rad",
             points=(point(0.0, 1.0),),
             residual=0.0,
@@ -119,9 +119,9 @@ def test_weights_that_tell_nothing_are_refused(points, said):
 
 
 def test_what_is_stored_is_laid_over_the_robot_file(config):
-    path = calibration_store.save(config, a_record(config))
+    path = store.save(config, a_record(config))
     assert path.name == "bench.calibration.yaml"
-    found = calibration_store.load(config)["elbow_encoder"]
+    found = store.load(config)["elbow_encoder"]
     assert found.identity == "canopen:1-2-3"
     assert dict(found.settings) == {"zero": 0.25, "direction": -1}
     raw = yaml.safe_load(path.read_text())
@@ -130,44 +130,44 @@ def test_what_is_stored_is_laid_over_the_robot_file(config):
 
 
 def test_the_file_before_is_kept_and_other_records_stay(config):
-    calibration_store.save(config, a_record(config))
-    path = calibration_store.save(config, a_record(config, device="biceps_drive", identity="canopen:1-2-4"))
-    assert set(calibration_store.load(config)) == {"elbow_encoder", "biceps_drive"}
-    before = yaml.safe_load(path.with_name(path.name + calibration_store.KEPT).read_text())
+    store.save(config, a_record(config))
+    path = store.save(config, a_record(config, device="biceps_drive", identity="canopen:1-2-4"))
+    assert set(store.load(config)) == {"elbow_encoder", "biceps_drive"}
+    before = yaml.safe_load(path.with_name(path.name + store.KEPT).read_text())
     assert list(before) == ["canopen:1-2-3"]
     names = [file.name for file in path.parent.iterdir() if file.is_file()]
     assert sorted(names) == ["bench.calibration.yaml", "bench.calibration.yaml.before"]
 
 
 def test_a_replaced_device_takes_the_place_of_the_one_before(config):
-    calibration_store.save(config, a_record(config))
-    calibration_store.save(config, a_record(config, identity="canopen:1-2-9"))
-    assert [record.identity for record in calibration_store.records(config)] == ["canopen:1-2-9"]
+    store.save(config, a_record(config))
+    store.save(config, a_record(config, identity="canopen:1-2-9"))
+    assert [record.identity for record in store.records(config)] == ["canopen:1-2-9"]
 
 
 def test_a_record_that_was_edited_is_refused(config):
-    path = calibration_store.save(config, a_record(config))
+    path = store.save(config, a_record(config))
     path.write_text(path.read_text().replace("zero: 0.25", "zero: 0.26"))
     with pytest.raises(ConfigError, match=r"calibration of 'elbow_encoder' .* was edited: its hash does not fit"):
         build(config, SystemClock())
 
 
 def test_a_record_is_refused_when_what_it_was_measured_with_changed(config):
-    calibration_store.save(config, a_record(config, device="biceps_drive"))
+    store.save(config, a_record(config, device="biceps_drive"))
     body = description(folder=config.folder)
     body["kinds"]["drive"]["settings"] = {**body["kinds"]["drive"]["settings"], "gear": 50}
     with pytest.raises(ConfigError, match="was measured with gear 29, the robot file has 50 now"):
-        calibration_store.load(RobotConfig.model_validate(body))
+        store.load(RobotConfig.model_validate(body))
     body["kinds"]["drive"]["settings"] = {**body["kinds"]["drive"]["settings"], "gear": 29, "silent_after": 0.3}
-    assert calibration_store.load(RobotConfig.model_validate(body))
+    assert store.load(RobotConfig.model_validate(body))
 
 
 def test_a_setting_that_was_not_there_counts_as_changed(config):
-    calibration_store.save(config, a_record(config))
+    store.save(config, a_record(config))
     body = description(folder=config.folder)
     body["kinds"]["encoder"]["settings"] = {**body["kinds"]["encoder"]["settings"], "counts_per_turn": 4096}
     with pytest.raises(ConfigError, match="counts_per_turn not given, the robot file has 4096 now"):
-        calibration_store.load(RobotConfig.model_validate(body))
+        store.load(RobotConfig.model_validate(body))
 
 
 @pytest.mark.parametrize(
@@ -180,20 +180,20 @@ def test_a_setting_that_was_not_there_counts_as_changed(config):
     ],
 )
 def test_a_file_that_is_none_is_refused(config, text, said):
-    calibration_store.path_of(config).write_text(text)
+    store.path_of(config).write_text(text)
     with pytest.raises(ConfigError, match=said):
-        calibration_store.load(config)
+        store.load(config)
 
 
 def test_a_file_that_cannot_be_written_is_told(config, tmp_path):
     record = a_record(config)
     with pytest.raises(ConfigError, match="cannot be kept"):
-        calibration_store.save(config.model_copy(update={"folder": tmp_path / "nowhere"}), record)
+        store.save(config.model_copy(update={"folder": tmp_path / "nowhere"}), record)
 
 
 def test_a_record_of_a_device_that_is_gone_is_passed_over(config):
-    calibration_store.save(config, a_record(config, device="shoulder_encoder"))
-    assert calibration_store.load(config) == {}
+    store.save(config, a_record(config, device="shoulder_encoder"))
+    assert store.load(config) == {}
 
 
 def test_an_encoder_tells_the_truth_after_one_position(config, rig):
@@ -201,7 +201,7 @@ def test_an_encoder_tells_the_truth_after_one_position(config, rig):
     settle(rig, angle=-0.7)
     with Measuring(what) as device:
         seen = device.look(0.3, 0.2, 0.005)
-        calibration_store.save(config, device.record(joint_line([seen], device.now.factor, 0.1), (seen,)))
+        store.save(config, device.record(joint_line([seen], device.now.factor, 0.1), (seen,)))
         assert device.identity.startswith("canopen:")
     with open_robot(config) as robot:
         for _ in range(2000):
@@ -222,7 +222,7 @@ def test_a_cell_tells_the_truth_after_three_weights_and_keeps_its_gain_at_a_tare
             settle(rig, tension=told)
             points.append(device.look(known, 0.2, 0.1))
         line = cell_line(points, device.now.factor, 0.1)
-        calibration_store.save(config, device.record(line, tuple(points)))
+        store.save(config, device.record(line, tuple(points)))
         assert line.factor == pytest.approx(0.8, rel=1e-3)
         assert device.now.factor == pytest.approx(0.8, rel=1e-3)
         settle(rig, tension=4.5)
@@ -272,7 +272,7 @@ def test_a_device_that_moves_or_brings_nothing_is_refused(config, rig):
 
 
 def test_another_device_in_the_place_of_the_one_that_was_calibrated_is_refused(config, rig):
-    calibration_store.save(config, a_record(config))
+    store.save(config, a_record(config))
     _, devices = build(config, SystemClock())
     encoder = next(device for device in devices if device.name == "elbow_encoder")
     encoder._bus.open()

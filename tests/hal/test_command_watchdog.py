@@ -1,7 +1,7 @@
 import pytest
 
 from hal.errors import CommandRefused
-from hal.watchdog import CommandWatchdog
+from hal.safety.watchdog import CommandWatchdog
 
 
 @pytest.fixture

@@ -6,7 +6,6 @@ import can
 import pytest
 from dbc_bench import axis, dbc_bench, opened
 
-from hal.bus import Bus
 from hal.clock import SystemClock
 from hal.config import BusConfig
 from hal.device import DeviceState
@@ -18,6 +17,7 @@ from hal.drivers.dbc_servo import DbcServo
 from hal.drivers.dbc_settings import DbcSettings, ServoSettings, StepConfig
 from hal.errors import CommandRefused, ConfigError
 from hal.protocols import dbc
+from hal.wire.bus import Bus
 
 FILE = """VERSION ""
 

@@ -5,12 +5,12 @@ from pathlib import Path
 import pytest
 
 from hal.config import RobotConfig
-from hal.decode import describe
-from hal.decode_book import EXTENDED, Book, Frame
 from hal.drivers.canopen_node import data_sheet
+from hal.finding.book import EXTENDED, Book, Frame
+from hal.finding.decode import describe
+from hal.finding.robot_book import books
 from hal.protocols.cia301 import Mapped
 from hal.protocols.sdo import Upload
-from hal.robot_book import books
 
 EDS = Path(__file__).parents[2] / "robots" / "eds"
 

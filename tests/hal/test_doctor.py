@@ -6,12 +6,13 @@ from dataclasses import replace
 import pytest
 from hal_bench import ROBOTS, BenchWorld, description, hardware
 
-from hal import calibration_store, doctor
-from hal.calibration_store import Point, Record
+from hal.calibration import store
+from hal.calibration.store import Point, Record
 from hal.config import BusConfig, RobotConfig
-from hal.findings import Verdict
-from hal.interface_check import interfaces, socketcan
-from hal.link import Link, look_up, parse
+from hal.finding import doctor
+from hal.finding.findings import Verdict
+from hal.finding.interface import interfaces, socketcan
+from hal.finding.link import Link, look_up, parse
 from simulators.rig import Rig
 
 SHOWN = {
@@ -120,12 +121,12 @@ def with_a_record(folder, **changes):
         "device": "elbow_encoder",
         "identity": "canopen:1-2-3",
         "settings": settings,
-        "measured_with": calibration_store.measured_with(config, "elbow_encoder", settings),
+        "measured_with": store.measured_with(config, "elbow_encoder", settings),
         "unit": "rad",
         "points": (Point(known=0.0, read=1.0, std=0.0, samples=9),),
         "residual": 0.0,
     }
-    calibration_store.save(config, calibration_store.sealed(Record(**{**body, **changes})))
+    store.save(config, store.sealed(Record(**{**body, **changes})))
     return config
 
 

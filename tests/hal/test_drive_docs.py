@@ -6,9 +6,9 @@ from pathlib import Path
 import yaml
 from hal_bench import ROBOTS
 
+from hal.commissioning.pdo_map import PdoSettings
 from hal.config import RobotConfig
 from hal.drivers.cia402_settings import DriveSettings
-from hal.pdo_map import PdoSettings
 from hal.robot import open_robot
 
 TEXT = (Path(__file__).parents[2] / "docs" / "devices.md").read_text()

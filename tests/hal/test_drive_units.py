@@ -5,7 +5,6 @@ import math
 import pytest
 from drive_bench import ELBOW, SETTINGS, joint_description
 
-from hal import budget
 from hal.config import RobotConfig
 from hal.drivers.cia402 import Cia402Drive
 from hal.drivers.cia402_modes import SetPointHandshake
@@ -14,6 +13,7 @@ from hal.drivers.cia402_units import drive_units
 from hal.errors import ConfigError
 from hal.protocols.cia402 import VELOCITY_UNITS
 from hal.robot import open_robot
+from hal.wire import budget
 
 
 def units(unit="counts/s", rated_torque=0.2, **settings):

@@ -8,8 +8,8 @@ from device_kinds import KINDS
 from fuzz import fuzz
 from hal_bench import ROBOTS
 
-from hal.decode import describe
-from hal.decode_book import Book, Frame
+from hal.finding.book import Book, Frame
+from hal.finding.decode import describe
 from hal.protocols import cia301, cia303, cia402, cia404, cia406, dbc, mit, sdo
 from hal.protocols.error_frames import error_frame
 from hal.protocols.mit import Layout, Ranges

@@ -8,14 +8,14 @@ import pytest
 from drive_bench import JointBench
 from hal_bench import ROBOTS
 
-from hal.bus import Bus
 from hal.clock import SystemClock
+from hal.commissioning.sdo_client import SdoClient
 from hal.config import BusConfig
 from hal.drivers.canopen_node import data_sheet
 from hal.errors import DeviceRefused
 from hal.protocols import cia301, cia402
 from hal.protocols.cia402 import State
-from hal.sdo_client import SdoClient
+from hal.wire.bus import Bus
 from simulators.nodes import drive_states
 
 NODE = 5

@@ -6,7 +6,7 @@ from hal_bench import description
 
 from hal.config import RobotConfig
 from hal.errors import ConfigError
-from hal.limits import Limiter
+from hal.safety.limiter import Limiter
 
 PERIOD = 0.005
 CALM = {"muscle_tension": np.array([20.0, 20.0]), "muscle_length": np.array([0.3, 0.3]), "joint_position": np.zeros(1)}

@@ -5,8 +5,8 @@ import pytest
 from hal_bench import ROBOTS
 from pydantic import ValidationError
 
+from hal.commissioning.pdo_map import Pdo, PdoMap, PdoSettings, check_map, lay_out
 from hal.errors import ConfigError
-from hal.pdo_map import Pdo, PdoMap, PdoSettings, check_map, lay_out
 from hal.protocols import cia301
 from hal.protocols.cia301 import Mapped
 

@@ -10,8 +10,8 @@ from hal_bench import BenchWorld, description, hardware
 
 from hal.config import BusConfig, RobotConfig
 from hal.errors import BusGone, ConfigError
-from hal.scan import compare, scan
-from hal.tap import Tap
+from hal.finding.scan import compare, scan
+from hal.finding.tap import Tap
 from simulators.nodes.spec import CellConstants, NodeSpec
 from simulators.rig import Rig
 

@@ -4,7 +4,7 @@ import socket
 
 import pytest
 
-from hal.findings import Verdict
+from hal.finding.findings import Verdict
 from services import doctor, host_checks
 from services.messages import Status
 

@@ -14,9 +14,9 @@ from pathlib import Path
 import can
 import pytest
 
-from hal.bus import Bus
 from hal.clock import SystemClock
 from hal.config import BusConfig
+from hal.wire.bus import Bus
 
 LIMIT = 20.0
 LATE = 0.2

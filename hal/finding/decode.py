@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import canopen
 from canopen.objectdictionary import ODVariable
 
-from hal.decode_book import EXTENDED, Book, Frame, Pdo
+from hal.finding.book import EXTENDED, Book, Frame, Pdo
 from hal.protocols import cia301, cia402, sdo
 from hal.protocols.cia301 import NmtCommand, NmtState
 from hal.protocols.error_frames import error_frame

@@ -7,12 +7,12 @@ Source: ODrive CANSimple (docs.odriverobotics.com): identifier = node << 5 | com
 from collections import Counter
 from dataclasses import dataclass, field
 
-from hal.budget import frame_bits
-from hal.bus import OWN_NODE
-from hal.decode import nmt_words
-from hal.decode_book import Frame
+from hal.finding.book import Frame
+from hal.finding.decode import nmt_words
 from hal.protocols import cia301, sdo
 from hal.protocols.mit import Special, special
+from hal.wire.budget import frame_bits
+from hal.wire.bus import OWN_NODE
 
 _MIT_SPECIALS = {
     special(Special.ENTER): "enter motor mode",

@@ -13,18 +13,18 @@ from typing import Any, Protocol
 import can
 import canopen
 
-from hal.budget import OWN_HEARTBEAT_RATE
-from hal.bus_kernel import Kernel, set_buffers
-from hal.bus_receive import OWN_NODE, Receiver
-from hal.bus_routes import Handler
-from hal.bus_send import PATIENCE, Sender
-from hal.bus_state import UNUSABLE, BusState, BusWatch
-from hal.bus_thread import ThreadWatch
-from hal.bus_time import STAMPED, WAITED, ArrivalClock, FrameClock
 from hal.clock import BusClock
 from hal.config import BusConfig
 from hal.errors import ConfigError
 from hal.protocols import cia301
+from hal.wire.budget import OWN_HEARTBEAT_RATE
+from hal.wire.kernel import Kernel, set_buffers
+from hal.wire.receive import OWN_NODE, Receiver
+from hal.wire.routes import Handler
+from hal.wire.send import PATIENCE, Sender
+from hal.wire.stamps import STAMPED, WAITED, ArrivalClock, FrameClock
+from hal.wire.state import UNUSABLE, BusState, BusWatch
+from hal.wire.thread import ThreadWatch
 
 __all__ = ["OWN_NODE", "PATIENCE", "Answers", "Bus", "BusState", "Handler"]
 

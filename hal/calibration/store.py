@@ -16,7 +16,7 @@ import yaml
 from pydantic import ValidationError
 
 from hal import registry
-from hal.calibration import Calibration
+from hal.calibration.line import Calibration
 from hal.config import RobotConfig
 from hal.errors import ConfigError
 from hal.section import Section, explain

@@ -12,10 +12,10 @@ import time
 import canopen
 from canopen.objectdictionary import ODVariable
 
-from hal.bus import Bus
 from hal.errors import DeviceRefused, DeviceSilent
 from hal.protocols import cia301
 from hal.protocols.sdo import describe_abort
+from hal.wire.bus import Bus
 
 ANSWER_TIME = 0.3
 """How long [s] a node may take to answer a request."""

@@ -2,9 +2,10 @@
 
 from collections.abc import Iterator
 
-from hal import link, registry
+from hal import registry
 from hal.config import BusConfig, RobotConfig
-from hal.findings import Finding, bad, ok, warning
+from hal.finding import link
+from hal.finding.findings import Finding, bad, ok, warning
 
 
 def interfaces(config: RobotConfig) -> Iterator[Finding]:

@@ -8,13 +8,13 @@ import time
 from collections import deque
 from dataclasses import dataclass
 
-from hal.budget import frame_bits
-from hal.decode_book import Frame
+from hal.finding.book import Frame
+from hal.finding.heard import Heard
+from hal.finding.tap import Tap
 from hal.protocols import cia301, sdo
 from hal.protocols.mit import Special, special
 from hal.protocols.sdo import Upload
-from hal.scan_heard import Heard
-from hal.tap import Tap
+from hal.wire.budget import frame_bits
 
 TRIES = 2
 BURST = 4

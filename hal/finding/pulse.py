@@ -4,9 +4,9 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
-from hal.budget import OWN_HEARTBEAT_RATE
-from hal.bus import Bus
 from hal.clock import SystemClock
+from hal.wire.budget import OWN_HEARTBEAT_RATE
+from hal.wire.bus import Bus
 
 PATIENCE = 0.01
 """How long [s] to wait for the nodes' answers, so that those of one SYNC are not taken for a second node's."""

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import can
 
-from hal.bus_routes import Routes
-from hal.bus_send import PAUSE, PAUSES
+from hal.wire.routes import Routes
+from hal.wire.send import PAUSE, PAUSES
 
 IN_FLIGHT = 64
 """Frames that a socket may have taken and not yet sent: these cannot be taken back."""

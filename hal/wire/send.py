@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 import can
 
-from hal.budget import frame_bits
+from hal.wire.budget import frame_bits
 
 PAUSE = 0.0002
 """Between two tries to have a full interface take a frame [s]; a frame at 1 Mbit/s needs about 0.1 ms."""

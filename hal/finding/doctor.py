@@ -6,18 +6,19 @@ Nothing is enabled: the devices are opened, turned for a second with their motor
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
-from hal import budget, calibration_store
-from hal.bus import Bus
-from hal.bus_state import BusState
-from hal.calibration import Calibration
+from hal.calibration import store
+from hal.calibration.line import Calibration
 from hal.clock import SystemClock
 from hal.config import RobotConfig
 from hal.device import Device
 from hal.drivers.can_device import CanDevice
 from hal.errors import ConfigError, HalError
-from hal.findings import Finding, bad, ok, warning
+from hal.finding.findings import Finding, bad, ok, warning
+from hal.finding.pulse import pulse
 from hal.fleet import build
-from hal.pulse import pulse
+from hal.wire import budget
+from hal.wire.bus import Bus
+from hal.wire.state import BusState
 
 DURATION = 1.0
 """How long [s] the devices are turned to see whether they answer every cycle."""
@@ -46,7 +47,7 @@ def described(config: RobotConfig) -> Iterator[Finding]:
 def _calibrations(config: RobotConfig) -> dict[str, Calibration]:
     """Those that are stored; none if one is refused, which `calibrated` tells: the rest can be looked at even so."""
     try:
-        return calibration_store.load(config)
+        return store.load(config)
     except ConfigError:
         return {}
 
@@ -54,8 +55,8 @@ def _calibrations(config: RobotConfig) -> dict[str, Calibration]:
 def calibrated(config: RobotConfig) -> Finding:
     """Whether the calibrations hold, and which devices have none though their driver takes one."""
     try:
-        stored = calibration_store.load(config)
-        dates = [record.date[:10] for record in calibration_store.records(config) if record.device in stored]
+        stored = store.load(config)
+        dates = [record.date[:10] for record in store.records(config) if record.device in stored]
     except ConfigError as error:
         return bad("calibration", str(error))
     has = f"{len(stored)} devices, the oldest of {min(dates)}" if stored else "None"
@@ -65,7 +66,7 @@ def calibrated(config: RobotConfig) -> Finding:
             "calibration",
             f"{has}. {_listed(nameless)} cannot tell who they are: when you replace one, calibrate it again.",
         )
-    missing = calibration_store.uncalibrated(config, stored)
+    missing = store.uncalibrated(config, stored)
     if missing:
         return warning(
             "calibration",
@@ -151,9 +152,7 @@ def _buses(buses: Sequence[Bus], there: set[str], config: RobotConfig) -> Iterat
         what, settings = f"bus {bus.name}", config.buses[bus.name]
         if bus.name not in there:
             advice = (
-                " Start `gemuco simulate`, or name real interfaces."
-                if settings.interface in calibration_store.SIMULATED
-                else ""
+                " Start `gemuco simulate`, or name real interfaces." if settings.interface in store.SIMULATED else ""
             )
             yield bad(what, f"It does not open: {bus.text}{advice}")
             continue

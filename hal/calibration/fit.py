@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hal.calibration_store import Point
+from hal.calibration.store import Point
 from hal.errors import HalError
 
 SCALE_TOLERANCE = 0.1

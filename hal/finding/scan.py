@@ -8,9 +8,9 @@ import time
 from dataclasses import dataclass
 
 from hal.config import RobotConfig
-from hal.scan_ask import ask_all, look_for_mit
-from hal.scan_heard import Found, Heard
-from hal.tap import Tap
+from hal.finding.ask import ask_all, look_for_mit
+from hal.finding.heard import Found, Heard
+from hal.finding.tap import Tap
 
 __all__ = ["Found", "Scan", "compare", "scan"]
 

@@ -4,13 +4,13 @@ from dataclasses import dataclass, field
 
 import can
 
-from hal.bus import OWN_NODE, PATIENCE, Bus
+from hal.commissioning.pdo_map import PdoMap
+from hal.commissioning.pdos import configure_pdos
+from hal.commissioning.sdo_client import SdoClient
 from hal.errors import WrongDevice
-from hal.pdo_commissioning import configure_pdos
-from hal.pdo_map import PdoMap
 from hal.protocols import cia301
 from hal.protocols.cia301 import Mapped, NmtCommand
-from hal.sdo_client import SdoClient
+from hal.wire.bus import OWN_NODE, PATIENCE, Bus
 
 HEARTBEAT_TIME = 0.1
 """Period [s] of a node's heartbeat."""

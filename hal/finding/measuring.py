@@ -9,16 +9,17 @@ from typing import Any, Self
 
 import numpy as np
 
-from hal import calibration_store, registry
-from hal.calibration_fit import CalibrationRefused, Line
-from hal.calibration_store import Point, Record
+from hal import registry
+from hal.calibration import store
+from hal.calibration.fit import CalibrationRefused, Line
+from hal.calibration.store import Point, Record
 from hal.clock import SystemClock
 from hal.config import RobotConfig
 from hal.device import DeviceState
 from hal.errors import ConfigError, DeviceSilent
+from hal.finding.pulse import pulse
 from hal.fleet import build
 from hal.limit_config import LimitConfig
-from hal.pulse import pulse
 
 TRIES = 3
 SETTLE = 10
@@ -103,10 +104,10 @@ class Subject:
 
     def _measured(self, identity: str) -> Mapping[str, Any]:
         """The settings of an earlier calibration of this very device, if there is one that holds."""
-        for record in calibration_store.records(self.config):
+        for record in store.records(self.config):
             if record.device == self.device and record.identity == identity:
                 with contextlib.suppress(ConfigError):  # one that is refused is not in force
-                    return calibration_store.checked(self.config, record).settings
+                    return store.checked(self.config, record).settings
         return {}
 
     def _at(self, given: Any, default: float) -> float:
@@ -287,12 +288,12 @@ class Measuring:
         """
         what = self._what
         settings = what.settings(line, self.identity)
-        return calibration_store.sealed(
+        return store.sealed(
             Record(
                 device=what.device,
                 identity=self.identity,
                 settings=settings,
-                measured_with=calibration_store.measured_with(what.config, what.device, settings),
+                measured_with=store.measured_with(what.config, what.device, settings),
                 unit=what.unit,
                 points=points,
                 residual=line.residual,

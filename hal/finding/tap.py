@@ -14,8 +14,8 @@ from typing import Self
 import can
 
 from hal.config import BusConfig
-from hal.decode_book import Frame
 from hal.errors import BusGone, ConfigError
+from hal.finding.book import Frame
 
 POLL = 0.1
 """How long [s] a reader waits before it looks whether it shall end."""

@@ -6,8 +6,8 @@ from typing import Literal
 
 import canopen
 
+from hal.commissioning.pdo_map import Pdo, PdoMap, describe
 from hal.errors import ConfigError
-from hal.pdo_map import Pdo, PdoMap, describe
 from hal.protocols import cia301
 from hal.protocols.cia301 import Mapped
 

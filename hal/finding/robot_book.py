@@ -4,17 +4,17 @@ import math
 from typing import Any
 
 from hal import registry
-from hal.bus import OWN_NODE
 from hal.clock import SystemClock
+from hal.commissioning.pdos import cob_id
 from hal.config import RobotConfig
-from hal.decode_book import EXTENDED, Book, Explain
 from hal.device import Device
 from hal.drivers.canopen_node import CanopenNode, data_sheet
 from hal.drivers.dbc_sequence import Address
+from hal.finding.book import EXTENDED, Book, Explain
 from hal.fleet import build
-from hal.pdo_commissioning import cob_id
 from hal.protocols import cia301, dbc, mit
 from hal.protocols.mit import Layout, Ranges
+from hal.wire.bus import OWN_NODE
 
 
 def books(config: RobotConfig) -> dict[str, Book]:

@@ -3,11 +3,11 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from hal.commissioning.pdo_map import Pdo, PdoMap, describe
+from hal.commissioning.sdo_client import SdoClient
 from hal.errors import DeviceRefused
-from hal.pdo_map import Pdo, PdoMap, describe
 from hal.protocols import cia301
 from hal.protocols.cia301 import Mapped
-from hal.sdo_client import SdoClient
 
 _COB_ID = 0x7FF
 _NO_REQUESTS = 1 << 30

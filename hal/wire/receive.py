@@ -5,12 +5,12 @@ import math
 
 import can
 
-from hal.budget import frame_bits
-from hal.bus_routes import EXTENDED, Routes, name_of
-from hal.bus_state import BusState, BusWatch
-from hal.bus_time import ArrivalClock, FrameClock
 from hal.protocols import cia301
 from hal.protocols.error_frames import error_frame
+from hal.wire.budget import frame_bits
+from hal.wire.routes import EXTENDED, Routes, name_of
+from hal.wire.stamps import ArrivalClock, FrameClock
+from hal.wire.state import BusState, BusWatch
 
 log = logging.getLogger(__name__)
 
