@@ -109,6 +109,7 @@ def _signals(samples: Sequence[Sample | None], estimate: Estimates | None) -> Ta
         if (sample := measured.get(name)) is not None:
             valid = f"{int(sample.valid[name].sum())}/{sample.valid[name].size}"
             age = f"{1e3 * float(sample.age[name].max()):.1f}"
+            values = _numbers(sample.values[name], np.zeros(sample.values[name].size, bool))
         if estimate is not None and name in estimate.values:
             method, source = estimate.method[name], estimate.mask[name].replace("+", ", ")
             values = _numbers(estimate.values[name], estimate.estimated[name])

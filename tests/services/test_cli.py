@@ -13,7 +13,9 @@ def gemuco(*words: str, folder: Path | None = None) -> subprocess.CompletedProce
 
 
 @pytest.mark.parametrize(
-    "verb", ["simulate", "hal", "serve", "collect", "train", "query", "top", "record", "demo", "reproduce"]
+    "verb",
+    ["simulate", "hal", "serve", "collect", "train", "query", "top", "record", "demo", "reproduce"]
+    + ["estop", "scan", "doctor", "calibrate", "can"],
 )
 def test_every_verb_explains_itself(verb: str) -> None:
     told = gemuco(verb, "--help")
