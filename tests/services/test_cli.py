@@ -14,11 +14,11 @@ def gemuco(*words: str, folder: Path | None = None) -> subprocess.CompletedProce
 
 @pytest.mark.parametrize(
     "verb",
-    ["simulate", "hal", "serve", "collect", "train", "query", "top", "record", "demo", "reproduce"]
-    + ["estop", "scan", "doctor", "calibrate", "can"],
+    ["simulate", "hal", "serve", "collect", "train", "query", "top", "record", "demo", "reproduce", "estop", "scan"]
+    + ["doctor", "calibrate joint", "calibrate cell", "can dump"],
 )
 def test_every_verb_explains_itself(verb: str) -> None:
-    told = gemuco(verb, "--help")
+    told = gemuco(*verb.split(), "--help")
     assert told.returncode == 0
     assert "ROBOT" in told.stdout
 
