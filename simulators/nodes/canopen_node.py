@@ -5,7 +5,7 @@ from collections.abc import Callable
 from enum import IntEnum
 
 from simulators.nodes.node import Frame, Handler
-from simulators.nodes.objects import Abort, ObjectDictionary, Refused, Value, read_eds
+from simulators.nodes.objects import Abort, ObjectDictionary, Refused, Value, as_maker_says, read_eds
 from simulators.nodes.pdo import Pdo, PdoTable
 from simulators.nodes.plant import Plant
 from simulators.nodes.sdo import SdoServer
@@ -39,7 +39,8 @@ class CanopenNode:
         self.spec = spec
         self.plant = plant
         self._outbox = outbox
-        self.objects = ObjectDictionary(read_eds(spec.eds, spec.node))
+        entries = read_eds(spec.eds, spec.node)
+        self.objects = ObjectDictionary(as_maker_says(entries, spec.sheet, spec.node) if spec.sheet else entries)
         self.objects.power_on |= {(0x1018, 4): spec.serial, (0x2000, 0): spec.name}
         self.objects.on_write[0x1003] = lambda sub, old, new: self._forget_errors()
         self.objects.on_write[0x1016] = self._check_consumer

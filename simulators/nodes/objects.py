@@ -104,11 +104,29 @@ def read_eds(path: Path, node: int) -> dict[Key, Entry]:
     return entries
 
 
+def as_maker_says(ours: dict[Key, Entry], path: Path, node: int) -> dict[Key, Entry]:
+    """What a node of ours has, with the identity, defaults and limits of a maker's EDS file laid over it.
+
+    Objects whose type is another one there than here stay ours, since the node computes with them.
+    """
+    entries = dict(ours)
+    for key, (entry, is_relative) in _sheet(path, others_too=True).items():
+        if key not in ours or ours[key].format == entry.format:
+            entries[key] = replace(entry, default=entry.default + node) if is_relative else entry  # type: ignore[operator]
+    return entries
+
+
 @functools.cache
-def _sheet(path: Path) -> dict[Key, tuple[Entry, bool]]:
-    """The values of an EDS file for node 0, and whether the node id is added to their defaults."""
+def _sheet(path: Path, others_too: bool = False) -> dict[Key, tuple[Entry, bool]]:
+    """The values of an EDS file for node 0, and whether the node id is added to their defaults.
+
+    Args:
+        path: The file.
+        others_too: Whether it may have types that no node of ours uses; those objects are left out.
+    """
     dictionary = canopen.import_od(str(path), node_id=0)
-    return {(v.index, v.subindex): (_entry(v), v.relative) for v in _variables(dictionary)}
+    variables = (v for v in _variables(dictionary) if not others_too or v.data_type in (*_FORMATS, _STRING))
+    return {(v.index, v.subindex): (_entry(v), v.relative) for v in variables}
 
 
 def _variables(dictionary: canopen.ObjectDictionary) -> Iterator[ODVariable]:

@@ -130,6 +130,7 @@ class NodeSpec:
         node: Node id; 1 to 127 on CANopen.
         element: `signal.element` of the world that it measures or moves.
         constants: Its electrical constants; their type says what kind of node it is.
+        sheet: A maker's EDS file whose device it shall look like; None: ours.
     """
 
     name: str
@@ -137,6 +138,7 @@ class NodeSpec:
     node: int
     element: str
     constants: Constants
+    sheet: Path | None = None
 
     @property
     def kind(self) -> str:

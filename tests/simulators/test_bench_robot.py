@@ -74,3 +74,27 @@ def test_a_robot_file_alone_gives_a_robot_that_answers_and_follows():
     finally:
         rig.stop()
     assert not rig.failure
+
+
+def test_a_makers_data_sheet_gives_a_device_of_that_maker(tmp_path):
+    sheet = (ARM.folder / "eds" / "servo_drive.eds").read_text()
+    ours = str(0x47454D55)
+    assert ours in sheet
+    (tmp_path / "acme.eds").write_text(sheet.replace(ours, str(0xACE0)))
+    body = ARM.model_dump(by_alias=True) | {"folder": tmp_path}
+    drive = body["devices"]["biceps_drive"]
+    for bus in body["buses"]:
+        body["buses"][bus].update(interface="virtual", channel=f"makers_{bus}")
+    body["kinds"]["muscle_drive"]["settings"]["eds"] = "acme.eds"
+    body["devices"] = {"biceps_drive": drive}
+    body["signals"] = {"muscle_length": {"unit": "m", "elements": ["biceps"]}}
+    body["limits"] = {}
+    config = RobotConfig.model_validate(body)
+    rig = simulator.rig(config, "bench", 0)
+    rig.start()
+    try:
+        with open_robot(config) as robot:
+            assert robot.health()["devices"]["biceps_drive"]["state"] == "ready"
+            assert robot._devices[0].identity.startswith("canopen:0000ACE0-00000402-")
+    finally:
+        rig.stop()

@@ -138,5 +138,6 @@ def hardware(config: RobotConfig) -> list[NodeSpec]:
         constants: Any = CONSTANTS[kind](settings)
         if hasattr(settings, "channels"):
             constants = replace(constants, more=_more(settings, device.elements))
-        nodes.append(NodeSpec(name, device.bus, device.node, element, constants))
+        sheet = config.folder / settings.eds if hasattr(settings, "eds") else None
+        nodes.append(NodeSpec(name, device.bus, device.node, element, constants, sheet))
     return nodes
