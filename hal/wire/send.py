@@ -18,6 +18,9 @@ PAUSE = 0.0002
 """Between two tries to have a full interface take a frame [s]; a frame at 1 Mbit/s needs about 0.1 ms."""
 PAUSES = 10
 """All frames of a cycle together may wait for so many pauses: 2 ms, whatever the interface does."""
+TURN = 0.02
+"""All frames of a cycle together may wait so long [s] while another thread hands over a frame; that is one system call,
+but on a busy machine with one CPU a thread may be interrupted in it."""
 PATIENCE = 0.05
 """What is asked once may wait so long [s], and not in the cycle."""
 FAILED_SENDS = 3
@@ -27,6 +30,7 @@ STUCK = 1.0
 
 _BITS = tuple(frame_bits(size) for size in range(9))
 _FULL = (None, errno.ENOBUFS, errno.EAGAIN)
+_BUSY = can.CanOperationError("the interface is still busy with another frame", errno.EBUSY)
 
 
 class Sender:
@@ -43,6 +47,7 @@ class Sender:
         self._interface: can.BusABC | None = None
         self._lock = threading.Lock()
         self._pauses = PAUSES
+        self._turn = TURN
         self._in_a_row: dict[int, int] = {}
         self._given_up = ""
         self._since: float | None = None
@@ -56,7 +61,7 @@ class Sender:
 
     def begin(self) -> None:
         """A cycle begins, and may wait again."""
-        self._pauses = PAUSES
+        self._pauses, self._turn = PAUSES, TURN
 
     @property
     def problem(self) -> str:
@@ -81,8 +86,7 @@ class Sender:
             self._counters["send_failures"] += 1
             self._failed(f"Frame {message.arbitration_id:03X}h has {size} data bytes; a classic frame has at most 8.")
             return False
-        limit = patience or self._pauses * PAUSE
-        error = self._try(message, limit)
+        error = self._try(message, patience)
         pauses = round(patience / PAUSE)
         while error is not None and _is_full(error):
             if pauses:
@@ -92,7 +96,7 @@ class Sender:
             else:
                 break
             time.sleep(PAUSE)
-            error = self._try(message, limit)
+            error = self._try(message, patience)
         if error is not None:
             self._note(message, error)
             return False
@@ -102,10 +106,10 @@ class Sender:
         self.bits += _BITS[size]
         return True
 
-    def _try(self, message: can.Message, limit: float) -> Exception | None:
-        """What came of handing a frame to the interface; waits up to `limit` [s] for another thread that does so."""
-        if not self._lock.acquire(timeout=limit):
-            return can.CanOperationError("the interface is still busy with another frame", errno.EBUSY)
+    def _try(self, message: can.Message, patience: float) -> Exception | None:
+        """What came of handing a frame to the interface, after waiting for another thread that does so."""
+        if not self._lock.acquire(blocking=False) and not self._wait(patience):
+            return _BUSY
         try:
             interface = self._interface
             if interface is None:
@@ -119,9 +123,20 @@ class Sender:
             self._lock.release()
         return None
 
+    def _wait(self, patience: float) -> bool:
+        """Wait for the interface while another thread uses it; whether it is ours now."""
+        if patience:
+            return self._lock.acquire(timeout=patience)
+        start = time.monotonic()
+        is_ours = self._lock.acquire(timeout=self._turn)
+        self._turn = max(self._turn - (time.monotonic() - start), 0.0)
+        return is_ours
+
     def _note(self, message: can.Message, error: Exception) -> None:
         identifier = message.arbitration_id
         self._counters["send_failures"] += 1
+        if error is _BUSY:  # one that does not come back is a problem of its own, and told as such
+            return
         failed = self._in_a_row[identifier] = self._in_a_row.get(identifier, 0) + 1
         text = f"Frame {identifier:03X}h could not be sent: {error}."
         if failed >= FAILED_SENDS:

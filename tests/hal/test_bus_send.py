@@ -220,3 +220,19 @@ def test_what_is_no_socket_is_left_alone_and_nothing_leaks(handle):
     assert len(list(Path("/proc/self/fd").iterdir())) == before
     for end in ends:
         os.close(end)
+
+
+def test_while_another_thread_hands_over_a_frame_a_cycle_waits_for_a_turn_and_no_more(bus, interface):
+    interface.is_stuck.set()
+    other = threading.Thread(target=bus.send, args=(frame(0x603),))
+    other.start()
+    wait_for(lambda: interface.tries == 1, "the other thread sends")
+    for _ in range(FAILED_SENDS + 1):
+        bus.begin()
+        assert [bus.send(frame(0x201 + node)) for node in range(3)] == [False] * 3
+    interface.is_stuck.clear()
+    other.join()
+    bus.begin()
+    assert bus.send(frame())
+    assert bus.counters["opened"] == 1, "a busy machine is no reason to open the interface again"
+    assert [identifier for identifier, _ in interface.taken] == [0x603, 0x201]

@@ -96,6 +96,31 @@ def test_a_stamp_in_the_future_is_not_believed(clock):
     assert frames.counters["bad_stamps"] == 1
 
 
+class SlowClock(ManualClock):
+    """Reading it takes time, as where the kernel has to be asked."""
+
+    COST = 0.0001
+    reads = 0
+
+    def monotonic(self):
+        self.reads += 1
+        self.advance(self.COST)
+        return super().monotonic()
+
+
+def test_where_reading_a_clock_is_slow_late_frames_do_not_have_it_read_every_time():
+    clock = SlowClock()
+    clock.set_wall(1.7e9)
+    frames = FrameClock(clock)
+    before = clock.reads
+    for _ in range(100):
+        clock.advance(0.0001)
+        now = clock.monotonic()
+        assert frames.received(stamp(clock, 0.008), now) == pytest.approx(now - 0.008, abs=5e-4)
+    assert clock.reads - before < 300
+    assert frames.counters["bad_stamps"] == 0
+
+
 def test_no_frame_is_ever_newer_than_now(clock):
     frames = FrameClock(clock)
     chance = random.Random(5)
