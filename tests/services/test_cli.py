@@ -12,11 +12,13 @@ def gemuco(*words: str, folder: Path | None = None) -> subprocess.CompletedProce
     return subprocess.run(command, capture_output=True, text=True, timeout=60, cwd=folder or ROOT, check=False)
 
 
-@pytest.mark.parametrize(
-    "verb",
-    ["simulate", "hal", "serve", "collect", "train", "query", "top", "record", "demo", "reproduce", "estop", "scan"]
-    + ["doctor", "calibrate joint", "calibrate cell", "can dump"],
+VERBS = (
+    "simulate, hal, serve, vision, collect, train, query, top, record, demo, reproduce, estop, scan, doctor, "
+    "calibrate joint, calibrate cell, can dump"
 )
+
+
+@pytest.mark.parametrize("verb", VERBS.split(", "))
 def test_every_verb_explains_itself(verb: str) -> None:
     told = gemuco(*verb.split(), "--help")
     assert told.returncode == 0
