@@ -22,7 +22,7 @@ PLAIN = {
     "rollback": "model",
     "normal": "model",
 }
-VERBS = ("estimate", "anomaly", "control", "simulate", "target", "adapt", "describe", "fault", "home", *PLAIN)
+VERBS = ("estimate", "anomaly", "control", "simulate", "target", "adapt", "describe", "fault", "home", "tare", *PLAIN)
 WATCH_EVERY = 1.0
 CONNECTS_WITHIN = 0.5
 """Time [s] that connections to running services take at most."""
@@ -108,6 +108,8 @@ def _answer(client: Client, verb: str, words: Sequence[str], hide: Sequence[str]
         return _fault(client, " ".join(words))
     if verb == "home":
         return client.home(_one(verb, words, "the name of a drive"))
+    if verb == "tare":
+        return client.tare(_one(verb, words, "the name of a sensor"))
     if verb == "describe":
         service = words[0] if words else "hal"
         if service not in keys.SERVICES:

@@ -199,6 +199,8 @@ def query(
 
     [bold]enable[/], [bold]disable[/], [bold]stop[/], [bold]reset[/], [bold]home DRIVE[/] the HAL's motors
 
+    [bold]tare SENSOR[/] what it measures now is zero, while the robot is off
+
     [bold]describe [SERVICE][/] who a service is
 
     [bold]fault TEXT[/] break something in the simulator

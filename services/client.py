@@ -190,6 +190,10 @@ class Client:
         """Ask one drive to find its zero, which moves it; the robot must be off, and its mode is then `homing`."""
         return self.ask("hal", "home", {"device": device})
 
+    def tare(self, device: str) -> dict[str, Any]:
+        """Ask one sensor to take what it measures as zero while the robot is off; its health tells what came of it."""
+        return self.ask("hal", "tare", {"device": device})
+
     def estop(self, reason: str = "") -> dict[str, Any]:
         """Stop every drive as fast as it can, whatever the robot does; leave the fault with `reset`.
 

@@ -56,7 +56,8 @@ class HalService:
         service.verb("disable", lambda _: self._do(robot.disable))
         service.verb("stop", lambda _: self._do(lambda: robot.stop("A client asked to stop.")))
         service.verb("reset", lambda _: self._do(robot.reset))
-        service.verb("home", lambda given: self._do(lambda: robot.home(_named(given))))
+        service.verb("home", lambda given: self._do(lambda: robot.home(_named("home", given))))
+        service.verb("tare", lambda given: self._do(lambda: robot.tare(_named("tare", given))))
         service.verb("estop", self._estop)
 
     def run(self, stop: threading.Event) -> None:
@@ -149,9 +150,9 @@ class HalService:
         return {"mode": self._robot.mode, "fault": self._robot.fault_text}
 
 
-def _named(given: dict[str, Any]) -> str:
+def _named(verb: str, given: dict[str, Any]) -> str:
     if set(given) != {"device"}:
-        raise BadArguments(f"home takes {{device: name}}, not {{{', '.join(given)}}}.")
+        raise BadArguments(f"{verb} takes {{device: name}}, not {{{', '.join(given)}}}.")
     return str(given["device"])
 
 

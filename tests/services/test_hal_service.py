@@ -156,6 +156,22 @@ def test_commands_while_off_are_refused(arm: Processes) -> None:
     assert "mode 'off'" in arm.refused()["text"]
 
 
+def test_a_sensor_is_tared_while_the_robot_is_off_and_only_then(arm: Processes) -> None:
+    cell = next(name for name in arm.client.describe("hal")["devices"] if name.endswith("_cell"))
+
+    def tared() -> int:
+        return int(arm.client.status("hal").facts["devices"][cell]["counters"]["tared"])
+
+    arm.client.disable()
+    eventually(lambda: arm.mode() == "off")
+    before = tared()
+    arm.client.tare(cell)
+    eventually(lambda: tared() == before + 1)
+    _enable(arm)
+    with pytest.raises(CommandRefused):
+        arm.client.tare(cell)
+
+
 def test_reset_of_an_enabled_robot_comes_back_as_what_it_was(arm: Processes) -> None:
     _enable(arm)
     with pytest.raises(CommandRefused):
