@@ -312,7 +312,7 @@ class Robot:
             actuators.damp()
             return limited
         if act is Act.START:  # the set-point is where the robot is, so that nothing jumps
-            limiter.start(self._measured)
+            limiter.start(self._start.believed())
         elif act is Act.PARK:
             limited = limiter.step(self._park, self._measured, is_parking=True)
         else:

@@ -33,13 +33,13 @@ class Start:
         self._signal = config.command.signal
         self._elements = config.signals[self._signal].elements
         self._seen = -np.inf
-        self._newest = self._asked = np.full(len(self._elements), np.nan)
+        self._newest = self._before = self._asked = self._believed = np.full(len(self._elements), np.nan)
         low, high = config.bounds(self._signal)
         self._may_move = MOVED * (high - low) if quantity == "position" else np.full(len(self._elements), np.inf)
 
     def note(self, measured: Arrays, now: float) -> None:
         """What the cycle at monotonic time `now` [s] measured."""
-        self._newest = measured[self._signal]
+        self._before, self._newest = self._newest, measured[self._signal]
         if np.isfinite(self._newest).all():
             self.known, self._seen = measured, now
 
@@ -58,7 +58,19 @@ class Start:
         excluded = limiter.excluded(self.known)
         if excluded:
             raise CommandRefused(excluded)
-        self._asked = self.known[self._signal]
+        self._asked = self._believed = self.known[self._signal]
+
+    def believed(self) -> Arrays:
+        """Where the robot is while its drives are being enabled [unit of the commanded signal].
+
+        Of the last two measurements of an element that which is nearer to what was believed before: a single wrong one
+        is not followed.
+        """
+        newest, before, believed = self._newest, self._before, self._believed
+        with np.errstate(invalid="ignore"):
+            nearer = np.where(np.abs(newest - believed) <= np.abs(before - believed), newest, before)
+        self._believed = np.where(np.isfinite(nearer), nearer, believed)
+        return {self._signal: self._believed}
 
     def moved(self, measured: Arrays) -> str:
         """What has moved further since `check` than can be while the drives are being enabled; empty if nothing has."""

@@ -39,3 +39,20 @@ def test_a_brake_that_gives_way_a_little_is_no_fault(bench):
     bench.robot.enable()
     bench.world.length[0] += 0.01  # m
     bench.until(lambda: bench.robot.mode == "hold", "enabling", 40)
+
+
+@pytest.mark.parametrize("cycle", range(1, 8))
+def test_one_wrong_measurement_while_it_is_enabled_is_not_where_it_starts_from(bench, cycle):
+    bench.cycle(3)
+    bench.robot.enable()
+    bench.cycle(cycle)
+    bench.world.length[0] += 0.01  # m, within what a brake may give way
+    bench.cycle()
+    bench.world.length[0] -= 0.01
+    bench.cycle()
+    set_points = []
+    for _ in range(30):
+        _, applied = bench.cycle()
+        set_points.append(applied.values[0])
+    assert bench.robot.mode == "hold"
+    assert set_points == pytest.approx([0.3] * 30, abs=1e-4)  # m
