@@ -159,7 +159,7 @@ class Robot:
             if self._modes.mode is Mode.OFF:
                 self._start.check(self._clock.monotonic(), self._limiter)
                 self._desired = None
-                self._limiter.start(self._start.known)
+                self._limiter.start(self._start.believed())
             self._modes.enable(self._clock.monotonic())
 
     def home(self, device: str) -> None:

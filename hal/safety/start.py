@@ -1,5 +1,7 @@
 """Whether a robot may be enabled where it is."""
 
+from collections import deque
+
 import numpy as np
 
 from hal.config import RobotConfig
@@ -30,18 +32,20 @@ class Start:
             quantity: What the drives are commanded in; only positions have a place to start from.
         """
         self.known: Arrays = {}
+        self._recent: deque[np.ndarray] = deque(maxlen=3)
         self._signal = config.command.signal
         self._elements = config.signals[self._signal].elements
         self._seen = -np.inf
-        self._newest = self._before = self._asked = self._believed = np.full(len(self._elements), np.nan)
+        self._newest = self._asked = np.full(len(self._elements), np.nan)
         low, high = config.bounds(self._signal)
         self._may_move = MOVED * (high - low) if quantity == "position" else np.full(len(self._elements), np.inf)
 
     def note(self, measured: Arrays, now: float) -> None:
         """What the cycle at monotonic time `now` [s] measured."""
-        self._before, self._newest = self._newest, measured[self._signal]
+        self._newest = measured[self._signal]
         if np.isfinite(self._newest).all():
             self.known, self._seen = measured, now
+            self._recent.append(self._newest)
 
     def check(self, now: float, limiter: Limiter) -> None:
         """Look before anything is enabled.
@@ -58,19 +62,11 @@ class Start:
         excluded = limiter.excluded(self.known)
         if excluded:
             raise CommandRefused(excluded)
-        self._asked = self._believed = self.known[self._signal]
+        self._asked = self.believed()[self._signal]
 
     def believed(self) -> Arrays:
-        """Where the robot is while its drives are being enabled [unit of the commanded signal].
-
-        Of the last two measurements of an element that which is nearer to what was believed before: a single wrong one
-        is not followed.
-        """
-        newest, before, believed = self._newest, self._before, self._believed
-        with np.errstate(invalid="ignore"):
-            nearer = np.where(np.abs(newest - believed) <= np.abs(before - believed), newest, before)
-        self._believed = np.where(np.isfinite(nearer), nearer, believed)
-        return {self._signal: self._believed}
+        """The middle one of the last three measurements of the commanded signal: one wrong one is not followed."""
+        return {self._signal: np.median(self._recent, axis=0)}
 
     def moved(self, measured: Arrays) -> str:
         """What has moved further since `check` than can be while the drives are being enabled; empty if nothing has."""
