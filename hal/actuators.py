@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from hal.config import RobotConfig
-from hal.device import UNDER_POWER, Device, DeviceState
+from hal.device import Device, DeviceState
 from hal.errors import CommandRefused, ConfigError
 
 
@@ -85,7 +85,7 @@ class Actuators:
     @property
     def are_powered(self) -> bool:
         """Whether any has power, as far as it tells."""
-        return any(state in UNDER_POWER for state in self.states())
+        return any(device.has_power for device in self.devices)
 
     def named(self, states: Sequence[DeviceState], wanted: DeviceState) -> str:
         """Names of those that are not in the wanted state."""

@@ -124,6 +124,11 @@ class Device(abc.ABC):
     def health(self) -> DeviceHealth:
         """State, a sentence and counters."""
 
+    @property
+    def has_power(self) -> bool:
+        """Whether its motor has power, as far as it tells; a device in fault may have it still."""
+        return self.health().state in UNDER_POWER
+
     @abc.abstractmethod
     def close(self) -> None:
         """Disable and let go. Safe to call twice, and when the bus is gone."""

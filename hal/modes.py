@@ -191,7 +191,7 @@ class ModeMachine:
         """
         if self.mode not in (Mode.OFF, Mode.FAULT):
             raise CommandRefused(f"The robot is in mode '{self.mode}', there is no fault to reset.")
-        powered = [d.name for d in self._actuators.devices if d.health().state in _POWERED]
+        powered = [device.name for device in self._actuators.devices if device.has_power]
         if powered:
             raise CommandRefused(f"Still enabled: {', '.join(powered)}. If they do not let go, cut the power.")
         self.mode, self.fault_text, self._is_emergency = Mode.OFF, "", False
@@ -220,7 +220,8 @@ class ModeMachine:
         """Why the group must stop, given the drives' states; empty if it need not."""
         if self.mode is Mode.OFF or self.mode is Mode.HOMING:
             for device, state in zip(self._actuators.devices, states, strict=True):
-                if state in _POWERED and device is not self._homing:
+                is_powered = state in _POWERED or (state is DeviceState.FAULT and device.has_power)
+                if is_powered and device is not self._homing:
                     return f"'{device.name}' is {state}, which nobody asked for. {device.health().text}".rstrip()
             return ""
         fits = _FIT[self.mode] if self.act is not Act.IDLE else _LETTING_GO

@@ -12,7 +12,7 @@ import numpy as np
 
 from hal.calibration.line import Calibration
 from hal.config import Positive, Section
-from hal.device import Device, DeviceHealth, DeviceState, Reading
+from hal.device import UNDER_POWER, Device, DeviceHealth, DeviceState, Reading
 from hal.errors import DeviceSilent, HalError, WrongDevice
 from hal.wire.bus import Bus
 
@@ -115,6 +115,8 @@ class CanDevice(Device):
         self._counters = self._health.counters
         self._trouble: tuple[DeviceState, str] = (DeviceState.CLOSED, "Not opened yet.")
         self._opening = threading.Lock()
+        self._standing_lock = threading.Lock()
+        self._is_closed = True
         place.bus.needs_sync |= self.NEEDS_SYNC
         place.bus.expect(self)
 
@@ -132,6 +134,16 @@ class CanDevice(Device):
     def _fault(self) -> str:
         """The fault that the device reports, in a sentence; empty if none."""
         return ""
+
+    def _drives(self) -> bool:
+        """Whether its motor has power by what came last, whatever else it reports."""
+        return False
+
+    @property
+    def has_power(self) -> bool:
+        """See `Device.has_power`; a fault that is reported beside the state says nothing of the power."""
+        state = self.health().state
+        return state in UNDER_POWER or (state is DeviceState.FAULT and self._drives())
 
     def _running(self) -> tuple[DeviceState, str]:
         """State and sentence of a device that is commissioned, answers, and reports no fault."""
@@ -153,6 +165,7 @@ class CanDevice(Device):
             self._opening.release()
 
     def _open(self) -> None:
+        self._is_closed = False
         self.identity = self._identify()
         self._check_calibration()
         boots = self._counters["boots"]
@@ -197,22 +210,16 @@ class CanDevice(Device):
     def close(self) -> None:
         """See `Device.close`."""
         with self._opening:
-            if not self.is_commissioned:
-                return
-            self.is_commissioned = False
-            self._trouble = (DeviceState.CLOSED, "Closed.")
-            self._release()
+            with self._standing_lock:  # what still comes from the bus must not look like a device being opened
+                was_commissioned, self.is_commissioned = self.is_commissioned, False
+                self._is_closed, self._trouble = True, (DeviceState.CLOSED, "Closed.")
+            if was_commissioned:
+                self._release()
 
     @property
     def is_heard(self) -> bool:
         """Whether it answered lately enough not to count as silent."""
         return self.missed <= self._silent_cycles
-
-    def _answered(self, value: float, received: float) -> None:
-        """The frame with the main quantity has come: the value first, then its time, so that no value looks newer."""
-        self._values[0] = value
-        self._received[0] = received
-        self._is_answered()
 
     def _is_answered(self) -> None:
         """All that the device sends in a cycle has come."""
@@ -221,5 +228,7 @@ class CanDevice(Device):
 
     def _lose(self, text: str) -> None:
         """The device is not as we configured it any more."""
-        self.is_commissioned = False
-        self._trouble = (DeviceState.OPENING, text)
+        with self._standing_lock:
+            self.is_commissioned = False
+            if not self._is_closed:
+                self._trouble = (DeviceState.OPENING, text)

@@ -186,6 +186,9 @@ class Cia402Drive(CanopenNode):
         self._state, self._statusword, self._counts = State.NOT_READY, -1, None
         self._is_wanted, self._letting_go, self._slowing, self._homing = False, 0, 0, None
 
+    def _drives(self) -> bool:
+        return self._state in (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_REACTION)
+
     def _running(self) -> tuple[DeviceState, str]:
         state, homing = self._state, self._homing
         if state is State.FAULT or state is State.FAULT_REACTION:

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from hal.device import Check, DeviceState
+from hal.device import UNDER_POWER, Check, DeviceState
 from hal.drivers.can_device import Place
 from hal.drivers.dbc import FRAME_BYTES, POLL, DbcNode
 from hal.drivers.dbc_inbox import Letter, Raws
@@ -195,6 +195,9 @@ class DbcServo(DbcNode):
         if self._meaning.get(self._state.raw, DeviceState.FAULT) is DeviceState.FAULT:
             return f"{self._place} is in its state '{self._state.words()}' ({self._settings.state.signal})."
         return ""
+
+    def _drives(self) -> bool:
+        return self._meaning.get(self._state.raw) in UNDER_POWER
 
     def _standing(self) -> tuple[DeviceState, str]:
         meaning = self._meaning.get(self._state.raw)

@@ -206,6 +206,9 @@ class MitDrive(CanDevice):
         told = mit.describe_error(error, self._layout)
         return f"{self._place} reports {told}. Reset it when the cause is gone; if it stays, cut its power once."
 
+    def _drives(self) -> bool:
+        return self._is_powered
+
     def _running(self) -> tuple[DeviceState, str]:
         self._look_for_drop()
         text = self._dropped

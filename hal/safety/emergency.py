@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from hal.clock import Clock
 from hal.config import RobotConfig
-from hal.device import UNDER_POWER, Device, DeviceState
+from hal.device import Device, DeviceState
 from hal.wire.bus import Bus
 from hal.wire.state import UNUSABLE
 
@@ -131,7 +131,7 @@ class EmergencyStop:
     def _has_stopped(self, device: Device, since: float) -> bool:
         """Whether the drive said after `since` [monotonic s] that it is without power."""
         is_fresh = not device.measures or float(device.read().received.max()) > since or not self._buses
-        return is_fresh and device.health().state in _STOPPED
+        return is_fresh and device.health().state in _STOPPED and not device.has_power
 
     def _tell(self, device: Device, after: float | None) -> Stopped:
         name = device.name
@@ -141,8 +141,9 @@ class EmergencyStop:
         if bus is not None and bus.state in UNUSABLE:
             return Stopped(name, False, f"cannot be reached, bus '{bus.name}' is {bus.state}; cut the power")
         health = device.health()
-        if health.state in UNDER_POWER:
-            return Stopped(name, False, f"is still {health.state}; cut the power")
+        if device.has_power:
+            power = "under power, in " if health.state is DeviceState.FAULT else ""
+            return Stopped(name, False, f"is still {power}{health.state}; cut the power")
         return Stopped(name, False, f"did not answer ({health.state}); cut the power")
 
 

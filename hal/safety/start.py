@@ -11,8 +11,6 @@ from hal.safety.limiter import Limiter
 
 MEMORY = 0.25
 """The robot may be enabled where all its drives were seen not longer ago [s]: a lost frame is no obstacle."""
-
-
 MOVED = 0.05
 """Part of its range that an element may move while the drives are being enabled: brakes open, nothing pushes yet."""
 
@@ -43,6 +41,8 @@ class Start:
     def note(self, measured: Arrays, now: float) -> None:
         """What the cycle at monotonic time `now` [s] measured."""
         self._newest = measured[self._signal]
+        if now - self._seen > MEMORY:  # it may have been moved while nobody looked
+            self._recent.clear()
         if np.isfinite(self._newest).all():
             self.known, self._seen = measured, now
             self._recent.append(self._newest)
