@@ -3,10 +3,11 @@ PYTHON ?= python3
 BIN := .venv/bin
 VMCAN ?= ../shared/tools/vmcan.sh
 STAMP := .venv/installed
+CLOCKLESS := tests/gemuco tests/house tests/hal/test_campaign.py tests/hal/test_fuzz.py
 SOCKETCAN := $(addprefix tests/system/test_socketcan,.py _bus.py _drivers.py _states.py)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo reproduce test check format faults bench test-socketcan test-controllers results clean
+.PHONY: help setup demo reproduce test check format faults fuzz bench test-socketcan test-controllers results clean test-compose wheels test-network
 
 help:            ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 18
@@ -24,8 +25,11 @@ demo: $(STAMP)   ## one minute with a muscle-driven arm that loses a sensor and 
 reproduce: $(STAMP)  ## the paper's experiments on three simulated robots, its figures beside ours
 	for robot in pr2 musashi kxr; do $(BIN)/gemuco reproduce $$robot || exit 1; done
 
-test: $(STAMP)   ## all tests
-	$(BIN)/python -m pytest
+test: $(STAMP)   ## all tests; those that need no clock run beside the others, and yield to them
+	@mkdir -p build; nice -n 19 $(BIN)/python -m pytest -p no:cacheprovider $(CLOCKLESS) >build/clockless.log 2>&1 & beside=$$!; \
+	trap 'kill $$beside; exit 130' INT TERM; \
+	$(BIN)/python -m pytest $(addprefix --ignore=,$(CLOCKLESS)); found=$$?; \
+	wait $$beside || found=1; cat build/clockless.log; exit $$found
 
 check: $(STAMP)  ## formatting, lint, types, import contracts
 	$(BIN)/ruff format --check .
@@ -47,9 +51,21 @@ test-controllers: $(STAMP)  ## drivers on two CAN controllers at 1 Mbit/s: can0 
 	elif [ -x "$(VMCAN)" ] && command -v qemu-system-x86_64 >/dev/null; then VMCAN_HW=1 "$(VMCAN)" -b qemu -t 580 "$(CURDIR)" $(BIN)/python -m pytest -p no:cacheprovider tests/system/test_socketcan_states.py; \
 	else echo "skipped: no controllers can0 and can1 here, and no '$(VMCAN)' with qemu-system-x86_64 to boot a machine that has them"; fi
 
+test-compose: $(STAMP)  ## the simulated stack in containers: up, a client, each container killed once, down; needs Docker
+	$(BIN)/python tests/system/compose_check.py
+
+wheels: $(STAMP)  ## fill wheels/, from which the images are then built without a network
+	$(BIN)/python deploy/requirements.py +sim | $(BIN)/python -m pip download --quiet --dest wheels --constraint constraints.txt --requirement /dev/stdin setuptools
+
 faults: $(STAMP)  ## the robot broken in every way with many seeds (docs/safety.md), and a million random frames
 	$(BIN)/python tests/hal/campaign.py --seeds 7 --json runs/faults.json
 	$(BIN)/python tests/hal/fuzz.py --frames 1000000
+
+fuzz: $(STAMP)    ## a hundred thousand bad messages on every key of a running robot
+	$(BIN)/python tests/system/fuzz_messages.py --count 100000
+
+test-network: $(STAMP)  ## HAL and model on a link that is cut, slow or lossy, over TCP and QUIC (docs/network.md); needs root
+	$(BIN)/python tests/network/campaign.py --json runs/network.json
 
 bench: $(STAMP)   ## the loops' punctuality beside bare timers, 10 minutes
 	$(BIN)/python -m benchmarks.loops

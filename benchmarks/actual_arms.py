@@ -10,9 +10,10 @@ from gemuco.schema import BodySchema
 from hal import registry
 from hal.config import RobotConfig
 from hal.robot import Robot
-from services import artifacts, collector, trainer
-from services.living_model import load_model
-from services.playground import DirectPlayground
+from services.learning import collector, trainer
+from services.learning.playground import DirectPlayground
+from services.model import artifacts
+from services.model.living_model import load_model
 from simulators.direct import DirectDevice, WorldClock
 
 

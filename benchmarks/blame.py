@@ -20,7 +20,7 @@ from gemuco.blame import suspects
 from gemuco.normal import Normal, prediction_errors
 from gemuco.schema import BodySchema
 from hal.config import RobotConfig, load_robot
-from services.model_config import model_config
+from services.model.model_config import model_config
 
 JOINTS, TENSIONS = "joint_position", "muscle_tension"
 OFF = 0.3  # [rad]

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from hal.config import RobotConfig, load_robot
 from hal.robot import Robot
-from services.collector import Wanted, collect_direct
-from services.stand_in import condition_of, simulator_of, variant_of
+from services.hardware.stand_in import condition_of, simulator_of, variant_of
+from services.learning.collector import Wanted, collect_direct
 
 CYCLES = 2000
 

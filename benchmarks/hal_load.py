@@ -27,9 +27,9 @@ from hal.config import RobotConfig, load_robot
 from hal.errors import CommandRefused
 from hal.robot import ANSWER_SHARE, Robot, open_robot
 from hal.wire.budget import budgets
-from services import realtime
-from services.hal_service import CYCLE_PRIORITY, RECEIVE_PRIORITY
-from services.simulator_service import PRIORITY, THREADS
+from services.hardware.hal_service import CYCLE_PRIORITY, RECEIVE_PRIORITY
+from services.hardware.simulator_service import PRIORITY, THREADS
+from services.process import realtime
 
 ARM = Path(__file__).parents[1] / "robots" / "musashi_arm.yaml"
 RATE = 200.0

@@ -18,13 +18,13 @@ from gemuco.dataset import Dataset, Episode
 from gemuco.schema import BodySchema
 from gemuco.train import fine_tune, fit
 from hal.config import load_robot
-from services.artifacts import robot_file
-from services.collector import Wanted, collect_direct
-from services.model_config import model_config
+from services.learning.collector import Wanted, collect_direct
+from services.learning.trainer import train_config
+from services.model.artifacts import robot_file
+from services.model.model_config import model_config
 from services.reproduce.pr2_actual import flexible, parted
 from services.reproduce.pr2_arm import JOINTS
 from services.reproduce.pr2_simulated import errors_by_grasp
-from services.trainer import train_config
 
 SHARE, FAR = 0.01, 10.0
 TUNING = 1e-3

@@ -25,10 +25,10 @@ from hal.config import RobotConfig, load_robot
 from hal.errors import CommandRefused
 from services.client import Client
 from services.errors import NotEngaged
-from services.gemuco_service import PRIORITIES
-from services.lateness import Lateness
-from services.realtime import prepare_process, prepare_thread
-from services.supervisor import Supervisor, gemuco_command
+from services.model.gemuco_service import PRIORITIES
+from services.process.lateness import Lateness
+from services.process.realtime import prepare_process, prepare_thread
+from services.process.supervisor import Supervisor, gemuco_command
 
 TARGET_EVERY = 1.0
 REACH = 0.6

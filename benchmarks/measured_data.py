@@ -18,8 +18,8 @@ from gemuco.dataset import Dataset, Episode
 from gemuco.schema import BodySchema
 from gemuco.structure import Judge, Thresholds, determine, train_masks
 from gemuco.train import fit
-from services.measured import MeasuredConfig, load_measured, read
-from services.trainer import train_config
+from services.learning.measured import MeasuredConfig, load_measured, read
+from services.learning.trainer import train_config
 
 ROOT = Path(__file__).parents[1]
 BOARDS = tuple(f"board_{i}" for i in range(4))

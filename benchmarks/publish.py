@@ -17,10 +17,10 @@ from pathlib import Path
 import numpy as np
 
 from hal.config import RobotConfig, load_robot
-from services import keys, messages
 from services.client import Client
-from services.messages import Applied, Sample
-from services.service import Service
+from services.process.service import Service
+from services.wire import keys, messages
+from services.wire.messages import Applied, Sample
 
 ROUNDS = 15
 TURNS = 2000

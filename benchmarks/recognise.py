@@ -26,8 +26,8 @@ from gemuco.train import fit
 from gemuco.train_config import TrainConfig
 from hal import registry
 from hal.config import RobotConfig, load_robot
-from services.artifacts import robot_file
-from services.model_config import collect_config, model_config
+from services.model.artifacts import robot_file
+from services.model.model_config import collect_config, model_config
 
 TIP = "tool_tip_position"
 AFTER = (1, 2, 5, 10, 20, 35)

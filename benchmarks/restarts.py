@@ -19,7 +19,7 @@ from benchmarks.actual_arms import model
 from benchmarks.loops import engage, measures
 from hal.config import load_robot
 from services.client import Client
-from services.supervisor import Supervisor, gemuco_command
+from services.process.supervisor import Supervisor, gemuco_command
 
 
 def until(condition: Callable[[], bool], limit: float = 30.0) -> float:

@@ -17,7 +17,8 @@ from rich.table import Table
 
 from gemuco.dataset import Dataset
 from hal.config import RobotConfig, load_robot
-from services import artifacts, collector, trainer
+from services.learning import collector, trainer
+from services.model import artifacts
 
 ROBOTS = ("pr2_duster", "musashi_arm", "kxr_humanoid")
 BAR = 240.0

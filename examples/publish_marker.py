@@ -8,9 +8,9 @@ import time
 
 import numpy as np
 
-from services import keys
-from services.messages import Sample
-from services.service import Service
+from services.process.service import Service
+from services.wire import keys
+from services.wire.messages import Sample
 
 robot = sys.argv[1] if len(sys.argv) > 1 else "pr2_duster"
 end = time.monotonic() + float(sys.argv[2] if len(sys.argv) > 2 else 10)

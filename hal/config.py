@@ -10,7 +10,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from hal.errors import ConfigError
 from hal.limit_config import CommandConfig, LimitConfig, RangeConfig, StopConfig
-from hal.section import Finite, Positive, Section, explain
+from hal.section import Finite, Positive, Rate, Section, explain
 
 __all__ = [
     "BusConfig", "CommandConfig", "ComputedConfig", "DeviceConfig", "Finite", "KindConfig", "LimitConfig", "Positive",
@@ -99,11 +99,11 @@ class DeviceConfig(Section):
 class RatesConfig(Section):
     """Loop rates [Hz]."""
 
-    hal: Positive = 200.0
-    estimation: Positive = 200.0
-    control: Positive = 50.0
-    anomaly: Positive = 100.0
-    update: Positive = 10.0
+    hal: Rate = 200.0
+    estimation: Rate = 200.0
+    control: Rate = 50.0
+    anomaly: Rate = 100.0
+    update: Rate = 10.0
 
 
 class RobotConfig(Section):
@@ -121,6 +121,8 @@ class RobotConfig(Section):
     devices: dict[str, DeviceConfig] = Field(default_factory=dict)
     simulator: str | None = None
     """`module:name` of what stands in for the hardware."""
+    urdf: Path | None = None
+    """What the robot looks like, for the live page; relative to the robot file."""
     conditions: tuple[str, ...] = ()
     """Ways the body is known to be, such as the tools it may hold; the first unless said otherwise."""
     model: dict[str, Any] = Field(default_factory=dict)

@@ -87,7 +87,7 @@ class CommandConfig(Section):
     """Which signal is commanded, how long a command lives, and what happens when none comes."""
 
     signal: str
-    time_to_live: Positive = 0.1
+    time_to_live: Annotated[float, Field(gt=0, le=10)] = 0.1
     """Age [s] of a command beyond which it is not followed any more."""
     hold: Annotated[float, Field(ge=0)] = 1.0
     """How long [s] the last applied command is held before the robot stops; how long a stop holds or damps."""

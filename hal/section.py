@@ -12,6 +12,8 @@ class Section(BaseModel):
 
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Rate = Annotated[float, Field(gt=0, le=10_000, allow_inf_nan=False)]
+"""Ticks per second [Hz], and no more than a loop in Python could ever do."""
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 

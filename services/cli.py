@@ -1,13 +1,14 @@
 """The command line: every verb of gemuco, each ending in a sentence when something is wrong."""
 
 import sys
+from importlib import metadata
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from services import hardware_verbs
-from services.verb import Connect, RobotFile, load, robot_name, robot_path, speaks_plainly
+from services.verbs import deploy, hardware, network, page, recording
+from services.verbs.verb import Connect, RobotFile, load, robot_name, robot_path, speaks_plainly
 
 app = typer.Typer(
     name="gemuco",
@@ -31,11 +32,18 @@ Variant = Annotated[
 ]
 
 
+def _version(is_asked: bool) -> None:
+    if is_asked:
+        typer.echo(f"gemuco {metadata.version('gemuco')}")
+        raise typer.Exit
+
+
 @app.callback()
 def main(
     verbose: Annotated[
         bool, typer.Option("--verbose", "-v", help="Log what happens, not only what goes wrong.")
     ] = False,
+    version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Tell it.")] = False,
 ) -> None:
     """Begin logging on stderr; the verbs do the rest."""
     import logging
@@ -59,7 +67,7 @@ def simulate(
 
     Break things while it runs with `gemuco query ROBOT fault "muscle_cut biceps"`.
     """
-    from services.simulator_service import run_simulator
+    from services.hardware.simulator_service import run_simulator
 
     return run_simulator(load(robot), variant, seed, condition, connect or ())
 
@@ -71,7 +79,7 @@ def hal(robot: RobotFile, connect: Connect = None) -> int:
 
     Starts with the motors off, and turns them on only when asked.
     """
-    from services.hal_service import run_hal
+    from services.hardware.hal_service import run_hal
 
     return run_hal(load(robot), connect or ())
 
@@ -83,7 +91,7 @@ def vision(robot: RobotFile, variant: Variant = None, seed: Seed = 0, connect: C
 
     A real robot's camera publishes on the same key instead. Cover it with `gemuco query ROBOT fault camera_covered`.
     """
-    from services.vision_service import run_vision
+    from services.hardware.vision_service import run_vision
 
     run_vision(load(robot), variant, seed, connect or ())
 
@@ -96,8 +104,8 @@ def serve(
     connect: Connect = None,
 ) -> None:
     """Run the model: estimation, control, anomaly detection and online update, until Ctrl-C."""
-    from services import artifacts
-    from services.gemuco_service import serve as run_model
+    from services.model import artifacts
+    from services.model.gemuco_service import serve as run_model
 
     config = load(robot)
     run_model(config, model or artifacts.model_folder(config.robot), connect or ())
@@ -125,7 +133,8 @@ def collect(
     out: Annotated[Path | None, typer.Option(help="Where to write; runs/<robot>/data.npz if not given.")] = None,
 ) -> None:
     """Record random safe motion, or taught postures, to train from."""
-    from services import artifacts, collector
+    from services.learning import collector
+    from services.model import artifacts
     from services.show import progress
 
     config, wanted = load(robot), collector.Wanted(tuple(condition or ()), samples, postures)
@@ -149,10 +158,10 @@ def train(
         str, typer.Argument(metavar="ROBOT", help="A robot file, its name, or a description of measured data.")
     ],
     data: Annotated[
-        Path | None,
+        list[Path] | None,
         typer.Option(
-            help="Recorded samples; runs/<robot>/data.npz if not given. With a description of measured data the folder "
-            "of its files; that of the description if not given."
+            help="Collected samples, runs/<robot>/data.npz if not given; or recordings (.mcap), again for another one. "
+            "With a description of measured data the folder of its files; that of the description if not given."
         ),
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Where to write; runs/<robot>/model if not given.")] = None,
@@ -162,15 +171,18 @@ def train(
             "--from", help="Fine-tune this model, such as one trained in simulation, on few samples of the robot."
         ),
     ] = None,
+    condition: Annotated[
+        str | None, typer.Option(help="How the body was in these recordings; as they tell if not given.")
+    ] = None,
     seed: Seed = 0,
 ) -> None:
     """Find out which signals explain which, train, and tell the errors in physical units.
 
     Interrupted (Ctrl-C, or killed), the same command goes on where it was.
     """
-    from services.train_verb import run_training
+    from services.verbs.train import run_training
 
-    run_training(robot_path(robot), data, out, base, seed)
+    run_training(robot_path(robot), data or (), out, base, seed, condition)
 
 
 @app.command(context_settings={"ignore_unknown_options": True})  # a target may be negative
@@ -201,11 +213,11 @@ def query(
 
     [bold]tare SENSOR[/] what it measures now is zero, while the robot is off
 
-    [bold]describe [SERVICE][/] who a service is
+    [bold]describe[/] what the robot is    [bold]describe SERVICE[/] who a service is
 
     [bold]fault TEXT[/] break something in the simulator
     """
-    from services.ask import ask_robot
+    from services.verbs.ask import ask_robot
 
     return ask_robot(robot_name(robot), verb, tuple(words or ()), tuple(hide or ()), watch, connect or ())
 
@@ -222,7 +234,7 @@ def estop(
     Prints what each drive did. Exit code 1 and a loud line if one did not stop or nobody answered: then cut the power.
     This is no safety-rated emergency stop.
     """
-    from services.estop import estop_robot
+    from services.verbs.estop import estop_robot
 
     return estop_robot(robot_name(robot), reason, connect or ())
 
@@ -230,27 +242,23 @@ def estop(
 @app.command()
 @speaks_plainly
 def top(
-    robot: RobotFile,
+    robot: Annotated[
+        str | None, typer.Argument(metavar="[ROBOT]", help="A robot file, or the name of one; all robots if not given.")
+    ] = None,
     once: Annotated[bool, typer.Option("--once", help="Print once and exit.")] = False,
     connect: Connect = None,
 ) -> int:
-    """Watch a running robot: rates, lateness, ages of signals, estimates, anomaly, mode of the motors."""
-    from services.top import watch
+    """Watch all robots, trouble first, or one: rates, lateness, ages of signals, estimates, anomaly, motors.
+
+    Without --connect those of this machine. With --once the exit code tells: 0 if all robots are well (one: is there).
+    """
+    if robot is None:
+        from services.verbs.fleet_top import watch_fleet
+
+        return watch_fleet(once, connect or ())
+    from services.verbs.top import watch
 
     return watch(robot_name(robot), once, connect or ())
-
-
-@app.command()
-@speaks_plainly
-def record(
-    robot: RobotFile,
-    out: Annotated[Path, typer.Argument(metavar="FILE", help="The file to write, such as walk.mcap; must not exist.")],
-    connect: Connect = None,
-) -> int:
-    """Write down all that a robot's services publish, as MCAP, until Ctrl-C."""
-    from services.recorder import run_recorder
-
-    return run_recorder(robot_name(robot), out, connect or ())
 
 
 @app.command()
@@ -266,7 +274,7 @@ def demo(
 
     Makes a model first if there is none; then starts simulated hardware, HAL and model as processes, and plays.
     """
-    from services.demo import play
+    from services.demo.demo import play
 
     return play(load(robot), robot_path(robot), seed, out)
 
@@ -295,7 +303,8 @@ def reproduce(
     typer.echo(f"Figures and tables are in {out / robot}.")
 
 
-hardware_verbs.register(app)
+for verbs in (hardware, network, recording, page, deploy):
+    verbs.register(app)
 
 
 if __name__ == "__main__":

@@ -165,7 +165,7 @@ def _join(channel: str, path: Path) -> socket.socket:
         reason = error.strerror or "no answer"
     link.close()
     raise can.CanInitializationError(
-        f"Nobody serves the hub channel '{channel}' ({path}: {reason}). Is the simulator running?"
+        f"Nobody serves the hub channel '{channel}' ({path}: {reason}). Is `gemuco simulate` running?"
     )
 
 

@@ -44,9 +44,9 @@ class Tap:
                 config.channel, config.interface, ignore_config=True, bitrate=config.bitrate, **config.options
             )
         except Exception as error:  # an interface plugin may raise anything
-            advice = "Is `gemuco simulate` running?" if config.interface == "hub" else "Is it there, is it up?"
             where, why = f"'{self.name}' ({config.interface} {config.channel})", str(error).rstrip(".")
-            raise BusGone(f"Bus {where} does not open: {why}. {advice}") from error
+            advice = "" if why.endswith("?") else ". Is it there, is it up?"
+            raise BusGone(f"Bus {where} does not open: {why}{advice}") from error
         return self
 
     def __exit__(

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from hal.config import load_robot
-from services.artifacts import robot_file
-from services.model_config import collect_config
+from services.model.artifacts import robot_file
+from services.model.model_config import collect_config
 from services.reproduce.kxr_actual import FOLLOWING, MODELS, Actual, actual
 from services.reproduce.kxr_figures import draw
 from services.reproduce.kxr_robot import CENTER

@@ -10,14 +10,14 @@ from gemuco.dataset import Dataset, Episode
 from gemuco.schema import BodySchema
 from gemuco.train import fine_tune
 from hal.config import RobotConfig
-from services.living_model import layout_of
-from services.model_config import model_config
+from services.learning.trainer import train_config
+from services.model.living_model import layout_of
+from services.model.model_config import model_config
 from services.reproduce.kxr_robot import JOINTS, Standing, inverse, random_targets, safe_postures, stiff
 from services.reproduce.kxr_simulated import AFTER, FRESH, LEADS, TOOLS, WAYS, control_of, leads, recognitions
 from services.reproduce.kxr_trials import Course, follow, follow_blindly, samples_until
 from services.reproduce.runs import Run
 from services.show import Tell
-from services.trainer import train_config
 
 ACTUAL = "actual"
 TAUGHT_GRID = (5, 3, 2, 2)

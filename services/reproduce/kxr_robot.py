@@ -8,8 +8,8 @@ import numpy as np
 
 from hal import registry
 from hal.config import RobotConfig
-from services.model_config import collect_config
-from services.motion import Forecast
+from services.learning.motion import Forecast
+from services.model.model_config import collect_config
 
 JOINTS, CENTER, TIP, PIXEL = "joint_position", "center_of_gravity", "tool_tip_position", "tool_tip_pixel"
 TICK = 0.02

@@ -9,9 +9,10 @@ import numpy as np
 from gemuco.adapt import UpdateConfig
 from gemuco.masks import all_masks, label
 from gemuco.schema import BodySchema
-from services.collector import collect_direct
-from services.control_config import ControlConfig
-from services.model_config import model_config
+from services.learning.collector import collect_direct
+from services.learning.trainer import train
+from services.model.control_config import ControlConfig
+from services.model.model_config import model_config
 from services.reproduce.kxr_robot import (
     CENTER,
     JOINTS,
@@ -26,7 +27,6 @@ from services.reproduce.kxr_robot import (
 from services.reproduce.kxr_trials import Course, follow, follow_blindly, recognise, samples_until
 from services.reproduce.runs import Run
 from services.show import Tell
-from services.trainer import train
 
 NOMINAL = "nominal"
 TOOLS = {

@@ -9,7 +9,7 @@ from gemuco.adapt import UpdateConfig, Updater
 from gemuco.descent import DescentConfig
 from gemuco.schema import BodySchema
 from hal.config import RobotConfig
-from services.control_config import ControlConfig, controller_of
+from services.model.control_config import ControlConfig, controller_of
 from services.reproduce.kxr_robot import CENTER, TIP, Standing
 
 SEARCH = DescentConfig(gamma_max=0.5, candidates=10, iterations=100)

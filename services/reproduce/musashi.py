@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from hal.config import load_robot
-from services.artifacts import robot_file
+from services.model.artifacts import robot_file
 from services.reproduce import musashi_control as control
 from services.reproduce import musashi_figures as figures
 from services.reproduce import musashi_simulation as simulation

@@ -4,9 +4,9 @@ import numpy as np
 
 from gemuco.schema import BodySchema
 from hal.config import RobotConfig
-from services.control_config import ControlConfig, TermConfig, controller_of
-from services.model_config import model_config
-from services.playground import CollectionStopped
+from services.learning.playground import CollectionStopped
+from services.model.control_config import ControlConfig, TermConfig, controller_of
+from services.model.model_config import model_config
 from services.reproduce.musashi_motion import POSITION, TENSION, ActualArm, go
 
 TARGETS, STARTS = 5, 5

@@ -7,13 +7,13 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from hal.config import RobotConfig
+from services.learning.structure_plot import plot as plot_structure
 from services.reproduce import musashi_simulation as simulation
 from services.reproduce.figures import bars, picture, score_over_time
 from services.reproduce.musashi_control import OURS
 from services.reproduce.musashi_model import decay
 from services.reproduce.musashi_motion import POSITION, RATE, TENSION
 from services.reproduce.musashi_seed import AFTER, BEFORE, STORY, STORY_MUSCLE, Outcome
-from services.structure_plot import plot as plot_structure
 
 COLORS = {BEFORE: "tab:orange", AFTER: "tab:blue"}
 SMOOTH = 50

@@ -12,10 +12,10 @@ from gemuco.schema import BodySchema
 from gemuco.train import fit
 from hal import registry
 from hal.config import RobotConfig
-from services.living_model import layout_of
-from services.model_config import model_config
+from services.learning.trainer import train_config
+from services.model.living_model import layout_of
+from services.model.model_config import model_config
 from services.reproduce.musashi_motion import LENGTH, POSITION, RATE, TENSION, signals
-from services.trainer import train_config
 
 SAMPLES = 10_000
 """Random joint positions and tensions of the geometric model, as many as in the paper."""

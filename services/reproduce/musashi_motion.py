@@ -11,9 +11,9 @@ from gemuco.dataset import Dataset, Episode
 from gemuco.signals import Layout, Signal
 from hal import registry
 from hal.config import RobotConfig
-from services.living_model import layout_of
-from services.playground import CollectionStopped, DirectPlayground
-from services.stand_in import simulator_of
+from services.hardware.stand_in import simulator_of
+from services.learning.playground import CollectionStopped, DirectPlayground
+from services.model.living_model import layout_of
 
 POSITION, TENSION, LENGTH = "joint_position", "muscle_tension", "muscle_length"
 SENT = "sent_length"

@@ -12,8 +12,8 @@ from gemuco.simulate import Simulator
 from gemuco.torque import TorqueBalance
 from hal import registry
 from hal.config import RobotConfig
-from services.control_config import controller_of, terms_of
-from services.model_config import model_config
+from services.model.control_config import controller_of, terms_of
+from services.model.model_config import model_config
 from services.reproduce.musashi_control import GRAVITY
 from services.reproduce.musashi_motion import LENGTH, POSITION, SENT, TENSION, signals
 

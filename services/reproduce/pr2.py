@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from hal.config import load_robot
-from services.artifacts import robot_file
+from services.model.artifacts import robot_file
 from services.reproduce.pr2_actual import MODELS, Actual, actual
 from services.reproduce.pr2_arm import JOINTS, TIP
 from services.reproduce.pr2_figures import draw

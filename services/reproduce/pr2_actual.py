@@ -10,15 +10,15 @@ from gemuco.dataset import Dataset, Episode
 from gemuco.schema import BodySchema
 from gemuco.train import fine_tune
 from hal.config import RobotConfig
-from services.collector import Wanted, collect_direct
-from services.model_config import collect_config, model_config
+from services.hardware.stand_in import simulator_of
+from services.learning.collector import Wanted, collect_direct
+from services.learning.trainer import train_config
+from services.model.model_config import collect_config, model_config
 from services.reproduce.pr2_arm import JOINTS, TIP, Arm, Geometry, duster_motion
 from services.reproduce.pr2_simulated import BELIEVED, ELEVATION, errors_by_grasp
 from services.reproduce.pr2_trials import Course, control_along, follow_blindly, model_error
 from services.reproduce.runs import Run
 from services.show import Tell
-from services.stand_in import simulator_of
-from services.trainer import train_config
 
 ACTUAL = "actual"
 COLLECTED, LEARNED = 0.35, 0.25

@@ -7,7 +7,7 @@ import numpy as np
 
 from hal import registry
 from hal.config import RobotConfig
-from services.model_config import collect_config
+from services.model.model_config import collect_config
 
 JOINTS, TIP = "joint_position", "tool_tip_position"
 TICK = 0.02

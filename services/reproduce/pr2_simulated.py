@@ -9,13 +9,13 @@ import numpy as np
 from gemuco.adapt import UpdateConfig
 from gemuco.dataset import Dataset
 from gemuco.schema import BodySchema
-from services.collector import Wanted, collect_direct
-from services.model_config import collect_config
+from services.learning.collector import Wanted, collect_direct
+from services.learning.trainer import train
+from services.model.model_config import collect_config
 from services.reproduce.pr2_arm import Arm, Geometry, duster_motion
 from services.reproduce.pr2_trials import Course, control_along, estimate_along, model_error
 from services.reproduce.runs import Run
 from services.show import Tell
-from services.trainer import train
 
 NOMINAL = "nominal"
 BELIEVED = "l500_phi30"

@@ -12,7 +12,7 @@ from gemuco.dataset import Dataset
 from gemuco.errors import CheckpointError, DatasetError
 from gemuco.schema import BodySchema
 from hal.config import RobotConfig
-from services.artifacts import fingerprint
+from services.model.artifacts import fingerprint
 from services.show import Tell
 
 Outcome = TypeVar("Outcome")

@@ -18,6 +18,8 @@ _log = logging.getLogger(__name__)
 SYNC = 0x080
 TICK = 0.005
 """How often nodes look at the time [s]."""
+MOST_ANSWERING = 0.02
+"""How long [s] after a look at the time is due the frames that still come are answered first."""
 _REOPEN = 0.2
 """Pause [s] before a bus that failed is opened again."""
 
@@ -83,14 +85,21 @@ class Segment:
             try:
                 message = self._receive(max(due - monotonic(), 0.0))
                 if message is not None:
-                    with self.lock:
-                        self._handle(message, monotonic())
-                self.answer(monotonic())
+                    self._answer_from(message, monotonic, due + MOST_ANSWERING)
                 if monotonic() >= due:  # heartbeats that waited have been heard by now
                     self.tick(monotonic())
                     due = max(due + TICK, monotonic())
             except (can.CanError, OSError) as error:
                 self._reopen(error, is_running)
+
+    def _answer_from(self, message: can.Message | None, monotonic: Callable[[], float], until: float) -> None:
+        """Answer this frame and those that wait, but not for ever: who is busy still says that it is alive."""
+        with self.lock:
+            while message is not None:
+                now = monotonic()
+                self._handle(message, now)
+                message = self._receive(0.0) if now < until else None
+            self._flush()
 
     def _receive(self, timeout: float) -> can.Message | None:
         assert self._bus is not None, "the segment is not open"

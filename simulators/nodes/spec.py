@@ -10,7 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Protocol
 
-EDS_FOLDER = Path(__file__).resolve().parents[2] / "robots" / "eds"
+_CHECKOUT = Path(__file__).resolve().parents[2]
+EDS_FOLDER = (_CHECKOUT if (_CHECKOUT / "robots").is_dir() else Path.cwd()) / "robots" / "eds"
+"""Beside this package, or, where it is installed without the robot files, where their names are looked up too."""
 
 
 class Constants(Protocol):

@@ -41,7 +41,7 @@ def frame(identifier=0x181, data=b"12345678"):
 def test_without_a_peer_it_is_gone_and_goes_on_trying(bus):
     bus.open()
     assert bus.state is BusState.GONE
-    assert "Is the simulator running?" in bus.text
+    assert "Is `gemuco simulate` running?" in bus.text
     assert not bus.send(frame())
     assert bus.counters["send_failures"] == 1
 

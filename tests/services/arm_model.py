@@ -9,9 +9,9 @@ from gemuco.dataset import Dataset, Episode
 from gemuco.schema import BodySchema
 from gemuco.train import TrainConfig, fit
 from hal.config import RobotConfig, load_robot
-from services.estimation import Fresh
-from services.living_model import layout_of
-from services.messages import Sample
+from services.model.estimation import Fresh
+from services.model.living_model import layout_of
+from services.wire.messages import Sample
 from simulators.robots.musashi_arm.motion import random_states
 
 ROBOT = Path(__file__).parents[2] / "robots" / "musashi_arm.yaml"

@@ -5,8 +5,8 @@ from typing import Any
 import msgpack
 import numpy as np
 
-from services import messages
-from services.messages import Command, Sample
+from services.wire import messages
+from services.wire.messages import Command, Sample
 
 
 def bad_commands(sample: Sample) -> dict[str, tuple[bytes, str, str]]:
@@ -17,7 +17,7 @@ def bad_commands(sample: Sample) -> dict[str, tuple[bytes, str, str]]:
     """
 
     def command(values: Any = (0.1, 0.1), **change: Any) -> bytes:
-        fields = {"signal": "muscle_length", "cycle": sample.cycle, "hal_boot": sample.boot, **change}
+        fields = {"signal": "muscle_length", "cycle": sample.cycle, "hal_boot": sample.boot, "boot": 5, **change}
         return messages.encode(Command(values=np.asarray(values, float), **fields))
 
     later: bytes = msgpack.packb(msgpack.unpackb(command()) | {"v": 2})
@@ -32,6 +32,7 @@ def bad_commands(sample: Sample) -> dict[str, tuple[bytes, str, str]]:
         "too many": (command(np.zeros(3)), "refused", "has 2 values, not shape"),
         "another signal": (command(signal="joint_position"), "refused", "takes 'muscle_length'"),
         "another run": (command(hal_boot=1), "refused", "another run of the HAL"),
+        "from nobody": (command(boot=0), "refused", "does not tell its sender's `boot`"),
         "an old cycle": (command(cycle=1), "refused", "ycle 1"),
         "a future cycle": (command(cycle=10**9), "refused", "ycle 1000000000"),
     }

@@ -17,9 +17,10 @@ import numpy as np
 import yaml
 
 from hal.config import RobotConfig
-from services import keys
 from services.client import Client
-from services.messages import Status
+from services.process.supervisor import die_with
+from services.wire import keys
+from services.wire.messages import Status
 from simulators.nodes.spec import CellConstants, DriveConstants, EncoderConstants, NodeSpec
 from simulators.rig import Rig
 
@@ -120,8 +121,8 @@ class SmallArm:
 simulator = SmallArm()
 
 _RUN = {
-    "simulator": "from services.simulator_service import run_simulator as run; arguments = ('plain', 0)",
-    "hal": "from services.hal_service import run_hal as run; arguments = ()",
+    "simulator": "from services.hardware.simulator_service import run_simulator as run; arguments = ('plain', 0)",
+    "hal": "from services.hardware.hal_service import run_hal as run; arguments = ()",
 }
 _MAIN = """
 import sys
@@ -155,9 +156,13 @@ class Processes:
 
     def __enter__(self) -> Self:
         self.client.__enter__()
-        self.start("simulator")
-        self.start("hal")
-        eventually(lambda: self.all_valid())
+        try:
+            self.start("simulator")
+            self.start("hal")
+            eventually(lambda: self.all_valid())
+        except BaseException:
+            self.__exit__(None, None, None)
+            raise
         return self
 
     def __exit__(
@@ -175,6 +180,7 @@ class Processes:
             env={**os.environ, "PYTHONPATH": path},
             stderr=subprocess.PIPE,
             text=True,
+            preexec_fn=die_with(os.getpid()),
         )
 
     def start(self, service: str) -> None:

@@ -1,5 +1,6 @@
 import subprocess
 import sys
+from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -55,7 +56,7 @@ def test_what_is_missing_is_said(tmp_path: Path) -> None:
 
 
 def test_the_service_does_not_import_torch() -> None:
-    program = "import sys, services.gemuco_service; sys.exit('torch' in sys.modules)"
+    program = "import sys, services.model.gemuco_service; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", program], timeout=60, check=False, cwd=ROOT).returncode == 0
 
 
@@ -75,3 +76,9 @@ def test_collect_and_train_make_a_model(tmp_path: Path) -> None:
     assert "joint_position" in trained.stdout
     assert "rad" in trained.stdout
     assert (tmp_path / "runs" / "small_arm" / "model" / "manifest.json").exists()
+
+
+def test_the_version_is_told() -> None:
+    told = gemuco("--version")
+    assert told.returncode == 0
+    assert told.stdout.strip() == f"gemuco {metadata.version('gemuco')}"

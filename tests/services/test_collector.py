@@ -12,10 +12,10 @@ from typer.testing import CliRunner
 from gemuco.schema import BodySchema
 from hal.errors import ConfigError
 from services.cli import app
-from services.collector import Wanted, collect_direct
-from services.motion import NowhereToGo, random_postures, way
-from services.playground import CollectionStopped
-from services.postures import BadPostures
+from services.learning.collector import Wanted, collect_direct
+from services.learning.motion import NowhereToGo, random_postures, way
+from services.learning.playground import CollectionStopped
+from services.learning.postures import BadPostures
 
 LOW, HIGH = np.array([-1.0, -1.5]), np.array([1.0, 1.5])
 
@@ -66,7 +66,7 @@ def test_random_motion_keeps_the_constraints_on_the_way_and_the_limits() -> None
 
 
 def small_config(**changes):
-    from services.model_config import collect_config
+    from services.model.model_config import collect_config
 
     return collect_config(config(collect={"speed": 2.0, "hold": 0.2, "rate": 10} | changes))
 

@@ -10,12 +10,13 @@ from hal.clock import Clock, ManualClock, SystemClock
 from hal.config import RobotConfig
 from hal.device import Device, DeviceHealth, DeviceState, Reading
 from hal.robot import Robot
-from services import messages
-from services.command_intake import CommandIntake
-from services.hal_service import HalService
-from services.messages import Command, Sample
-from services.service import Service
-from services.session import close_session, open_session
+from services.hardware.command_intake import CommandIntake
+from services.hardware.hal_service import HalService
+from services.hardware.lease import Lease
+from services.process.service import Service
+from services.wire import messages
+from services.wire.messages import Command, Sample
+from services.wire.session import close_session, open_session
 
 BOOT = 77
 
@@ -72,7 +73,7 @@ class Taken:
         self.clock = ManualClock()
         self.robot = Robot(config, [Wires(config, self.clock)], clock=self.clock)
         self.session = open_session(robot, "client")
-        self.intake = CommandIntake(self.session, config, self.robot, BOOT)
+        self.intake = CommandIntake(self.session, config, self.robot, BOOT, Lease(self.clock))
         self.robot.open()
         self.cycle()
         self.robot.enable()

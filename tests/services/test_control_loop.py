@@ -3,13 +3,13 @@ import pytest
 from arm_model import arm, fresh, small_model
 
 from hal.clock import ManualClock
-from services.control_loop import BUMP, Control
 from services.errors import NotEngaged, TargetRefused
-from services.estimation import Estimation, Fresh, Freshness
-from services.gemuco_service import ModelSolver
-from services.living_model import LivingModel
-from services.messages import Applied, Command, Target
-from services.model_config import model_config
+from services.model.control_loop import BUMP, Control
+from services.model.estimation import Estimation, Fresh, Freshness
+from services.model.gemuco_service import ModelSolver
+from services.model.living_model import LivingModel
+from services.model.model_config import model_config
+from services.wire.messages import Applied, Command, Target
 
 PERIOD = 0.02
 

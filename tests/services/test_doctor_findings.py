@@ -1,12 +1,15 @@
 """What the doctor makes of this machine, of open ports, and of a HAL's status."""
 
 import socket
+from pathlib import Path
 
 import pytest
 
 from hal.finding.findings import Verdict
-from services import doctor, host_checks
-from services.messages import Status
+from services.hardware import doctor, host_checks
+from services.security.init import init, placed
+from services.security.plan import Plan
+from services.wire.messages import Status
 
 BUS = {"state": "ok", "text": "", "load": 0.41, "unknown": []}
 DEVICE = {"state": "ready", "text": "", "counters": {}}
@@ -56,9 +59,12 @@ def test_a_hal_that_is_not(changes: dict[str, object], what: str, verdict: Verdi
 
 def test_open_ports_are_seen_with_their_addresses() -> None:
     with socket.create_server(("127.0.0.1", 0)) as inside, socket.create_server(("0.0.0.0", 0)) as outside:
-        ports = {number: address for address, number in doctor.listening()}
+        ports = {number: address for protocol, address, number in doctor.listening() if protocol == "tcp"}
         assert doctor._is_loopback(ports[inside.getsockname()[1]])
         assert not doctor._is_loopback(ports[outside.getsockname()[1]])
+    with socket.socket(type=socket.SOCK_DGRAM) as outside:
+        outside.bind(("0.0.0.0", 0))
+        assert ("udp", "0.0.0.0", outside.getsockname()[1]) in doctor.listening()
 
 
 def test_every_check_of_this_machine_says_something() -> None:
@@ -66,3 +72,20 @@ def test_every_check_of_this_machine_says_something() -> None:
     names = ["wall clock", "clock steps", "clock source", "scheduling", "memory", "processor"]
     assert [finding.what for finding in found] == names
     assert all(finding.text for finding in found)
+
+
+def test_role_files_are_told_with_their_end(tmp_path: Path) -> None:
+    folder, home = tmp_path / "keys", placed("127.0.0.1")
+    init(folder, Plan(routers=["127.0.0.1"], robots={"a": home}, days=400))
+    viewer = folder / "viewer.json"
+    assert [found.verdict for found in doctor.role_files([str(viewer)])] == [Verdict.OK]
+    viewer.chmod(0o644)
+    assert [found.verdict for found in doctor.role_files([str(viewer)])] == [Verdict.OK, Verdict.BAD]
+    init(tmp_path / "soon", Plan(routers=["127.0.0.1"], robots={"a": home}, days=9))
+    (found,) = doctor.role_files([str(tmp_path / "soon" / "viewer.json")])
+    assert found.verdict is Verdict.WARNING
+    assert "in 8 days" in found.text
+    (found,) = doctor.role_files([str(tmp_path / "none.json"), "tcp/127.0.0.1:7447"])
+    assert found.verdict is Verdict.BAD
+    assert "cannot be read" in found.text
+    assert not list(doctor.role_files(["tcp/127.0.0.1:7447"]))

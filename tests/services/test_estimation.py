@@ -5,9 +5,9 @@ import numpy as np
 from arm_model import arm, fresh, sample_of, small_model
 
 from hal.clock import ManualClock
-from services.anomaly_loop import AnomalyWatch
-from services.estimation import Estimation, Fresh, Freshness
-from services.messages import Anomaly, Estimates
+from services.model.anomaly_loop import AnomalyWatch
+from services.model.estimation import Estimation, Fresh, Freshness
+from services.wire.messages import Anomaly, Estimates
 
 
 class Bench:

@@ -15,10 +15,10 @@ from small_arm import Processes, eventually
 
 from hal.config import load_robot
 from hal.errors import CommandRefused, ConfigError
-from services import keys, messages
 from services.errors import RemoteError
-from services.hal_service import run_hal
-from services.simulator_service import run_simulator
+from services.hardware.hal_service import run_hal
+from services.hardware.simulator_service import run_simulator
+from services.wire import keys, messages
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +77,7 @@ def test_status_and_description_tell_what_runs(arm: Processes) -> None:
     assert (status.state, status.text) == ("running", "")
     assert status.loops["hal"]["rate_wanted"] == 200.0
     assert {name: bus["state"] for name, bus in status.facts["buses"].items()} == {"can0": "ok", "can1": "ok"}
-    who = arm.client.describe()
+    who = arm.client.describe("hal")
     assert who["pid"] == arm.pid("hal")
     assert who["signals"]["muscle_length"] == {"unit": "m", "elements": ["biceps", "triceps"], "source": "hal"}
     assert arm.client.alive() == {"hal", "simulator"}
@@ -107,6 +107,10 @@ _COMMANDER = """
 import sys, numpy as np
 from services.client import Client
 with Client(sys.argv[1]) as client:
+    client.next_sample()
+    print("ready", flush=True)
+    while client.applied(timeout=1.0).mode != "hold":
+        pass
     while True:
         sample = client.next_sample()
         if sample: client.command("muscle_length", np.zeros(2), sample)
@@ -114,8 +118,10 @@ with Client(sys.argv[1]) as client:
 
 
 def test_a_killed_commander_is_followed_no_longer_than_its_time_to_live(arm: Processes) -> None:
+    commander = subprocess.Popen([sys.executable, "-c", _COMMANDER, arm.robot], stdout=subprocess.PIPE, text=True)
+    assert commander.stdout is not None
+    commander.stdout.readline()
     _enable(arm)
-    commander = subprocess.Popen([sys.executable, "-c", _COMMANDER, arm.robot])
     eventually(lambda: arm.mode() == "follow")
     commander.kill()
     commander.wait()
@@ -238,7 +244,7 @@ def test_a_killed_hal_is_missed_at_once_and_comes_back_disabled(arm: Processes) 
 
 def test_a_killed_simulator_makes_all_invalid_and_comes_back_without_a_restart_of_the_hal(arm: Processes) -> None:
     _enable(arm)
-    boot = arm.client.describe()["boot"]
+    boot = arm.client.describe("hal")["boot"]
     arm.kill("simulator")
 
     def nothing_valid() -> bool:
@@ -250,7 +256,7 @@ def test_a_killed_simulator_makes_all_invalid_and_comes_back_without_a_restart_o
     arm.start("simulator")
     eventually(arm.all_valid)
     assert arm.mode() in ("fault", "off")
-    assert arm.client.describe()["boot"] == boot
+    assert arm.client.describe("hal")["boot"] == boot
     _enable(arm)
     arm.client.disable()
 

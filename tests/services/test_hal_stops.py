@@ -14,9 +14,9 @@ import pytest
 from small_arm import FRESH, Processes, eventually
 
 from hal.errors import CommandRefused
-from services import keys
 from services.client import Client
-from services.messages import Status
+from services.wire import keys
+from services.wire.messages import Status
 
 ROOT = Path(__file__).resolve().parents[2]
 RATE = 0.25

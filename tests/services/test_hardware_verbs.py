@@ -14,8 +14,8 @@ from typer.testing import CliRunner, Result
 from hal.config import RobotConfig, load_robot
 from services.cli import app
 from services.client import Client
-from services.hal_service import run_hal
-from services.lock import instead_of
+from services.hardware.hal_service import run_hal
+from services.process.lock import instead_of
 from simulators.rig import Rig
 from simulators.robots.bench import hardware
 from simulators.robots.bench.world import BenchWorld

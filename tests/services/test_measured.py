@@ -7,7 +7,7 @@ import pytest
 from gemuco.errors import DatasetError
 from hal.config import load_robot
 from hal.errors import ConfigError
-from services.measured import is_description, load_measured, read
+from services.learning.measured import is_description, load_measured, read
 
 ROOT = Path(__file__).parents[2]
 DATA = Path(os.environ.get("GEMUCO_DATA", ROOT.parent / "shared" / "data"))

@@ -1,4 +1,5 @@
 import dataclasses
+from typing import Any
 
 import msgpack
 import numpy as np
@@ -6,13 +7,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from services import keys, messages
-from services.messages import (
+from services.wire import keys, messages
+from services.wire.messages import (
     MAX_BYTES,
     Anomaly,
     Applied,
     Command,
     Estimates,
+    Holder,
     Message,
     MessageError,
     Sample,
@@ -32,8 +34,10 @@ EXAMPLES: list[Message] = [
         limited_by=["rate"], sender=4,
     ),
     Estimates(
-        cycle=-1, values=VALUES, estimated=TRUTH, std=VALUES, method={"joint_position": "mask"},
-        mask={"joint_position": "muscle_length+muscle_tension"}, residual={"joint_position": 0.5},
+        cycle=-1, values=VALUES, estimated=TRUTH, std=VALUES,
+        method={"joint_position": "mask", "muscle_tension": "measured"},
+        mask={"joint_position": "muscle_length+muscle_tension", "muscle_tension": ""},
+        residual={"joint_position": 0.5, "muscle_tension": 0.0},
     ),
     Anomaly(
         cycle=1, score=float("nan"), threshold=3.0, is_anomaly=False, blamed="muscle_tension.biceps",
@@ -42,6 +46,7 @@ EXAMPLES: list[Message] = [
     Update(active=True, model_version=2, window=20, dropped=3, loss=0.25),
     Target(signal="joint_position", values=np.zeros(5)),
     Status(service="hal", state="running", loops={"hal": {"rate": 200.0}}, facts={"buses": {"can0": [1, "ok", None]}}),
+    Holder(name="anna@ws1 (pid 7)", holder=2**52, through=9, left=0.5),
 ]  # fmt: skip
 
 
@@ -138,3 +143,22 @@ def test_a_key_comes_apart_again() -> None:
     for bad in ("", "gemuco", "gemuco/arm", "gemuco/arm/hal/", "other/arm/hal/sample", "gemuco//hal/sample"):
         with pytest.raises(ValueError, match="not a gemuco key"):
             keys.parse(bad)
+
+
+@pytest.mark.parametrize(
+    ("field", "content", "said"),
+    [
+        ("valid", {}, "names other signals in 'valid' than in 'values'"),
+        ("age", {"joint_position": np.zeros(2), "elbow": np.zeros(1)}, "names other signals in 'age'"),
+        ("age", {"joint_position": np.zeros(3)}, "has 3 elements in 'age.joint_position' and 2 in 'values'"),
+        ("values", {"joint_position": np.zeros(0)}, "a signal without elements"),
+    ],
+)
+def test_a_sample_that_does_not_agree_with_itself_is_none(field: str, content: object, said: str) -> None:
+    parts: dict[str, Any] = {
+        "values": {"joint_position": np.zeros(2)},
+        "age": {"joint_position": np.zeros(2)},
+        "valid": {"joint_position": np.ones(2, bool)},
+    } | {field: content}
+    with pytest.raises(MessageError, match=said):
+        messages.decode(messages.encode(Sample(cycle=1, source="can", complete=True, **parts)), Sample)

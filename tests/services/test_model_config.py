@@ -4,7 +4,7 @@ import pytest
 
 from hal.config import RobotConfig, load_robot
 from hal.errors import ConfigError
-from services.model_config import collect_config, model_config
+from services.model.model_config import collect_config, model_config
 
 ROBOT = Path(__file__).parents[2] / "robots" / "musashi_arm.yaml"
 

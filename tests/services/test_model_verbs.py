@@ -7,12 +7,12 @@ import pytest
 from arm_model import arm, small_model, states
 
 from gemuco.errors import NotFinite, NotObservable, UnknownSignal, WrongSize
-from services.ask import ask_robot
 from services.client import Client
-from services.control_config import controller_of, simulator_of
 from services.errors import BadArguments
-from services.gemuco_service import GemucoService
-from services.service import Service
+from services.model.control_config import controller_of, simulator_of
+from services.model.gemuco_service import GemucoService
+from services.process.service import Service
+from services.verbs.ask import ask_robot
 
 
 @pytest.fixture
@@ -109,3 +109,18 @@ def test_the_command_line_asks_too(model: GemucoService, robot: str, capsys: pyt
     command = [str(value) for value in states(seed=5)["muscle_length"][3]]
     assert ask_robot(robot, "simulate", command, (), False, ()) == 0
     assert "states:" in capsys.readouterr().out
+
+
+def test_history_holds_what_was_estimated(client: Client, model: GemucoService) -> None:
+    for _ in range(3):
+        model.estimation.tick()
+    found = client.history(60.0, timeout=20.0)
+    assert len(found.stamp_ns) == 3
+    assert list(found.values) == list(small_model().layout.names)
+    latest = model.estimation.latest
+    assert latest is not None
+    for name, values in latest.values.items():
+        np.testing.assert_array_equal(found.values[name][-1], values)
+        np.testing.assert_array_equal(found.estimated[name][-1], latest.estimated[name])
+    with pytest.raises(BadArguments, match="Known arguments: seconds, signals, begin, end"):
+        client.ask("model", "history", {"minutes": 1})

@@ -1,114 +1,302 @@
+import os
+import resource
+import shutil
 import signal
 import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import jsonschema
+import msgspec
 import pytest
+import zenoh
+from any_message import ARM, a_message
 from mcap.reader import make_reader
 
-from services import keys, messages
 from services.errors import RecordingError
-from services.messages import Update
-from services.recorder import FLUSH_EVERY, Recorder, run_recorder
-from services.recording import losses, read
-from services.session import close_session, open_session
-from services.streams import Publisher
+from services.process.service import Service
+from services.recording import recorder
+from services.recording.losses import LOG, MOST_KEYS, OTHERS, Losses
+from services.recording.reading import about, log_lines, losses, read
+from services.recording.recorder import Recorder, Waiting, run_recorder
+from services.recording.writer import UNREADABLE, Limits, RecordingWriter
+from services.wire import keys, messages
+from services.wire.records import Holder, Sample, Update
+from services.wire.session import close_session, open_session
+from services.wire.streams import Publisher
 
 
 def _update(version: int) -> Update:
     return Update(stamp_ns=version + 1, active=True, model_version=version, window=0, dropped=0, loss=0.0)
 
 
-def _wait_for(recorder: Recorder, written: int) -> None:
-    deadline = time.monotonic() + 20.0
-    while recorder.written < written:
-        assert time.monotonic() < deadline, recorder.counters()
+def _eventually(happened: Callable[[], Any], within: float = 30.0) -> None:
+    deadline = time.monotonic() + within
+    while not happened():
+        assert time.monotonic() < deadline
         time.sleep(0.01)
 
 
-def test_what_was_published_is_read_back_in_order(robot: str, tmp_path: Path) -> None:
-    session = open_session(robot, "client")
+@pytest.fixture
+def session(robot: str) -> Iterator[zenoh.Session]:
+    opened = open_session(robot, "hal")
+    yield opened
+    close_session(opened)
+
+
+@contextmanager
+def _recording(session: zenoh.Session, robot: str, path: Path, limits: Limits | None = None) -> Iterator[Recorder]:
+    with recorder.recording(session, robot, path, ARM, "a tool", limits) as found:
+        yield found
+
+
+def _versions(*paths: Path) -> list[int]:
+    return [one.message.model_version for one in read(paths) if isinstance(one.message, Update)]
+
+
+def test_what_was_published_is_read_back_in_order(robot: str, session: zenoh.Session, tmp_path: Path) -> None:
     path = tmp_path / "new" / "run.mcap"
-    with Recorder(session, robot, path) as recorder:
+    sample = a_message(Sample)
+    with _recording(session, robot, path) as found:
         updates = Publisher(session, keys.update(robot), Update, boot=3)
         for version in range(100):
             updates.put(_update(version))
-        session.put(keys.sample(robot), b"no message of ours")
-        _wait_for(recorder, 101)
-    close_session(session)
-    recorded = list(read(path))
-    assert [entry.message.model_version for entry in recorded if isinstance(entry.message, Update)] == list(range(100))
-    assert {entry.key for entry in recorded} == {keys.update(robot)}
-    assert list(read(path, [keys.sample(robot)])) == []
-    assert losses(path) == {"dropped": 0, "missed": 0}
+        session.put(keys.sample(robot), messages.encode(sample))
+        _eventually(lambda: found.writer.written == 101)
+    assert _versions(path) == list(range(100))
+    (again,) = read(path, [keys.sample(robot)])
+    assert messages.encode(again.message) == messages.encode(sample)
+    assert losses(path) == {"dropped": 0, "missed": 0, "malformed": 0}
+    (facts,) = about(path)
+    assert (facts.robot, facts.condition, facts.part, facts.is_whole) == (robot, "a tool", 1, True)
+    assert facts.catalogue == ARM
+
+
+def test_any_tool_that_reads_mcap_finds_json_that_fits_its_schema(
+    robot: str, session: zenoh.Session, tmp_path: Path
+) -> None:
+    """The plain mcap library and a JSON Schema validator; nothing of ours."""
+    path = tmp_path / "run.mcap"
+    with _recording(session, robot, path) as found:
+        for record, key in ((Sample, keys.sample(robot)), (Update, keys.update(robot)), (Holder, keys.holder(robot))):
+            session.put(key, messages.encode(a_message(record)))
+        _eventually(lambda: found.writer.written == 3)
+    seen = {}
     with path.open("rb") as stream:
-        summary = make_reader(stream).get_summary()
-    assert summary is not None
-    assert {channel.topic: channel.message_encoding for channel in summary.channels.values()} == {
-        keys.update(robot): "msgpack",
-        keys.sample(robot): "msgpack",
-    }
-    assert summary.statistics is not None
-    assert summary.statistics.message_count == 101
+        reader = make_reader(stream, validate_crcs=True)
+        for schema, channel, message in reader.iter_messages():
+            assert schema is not None and (schema.encoding, channel.message_encoding) == ("jsonschema", "json")
+            jsonschema.validate(msgspec.json.decode(message.data), msgspec.json.decode(schema.data))
+            seen[channel.topic] = schema.name
+        summary = reader.get_summary()
+    assert summary is not None and summary.statistics is not None
+    assert summary.statistics.message_count >= 4
+    log = keys.robot_key(robot, "recorder", "log")
+    assert seen == {
+        keys.sample(robot): "gemuco.Sample", keys.update(robot): "gemuco.Update", keys.holder(robot): "gemuco.Holder",
+        log: LOG,
+    }  # fmt: skip
 
 
-class StalledDisk(Recorder):
-    """A recorder whose disk stands still until the test lets it go on."""
+def test_unknown_keys_and_bytes_that_are_no_message_are_kept_and_counted(
+    robot: str, session: zenoh.Session, tmp_path: Path
+) -> None:
+    path = tmp_path / "run.mcap"
+    with _recording(session, robot, path) as found:
+        session.put(keys.robot_key(robot, "gripper", "note"), b'{"grip": 1}', encoding="application/json")
+        session.put(keys.robot_key(robot, "gripper", "image"), b"\x89PNG", encoding="image/png")
+        session.put(keys.sample(robot), b"no message of ours")
+        session.put(keys.update(robot), messages.encode(a_message(Sample)))
+        _eventually(lambda: found.writer.written == 4)
+        assert found.counters()["foreign"] == 2
+    kept = {}
+    with path.open("rb") as stream:
+        for schema, channel, message in make_reader(stream).iter_messages():
+            if schema is None:
+                kept[channel.topic.rpartition(f"{robot}/")[2]] = channel.message_encoding, message.data[:8]
+    assert kept == {
+        "gripper/note": ("json", b'{"grip":'), "gripper/image": ("image/png", b"\x89PNG"),
+        f"hal/sample{UNREADABLE}": ("msgpack", b"no messa"),
+        f"model/update{UNREADABLE}": ("msgpack", messages.encode(a_message(Sample))[:8]),
+    }  # fmt: skip
+    assert losses(path)["malformed"] == 2
+    assert [line["key"] for line in log_lines(path) if line["kind"] == "malformed"] == [
+        keys.sample(robot),
+        keys.update(robot),
+    ]
+    assert list(read(path)) == []
 
-    def __init__(self, *arguments: Any, **more: Any) -> None:
-        super().__init__(*arguments, **more)
+
+def test_who_comes_goes_and_commands_is_in_the_log(robot: str, session: zenoh.Session, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with _recording(session, robot, path) as found:
+        token = session.liveliness().declare_token(keys.alive(robot, "model"))
+        _eventually(lambda: found.writer.size)
+        for name in ("anna", "anna", "", "ben"):
+            session.put(keys.holder(robot), messages.encode(Holder(name=name, holder=1)))
+        _eventually(lambda: found.writer.written == 4)
+        token.undeclare()
+        _eventually(lambda: [line for line in log_lines(path) if line["kind"] == "gone"])
+    said = [line["message"] for line in log_lines(path) if line["kind"] in ("alive", "gone", "holder")]
+    assert said == [
+        "The 'model' service came.", "anna commands the robot.", "Nobody commands the robot.",
+        "ben commands the robot.", "The 'model' service went.",
+    ]  # fmt: skip
+
+
+def test_the_hal_tells_what_elements_are_called(robot: str, tmp_path: Path) -> None:
+    told = {"signals": ARM.plain(), "rates": {"hal": 200.0}}
+    path = tmp_path / "run.mcap"
+    with Service(robot, "hal", describe=lambda: told) as hal:
+        client = open_session(robot, "recorder")
+        with recorder.recording(client, robot, path) as found:
+            samples = Publisher(hal.session, keys.sample(robot), Sample, 1)
+            _eventually(lambda: samples.has_listener)
+            sample = a_message(Sample)
+            assert isinstance(sample, Sample)
+            samples.put(sample)
+            _eventually(lambda: found.writer.written >= 1)
+        close_session(client)
+    (facts,) = about(path)
+    assert facts.described["rates"] == {"hal": 200.0}
+    assert not {"pid", "host"} & facts.described.keys()
+    (one,) = read(path, [keys.sample(robot)])
+    assert one.form.catalogue == ARM
+
+
+def test_without_anybody_who_names_them_elements_have_numbers(
+    robot: str, session: zenoh.Session, tmp_path: Path
+) -> None:
+    path = tmp_path / "run.mcap"
+    with recorder.recording(session, robot, path) as found:
+        session.put(keys.sample(robot), messages.encode(a_message(Sample)))
+        _eventually(lambda: found.writer.written == 1)
+    (one,) = read(path, [keys.sample(robot)])
+    assert one.form.catalogue.signals["joint_position"].elements == ("element_1", "element_2")
+
+
+class StalledDisk(RecordingWriter):
+    """A writer whose disk stands still until the test lets it go on."""
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
         self.stands = threading.Event()
         self.goes_on = threading.Event()
 
-    def _add(self, key: str, received_ns: int, payload: bytes) -> None:
+    def add(self, key: str, received_ns: int, payload: bytes, encoding: str = "") -> None:
         self.stands.set()
-        assert self.goes_on.wait(20.0)
-        super()._add(key, received_ns, payload)
+        assert self.goes_on.wait(30.0)
+        super().add(key, received_ns, payload, encoding)
 
 
-def test_losses_are_counted_and_written_into_the_file(robot: str, tmp_path: Path) -> None:
-    session = open_session(robot, "client")
+def test_losses_are_counted_and_written_into_the_file(robot: str, session: zenoh.Session, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    with StalledDisk(session, robot, path, depth=4) as recorder:
+    writer = StalledDisk(path, robot, ARM)
+    with Recorder(session, robot, writer, most=4) as found:
         session.put(keys.update(robot), messages.encode(_update(0), seq=0, boot=3))
-        assert recorder.stands.wait(10.0)
+        assert writer.stands.wait(20.0)
         for seq in (1, 5, 6, 7, 8, 9):
             session.put(keys.update(robot), messages.encode(_update(seq), seq=seq, boot=3))
-        deadline = time.monotonic() + 10.0
-        while recorder.dropped < 2:
-            assert time.monotonic() < deadline
-            time.sleep(0.001)
-        recorder.goes_on.set()
-        _wait_for(recorder, 5)
+        writer.goes_on.set()
+        _eventually(lambda: writer.written == 5)
         session.put(keys.update(robot), messages.encode(_update(0), seq=0, boot=4))
-        _wait_for(recorder, 6)
-    close_session(session)
+        _eventually(lambda: writer.written == 6)
     assert [entry.message.seq for entry in read(path)] == [0, 1, 5, 6, 7, 0]
-    assert losses(path) == {"dropped": 2, "missed": 3}
+    assert losses(path) == {"dropped": 2, "missed": 3, "malformed": 0}
+    told = {line["kind"]: (line["key"], line["count"]) for line in log_lines(path) if "count" in line}
+    assert told == {"dropped": (keys.update(robot), 2), "missed": (keys.update(robot), 3)}
+    assert recorder.missing(found.counters()) == ("Of its messages 2 could not be written, 3 never arrived here.")
+
+
+def test_senders_of_one_key_are_counted_apart() -> None:
+    counted = RecordingWriter(Path("never.mcap"), "arm", ARM).losses
+    for seq in range(5):
+        counted.arrived("a", 1, seq)
+        counted.arrived("a", 2, 2 * seq)
+    assert counted.totals()["missed"] == 4
+
+
+def test_what_waits_is_bounded_in_number_and_bytes() -> None:
+    waiting = Waiting(most=3, most_bytes=100)
+    for size in (60, 60, 30, 5, 5):
+        waiting.put(recorder.Arrived("message", "key", 0, bytes(size)))
+    items, dropped = waiting.take()
+    assert [len(item.payload) for item in items] == [60, 30, 5]
+    assert dropped == {"key": 2}
+    for number in range(10):
+        waiting.put(recorder.Arrived("message", f"key {number}", 0, bytes(101)))
+    assert len(waiting.take()[1]) == 4  # no more names than messages are remembered
+
+
+def test_a_new_file_begins_when_one_is_big_or_long_and_nothing_is_lost_or_doubled(robot: str, tmp_path: Path) -> None:
+    second = 10**9
+    path = tmp_path / "run.mcap"
+    writer = RecordingWriter(path, robot, ARM, "", Limits(max_seconds=2.0))
+    writer.open(0)
+    for number in range(100):
+        now = number * second // 10
+        writer.add(keys.update(robot), now, messages.encode(_update(number), seq=number))
+        if number % 7 == 0:
+            writer.commit(now)
+    writer.finish(10 * second)
+    files = sorted(tmp_path.iterdir())
+    assert [file.name for file in files] == [f"run-00000{number}.mcap" for number in range(1, 6)]
+    assert [len(_versions(file)) for file in files] == [20] * 5
+    assert _versions(*reversed(files)) == list(range(100))
+    assert losses(files)["missed"] == 0
+    assert [facts.part for facts in about(files)] == [1, 2, 3, 4, 5]
+    again = RecordingWriter(path, robot, ARM, "", Limits(max_bytes=4000))
+    again.open(0)
+    for number in range(200):
+        again.add(keys.update(robot), number, messages.encode(_update(number), seq=number, boot=number % 50))
+        again.commit(number)
+    again.finish(200)
+    assert again.paths[0].name == "run-000006.mcap"
+    assert len(again.paths) > 2 and _versions(*again.paths) == list(range(200))
+    assert all(file.stat().st_size >= 4000 for file in again.paths[:-1])
+
+
+def test_what_is_counted_as_dropped_has_no_more_names_than_are_kept() -> None:
+    counted = Losses()
+    for number in range(2 * MOST_KEYS):
+        counted.drop(f"key {number}", 2)
+    assert len(counted.dropped) == MOST_KEYS + 1
+    assert counted.totals()["dropped"] == 4 * MOST_KEYS
+    assert counted.dropped[OTHERS] == 2 * MOST_KEYS
+
+
+def test_a_recording_without_limits_begins_a_new_file_every_hour(robot: str, tmp_path: Path) -> None:
+    writer = RecordingWriter(tmp_path / "run.mcap", robot, ARM)
+    writer.open(0)
+    for number in range(3):
+        writer.add(keys.update(robot), number * 1800 * 10**9, messages.encode(_update(number), seq=number))
+    writer.finish(3600 * 10**9)
+    assert [path.name for path in writer.paths] == ["run.mcap", "run-000002.mcap"]
+    assert _versions(*writer.paths) == [0, 1, 2]
 
 
 def test_a_recording_never_replaces_a_file(robot: str, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     path.write_text("precious")
-    session = open_session(robot, "client")
-    with pytest.raises(RecordingError, match="never replaces"):
-        Recorder(session, robot, path).__enter__()
-    close_session(session)
     told = threading.Event()
     told.set()
-    for name in ("run-2.mcap", "run-3.mcap"):
+    for name in ("run-000002.mcap", "run-000003.mcap"):
         assert run_recorder(robot, path, stop=told) == 0
-        assert losses(tmp_path / name) == {"dropped": 0, "missed": 0}
+        assert losses(tmp_path / name) == {"dropped": 0, "missed": 0, "malformed": 0}
     assert path.read_text() == "precious"
 
 
-def test_a_folder_that_cannot_be_written_is_told(robot: str, tmp_path: Path) -> None:
+def test_a_file_that_cannot_be_written_is_told(robot: str, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(RecordingError, match="cannot be written: "):
         run_recorder(robot, tmp_path / "file" / "run.mcap", stop=threading.Event())
+    with pytest.raises(RecordingError, match=r"ends in \.mcap"):
+        run_recorder(robot, tmp_path / "run.bag", stop=threading.Event())
 
 
 def test_what_is_no_recording_says_so(tmp_path: Path) -> None:
@@ -118,34 +306,136 @@ def test_what_is_no_recording_says_so(tmp_path: Path) -> None:
         list(read(path))
     with pytest.raises(RecordingError, match="cannot be read: No such file"):
         list(read(tmp_path / "nowhere.mcap"))
+    with pytest.raises(RecordingError, match="No recording was named"):
+        list(read([]))
 
 
-_RECORD = "import sys; from services.recorder import run_recorder; sys.exit(run_recorder(sys.argv[1], sys.argv[2]))"
+_RECORD = (
+    "import sys; from services.recording.recorder import run_recorder; sys.exit(run_recorder(sys.argv[1], sys.argv[2]))"
+)
 
 
 @pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
-def test_a_recording_is_readable_however_its_process_ends(robot: str, tmp_path: Path, end: signal.Signals) -> None:
-    """After kill -9 only the newest part, not flushed yet, may be missing."""
+def test_a_recording_is_readable_however_its_process_ends(
+    robot: str, session: zenoh.Session, tmp_path: Path, end: signal.Signals
+) -> None:
+    """After kill -9 only the newest part, at most a second, may be missing."""
     path = tmp_path / "run.mcap"
-    session = open_session(robot, "hal")
     updates = Publisher(session, keys.update(robot), Update, boot=3)
     process = subprocess.Popen([sys.executable, "-c", _RECORD, robot, str(path)])
     try:
-        deadline = time.monotonic() + 20.0
-        while not updates.has_listener:
-            assert time.monotonic() < deadline
-            time.sleep(0.01)
+        _eventually(lambda: updates.has_listener)
         for version in range(150):
             updates.put(_update(version))
-            time.sleep(0.01)
-        if end is signal.SIGKILL:
-            time.sleep(2 * FLUSH_EVERY)
+        _eventually(lambda: path.exists() and len(_try(lambda: _versions(path))) == 150)
         process.send_signal(end)
         assert process.wait(20.0) == (-signal.SIGKILL if end is signal.SIGKILL else 0)
     finally:
         process.kill()
         process.wait()
-        close_session(session)
-    versions = [entry.message.model_version for entry in read(path) if isinstance(entry.message, Update)]
-    assert versions == list(range(150))
-    assert losses(path) == {"dropped": 0, "missed": 0}
+    assert _versions(path) == list(range(150))
+    assert about(path)[0].is_whole == (end is not signal.SIGKILL)
+
+
+def _try(reading: Callable[[], list[int]]) -> list[int]:
+    try:
+        return reading()
+    except RecordingError:  # nothing is safe yet
+        return []
+
+
+def test_a_full_disk_ends_the_file_and_a_new_one_begins_when_there_is_space(
+    robot: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The least space that is left free is moved instead of the disk being filled."""
+    free = shutil.disk_usage(tmp_path).free
+    path = tmp_path / "run.mcap"
+    writer = RecordingWriter(path, robot, ARM, "", Limits(least_free=free // 4))
+    writer.open(0)
+    writer.add(keys.update(robot), 0, messages.encode(_update(0), seq=0))
+    writer._limits = Limits(least_free=2 * free)
+    writer.commit(1)
+    assert "Nothing is recorded: the disk of" in writer.failure and writer.failure in caplog.text
+    assert about(path)[0].is_whole and _versions(path) == [0]
+    for number in range(1, 5):
+        writer.add(keys.update(robot), number, messages.encode(_update(number), seq=number))
+        writer.commit(number)
+    assert writer.losses.totals()["dropped"] == 4
+    writer._limits, writer._again = Limits(least_free=free // 4), 0.0
+    writer.add(keys.update(robot), 5, messages.encode(_update(5), seq=5))
+    writer.finish(6)
+    assert writer.failure == ""
+    assert _versions(*writer.paths) == [0, 5]
+    assert losses(writer.paths)["dropped"] == 4
+    said = [line["message"] for line in log_lines(writer.paths[1])]
+    assert any("Before this file: Nothing is recorded" in text for text in said)
+
+
+def _limited(robot: str, folder: str) -> None:
+    """In a process of its own: files may have 20 kB, as on a full disk; prints what is left of it."""
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+    writer = RecordingWriter(Path(folder) / "run.mcap", robot, ARM, "", Limits())
+    writer.open(0)
+    for number in range(900):
+        writer.add(keys.update(robot), number, messages.encode(_update(number), seq=number, boot=number % 8 + 1))
+        writer._again = 0.0
+        if number % 50 == 0:
+            writer.commit(number)
+    writer.finish(900)
+    print(writer.written, writer.losses.totals()["dropped"])
+
+
+def test_a_file_that_can_be_written_no_further_stays_readable(robot: str, tmp_path: Path) -> None:
+    code = f"from test_recorder import _limited; _limited({robot!r}, {str(tmp_path)!r})"
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=Path(__file__).parent, capture_output=True, text=True, timeout=60
+    )
+    written, dropped = map(int, done.stdout.split())
+    assert written + dropped == 900 and written > 0 and dropped > 0, done.stderr
+    assert "File too large" in done.stderr
+    files = sorted(tmp_path.iterdir())
+    assert len(files) > 1 and all(file.stat().st_size <= 20_000 for file in files)
+    found = _versions(*files)
+    assert len(found) == written and found == sorted(set(found))
+
+
+def test_a_damaged_part_is_left_out_and_the_rest_is_read(
+    robot: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "run.mcap"
+    writer = RecordingWriter(path, robot, ARM)
+    writer.open(0)
+    sizes = []
+    for number in range(30):
+        writer.add(keys.update(robot), number + 1, messages.encode(_update(number), seq=number))
+        if number % 10 == 9:
+            writer.commit(number + 1)
+            sizes.append(writer.size)
+    writer.finish(40)
+    data = bytearray(path.read_bytes())
+    middle = (sizes[0] + sizes[1]) // 2 - 60
+    data[middle : middle + 8] = bytes(byte ^ 0xFF for byte in data[middle : middle + 8])
+    path.write_bytes(data)
+    assert _versions(path) == [*range(10), *range(20, 30)]
+    assert "is damaged" in caplog.text
+    for length in range(0, len(data), 97):
+        (tmp_path / "cut.mcap").write_bytes(data[:length])
+        assert set(_try(lambda: _versions(tmp_path / "cut.mcap"))) <= set(range(30))
+
+
+def test_nothing_secret_is_in_a_recording(robot: str, tmp_path: Path) -> None:
+    role = tmp_path / "role.json"
+    role.write_text('{"transport": {"auth": {"usrpwd": {"user": "recorder", "password": "open sesame"}}}}')
+    path = tmp_path / "run.mcap"
+    code = (
+        "import sys, threading\nfrom services.recording.recorder import run_recorder\nstop = threading.Event()\n"
+        f"threading.Timer(1.5, stop.set).start()\nrun_recorder({robot!r}, {str(path)!r}, [{str(role)!r}], stop)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60, env={**os.environ, "SECRET": "open sesame"})
+    with path.open("rb") as stream:
+        reader = make_reader(stream)
+        found = b"".join(message.data for _, _, message in reader.iter_messages())
+        found += b"".join(str(facts.metadata).encode() for facts in reader.iter_metadata())
+    assert b'"service":"recorder"' in found
+    for secret in (b"open sesame", b"usrpwd", b"role.json"):
+        assert secret not in found and secret not in path.read_bytes()

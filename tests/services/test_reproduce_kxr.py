@@ -9,8 +9,8 @@ from gemuco.dataset import Dataset, Episode
 from gemuco.train import fit
 from gemuco.train_config import TrainConfig
 from hal.config import load_robot
-from services.living_model import layout_of
-from services.model_config import collect_config, model_config
+from services.model.living_model import layout_of
+from services.model.model_config import collect_config, model_config
 from services.reproduce.kxr_actual import taught_postures
 from services.reproduce.kxr_robot import (
     CENTER,

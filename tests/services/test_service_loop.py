@@ -6,9 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hal.clock import ManualClock
-from services.lateness import GROWTH, RESOLUTION, Lateness
-from services.loop import Grid, Loop
-from services.realtime import prepare_thread, promote
+from services.process.lateness import GROWTH, RESOLUTION, Lateness
+from services.process.loop import Grid, Loop
+from services.process.realtime import prepare_thread, promote
 
 
 def test_grid_stays_on_multiples_of_the_period() -> None:
@@ -145,3 +145,36 @@ def test_loop_cannot_be_started_twice_and_stops_before_its_start() -> None:
         loop.start()
     loop.stop()
     assert loop.statistics()["ticks"] == 0
+
+
+class _Busy:
+    """A loop whose ticks take so long [s] of a manual clock, for one second of it."""
+
+    def __init__(self, rate: float, takes: float, delayed: float = 0.0) -> None:
+        self.clock = ManualClock()
+        self.loop = Loop("busy", rate, lambda: self.clock.advance(takes), self.clock)
+        begun = self.clock.monotonic()
+
+        def late(deadline: float) -> None:
+            if self.clock.monotonic() - begun > 1.0:
+                self.loop.stop()
+            self.clock.advance(max(0.0, deadline - self.clock.monotonic()) + delayed)
+
+        self.clock.sleep_until = late  # type: ignore[method-assign]
+        self.loop._run()
+        self.loop.statistics()
+
+
+@pytest.mark.parametrize(
+    ("takes", "delayed", "said"),
+    [
+        (0.002, 0.0, ""),
+        (0.0095, 0.0, ""),
+        (0.025, 0.0, "a tick takes 25 ms, of 10 that it has"),
+        (0.001, 0.018, "of the time. Is this machine busy?"),
+    ],
+)
+def test_a_loop_that_does_not_keep_its_rate_says_why(takes: float, delayed: float, said: str) -> None:
+    loop = _Busy(100.0, takes, delayed).loop
+    assert said in loop.trouble if said else not loop.trouble
+    assert bool(said) == ("of 100 Hz" in loop.trouble)

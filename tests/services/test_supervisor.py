@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from services.supervisor import ChildDied, NotReady, Supervisor
+from services.process.supervisor import ChildDied, NotReady, Supervisor
 
 SLEEPER = [sys.executable, "-c", "import time; time.sleep(60)"]
 STUBBORN = [
@@ -66,7 +66,7 @@ def test_no_child_survives_its_supervisor(tmp_path: Path, number: signal.Signals
     program = textwrap.dedent(f"""
         import sys, time
         from pathlib import Path
-        from services.supervisor import Supervisor
+        from services.process.supervisor import Supervisor
         with Supervisor(Path({str(tmp_path)!r})) as supervisor:
             print(supervisor.start("sleeper", {SLEEPER!r}).process.pid, flush=True)
             time.sleep(60)

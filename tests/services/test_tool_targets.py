@@ -3,8 +3,8 @@ import pytest
 from small_hand import TOOLS, config, gravity_of, tip_of
 
 from hal.errors import ConfigError
-from services.motion import NowhereToGo
-from services.tool_targets import APART, CLOSE, common_targets
+from services.demo.tool_targets import APART, CLOSE, common_targets
+from services.learning.motion import NowhereToGo
 
 BOTH = ("short", "long")
 LIMITS = {"joint_position": {"low": [-1.0, -2.2], "high": [1.0, 2.2]}}

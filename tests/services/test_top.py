@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from services.messages import Sample
-from services.top import _signals
+from services.verbs.top import _signals
+from services.wire.messages import Sample
 
 
 @pytest.fixture

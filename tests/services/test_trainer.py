@@ -11,8 +11,8 @@ from gemuco.dataset import Dataset, Episode
 from gemuco.errors import DatasetError, NotWritten
 from gemuco.history import History
 from gemuco.signals import Layout
-from services import trainer
-from services.living_model import layout_of
+from services.learning import trainer
+from services.model.living_model import layout_of
 
 SMALL = {
     "network": {"hidden": [20], "latent": 8},

@@ -9,11 +9,11 @@ from gemuco.errors import NotEnoughData
 from gemuco.schema import BodySchema
 from gemuco.train import TrainConfig, fit
 from hal.clock import ManualClock
-from services.estimation import Fresh, Freshness
-from services.living_model import LivingModel, layout_of
-from services.messages import Update
-from services.model_config import UpdateConfig
-from services.update_loop import OnlineUpdate
+from services.model.estimation import Fresh, Freshness
+from services.model.living_model import LivingModel, layout_of
+from services.model.model_config import UpdateConfig
+from services.model.update_loop import OnlineUpdate
+from services.wire.messages import Update
 
 
 class Bench:

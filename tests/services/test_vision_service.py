@@ -18,19 +18,21 @@ from small_hand import HandWorld, config
 from hal.clock import ManualClock
 from hal.config import RobotConfig
 from hal.errors import ConfigError
-from services import keys
-from services.ask import ask_robot
 from services.client import Client
-from services.collector import Wanted, collect_direct
 from services.errors import AlreadyRunning, RemoteError
-from services.estimation import Fresh, Freshness
-from services.messages import MessageError, Sample, Status
-from services.recorder import Recorder
-from services.recording import read
-from services.service import Service
-from services.session import port
-from services.top import watch
-from services.vision_service import run_vision
+from services.hardware.vision_service import run_vision
+from services.learning.collector import Wanted, collect_direct
+from services.model.estimation import Fresh, Freshness
+from services.process.service import Service
+from services.recording.reading import read
+from services.recording.recorder import Recorder
+from services.recording.schema import Catalogue
+from services.recording.writer import RecordingWriter
+from services.verbs.ask import ask_robot
+from services.verbs.top import watch
+from services.wire import keys
+from services.wire.messages import MessageError, Sample, Status
+from services.wire.session import endpoint
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "publish_marker.py"
 
@@ -148,7 +150,10 @@ def test_a_robot_without_a_camera_is_told(robot: str) -> None:
 
 def test_top_and_the_recorder_show_what_is_seen(robot: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with Truth(robot), camera_of(config(robot)), Service(robot, "recorder") as service:
-        with Recorder(service.session, robot, tmp_path / "seen.mcap"), Client(robot) as client:
+        with (
+            Recorder(service.session, robot, RecordingWriter(tmp_path / "seen.mcap", robot, Catalogue({}))),
+            Client(robot) as client,
+        ):
             assert client.vision(timeout=10.0) is not None
             watch(robot, True, ())
         told = capsys.readouterr().out
@@ -194,7 +199,7 @@ def test_any_program_may_be_the_camera(robot: str) -> None:
 
 def test_the_frame_of_the_documentation_is_one(robot: str) -> None:
     program = (EXAMPLE.parents[1] / "docs" / "keys.md").read_text().split("```python\n")[-1].split("```")[0]
-    program = program.replace("PORT", str(port(robot, "model"))).replace("gemuco/kxr_humanoid/", f"gemuco/{robot}/")
+    program = program.replace("ENDPOINT", endpoint(robot, "model")).replace("gemuco/kxr_humanoid/", f"gemuco/{robot}/")
     with Service(robot, "model") as model:
         frames = model.newest(keys.vision(robot), Sample)
         for _ in range(5):

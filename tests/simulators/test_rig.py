@@ -182,6 +182,38 @@ def test_a_bus_that_fails_is_opened_again(tmp_path):
     segment.close()
 
 
+class EndlessBus(can.BusABC):
+    """A bus on which the next frame is there before the last one was answered."""
+
+    def __init__(self):
+        super().__init__(channel="endless")
+        self.sent = []
+
+    def recv(self, timeout=None):
+        return can.Message(arbitration_id=0x123, is_extended_id=False)
+
+    def send(self, msg, timeout=None):
+        self.sent.append(msg.arbitration_id)
+
+
+def test_nodes_that_never_come_to_the_end_of_answering_say_that_they_are_alive():
+    rig, bus, now = Rig(config(), SpringWorld(), []), EndlessBus(), 0.0
+
+    def monotonic():
+        nonlocal now
+        now += 1e-4  # each look at the clock
+        return now
+
+    segment = Segment("can0", SPECS, rig._plant, lambda: bus)
+    segment.open(0.0)
+    segment.nodes["hinge_encoder"].objects.values[0x1017, 0] = 50  # ms
+    bus.sent.clear()
+    segment.serve(monotonic, lambda: now < 1.0)
+    segment.close()
+    assert bus.sent.count(0x700 + ENCODER) == pytest.approx(20, abs=3)
+    assert segment.counters["received"] > 3000
+
+
 @pytest.mark.parametrize("seed", range(8))
 def test_no_frame_however_malformed_brings_a_node_down(seed):
     chance = random.Random(seed)

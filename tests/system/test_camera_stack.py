@@ -15,10 +15,10 @@ from gemuco.schema import BodySchema
 from gemuco.train import TrainConfig, fit
 from hal.config import load_robot
 from services.client import Client
-from services.collector import Wanted, collect_bus
-from services.living_model import layout_of
-from services.messages import Estimates
-from services.supervisor import Supervisor, gemuco_command
+from services.learning.collector import Wanted, collect_bus
+from services.model.living_model import layout_of
+from services.process.supervisor import Supervisor, gemuco_command
+from services.wire.messages import Estimates
 
 SERVICES_TESTS = Path(__file__).parents[1] / "services"
 sys.path.append(str(SERVICES_TESTS))

@@ -1,91 +1,15 @@
 """The whole stack as processes: simulated nodes, HAL and model of the shipped arm under a name of its own."""
 
 import os
-import signal
 import subprocess
-import sys
-import time
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
-import yaml
+from arm_stack import PATIENCE, Stack, eventually
 
-from hal.config import load_robot
-from hal.errors import CommandRefused
-from services.artifacts import fingerprint
-from services.client import Client
-from services.errors import NotEngaged, TargetRefused
-from services.supervisor import Supervisor, gemuco_command
-
-ROOT = Path(__file__).parents[2]
-sys.path.append(str(ROOT / "tests" / "services"))
-from arm_model import small_model  # noqa: E402
-
-PATIENCE = 30.0
-"""Longer than anything takes, on a machine with other work [s]."""
-
-
-def eventually(condition: Callable[[], bool], timeout: float = PATIENCE) -> None:
-    deadline = time.monotonic() + timeout
-    while not condition():
-        assert time.monotonic() < deadline, "it did not happen in time"
-        time.sleep(0.02)
-
-
-class Stack:
-    """The processes of one robot, started and killed by name."""
-
-    def __init__(self, folder: Path, robot: str) -> None:
-        self.folder, self.robot = folder, robot
-        description = yaml.safe_load((ROOT / "robots" / "musashi_arm.yaml").read_text())
-        description["robot"] = robot
-        for bus in description["buses"]:
-            description["buses"][bus]["channel"] = f"{robot}_{bus}"
-        for kind in description["kinds"].values():
-            kind["settings"]["eds"] = str(ROOT / "robots" / kind["settings"]["eds"])
-        self.file = folder / f"{robot}.yaml"
-        self.file.write_text(yaml.safe_dump(description, sort_keys=False))
-        self.model = folder / "runs" / robot / "model"
-        small_model().with_manifest(fingerprint=fingerprint(load_robot(self.file))).save(self.model)
-        self.supervisor = Supervisor(folder / "logs")
-        self.client = Client(robot)
-        self.commands = {
-            "simulator": ("simulate", str(self.file)),
-            "hal": ("hal", str(self.file)),
-            "model": ("serve", str(self.file), "--model", str(self.model)),
-        }
-
-    def start(self, *names: str) -> None:
-        for name in names:
-            self.supervisor.start(name, gemuco_command(*self.commands[name]))
-            self.supervisor.wait_ready(name, lambda name=name: self.state(name) == "running", PATIENCE)
-
-    def state(self, service: str) -> str:
-        status = self.client.status(service)
-        return "" if status is None else status.state
-
-    def method(self) -> str:
-        estimate = self.client.estimate()
-        return "" if estimate is None else estimate.method["joint_position"]
-
-    def mode(self) -> str:
-        applied = self.client.applied(timeout=0.5)
-        return "" if applied is None else applied.mode
-
-    def engage(self) -> None:
-        def follows() -> bool:
-            if self.mode() == "fault":
-                self.client.reset()
-            try:
-                if self.mode() not in ("hold", "follow"):
-                    self.client.engage()
-            except (NotEngaged, CommandRefused):
-                return False  # a moment without a fresh sample, or a drive that is not ready yet
-            return self.mode() == "follow"
-
-        eventually(follows)
+from services.errors import TargetRefused
+from services.process.supervisor import gemuco_command
 
 
 @pytest.fixture(scope="module")
@@ -194,25 +118,3 @@ def test_a_killed_process_comes_back_and_state_flows_again(stack: Stack, name: s
     stack.start(name)
     eventually(lambda: stack.method() == "measured")
     assert stack.mode() == "off"
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupted_demo_leaves_no_process(tmp_path: Path, number: signal.Signals) -> None:
-    stack = Stack(tmp_path, f"demo_{number.name.lower()}_{os.getpid()}")
-    log = tmp_path / "demo.log"
-    with log.open("w") as sink:
-        demo = subprocess.Popen(
-            gemuco_command("demo", str(stack.file)), cwd=tmp_path, stdout=sink, stderr=sink, start_new_session=True
-        )
-    try:
-        eventually(lambda: "Processes:" in log.read_text() or demo.poll() is not None)
-        line = next((line for line in log.read_text().splitlines() if line.startswith("Processes:")), None)
-        assert line is not None, log.read_text()
-        pids = [int(word.strip(",")) for word in line.split() if word.strip(",").isdigit()]
-        assert len(pids) >= 3
-        demo.send_signal(number)
-        assert demo.wait(PATIENCE) != 0
-        eventually(lambda: not any(Path(f"/proc/{pid}").exists() for pid in pids))
-    finally:
-        demo.kill()
-        demo.wait()

@@ -15,10 +15,10 @@ from gemuco.dataset import Dataset, Episode
 from gemuco.train import TrainConfig, fit
 from hal.config import load_robot
 from hal.errors import ConfigError
-from services import demo
-from services.artifacts import fingerprint
-from services.living_model import layout_of
-from services.supervisor import gemuco_command
+from services.demo import demo
+from services.model.artifacts import fingerprint
+from services.model.living_model import layout_of
+from services.process.supervisor import gemuco_command
 
 SERVICES_TESTS = Path(__file__).parents[1] / "services"
 sys.path.append(str(SERVICES_TESTS))

@@ -1,0 +1,137 @@
+"""What a question through the client costs, beside a bare zenoh query with the same bytes; and importing the client.
+
+    python -m benchmarks.remote_client [--questions 1000] [--router]
+
+The model service of a light robot runs in one process, a bare queryable that answers the same bytes in another; both
+are asked in turn, so that whatever else the machine does falls on both. `--router`: all of it through a router.
+"""
+
+import argparse
+import multiprocessing
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import nullcontext
+from pathlib import Path
+
+import msgpack
+import numpy as np
+import zenoh
+
+from benchmarks import light_robot
+from services.client import Client
+from services.wire.session import CLIENT, endpoint, open_session
+
+RATE = 50.0
+KEY = "bare/echo"
+
+
+def echo(robot: str, connect: tuple[str, ...], answer: bytes) -> None:
+    """Answer the same bytes for ever, in a process of its own; the recorder's place is free."""
+    session = open_session(robot, "recorder", connect)
+
+    def reply(query: zenoh.Query) -> None:
+        with query:
+            query.reply(KEY, answer)
+
+    session.declare_queryable(KEY, reply)
+    while True:
+        time.sleep(1.0)
+
+
+def ask_bare(session: zenoh.Session, question: bytes) -> None:
+    for reply in session.get(KEY, payload=question, timeout=10.0):
+        if reply.ok is not None:
+            reply.ok.payload.to_bytes()
+
+
+def timed(ask: Callable[[], object]) -> float:
+    begun = time.perf_counter()
+    ask()
+    return time.perf_counter() - begun
+
+
+def line(what: str, times: list[float]) -> str:
+    p50, p99 = (1e3 * float(np.percentile(times, q)) for q in (50, 99))
+    return f"{what:44s} p50 {p50:7.2f} ms   p99 {p99:7.2f} ms"
+
+
+def imports(times: int = 7) -> dict[str, float]:
+    """Median wall time [s] of importing, each in an interpreter of its own, in turn."""
+    statements = ("import numpy, zenoh", "import services.client")
+    found: dict[str, list[float]] = {statement: [] for statement in statements}
+    for _ in range(times):
+        for statement in statements:
+            program = f"import time; begun = time.perf_counter(); {statement}; print(time.perf_counter() - begun)"
+            done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+            found[statement].append(float(done.stdout))
+    return {statement: statistics.median(values) for statement, values in found.items()}
+
+
+def measure(robot: str, connect: tuple[str, ...], questions: int) -> None:
+    """Ask both in turn, and print."""
+    with Client(robot, connect) as client:
+        while client.estimate(timeout=60.0) is None:
+            pass
+        schema = client.describe("model", timeout=60.0)["signals"]
+        values = {name: [0.1] * len(one["elements"]) for name, one in schema.items()}
+        asked = {"values": values, "hide": ["joint_position"]}
+        question = msgpack.packb(asked)
+        answer = msgpack.packb({"ok": client.ask("model", "estimate", asked, 60.0)})
+        child = multiprocessing.get_context("spawn").Process(target=echo, args=(robot, connect, answer), daemon=True)
+        child.start()
+        places = connect or (endpoint(robot, "recorder"),)  # the client connects to the recorder by itself otherwise
+        with open_session(robot, CLIENT, places) as bare:
+            while not any(reply.ok for reply in bare.get(KEY, payload=question, timeout=1.0)):
+                time.sleep(0.05)
+            plain, verb, read = [], [], []
+            for _ in range(questions):
+                plain.append(timed(lambda: ask_bare(bare, question)))
+                verb.append(timed(lambda: client.estimate(values, ["joint_position"])))
+                read.append(timed(client.estimate))
+        child.kill()
+        print(f"{questions} questions of {len(question)} bytes, answers of {len(answer)} bytes")
+        print(line("bare zenoh query, the same bytes", plain))
+        print(line("Client.estimate(values, hide): 3 signals", verb))
+        print(line("Client.estimate(): the newest published", read))
+        time.sleep(max(0.0, 20.0 - questions * 0.005))
+        for seconds in (1.0, 60.0):
+            found = client.history(seconds)
+            took = [timed(lambda seconds=seconds: client.history(seconds)) for _ in range(20)]
+            print(line(f"Client.history({seconds:g}): {len(found.stamp_ns)} rows", took))
+
+
+def main() -> None:
+    """Start the robot, measure, end it."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--questions", type=int, default=1000)
+    parser.add_argument("--router", action="store_true")
+    asked = parser.parse_args()
+    robot = f"remote_{os.getpid()}"
+    for statement, seconds in imports().items():
+        print(f"{statement:44s} {1e3 * seconds:.0f} ms")
+    with tempfile.TemporaryDirectory() as folder:
+        file = light_robot.write(Path(folder), robot, RATE, with_bus=False)
+        light_robot.make_model(file, Path(folder) / "model")
+        where = f"unixsock-stream/{folder}/router"
+        settings = (
+            f'{{mode: "router", listen: {{endpoints: ["{where}"]}}, scouting: {{multicast: {{enabled: false}}}}}}'
+        )
+        with zenoh.open(zenoh.Config.from_json5(settings)) if asked.router else nullcontext():
+            process = subprocess.Popen(
+                [sys.executable, "-m", "benchmarks.fleet_robot", str(file), f"{folder}/model", "1",
+                 where if asked.router else ""],
+            )  # fmt: skip
+            try:
+                measure(robot, (where,) if asked.router else (), asked.questions)
+            finally:
+                process.terminate()
+                process.wait(60.0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""Stories that a simulated robot plays, and their pictures."""

@@ -1,0 +1,211 @@
+"""`gemuco demo`: everything from nothing, one minute of story, and nothing left behind."""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from hal.config import RobotConfig
+from hal.errors import ConfigError
+from services.client import Client
+from services.demo.actor import Actor, Stage
+from services.demo.story import MUSCLE, Story
+from services.demo.timeline import Timeline
+from services.demo.tool_story import ToolStory
+from services.learning import collector, trainer
+from services.model import artifacts
+from services.model.control_config import ControlConfig
+from services.model.living_model import load_model
+from services.model.model_config import model_config
+from services.process.supervisor import Supervisor, gemuco_command
+from services.show import progress
+
+READY_WITHIN = 30.0
+"""Time [s] that a process has to come up on a busy machine."""
+CLIENT = "remote client"
+LEAST_LINES = 20
+"""What the remote client must have printed to count as observed."""
+
+
+def play(robot: RobotConfig, path: Path, seed: int, out: Path) -> int:
+    """Make a model if there is none, run the processes, play the story; the exit code is 0 if all was observed.
+
+    Args:
+        robot: The robot file's content.
+        path: The robot file.
+        seed: Which of the actual robots.
+        out: Folder for plot, recording and logs.
+    """
+    console = Console()
+    started = time.monotonic()
+    target = control_of(robot).target
+    make_model(robot, console)
+    recording = out / "story.mcap"
+    recording.unlink(missing_ok=True)
+    with Supervisor(out) as supervisor:
+        remote = RemoteClient(f"{target} [{robot.signals[target].unit}]", out / "client.log", console)
+        with Client(robot.robot) as client:
+            start(robot, path, seed, target, recording, supervisor, client, console)
+
+            def idle() -> None:
+                supervisor.check()
+                remote.tell()
+
+            actor = Actor(client, idle, console.print)
+            stages = perform(robot, client, target, seed, actor, out / "story.png", console)
+        supervisor.stop("client", "recorder")
+        remote.tell()
+    ok = summary(stages, actor.stops, remote, out, console)
+    console.print(f"{time.monotonic() - started:.0f} s in all.")
+    return 0 if ok else 1
+
+
+def control_of(robot: RobotConfig) -> ControlConfig:
+    """How the robot is controlled in its story.
+
+    Raises:
+        ConfigError: Not at all, or there is no story of such a robot.
+    """
+    control = model_config(robot).control
+    if not has_tools(robot) and MUSCLE not in robot.signals[robot.command.signal].elements:
+        raise ConfigError(
+            f"There is no story for '{robot.robot}': it has neither conditions with a signal that a camera sees, nor a "
+            f"muscle {MUSCLE} to cut."
+        )
+    if control is None:
+        raise ConfigError(
+            f"The robot file of '{robot.robot}' has no model.control section, so there is nothing to play."
+        )
+    return control
+
+
+def has_tools(robot: RobotConfig) -> bool:
+    """Whether the robot holds one of several tools, and a camera looks on."""
+    return bool(robot.conditions and robot.seen)
+
+
+def perform(
+    robot: RobotConfig, client: Client, target: str, seed: int, actor: Actor, picture: Path, console: Console
+) -> list[Stage]:
+    """Play the story that suits the robot, about its tools if it has some, and draw it."""
+    sizes = robot.signals[target].size, robot.signals[robot.command.signal].size
+    if has_tools(robot):
+        from services.demo import tool_plot
+
+        schema = load_model(robot, artifacts.model_folder(robot.robot))
+        with Timeline(client, target, *sizes, robot.seen) as timeline:
+            told = ToolStory(robot, client, timeline, seed, actor, console.print, schema).play()
+        tool_plot.plot(robot, target, schema, timeline, told, picture)
+        return told.stages
+    from services.demo import story_plot
+
+    with Timeline(client, target, *sizes, [target]) as timeline:
+        marks = Story(robot, client, timeline, seed, actor, console.print).play()
+    story_plot.plot(robot, timeline, marks, picture)
+    return marks.stages
+
+
+def make_model(robot: RobotConfig, console: Console) -> None:
+    """Collect and train if there is no model that fits the robot file."""
+    folder = artifacts.model_folder(robot.robot)
+    if trainer.fits(robot, folder):
+        console.print(f"Using the model in {folder}.")
+        return
+    console.print("No model yet: the designer's model moves at random, and the body schema is learned from it.")
+    with progress("collecting") as tell:
+        found = collector.collect_direct(robot, None, 0, progress=tell)
+    console.print(f"{len(found.dataset)} samples, {found.speed:.0f} times faster than real time.")
+    with progress("training") as tell:
+        trained = trainer.train(robot, found.dataset, 0, tell)
+    trainer.show(trained, console)
+    trainer.save(trained, folder)
+
+
+def start(
+    robot: RobotConfig,
+    path: Path,
+    seed: int,
+    target: str,
+    recording: Path,
+    supervisor: Supervisor,
+    client: Client,
+    console: Console,
+) -> None:
+    """Start the processes one after another, each when the one before is ready; the last one watches `target`.
+
+    Raises:
+        ChildDied: One of them ended.
+        NotReady: One of them did not come up in time.
+    """
+    commands = {
+        "simulator": ("simulate", str(path), "--variant", "actual", "--seed", str(seed)),
+        "hal": ("hal", str(path)),
+        **({"vision": ("vision", str(path), "--variant", "actual", "--seed", str(seed))} if robot.seen else {}),
+        "model": ("serve", str(path)),
+        "recorder": ("record", str(path), str(recording)),
+    }
+    for name, command in commands.items():
+        supervisor.start(name, gemuco_command(*command))
+        supervisor.wait_ready(name, _is_running(client, name), READY_WITHIN)
+    supervisor.start("client", gemuco_command("query", robot.robot, "estimate", target, "--watch"))
+    names = ", ".join(f"{child.name} {child.process.pid}" for child in supervisor.children.values())
+    console.print(f"[bold]Processes:[/] {names}")
+
+
+def _is_running(client: Client, name: str) -> Callable[[], bool]:
+    def is_running() -> bool:
+        status = client.status(name)
+        return status is not None and status.state == "running"
+
+    return is_running
+
+
+class RemoteClient:
+    """Shows what the remote client's process prints."""
+
+    def __init__(self, sign: str, log: Path, console: Console) -> None:
+        """`sign` is what a line begins with that is an estimate."""
+        self._sign, self._log, self._console = sign, log, console
+        self._read = 0
+        self.lines = 0
+        """Estimates that it printed."""
+        self.estimated = 0
+        """Of those, such that were not measured."""
+
+    def tell(self) -> None:
+        """Print the whole lines that are new."""
+        if not self._log.exists():
+            return
+        with self._log.open() as log:
+            log.seek(self._read)
+            text = log.read()
+        whole, newline, _ = text.rpartition("\n")
+        self._read += len((whole + newline).encode())
+        for line in whole.splitlines():
+            self.lines += self._sign in line
+            self.estimated += "estimated from" in line
+            self._console.print(f"    {CLIENT}: {line}", style="dim", highlight=False, markup=False)
+
+
+def summary(stages: list[Stage], stops: int, remote: RemoteClient, out: Path, console: Console) -> bool:
+    """Print what happened as a table; whether every stage was really observed."""
+    table = Table(title="What happened", title_justify="left", show_lines=True)
+    table.add_column("stage")
+    table.add_column("measured")
+    table.add_column("observed", justify="center")
+    for stage in stages:
+        table.add_row(stage.name, "\n".join(stage.figures), _yes(stage.observed))
+    heard = remote.lines >= LEAST_LINES and remote.estimated > 0
+    text = f"{remote.lines} estimates printed by a process of its own, {remote.estimated} of them not measured"
+    table.add_row(CLIENT, text, _yes(heard))
+    console.print(table)
+    if stops:
+        console.print(f"The HAL stopped the arm {stops} times by itself, see above.")
+    console.print(f"Plot: {out / 'story.png'}   recording: {out / 'story.mcap'}   logs: {out}/*.log")
+    return heard and all(stage.observed for stage in stages)
+
+
+def _yes(observed: bool) -> str:
+    return "[green]yes[/]" if observed else "[red]no[/]"

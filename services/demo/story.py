@@ -1,0 +1,201 @@
+"""The story of the demo: an arm moves, loses a sensor, learns its body, loses a muscle."""
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from hal.config import RobotConfig
+from services.client import Client
+from services.demo.actor import NOTICED_WITHIN, Actor, Stage
+from services.demo.timeline import Timeline, hidden_error
+from services.wire.messages import Anomaly
+
+POSE_TIME = 2.5
+"""Time for one pose [s]."""
+POSES = 6
+"""Fresh poses at which the model is measured, before and after the update; none of them is learned from."""
+LEARNING_POSES = 8
+LEARNING_TIME = 2.0
+SILENT_POSES = 3
+CUT_POSES = 3
+INSIDE = 0.15
+"""Targets keep this share of the range away from the limits."""
+ENCODER, SILENT_ELEMENT = "shoulder_roll_encoder", "shoulder_roll"
+MUSCLE = "deltoid_side"
+
+
+@dataclass(slots=True)
+class Marks:
+    """Moments and figures that the plot shows, on the timeline's clock."""
+
+    silent: tuple[float, float] = (0.0, 0.0)
+    learning: tuple[float, float] = (0.0, 0.0)
+    cut: float = 0.0
+    alarm: float = float("nan")
+    blamed: str = ""
+    error_before: float = float("nan")
+    error_after: float = float("nan")
+    stages: list[Stage] = field(default_factory=list)
+
+
+class Story:
+    """Plays the stages through a client, as any remote program could."""
+
+    def __init__(
+        self, robot: RobotConfig, client: Client, timeline: Timeline, seed: int, actor: Actor,
+        tell: Callable[[str], None],
+    ) -> None:  # fmt: skip
+        """`tell` is called with what happens."""
+        self._client, self._timeline, self._actor, self._tell = client, timeline, actor, tell
+        self._signal = "joint_position"
+        self._elements = robot.signals[self._signal].elements
+        self._muscles = robot.signals[robot.command.signal].elements
+        self._muscle_signals = {name for name, signal in robot.signals.items() if signal.elements == self._muscles}
+        self._low, self._high = robot.bounds(self._signal)
+        self._random = np.random.default_rng(seed)
+        self._poses = [self._pose() for _ in range(POSES)]
+        self.marks = Marks()
+
+    def play(self) -> Marks:
+        """All stages, about a minute."""
+        for stage in (self.move, self.lose_sensor, self.learn, self.lose_muscle):
+            self.marks.stages.append(self._actor.play(stage))
+        return self.marks
+
+    def move(self) -> Stage:
+        """(a) Targets are reached."""
+        self._tell("[bold](a)[/] The controller moves the arm to targets.")
+        start = self._timeline.now()
+        self._actor.engage()
+        misses, errors = self._measure_poses()
+        self.marks.error_before = _mean_norm(errors)
+        reached = _mean_norm(misses)
+        figures = (
+            f"{POSES} targets, distance from the target {reached:.3f} rad (mean norm of 5 joints)",
+            f"with all encoders hidden, the model would be wrong by {self.marks.error_before:.3f} rad",
+        )
+        truth = self._timeline.between("truth", start, self._timeline.now())
+        span = float(np.nanmax(np.nanmax(truth, axis=0) - np.nanmin(truth, axis=0)))
+        return Stage("moves to targets", start, self._timeline.now(), figures, reached < 0.5 and span > 0.3)
+
+    def lose_sensor(self) -> Stage:
+        """(b) An encoder falls silent; the arm goes on with an estimate."""
+        self._tell(f"[bold](b)[/] The node of {ENCODER} falls silent. The arm goes on with an estimate.")
+        index = self._elements.index(SILENT_ELEMENT)
+        start = self._timeline.now()
+        self._client.fault(f"sensor_silent {ENCODER}")
+        noticed = self._actor.wait(lambda: self._is_estimated(index), NOTICED_WITHIN)
+        delay = self._timeline.now() - start
+        for _ in range(SILENT_POSES):
+            self._go(self._pose(), LEARNING_TIME)
+        end = self._timeline.now()
+        self._client.fault(f"node_back {ENCODER}")
+        returned = self._actor.wait(lambda: not self._is_estimated(index), NOTICED_WITHIN)
+        self.marks.silent = (start, end)
+        error = np.abs(self._silent_error(index, start + delay, end))
+        source = _most_common(self._timeline.between("source", start + delay, end).tolist())
+        source = "method " + source.replace(" ", ", from ").replace("+", ", ")
+        worst = float(np.nanmax(error)) if error.size else float("nan")
+        mean = float(np.nanmean(error)) if error.size else float("nan")
+        figures = (
+            f"marked as estimated after {1e3 * delay:.0f} ms, {source}",
+            f"true error of {SILENT_ELEMENT} while silent: mean {mean:.3f} rad, worst {worst:.3f} rad",
+            "measured again when the node came back" if returned else "not measured again after the node came back",
+        )
+        return Stage("loses an encoder", start, self._timeline.now(), figures, noticed and returned and mean < 0.5)
+
+    def learn(self) -> Stage:
+        """(c) The model learns online while the arm moves, and is measured on fresh poses."""
+        self._tell("[bold](c)[/] The online update learns from the arm's own motion.")
+        start = self._timeline.now()
+        self._client.adapt(True)
+        for _ in range(LEARNING_POSES):
+            self._go(self._pose(), LEARNING_TIME)
+        update = self._client.update(timeout=1.0)
+        self._client.adapt(False)
+        self.marks.learning = (start, self._timeline.now())
+        misses, errors = self._measure_poses()
+        self.marks.error_after = _mean_norm(errors)
+        normal = self._client.ask("model", "normal")
+        before, after = self.marks.error_before, self.marks.error_after
+        window = 0 if update is None else update.window
+        figures = (
+            f"learned for {self.marks.learning[1] - start:.0f} s from {window} samples",
+            f"estimate on {POSES} fresh poses with all encoders hidden: {before:.3f} rad before, {after:.3f} rad after",
+            f"distance from the targets now {_mean_norm(misses):.3f} rad",
+            f"what is normal learned anew from {normal['samples']} samples",
+        )
+        return Stage("learns its own body", start, self._timeline.now(), figures, after < before)
+
+    def lose_muscle(self) -> Stage:
+        """(d) A muscle is cut, and the anomaly detector says which."""
+        self._tell(f"[bold](d)[/] The wire of {MUSCLE} is cut.")
+        start = self._timeline.now()
+        calm = self._timeline.between("is_anomaly", start - 2.0, start)
+        score = float(np.nanmedian(self._timeline.between("score", start - 2.0, start)))
+        self._client.fault(f"muscle_cut {MUSCLE}")
+        self.marks.cut = start
+        alarmed = self._actor.wait(self._is_alarmed, NOTICED_WITHIN)
+        self.marks.alarm = self._timeline.now()
+        for _ in range(CUT_POSES):
+            self._go(self._pose(), LEARNING_TIME)
+        early = [anomaly for at, anomaly in self._timeline.anomalies if start <= at < self.marks.alarm + 1.0]
+        element = _most_common([anomaly.blamed for anomaly in early])
+        self.marks.blamed = self._blamed_muscle(early)
+        end = self._timeline.now()
+        after = float(np.nanmedian(self._timeline.between("score", self.marks.alarm, end)))
+        limit = float(np.nanmedian(self._timeline.between("threshold", start, end)))
+        figures = (
+            f"anomaly score {score:.1f} before the cut, {after:.1f} after it, threshold {limit:.1f}",
+            f"told after {1e3 * (self.marks.alarm - start):.0f} ms; blamed element {element or 'none'}",
+            f"muscle with the largest part in the score: {self.marks.blamed or 'none'}",
+        )
+        right = self.marks.blamed == MUSCLE
+        self._client.disengage()
+        return Stage("loses a muscle", start, end, figures, alarmed and right and not calm.any())
+
+    def _blamed_muscle(self, anomalies: list[Anomaly]) -> str:
+        """The muscle whose tension and length together contribute most; empty without anomalies."""
+        total = np.zeros(len(self._muscles))
+        for anomaly in anomalies:
+            for signal in self._muscle_signals & anomaly.contribution.keys():
+                total += np.nan_to_num(anomaly.contribution[signal])
+        return self._muscles[int(np.argmax(total))] if anomalies else ""
+
+    def _measure_poses(self) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """At every fresh pose: target minus truth, and estimate with the encoders hidden minus truth [rad]."""
+        misses, errors = [], []
+        for pose in self._poses:
+            self._go(pose, POSE_TIME)
+            misses.append(pose - self._actor.truth(self._signal))
+            errors.append(hidden_error(self._client, self._signal, [self._signal]))
+        return misses, errors
+
+    def _go(self, pose: np.ndarray, duration: float) -> None:
+        self._actor.go(self._signal, pose, duration)
+
+    def _pose(self) -> np.ndarray:
+        margin = INSIDE * (self._high - self._low)
+        return self._random.uniform(self._low + margin, self._high - margin)
+
+    def _is_estimated(self, index: int) -> bool:
+        estimate = self._client.estimate()
+        return estimate is not None and bool(estimate.estimated[self._signal][index])
+
+    def _is_alarmed(self) -> bool:
+        anomaly = self._client.anomaly()
+        return anomaly is not None and anomaly.is_anomaly
+
+    def _silent_error(self, index: int, start: float, end: float) -> np.ndarray:
+        value, truth = (self._timeline.between(name, start, end) for name in ("value", "truth"))
+        return value[:, index] - truth[:, index] if len(value) else np.zeros(0)
+
+
+def _mean_norm(errors: list[np.ndarray]) -> float:
+    return float(np.mean([np.linalg.norm(error) for error in errors]))
+
+
+def _most_common(words: list[str]) -> str:
+    return Counter(words).most_common(1)[0][0] if words else ""

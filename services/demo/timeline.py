@@ -1,0 +1,113 @@
+"""What happened during a story, sampled beside it: truth, estimate, hidden estimate, anomaly, applied command."""
+
+import math
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Sequence
+
+import numpy as np
+
+from gemuco.errors import SchemaError
+from hal.errors import HalError
+from services.client import Client
+from services.errors import ServiceError
+from services.wire.messages import Anomaly, Update
+
+EVERY = 0.05
+"""Time between two rows [s]."""
+HIDDEN_EVERY = 4
+"""Each so many rows, the model is asked for the signal as if it were not measured at all."""
+
+
+class Timeline:
+    """Rows of a story in a thread of its own, as columns of arrays.
+
+    Columns are `time` [s since the start], `truth`, `value`, `estimated` and `source` (method and signals) of one
+    signal, `applied` command, `score`, `threshold`, `is_anomaly` and `verdict`; and on a time axis of their own
+    `hidden_time` and `hidden_error`, the norm of what the model says of the hidden signal minus the truth [its unit].
+    What was not there is NaN.
+    """
+
+    def __init__(self, client: Client, signal: str, size: int, commands: int, hide: Sequence[str]) -> None:
+        """Prepare for a signal of so many elements, and for asking the model with some signals hidden."""
+        self._client, self._signal, self._hide = client, signal, hide
+        self._nothing, self._no_command = np.full(size, np.nan), np.full(commands, np.nan)
+        self._columns: dict[str, list[object]] = defaultdict(list)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="timeline", daemon=True)
+        self._start = time.monotonic()
+        self.anomalies: list[tuple[float, Anomaly]] = []
+        """Time [s] and message of every row that was an anomaly."""
+        self.updates: list[tuple[float, Update]] = []
+        """Time [s] and message of what the online update said, once each."""
+
+    def __enter__(self) -> "Timeline":
+        self._start = time.monotonic()
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join()
+
+    def now(self) -> float:
+        """Seconds since the start."""
+        return time.monotonic() - self._start
+
+    def column(self, name: str) -> np.ndarray:
+        """A column so far, shape (rows,) or (rows, n)."""
+        return np.array(list(self._columns[name]))
+
+    def between(self, name: str, start: float, end: float, axis: str = "time") -> np.ndarray:
+        """The rows of a column in a span of time [s]."""
+        column = self.column(name)
+        at = self.column(axis)[: len(column)]
+        return column[: len(at)][(at >= start) & (at < end)]
+
+    def _run(self) -> None:
+        row = 0
+        while not self._stop.wait(max(0.0, row * EVERY - self.now())):
+            self._sample()
+            if row % HIDDEN_EVERY == 0:
+                self._ask_hidden()
+            row = max(row + 1, math.floor(self.now() / EVERY))
+
+    def _sample(self) -> None:
+        truth, estimate = self._client.truth(), self._client.estimate()
+        anomaly, applied = self._client.anomaly(), self._client.applied()
+        add = {
+            "truth": self._nothing if truth is None else truth.values[self._signal],
+            "value": self._nothing if estimate is None else estimate.values[self._signal],
+            "estimated": self._nothing if estimate is None else estimate.estimated[self._signal].astype(float),
+            "source": "" if estimate is None else f"{estimate.method[self._signal]} {estimate.mask[self._signal]}",
+            "applied": self._no_command if applied is None else applied.values,
+            "score": math.nan if anomaly is None else anomaly.score,
+            "threshold": math.nan if anomaly is None else anomaly.threshold,
+            "is_anomaly": anomaly is not None and anomaly.is_anomaly,
+            "verdict": "" if anomaly is None else anomaly.verdict,
+        }
+        update = self._client.update()
+        if update is not None and (not self.updates or update is not self.updates[-1][1]):
+            self.updates.append((self.now(), update))
+        if anomaly is not None and anomaly.is_anomaly:
+            self.anomalies.append((self.now(), anomaly))
+        for name, value in add.items():
+            self._columns[name].append(value)
+        self._columns["time"].append(self.now())
+
+    def _ask_hidden(self) -> None:
+        try:
+            error = hidden_error(self._client, self._signal, self._hide)
+        except (ServiceError, SchemaError, HalError):
+            error = self._nothing
+        self._columns["hidden_error"].append(float(np.linalg.norm(error)))
+        self._columns["hidden_time"].append(self.now())
+
+
+def hidden_error(client: Client, signal: str, hide: Sequence[str]) -> np.ndarray:
+    """What the model says of a signal while some are hidden, minus the truth [unit], shape (n,); NaN if unknown."""
+    answer = client.infer(signal, hide=hide)
+    truth = client.truth()
+    value = np.asarray(answer["values"], float)
+    return value - truth.values[signal] if truth is not None else np.full(len(value), np.nan)

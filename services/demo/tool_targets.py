@@ -1,0 +1,82 @@
+"""Targets that a robot can reach with either of two tools, by its designer's model."""
+
+import numpy as np
+
+from hal import registry
+from hal.config import RobotConfig
+from hal.errors import ConfigError
+from services.learning.motion import Forecast, NowhereToGo
+from services.model.model_config import collect_config
+
+DRAWN = 30_000
+"""Random postures per tool."""
+INSIDE = 0.1
+"""Postures keep this share of the range away from the limits."""
+TRIED = 3000
+"""Of those, how many are tried as a target."""
+CLOSE = 0.02
+"""So near [unit of the target] a posture with the other tool must come to a target."""
+APART = (0.08, 0.25)
+"""Least and largest distance from one target to the next [unit of the target]."""
+
+
+def common_targets(
+    robot: RobotConfig, signal: str, conditions: tuple[str, str], count: int, seed: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Draw targets that random postures reach under both conditions, each within limits and constraints.
+
+    Args:
+        robot: The robot file, whose `collect` section has a forecast of the signal.
+        signal: What is to be reached.
+        conditions: Two of the robot's conditions.
+        count: How many targets.
+        seed: Of the draws.
+
+    Returns:
+        Targets [unit of the signal], shape (count, n), each near the one before; and the postures that reach them
+        under the first condition [unit of the commanded signal], shape (count, k).
+
+    Raises:
+        ConfigError: Nothing forecasts the signal.
+        NowhereToGo: There are not so many.
+    """
+    random = np.random.default_rng(seed)
+    (postures, first), (_, second) = (_reached(robot, signal, condition, random) for condition in conditions)
+    order = random.permutation(len(first))[:TRIED]
+    chosen: list[int] = []
+    for _ in range(count):
+        chosen.append(_next(order, first, second, chosen))
+    return first[chosen], postures[chosen]
+
+
+def _next(order: np.ndarray, first: np.ndarray, second: np.ndarray, chosen: list[int]) -> int:
+    """The first in an order that is new, near the last one chosen, and reached by the second tool as well."""
+    least, largest = APART
+    for index in order:
+        away = np.linalg.norm(first[chosen] - first[index], axis=1)
+        if chosen and (away.min() < least or away[-1] > largest):
+            continue
+        if len(second) and np.linalg.norm(second - first[index], axis=1).min() <= CLOSE:
+            return int(index)
+    raise NowhereToGo(
+        f"No {len(chosen) + 1} targets near one another are reached with both tools, by the forecast of the robot "
+        "file's 'collect' section. Widen collect.constraints, or order `conditions` so that the first and the last "
+        "reach the same places."
+    )
+
+
+def _reached(
+    robot: RobotConfig, signal: str, condition: str, random: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Random postures that are allowed under a condition, shape (m, k), and what they reach, shape (m, n)."""
+    config = collect_config(robot)
+    if config.forecast is None:
+        raise ConfigError(f"Robot '{robot.robot}' has no collect.forecast, so which targets it reaches is not known.")
+    low, high = robot.bounds(robot.command.signal)
+    margin = INSIDE * (high - low)
+    postures = random.uniform(low + margin, high - margin, (DRAWN, low.size))
+    postures = postures[~Forecast(robot, config, condition).outside(postures).any(axis=1)]
+    found = registry.load(config.forecast)(robot, condition, postures)
+    if signal not in found:
+        raise ConfigError(f"{config.forecast} forecasts {', '.join(found)}; the targets are of {signal}.")
+    return postures, np.asarray(found[signal], float)

@@ -1,0 +1,206 @@
+"""`gemuco doctor`: everything that a robot needs, looked at, one line each, with what to do."""
+
+import socket
+import struct
+import time
+from collections.abc import Iterable, Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from rich.markup import escape
+from rich.table import Table
+
+from hal.config import RobotConfig, load_robot
+from hal.errors import ConfigError
+from hal.finding import doctor
+from hal.finding.findings import Finding, Verdict, bad, ok, warning
+from hal.finding.interface import interfaces
+from services import show
+from services.client import Client
+from services.errors import AlreadyRunning, ServiceError
+from services.hardware import host_checks
+from services.model.artifacts import robot_file
+from services.process.lock import instead_of
+from services.wire import keys
+from services.wire.connect import role_file, sorted_out
+from services.wire.entering import ending, expiry, exposed
+from services.wire.messages import Status
+from services.wire.session import port
+
+APPEARS_WITHIN = 3.0
+"""How long [s] to wait for the status of a HAL."""
+CONNECTS_WITHIN = 0.5
+"""How long [s] a new client may take to see services that run."""
+LATE = 0.005
+"""p99 of the cycle's lateness [s] that is worth a warning."""
+_MARKS = {Verdict.OK: "[green]ok[/]", Verdict.WARNING: "[yellow]warning[/]", Verdict.BAD: "[bold red]bad[/]"}
+_WAITS = {"tcp": "0A", "udp": "07"}
+"""State of a socket that waits for others, in /proc/net."""
+
+
+def run_doctor(robot: str, connect: Iterable[str] = ()) -> int:
+    """Look at everything, print it, return the exit code: 1 if anything is bad.
+
+    Args:
+        robot: Name or file.
+        connect: Where a secured robot is entered: endpoints and role files.
+    """
+    worst = dict.fromkeys(Verdict, 0)
+    console = show.console()
+    for finding in _findings(robot, tuple(connect)):
+        worst[finding.verdict] += 1
+        if console.is_terminal:
+            row = Table.grid(padding=(0, 2))
+            row.add_column(width=7)
+            row.add_column(width=24)
+            row.add_row(_MARKS[finding.verdict], finding.what, escape(finding.text))
+            console.print(row)
+        else:  # in a file or a pipe a line is a line
+            print(f"{finding.verdict:<8} {finding.what:<24} {finding.text}")
+    console.print(f"{worst[Verdict.OK]} ok, {worst[Verdict.WARNING]} warnings, {worst[Verdict.BAD]} bad.")
+    return 1 if worst[Verdict.BAD] else 0
+
+
+def _findings(robot: str, connect: tuple[str, ...]) -> Iterator[Finding]:
+    try:
+        config = load_robot(robot_file(robot))
+    except ConfigError as error:
+        yield bad("robot file", str(error))
+        return
+    described = list(doctor.described(config))
+    yield from described
+    is_sound = all(finding.what != "robot file" or finding.verdict is Verdict.OK for finding in described)
+    if is_sound:
+        yield from interfaces(config)
+        yield from _devices(config, connect)
+    yield from host_checks.clocks()
+    yield from host_checks.real_time()
+    yield from role_files(connect)
+    yield from _network(config, connect)
+
+
+def _devices(config: RobotConfig, connect: tuple[str, ...]) -> Iterator[Finding]:
+    """From the HAL of this machine if it runs, or else by opening the buses in its place."""
+    try:
+        with instead_of(config.robot, "hal"):
+            yield ok("HAL", "None runs: the buses are opened here, with the motors off.")
+            yield from doctor.examine(config)
+    except ConfigError as error:
+        yield bad("devices", str(error))
+    except AlreadyRunning as error:
+        try:
+            with Client(config.robot, connect) as client:
+                status = client.status("hal", timeout=APPEARS_WITHIN)
+        except ServiceError as why:
+            yield bad("HAL", f"{error} It cannot be asked: {why}")
+            return
+        if status is None:
+            yield bad("HAL", f"{error} It publishes no status: is it still starting?")
+        else:
+            yield from from_status(status)
+
+
+def from_status(status: Status) -> Iterator[Finding]:
+    """What a running HAL says of its buses and devices; nothing is disturbed."""
+    facts = status.facts
+    yield ok("HAL", f"Runs, mode '{facts.get('mode')}'; it is asked, and the buses are left alone.")
+    if facts.get("fault"):
+        yield bad("fault", str(facts["fault"]))
+    for name, bus in facts.get("buses", {}).items():
+        yield from _bus(name, bus)
+    devices: dict[str, Any] = facts.get("devices", {})
+    ill = {name: device for name, device in devices.items() if device["text"]}
+    for name, device in ill.items():
+        is_bad = device["state"] in ("silent", "fault", "opening", "closed")
+        yield (bad if is_bad else warning)(f"node {name}", device["text"])
+    if not ill:
+        yield ok("nodes", f"All {len(devices)} answer; identity and mapping were checked when they were opened.")
+    cycles, incomplete = int(facts.get("cycles", 0)), int(facts.get("incomplete", 0))
+    if cycles:
+        text = f"{1 - incomplete / cycles:.1%} of {cycles} cycles were complete."
+        yield (warning if incomplete > 0.02 * cycles else ok)("cycles", text)
+    loop = status.loops.get("hal", {})
+    if loop:
+        late = loop.get("late_p99", 0.0)
+        text = f"{loop.get('rate', 0):.1f} of {loop.get('rate_wanted', 0):g} Hz, late by {late * 1e3:.2g} ms (p99)."
+        yield (warning if late > LATE else ok)("cycle time", text + (" Is this machine busy?" if late > LATE else ""))
+    if facts.get("limits"):
+        yield warning("limits", str(facts["limits"]))
+
+
+def _bus(name: str, bus: dict[str, Any]) -> Iterator[Finding]:
+    text = f"{bus['state']}, load {bus['load']:.0%}. {bus['text']}".strip()
+    verdict = {"ok": ok, "warning": warning}.get(bus["state"], bad)
+    yield verdict(f"bus {name}", text)
+    if bus.get("unknown"):
+        strangers = ", ".join(str(stranger) for stranger in bus["unknown"])
+        yield warning(f"strangers {name}", f"Frames of nobody in the robot file: {strangers}.")
+
+
+def role_files(connect: Iterable[str]) -> Iterator[Finding]:
+    """How long the certificates in these role files are valid, and who may read them."""
+    try:
+        for file in sorted_out(connect)[1]:
+            configuration = role_file(file)
+            until = ending(configuration)
+            if until is None:
+                yield warning("role file", f"'{file}' holds no certificate.")
+            elif said := expiry(configuration):
+                yield (bad if until <= datetime.now(UTC) else warning)("role file", said)
+            else:
+                yield ok("role file", f"The certificate in '{file}' is valid until {until:%Y-%m-%d}.")
+            if said := exposed(file):
+                yield bad("role file", said)
+    except (ServiceError, OSError) as error:
+        yield bad("role file", str(error))
+
+
+def _network(config: RobotConfig, connect: tuple[str, ...]) -> Iterator[Finding]:
+    """Can a session be opened, and can anybody else than this machine reach the robot?"""
+    try:
+        with Client(config.robot, connect) as client:
+            deadline = time.monotonic() + CONNECTS_WITHIN
+            while not (alive := sorted(client.alive())) and time.monotonic() < deadline:
+                time.sleep(0.02)
+    except ServiceError as error:
+        yield bad("zenoh", str(error))
+        return
+    yield ok("zenoh", f"A session opens; services that are seen: {', '.join(alive) or 'none'}.")
+    ports = {port(config.robot, service) for service in keys.SERVICES}
+    outside: dict[str, set[int]] = {"tcp": set(), "udp": set()}
+    for protocol, address, number in listening():
+        if number in ports and not _is_loopback(address):
+            outside[protocol].add(number)
+    if outside["tcp"]:
+        told = ", ".join(map(str, sorted(outside["tcp"])))
+        text = f"Port {told} is open to other machines: whoever reaches it may move the robot, unless a role file"
+        yield warning("outside", f"{text} asks for a certificate. Is that meant?")
+    if outside["udp"]:
+        told = ", ".join(map(str, sorted(outside["udp"])))
+        yield ok("outside", f"Port {told} is open to other machines over QUIC, which role files ask a certificate for.")
+    if not any(outside.values()):
+        yield ok("outside", "No port of this robot is open to other machines.")
+
+
+def listening() -> Iterator[tuple[str, str, int]]:
+    """Protocol (`tcp` or `udp`), address and port of every socket of this machine that waits for others."""
+    for protocol, state in _WAITS.items():
+        for path in (Path(f"/proc/net/{protocol}"), Path(f"/proc/net/{protocol}6")):
+            if not path.exists():
+                continue
+            for line in path.read_text().splitlines()[1:]:
+                words = line.split()
+                if words[3] == state:
+                    address, _, number = words[1].partition(":")
+                    yield protocol, _address(address), int(number, 16)
+
+
+def _address(text: str) -> str:
+    """An address as /proc writes it: words of four bytes in the machine's own order."""
+    raw = b"".join(struct.pack("=I", int(text[start : start + 8], 16)) for start in range(0, len(text), 8))
+    return socket.inet_ntop(socket.AF_INET if len(raw) == 4 else socket.AF_INET6, raw)
+
+
+def _is_loopback(address: str) -> bool:
+    return address.startswith("127.") or address in ("::1", "::ffff:127.0.0.1")

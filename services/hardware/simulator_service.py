@@ -1,0 +1,168 @@
+"""The process that pretends to be the robot: simulated nodes on the robot file's buses; faults in, truth out."""
+
+import logging
+import threading
+import time
+from collections.abc import Iterable, Mapping
+from typing import Any, Protocol
+
+import numpy as np
+
+from hal.config import RobotConfig
+from services.hardware.stand_in import condition_of, simulator_of, variant_of
+from services.process import realtime
+from services.process.loop import Loop
+from services.process.service import Service, until_told
+from services.wire import keys, messages
+from services.wire.messages import MessageError, Status
+
+log = logging.getLogger(__name__)
+
+TRUTH_RATE = 100.0
+PRIORITY = 15
+"""Above every normal program, below HAL and service: above them it would wake for each of the HAL's frames instead of
+once for all of a cycle, which costs a fifth of a core and the service every thirtieth anomaly tick."""
+NETWORK_PRIORITY = 15
+THREADS = ("physics", "nodes ", "hub ")
+
+
+class Rig(Protocol):
+    """Simulated hardware that runs in real time (`simulators.rig.Rig`)."""
+
+    failure: str
+
+    def start(self) -> None:
+        """Run in real time until `stop`."""
+        ...
+
+    def stop(self) -> None:
+        """Stop and close the world."""
+        ...
+
+    def fault(self, text: str) -> str:
+        """Break something; the sentence tells what was done."""
+        ...
+
+    def truth(self) -> Mapping[str, np.ndarray]:
+        """Every signal as it is [its unit], shapes (n,)."""
+        ...
+
+    def stats(self) -> dict[str, Any]:
+        """Counters."""
+        ...
+
+
+class SimulatorService:
+    """A running rig on zenoh.
+
+    Args:
+        robot: The robot's name.
+        rig: Not started yet.
+        service: The process's session.
+        variant: Which variant of the robot it is; told in the status.
+    """
+
+    def __init__(self, robot: str, rig: Rig, service: Service, variant: str) -> None:
+        self._rig = rig
+        self._service = service
+        self._variant = variant
+        self._cycle = 0
+        self._truth = service.publisher(keys.truth(robot), messages.Sample)
+        self._loop = Loop("truth", TRUTH_RATE, self.tick, priority=PRIORITY)
+        service.watch(self._loop)
+        service.verb("fault", self._fault)
+
+    def run(self, stop: threading.Event) -> int:
+        """Run the rig until `stop` is set or it fails; the exit code."""
+        self._rig.start()
+        try:
+            for prefix in THREADS:
+                realtime.promote(prefix, PRIORITY)
+            realtime.freeze()
+            self._loop.start()
+            realtime.promote_rest(NETWORK_PRIORITY)
+            self._service.run(lambda: self._status(stop), stop)
+        finally:
+            self._loop.stop()
+            self._rig.stop()
+        return 1 if self._rig.failure else 0
+
+    def tick(self) -> None:
+        """Publish what is true now."""
+        values = {name: np.asarray(value, float) for name, value in self._rig.truth().items()}
+        self._cycle += 1
+        self._truth.put(
+            messages.Sample(
+                stamp_ns=time.time_ns(),
+                cycle=self._cycle,
+                source="truth",
+                complete=True,
+                values=values,
+                age={name: np.zeros(value.shape) for name, value in values.items()},
+                valid={name: np.ones(value.shape, bool) for name, value in values.items()},
+            )
+        )
+
+    def _fault(self, arguments: dict[str, Any]) -> dict[str, str]:
+        text = arguments.get("text")
+        if not isinstance(text, str) or not text.strip():
+            raise MessageError("The verb 'fault' takes {text: what to break}, as in 'muscle_cut biceps'.")
+        done = self._rig.fault(text)
+        log.info("%s", done)
+        return {"text": done}
+
+    def _status(self, stop: threading.Event) -> Status:
+        failure = self._rig.failure
+        if failure:
+            log.error("The simulation failed: %s", failure)
+            stop.set()
+        return Status(
+            stamp_ns=time.time_ns(),
+            service=self._service.name,
+            state="fault" if failure else "running",
+            text=failure,
+            loops={"truth": self._loop.statistics()},
+            facts={"variant": self._variant, **self._rig.stats()},
+        )
+
+
+def run_simulator(
+    config: RobotConfig,
+    variant: str | None = None,
+    seed: int = 0,
+    condition: str | None = None,
+    connect: Iterable[str] = (),
+    stop: threading.Event | None = None,
+) -> int:
+    """Run what stands in for a robot's hardware until SIGTERM, SIGINT or `stop`.
+
+    Args:
+        config: The robot file.
+        variant: One of the simulator's variants; the designer's if None.
+        seed: Chooses among the robots of a variant, and their noise.
+        condition: One of the robot file's conditions; the first if None.
+        connect: Endpoints, such as a router's, and role files.
+        stop: Ends the service in place of the signals.
+
+    Returns:
+        The process's exit code; 1 if the simulation failed.
+
+    Raises:
+        ConfigError: The robot file names no simulator, or one that is not there; an unknown variant or condition.
+        AlreadyRunning: The robot is simulated already.
+        ServiceError: No session.
+    """
+    realtime.prepare_process()
+    simulator = simulator_of(config)
+    variant, condition = variant_of(config, variant), condition_of(config, condition)
+    told_apart = {
+        "variant": variant,
+        "condition": condition,
+        "seed": seed,
+        "variants": list(simulator.variants),
+        "conditions": list(simulator.conditions),
+    }
+    with until_told(stop) as told, Service(config.robot, "simulator", connect, lambda: told_apart) as service:
+        log.info("Simulator of robot '%s' runs (%s, seed %d)", config.robot, variant, seed)
+        rig = simulator.rig(config, variant, seed, condition)
+        return SimulatorService(config.robot, rig, service, variant).run(told)

@@ -1,0 +1,1 @@
+"""From a robot that moves to a model of it."""

@@ -1,0 +1,246 @@
+"""From recorded data to a model that can serve: structure, training, and what the errors mean in physical units."""
+
+import shutil
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.table import Table
+
+from gemuco.dataset import Dataset
+from gemuco.errors import CheckpointError, DatasetError, NotWritten
+from gemuco.history import History
+from gemuco.masks import label
+from gemuco.schema import BodySchema
+from gemuco.writing import writing
+from hal.config import RobotConfig
+from services.model.artifacts import fingerprint
+from services.model.living_model import layout_of
+from services.model.model_config import ModelConfig, model_config
+
+if TYPE_CHECKING:
+    from gemuco.structure import Structure
+    from gemuco.train import TrainConfig
+
+Progress = Callable[[float, str], None]
+
+GENTLER = 1.0 / 3.0
+"""Peak learning rate of fine-tuning, as a share of the robot file's."""
+
+
+@dataclass(frozen=True, slots=True)
+class Trained:
+    """A model and how it came about.
+
+    Attributes:
+        schema: The body schema, with the robot file's fingerprint in its manifest.
+        structure: What was found out about the signals; None where an older model's was kept.
+        history: How the training went.
+        samples: How many samples it was made from.
+        seconds: How long structure and training took.
+    """
+
+    schema: BodySchema
+    structure: "Structure | None"
+    history: History
+    samples: int
+    seconds: float
+
+
+def train(
+    robot: RobotConfig,
+    dataset: Dataset,
+    seed: int,
+    progress: Progress,
+    drafts: Path | None = None,
+    base: BodySchema | None = None,
+) -> Trained:
+    """The model of a robot; see `learn`, or `tune` where there is a model to begin from.
+
+    Raises:
+        DatasetError: The data are of another robot, or in other units.
+        NotEnoughData: Too few samples, or nothing can be inferred.
+    """
+    try:
+        own = dataset.of(layout_of(robot))
+    except DatasetError as error:
+        raise DatasetError(
+            f"The data do not fit '{robot.robot}': {error} Record data of this robot with `gemuco collect`."
+        ) from None
+    facts = {"robot": robot.robot, "fingerprint": fingerprint(robot)}
+    if base is not None:
+        return tune(base, model_config(robot), own, seed, progress, drafts, **facts)
+    return learn(model_config(robot), own, seed, progress, drafts, **facts)
+
+
+def learn(
+    config: ModelConfig, dataset: Dataset, seed: int, progress: Progress, drafts: Path | None = None, **facts: str
+) -> Trained:
+    """Determine the structure and train.
+
+    Args:
+        config: How.
+        dataset: Episodes of one body.
+        seed: Of all that is random.
+        progress: Told the share done, 0 to 1, and a line of text.
+        drafts: A folder to keep trainings in, so that what was interrupted goes on; nothing is kept without one.
+        facts: For the model's manifest.
+
+    Raises:
+        NotEnoughData: Too few samples, or nothing can be inferred.
+    """
+    from gemuco import structure
+    from gemuco import train as training
+
+    started = time.monotonic()
+    first = train_config(config, config.structure.epochs, seed)
+    last = train_config(config, config.training.epochs, seed)
+    wanted = config.structure
+    share = first.epochs * wanted.splits / (first.epochs * wanted.splits + last.epochs)
+    thresholds = structure.Thresholds(wanted.threshold_out, wanted.threshold_in, wanted.measure, wanted.over)
+    found = structure.determine(
+        dataset, first, thresholds, lambda done, text: progress(share * done, text), wanted.splits, drafts
+    )
+    schema, history = training.fit(
+        dataset,
+        last,
+        found.masks,
+        lambda done, text: progress(share + (1 - share) * done, text),
+        found.x_out,
+        resume=None if drafts is None else drafts / "training.safetensors",
+    )
+    names = dataset.layout.names
+    schema = schema.with_manifest(
+        **facts,
+        samples=len(dataset),
+        held_out_loss=history.best,
+        L_i=found.L_i,
+        L_m={label(mask, names): found.L_m[mask] for mask in found.listed},
+    )
+    return Trained(schema, found, history, len(dataset), time.monotonic() - started)
+
+
+def tune(
+    base: BodySchema,
+    config: ModelConfig,
+    dataset: Dataset,
+    seed: int,
+    progress: Progress,
+    drafts: Path | None = None,
+    **facts: str,
+) -> Trained:
+    """Train a model further on few samples of the real body; network and masks stay those of the model.
+
+    Args:
+        base: The model to begin from, such as one trained in simulation.
+        config: How; the learning rate is a third of it.
+        dataset: Episodes of the body as it is.
+        seed: Of all that is random.
+        progress: Told the share done, 0 to 1, and a line of text.
+        drafts: As for `learn`.
+        facts: For the model's manifest.
+
+    Raises:
+        DatasetError: The data lack a signal of the model, or are in other units.
+        NotEnoughData: Too few samples.
+    """
+    from gemuco.train import fine_tune
+
+    started = time.monotonic()
+    gentle = train_config(config, config.training.epochs, seed)
+    gentle = replace(gentle, rate=GENTLER * gentle.rate)
+    resume = None if drafts is None else drafts / "training.safetensors"
+    schema, history = fine_tune(base, dataset, gentle, progress, resume=resume)
+    schema = schema.with_manifest(**facts, samples=len(dataset), held_out_loss=history.best)
+    return Trained(schema, None, history, len(dataset), time.monotonic() - started)
+
+
+def fits(robot: RobotConfig, folder: Path) -> bool:
+    """Whether a sound model lies there that was made for this robot file."""
+    try:
+        return BodySchema.load(folder).manifest.get("fingerprint") == fingerprint(robot)
+    except CheckpointError:
+        return False
+
+
+def save(trained: Trained, folder: Path) -> None:
+    """Write the model, the pictures of its structure and training beside it; its drafts are of no more use."""
+    from services.learning import structure_plot, training_plot
+
+    trained.schema.save(folder)
+    with writing("The pictures", folder):
+        if trained.structure is not None:
+            structure_plot.plot(trained.structure, folder / "structure.png")
+        training_plot.plot(trained.history, f"{trained.samples} samples", folder / "training.png")
+    shutil.rmtree(drafts_of(folder), ignore_errors=True)
+
+
+def drafts_of(folder: Path) -> Path:
+    """Where unfinished trainings of the model in a folder are kept.
+
+    Raises:
+        NotWritten: The folder is a file: better told before training than after.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise NotWritten(f"'{folder}' is a file; a model is kept in a folder. Name another place.")
+    return folder.with_name(folder.name + ".draft")
+
+
+def show(trained: Trained, console: Console) -> None:
+    """Print the structure, and the error of each signal under each mask in its own unit."""
+    if trained.structure is not None:
+        console.print(trained.structure.report(), highlight=False)
+    table = Table(title="Error on held-out data, by what it is estimated from", title_justify="left")
+    table.add_column("estimated from")
+    table.add_column("signal")
+    table.add_column("error (rms)", justify="right")
+    for mask, name, unit, rms in trained.schema.error_rows():
+        table.add_row(mask, name, f"{rms:.4g} {unit}")
+    console.print(table)
+    what = "training" if trained.structure is None else "structure and training"
+    console.print(f"{trained.samples} samples, {what} in {trained.seconds:.1f} s.")
+    for sentence in remarks(trained.history):
+        console.print(sentence, style="yellow", highlight=False)
+
+
+def remarks(history: History) -> list[str]:
+    """What a person should know of the data and the training."""
+    found = list(history.notes)
+    if history.resumed:
+        found.append(f"An interrupted training went on at epoch {history.resumed + 1}.")
+    if history.dead:
+        found.append(
+            f"Never varied or never measured: {', '.join(history.dead)}. What they say has no effect on the model. "
+            "Check these sensors, or leave them out."
+        )
+    if history.skipped:
+        found.append(f"{history.skipped} training samples were skipped: they lack something of every mask.")
+    if history.rejected:
+        found.append(
+            f"{history.rejected} measured signals in the training data were taken for outliers: the other signals of "
+            "their samples contradict them. If there are many, look for a loose sensor."
+        )
+    return found
+
+
+def train_config(config: ModelConfig, epochs: int, seed: int) -> "TrainConfig":
+    """The robot file's way to train, for so many epochs."""
+    from gemuco.train import TrainConfig
+
+    return TrainConfig(
+        hidden=config.network.hidden,
+        latent=config.network.latent,
+        activation=config.network.activation,
+        bias_size=config.network.bias,
+        epochs=epochs,
+        batch=config.training.batch,
+        rate=config.training.rate,
+        bias_rate=config.training.bias_rate,
+        held_out=config.training.held_out,
+        patience=config.training.patience or epochs,
+        outliers=config.training.outliers,
+        seed=seed,
+    )

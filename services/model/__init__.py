@@ -1,0 +1,1 @@
+"""The model service: four loops on the newest sample."""

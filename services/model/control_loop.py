@@ -1,0 +1,203 @@
+"""The control loop: targets in, commands out, nothing without being engaged and nothing on an old sample."""
+
+import math
+import threading
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
+
+import numpy as np
+
+from hal.clock import Clock
+from hal.config import RobotConfig
+from services.errors import CommandHeld, NotEngaged, TargetRefused, TooLate
+from services.model.control_config import ControlConfig
+from services.model.estimation import Estimation, Fresh, Newest
+from services.wire.messages import Applied, Command, Target
+from services.wire.plain_text import shown
+
+BUMP = 0.3
+"""Time constant [s] in which the first command's distance from where the servos are fades out."""
+LONGEST_STEP = 0.1
+"""A tick that comes later than this [s] moves the reference no further than one that comes in time."""
+LIVE_MODES = ("hold", "follow")
+DEAD_MODES = ("off", "homing", "stopping", "fault")
+
+
+class Solver(Protocol):
+    """Something that finds the command [its unit], shape (n,), that brings about a target."""
+
+    def __call__(self, target: Mapping[str, np.ndarray], now: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Solve for signal -> reference, starting from signal -> value now."""
+        ...
+
+
+def check_target(robot: RobotConfig, config: ControlConfig, target: Target) -> np.ndarray:
+    """The reference [unit of the target signal], shape (n,).
+
+    Raises:
+        TargetRefused: Not the signal that is controlled, a wrong size, not a number, or outside of the limits.
+    """
+    if target.signal not in robot.signals:
+        raise TargetRefused(f"Target signal {shown(target.signal)} is not a signal. Known: {', '.join(robot.signals)}.")
+    if target.signal != config.target:
+        raise TargetRefused(f"'{target.signal}' is not controlled; the robot file says '{config.target}' is.")
+    signal = robot.signals[target.signal]
+    if target.values.shape != (signal.size,):
+        names = ", ".join(signal.elements)
+        raise TargetRefused(f"A {target.signal} target has {signal.size} values ({names}), not {target.values.size}.")
+    if not np.isfinite(target.values).all():
+        raise TargetRefused(f"A {target.signal} target holds a value that is not a number.")
+    low, high = robot.bounds(target.signal)
+    for index in np.flatnonzero((target.values < low) | (target.values > high)):
+        raise TargetRefused(
+            f"{target.signal}.{signal.elements[index]} of {target.values[index]:.3f} {signal.unit} is outside of its "
+            f"limits, {low[index]:.3f} to {high[index]:.3f} {signal.unit}."
+        )
+    return np.array(target.values, float)
+
+
+class Control:
+    """Moves a reference towards the target, solves for the command, and sends it while that is safe."""
+
+    def __init__(
+        self,
+        robot: RobotConfig,
+        config: ControlConfig,
+        newest: Newest,
+        applied: Callable[[], Applied | None],
+        estimation: Estimation,
+        solver: Solver,
+        send: Callable[[Command], None],
+        clock: Clock,
+    ) -> None:
+        """`newest` and `applied` return what the HAL said last."""
+        self._robot, self._config, self._clock = robot, config, clock
+        self._newest, self._applied, self._estimation = newest, applied, estimation
+        self._solver, self._send = solver, send
+        self._lock = threading.Lock()
+        self._led_in_at = -math.inf
+        self._ticked_at = -math.inf
+        self._was_live = False
+        self._reference: np.ndarray | None = None
+        self._target: np.ndarray | None = None
+        self._bump: np.ndarray | None = None
+        self.engaged = False
+        self.text = ""
+        self.counters = {"sent": 0, "waited": 0, "refused_targets": 0}
+
+    def set_target(self, target: Target) -> None:
+        """Where to go from now on.
+
+        Raises:
+            TargetRefused: It cannot be reached safely; the target before stays.
+        """
+        values = check_target(self._robot, self._config, target)
+        with self._lock:
+            self._target, self.text = values, ""
+
+    def try_target(self, target: Target, check: Callable[[Target], None] = lambda _: None) -> None:
+        """Take a target that came without anybody waiting for an answer; a refusal is counted and told in `facts`.
+
+        Args:
+            target: As it was published.
+            check: Raises `CommandHeld` or `TooLate` if it must not be followed.
+        """
+        try:
+            check(target)
+            self.set_target(target)
+        except (TargetRefused, CommandHeld, TooLate) as refusal:
+            self.counters["refused_targets"] += 1
+            self.text = str(refusal)
+
+    def engage(self, enable: Callable[[], Any]) -> None:
+        """Take over from where the body is, and ask the HAL to enable.
+
+        Raises:
+            NotEngaged: There is no fresh sample, or the posture can neither be measured nor estimated.
+        """
+        if self._fresh() is None:
+            raise NotEngaged("No fresh sample comes from the HAL, so there is nothing to start from. Is it running?")
+        posture = self._posture()
+        if posture is None:
+            raise NotEngaged(f"'{self._config.target}' can neither be measured nor estimated, so nothing is engaged.")
+        enable()
+        with self._lock:
+            self._reference, self._target, self._bump = posture, None, None
+            self._was_live = False
+            self._ticked_at = self._clock.monotonic()
+            self.engaged, self.text = True, ""
+
+    def disengage(self, why: str = "") -> None:
+        """Send nothing any more; the HAL then holds, and disables."""
+        with self._lock:
+            self.engaged, self.text = False, why
+            self._target = self._reference = None
+
+    def tick(self) -> None:
+        """Send one command, if engaged, on a fresh sample, and the drives follow."""
+        if not self.engaged:
+            return
+        fresh, mode = self._fresh(), self._mode()
+        if self._was_live and mode in DEAD_MODES:
+            self.disengage(f"The HAL went to '{mode}', so the controller let go. Engage it again when that is mended.")
+            return
+        if fresh is None or mode not in LIVE_MODES or self._estimation.latest is None:
+            self.counters["waited"] += 1
+            return
+        self._was_live = True
+        with self._lock:
+            reference = self._advance()
+            if reference is None:
+                return
+            values = self._command(reference, self._estimation.latest.values)
+            if not np.isfinite(values).all():
+                self.text = "The model's command is not a number; nothing was sent."
+                return
+            signal = self._robot.command.signal
+            self._send(Command(signal=signal, values=values, cycle=fresh.sample.cycle, hal_boot=fresh.sample.boot))
+            self.counters["sent"] += 1
+
+    def facts(self) -> dict[str, Any]:
+        """For the status message."""
+        with self._lock:
+            target = [] if self._target is None else self._target.tolist()
+            reference = [] if self._reference is None else self._reference.tolist()
+        return {"engaged": self.engaged, "target": target, "reference": reference, "text": self.text, **self.counters}
+
+    def _fresh(self) -> Fresh | None:
+        fresh = self._newest()
+        if fresh is None or self._clock.monotonic() - fresh.received > self._robot.command.time_to_live:
+            return None
+        return fresh
+
+    def _mode(self) -> str:
+        applied = self._applied()
+        return "off" if applied is None else applied.mode
+
+    def _posture(self) -> np.ndarray | None:
+        latest = self._estimation.latest
+        values = None if latest is None else latest.values.get(self._config.target)
+        if values is None or not np.isfinite(values).all():
+            return None
+        low, high = self._robot.bounds(self._config.target)
+        return np.clip(values, low, high)
+
+    def _advance(self) -> np.ndarray | None:
+        """Move the reference on a straight line towards the target, all elements arriving together."""
+        now = self._clock.monotonic()
+        step = self._config.speed * min(now - self._ticked_at, LONGEST_STEP)
+        self._ticked_at = now
+        if self._reference is not None and self._target is not None:
+            way = self._target - self._reference
+            longest = float(np.abs(way).max())
+            self._reference = self._target if longest <= step else self._reference + way * (step / longest)
+        return self._reference
+
+    def _command(self, reference: np.ndarray, now: Mapping[str, np.ndarray]) -> np.ndarray:
+        """The solved command, led in from where the servos stand when the controller took over."""
+        solved = self._solver({self._config.target: reference}, now)
+        measured = now[self._robot.command.signal]
+        if self._bump is None:
+            self._bump = np.where(np.isfinite(measured), measured - solved, 0.0)
+            self._led_in_at = self._clock.monotonic()
+        return solved + self._bump * math.exp(-(self._clock.monotonic() - self._led_in_at) / BUMP)

@@ -1,0 +1,120 @@
+"""The estimation loop: stale is masked, estimated, and marked as estimated."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from gemuco.masks import label
+from gemuco.schema import BodySchema
+from hal.clock import Clock
+from hal.config import RobotConfig, SignalConfig
+from services.model.living_model import layout_of
+from services.wire.messages import Estimates, Sample
+from services.wire.streams import Newest as Reader
+
+
+@dataclass(frozen=True, slots=True)
+class Fresh:
+    """A sample and when it arrived.
+
+    Attributes:
+        sample: As it was sent.
+        received: This process's monotonic time [s]; ages go on from here, for two clocks are never compared.
+    """
+
+    sample: Sample
+    received: float
+
+    @classmethod
+    def of(cls, reader: Reader[Sample]) -> "Fresh | None":
+        """The last sample that arrived at a reader, however old."""
+        last = reader.last()
+        return None if last is None else cls(last[1], last[0])
+
+
+Newest = Callable[[], Fresh | None]
+
+
+class Freshness:
+    """What of the newest samples, the HAL's and the camera's, may be used now.
+
+    A value may be as old as its signal's `stale_after` when it is published, and the sample may wait as long again on
+    its way and here, since that happens on a busy machine. With the default of 20 ms a silent sensor is noticed within
+    40 ms. Each signal is taken from the process that the robot file says is its source, and from no other.
+    """
+
+    def __init__(self, robot: RobotConfig, newest: Newest, clock: Clock, seen: Newest | None = None) -> None:
+        """Prepare for the model's signals.
+
+        Args:
+            robot: The robot file.
+            newest: Returns the last sample of the HAL, however old.
+            clock: Of this process.
+            seen: Returns the last sample of the camera's process, however old.
+        """
+        self._signals = [(name, robot.signals[name]) for name in layout_of(robot).names]
+        self._newest: dict[str, Newest | None] = {"hal": newest, "vision": seen}
+        self._clock = clock
+
+    def take(self) -> tuple[Fresh | None, dict[str, np.ndarray]]:
+        """The HAL's newest sample, and all usable values [unit], shapes (n,); NaN where invalid or stale by now.
+
+        The sample is None if nothing of it is usable; what the camera sees may be usable then.
+        """
+        newest = {source: None if take is None else take() for source, take in self._newest.items()}
+        now = self._clock.monotonic()
+        values = {name: _usable(name, signal, newest[signal.source], now) for name, signal in self._signals}
+        alive = any(np.isfinite(values[name]).any() for name, signal in self._signals if signal.source == "hal")
+        return newest["hal"] if alive else None, values
+
+
+def _usable(name: str, signal: SignalConfig, fresh: Fresh | None, now: float) -> np.ndarray:
+    """The values of one signal at monotonic time `now` [s], NaN where they must not be used."""
+    if fresh is None:
+        return np.full(signal.size, np.nan)
+    sample = fresh.sample
+    value, valid, age = sample.values.get(name), sample.valid.get(name), sample.age.get(name)
+    shape = (signal.size,)
+    if value is None or valid is None or age is None or not value.shape == valid.shape == age.shape == shape:
+        return np.full(signal.size, np.nan)
+    waited = now - fresh.received
+    return np.where(valid & (np.maximum(age, waited) <= signal.stale_after), value, np.nan)
+
+
+class Estimation:
+    """Makes one `Estimates` per tick from the newest sample."""
+
+    def __init__(
+        self,
+        freshness: Freshness,
+        schema: Callable[[], BodySchema],
+        publish: Callable[[Estimates], None],
+        clock: Clock,
+    ) -> None:
+        """`schema` returns the body schema in use at the moment."""
+        self._freshness, self._schema, self._publish, self._clock = freshness, schema, publish, clock
+        self.latest: Estimates | None = None
+
+    def tick(self) -> None:
+        """Publish what is measured, and estimates in place of what is not."""
+        fresh, values = self._freshness.take()
+        found = self._schema().estimate(values)
+        names = tuple(found)
+        self.latest = Estimates(
+            stamp_ns=self._clock.now_ns(),
+            cycle=-1 if fresh is None else fresh.sample.cycle,
+            values={name: found[name].value for name in names},
+            estimated={name: found[name].estimated for name in names},
+            std={name: found[name].std for name in names},
+            method={name: found[name].method for name in names},
+            mask={name: label(found[name].mask, names) for name in names},
+            residual={name: float(found[name].residual) for name in names},
+        )
+        self._publish(self.latest)
+
+    def counts(self) -> dict[str, int]:
+        """How many signals were `measured`, `estimated` and `none` of both in the last tick."""
+        methods = list(self.latest.method.values()) if self.latest is not None else []
+        measured, none = methods.count("measured"), methods.count("none")
+        return {"measured": measured, "estimated": len(methods) - measured - none, "none": none}

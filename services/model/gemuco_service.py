@@ -1,0 +1,262 @@
+"""The body schema as a service: estimation, control, anomaly and update, four loops on the newest sample."""
+
+import threading
+import time
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gemuco import adapt
+from gemuco.descent import DescentConfig
+from gemuco.errors import SchemaError
+from gemuco.schema import BodySchema
+from hal.clock import SystemClock
+from hal.config import RobotConfig
+from services.model.anomaly_loop import AnomalyWatch
+from services.model.control_config import ControlConfig, controller_of
+from services.model.control_loop import Control
+from services.model.directing import Directing
+from services.model.estimation import Estimation, Fresh, Freshness
+from services.model.living_model import LivingModel, load_model
+from services.model.model_config import ModelConfig, model_config
+from services.model.model_verbs import ModelVerbs
+from services.model.target_intake import TargetIntake
+from services.model.update_loop import OnlineUpdate
+from services.process.loop import Loop
+from services.process.realtime import freeze, prepare_process, promote_rest
+from services.process.service import Service, until_told
+from services.wire import keys, query
+from services.wire.caller import ASKING
+from services.wire.history import HistoryRing
+from services.wire.messages import Anomaly, Applied, Command, Estimates, Holder, Sample, Status, Update
+from services.wire.streams import Newest
+
+SEARCH = DescentConfig(gamma_max=0.1, candidates=10, iterations=8)
+"""Losses that are norms have gradients that do not fade; with larger steps the torque balance gets stuck. Each tick
+goes on where the last one ended, so few suffice."""
+SETTLED = 50
+"""After so many solves for the same reference with the same model, the command stays as it is."""
+NETWORK_PRIORITY = 45
+PRIORITIES = {"estimation": 40, "control": 35, "anomaly": 30, "update": 10}
+"""SCHED_FIFO where the system allows it; the update is lowest but not without, or it would hold the interpreter up."""
+
+
+class ModelSolver:
+    """The controller of whichever model is in use."""
+
+    def __init__(self, living: LivingModel, robot: RobotConfig, config: ControlConfig) -> None:
+        """Prepare for the robot file's control section.
+
+        Raises:
+            SchemaError: This model cannot control; the text says what it lacks.
+        """
+        schema = living.schema
+        self._living = living
+        self._controller = controller_of(schema, robot, config, SEARCH)
+        middle = schema.layout.split(schema.scaler.mean)
+        self._controller.solve({config.target: middle[config.target]}, {})
+        self._controller.restart()
+        self._reference = np.zeros(0)
+        self._solved = 0
+        self._command = np.zeros(0)
+        self._target = config.target
+
+    def __call__(self, target: Mapping[str, np.ndarray], now: Mapping[str, np.ndarray]) -> np.ndarray:
+        """The command [its unit], shape (n,), that brings about a target."""
+        schema, reference = self._living.schema, target[self._target]
+        if self._controller.schema is not schema or not np.array_equal(reference, self._reference):
+            self._controller.swap(schema)
+            self._reference, self._solved = reference, 0
+        if self._solved < SETTLED:
+            self._command = self._controller.solve(target, now).command
+            self._solved += 1
+        return self._command
+
+
+class GemucoService:
+    """The four loops of one robot, bound to its session."""
+
+    def __init__(self, robot: RobotConfig, schema: BodySchema, service: Service) -> None:
+        """Subscribe, publish and prepare; nothing ticks yet."""
+        self.robot, self.config, self.service = robot, model_config(robot), service
+        self.clock = SystemClock()
+        self.living = LivingModel(schema)
+        self.verbs = ModelVerbs(self)
+        self._samples = service.newest(keys.sample(robot.robot), Sample)
+        self._seen = service.newest(keys.vision(robot.robot), Sample) if robot.seen else None
+        self._applied = service.newest(keys.applied(robot.robot), Applied)
+        self._targets = TargetIntake(service.session, robot.robot)
+        self.directing = Directing(
+            service.boot,
+            self.newest_sample,
+            service.newest(keys.holder(robot.robot), Holder),
+            robot.rates.hal,
+            self.clock,
+        )
+        self.freshness = Freshness(robot, self.newest_sample, self.clock, self._newest_seen)
+        self.history = HistoryRing({one.name: one.size for one in schema.layout.signals}, robot.rates.estimation)
+        self._estimates = service.publisher(keys.estimate(robot.robot), Estimates)
+        self.estimation = Estimation(self.freshness, self._schema, self._tell, self.clock)
+        self.anomaly = AnomalyWatch(
+            self.freshness,
+            self._schema,
+            self.config.anomaly.after,
+            service.publisher(keys.anomaly(robot.robot), Anomaly).put,
+            self.clock,
+        )
+        self.update = OnlineUpdate(
+            self.freshness,
+            self.living,
+            self.config.update,
+            self._learner,
+            lambda: self.control is not None and self.control.engaged,
+            service.publisher(keys.update(robot.robot), Update).put,
+            self.clock,
+        )
+        self.control, self.no_control = self._make_control(self.config)
+        rates = robot.rates
+        ticks = {
+            "estimation": (rates.estimation, self.estimation.tick),
+            "control": (rates.control, self._control_tick),
+            "anomaly": (rates.anomaly, self.anomaly.tick),
+            "update": (rates.update, self.update.tick),
+        }
+        self.loops = [Loop(name, rate, tick, self.clock, PRIORITIES[name]) for name, (rate, tick) in ticks.items()]
+        service.watch(*self.loops)
+
+    def newest_sample(self) -> Fresh | None:
+        """The last sample that arrived, however old."""
+        return Fresh.of(self._samples)
+
+    def _newest_seen(self) -> Fresh | None:
+        return None if self._seen is None else Fresh.of(self._seen)
+
+    def enable_hal(self) -> dict[str, Any]:
+        """Ask the HAL to enable the drives, on behalf of whoever asks."""
+        caller = ASKING.get()
+        key = keys.verb(self.robot.robot, "hal", "enable")
+        answer = query.ask(self.service.session, key, caller=lambda: self.directing.on_behalf(caller))
+        self.directing.begin(caller)
+        return answer
+
+    def status(self) -> Status:
+        """State and counters of this second."""
+        fresh, values = self.freshness.take()
+        missing = [name for name, value in values.items() if not np.isfinite(value).all()]
+        loops = {loop.name: loop.statistics() for loop in self.loops}
+        failing = [f"{loop.name}: {loop.trouble}" for loop in self.loops if loop.trouble]
+        text = ""
+        if fresh is None:
+            text = "No fresh sample comes from the HAL. Is `gemuco hal` running?"
+        elif missing:
+            text = f"Estimating {', '.join(missing)}: not measured at the moment.{self._blind()}"
+        elif failing:
+            text = failing[0]
+        return Status(
+            stamp_ns=time.time_ns(),
+            service="model",
+            state="degraded" if text else "running",
+            text=text,
+            loops=loops,
+            facts={
+                "model_version": self.living.version,
+                "camera": bool(self.robot.seen),
+                "adapting": self.update.is_active,
+                "control": self.no_control if self.control is None else self.control.facts(),
+                "scheduling": {loop.name: loop.scheduling for loop in self.loops},
+                "rejected": self._targets.rejected + sum(reader.rejected for reader in self._readers()),
+                "signals": self.estimation.counts(),
+                "anomaly": self.anomaly.summary(),
+                "failing": failing,
+            },
+        )
+
+    def run(self, stop: threading.Event) -> None:
+        """Serve until told to stop."""
+        self.verbs.serve(self.service)
+        freeze()
+        for loop in self.loops:
+            loop.start()
+        promote_rest(NETWORK_PRIORITY)
+        try:
+            self.service.run(self.status, stop)
+        finally:
+            for loop in self.loops:
+                loop.stop()
+
+    def _blind(self) -> str:
+        """What to check when nothing comes from the camera's process; empty when something does."""
+        seen = self._newest_seen()
+        longest = max((self.robot.signals[name].stale_after for name in self.robot.seen), default=0.0)
+        if not self.robot.seen or (seen is not None and self.clock.monotonic() - seen.received <= longest):
+            return ""
+        return " No camera publishes. Is `gemuco vision` running?"
+
+    def _tell(self, estimates: Estimates) -> None:
+        self._estimates.put(estimates)
+        self.history.add(estimates, self.clock.monotonic())
+
+    def _schema(self) -> BodySchema:
+        return self.living.schema
+
+    def _learner(self, schema: BodySchema) -> adapt.Updater:
+        config = self.config.update
+        return adapt.Updater(schema, adapt.UpdateConfig(**config.model_dump(exclude={"interval"})))
+
+    def _make_control(self, config: ModelConfig) -> tuple[Control | None, str]:
+        """The controller, or why there is none."""
+        if config.control is None:
+            return None, f"The robot file of '{self.robot.robot}' has no model.control section."
+        try:
+            solver = ModelSolver(self.living, self.robot, config.control)
+        except SchemaError as error:
+            return None, f"This model cannot control: {error}"
+        commands = self.service.publisher(keys.command(self.robot.robot), Command)
+        return (
+            Control(
+                self.robot, config.control, self.newest_sample, self._newest_applied, self.estimation, solver,
+                lambda command: commands.put(replace(command, name=self.directing.name)), self.clock,
+            ),
+            "",
+        )  # fmt: skip
+
+    def _readers(self) -> list[Newest[Any]]:
+        readers: list[Newest[Any] | None] = [self._samples, self._seen, self._applied]
+        return [reader for reader in readers if reader is not None]
+
+    def _newest_applied(self) -> Applied | None:
+        return self._applied.get(self.robot.command.time_to_live)
+
+    def _control_tick(self) -> None:
+        if self.control is None:
+            return
+        control = self.control
+        self._targets.take(lambda target: control.try_target(target, self.directing.may_set))
+        if control.engaged and (why := self.directing.ended()):
+            control.disengage(why)
+        control.tick()
+
+
+def serve(robot: RobotConfig, folder: Path, connect: Iterable[str] = (), stop: threading.Event | None = None) -> None:
+    """Run the model service of a robot until SIGTERM, SIGINT or `stop`.
+
+    Args:
+        robot: The robot file.
+        folder: Where the trained model lies.
+        connect: Endpoints, such as a router's, and role files.
+        stop: An event that ends it; signals are then left alone.
+
+    Raises:
+        CheckpointError: No model there, or one of another body.
+        AlreadyRunning: The robot already has a model service.
+    """
+    prepare_process()
+    schema = load_model(robot, folder)
+    made: list[GemucoService] = []
+    service = Service(robot.robot, "model", connect, lambda: made[0].verbs.describe() if made else {})
+    with until_told(stop) as told, service:
+        made.append(GemucoService(robot, schema, service))
+        made[0].run(told)

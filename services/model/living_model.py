@@ -1,0 +1,75 @@
+"""The body schema in use: read by four loops at any time, replaced whole by one."""
+
+import threading
+from pathlib import Path
+
+from gemuco.errors import CheckpointError
+from gemuco.schema import BodySchema
+from gemuco.signals import Layout, Signal
+from hal.config import RobotConfig
+from services.model.model_config import model_config
+
+
+def layout_of(robot: RobotConfig) -> Layout:
+    """The signals that the robot file gives the model, all of them unless it names some."""
+    names = model_config(robot).signals or tuple(robot.signals)
+    chosen = ((name, robot.signals[name]) for name in names)
+    return Layout(tuple(Signal(name, signal.size, signal.unit, signal.elements) for name, signal in chosen))
+
+
+def load_model(robot: RobotConfig, folder: Path) -> BodySchema:
+    """The trained schema of a robot.
+
+    Raises:
+        CheckpointError: There is none, it is damaged, or it is of another body than the robot file describes.
+    """
+    if not folder.exists():
+        raise CheckpointError(f"There is no model in '{folder}'. Make one with `gemuco collect` and `gemuco train`.")
+    schema = BodySchema.load(folder)
+    if set(schema.layout.signals) != set(layout_of(robot).signals):
+        theirs, ours = ", ".join(schema.layout.names), ", ".join(layout_of(robot).names)
+        raise CheckpointError(
+            f"The model in '{folder}' is of another body: its signals are {theirs}; the robot file's are {ours}, "
+            "or their elements or units differ. Train again."
+        )
+    return schema
+
+
+class LivingModel:
+    """Holds the schema in use and the one before adaption began; a reader sees one or the other, never a mixture."""
+
+    def __init__(self, schema: BodySchema) -> None:
+        self._lock = threading.Lock()
+        self._schema = schema
+        self._before: BodySchema | None = None
+        self.version = 0
+
+    @property
+    def schema(self) -> BodySchema:
+        """The schema in use."""
+        return self._schema
+
+    @property
+    def before(self) -> BodySchema | None:
+        """The schema before adaption began; None if it never did."""
+        return self._before
+
+    def keep(self) -> None:
+        """Remember the schema in use for `rollback`, unless one is already remembered."""
+        with self._lock:
+            self._before = self._before or self._schema
+
+    def swap(self, schema: BodySchema) -> int:
+        """Use another schema from now on; returns its version."""
+        with self._lock:
+            self._schema = schema
+            self.version += 1
+            return self.version
+
+    def rollback(self) -> int:
+        """Back to the schema before adaption began; returns the version."""
+        with self._lock:
+            if self._before is not None:
+                self._schema, self._before = self._before, None
+                self.version += 1
+            return self.version

@@ -1,0 +1,254 @@
+"""What the model service can be asked for, by anybody on the network."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from gemuco.estimate import Estimate
+from gemuco.masks import label
+from gemuco.schema import BodySchema
+from gemuco.signals import Signal
+from services.errors import BadArguments, NotEngaged
+from services.model.control_config import controller_of, simulator_of
+from services.model.control_loop import Control
+from services.process.service import Service
+from services.wire.caller import Caller
+from services.wire.messages import Target
+from services.wire.plain_text import shown
+from services.wire.query import Guard, Handler
+
+if TYPE_CHECKING:
+    from services.model.gemuco_service import GemucoService
+
+MOST_STEPS = 200
+"""Commands that one question may simulate; a step takes some ten milliseconds."""
+
+
+class ModelVerbs:
+    """Handlers of `gemuco/<robot>/model/do/...`; each takes and returns a map."""
+
+    def __init__(self, service: "GemucoService") -> None:
+        self._service = service
+
+    def handlers(self) -> dict[str, Handler]:
+        """Verb -> handler; `describe` comes with every service."""
+        return {
+            "estimate": self.estimate,
+            "control": self.solve,
+            "simulate": self.simulate,
+            "anomaly": self.anomaly,
+            "history": self.history,
+            "engage": self.engage,
+            "disengage": self.disengage,
+            "target": self.target,
+            "adapt": self.adapt,
+            "rollback": self.rollback,
+            "normal": self.normal,
+        }
+
+    def serve(self, service: Service) -> None:
+        """Answer all of them; what changes what the robot does only for who commands, letting go for everybody."""
+        directing = self._service.directing
+        guards: dict[str, Guard] = dict.fromkeys(("adapt", "rollback", "normal"), self._may_change)
+        guards |= {"engage": directing.may_move, "target": directing.may_move}
+        for name, handler in self.handlers().items():
+            service.verb(name, handler, guards.get(name), always=name == "disengage")
+
+    def _may_change(self, caller: Caller) -> None:
+        """Raise unless the caller may change the model; another model moves the robot while one is engaged."""
+        control, directing = self._service.control, self._service.directing
+        (directing.may_move if control is not None and control.engaged else directing.check)(caller)
+
+    def describe(self) -> dict[str, Any]:
+        """What the model is about."""
+        schema, robot, control = self._service.living.schema, self._service.robot, self._service.config.control
+        return {
+            "signals": {s.name: {"unit": s.unit, "elements": list(s.elements)} for s in schema.layout.signals},
+            "x_in": list(schema.x_in),
+            "x_out": list(schema.x_out),
+            "conditions": list(schema.biases),
+            "biases": {name: np.asarray(bias, float) for name, bias in schema.biases.items()},
+            "masks": [label(mask, schema.layout.names) for mask in schema.masks],
+            "rates": robot.rates.model_dump(),
+            "controls": control.target if control and self._service.control else "",
+            "model_version": self._service.living.version,
+            "manifest": dict(schema.manifest),
+        }
+
+    def estimate(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Estimate one signal or all, from the newest sample or from given values, some of them hidden."""
+        _only(arguments, "signal", "values", "hide")
+        schema = self._service.living.schema
+        if not isinstance(arguments.get("signal", ""), str):
+            raise BadArguments(f"'signal' must be a name. Known signals: {', '.join(schema.layout.names)}.")
+        values, cycle = self._values(arguments)
+        facts = {"cycle": cycle, "model_version": self._service.living.version}
+        if "signal" in arguments:
+            signal = schema.layout.signal(arguments["signal"])
+            return _estimate(schema, signal, schema.estimate(values)[signal.name]) | facts
+        found = schema.estimate(values)
+        return {"signals": {s.name: _estimate(schema, s, found[s.name]) for s in schema.layout.signals}} | facts
+
+    def solve(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """The command that the robot file's loss finds for a target; nothing is sent, nothing moves."""
+        _only(arguments, "target", "values")
+        service, schema = self._service, self._service.living.schema
+        if service.config.control is None:
+            raise NotEngaged(service.no_control)
+        target = _signals(arguments.get("target"), "target")
+        now, cycle = self._values({"values": arguments.get("values")})
+        found = controller_of(schema, service.robot, service.config.control).solve(target, now)
+        signal = schema.layout.signal(service.robot.command.signal)
+        return {
+            "signal": signal.name,
+            "unit": signal.unit,
+            "elements": list(signal.elements),
+            "values": found.command,
+            "predicted": found.predicted,
+            "loss": found.loss,
+            "residual": found.residual,
+            "route": found.route,
+            "mask": label(found.mask, schema.layout.names),
+            "cycle": cycle,
+            "model_version": service.living.version,
+        }
+
+    def simulate(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """The states that commands bring about one after the other, under the robot file's constraints."""
+        _only(arguments, "commands", "given", "values")
+        service, schema = self._service, self._service.living.schema
+        commands = arguments.get("commands")
+        if not isinstance(commands, list) or not 1 <= len(commands) <= MOST_STEPS:
+            what = service.robot.command.signal
+            raise BadArguments(f"'commands' must be a list of 1 to {MOST_STEPS} commands of '{what}'.")
+        given = _signals(arguments.get("given") or {}, "given")
+        now, _ = self._values({"values": arguments.get("values")})
+        simulator = simulator_of(schema, service.robot, service.config.simulation)
+        steps = list(simulator.run([_numbers(command, "commands") for command in commands], given, now))
+        return {
+            "states": {name: np.stack([step.values[name] for step in steps]) for name in steps[0].values},
+            "loss": [step.loss for step in steps],
+            "residual": [step.residual for step in steps],
+            "route": steps[0].route,
+            "mask": label(steps[0].mask, schema.layout.names),
+            "model_version": service.living.version,
+        }
+
+    def anomaly(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """How unlike normal the newest sample is, or given values, some of them hidden."""
+        _only(arguments, "values", "hide")
+        values, cycle = self._values(arguments)
+        found = self._service.living.schema.anomaly(values)
+        return {
+            "score": found.score,
+            "threshold": found.threshold,
+            "is_anomaly": found.is_anomaly,
+            "blamed": found.blamed,
+            "contribution": found.contribution,
+            "cycle": cycle,
+            "model_version": self._service.living.version,
+        }
+
+    def history(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """What was estimated in the last seconds, page by page."""
+        _only(arguments, "seconds", "signals", "begin", "end")
+        service = self._service
+        return service.history.answer(arguments, service.service.boot, service.clock.monotonic())
+
+    def engage(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Take over from where the body is, and ask the HAL to enable."""
+        _only(arguments)
+        control = self._control()
+        control.engage(self._service.enable_hal)
+        return control.facts()
+
+    def disengage(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Send nothing any more; the HAL then holds, and disables."""
+        control = self._control()
+        control.disengage()
+        return control.facts()
+
+    def target(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Set a target, and hear of it if it is refused."""
+        _only(arguments, "signal", "values")
+        control = self._control()
+        values = _numbers(arguments.get("values"), "values")
+        control.set_target(Target(signal=str(arguments.get("signal", "")), values=values))
+        return control.facts()
+
+    def adapt(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Start or stop the online update of W."""
+        _only(arguments, "active")
+        if not isinstance(arguments.get("active"), bool):
+            raise BadArguments("'adapt' needs active: true or false.")
+        self._service.update.adapt(arguments["active"])
+        return {"active": self._service.update.is_active, "model_version": self._service.living.version}
+
+    def rollback(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Stop the update and go back to the model before it began."""
+        _only(arguments)
+        return {"active": False, "model_version": self._service.update.rollback()}
+
+    def normal(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Learn anew what is normal, from the samples since the model last changed."""
+        _only(arguments)
+        samples = self._service.update.learn_normal()
+        normal = self._service.living.schema.normal
+        return {"samples": samples, "threshold": None if normal is None else normal.threshold}
+
+    def _control(self) -> Control:
+        if self._service.control is None:
+            raise NotEngaged(self._service.no_control)
+        return self._service.control
+
+    def _values(self, arguments: Mapping[str, Any]) -> tuple[dict[str, np.ndarray], int]:
+        """What to judge by, without what is hidden, and its cycle; -1 when it was given or nothing is fresh."""
+        given, cycle = arguments.get("values"), -1
+        if given is None:
+            fresh, values = self._service.freshness.take()
+            cycle = -1 if fresh is None else fresh.sample.cycle
+        else:
+            values = _signals(given, "values")
+        hidden = arguments.get("hide") or []
+        if not isinstance(hidden, list) or not all(isinstance(name, str) for name in hidden):
+            raise BadArguments("'hide' must be a list of names of signals.")
+        for name in hidden:
+            self._service.living.schema.layout.slice(name)
+            values.pop(name, None)
+        return values, cycle
+
+
+def _estimate(schema: BodySchema, signal: Signal, found: Estimate) -> dict[str, Any]:
+    return {
+        "signal": signal.name,
+        "unit": signal.unit,
+        "elements": list(signal.elements),
+        "values": found.value,
+        "std": found.std,
+        "estimated": found.estimated,
+        "method": found.method,
+        "mask": label(found.mask, schema.layout.names),
+        "residual": found.residual,
+    }
+
+
+def _only(arguments: Mapping[str, Any], *known: str) -> None:
+    for name in sorted(set(arguments) - set(known)):
+        raise BadArguments(f"Unknown argument {shown(name)}. Known arguments: {', '.join(known) or 'none'}.")
+
+
+def _numbers(value: Any, name: str) -> np.ndarray:
+    try:
+        array = np.asarray(value, float)
+    except (TypeError, ValueError, OverflowError, RecursionError):
+        array = np.zeros((0, 0))
+    if array.ndim != 1:
+        raise BadArguments(f"'{name}' must be a list of numbers.")
+    return array
+
+
+def _signals(value: Any, name: str) -> dict[str, np.ndarray]:
+    if not isinstance(value, dict) or not all(isinstance(signal, str) for signal in value):
+        raise BadArguments(f"'{name}' must be a map from signal to a list of numbers.")
+    return {signal: _numbers(numbers, signal) for signal, numbers in value.items()}

@@ -1,0 +1,1 @@
+"""What every process has: lock, session, loops in time, health, an end."""

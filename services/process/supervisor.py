@@ -1,0 +1,169 @@
+"""Child processes that never outlive their parent: started in groups of their own, watched, and stopped in time."""
+
+import contextlib
+import ctypes
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType, TracebackType
+from typing import Any
+
+from services.errors import ServiceError
+
+_PR_SET_PDEATHSIG = 1
+_LIBC = ctypes.CDLL(None, use_errno=True)
+LAST_LINES = 5
+POLL = 0.05
+
+
+def gemuco_command(*arguments: str) -> list[str]:
+    """The command line of one of our own verbs."""
+    return [sys.executable, "-m", "services.cli", *arguments]
+
+
+class ChildDied(ServiceError):
+    """A supervised process ended by itself; the text tells how, and what it said last."""
+
+
+class NotReady(ServiceError):
+    """A supervised process did not become ready in time."""
+
+
+@dataclass(slots=True)
+class Child:
+    """One supervised process."""
+
+    name: str
+    command: tuple[str, ...]
+    log: Path
+    process: subprocess.Popen[bytes]
+
+    def ended(self) -> str:
+        """How it ended and its last lines, in one sentence; empty while it runs."""
+        code = self.process.poll()
+        if code is None:
+            return ""
+        how = f"was ended by {signal.Signals(-code).name}" if code < 0 else f"exited with {code}"
+        said = " / ".join(line.strip() for line in self.log.read_text(errors="replace").splitlines()[-LAST_LINES:])
+        return f"'{self.name}' {how}. Its last words: {said or 'none'}. All of them: {self.log}."
+
+
+class Supervisor:
+    """Starts children and sees to it that none is left behind, whatever ends this process.
+
+    A child gets a session of its own, so that Ctrl-C in the terminal reaches only the supervisor, which stops the
+    children in the opposite order of their start. The kernel ends a child when the supervisor dies without a word.
+    """
+
+    def __init__(self, folder: Path, grace: float = 5.0) -> None:
+        """Logs go to `folder/<name>.log`; a child that ignores SIGTERM for `grace` [s] is killed."""
+        self.folder = folder
+        self.grace = grace
+        self.children: dict[str, Child] = {}
+        self._handlers: dict[int, Any] = {}
+
+    def __enter__(self) -> "Supervisor":
+        """Turn SIGTERM and SIGHUP into `SystemExit`, so that leaving the block stops the children."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            self._handlers[number] = signal.signal(number, _leave)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            self.stop_all()
+        finally:
+            for number, handler in self._handlers.items():
+                signal.signal(number, handler)
+
+    def start(self, name: str, command: Sequence[str]) -> Child:
+        """Start a process; call from the main thread, whose death ends the child."""
+        log = self.folder / f"{name}.log"
+        with log.open("wb") as sink:
+            process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=sink,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+                preexec_fn=die_with(os.getpid()),
+                env={**os.environ, "PYTHONUNBUFFERED": "1", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
+            )
+        child = Child(name, tuple(command), log, process)
+        self.children[name] = child
+        return child
+
+    def wait_ready(self, name: str, is_ready: Callable[[], bool], timeout: float) -> None:
+        """Block until `is_ready()`.
+
+        Raises:
+            ChildDied: A child ended meanwhile.
+            NotReady: The time [s] is over.
+        """
+        deadline = time.monotonic() + timeout
+        while not is_ready():
+            self.check()
+            if time.monotonic() > deadline:
+                log = self.children[name].log
+                raise NotReady(f"'{name}' was not ready within {timeout:g} s. What it said is in {log}.")
+            time.sleep(POLL)
+
+    def check(self) -> None:
+        """Raise `ChildDied` if a child has ended that nobody stopped."""
+        for child in self.children.values():
+            if said := child.ended():
+                raise ChildDied(said)
+
+    def kill(self, name: str) -> None:
+        """End a child as a crash would (SIGKILL), and forget it."""
+        child = self.children.pop(name)
+        _signal_group(child.process, signal.SIGKILL)
+        child.process.wait()
+
+    def stop(self, *names: str) -> None:
+        """Ask children to end, one after the other, and kill those that do not within the grace time."""
+        for child in [self.children[name] for name in names if name in self.children]:
+            _signal_group(child.process, signal.SIGTERM)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                child.process.wait(self.grace)
+            _signal_group(child.process, signal.SIGKILL)
+            child.process.wait()
+            del self.children[child.name]
+
+    def stop_all(self) -> None:
+        """Stop every child, the last started first; a second Ctrl-C meanwhile only makes it faster."""
+        try:
+            self.stop(*reversed(self.children))
+        except BaseException:
+            for name in list(self.children):
+                self.kill(name)
+            raise
+
+
+def _leave(number: int, frame: FrameType | None) -> None:
+    signal.signal(number, signal.SIG_IGN)
+    raise SystemExit(128 + number)
+
+
+def die_with(parent: int) -> Callable[[], None]:
+    """What a child does before it becomes a program (`preexec_fn`), so that the kernel ends it with its parent."""
+
+    def in_child() -> None:
+        _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        if os.getppid() != parent:  # it died between fork and prctl
+            os._exit(1)
+
+    return in_child
+
+
+def _signal_group(process: subprocess.Popen[bytes], number: signal.Signals) -> None:
+    """Signal the child's whole session; it is its own group's leader."""
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(process.pid, number)

@@ -1,0 +1,1 @@
+"""What was said on the wire, in files: written, read, replayed, exported."""

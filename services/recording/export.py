@@ -1,0 +1,227 @@
+"""Recordings as tables for other programs: one per key, a row per message, a column per element with its unit.
+
+Messages are written as they are read, so a recording may be larger than the memory.
+"""
+
+import csv
+import json
+import math
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Protocol
+
+import numpy as np
+
+from services.errors import RecordingError
+from services.recording.reading import Paths, Recorded, about, one_robot, read
+from services.recording.schema import TRUTHS, UNITS, Form
+from services.wire import keys
+from services.wire.records import Message
+
+ROWS = 4096
+"""Rows that are written together."""
+FIRST = ("received [ns]", "stamp [ns]", "seq", "boot")
+PLAIN = "values"
+"""The field whose columns need no prefix: what it is about."""
+
+
+class Table(Protocol):
+    """A file that takes rows of the same columns."""
+
+    path: Path
+
+    def write(self, rows: list[list[Any]]) -> None:
+        """Add rows."""
+
+    def close(self) -> None:
+        """Finish the file."""
+
+
+class CsvTable:
+    """Comma-separated text with the names of the columns in the first line; what was not measured is empty."""
+
+    def __init__(self, path: Path, columns: list[str], first: list[Any]) -> None:
+        self.path = path.with_name(path.name + ".csv")
+        self._file = self.path.open("x", newline="", encoding="utf-8")
+        self._writer = csv.writer(self._file)
+        self._writer.writerow(columns)
+
+    def write(self, rows: list[list[Any]]) -> None:
+        """Add rows."""
+        self._writer.writerows([["" if x is None else x for x in row] for row in rows])
+
+    def close(self) -> None:
+        """Finish the file."""
+        self._file.close()
+
+
+class ParquetTable:
+    """Apache Parquet; what was not measured is null."""
+
+    def __init__(self, arrow: ModuleType, path: Path, columns: list[str], first: list[Any]) -> None:
+        import pyarrow.parquet
+
+        self._arrow = arrow
+        self.path = path.with_name(path.name + ".parquet")
+        if self.path.exists():
+            raise FileExistsError
+        kinds = {bool: arrow.bool_(), int: arrow.int64(), float: arrow.float64(), str: arrow.string()}
+        pairs = zip(columns, first, strict=True)
+        self._schema = arrow.schema([(name, kinds[float if value is None else type(value)]) for name, value in pairs])
+        self._writer = pyarrow.parquet.ParquetWriter(self.path, self._schema, compression="zstd")
+
+    def write(self, rows: list[list[Any]]) -> None:
+        """Add rows, as one row group."""
+        arrays = [
+            self._arrow.array(column, field.type)
+            for column, field in zip(zip(*rows, strict=True), self._schema, strict=True)
+        ]
+        self._writer.write_table(self._arrow.Table.from_arrays(arrays, schema=self._schema))
+
+    def close(self) -> None:
+        """Finish the file."""
+        self._writer.close()
+
+
+def run_export(paths: Paths, out: Path, form: str) -> None:
+    """Write recordings as tables, and print which.
+
+    Args:
+        paths: Recordings of one robot, in any order.
+        out: Folder for the tables; existing ones are refused.
+        form: `csv` or `parquet`.
+
+    Raises:
+        RecordingError: The recordings cannot be read, or the tables cannot be written.
+    """
+    for path, rows in export(paths, out, form).items():
+        print(f"{rows} rows in {path}")
+
+
+def export(paths: Paths, out: Path, form: str) -> dict[Path, int]:
+    """Write recordings as tables; see `run_export`.
+
+    Returns:
+        Every table and how many rows it has.
+    """
+    files = about(paths)
+    one_robot(files)
+    make = _maker(form)
+    tables: dict[tuple[str, str], _Filling] = {}
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        for one in read([file.path for file in files]):
+            which = (one.key, json.dumps([one.form.schema["x-signals"], getattr(one.message, "signal", "")]))
+            if which not in tables:
+                number = 1 + sum(key == one.key for key, _ in tables)
+                tables[which] = _Filling(one, out / _name(one.key, number), make)
+            tables[which].add(one)
+        for table in tables.values():
+            table.close()
+    except FileExistsError:
+        raise RecordingError(f"There are tables in '{out}' already; none is replaced. Name another folder.") from None
+    except OSError as error:
+        raise RecordingError(f"The tables in '{out}' cannot be written: {error.strerror or error}.") from None
+    if not tables:
+        raise RecordingError("There are no messages in these recordings.")
+    return {table.path: table.rows for table in tables.values()}
+
+
+def _maker(form: str) -> Callable[[Path, list[str], list[Any]], Table]:
+    if form == "csv":
+        return CsvTable
+    if form != "parquet":
+        raise RecordingError(f"'{form}' is no format of tables. Known formats: csv, parquet.")
+    try:
+        import pyarrow
+    except ImportError:
+        raise RecordingError(
+            "Parquet needs pyarrow, which is not installed: pip install 'gemuco[parquet]'. Or export csv."
+        ) from None
+    return lambda path, columns, first: ParquetTable(pyarrow, path, columns, first)
+
+
+def _name(key: str, number: int) -> str:
+    """`hal.sample`; `hal.sample-2` after the robot described itself anew, `model.target-2` of another signal."""
+    _, service, rest = keys.parse(key)
+    return f"{service}.{rest.replace('/', '.')}" + (f"-{number}" if number > 1 else "")
+
+
+class _Filling:
+    """A table being filled."""
+
+    def __init__(self, first: Recorded, path: Path, make: Callable[[Path, list[str], list[Any]], Table]) -> None:
+        self.rows = 0
+        self._columns = [name for name, _ in _cells(first)]
+        self._waiting: list[list[Any]] = []
+        self._table = make(path, self._columns, [value for _, value in _cells(first, typed=True)])
+        self.path = self._table.path
+
+    def add(self, one: Recorded) -> None:
+        self._waiting.append([value for _, value in _cells(one)])
+        if len(self._waiting) >= ROWS:
+            self._write()
+
+    def close(self) -> None:
+        if self._waiting:
+            self._write()
+        self._table.close()
+
+    def _write(self) -> None:
+        self._table.write(self._waiting)
+        self.rows += len(self._waiting)
+        self._waiting = []
+
+
+def _cells(one: Recorded, typed: bool = False) -> Iterator[tuple[str, Any]]:
+    """Name and value of every column, in an order that depends on the form alone.
+
+    Args:
+        one: A recorded message.
+        typed: With a value of the column's type in place of one that is missing.
+    """
+    message, form = one.message, one.form
+    yield from zip(FIRST, (one.received_ns, message.stamp_ns, message.seq, message.boot), strict=True)
+    for name, hint in form.hints.items():
+        if name in ("stamp_ns", "seq", "boot", "TYPE"):
+            continue
+        yield from _columns(name, hint, message, form, typed)
+
+
+def _columns(name: str, hint: Any, message: Message, form: Form, typed: bool) -> Iterator[tuple[str, Any]]:
+    value = getattr(message, name)
+    signals = form.catalogue.signals
+    if hint is np.ndarray and not form.by_signal:
+        yield name, json.dumps(value.tolist())
+    elif hint is np.ndarray or hint == dict[str, np.ndarray]:
+        only = getattr(message, "signal", "")
+        found = {only: value} if hint is np.ndarray else value
+        for signal, listed in signals.items():
+            if only and signal != only:
+                continue
+            unit = UNITS.get(name, listed.unit)
+            prefix = "" if name == PLAIN else f"{name}."
+            suffix = f" [{unit}]" if unit and name not in TRUTHS else ""
+            numbers = found.get(signal)
+            for index, element in enumerate(listed.elements):
+                yield f"{prefix}{signal}.{element}{suffix}", _cell(name, numbers, index, typed)
+    elif hint in (dict[str, float], dict[str, str]):
+        empty: Any = "" if hint == dict[str, str] else math.nan
+        for signal in signals:
+            yield f"{name}.{signal}", _number(value.get(signal, empty))
+    elif hint is float:
+        yield f"{name} [{UNITS[name]}]" if name in UNITS else name, _number(value)
+    else:
+        yield name, value if isinstance(value, bool | int | str) else json.dumps(value)
+
+
+def _cell(name: str, numbers: np.ndarray | None, index: int, typed: bool) -> bool | float | None:
+    if name in TRUTHS:
+        return bool(numbers[index]) if numbers is not None else (False if typed else None)
+    return None if numbers is None else _number(float(numbers[index]))
+
+
+def _number(value: Any) -> Any:
+    """A number that is none is no value in a table."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,310 @@
+"""What somebody could try who must not, one function per subject; each tells what was refused and what was not."""
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from typing import Any, Literal
+
+import zenoh
+
+from services.security.authority import Authority, Identity, encoded
+from services.security.init import CA, CA_KEY
+from services.security.plan import Plan
+from services.security.stage import PAUSE, PAYLOAD, Ears, Stage, answer, answered, until
+from services.wire.roles import RATES, SIZES
+
+Verdict = Literal["refused", "NOT REFUSED", "works", "DOES NOT WORK", "not tried"]
+REPEATS = 5
+"""Attempts of each attack: one message may be lost by chance."""
+FLOOD = 0.5
+"""How long [s] to flood."""
+LISTENS = 0.3
+"""How long [s] to listen for what should not be heard, after those have heard it who should."""
+NEVER_HEARD = b"gemuco security check, forged"
+
+
+@dataclass(frozen=True, slots=True)
+class Attempt:
+    """What was tried, and what came of it."""
+
+    what: str
+    verdict: Verdict
+    text: str = ""
+
+
+def refused(what: str, is_refused: bool, text: str = "") -> Attempt:
+    """An attack."""
+    return Attempt(what, "refused" if is_refused else "NOT REFUSED", text)
+
+
+def allowed(what: str, works: bool, text: str = "") -> Attempt:
+    """Its counterpart: without it, a refusal would prove nothing."""
+    return Attempt(what, "works" if works else "DOES NOT WORK", text)
+
+
+def people(plan: Plan) -> tuple[str, str, str]:
+    """Names of an operator and a viewer of the attacked robot, and the robot's name."""
+    robot = next(iter(plan.robots))
+    named = {person.role: name for name, person in reversed(plan.people.items()) if {"*", robot} & set(person.robots)}
+    return named.get("operator", ""), named.get("viewer", ""), robot
+
+
+def entering(stage: Stage, name: str, where: str = "", at: str = "the router") -> Iterator[Attempt]:
+    """Getting in with less than all that it takes."""
+    stage.member(name, where)
+    yield allowed(f"{name} gets in at {at}", True)
+
+    def tried(what: str, change: Callable[[dict[str, Any], dict[str, Any], dict[str, Any]], None]) -> Attempt:
+        found = stage.outside(name, where)
+        change(found, found["transport"]["link"]["tls"], found["transport"]["auth"]["usrpwd"])
+        return refused(f"{what} at {at}", not stage.enters(found))
+
+    yield tried("clear text", _clear_text)
+    yield tried("no certificate", _no_certificate)
+    stranger = Authority.new()
+    yield tried("certificate of a foreign authority", lambda _, tls, __: _as(tls, _signed(stranger, name)))
+    key = stage.folder / CA_KEY
+    if key.exists():
+        ours = Authority(Identity((stage.folder / CA).read_bytes(), key.read_bytes()))
+        ended = _signed(ours, name, timedelta(hours=-1))
+        yield tried("expired certificate", lambda _, tls, __: _as(tls, ended))
+    else:
+        yield Attempt(f"expired certificate at {at}", "not tried", f"{CA_KEY} is not here to sign one")
+    yield tried("wrong password", lambda _, __, login: login.update(password="wrong"))
+    yield tried("unknown user", lambda _, __, login: login.update(user="stranger"))
+    yield tried("no password", lambda found, _, __: found["transport"].pop("auth"))
+
+
+def at_the_hal(stage: Stage, operator: str, viewer: str) -> Iterator[Attempt]:
+    """The robot's own links are for its own services only."""
+    yield from entering(stage, f"model.{stage.robot}", stage.hal, "the HAL")
+    for name in (operator, viewer):
+        yield refused(f"{name} past the router, at the HAL", not stage.enters(stage.outside(name, stage.hal)))
+    heard = Ears(stage.hal_session, stage.key("hal", "command"))
+    recorder = stage.member(f"recorder.{stage.robot}", stage.hal)
+    model = stage.member(f"model.{stage.robot}", stage.hal)
+    for _ in range(REPEATS):
+        recorder.put(stage.key("hal", "command"), NEVER_HEARD)
+        time.sleep(PAUSE)
+    works = until(lambda: model.put(stage.key("hal", "command"), PAYLOAD) is None and heard.count(PAYLOAD))
+    yield allowed("model commands at the HAL", works)
+    yield refused("recorder commands at the HAL", not heard.count(NEVER_HEARD))
+
+
+class Inside:
+    """Attacks of those who were let in."""
+
+    def __init__(self, stage: Stage, operator: str, viewer: str) -> None:
+        self.stage = stage
+        self.command, self.target = stage.key("hal", "command"), stage.key("model", "target")
+        self.operator, self.viewer = stage.member(operator), stage.member(viewer)
+        self.names = operator, viewer
+        self.recorder = stage.member(f"recorder.{stage.robot}")
+        self.hal = stage.member(f"hal.{stage.robot}")
+        self.heard, self.seen = Ears(self.recorder, stage.key("**")), Ears(self.viewer, stage.key("hal", "status"))
+        self._number = 0
+
+    def run(self) -> Iterator[Attempt]:
+        """All of them."""
+        yield from self.allowed()
+        yield from self.saying()
+        yield from self.anothers_password()
+        yield from self.spying()
+        yield from self.asking()
+        yield from self.serving()
+        yield from self.robots()
+        yield from self.limits()
+
+    def allowed(self) -> Iterator[Attempt]:
+        """What must work, or else the rest would prove nothing."""
+        stage = self.stage
+        yield allowed("operator commands", self.settled())
+        status = stage.key("hal", "status")
+        works = until(lambda: self.hal.put(status, PAYLOAD) is None and self.seen.count(PAYLOAD))
+        yield allowed("viewer looks on", works)
+        if stage.is_running:
+            return
+        describe = stage.key("hal", "do", "describe")
+        yield allowed("operator asks the HAL", until(lambda: answered(self.operator, describe)))
+        yield allowed("viewer asks who the HAL is", until(lambda: answered(self.viewer, describe)))
+        yield allowed("viewer sees who is alive", until(lambda: "model" in self._alive(self.viewer)))
+
+    def settled(self) -> bool:
+        """Whether what the operator says now is heard; whatever was said before has been then, if it ever is."""
+        self._number += 1
+        mark = PAYLOAD + str(self._number).encode()
+        return until(lambda: self.operator.put(self.command, mark) is None and self.heard.count(mark))
+
+    def saying(self) -> Iterator[Attempt]:
+        """A viewer says nothing, under no name."""
+        stage, forged = self.stage, (("hal", "sample"), ("model", "estimate"), ("vision", "sample"))
+        attacks = {
+            "viewer commands": self.command,
+            "viewer sets a target": self.target,
+            "viewer puts on wildcards": stage.key("hal", "*"),
+            "viewer puts on every key": "gemuco/**",
+            **{f"viewer forges {service}/{noun}": stage.key(service, noun) for service, noun in forged},
+        }
+        before = self.heard.count(b"")
+        yield from self._said(self.viewer, attacks, lambda: self.viewer.delete(self.command))
+        yield refused("viewer deletes", self.heard.count(b"") == before)
+
+    def _said(
+        self, session: zenoh.Session, attacks: Mapping[str, str], also: Callable[[], object] = lambda: None
+    ) -> Iterator[Attempt]:
+        """Put on keys; each attack has a payload of its own, by which it is known wherever it is heard."""
+        marks = {what: NEVER_HEARD + what.encode() for what in attacks}
+        for _ in range(REPEATS):
+            for what, key in attacks.items():
+                session.put(key, marks[what])
+            also()
+            time.sleep(PAUSE)
+        if not self.settled():
+            yield allowed("operator is heard meanwhile", False)
+        for what, mark in marks.items():
+            yield refused(what, not self.heard.count(mark))
+
+    def anothers_password(self) -> Iterator[Attempt]:
+        """Both belong together: who has one of them gets in, and can do nothing."""
+        operator, viewer = self.names
+        found = self.stage.outside(viewer)
+        found["transport"]["auth"] = self.stage.outside(operator)["transport"]["auth"]
+        what = "viewer's certificate with the operator's password"
+        try:
+            mixed = self.stage.open(found)
+        except zenoh.ZError:
+            yield refused(what, True, "not even let in")
+            return
+        ears = Ears(mixed, self.stage.key("hal", "status"))
+        yield from self._said(mixed, {f"{what}: commands": self.command})
+        yield refused(f"{what}: looks on", not self._shown(ears))
+
+    def _shown(self, *ears: Ears) -> bool:
+        """Whether anybody but the viewer hears a status that the viewer hears."""
+        self._number += 1
+        mark, key = PAYLOAD + str(self._number).encode(), self.stage.key("hal", "status")
+        until(lambda: self.hal.put(key, mark) is None and self.seen.count(mark))
+        return until(lambda: any(one.count(mark) for one in ears), LISTENS)
+
+    def spying(self) -> Iterator[Attempt]:
+        """What is commanded is for the robot."""
+        name, patterns = self.names[1], ("**", "gemuco/**", self.stage.key("**"), self.command)
+        spies = {pattern: Ears(self.stage.member(name), pattern) for pattern in patterns}
+        if not (self.settled() and self.settled()):
+            yield allowed("operator is heard meanwhile", False)
+        until(lambda: all(ears.anything for ears in spies.values()), LISTENS)
+        for pattern, ears in spies.items():
+            yield refused(f"viewer spies on {pattern}", not ears.anything)
+
+    def asking(self) -> Iterator[Attempt]:
+        """A viewer asks only what changes nothing; nobody asks the router about itself."""
+        stage, asked = self.stage, []
+        if not stage.is_running:
+            for service, verb in (("hal", "enable"), ("model", "engage")):
+                session = stage.hal_session if service == "hal" else stage.model_session
+                key = stage.key(service, "do", verb)
+                asked.append(answer(session, key, b"done"))
+                works = until(lambda key=key: answered(self.operator, key, b"done"))  # type: ignore[misc]
+                yield allowed(f"operator asks {service}/do/{verb}", works)
+                for selector in (key, "gemuco/**"):
+                    yield refused(f"viewer asks {selector}", not answered(self.viewer, selector, b"done"))
+        for name, session in zip(self.names, (self.operator, self.viewer), strict=True):
+            replies = [str(one.ok.key_expr) for one in session.get("@/**", timeout=1.0) if one.ok is not None]
+            told = [one for one in replies if str(session.zid()) not in one.split("/")[1]]  # its own is its own
+            yield refused(f"{name} reads the router's admin space", not told)
+
+    def serving(self) -> Iterator[Attempt]:
+        """Nobody answers or is alive in another's place."""
+        fake = self.stage.key("model", "do", "estimate")
+        queryable = answer(self.viewer, fake, NEVER_HEARD)
+        token = self.viewer.liveliness().declare_token(self.stage.key("vision", "alive"))
+        self.settled()
+        is_fooled = any(answered(self.operator, fake, NEVER_HEARD) for _ in range(REPEATS))
+        yield refused("viewer answers in the model's place", not is_fooled)
+        yield refused("viewer pretends that the camera is alive", "vision" not in self._alive(self.operator))
+        queryable.undeclare()
+        token.undeclare()
+
+    def robots(self) -> Iterator[Attempt]:
+        """A robot's services are for that robot."""
+        stage = self.stage
+        other = next((name for name in stage.plan.robots if name != stage.robot), "")
+        if not other:
+            yield Attempt("HAL of one robot forges another's", "not tried", "there is one robot only")
+            return
+        hearer, theirs = Ears(stage.member(f"recorder.{other}"), f"gemuco/{other}/**"), stage.member(f"hal.{other}")
+        nouns = ("hal/sample", "model/estimate", "hal/command")
+        for _ in range(REPEATS):
+            for noun in nouns:
+                self.hal.put(f"gemuco/{other}/{noun}", NEVER_HEARD + noun.encode())
+            time.sleep(PAUSE)
+        key = f"gemuco/{other}/hal/status"
+        yield allowed(
+            f"hal.{other} is heard", until(lambda: theirs.put(key, PAYLOAD) is None and hearer.count(PAYLOAD))
+        )
+        for noun in nouns:
+            is_heard = hearer.count(NEVER_HEARD + noun.encode())
+            yield refused(f"hal.{stage.robot} forges {noun} of '{other}'", not is_heard)
+        yield from self._said(self.hal, {f"hal.{stage.robot} forges model/estimate": stage.key("model", "estimate")})
+
+    def limits(self) -> Iterator[Attempt]:
+        """Even who may speak may not shout."""
+        most = SIZES["hal/command"]
+        yield allowed(f"operator sends {most} bytes", self._passes(b"s" * most))
+        for _ in range(REPEATS):
+            self.operator.put(self.command, b"l" * (most + 1))
+        if not self.settled():
+            yield allowed("operator is heard meanwhile", False)
+        yield refused(f"operator sends {most + 1} bytes", not self.heard.count(b"l" * (most + 1)))
+        sent, begun, flood = 0, time.monotonic(), PAYLOAD + b" flood"
+        while (lasted := time.monotonic() - begun) < FLOOD:
+            self.operator.put(self.target, flood)
+            sent += 1
+        self.settled()
+        heard, most_heard = self.heard.count(flood, self.target), 1.5 * RATES["model/target"] * lasted
+        text = f"{sent} sent in {lasted:.1f} s, {heard} passed"
+        if sent < 2 * most_heard:
+            yield Attempt("operator floods", "not tried", f"{text}: this machine is too slow")
+        else:
+            yield refused("operator floods", heard <= most_heard, text)
+
+    def _passes(self, payload: bytes) -> bool:
+        return until(lambda: self.operator.put(self.command, payload) is None and self.heard.count(payload))
+
+    def _alive(self, session: zenoh.Session) -> set[str]:
+        replies = session.liveliness().get(self.stage.key("*", "alive"), timeout=2.0)
+        return {str(one.ok.key_expr).split("/")[2] for one in replies if one.ok is not None}
+
+
+def impostor(stage: Stage, name: str) -> Attempt:
+    """A router that somebody else made: a client must not go in there with its password."""
+    stranger, fake = Authority.new(), stage.of("router")
+    fake["listen"]["endpoints"] = [where := stage.another_endpoint()]
+    tls = fake["transport"]["link"]["tls"]
+    _as(tls, _signed(stranger, "router", hosts=("127.0.0.1",)))
+    tls |= {"root_ca_certificate_base64": encoded(stranger.identity.certificate), "enable_mtls": False}
+    stage.open(fake)
+    return refused("a router of a foreign authority", not stage.enters(stage.outside(name, where)))
+
+
+def _clear_text(found: dict[str, Any], tls: dict[str, Any], login: dict[str, Any]) -> None:
+    found["connect"] = found["connect"] | {
+        "endpoints": [f"tcp/{one.partition('/')[2]}" for one in found["connect"]["endpoints"]]
+    }
+    found["transport"]["link"]["protocols"] = ["tcp"]
+
+
+def _no_certificate(found: dict[str, Any], tls: dict[str, Any], login: dict[str, Any]) -> None:
+    for part in ("connect_certificate_base64", "connect_private_key_base64", "enable_mtls"):
+        tls.pop(part)
+
+
+def _signed(by: Authority, name: str, for_: timedelta = timedelta(days=1), hosts: tuple[str, ...] = ()) -> Identity:
+    return by.sign(name, hosts, datetime.now(UTC) + for_)
+
+
+def _as(tls: dict[str, Any], identity: Identity) -> None:
+    certificate, key = encoded(identity.certificate), encoded(identity.key)
+    for kind in ("connect", "listen"):
+        tls |= {f"{kind}_certificate_base64": certificate, f"{kind}_private_key_base64": key}

@@ -1,0 +1,119 @@
+"""A certificate authority of one's own, and certificates that say which role somebody has."""
+
+import base64
+import ipaddress
+from collections.abc import Iterable
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from typing import Self
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from services.errors import ServiceError
+
+AUTHORITY = "gemuco authority"
+AUTHORITY_DAYS = 3650
+BACKDATED = timedelta(days=1)
+"""The clock of a robot that was just turned on may be behind."""
+_BOTH = x509.ExtendedKeyUsage([ExtendedKeyUsageOID.CLIENT_AUTH, ExtendedKeyUsageOID.SERVER_AUTH])
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """A certificate and its private key, both PEM."""
+
+    certificate: bytes
+    key: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Authority:
+    """Who signs certificates; whoever has its key can be anybody."""
+
+    identity: Identity
+
+    @classmethod
+    def new(cls, days: int = AUTHORITY_DAYS) -> Self:
+        """Make one."""
+        key = ec.generate_private_key(ec.SECP256R1())
+        name = _name(AUTHORITY)
+        usage = x509.KeyUsage(
+            digital_signature=True, key_cert_sign=True, crl_sign=True, content_commitment=False, key_encipherment=False,
+            data_encipherment=False, key_agreement=False, encipher_only=False, decipher_only=False,
+        )  # fmt: skip
+        certificate = (
+            _builder(name, name, key.public_key(), datetime.now(UTC) + timedelta(days=days))
+            .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+            .add_extension(usage, critical=True)
+            .sign(key, hashes.SHA256())
+        )
+        return cls(Identity(_pem(certificate), _key_pem(key)))
+
+    def sign(self, name: str, hosts: Iterable[str], until: datetime) -> Identity:
+        """A certificate for somebody.
+
+        Args:
+            name: The role, as in `hal.musashi_arm`: the common name, which access control goes by.
+            hosts: Names and addresses under which others reach it; none for who never listens.
+            until: When it ends.
+        """
+        signer = serialization.load_pem_private_key(self.identity.key, None)
+        issuer = x509.load_pem_x509_certificate(self.identity.certificate).subject
+        if not isinstance(signer, ec.EllipticCurvePrivateKey):
+            raise ServiceError("The authority's key is not one that `gemuco security init` made.")
+        key = ec.generate_private_key(ec.SECP256R1())
+        builder = _builder(_name(name), issuer, key.public_key(), until)
+        builder = builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        builder = builder.add_extension(_BOTH, critical=False)
+        if places := [_place(host) for host in hosts]:
+            builder = builder.add_extension(x509.SubjectAlternativeName(places), critical=False)
+        return Identity(_pem(builder.sign(signer, hashes.SHA256())), _key_pem(key))
+
+
+def encoded(pem: bytes) -> str:
+    """PEM as zenoh's configuration takes it inline."""
+    return base64.b64encode(pem).decode()
+
+
+def decoded(text: str) -> bytes:
+    """The opposite of `encoded`."""
+    return base64.b64decode(text)
+
+
+def _builder(
+    name: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePublicKey, until: datetime
+) -> x509.CertificateBuilder:
+    begins = min(datetime.now(UTC), until) - BACKDATED
+    return (
+        x509.CertificateBuilder()
+        .subject_name(name)
+        .issuer_name(issuer)
+        .public_key(key)
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(begins)
+        .not_valid_after(until)
+    )
+
+
+def _name(text: str) -> x509.Name:
+    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, text)])
+
+
+def _place(host: str) -> x509.GeneralName:
+    try:
+        return x509.IPAddress(ipaddress.ip_address(host.strip("[]")))
+    except ValueError:
+        return x509.DNSName(host)
+
+
+def _pem(certificate: x509.Certificate) -> bytes:
+    return certificate.public_bytes(serialization.Encoding.PEM)
+
+
+def _key_pem(key: ec.EllipticCurvePrivateKey) -> bytes:
+    return key.private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )

@@ -1,0 +1,173 @@
+"""Role files: one self-contained zenoh configuration per role, with its certificate, key and password inside."""
+
+import json
+import os
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from services.errors import ServiceError
+from services.security import access
+from services.security.authority import Identity, decoded, encoded
+from services.security.plan import LINKS, LISTENING, Plan, dialled, listened
+from services.wire.connect import merged, role_file
+from services.wire.member import Member
+from services.wire.roles import ROLES, ROUTER
+from services.wire.session import plain_settings, port
+
+ROUTER_SESSIONS = 256
+SERVICE_SESSIONS = 32
+PERSON_OPENS_MS = 2000
+"""Far away, certificates and passwords take some round trips; a robot's own links are repeated sooner."""
+ROUTER_ACCEPTS_MS = 3000
+
+
+@dataclass(frozen=True, slots=True)
+class Secrets:
+    """What is made once for a member and stays in its role file: identity and password."""
+
+    identity: Identity
+    password: str
+
+
+def secrets_of(path: Path) -> Secrets:
+    """The secrets of a role file.
+
+    Raises:
+        ServiceError: It is none that `gemuco security init` made.
+    """
+    transport = role_file(path).get("transport", {})
+    try:
+        tls = transport["link"]["tls"]
+        identity = Identity(decoded(tls["connect_certificate_base64"]), decoded(tls["connect_private_key_base64"]))
+        return Secrets(identity, transport["auth"]["usrpwd"]["password"])
+    except (KeyError, TypeError, ValueError):
+        raise ServiceError(f"'{path}' is no role file that `gemuco security init` made.") from None
+
+
+def configuration(plan: Plan, name: str, known: Mapping[str, Secrets], authority: bytes) -> dict[str, Any]:
+    """The role file of a member.
+
+    Args:
+        plan: Who is where.
+        name: As in `plan.members()`.
+        known: The secrets of all members.
+        authority: Certificate (PEM) of who signed.
+    """
+    member = plan.members()[name]
+    if name == ROUTER:
+        own = _router(plan, known)
+    elif ROLES[member.role].is_service:
+        own = _service(plan, name, known)
+    else:
+        own = _person(plan)
+    common = {
+        "metadata": {"gemuco": {"role": member.role, "robots": list(member.robots)}},
+        "transport": {
+            "link": {"protocols": [plan.protocol], "tls": _tls(known[name].identity, authority)},
+            "auth": {"usrpwd": {"user": name, "password": known[name].password}},
+        },
+    }
+    return merged(merged(plain_settings(), common), own)
+
+
+def write(path: Path, content: str, mode: int = 0o600) -> None:
+    """Write a file whole or not at all, readable only as `mode` says from the first byte on."""
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "w") as file:
+            os.fchmod(handle, mode)
+            file.write(content)
+        Path(name).replace(path)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise
+
+
+def text_of(content: Mapping[str, Any]) -> str:
+    """A configuration as it stands in a role file."""
+    return json.dumps(content, indent=1) + "\n"
+
+
+def _router(plan: Plan, known: Mapping[str, Secrets]) -> dict[str, Any]:
+    members = plan.members()
+    subjects = {
+        name: (access.known_by(name, dials=True), access.rules_of(ROLES[member.role], member.robots))
+        for name, member in members.items()
+        if name != ROUTER
+    }
+    place, host = plan.routers[0], plan.hosts(ROUTER)[0]
+    return {
+        "mode": "router",
+        "listen": {"endpoints": [f"{plan.protocol}/{listened(host, place.rpartition(':')[2])}"]},
+        "transport": {
+            "unicast": {"max_sessions": ROUTER_SESSIONS, "accept_timeout": ROUTER_ACCEPTS_MS},
+            "auth": {"usrpwd": {"dictionary": _dictionary(members, known)}},
+        },
+        "access_control": access.access_control(
+            subjects | {ROUTER: (access.known_by(ROUTER, dials=False), access.THROUGH)}
+        ),
+        **access.limits(plan.robots),
+    }
+
+
+def _service(plan: Plan, name: str, known: Mapping[str, Secrets]) -> dict[str, Any]:
+    service, _, robot = name.partition(".")
+    hosts = plan.robots[robot]
+    dials = LINKS.get(service, ())
+    callers = [other for other, places in LINKS.items() if service in places]
+    subjects = {
+        **{
+            other: (access.known_by(f"{other}.{robot}", dials=True), access.rules_of(ROLES[other], [robot]))
+            for other in callers
+        },
+        **{
+            other: (access.known_by(f"{other}.{robot}", dials=False), access.rules_of(ROLES[other], [robot]))
+            for other in dials
+        },
+        ROUTER: (
+            access.known_by(ROUTER, dials=False),
+            access.mirrored(access.rules_of(ROLES[service], [robot])),
+        ),
+    }
+    listens = [f"{plan.protocol}/{listened(hosts[service], port(robot, service))}"] if service in LISTENING else []
+    places = [*(dialled(hosts[other], port(robot, other)) for other in dials), plan.routers[0]]
+    own: dict[str, Any] = {
+        "mode": "peer",
+        "listen": {"endpoints": listens},
+        "connect": {"endpoints": [f"{plan.protocol}/{place}" for place in places]},
+        "transport": {"unicast": {"max_sessions": SERVICE_SESSIONS}},
+        "access_control": access.access_control(subjects),
+    }
+    if callers:
+        names = {f"{other}.{robot}": Member(other, (robot,)) for other in callers}
+        own["transport"]["auth"] = {"usrpwd": {"dictionary": _dictionary(names, known)}}
+    return own
+
+
+def _person(plan: Plan) -> dict[str, Any]:
+    return {
+        "mode": "client",
+        "connect": {"endpoints": [f"{plan.protocol}/{place}" for place in plan.routers]},
+        "transport": {"unicast": {"open_timeout": PERSON_OPENS_MS}},
+    }
+
+
+def _dictionary(members: Mapping[str, Member], known: Mapping[str, Secrets]) -> dict[str, str]:
+    return {name: known[name].password for name in members}
+
+
+def _tls(identity: Identity, authority: bytes) -> dict[str, Any]:
+    certificate, key = encoded(identity.certificate), encoded(identity.key)
+    return {
+        "root_ca_certificate_base64": encoded(authority),
+        "listen_certificate_base64": certificate,
+        "listen_private_key_base64": key,
+        "connect_certificate_base64": certificate,
+        "connect_private_key_base64": key,
+        "enable_mtls": True,
+        "verify_name_on_connect": True,
+        "close_link_on_expiration": True,
+    }

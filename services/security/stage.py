@@ -1,0 +1,206 @@
+"""Where the security check plays: a router, a HAL and a model of the role files, and whoever wants to get at them."""
+
+import copy
+import json
+import socket
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import zenoh
+
+from services.errors import ServiceError
+from services.security.plan import Plan
+from services.wire import keys
+from services.wire.connect import merged, role_file
+from services.wire.entering import usable
+from services.wire.roles import ROUTER
+
+Weaken = Callable[[str, dict[str, Any]], None]
+"""Takes a member's name and its configuration, and spoils it."""
+PAYLOAD = b"gemuco security check"
+"""No receiver takes this for a message."""
+WITHIN = 15.0
+"""How long [s] what is allowed may take to happen, on a machine that has much else to do."""
+PATIENT = {"unicast": {"open_timeout": 5000, "accept_timeout": 5000}, "link": {"tx": {"lease": 10000}}}
+"""What is proved is not how soon a frozen process is noticed."""
+PAUSE = 0.02
+ONCE = {"endpoints": [], "timeout_ms": 0, "exit_on_failure": True}
+"""One attempt to get in."""
+
+
+class Ears:
+    """What arrives at a session on some keys."""
+
+    def __init__(self, session: zenoh.Session, *patterns: str) -> None:
+        self._lock = threading.Lock()
+        self._heard: list[tuple[str, bytes]] = []
+        self._subscribers = [session.declare_subscriber(pattern, self._hear) for pattern in patterns]
+
+    def _hear(self, sample: zenoh.Sample) -> None:
+        with self._lock:
+            self._heard.append((str(sample.key_expr), sample.payload.to_bytes()))
+
+    @property
+    def anything(self) -> bool:
+        """Whether anything was heard."""
+        with self._lock:
+            return bool(self._heard)
+
+    def count(self, payload: bytes, key: str = "") -> int:
+        """How often a payload was heard, on one key or on all."""
+        with self._lock:
+            return sum(said == payload and (not key or on == key) for on, said in self._heard)
+
+
+class Stage:
+    """The sessions of one check, as a context manager.
+
+    Args:
+        folder: Of `gemuco security init`.
+        running: The endpoint of a router that runs already; one of its own otherwise.
+        weaken: For the tests of the check.
+
+    Attributes:
+        robot: The one that is attacked.
+        router: The router's endpoint.
+        hal: The HAL's; empty if the check starts none.
+    """
+
+    def __init__(self, folder: Path, running: str | None = None, weaken: Weaken | None = None) -> None:
+        plan = Plan.read(folder)
+        if plan is None or not plan.robots:
+            raise ServiceError(f"'{folder}' is no folder of `gemuco security init`: it has no plan.json with a robot.")
+        self.plan, self.folder, self.robot = plan, folder, next(iter(plan.robots))
+        self._weaken = weaken or (lambda name, found: None)
+        self._sessions: list[zenoh.Session] = []
+        self._kept: list[Any] = []
+        self.is_running = running is not None
+        self.router = running or self.another_endpoint()
+        self.hal = "" if running else self.another_endpoint()
+
+    def __enter__(self) -> Self:
+        try:
+            if not self.is_running:
+                self._start()
+        except BaseException:
+            self.__exit__(None, None, None)
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        closing = [threading.Thread(target=one.close, daemon=True) for one in self._sessions]
+        for thread in closing:
+            thread.start()
+        for thread in closing:
+            thread.join(2.0)
+
+    def _start(self) -> None:
+        router = self.of(ROUTER)
+        router["listen"]["endpoints"] = [self.router]
+        self._weaken(ROUTER, router)
+        self.open(router)
+        hal, model = (self.of(f"{service}.{self.robot}") for service in ("hal", "model"))
+        hal["listen"]["endpoints"], model["listen"]["endpoints"] = [self.hal], []
+        hal["connect"]["endpoints"], model["connect"]["endpoints"] = [self.router], [self.hal, self.router]
+        self._weaken("hal", hal)
+        self.hal_session, self.model_session = self.open(hal), self.open(model)
+        for session, service in ((self.hal_session, "hal"), (self.model_session, "model")):
+            self._kept += [
+                answer(session, self.key(service, "do", "describe"), b"true"),
+                session.liveliness().declare_token(self.key(service, "alive")),
+            ]
+
+    def another_endpoint(self) -> str:
+        """One of this machine where nobody is."""
+        return f"{self.plan.protocol}/127.0.0.1:{_free_port(self.plan.protocol)}"
+
+    def of(self, name: str) -> dict[str, Any]:
+        """A fresh copy of a member's role file."""
+        path = self.folder / f"{name}.json"
+        return copy.deepcopy(role_file(path))
+
+    def outside(self, name: str, where: str = "") -> dict[str, Any]:
+        """A member's role file as whoever stole it would use it: going in at the router or elsewhere, without rules."""
+        found = self.of(name)
+        for part in ("access_control", "downsampling", "low_pass_filter", "listen"):
+            found.pop(part, None)
+        found["transport"]["auth"]["usrpwd"].pop("dictionary", None)
+        found |= {"mode": "client", "connect": ONCE | {"endpoints": [where or self.router]}}
+        return found
+
+    def open(self, configuration: dict[str, Any]) -> zenoh.Session:
+        """Open a session that is closed with the stage.
+
+        Raises:
+            zenoh.ZError: It is refused.
+        """
+        with usable(merged(configuration, {"transport": PATIENT})) as taken:
+            session = zenoh.open(zenoh.Config.from_json5(json.dumps(taken)))
+        self._sessions.append(session)
+        return session
+
+    def enters(self, configuration: dict[str, Any]) -> bool:
+        """Whether a session opens."""
+        try:
+            self.open(configuration)
+        except zenoh.ZError:
+            return False
+        return True
+
+    def member(self, name: str, where: str = "") -> zenoh.Session:
+        """A session of a member at the router.
+
+        Raises:
+            ServiceError: It does not get in, and should.
+        """
+        found = self.outside(name, where)
+        found["connect"] |= {"timeout_ms": round(1e3 * WITHIN)}
+        try:
+            return self.open(found)
+        except zenoh.ZError:
+            raise ServiceError(
+                f"'{name}' does not get in at {where or self.router} with its own role file: nothing can be proved."
+            ) from None
+
+    def key(self, *parts: str) -> str:
+        """A key of the attacked robot."""
+        return keys.robot_key(self.robot, *parts)
+
+
+def until(happened: Callable[[], object], within: float = WITHIN) -> bool:
+    """Wait for something that should happen."""
+    deadline = time.monotonic() + within
+    while time.monotonic() < deadline:
+        if happened():
+            return True
+        time.sleep(PAUSE)
+    return False
+
+
+def answer(session: zenoh.Session, key: str, payload: bytes) -> zenoh.Queryable:
+    """Answer a question with the same payload always."""
+
+    def reply(query: zenoh.Query) -> None:
+        with query:
+            query.reply(key, payload)
+
+    return session.declare_queryable(key, reply)
+
+
+def answered(session: zenoh.Session, selector: str, payload: bytes = b"true", timeout: float = 2.0) -> bool:
+    """Whether a question is answered with this payload by anybody."""
+    replies = session.get(selector, target=zenoh.QueryTarget.ALL, timeout=timeout)
+    return any(reply.ok is not None and reply.ok.payload.to_bytes() == payload for reply in replies)
+
+
+def _free_port(protocol: str) -> int:
+    kind = socket.SOCK_DGRAM if protocol == "quic" else socket.SOCK_STREAM
+    with socket.socket(type=kind) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])

@@ -1,0 +1,46 @@
+"""The verbs of what a person looks at: the live page."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from services.verbs.verb import Connect, RobotFile, robot_name, robot_path, speaks_plainly
+
+
+def register(app: typer.Typer) -> None:
+    """Add the verbs to the command line."""
+    app.command()(view)
+
+
+@speaks_plainly
+def view(
+    robot: RobotFile,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page; 0 for any.")] = 8090,
+    host: Annotated[
+        str, typer.Option(help="Address to serve on. Elsewhere than 127.0.0.1 anybody may look, and has no buttons.")
+    ] = "127.0.0.1",
+    urdf: Annotated[
+        Path | None, typer.Option(help="What the robot looks like; as the robot file says if not given.")
+    ] = None,
+    connect: Connect = None,
+) -> None:
+    """Show a running robot in the browser: signals, the robot in 3D, plots, anomaly, loops, buttons, teaching.
+
+    Needs the extra packages: pip install 'gemuco[view]'.
+    """
+    from services.view.run import view as show
+
+    show(robot_name(robot), host, port, connect or (), urdf or _urdf_of(robot))
+
+
+def _urdf_of(robot: str) -> Path | None:
+    """As the robot file says, where there is one: a client needs none."""
+    from hal.config import load_robot
+    from hal.errors import ConfigError
+
+    try:
+        config = load_robot(robot_path(robot))
+    except ConfigError:
+        return None
+    return None if config.urdf is None else config.folder / config.urdf

@@ -1,0 +1,85 @@
+"""`gemuco train`: from recorded data to a saved model, with what a person should know on the screen."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import typer
+
+from gemuco.dataset import Dataset
+from gemuco.errors import DatasetError
+from gemuco.schema import BodySchema
+from hal.config import RobotConfig, load_robot
+from services import show
+from services.learning import measured, trainer
+from services.learning.trainer import Progress, Trained
+from services.model import artifacts
+from services.recording.dataset import is_recording, pick
+
+
+def run_training(
+    file: Path, data: Sequence[Path], out: Path | None, base: Path | None, seed: int, condition: str | None = None
+) -> None:
+    """Train a model and save it.
+
+    Args:
+        file: A robot file, or a description of measured data.
+        data: Collected samples, recordings, or the folder of the measured files; where they usually lie if not given.
+        out: Where to save; runs/<robot>/model if not given.
+        base: A model to fine-tune; learned from nothing if not given.
+        seed: Of all that is random.
+        condition: How the body was in recordings; as they tell if not given.
+
+    Raises:
+        SchemaError: Data, model or settings are not what is needed.
+        RecordingError: A recording cannot be read.
+    """
+    known = None if base is None else BodySchema.load(base)
+    if measured.is_description(file):
+        described = measured.load_measured(file)
+        folder_of_files = _only(data) or file.parent
+        name, dataset = described.recording, measured.read(described, folder_of_files)
+    else:
+        robot = load_robot(file)
+        name, dataset = robot.robot, _data(robot, data, condition)
+    folder = out or artifacts.model_folder(name)
+    drafts = trainer.drafts_of(folder)
+
+    def train(tell: Progress) -> Trained:
+        if not measured.is_description(file):
+            return trainer.train(robot, dataset, seed, tell, drafts, known)
+        if known is not None:
+            return trainer.tune(known, described.model, dataset, seed, tell, drafts, recording=name)
+        return trainer.learn(described.model, dataset, seed, tell, drafts, recording=name)
+
+    if drafts.exists():
+        typer.echo(f"A training of {folder} was interrupted; it goes on if data and settings are the same.")
+    try:
+        with show.progress("training") as tell:
+            trained = train(tell)
+    except KeyboardInterrupt:
+        typer.echo("Interrupted. The same command goes on from here.", err=True)
+        raise
+    trainer.show(trained, show.console())
+    trainer.save(trained, folder)
+    typer.echo(f"Saved in {folder}, with pictures of how it came about.")
+
+
+def _data(robot: RobotConfig, data: Sequence[Path], condition: str | None) -> Dataset:
+    """What was collected, or what recordings hold."""
+    if not any(is_recording(path) for path in data):
+        if condition is not None:
+            raise DatasetError(
+                "Only recordings (.mcap) need to be told their condition; collected samples have theirs."
+            )
+        return Dataset.load(_only(data) or artifacts.data_path(robot.robot))
+    if not all(is_recording(path) for path in data):
+        raise DatasetError("Train from recordings (.mcap) or from collected samples (.npz), not from both at once.")
+    found = pick(robot, data, condition)
+    typer.echo(found.sentence())
+    return found.dataset
+
+
+def _only(data: Sequence[Path]) -> Path | None:
+    if len(data) > 1:
+        raise DatasetError(f"Only recordings (.mcap) can be several; {data[0]} and {data[1]} are not.")
+    return data[0] if data else None

@@ -1,0 +1,130 @@
+"""Curves over the last seconds as SVG: gaps stay gaps, and the axes move only when they must.
+
+viser's uPlot draws a line across values that are not there.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+
+import numpy as np
+
+from services.view.trail import WINDOW
+
+COLORS = (
+    "#7cc0ff", "#63d297", "#ff8f8f", "#c792ea", "#5fd7d7", "#f5e07a", "#b8a1ff", "#8fd46a", "#ff9ecb", "#a9b4c2",
+)  # fmt: skip
+WIDTH = 376
+LEFT, RIGHT, TOP, BOTTOM = 46, 8, 6, 18
+"""Room [px] around the curves."""
+SECONDS = (-30, -20, -10, 0)
+ROOMY = 3.0
+"""The axis is made smaller only when it is so many times larger than what is to be seen."""
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """One curve: a name for the legend, its values, shape (k,), NaN where there is a gap, and how it is drawn."""
+
+    name: str
+    values: np.ndarray
+    color: str
+    dashed: bool = False
+
+
+class Chart:
+    """Draws curves against time; remembers its axis.
+
+    Args:
+        height: Of the picture [px].
+    """
+
+    def __init__(self, height: int) -> None:
+        self._height = height
+        self._range: tuple[float, float] | None = None
+        self._key = ""
+
+    def svg(self, time: np.ndarray, lines: Sequence[Line], unit: str, key: str) -> str:
+        """The picture.
+
+        Args:
+            time: Relative to now [s], shape (k,).
+            lines: The curves.
+            unit: Of all of them.
+            key: What is drawn; another one gets another axis.
+        """
+        low, high = self._axis(lines, key)
+        parts = [f'<svg viewBox="0 0 {WIDTH} {self._height}" class="gm-map" role="img">']
+        parts.append(f'<rect x="0.5" y="0.5" width="{WIDTH - 1}" height="{self._height - 1}" rx="4" class="frame"/>')
+        bottom = self._height - BOTTOM
+        for tick in ticks(low, high):
+            y = self._y(tick, low, high)
+            parts.append(f'<path d="M{LEFT} {y:.1f}H{WIDTH - RIGHT}" class="grid"/>')
+            parts.append(f'<text x="{LEFT - 4}" y="{y + 3.5:.1f}" text-anchor="end" class="axis">{tick:.6g}</text>')
+        for second in SECONDS:
+            x = self._x(np.array([float(second)]))[0]
+            parts.append(f'<path d="M{x:.1f} {TOP}V{bottom}" class="grid"/>')
+            told = f"{second} s" if second == 0 else f"{second}"
+            anchor = "end" if second == 0 else "middle"
+            parts.append(f'<text x="{x:.1f}" y="{self._height - 5}" text-anchor="{anchor}" class="axis">{told}</text>')
+        parts.append(f'<text x="{LEFT + 4}" y="{TOP + 10}" class="axis">{escape(unit)}</text>')
+        xs = self._x(time)
+        parts += [self._curve(xs, line, low, high) for line in lines]
+        return "".join(parts) + "</svg>"
+
+    def _x(self, time: np.ndarray) -> np.ndarray:
+        return LEFT + (time + WINDOW) / WINDOW * (WIDTH - LEFT - RIGHT)
+
+    def _y(self, value: float, low: float, high: float) -> float:
+        return TOP + (high - value) / (high - low) * (self._height - TOP - BOTTOM)
+
+    def _curve(self, xs: np.ndarray, line: Line, low: float, high: float) -> str:
+        path, pen_down = [], False
+        for x, value in zip(xs, line.values, strict=True):
+            if not math.isfinite(value) or x < LEFT:
+                pen_down = False
+                continue
+            path.append(f"{'L' if pen_down else 'M'}{x:.0f} {self._y(value, low, high):.1f}")
+            pen_down = True
+        look = ' stroke-width="2.2" stroke-dasharray="5 3"' if line.dashed else ' stroke-width="1.4"'
+        return f'<path d="{"".join(path)}" fill="none" stroke="{line.color}"{look}/>'
+
+    def _axis(self, lines: Sequence[Line], key: str) -> tuple[float, float]:
+        """Lowest and highest value of the axis."""
+        known = np.concatenate([line.values[np.isfinite(line.values)] for line in lines] or [np.zeros(0)])
+        if key != self._key:
+            self._range, self._key = None, key
+        if not known.size:
+            return self._range or (0.0, 1.0)
+        low, high = float(known.min()), float(known.max())
+        shown = self._range
+        if shown is None or low < shown[0] or high > shown[1] or shown[1] - shown[0] > ROOMY * max(high - low, 1e-6):
+            room = max(0.15 * (high - low), 1e-3 * max(abs(low), abs(high)), 1e-6)
+            self._range = shown = (low - room, high + room)
+        return shown
+
+
+def ticks(low: float, high: float) -> list[float]:
+    """Three to six round numbers between two values."""
+    rough = (high - low) / 4.0
+    size = 10.0 ** math.floor(math.log10(rough))
+    step = next(size * factor for factor in (1, 2, 5, 10) if size * factor >= rough)
+    first = math.ceil(low / step)
+    return [round(index * step, 12) for index in range(first, math.floor(high / step) + 1)]
+
+
+def legend(lines: Sequence[Line]) -> str:
+    """Names of the curves that are not dashed, in their colors."""
+    names = (f'<span style="color:{line.color}">━ {escape(line.name)}</span>' for line in lines if not line.dashed)
+    return f'<div class="legend">{" ".join(names)} <span class="dim">╍ estimated</span></div>'
+
+
+def signal_lines(elements: Sequence[str], measured: np.ndarray, estimated: np.ndarray) -> list[Line]:
+    """Measured and estimated curves of elements, each of shape (elements, k)."""
+    found: list[Line] = []
+    for index, element in enumerate(elements):
+        color = COLORS[index % len(COLORS)]
+        found.append(Line(element, measured[index], color))
+        found.append(Line(element, estimated[index], "#ffb454" if len(elements) == 1 else color, dashed=True))
+    return found

@@ -1,0 +1,59 @@
+"""`gemuco view`: everything put together, until Ctrl-C."""
+
+import threading
+from collections.abc import Iterable
+from pathlib import Path
+
+import typer
+
+from services.model import artifacts
+from services.process.service import until_told
+from services.view.controls import Controls
+from services.view.page import Page, serve_page
+from services.view.role import is_loopback, why_read_only
+from services.view.site import open_site
+from services.view.watch import Watch
+from services.wire.member import member_of
+
+
+def view(
+    robot: str, host: str, port: int, connect: Iterable[str], urdf: Path | None, stop: threading.Event | None = None
+) -> None:
+    """Serve the page of a robot until SIGTERM, SIGINT or `stop`.
+
+    Args:
+        robot: The robot's name.
+        host: Address to bind.
+        port: Port to bind; 0 for any.
+        connect: Endpoints, such as a router's, and role files.
+        urdf: What the robot looks like; None for a page without 3D.
+        stop: Ends it in place of the signals.
+
+    Raises:
+        ServiceError: The port is taken, a package is missing, or a role file or the URDF cannot be read.
+    """
+    connect = tuple(connect)
+    read_only = why_read_only(member_of(connect), robot, host)
+    watch = Watch(robot, connect)
+    with until_told(stop) as end:
+        site = open_site(host, port, f"gemuco view {robot}")
+        try:
+            page = Page(site, robot, watch.look, Controls(lambda: watch.client, read_only), urdf, taught_path(robot))
+            watch.start()
+            if not is_loopback(host):
+                text = f"*** THE PAGE OF '{robot}' ASKS NOBODY WHO HE IS: WHOEVER REACHES {host} MAY LOOK ***"
+                typer.echo(text, err=True)
+            told = f"http://{host}:{site.get_port()}  {read_only or 'With buttons.'}  Ctrl-C ends it."
+            typer.echo(told)
+            try:
+                serve_page(page.turn, end)
+            finally:
+                page.close()
+                watch.stop()
+        finally:
+            site.stop()
+
+
+def taught_path(robot: str) -> Path:
+    """Where taught samples are recorded; `gemuco train --data` takes it."""
+    return artifacts.RUNS / robot / "taught.npz"

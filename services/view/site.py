@@ -1,0 +1,87 @@
+"""The web server of the page: viser, with what it leaves open closed."""
+
+import functools
+import logging
+import re
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from services.errors import ServiceError
+from services.view.role import is_loopback
+
+if TYPE_CHECKING:
+    import viser
+
+LOOPBACK_PAGES = re.compile(r"http://(127\.\d+\.\d+\.\d+|localhost|\[::1\])(:\d+)?")
+"""Pages that may open a connection to a server on loopback: a page of somebody else's in the same browser may not."""
+MISSING = "The live page needs two more packages: pip install 'gemuco[view]' (viser and yourdfpy)."
+
+
+def open_site(host: str, port: int, title: str) -> "viser.ViserServer":
+    """Serve an empty page.
+
+    Args:
+        host: Address to bind.
+        port: Port to bind; 0 for any.
+        title: Of the page.
+
+    Raises:
+        ServiceError: The packages are not installed, the port is taken, or the address is not of this machine.
+    """
+    try:
+        import rich
+        import viser
+        from viser import _messages
+    except ImportError:
+        raise ServiceError(MISSING) from None
+    _check_free(host, port)
+    rich.get_console().quiet = True  # viser prints a table to stdout
+    for name in ("websockets", "websockets.server"):  # a traceback per browser that vanished
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    with _only_pages(LOOPBACK_PAGES if is_loopback(host) else None):
+        site = viser.ViserServer(host=host, port=port, label=title, verbose=False)
+    if port and site.get_port() != port:  # viser takes the next free one
+        site.stop()
+        raise ServiceError(_taken(host, port))
+    # Anybody with the page open could have it published on the internet.
+    site._websock_server.unregister_handler(_messages.ShareUrlRequest)
+    return site
+
+
+@contextmanager
+def _only_pages(allowed: "re.Pattern[str] | None") -> Iterator[None]:
+    """Have viser's server refuse other pages' connections; viser does not pass this on to websockets."""
+    from websockets.asyncio import server
+
+    whole = server.serve
+    origins = None if allowed is None else [None, allowed]
+    server.serve = functools.partial(whole, origins=origins)  # type: ignore[misc, assignment]
+    try:
+        yield
+    finally:
+        server.serve = whole  # type: ignore[misc]
+
+
+def _check_free(host: str, port: int) -> None:
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.socket(family, socket.SOCK_STREAM) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, port))
+        except socket.gaierror:
+            raise ServiceError(f"'{host}' is no address that is known here.") from None
+        except PermissionError:
+            raise ServiceError(f"Port {port} needs root; take one above 1023 with --port.") from None
+        except OSError as error:
+            if error.errno == 98:  # EADDRINUSE
+                raise ServiceError(_taken(host, port)) from None
+            raise ServiceError(f"The page cannot be served on {host}:{port}: {error.strerror}.") from None
+
+
+def _taken(host: str, port: int) -> str:
+    return (
+        f"Port {port} on {host} is taken by another process. Choose another one with --port, or see which it is with "
+        f"`ss -ltnp 'sport = :{port}'`."
+    )

@@ -1,0 +1,61 @@
+"""The page's style sheet, and tables whose numbers stand below each other."""
+
+from collections.abc import Iterable, Sequence
+
+STYLE = """<style>
+.gm{padding:0 8px;font:12px/15px ui-sans-serif,system-ui,'Segoe UI',sans-serif;color:#d6dbe3}
+.gm table{border-collapse:collapse;width:100%;table-layout:fixed;font-variant-numeric:tabular-nums}
+.gm td,.gm th{padding:0 4px;white-space:nowrap;overflow:hidden;text-overflow:ellipsis;text-align:left;font-weight:400}
+.gm td.n,.gm th.n{text-align:right;font-family:ui-monospace,'DejaVu Sans Mono',monospace;font-size:11.5px}
+.gm tr.h th{color:#8b95a5;font-size:11px;border-bottom:1px solid #39404c;padding-top:1px}
+.gm tr.s th{color:#f0f3f8;font-weight:600;padding-top:4px;border-bottom:1px solid #2c323c}
+.gm tr.s th small{color:#8b95a5;font-weight:400;font-size:11px}
+.gm span.k-measured{color:#7cc0ff}.gm .k-estimated span,.gm tr.s th small.k-estimated{color:#ffb454}
+.gm span.k-masked{color:#c792ea}.gm span.k-old{color:#8b95a5}
+.gm tr.k-estimated td{background:#ffb45414}.gm tr.k-masked td{background:#c792ea18}
+.gm tr.k-old td{color:#7d8694;font-style:italic}
+.gm tr td.v{color:#f0f3f8}.gm tr.k-old td.v{color:#7d8694}
+.gm .u,.gm .dim{color:#8b95a5}
+.gm .b{border-radius:6px;padding:7px 10px 8px;border-left:6px solid;min-height:66px}
+.gm .b b{font-size:15px;line-height:19px;display:block}.gm .b b i{font-style:normal;margin-right:7px}
+.gm .b .also{color:#aab3c0;margin-top:3px;border-top:1px solid #ffffff1a;padding-top:3px}
+.gm .ok{background:#12301f;border-color:#3fb96f}.gm .note{background:#14304a;border-color:#5aa9ee}
+.gm .warn{background:#3a2c10;border-color:#ffb454}.gm .bad{background:#451a1c;border-color:#ff6b6b}
+.gm .gone{background:#2b2e35;border-color:#9aa3b2}
+.gm .facts{display:grid;grid-template-columns:62px 1fr;gap:0 8px;margin:6px 2px}
+.gm .facts span:nth-child(odd){color:#8b95a5}
+.gm .facts>span{white-space:nowrap;overflow:hidden;text-overflow:ellipsis}
+.gm .legend{display:flex;flex-wrap:wrap;gap:0 12px;font-size:11px;margin:2px 0 6px}
+.gm .good{color:#63d297}.gm .poor{color:#ffb454}.gm .lost{color:#ff7b7b}
+.gm-old{opacity:.45}
+.gm-map{width:100%;display:block}.gm-map .frame{fill:#171a20;stroke:#39404c}
+.gm-map .grid{stroke:#2a303a;fill:none}.gm-map .axis{fill:#8b95a5;font:10px sans-serif}
+.gm-map .condition{fill:none;stroke:#7cc0ff;stroke-width:1.5}.gm-map .condition.near{fill:#7cc0ff}
+.gm-map .label{fill:#b7c0cd;font:10.5px sans-serif}.gm-map .label.near{fill:#fff;font-weight:600}
+.gm-map .way{fill:none;stroke:#ffb454;stroke-width:1.5;opacity:.7}
+.gm-map .now{fill:none;stroke:#ffb454;stroke-width:2}
+</style>"""
+
+
+def page(content: str) -> str:
+    """A piece of the page in its own style."""
+    return f'<div class="gm">{content}</div>'
+
+
+def table(widths: Sequence[int], heads: Sequence[str], lines: Iterable[str]) -> str:
+    """A table of fixed columns.
+
+    Args:
+        widths: Of the columns [%].
+        heads: Their titles; one that begins with `>` is of numbers.
+        lines: Rows in HTML.
+    """
+    columns = "".join(f'<col style="width:{width}%">' for width in widths)
+    titles = "".join(f'<th class="n">{one[1:]}</th>' if one.startswith(">") else f"<th>{one}</th>" for one in heads)
+    return f'<table><colgroup>{columns}</colgroup><tr class="h">{titles}</tr>{"".join(lines)}</table>'
+
+
+def numbers(*cells: str) -> str:
+    """Cells of numbers; one that begins with `~` is of less interest, one with `!` wants attention."""
+    marks = {"~": "u", "!": "poor"}
+    return "".join(f'<td class="n {marks.get(c[:1], "")}">{c[1:] if c[:1] in marks else c}</td>' for c in cells)

@@ -1,0 +1,90 @@
+"""The last seconds of everything that is plotted, in bounded memory."""
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from services.view.rows import Kind, Row
+from services.view.seen import Seen
+
+WINDOW = 30.0
+"""How far back [s] the plots go."""
+RATE = 5.0
+"""Points per second [Hz]."""
+POINTS = round(WINDOW * RATE)
+WAY = 60
+"""Points of the parametric bias's trail."""
+MOVED = 1e-3
+"""The trail's next point is at least so far from the last."""
+
+
+@dataclass(frozen=True, slots=True)
+class Curves:
+    """What is plotted of some elements.
+
+    Attributes:
+        time: Relative to now [s], shape (k,).
+        measured: Per element, NaN where it was not measured, shape (elements, k).
+        estimated: Per element, NaN where it was measured, shape (elements, k).
+    """
+
+    time: np.ndarray
+    measured: np.ndarray
+    estimated: np.ndarray
+
+
+class Trail:
+    """Remembers; one thread adds and reads."""
+
+    def __init__(self) -> None:
+        self._times: deque[float] = deque(maxlen=POINTS)
+        self._values: dict[str, deque[tuple[float, float]]] = {}
+        self._judged: deque[tuple[float, float]] = deque(maxlen=POINTS)
+        self._bias: deque[np.ndarray] = deque(maxlen=WAY)
+
+    def add(self, now: float, seen: Seen, rows: Sequence[Row]) -> None:
+        """Note this moment [monotonic s]; calls that come sooner than the rate are ignored."""
+        if self._times and now - self._times[-1] < 0.9 / RATE:
+            return
+        told = {row.name: row for row in rows}
+        for name in told.keys() - self._values.keys():
+            self._values[name] = deque([(np.nan, np.nan)] * len(self._times), maxlen=POINTS)
+        self._times.append(now)
+        for name, values in self._values.items():
+            row = told.get(name)
+            measured = row.value if row is not None and row.kind is Kind.MEASURED else np.nan
+            values.append((measured, row.value if row is not None and row.kind is Kind.ESTIMATED else np.nan))
+        anomaly = seen.fresh(seen.anomaly)
+        self._judged.append((np.nan, np.nan) if anomaly is None else (anomaly.score, anomaly.threshold))
+        update = seen.fresh(seen.update)
+        if update is not None and len(update.bias) and np.isfinite(update.bias).all():
+            self._add_bias(np.array(update.bias, float))
+
+    def curves(self, names: Sequence[str], now: float) -> Curves:
+        """Of elements (`signal.element`), as far as they are known."""
+        time = self._since(now)
+        both = np.full((2, len(names), len(time)), np.nan)
+        for index, name in enumerate(names):
+            if values := self._values.get(name):
+                both[:, index] = np.array(values).T
+        return Curves(time, both[0], both[1])
+
+    def judged(self, now: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Time relative to now [s], score and threshold, each of shape (k,)."""
+        scores = np.array(self._judged, float).reshape(-1, 2)
+        return self._since(now), scores[:, 0], scores[:, 1]
+
+    def bias(self) -> np.ndarray:
+        """Where p was, oldest first, shape (k, size)."""
+        return np.array(self._bias)
+
+    def _since(self, now: float) -> np.ndarray:
+        return np.array(self._times, float) - now
+
+    def _add_bias(self, bias: np.ndarray) -> None:
+        if self._bias and len(self._bias[-1]) != len(bias):
+            self._bias.clear()  # another model
+        if not self._bias or float(np.linalg.norm(bias - self._bias[-1])) > MOVED:
+            self._bias.append(bias)

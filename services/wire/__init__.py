@@ -1,0 +1,1 @@
+"""What travels: keys, records, streams, questions and sessions; no robot, no model."""

@@ -1,0 +1,228 @@
+"""What travels between the processes, as typed records; `services.wire.messages` puts them on the wire."""
+
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+
+Arrays = dict[str, np.ndarray]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Message:
+    """What every message carries.
+
+    Attributes:
+        stamp_ns: The sender's wall clock when the content was true [ns since 1970].
+        seq: Counts up by one per message of this key and sender; a gap is a loss.
+        boot: Random number of the sending process; another one means it was restarted.
+    """
+
+    TYPE: ClassVar[str]
+    PER_SIGNAL: ClassVar[tuple[str, ...]] = ()
+    """Fields that tell something of each signal: of the same ones, with as many elements."""
+    stamp_ns: int = 0
+    seq: int = 0
+    boot: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sample(Message):
+    """One coherent cycle of the robot's sensors, or one frame of a camera.
+
+    Attributes:
+        cycle: The HAL's cycle number, or the number of the frame.
+        source: `can`, `camera`, `simulated`, `truth` or `replay`.
+        complete: Whether every device answered in this cycle.
+        values: Signal -> values [the signal's unit], shape (n,); NaN where not valid.
+        age: Signal -> age of each value when published [s], shape (n,); inf if never measured.
+        valid: Signal -> whether each value may be used, shape (n,).
+    """
+
+    TYPE: ClassVar[str] = "sample"
+    PER_SIGNAL: ClassVar[tuple[str, ...]] = ("values", "age", "valid")
+    cycle: int
+    source: str
+    complete: bool
+    values: Arrays
+    age: Arrays
+    valid: Arrays
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Command(Message):
+    """What is desired of the drives.
+
+    Attributes:
+        signal: The commanded signal.
+        values: Desired values [its unit], shape (n,).
+        cycle: `Sample.cycle` that the command answers; the HAL takes the command's age from it, on its own clock.
+        hal_boot: `Sample.boot` of that sample.
+        name: Who commands, for people; only the first that begins a stream needs it.
+    """
+
+    TYPE: ClassVar[str] = "command"
+    signal: str
+    values: np.ndarray
+    cycle: int
+    hal_boot: int
+    name: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Holder(Message):
+    """Who commands the robot.
+
+    Attributes:
+        name: For people; empty if nobody commands.
+        holder: `boot` of who commands; 0 if nobody does.
+        through: `boot` of the service that commands for the holder; 0 if it does so itself.
+        left: How long [s] the lease still runs.
+    """
+
+    TYPE: ClassVar[str] = "holder"
+    name: str
+    holder: int
+    through: int = 0
+    left: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Applied(Message):
+    """What was really sent to the drives in a cycle.
+
+    Attributes:
+        cycle: The HAL's cycle number.
+        mode: `off`, `enabling`, `hold`, `follow`, `homing`, `stopping` or `fault`.
+        signal: The commanded signal.
+        desired: Newest accepted command [its unit], shape (n,); NaN if none is alive.
+        values: Applied set-points [its unit], shape (n,); NaN while off.
+        limited_by: Which limits acted (`acceleration`, `effort`, `range`, `rate`, `tension`, `velocity`), sorted.
+        sender: `Command.boot` of the command that was followed; 0 if none.
+    """
+
+    TYPE: ClassVar[str] = "applied"
+    cycle: int
+    mode: str
+    signal: str
+    desired: np.ndarray
+    values: np.ndarray
+    limited_by: list[str]
+    sender: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Estimates(Message):
+    """Every signal of the body, measured where it can be and estimated where it cannot.
+
+    Attributes:
+        cycle: `Sample.cycle` it was made from; -1 without a fresh sample.
+        values: Signal -> measured values, with estimates in place of the elements that are not valid [unit];
+            NaN where neither is possible.
+        estimated: Signal -> which elements were estimated, shape (n,).
+        std: Signal -> expected error of an estimate (1 sigma) [unit], shape (n,); 0 where measured, NaN where unknown.
+        method: Signal -> `measured`, `mask`, `latent`, `input` or `none`.
+        mask: Signal -> the signals it was estimated from, joined by `+`.
+        residual: Signal -> how badly the model explains what it was given, in standard deviations of the
+            training data (root mean square); 0 where measured.
+    """
+
+    TYPE: ClassVar[str] = "estimates"
+    PER_SIGNAL: ClassVar[tuple[str, ...]] = ("values", "estimated", "std", "method", "mask", "residual")
+    cycle: int
+    values: Arrays
+    estimated: Arrays
+    std: Arrays
+    method: dict[str, str]
+    mask: dict[str, str]
+    residual: dict[str, float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Anomaly(Message):
+    """How unlike normal the body is.
+
+    Attributes:
+        cycle: `Sample.cycle` it was made from.
+        score: Mahalanobis distance (paper, II-K) of the prediction error; NaN without normal data.
+        threshold: Score above which it counts as an anomaly.
+        is_anomaly: Score above threshold for as long as the robot file asks, and not for a change of environment.
+        blamed: `signal.element` that is most likely wrong over the samples above the threshold; below it, the one that
+            contributes most.
+        verdict: `normal`, `environment` (another condition of the body explains the samples above the threshold),
+            `anomaly` (none does), or empty while there is nothing to judge.
+        contribution: Signal -> each element's part of score^2, shape (n,).
+    """
+
+    TYPE: ClassVar[str] = "anomaly"
+    cycle: int
+    score: float
+    threshold: float
+    is_anomaly: bool
+    blamed: str
+    contribution: Arrays
+    verdict: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Update(Message):
+    """What the online update does.
+
+    Attributes:
+        active: Whether it is engaged.
+        model_version: Counts up with every model that was swapped in.
+        window: Samples in the bounded window.
+        dropped: Oldest samples dropped so far.
+        loss: Mean squared error over the window, in standard deviations of the training data.
+        bias: The parametric bias p in use, shape (n,); empty without.
+        settled: Whether p is well known, so that W may follow.
+        rolled_back: How often W went back because it did worse on held-out samples.
+    """
+
+    TYPE: ClassVar[str] = "update"
+    active: bool
+    model_version: int
+    window: int
+    dropped: int
+    loss: float
+    bias: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    settled: bool = True
+    rolled_back: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Target(Message):
+    """Where the controller shall bring the body.
+
+    Attributes:
+        signal: Signal to reach, such as `joint_position`.
+        values: Reference [its unit], shape (n,).
+        cycle: `Sample.cycle` of the newest sample that the sender had seen; a target older than a second is refused.
+        hal_boot: `Sample.boot` of that sample.
+    """
+
+    TYPE: ClassVar[str] = "target"
+    signal: str
+    values: np.ndarray
+    cycle: int = 0
+    hal_boot: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Status(Message):
+    """Health of one service, once a second.
+
+    Attributes:
+        service: Which service.
+        state: One word: `starting`, `ready`, `running`, `degraded`, `fault`, `stopping`.
+        text: One sentence for a person; empty when all is well.
+        loops: Loop name -> rate_wanted, rate [Hz], late_p50, late_p99, late_max [s], ticks, skipped.
+        facts: Whatever else the service counts: devices, buses, controller, rejected messages.
+    """
+
+    TYPE: ClassVar[str] = "status"
+    service: str
+    state: str
+    text: str = ""
+    loops: dict[str, dict[str, float]] = field(default_factory=dict)
+    facts: dict[str, Any] = field(default_factory=dict)

@@ -1,0 +1,42 @@
+"""One message of every type, of an arm with three elements, for the tests of recordings."""
+
+import time
+import typing
+from typing import Any
+
+import numpy as np
+
+from services.recording.schema import Catalogue, Listed
+from services.wire.records import Message
+
+ARM = Catalogue({"joint_position": Listed("rad", ("elbow", "wrist")), "muscle_tension": Listed("N", ("biceps",))})
+BY_SIGNAL = {"joint_position": 2, "muscle_tension": 1}
+
+
+def a_message(record: type[Message], number: float = 0.1) -> Message:
+    """One of every type, its arrays filled with a number."""
+    arrays = {name: np.full(size, number) for name, size in BY_SIGNAL.items()}
+    truths = {name: np.arange(size) == 0 for name, size in BY_SIGNAL.items()}
+    fields: dict[str, Any] = {"stamp_ns": time.time_ns(), "seq": 7, "boot": 2**53 - 1}
+    for name, hint in typing.get_type_hints(record).items():
+        if name in fields or typing.get_origin(hint) is typing.ClassVar:
+            continue
+        if name == "signal":
+            fields[name] = "joint_position"
+        elif hint is np.ndarray:
+            fields[name] = np.full(2, 0.25 if name == "bias" else number)
+        elif hint == dict[str, np.ndarray]:
+            fields[name] = truths if name in ("valid", "estimated") else arrays
+        elif hint == dict[str, float]:
+            fields[name] = dict.fromkeys(BY_SIGNAL, number)
+        elif hint == dict[str, str]:
+            fields[name] = dict.fromkeys(BY_SIGNAL, "mask")
+        elif hint == dict[str, dict[str, float]]:
+            fields[name] = {"hal": {"rate": 200.0, "late_p99": 0.5}}
+        elif hint == list[str]:
+            fields[name] = ["range"]
+        elif typing.get_origin(hint) is dict:
+            fields[name] = {"devices": {"drive": {"text": "", "age": 0.5}}, "list": [1, None, True]}
+        else:
+            fields[name] = hint(number) if hint is float else hint(3) if hint is int else hint("x")
+    return record(**fields)

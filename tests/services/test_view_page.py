@@ -1,0 +1,205 @@
+"""The page over a real socket: what a browser gets, what it may press, and what it cannot do."""
+
+import os
+import resource
+import socket
+import threading
+import time
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import viser
+from browser import Browser
+from talking_robot import TalkingRobot
+from websockets.exceptions import InvalidStatus
+
+from gemuco.dataset import Dataset
+from services.errors import ServiceError
+from services.view import run
+from services.view.controls import Controls
+from services.view.role import why_read_only
+from services.view.site import open_site
+from services.wire.member import Member
+
+BUTTONS = {"Engage", "Disengage", "Reset", "Stop", "EMERGENCY STOP", "Record this posture", "Take over and hold"}
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+class Viewing:
+    """`gemuco view` in a thread."""
+
+    def __init__(self, robot: str, connect: tuple[str, ...] = ()) -> None:
+        self.port, self._stop = free_port(), threading.Event()
+        arguments = (robot, "127.0.0.1", self.port, connect, None, self._stop)
+        self._thread = threading.Thread(target=run.view, args=arguments, daemon=True)
+
+    def __enter__(self) -> "Viewing":
+        self._thread.start()
+        deadline = time.monotonic() + 60.0
+        while True:
+            with socket.socket() as probe:
+                if probe.connect_ex(("127.0.0.1", self.port)) == 0:
+                    return self
+            assert time.monotonic() < deadline
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join(10.0)
+        assert not self._thread.is_alive()
+
+
+@pytest.fixture
+def talking(robot: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[TalkingRobot]:
+    monkeypatch.chdir(tmp_path)  # taught samples are written below it
+    with TalkingRobot(robot) as found:
+        yield found
+
+
+def test_the_page_shows_every_state_and_recovers(talking: TalkingRobot):
+    with Viewing(talking.robot) as page, Browser(page.port) as browser:
+        browser.until(lambda b: "Healthy" in b.text() and "joint_position" in b.text())
+        talking.silent = True
+        browser.until(lambda b: "joint_position (elbow) is estimated from muscle_tension" in b.text())
+        talking.silent, talking.verdict = False, "anomaly"
+        browser.until(lambda b: "Most likely wrong: muscle_tension.biceps" in b.text())
+        talking.verdict = "normal"
+        talking.end("model")
+        browser.until(lambda b: "Model service gone" in b.text())
+        talking.end("hal")
+        browser.until(lambda b: "Robot gone" in b.text() and "k-old" in b.text())
+        talking.start("hal")
+        talking.start("model")
+        browser.until(lambda b: "Healthy" in b.text())
+
+
+def test_buttons_ask_the_robot(talking: TalkingRobot):
+    with Viewing(talking.robot) as page, Browser(page.port) as browser:
+        browser.until(lambda b: "Healthy" in b.text())
+        assert browser.labels() >= BUTTONS
+        browser.press("Stop")
+        browser.until(lambda b: "stop: done" in b.text())
+        browser.press("EMERGENCY STOP")
+        browser.until(lambda b: "estop: done" in b.text())
+        assert talking.asked == ["stop", "estop"]
+
+
+def test_a_posture_is_recorded_from_the_page(talking: TalkingRobot, tmp_path: Path):
+    with Viewing(talking.robot) as page, Browser(page.port) as browser:
+        browser.until(lambda b: "[rad]" in b.text() and "condition" in b.labels())
+        browser.press("Record this posture")
+        browser.until(lambda b: "needs a name" in b.text())
+        browser.fill("condition", "light")
+        browser.press("Record this posture")
+        browser.until(lambda b: "1 samples are in the file" in b.text())
+        talking.silent = True
+        browser.until(lambda b: "is estimated from" in b.text())
+        browser.press("Record this posture")
+        browser.until(lambda b: "is not measured now, so nothing was recorded" in b.text())
+    assert len(Dataset.load(tmp_path / "runs" / talking.robot / "taught.npz")) == 1
+
+
+def test_a_viewer_has_no_buttons(talking: TalkingRobot, tmp_path: Path):
+    role = tmp_path / "viewer.json"
+    role.write_text('{"metadata": {"gemuco": {"role": "viewer", "robots": ["*"]}}}')
+    with Viewing(talking.robot, (str(role),)) as page, Browser(page.port) as browser:
+        browser.until(lambda b: "Read only: the role is viewer" in b.text())
+        assert not browser.labels() & BUTTONS
+
+
+def test_who_may_press():
+    assert why_read_only(Member(), "arm", "127.0.0.1") == ""
+    assert why_read_only(Member("operator", ("*",)), "arm", "localhost") == ""
+    assert "role is viewer" in why_read_only(Member("viewer", ("arm",)), "arm", "127.0.0.1")
+    assert "not for 'arm'" in why_read_only(Member("operator", ("leg",)), "arm", "127.0.0.1")
+    assert "127.0.0.1 only" in why_read_only(Member(), "arm", "0.0.0.0")
+
+
+def test_a_read_only_page_asks_nothing_even_if_it_is_told_to():
+    asked: list[str] = []
+    controls = Controls(lambda: asked.append("client"), "Read only: so it is.")  # type: ignore[func-returns-value]
+    for verb in ("engage", "stop", "estop", "reset", "dance"):
+        outcome = controls.press(verb)
+        assert not outcome.is_done
+    assert not asked
+    assert "no button 'dance'" in outcome.text
+
+
+def test_without_a_robot_a_button_says_why(robot: str):
+    with Viewing(robot) as page, Browser(page.port) as browser:
+        browser.until(lambda b: "No robot" in b.text() and "Engage" in b.labels())
+        browser.press("Stop")
+        browser.until(lambda b: "Is `gemuco hal` running?" in b.text() and "stop: " in b.text())
+
+
+def test_the_page_of_somebody_else_may_not_connect(robot: str):
+    with Viewing(robot) as page:
+        with pytest.raises(InvalidStatus, match="403"):
+            Browser(page.port, origin="http://evil.example")
+        with pytest.raises(InvalidStatus, match="403"):
+            Browser(page.port, origin="http://127.0.0.1.evil.example")
+        Browser(page.port, origin=f"http://127.0.0.1:{page.port}").close()
+
+
+def test_nothing_can_be_published_on_the_internet(robot: str):
+    site = open_site("127.0.0.1", 0, "x")
+    try:
+        from viser import _messages
+
+        assert not site._websock_server._incoming_handlers.get(_messages.ShareUrlRequest)
+    finally:
+        site.stop()
+
+
+def test_the_page_needs_nothing_from_elsewhere(robot: str):
+    with Viewing(robot) as page, urllib.request.urlopen(f"http://127.0.0.1:{page.port}/") as answer:
+        html = answer.read().decode()
+    head = html[: html.index("<body")] if "<body" in html else html
+    assert not [tag for tag in head.split("<") if tag.startswith(("link", "script")) and 'src="http' in tag]
+
+
+def test_a_taken_port_is_one_sentence(robot: str):
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        with pytest.raises(ServiceError, match=f"Port {port} on 127.0.0.1 is taken"):
+            open_site("127.0.0.1", port, "x")
+    with pytest.raises(ServiceError, match="cannot be served"):
+        open_site("203.0.113.7", 8090, "x")
+
+
+def test_a_missing_package_is_one_sentence(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(__import__("sys").modules, "viser", None)
+    with pytest.raises(ServiceError, match=r"pip install 'gemuco\[view\]'"):
+        open_site("127.0.0.1", 0, "x")
+
+
+def test_a_browser_that_never_reads_holds_nothing_up(talking: TalkingRobot):
+    with Viewing(talking.robot) as page, Browser(page.port) as browser:
+        browser.until(lambda b: "Healthy" in b.text())
+        deaf = socket.create_connection(("127.0.0.1", page.port))
+        deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        deaf.sendall(
+            b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+            b"Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Version: 13\r\n"
+            b"Sec-WebSocket-Protocol: viser-v" + viser.__version__.encode() + b"\r\n\r\n"
+        )
+        before = resident()
+        for silent in (True, False) * 4:
+            talking.silent = silent
+            browser.until(lambda b, silent=silent: ("is estimated from" if silent else "Healthy") in b.text())
+        assert resident() - before < 30e6
+        deaf.close()
+
+
+def resident() -> float:
+    """Memory of this process [B]."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return float(pages * resource.getpagesize()) if os.name == "posix" else 0.0

@@ -1,0 +1,189 @@
+"""What the page shows, without a browser and without a network."""
+
+import math
+
+import numpy as np
+import pytest
+from talking_robot import DESCRIBED, anomaly, estimates, sample
+
+from services.view.attendance import service_rows
+from services.view.banner import LINGERS, Banner, Level, Steady, banner
+from services.view.bias_map import BiasPicture, project
+from services.view.charts import Chart, Line, ticks
+from services.view.controls import Outcome
+from services.view.markup import banner_html, facts_html, services_html, signals_html
+from services.view.page import source
+from services.view.rows import Kind, rows
+from services.view.seen import Heard, Seen
+from services.view.trail import POINTS, Trail
+from services.wire.messages import Holder, Status
+
+BOTH = frozenset({"hal", "model"})
+FAULT = {"hal": Heard(Status(service="hal", state="fault", text="It broke."), 0.1)}
+
+
+def seen(silent: bool = False, age: float = 0.01, **other: object) -> Seen:
+    facts: dict[str, object] = {
+        "robot": "arm", "alive": BOTH, "hal": DESCRIBED, "sample": Heard(sample(silent), age),
+        "estimate": Heard(estimates(silent), age), "anomaly": Heard(anomaly(), age),
+    }  # fmt: skip
+    return Seen(**(facts | other))  # type: ignore[arg-type]
+
+
+def shown(moment: Seen) -> Banner:
+    return banner(moment, rows(moment))
+
+
+def test_a_measured_value_is_shown_with_its_age():
+    row = rows(seen(age=0.1))[1]
+    assert (row.name, row.unit, row.kind, row.value) == ("joint_position.elbow", "rad", Kind.MEASURED, -0.5)
+    assert row.age == pytest.approx(0.101)
+
+
+def test_a_lost_sensor_is_estimated_and_says_from_what():
+    row = rows(seen(silent=True))[1]
+    assert (row.kind, row.value, row.std, row.source) == (Kind.ESTIMATED, -0.48, 0.02, "muscle_tension")
+    told = shown(seen(silent=True))
+    assert (told.level, told.title) == (Level.WARN, "Sensor lost")
+    assert told.text == "joint_position (elbow) is estimated from muscle_tension."
+
+
+def test_what_nobody_can_tell_is_masked_and_has_no_value():
+    row = rows(seen(silent=True, estimate=None))[1]
+    assert row.kind is Kind.MASKED
+    assert math.isnan(row.value)
+
+
+def test_old_values_are_never_shown_as_fresh():
+    found = rows(seen(age=3.0))
+    assert [row.kind for row in found] == [Kind.OLD] * 3
+    assert found[0].age == pytest.approx(3.001)
+    html = signals_html(found)
+    assert "measured" not in html
+    assert "3.0 s" in html
+
+
+def test_an_old_estimate_is_no_estimate():
+    assert rows(seen(silent=True, estimate=Heard(estimates(True), 3.0)))[1].kind is Kind.MASKED
+
+
+@pytest.mark.parametrize(
+    ("moment", "level", "title"),
+    [
+        (seen(), Level.OK, "Healthy"),
+        (seen(anomaly=Heard(anomaly("anomaly"), 0.0)), Level.BAD, "Anomaly"),
+        (seen(anomaly=Heard(anomaly("environment"), 0.0)), Level.NOTE, "Environment changed"),
+        (seen(alive=frozenset({"hal"}), estimate=None), Level.BAD, "Model service gone"),
+        (seen(estimate=Heard(estimates(), 3.0)), Level.BAD, "Model service silent"),
+        (seen(age=5.0, alive=frozenset()), Level.GONE, "Robot gone"),
+        (seen(age=5.0), Level.GONE, "Robot silent"),
+        (Seen(robot="arm"), Level.GONE, "No robot"),
+        (seen(linked=False, link_text="Nobody there."), Level.GONE, "Router gone"),
+        (seen(statuses=FAULT), Level.BAD, "Fault"),
+    ],
+)  # fmt: skip
+def test_every_state_has_its_banner(moment, level, title):
+    told = shown(moment)
+    assert (told.level, told.title) == (level, title)
+
+
+def test_the_worst_is_told_first_and_the_rest_below_it():
+    told = shown(seen(silent=True, anomaly=Heard(anomaly("anomaly"), 0.0)))
+    assert told.title == "Anomaly"
+    assert "muscle_tension.biceps" in told.text
+    assert told.also == ("Sensor lost: joint_position (elbow) is estimated from muscle_tension.",)
+
+
+def test_worse_is_shown_at_once_and_better_after_a_while():
+    ok, bad, steady = Banner(Level.OK, "a", ""), Banner(Level.BAD, "b", ""), Steady()
+    assert steady.show(ok, 0.0) is ok
+    assert steady.show(bad, 0.1) is bad
+    assert steady.show(ok, 0.5) is bad
+    assert steady.show(ok, 0.2 + LINGERS) is ok
+
+
+def test_services_that_are_gone_or_silent_are_not_shown_as_running():
+    status = Status(service="model", state="running", loops={"estimation": {"rate": 200.0, "rate_wanted": 200.0}})
+    found = {
+        row.name: row for row in service_rows(seen(alive=frozenset({"hal"}), statuses={"model": Heard(status, 9.0)}))
+    }
+    assert (found["model"].state, found["hal"].state) == ("gone", "silent")
+    assert "heard 9.0 s ago" in services_html(tuple(found.values()))
+
+
+def test_whatever_came_over_the_network_is_escaped():
+    evil = "<script>alert(1)</script>"
+    signals = {"signals": {evil: {"unit": evil, "elements": [evil], "source": "hal"}}, "command": {}, "limits": {}}
+    moment = seen(
+        hal=signals, holder=Heard(Holder(name=evil, holder=3, left=1.0), 0.0),
+        statuses={"hal": Heard(Status(service="hal", state=evil, text=evil, loops={evil: {}}), 0.0)},
+    )  # fmt: skip
+    pages = [
+        signals_html(rows(moment)), services_html(service_rows(moment)), banner_html(shown(moment)),
+        facts_html(moment, evil, "", Outcome(0.0, False, evil)),
+        BiasPicture().svg(project({evil: [0.0, 1.0], "b": [1.0, 0.0]}, np.zeros((1, 2))), False),
+    ]  # fmt: skip
+    assert not [html for html in pages if "<script" in html]
+
+
+def test_where_data_come_from():
+    assert source(seen()) == "robot (can)"
+    assert source(seen(alive=BOTH | {"simulator"})) == "simulated robot"
+    assert source(seen(age=9.0)) == "nothing comes"
+
+
+@pytest.mark.parametrize("size", [1, 2, 5])
+def test_p_is_mapped_whatever_its_size(size):
+    random = np.random.default_rng(0)
+    biases = {name: random.normal(size=size) for name in ("a", "b", "c")}
+    found = project(biases, np.array([biases["b"] * 0.9, biases["b"]]))
+    assert found is not None
+    assert found.nearest == "b"
+    assert found.apart == pytest.approx(0.0)
+    assert found.way.shape == (2, 2)
+    assert "b</text>" in BiasPicture().svg(found, False)
+
+
+def test_the_plane_of_many_dimensions_keeps_distances_that_lie_in_it():
+    found = project({"a": [0, 0, 0], "b": [3, 0, 0], "c": [0, 4, 0]}, np.zeros((0, 3)))
+    assert np.linalg.norm(found.conditions["b"] - found.conditions["c"]) == pytest.approx(5.0)
+
+
+def test_a_body_without_p_has_no_map():
+    assert project({"": []}, np.zeros((0, 0))) is None
+
+
+def test_the_map_does_not_jump_when_p_comes_back():
+    picture, biases = BiasPicture(), {"a": [0.0, 0.0], "b": [1.0, 1.0]}
+    picture.svg(project(biases, np.array([[3.0, 3.0]])), False)
+    far = picture.svg(project(biases, np.array([[3.0, 3.0]])), False)
+    near = picture.svg(project(biases, np.array([[0.5, 0.5]])), False)
+    places = [[part.split(" class")[0] for part in svg.split("<rect")[2:4]] for svg in (far, near)]
+    assert places[0] == places[1]
+
+
+def test_gaps_stay_gaps_in_a_plot():
+    values = np.array([1.0, 2.0, np.nan, 3.0, 4.0])
+    svg = Chart(100).svg(np.linspace(-4, 0, 5), [Line("a", values, "#fff")], "rad", "a")
+    curve = next(part for part in svg.split("<path") if 'stroke="#fff"' in part)
+    assert curve.count("M") == 2
+
+
+@pytest.mark.parametrize("ends", [(0.0, 1.0), (-0.031, 0.027), (1e4, 1e4 + 3), (-1e-5, 1e-5)])
+def test_ticks_are_few_and_inside(ends):
+    found = ticks(*ends)
+    assert 2 <= len(found) <= 6
+    assert ends[0] <= found[0] <= found[-1] <= ends[1] + 1e-12
+
+
+def test_a_trail_is_bounded_and_knows_what_vanished():
+    trail = Trail()
+    for index in range(POINTS + 50):
+        moment = seen(silent=index > POINTS)
+        trail.add(0.25 * index, moment, rows(moment))
+    curves = trail.curves(["joint_position.elbow", "nothing"], 0.25 * index)
+    assert curves.measured.shape == (2, POINTS)
+    assert curves.time[-1] == 0.0
+    assert np.isnan(curves.measured[0, -1])
+    assert curves.estimated[0, -1] == -0.48
+    assert np.isnan(curves.measured[1]).all()

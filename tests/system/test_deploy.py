@@ -1,0 +1,188 @@
+"""What the files of a deployment promise, without Docker: `make test-compose` looks whether they keep it."""
+
+import configparser
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+import yaml
+
+from services.hardware.hal_service import AT_REST_WITHIN
+from services.verbs.verb import speaks_plainly
+from services.wire import keys
+
+ROOT = Path(__file__).parents[2]
+UNITS = sorted((ROOT / "deploy" / "systemd").glob("*.service"))
+HEAVY = ("torch", "matplotlib", "pybullet", "pyarrow", "viser")
+"""What the image of a robot's services does not hold."""
+SERVICES = ("router", "hal", "gemuco", "recorder", "simulator", "train")
+ROLES = {"hal": "hal", "gemuco": "model", "recorder": "recorder", "simulator": "simulator"}
+
+
+def compose(name: str = "docker-compose.yml") -> dict[str, Any]:
+    found: dict[str, Any] = yaml.safe_load((ROOT / name).read_text())
+    return found
+
+
+def test_the_stack_is_what_it_is_said_to_be() -> None:
+    services = compose()["services"]
+    assert set(services) == set(SERVICES)
+    assert {name for name, one in services.items() if one.get("profiles")} == {"simulator", "train"}
+    assert all(one["profiles"] == ["simulated"] for one in services.values() if one.get("profiles"))
+
+
+@pytest.mark.parametrize("name", SERVICES)
+def test_every_container_can_do_little(name: str) -> None:
+    one = compose()["services"][name]
+    assert one["user"] == "10001:10001"
+    assert one["read_only"] is True
+    assert one["cap_drop"] == ["ALL"]
+    assert one["security_opt"] == ["no-new-privileges:true"]
+    assert not {"privileged", "cap_add", "devices", "ports"} & set(one)
+    assert one["pids_limit"] <= 512
+    assert one["mem_limit"]
+    assert one["logging"]["options"]["max-size"]
+    assert all(volume.endswith(":ro") for volume in one["volumes"] if volume.startswith("."))
+
+
+@pytest.mark.parametrize("name", [name for name in SERVICES if name != "train"])
+def test_every_service_is_checked_by_its_heartbeat_and_started_again(name: str) -> None:
+    one = compose()["services"][name]
+    test = one["healthcheck"]["test"]
+    assert test[:4] == ["CMD", "python", "-m", "services.health"]
+    assert test[4] == ROLES.get(name, name)
+    assert test[4] in (*keys.SERVICES, "router")
+    assert one["restart"] == "unless-stopped"
+
+
+def test_a_robot_is_given_the_time_to_come_to_rest() -> None:
+    assert int(compose()["services"]["hal"]["stop_grace_period"].rstrip("s")) > AT_REST_WITHIN
+    unit = next(unit for unit in UNITS if "hal" in unit.name)
+    assert int(re.findall(r"^TimeoutStopSec=(\d+)$", unit.read_text(), re.M)[0]) > AT_REST_WITHIN
+
+
+def test_secrets_are_files_of_the_host_and_each_service_sees_its_own() -> None:
+    secure = compose("docker-compose.secure.yml")
+    for name, one in secure["services"].items():
+        (given,) = one["secrets"]
+        assert given == {"source": ROLES.get(name, name), "target": "role"}
+        assert "/run/secrets/role" in str(one.get("environment", one.get("command")))
+    assert all(set(one) == {"file"} for one in secure["secrets"].values())
+    for name in ("docker-compose.yml", "docker-compose.secure.yml", "docker-compose.realtime.yml", ".env.example"):
+        assert not re.search(r"password|BEGIN [A-Z ]*KEY|token", (ROOT / name).read_text().replace("a password", ""))
+
+
+def test_only_the_override_gives_capabilities() -> None:
+    for name, one in compose("docker-compose.realtime.yml")["services"].items():
+        assert set(one["cap_add"]) <= {"SYS_NICE", "IPC_LOCK"}
+        assert set(one) <= {"cap_add", "ulimits"}, f"{name}: what is the owner's choice is a comment"
+
+
+def stages() -> dict[str, list[str]]:
+    """Stage -> its instructions."""
+    text = re.sub(r"\\\n", " ", (ROOT / "Dockerfile").read_text())
+    found: dict[str, list[str]] = {}
+    for line in text.splitlines():
+        if start := re.match(r"FROM \S+ AS (\w+)", line):
+            found[start[1]] = []
+        elif found and line.strip() and not line.startswith("#"):
+            found[list(found)[-1]].append(line)
+    return found
+
+
+@pytest.mark.parametrize("stage", ["services", "workshop"])
+def test_no_image_ends_as_root_or_installs_by_itself(stage: str) -> None:
+    lines = stages()[stage]
+    assert [line for line in lines if line.startswith("USER")][-1] == "USER 10001:10001"
+    assert not any("apt" in line or "pip " in line for line in lines)
+
+
+def test_the_image_holds_what_is_named_and_no_secrets() -> None:
+    ignored = (ROOT / ".dockerignore").read_text().split()
+    assert "*" in ignored
+    assert "**/*.calibration.yaml*" in ignored
+    named = {line[1:] for line in ignored if line.startswith("!")}
+    copied = {
+        word.rstrip("/")
+        for lines in stages().values()
+        for line in lines
+        if line.startswith("COPY") and "--from" not in line
+        for word in line.split()[1:-1]
+    }
+    assert copied <= named
+    assert all((ROOT / name).exists() for name in named)
+
+
+def test_a_robots_services_need_nothing_of_what_its_image_lacks() -> None:
+    """What the small image's processes import, with the large packages out of reach."""
+    modules = (
+        "hardware.hal_service", "model.gemuco_service", "recording.recorder", "process.router", "verbs.network",
+        "verbs.recording", "verbs.ask", "health",
+    )  # fmt: skip
+    code = "\n".join(
+        [
+            "import sys",
+            *(f"sys.modules[{name!r}] = None" for name in HEAVY),
+            "import services.cli",
+            *(f"import services.{name}" for name in modules),
+        ]
+    )
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert found.returncode == 0, found.stderr
+
+
+def test_what_the_small_image_lacks_is_told_in_a_sentence(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "torch", None)
+    with pytest.raises(typer.Exit) as ended:
+        speaks_plainly(lambda: __import__("torch"))()
+    assert ended.value.exit_code == 1
+    assert "needs the package 'torch'" in capsys.readouterr().err
+    with pytest.raises(ModuleNotFoundError):
+        speaks_plainly(lambda: __import__("services.no_such_file"))()
+
+
+def requirements(*words: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "deploy/requirements.py", *words]
+    return subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
+
+
+def test_requirements_of_an_image() -> None:
+    small = requirements("-torch", "-matplotlib").stdout
+    assert "numpy" in small
+    assert "torch" not in small
+    assert requirements("=torch", "+sim", "=pybullet").stdout.split() == ["torch>=2.6", "pybullet>=3.2.7"]
+    assert "does not ask for tensorflow" in requirements("-tensorflow").stderr
+
+
+@pytest.mark.parametrize("unit", UNITS, ids=lambda unit: unit.stem)
+def test_units_are_hardened_and_tell_the_manager_that_they_live(unit: Path) -> None:
+    found = configparser.ConfigParser(strict=False, interpolation=None)
+    found.optionxform = str  # type: ignore[assignment,method-assign]
+    found.read(unit)
+    service = found["Service"]
+    assert service["Type"] == "notify"
+    assert service["User"] == "gemuco"
+    assert service["Restart"] == "always"
+    assert int(service["TimeoutStopSec"]) >= 10
+    for name in ("NoNewPrivileges", "ProtectHome", "PrivateTmp", "RestrictSUIDSGID", "LockPersonality"):
+        assert service[name] == "yes"
+    assert service["ProtectSystem"] == "strict"
+    assert service["CapabilityBoundingSet"] == ""
+    if unit.stem.startswith(("gemuco-hal", "gemuco-model")):
+        assert int(service["LimitRTPRIO"]) > 51
+        assert int(service["WatchdogSec"]) > 10
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd-analyze here")
+def test_systemd_finds_nothing_wrong_with_the_units() -> None:
+    command = ["systemd-analyze", "verify", "--man=no", *map(str, UNITS)]
+    found = subprocess.run(command, capture_output=True, text=True, check=False)
+    said = [line for line in found.stderr.splitlines() if "/opt/gemuco/bin/gemuco is not executable" not in line]
+    assert said == []
