@@ -117,6 +117,11 @@ class BenchClock(ManualClock):
         return event.is_set()
 
 
+ENABLING = 60
+"""Cycles to enable in: an axis whose watchdog ran out is reset before, and its heartbeat, which comes every 20 cycles,
+confirms one after the other."""
+
+
 class Bench:
     """Robot and rig on `virtual` buses, moved in lockstep, so that a test of time needs no time."""
 
@@ -211,7 +216,7 @@ class Bench:
     def enable(self):
         self.cycle(2)
         self.robot.enable()
-        self.until(lambda: self.robot.mode == "hold", "enabling", 40)
+        self.until(lambda: self.robot.mode == "hold", "enabling", ENABLING)
 
     def follow(self, desired, cycles=1):
         """Command the same set-point in every cycle."""
