@@ -25,6 +25,8 @@ M = TypeVar("M", bound=Message)
 log = logging.getLogger(__name__)
 
 STATUS_EVERY = 1.0
+ANSWERED_WITHIN = 0.5
+"""How long [s] a service that ends still answers what it was asked before."""
 
 
 class _Statuses:
@@ -67,6 +69,7 @@ class Service:
         self._connect = tuple(connect)
         self._describe = describe
         self._lock = ServiceLock(robot, name)
+        self._asked = query.UnderWay()
         self._statuses = _Statuses()
         self._watched: list[Turning] = [self._statuses]
 
@@ -88,6 +91,7 @@ class Service:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if hasattr(self, "session"):
+            self._asked.wait(ANSWERED_WITHIN)
             close_session(self.session)
         self._lock.release()
 
@@ -114,7 +118,7 @@ class Service:
         self, name: str, handler: query.Handler, guard: query.Guard | None = None, *, always: bool = False
     ) -> None:
         """Answer a verb until the session closes; see `query.serve_verb`."""
-        query.serve_verb(self.session, keys.verb(self.robot, self.name, name), handler, guard, always)
+        query.serve_verb(self.session, keys.verb(self.robot, self.name, name), handler, guard, always, self._asked)
 
     def watch(self, *turning: Turning) -> None:
         """What has to go on for this service to be healthy, its loops above all. Call before `run`."""

@@ -6,6 +6,7 @@ an attachment tells the version of the wire format, and on the way there who ask
 
 import logging
 import math
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict
@@ -37,8 +38,35 @@ LOG_EVERY = 1.0
 """A verb that keeps failing is logged this often [s]."""
 
 
+class UnderWay:
+    """Counts the questions that are being answered, so that who ends can wait for the last answer to go out."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._count = 0
+
+    def __enter__(self) -> None:
+        with self._changed:
+            self._count += 1
+
+    def __exit__(self, *_: object) -> None:
+        with self._changed:
+            self._count -= 1
+            self._changed.notify_all()
+
+    def wait(self, within: float) -> bool:
+        """Wait so long [s] at most; whether none is left."""
+        with self._changed:
+            return self._changed.wait_for(lambda: not self._count, within)
+
+
 def serve_verb(
-    session: zenoh.Session, key: str, handler: Handler, guard: Guard | None = None, always: bool = False
+    session: zenoh.Session,
+    key: str,
+    handler: Handler,
+    guard: Guard | None = None,
+    always: bool = False,
+    under_way: UnderWay | None = None,
 ) -> zenoh.Queryable:
     """Answer queries on a key until the session closes.
 
@@ -52,22 +80,24 @@ def serve_verb(
             `caller.ASKING` meanwhile.
         guard: Takes the caller before that; what it raises is the answer.
         always: Do it whoever asks however badly, with no arguments if those that came cannot be read; for stopping.
+        under_way: Counts the questions until they are answered.
     """
-    return session.declare_queryable(key, _Verb(key, handler, guard, always).answer)
+    return session.declare_queryable(key, _Verb(key, handler, guard, always, under_way or UnderWay()).answer)
 
 
 class _Verb:
     """Answers the questions to one key."""
 
-    def __init__(self, key: str, handler: Handler, guard: Guard | None, always: bool) -> None:
+    def __init__(self, key: str, handler: Handler, guard: Guard | None, always: bool, under_way: UnderWay) -> None:
         self._key, self._handler, self._guard, self._always = key, handler, guard, always
+        self._under_way = under_way
         self._told = _pack({"v": VERSION})
         self._logged_at = -math.inf
 
     def answer(self, query: zenoh.Query) -> None:
         """Answer one question; raises nothing, for there is nobody above."""
         try:
-            with query:
+            with self._under_way, query:
                 answer = self._done(query) if str(query.key_expr) == self._key else self._refusal_of_many(query)
                 query.reply(self._key, answer, attachment=self._told)
         except Exception:  # the session closes
