@@ -16,7 +16,7 @@ COPY gemuco/ gemuco/
 COPY hal/ hal/
 COPY simulators/ simulators/
 COPY services/ services/
-RUN deploy/install.sh .
+RUN deploy/install.sh . && /opt/gemuco/bin/python -m gemuco.warm
 
 FROM ${PYTHON} AS services
 # Numbers, so that a host without these names can give them its volumes and devices.

@@ -15,6 +15,7 @@ help:            ## list the targets
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[sim,dev]'
+	$(BIN)/python -m gemuco.warm
 	@touch $(STAMP)
 
 setup: $(STAMP)  ## make .venv with the exact versions of constraints.txt

@@ -1,18 +1,20 @@
 """Control (paper, II-I): the command whose predicted outcome loses least."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gemuco.descent import DescentConfig
+from gemuco.descent import DescentConfig, NewtonConfig
 from gemuco.errors import NotFinite, NotObservable, SchemaError
 from gemuco.losses import Hold, Match, StayNear, Term
 from gemuco.masks import Mask, label
-from gemuco.routes import Limits, Search, bounds_of, checked_mask, checked_route
+from gemuco.routes import Limits, bounds_of, checked_mask, checked_route
 from gemuco.schema import BodySchema
+from gemuco.search import Search
 
-SEARCH = DescentConfig(gamma_max=0.5, candidates=10, iterations=20)
+SEARCH = NewtonConfig()
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,6 +29,7 @@ class Solution:
             (root mean square, standard deviations); NaN if no mask can tell.
         route: `mask` (usages a and b), `latent` (e) or `input` (f).
         mask: The signals that the network was given; empty for `latent`.
+        is_late: Whether time was up before the search ended; the command is the best that it had found.
     """
 
     command: np.ndarray
@@ -35,6 +38,7 @@ class Solution:
     residual: float
     route: str
     mask: Mask
+    is_late: bool = False
 
 
 class Controller:
@@ -59,7 +63,7 @@ class Controller:
         terms: Sequence[Term | Hold] | None,
         command: str,
         route: str = "auto",
-        search: DescentConfig | None = None,
+        search: DescentConfig | NewtonConfig | None = None,
         mask: Mask | None = None,
         limits: Limits | None = None,
     ) -> None:
@@ -107,7 +111,12 @@ class Controller:
         """Forget the warm start."""
         self._search.restart()
 
-    def solve(self, target: Mapping[str, np.ndarray], now: Mapping[str, np.ndarray] | None = None) -> Solution:
+    def solve(
+        self,
+        target: Mapping[str, np.ndarray],
+        now: Mapping[str, np.ndarray] | None = None,
+        within: float = math.inf,
+    ) -> Solution:
         """The command for a target.
 
         Args:
@@ -115,6 +124,7 @@ class Controller:
                 near; a search that shall stay near something begins there, others begin from the present and from
                 training data.
             now: Signal -> present value [its unit], shape (n,); NaN or absent where it is not known.
+            within: Time that a second-order search may take [s]; the best found until then is the solution.
 
         Raises:
             UnknownSignal: A name is not in the layout.
@@ -141,12 +151,18 @@ class Controller:
             if isinstance(wish, StayNear)
         ]
         begin = merged(schema, [present, *near])
-        found = self._search.find(schema, route, mask, bounds, direct, held, sorted(needed), begin, bool(near))
+        found = self._search.find(schema, route, mask, bounds, direct, held, sorted(needed), begin, bool(near), within)
         x = self._limited(found.x)
         values = schema.scaler.restore(x)
         predicted = {name: part for name, part in schema.layout.split(values).items() if np.isfinite(part).all()}
         return Solution(
-            predicted[self.command].copy(), predicted, found.loss, self._residual(x, wishes, target), route, mask
+            predicted[self.command].copy(),
+            predicted,
+            found.loss,
+            self._residual(x, wishes, target),
+            route,
+            mask,
+            found.is_late,
         )
 
     def _terms(self, target: Mapping[str, np.ndarray]) -> tuple[Term | Hold, ...]:

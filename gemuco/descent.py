@@ -54,6 +54,26 @@ class DescentConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class NewtonConfig:
+    """How far the second-order search goes (`gemuco.compiled.newton`).
+
+    Attributes:
+        iterations: At most so many steps.
+        tolerance: It ends when two steps in a row lower the loss by less than this share of it.
+    """
+
+    iterations: int = 30
+    tolerance: float = 1e-3
+
+    def __post_init__(self) -> None:
+        if not (self.iterations >= 0 and 0.0 <= self.tolerance < 1.0):
+            raise SchemaError(
+                f"A search needs no negative number of iterations and a tolerance from 0 to 1, not {self.iterations} "
+                f"and {self.tolerance}."
+            )
+
+
+@dataclass(frozen=True, slots=True)
 class Descent:
     """Where a descent ended.
 
@@ -61,11 +81,13 @@ class Descent:
         point: The best point, shape (n,).
         loss: Its loss.
         losses: Loss at the start and after every iteration.
+        is_late: Whether time was up before the end.
     """
 
     point: np.ndarray
     loss: float
     losses: tuple[float, ...]
+    is_late: bool = False
 
 
 def descend(

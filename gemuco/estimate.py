@@ -6,14 +6,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gemuco.descent import DescentConfig, descend
-from gemuco.kernels import Layer, pull, run, trace
+from gemuco.compiled.inference import infer
+from gemuco.descent import NewtonConfig
+from gemuco.fold import fitting, input_lines, latent_lines
+from gemuco.kernels import run
 from gemuco.masks import Mask, covered_by
+from gemuco.minimise import minimise
 
 if TYPE_CHECKING:
     from gemuco.schema import BodySchema
 
-SEARCH = DescentConfig(gamma_max=1.0, candidates=12, iterations=30)
+SEARCH = NewtonConfig()
 STARTS = 64
 """How many anchors of the training data a descent chooses its start from."""
 
@@ -51,36 +54,31 @@ class _Guess:
     mask: Mask
     residual: float
 
+    def where(self, missing: np.ndarray, joined: np.ndarray) -> "_Guess":
+        """With what was measured in place of what was guessed."""
+        value, std = np.where(missing, self.value, joined), np.where(missing, self.std, 0.0)
+        return _Guess(value, std, self.method, self.mask, self.residual)
+
 
 def estimate(schema: "BodySchema", values: Mapping[str, np.ndarray]) -> dict[str, Estimate]:
     """Every signal of the layout; see `BodySchema.estimate`."""
     joined = schema.layout.join_one(values)
     finite = np.isfinite(joined)
     whole = schema.layout.whole(finite)
+    missing = ~finite
+    measured = _Guess(joined, np.zeros(len(joined)), "measured", frozenset(), 0.0)
     guesses: dict[tuple[str, Mask], _Guess] = {}
     found: dict[str, Estimate] = {}
-    normalised: np.ndarray | None = None
-    for signal in schema.layout.signals:
-        span = schema.layout.slice(signal.name)
-        if signal.name in whole:
-            zeros = np.zeros(signal.size)
-            found[signal.name] = Estimate(joined[span], zeros, zeros > 0, "measured", frozenset(), 0.0)
-            continue
-        if normalised is None:
-            normalised = np.where(finite, schema.scaler.normalise(joined), np.nan)
-        method, mask = _route(schema, signal.name, whole, finite)
-        guess = guesses.get((method, mask))
-        if guess is None:
-            guess = guesses[method, mask] = _guess(schema, method, mask, normalised)
-        missing = ~finite[span]
-        found[signal.name] = Estimate(
-            np.where(missing, guess.value[span], joined[span]),
-            np.where(missing, guess.std[span], 0.0),
-            missing if method != "none" else np.zeros(signal.size, bool),
-            method,
-            mask,
-            guess.residual,
-        )
+    for name, span in schema.layout.slices.items():
+        guess, gone = measured, missing
+        if name not in whole:
+            way = _route(schema, name, whole, finite)
+            if way not in guesses:
+                guesses[way] = _guess(schema, *way, joined).where(missing, joined)
+            guess = guesses[way]
+            if guess.method == "none":
+                gone = np.zeros(len(joined), bool)
+        found[name] = Estimate(guess.value[span], guess.std[span], gone[span], guess.method, guess.mask, guess.residual)
     return found
 
 
@@ -105,22 +103,29 @@ def _route(schema: "BodySchema", name: str, whole: Mask, finite: np.ndarray) -> 
     return "none", frozenset()
 
 
-def _guess(schema: "BodySchema", method: str, mask: Mask, x: np.ndarray) -> _Guess:
-    full = np.full(schema.layout.size, np.nan)
+def _guess(schema: "BodySchema", method: str, mask: Mask, joined: np.ndarray) -> _Guess:
     if method == "mask":
-        full[schema.out_index] = schema.infer(x, mask)
-    elif method == "latent":
+        value, residual = infer(schema.eye, joined, *schema.gate(mask))
+        return _Guess(value, _std(schema, method, mask), method, mask, residual)
+    x = np.where(np.isfinite(joined), schema.scaler.normalise(joined), np.nan)
+    full = np.full(schema.layout.size, np.nan)
+    if method == "latent":
         full[schema.out_index] = latent_search(schema, x)
     elif method == "input":
         full = input_search(schema, x, mask)
     residual = _residual(x, full)
     if method == "latent":
         residual = max(residual, _residual(x, _again(schema, full)))
+    return _Guess(schema.scaler.restore(full), _std(schema, method, mask), method, mask, residual)
+
+
+def _std(schema: "BodySchema", method: str, mask: Mask) -> np.ndarray:
+    """Expected error of every element of the layout [unit], shape (size,); NaN where it is not known."""
     std = np.full(schema.layout.size, np.nan)
     known = schema.errors.get((method, mask))
     if known is not None:
         std[schema.out_index if len(known) == len(schema.out_index) else slice(None)] = known
-    return _Guess(schema.scaler.restore(full), std, method, mask, residual)
+    return std
 
 
 def _residual(x: np.ndarray, full: np.ndarray) -> float:
@@ -138,17 +143,6 @@ def _again(schema: "BodySchema", full: np.ndarray) -> np.ndarray:
     return again
 
 
-def _distance(
-    chain: tuple[Layer, ...], points: np.ndarray, data: np.ndarray, slope: bool
-) -> tuple[np.ndarray, np.ndarray]:
-    """Norm of the difference to the given outputs (paper, eq. state-loss), and its gradient with respect to points."""
-    given = np.isfinite(data)
-    values = trace(chain, points)
-    difference = np.where(given, values[-1] - data, 0.0).astype(points.dtype)
-    norm = np.sqrt(np.einsum("ij,ij->i", difference, difference))
-    return norm, pull(chain, values, difference / np.maximum(norm, 1e-9)[:, None]) if slope else points
-
-
 def latent_search(schema: "BodySchema", x: np.ndarray) -> np.ndarray:
     """Usage (e): the x_out that fits the given ones best, shape (out_size,) [standard deviations].
 
@@ -162,8 +156,9 @@ def latent_search(schema: "BodySchema", x: np.ndarray) -> np.ndarray:
         starts = run(schema.weights.encoder, schema.network_input(anchors, schema.masks[0]))
     else:
         starts = np.zeros((1, decoder[0].matrix.shape[0]), np.float32)
-    data = x[schema.out_index]
-    return run(decoder, descend(lambda z, slope: _distance(decoder, z, data, slope), starts, SEARCH).point)
+    data = np.full(len(x), np.nan)
+    data[schema.out_index] = x[schema.out_index]
+    return run(decoder, minimise(fitting(latent_lines(schema), data), starts, SEARCH).point)
 
 
 def input_search(schema: "BodySchema", x: np.ndarray, available: Mask) -> np.ndarray:
@@ -185,17 +180,14 @@ def input_search(schema: "BodySchema", x: np.ndarray, available: Mask) -> np.nda
     sought = schema.layout.indices(mask - available)
     sought = sought[~np.isfinite(x[sought])]
     columns = np.flatnonzero(np.isin(schema.in_index, sought) & (through > 0))
-    data = x[schema.out_index]
-
-    def objective(points: np.ndarray, slope: bool) -> tuple[np.ndarray, np.ndarray]:
-        inputs = np.repeat(base[None], len(points), axis=0)
-        inputs[:, columns] = points
-        norm, gradient = _distance(schema.weights.whole, inputs, data, slope)
-        return norm, gradient[:, columns] if slope else points
-
+    data = np.full(len(x), np.nan)
+    data[schema.out_index] = x[schema.out_index]
+    far = np.full(len(columns), np.inf)
+    inferred = np.ones(len(schema.out_index), bool)
     anchors = schema.anchors[:STARTS]
     starts = anchors[:, sought] if len(anchors) else np.zeros((1, len(sought)))
-    found = descend(objective, starts.astype(np.float32), SEARCH).point
+    lines = input_lines(schema, base, columns, np.zeros(0, int), inferred, np.zeros(len(x)), -far, far)
+    found = minimise(fitting(lines, data), starts, SEARCH).point
     result = np.full(schema.layout.size, np.nan)
     base[columns] = found
     result[schema.out_index] = run(schema.weights.whole, base)

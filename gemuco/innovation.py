@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gemuco.kernels import push, trace
+from gemuco.compiled.innovation import innovations
+from gemuco.kernels import run
 from gemuco.masks import Mask
 
 if TYPE_CHECKING:
@@ -28,12 +29,16 @@ class Pairs:
         index: Position of every error in the (masks, out_size) table, flattened, shape (n,).
         whiten: Turns errors into independent ones of variance 1, shape (n, n).
         log_volume: Logarithm of the determinant of the errors' covariance.
+        through: What each mask lets through, shape (masks, in_size).
+        tails: m of each mask, and room for p, shape (masks, x_in signals + bias_size).
     """
 
     masks: tuple[Mask, ...]
     index: np.ndarray
     whiten: np.ndarray
     log_volume: float
+    through: np.ndarray
+    tails: np.ndarray
 
 
 class Innovations:
@@ -76,7 +81,10 @@ class Innovations:
         chosen = tuple(masks[:used])
         covariance = self._covariance(chosen)[np.ix_(index, index)] if len(index) else np.zeros((0, 0))
         lower = np.linalg.cholesky(covariance)
-        return Pairs(chosen, index, np.linalg.inv(lower), 2.0 * float(np.log(np.diag(lower)).sum()))
+        gates = [schema.gate(m) for m in chosen]
+        through, tails = (np.stack(column) for column in zip(*gates, strict=True)) if gates else [np.zeros((0, 0))] * 2
+        volume = 2.0 * float(np.log(np.diag(lower)).sum())
+        return Pairs(chosen, index, np.linalg.inv(lower), volume, through, tails)
 
     def _blind(self, mask: Mask) -> np.ndarray:
         inside = [name in mask for name in self._schema.x_out]
@@ -104,7 +112,7 @@ class Innovations:
         if known is None:
             schema = self._schema
             inputs = schema.network_input(self._anchors, mask, self._biases)
-            found = trace(schema.weights.whole, inputs)[-1].astype(float)
+            found = run(schema.weights.whole, inputs).astype(float)
             known = self._anchor_errors[mask] = self._anchors[:, schema.out_index] - found
         return known
 
@@ -122,21 +130,9 @@ class Innovations:
         Returns:
             Errors, shape (rows, n), and derivatives, shape (rows, n, bias_size), in float64.
         """
-        count, size = biases.shape
-        inputs = np.stack([schema.network_input(rows, m, biases) for m in pairs.masks], axis=1)
-        inputs = inputs.reshape(count * len(pairs.masks), -1)
-        values = trace(schema.weights.whole, inputs)
-        tangent = np.zeros_like(inputs)
-        moved: list[np.ndarray] = []
-        for j in range(size):
-            tangent[:] = 0.0
-            tangent[:, inputs.shape[1] - size + j] = 1.0
-            moved.append(push(schema.weights.whole, values, tangent).reshape(count, -1)[:, pairs.index])
-        predicted = values[-1].reshape(count, -1)[:, pairs.index]
-        measured = np.tile(rows[:, schema.out_index], (1, len(pairs.masks)))[:, pairs.index]
-        errors = (measured.astype(float) - predicted) @ pairs.whiten.T
-        slopes = np.stack(moved, axis=-1).astype(float)
-        return errors, np.einsum("ij,rjk->rik", pairs.whiten, slopes)
+        p = np.ascontiguousarray(biases, np.float32)
+        x = np.ascontiguousarray(rows, float)
+        return innovations(schema.eye, x, p, pairs.through, pairs.tails, pairs.index, pairs.whiten)
 
 
 def own_bias(schema: "BodySchema", count: int) -> np.ndarray:

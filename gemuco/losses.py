@@ -265,19 +265,34 @@ class Difference:
         part = x[:, self.span]
         return ((part if self.matrix is None else part @ self.matrix.T) - self.wanted) * self.asked
 
-    def norm(self, weight: float) -> Bound:
+    def norm(self, weight: float) -> "Norm":
         """The loss weight * ||M x - w||."""
+        return Norm(self, weight)
 
-        def bound(x: np.ndarray, slope: bool = True) -> tuple[np.ndarray, np.ndarray]:
-            difference = self.at(x)
-            norm = np.sqrt(np.einsum("ij,ij->i", difference, difference))
-            gradient = np.zeros_like(x)
-            if slope:
-                way = difference * (weight / np.maximum(norm, TINY))[:, None]
-                gradient[:, self.span] = way if self.matrix is None else way @ self.matrix
-            return weight * norm, gradient
+    def rows(self, size: int) -> tuple[np.ndarray, np.ndarray]:
+        """What is asked as rows over the whole layout, shape (asked, size), and what they shall be, shape (asked,)."""
+        found = np.zeros((len(self.wanted), size))
+        found[:, self.span] = np.eye(len(self.wanted)) if self.matrix is None else self.matrix
+        return found[self.asked], self.wanted[self.asked]
 
-        return bound
+
+@dataclass(frozen=True, slots=True)
+class Norm:
+    """weight * ||M x - w|| of a prediction; a `Bound` that compiled searches know (`gemuco.fold`)."""
+
+    difference: Difference
+    weight: float
+
+    def __call__(self, x: np.ndarray, slope: bool = True) -> tuple[np.ndarray, np.ndarray]:
+        """See `Bound`."""
+        difference = self.difference.at(x)
+        norm = np.sqrt(np.einsum("ij,ij->i", difference, difference))
+        gradient = np.zeros_like(x)
+        if slope:
+            way = difference * (self.weight / np.maximum(norm, TINY))[:, None]
+            matrix = self.difference.matrix
+            gradient[:, self.difference.span] = way if matrix is None else way @ matrix
+        return self.weight * norm, gradient
 
 
 def total(bounds: Sequence[Bound], x: np.ndarray, slope: bool = True) -> tuple[np.ndarray, np.ndarray]:

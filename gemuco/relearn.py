@@ -5,8 +5,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gemuco.bias import Prior
+from gemuco.compiled.chain import pack, unpack
+from gemuco.compiled.learning import gradients
 from gemuco.innovation import own_bias
-from gemuco.kernels import pull, pull_weights, run, trace
+from gemuco.kernels import run
 from gemuco.optimiser import Optimiser
 from gemuco.window import Window
 
@@ -51,10 +53,10 @@ class Relearner:
     def restart(self, schema: "BodySchema") -> None:
         """Forget momentum and judgements, and go on from the W and p of a schema."""
         config = self._config
-        self._arrays = [array.copy() for array in schema.weights.arrays()]
+        self._chain = pack(schema.weights.whole)
         self._bias = schema.bias.copy()
-        self._optimiser = Optimiser(config.optimiser, config.rate, self._arrays)
-        self._bias_optimiser = Optimiser(config.optimiser, config.bias_rate, [self._bias])
+        self._optimiser = Optimiser(config.optimiser, config.rate, len(self._chain.flat))
+        self._bias_optimiser = Optimiser(config.optimiser, config.bias_rate, len(self._bias))
         self._best = schema.weights
         self._anchors, self._anchor_biases = _others(schema)
         self._calls = 0
@@ -77,30 +79,24 @@ class Relearner:
         for index in range(self._config.steps):
             loss = self._descend(schema, weights, bias)
             first = loss if index == 0 else first
-        if not all(np.isfinite(array).all() for array in (*self._arrays, self._bias)):
+        if not (np.isfinite(self._chain.flat).all() and np.isfinite(self._bias).all()):
             self.restart(schema)
             return schema, float("inf")
         if bias:
             schema = schema.with_bias(self._bias)
         if weights:
-            schema = self._judge(schema.with_weights(schema.weights.replaced([a.copy() for a in self._arrays])))
+            schema = self._judge(schema.with_weights(schema.weights.replaced(unpack(self._chain))))
         return schema, first
 
     def _descend(self, schema: "BodySchema", weights: bool, bias: bool) -> float:
         """One gradient step in place; returns the loss before it."""
         inputs, wanted, present = self._batch(schema)
-        chain = schema.weights.replaced(self._arrays).whole
-        values = trace(chain, inputs)
-        there = np.isfinite(wanted)
-        difference = np.where(there, values[-1] - wanted, 0.0).astype(np.float32)
-        count = max(1, int(there.sum()))
-        gradient = difference * np.float32(2.0 / count)
+        loss, by_weights, by_input = gradients(self._chain, inputs, wanted, weights)
         if weights:
-            self._optimiser.move(self._arrays, pull_weights(chain, values, gradient))
+            self._optimiser.move(self._chain.flat, by_weights)
         if bias:
-            by_input = pull(chain, values, gradient)[present, -len(self._bias) :]
-            self._bias_optimiser.move([self._bias], [by_input.sum(axis=0)])
-        return float(np.sum(difference**2)) / count
+            self._bias_optimiser.move(self._bias, by_input[present, -len(self._bias) :].sum(axis=0))
+        return float(loss)
 
     def _batch(self, schema: "BodySchema") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Each drawn sample once per mask it allows.
@@ -126,7 +122,7 @@ class Relearner:
             inputs = schema.network_input(rows[allowed], m, biases[allowed])
             parts.append((inputs, rows[allowed][:, schema.out_index], present[allowed]))
         inputs, wanted, present = (np.concatenate(column) for column in zip(*parts, strict=True))
-        return inputs, wanted, present
+        return inputs, wanted.astype(np.float32), present
 
     def _judge(self, schema: "BodySchema") -> "BodySchema":
         """The schema, or the best W so far where the new one does worse on held-out samples."""
@@ -142,8 +138,8 @@ class Relearner:
             self._optimiser.rate = min(self._config.rate, RECOVERY * self._optimiser.rate)
         elif self.held_out > WORSE * before:
             rate = 0.5 * self._optimiser.rate
-            self._arrays = [array.copy() for array in self._best.arrays()]
-            self._optimiser = Optimiser(self._config.optimiser, rate, self._arrays)
+            self._chain = pack(self._best.whole)
+            self._optimiser = Optimiser(self._config.optimiser, rate, len(self._chain.flat))
             self.held_out = before
             self.rolled_back += 1
             return best

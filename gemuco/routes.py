@@ -3,24 +3,20 @@ infers the rest (f). Estimation, control and simulation differ in what they ask;
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from gemuco.descent import Constraint, DescentConfig, Objective, descend
 from gemuco.errors import NotObservable, SchemaError, WrongSize
 from gemuco.estimate import STARTS
+from gemuco.fold import Lines, input_lines, latent_lines
 from gemuco.kernels import pull, run, trace
-from gemuco.losses import Bound, total
 from gemuco.masks import Mask, label
 from gemuco.scaler import CLIP
 
 if TYPE_CHECKING:
     from gemuco.schema import BodySchema
 
-SLIPPED = 0.05
-"""A held element this far [standard deviations] from where it shall be is not held."""
 ROUTES = ("auto", "mask", "latent", "input")
 Limits = Mapping[str, tuple[np.ndarray, np.ndarray]]
 """Signal -> lowest and highest value [its unit], shapes (n,)."""
@@ -56,6 +52,10 @@ class LatentRoute:
             return pull(self._decoder, values, np.ascontiguousarray(gradient[:, self._schema.out_index]))
 
         return x, back
+
+    def lines(self) -> Lines:
+        """For compiled searches."""
+        return latent_lines(self._schema)
 
     def final(self, point: np.ndarray) -> np.ndarray:
         """What was found, shape (size,) [standard deviations]; NaN for what is not in x_out."""
@@ -132,6 +132,12 @@ class InputRoute:
 
         return x, back
 
+    def lines(self) -> Lines:
+        """For compiled searches."""
+        return input_lines(
+            self._schema, self._base, self._columns, self.free, self._inferred, self._known, self.low, self.high
+        )
+
     def final(self, point: np.ndarray) -> np.ndarray:
         """What was found, shape (size,) [standard deviations]; NaN for what is neither input nor output."""
         schema = self._schema
@@ -152,112 +158,6 @@ class InputRoute:
         if len(self._schema.anchors) and not (found and only_there):
             found.append(self._schema.anchors[:STARTS, self.free])
         return np.concatenate(found or [np.zeros((1, len(self.free)))]).astype(np.float32)
-
-
-@dataclass(frozen=True, slots=True)
-class Found:
-    """Where a search along a route ended.
-
-    Attributes:
-        x: What is predicted there, shape (size,) [standard deviations]; NaN for what the route says nothing about.
-        loss: Sum of the terms.
-    """
-
-    x: np.ndarray
-    loss: float
-
-
-class Search:
-    """Searches along one route after the other, each beginning where the last one ended if the route is the same."""
-
-    def __init__(self, config: DescentConfig, limits: Limits | None) -> None:
-        self.config, self.limits = config, limits
-        self._warm: np.ndarray | None = None
-        self._way: tuple[str, Mask, int] | None = None
-
-    def restart(self) -> None:
-        """Forget where the last one ended."""
-        self._warm = None
-
-    def find(
-        self,
-        schema: "BodySchema",
-        route: str,
-        mask: Mask,
-        bounds: Sequence[Bound],
-        given: np.ndarray,
-        held: np.ndarray,
-        needed: Sequence[str],
-        begin: np.ndarray,
-        only_there: bool = False,
-    ) -> Found:
-        """Minimise terms along a route.
-
-        Args:
-            schema: The body schema.
-            route: `latent`; or `mask` or `input`, which differ only in how much of the mask is left free.
-            mask: The inputs of the network.
-            bounds: The terms.
-            given: What inputs are given and not searched for [standard deviations], shape (size,); NaN where free.
-            held: What predictions must equal, shape (size,) [standard deviations]; NaN where free.
-            needed: Signals that the terms are about.
-            begin: Where to begin [standard deviations], shape (size,); NaN where nothing is known.
-            only_there: Begin nowhere else if that is known; else training data are tried too.
-
-        Raises:
-            NotObservable: What is held cannot be, or a term is about a signal that is neither given nor inferred.
-        """
-        way: LatentRoute | InputRoute
-        if route == "latent":
-            way, size, low, high = LatentRoute(schema), -1, None, None
-        else:
-            way = InputRoute(schema, mask, given, needed, self.limits)
-            size, low, high = len(way.free), way.low, way.high
-            held = held.copy()
-            held[schema.layout.indices(mask)] = np.nan
-        starts = self._warm[None] if self._warm is not None and self._way == (route, mask, size) else None
-        if starts is None:
-            starts = way.starts(begin, only_there)
-        if size:
-            point = descend(_objective(way, bounds), starts, self.config, low, high, _constraint(way, held)).point
-        else:
-            point = starts[0]
-        x = way.final(point)
-        for element in np.flatnonzero(np.abs(x - held) > SLIPPED):
-            reached, asked = schema.scaler.restore(x)[element], schema.scaler.restore(held)[element]
-            raise NotObservable(
-                f"'{schema.layout.element(int(element))}' cannot be held at {asked:.4g}: the nearest found is "
-                f"{reached:.4g}. Is it within what the body can do, and within the limits?"
-            )
-        self._warm, self._way = point, (route, mask, size)
-        return Found(x, float(total(bounds, np.nan_to_num(x)[None])[0][0]))
-
-
-def _objective(route: Route, bounds: Sequence[Bound]) -> Objective:
-    def objective(points: np.ndarray, slope: bool) -> tuple[np.ndarray, np.ndarray]:
-        x, back = route.predict(points)
-        loss, gradient = total(bounds, x, slope)
-        return loss, back(gradient) if slope else gradient
-
-    return objective
-
-
-def _constraint(route: Route, held: np.ndarray) -> Constraint | None:
-    index = np.flatnonzero(np.isfinite(held))
-    if not len(index):
-        return None
-    wanted = held[index]
-
-    def constraint(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        x, back = route.predict(points)
-        rows = []
-        for element in index:
-            one = np.zeros_like(x)
-            one[:, element] = 1.0
-            rows.append(back(one))
-        return x[:, index] - wanted.astype(x.dtype), np.stack(rows, axis=1)
-
-    return constraint
 
 
 def bounds_of(schema: "BodySchema", limits: Limits | None) -> tuple[np.ndarray, np.ndarray]:

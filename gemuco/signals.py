@@ -35,12 +35,20 @@ class Signal:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Several signals in a fixed order: where each lies in the vector of all of them."""
+    """Several signals in a fixed order: where each lies in the vector of all of them.
+
+    Attributes:
+        signals: In their order.
+        names: Of the signals.
+        size: Elements of all signals together.
+        slices: Signal -> where it lies in the vector.
+    """
 
     signals: tuple[Signal, ...]
     names: tuple[str, ...] = field(init=False, compare=False, repr=False)
     size: int = field(init=False, compare=False, repr=False)
-    _slices: dict[str, slice] = field(init=False, compare=False, repr=False)
+    slices: dict[str, slice] = field(init=False, compare=False, repr=False)
+    _starts: np.ndarray = field(init=False, compare=False, repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "signals", tuple(self.signals))
@@ -53,7 +61,8 @@ class Layout:
             start += signal.size
         object.__setattr__(self, "names", tuple(slices))
         object.__setattr__(self, "size", start)
-        object.__setattr__(self, "_slices", slices)
+        object.__setattr__(self, "slices", slices)
+        object.__setattr__(self, "_starts", np.array([span.start for span in slices.values()], int))
 
     def slice(self, name: str) -> slice:
         """Where a signal lies in the vector.
@@ -62,7 +71,7 @@ class Layout:
             UnknownSignal: No signal has this name.
         """
         try:
-            return self._slices[name]
+            return self.slices[name]
         except KeyError:
             known = ", ".join(self.names)
             raise UnknownSignal(f"Signal '{name}' is not in the schema. Known signals: {known}.") from None
@@ -82,13 +91,13 @@ class Layout:
     def indices(self, names: Iterable[str]) -> np.ndarray:
         """Positions of the elements of some signals in the vector, in the order of the layout, shape (n,)."""
         subset = self.subset(names)
-        parts = [np.arange(self._slices[name].start, self._slices[name].stop) for name in subset.names]
+        parts = [np.arange(self.slices[name].start, self.slices[name].stop) for name in subset.names]
         return np.concatenate(parts) if parts else np.zeros(0, int)
 
     def element(self, index: int) -> str:
         """`signal.element` at a position of the vector."""
         for signal in self.signals:
-            span = self._slices[signal.name]
+            span = self.slices[signal.name]
             if span.start <= index < span.stop:
                 return f"{signal.name}.{signal.elements[index - span.start]}"
         raise UnknownSignal(f"Element {index} is outside of the layout of {self.size} elements.")
@@ -125,7 +134,7 @@ class Layout:
             arrays[name] = array
         joined = np.full((*(leading or ()), self.size), np.nan)
         for name, array in arrays.items():
-            joined[..., self._slices[name]] = array
+            joined[..., self.slices[name]] = array
         return joined
 
     def join_one(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -146,8 +155,11 @@ class Layout:
         """One vector, shape (..., size) -> signal -> array, shape (..., n). The arrays are views."""
         if vector.shape[-1] != self.size:
             raise WrongSize(f"The layout has {self.size} elements, but the array has shape {vector.shape}.")
-        return {name: vector[..., span] for name, span in self._slices.items()}
+        return {name: vector[..., span] for name, span in self.slices.items()}
 
     def whole(self, finite: np.ndarray) -> frozenset[str]:
         """Signals of which every element is there; `finite` is a truth value per element, shape (size,)."""
-        return frozenset(name for name, span in self._slices.items() if finite[span].all())
+        if not self.signals:
+            return frozenset()
+        there = np.logical_and.reduceat(finite, self._starts).tolist()
+        return frozenset(name for name, is_there in zip(self.slices, there, strict=True) if is_there)

@@ -6,14 +6,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from gemuco.control import merged, signals_of
-from gemuco.descent import DescentConfig
+from gemuco.descent import DescentConfig, NewtonConfig
 from gemuco.errors import NotFinite, NotObservable, SchemaError
 from gemuco.losses import Hold, Match, Term
 from gemuco.masks import Mask, best, label
-from gemuco.routes import Limits, Search, bounds_of, checked_mask, checked_route
+from gemuco.routes import Limits, bounds_of, checked_mask, checked_route
 from gemuco.schema import BodySchema
+from gemuco.search import Search
 
-SEARCH = DescentConfig(gamma_max=0.5, candidates=12, iterations=30)
+SEARCH = NewtonConfig()
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +53,7 @@ class Simulator:
         terms: Sequence[Term | Hold],
         command: str,
         route: str = "auto",
-        search: DescentConfig | None = None,
+        search: DescentConfig | NewtonConfig | None = None,
         mask: Mask | None = None,
         limits: Limits | None = None,
     ) -> None:

@@ -55,64 +55,75 @@ class TorqueBalance:
     def bind(self, schema: "BodySchema", target: Values, now: Values) -> Bound:
         """See `Term.bind`."""
         muscles = MuscleModel(schema, self)
+        theta, f = schema.layout.slice(self.position), schema.layout.slice(self.tension)
+        mean, std = schema.scaler.mean[theta], schema.scaler.std[theta]
         if self.at == "predicted":
-            return self._free(schema, muscles)
+            return Balanced(muscles, theta, f, mean, std, self.torque, self.weight, None)
         if self.position not in target or not np.isfinite(target[self.position]).all():
             raise NotFinite(f"Torque balance needs a whole reference of '{self.position}'; some of it is missing.")
         schema.layout.join({self.position: target[self.position]})
         posture = np.asarray(target[self.position], float)
-        return self._fixed(schema, muscles, posture)
+        return Balanced(muscles, theta, f, mean, std, self.torque, self.weight, posture)
 
-    def _fixed(self, schema: "BodySchema", muscles: "MuscleModel", posture: np.ndarray) -> Bound:
-        theta, f = schema.layout.slice(self.position), schema.layout.slice(self.tension)
-        normalised = (posture - schema.scaler.mean[theta]) / schema.scaler.std[theta]
-        torque = self._torque(posture)[None]
 
-        def bound(x: np.ndarray, slope: bool = True) -> tuple[np.ndarray, np.ndarray]:
-            postures = np.repeat(normalised[None], len(x), axis=0)
-            missing = muscles.missing(postures, x[:, f], torque)
-            gradient = np.zeros_like(x)
-            if slope:
-                gradient[:, f] = self.weight * missing.slopes()[1]
-            return self.weight * missing.norm, gradient
+@dataclass(frozen=True, slots=True)
+class Balanced:
+    """Torque balance bound to a schema; a `Bound` that compiled searches know (`gemuco.fold`).
 
-        return bound
+    Attributes:
+        muscles: The muscles as the network knows them.
+        theta: Where the posture lies in the layout.
+        f: Where the tension does.
+        mean: Of the posture [rad], shape (joints,).
+        std: Of the posture [rad], shape (joints,).
+        torque: Posture [rad] -> tau_ext [N m].
+        weight: Loss per N m.
+        posture: The given posture [rad], shape (joints,); None where it is the predicted one.
+    """
 
-    def _free(self, schema: "BodySchema", muscles: "MuscleModel") -> Bound:
-        theta, f = schema.layout.slice(self.position), schema.layout.slice(self.tension)
-        mean, std = schema.scaler.mean[theta], schema.scaler.std[theta]
+    muscles: "MuscleModel"
+    theta: slice
+    f: slice
+    mean: np.ndarray
+    std: np.ndarray
+    torque: Callable[[np.ndarray], np.ndarray]
+    weight: float
+    posture: np.ndarray | None
 
-        def bound(x: np.ndarray, slope: bool = True) -> tuple[np.ndarray, np.ndarray]:
-            postures = x[:, theta] * std + mean
-            torques = np.stack([self._torque(posture) for posture in postures])
-            missing = muscles.missing(x[:, theta], x[:, f], torques)
-            gradient = np.zeros_like(x)
-            if slope:
-                by_posture, by_tension = missing.slopes()
-                gradient[:, f] = self.weight * by_tension
-                gradient[:, theta] = self.weight * (by_posture + self._slope(postures, torques, missing.way) * std)
-            return self.weight * missing.norm, gradient
+    def __call__(self, x: np.ndarray, slope: bool = True) -> tuple[np.ndarray, np.ndarray]:
+        """See `Bound`."""
+        postures = x[:, self.theta] * self.std + self.mean
+        if self.posture is not None:
+            postures = np.repeat(self.posture[None], len(x), axis=0)
+        torques = self.torques(postures if self.posture is None else postures[:1])
+        missing = self.muscles.missing((postures - self.mean) / self.std, x[:, self.f], torques)
+        gradient = np.zeros_like(x)
+        if slope:
+            by_posture, by_tension = missing.slopes()
+            gradient[:, self.f] = self.weight * by_tension
+            if self.posture is None:
+                turned = np.einsum("ij,ijk->ik", missing.way, self.stiffness(postures, torques))
+                gradient[:, self.theta] = self.weight * (by_posture + turned * self.std)
+        return self.weight * missing.norm, gradient
 
-        return bound
+    def torques(self, postures: np.ndarray) -> np.ndarray:
+        """tau_ext at postures [N m], shape (n, joints)."""
+        return np.stack([np.asarray(self.torque(posture), float) for posture in postures])
 
-    def _torque(self, posture: np.ndarray) -> np.ndarray:
-        return np.asarray(self.torque(posture), float)
-
-    def _slope(self, postures: np.ndarray, torques: np.ndarray, way: np.ndarray) -> np.ndarray:
-        """Gradient of way . torque(posture) [N m/rad], shape (candidates, joints), by differences."""
-        slope = np.empty_like(postures)
+    def stiffness(self, postures: np.ndarray, torques: np.ndarray) -> np.ndarray:
+        """How tau_ext changes with the posture [N m/rad], shape (n, joints, joints), by differences."""
+        found = np.empty((*torques.shape, postures.shape[1]))
         for joint in range(postures.shape[1]):
             moved = postures.copy()
             moved[:, joint] += STEP
-            change = np.stack([self._torque(posture) for posture in moved]) - torques
-            slope[:, joint] = np.einsum("ij,ij->i", way, change) / STEP
-        return slope
+            found[:, :, joint] = (self.torques(moved) - torques) / STEP
+        return found
 
 
 class MuscleModel:
     """The muscles as the network knows them under the mask (position, tension)."""
 
-    __slots__ = ("_base", "_chain", "_f_mean", "f", "f_std", "l_std", "theta", "theta_std")
+    __slots__ = ("base", "chain", "f", "f_mean", "f_std", "l_std", "theta", "theta_std")
 
     def __init__(self, schema: "BodySchema", names: TorqueBalance) -> None:
         """Prepare the network.
@@ -129,15 +140,15 @@ class MuscleModel:
                 f"it from '{names.position}' and '{names.tension}'; see the masks that structure determination found."
             )
         dtype = schema.weights.encoder[0].matrix.dtype
-        self._base = schema.network_input(np.zeros(layout.size), mask).astype(dtype)
+        self.base = schema.network_input(np.zeros(layout.size), mask).astype(dtype)
         self.theta = _columns(schema.in_index, theta)
         self.f = _columns(schema.in_index, f)
         last = schema.weights.decoder[-1]
         columns = _columns(schema.out_index, length)
         last = Layer(np.ascontiguousarray(last.matrix[:, columns]), last.offset[columns], last.activation)
-        self._chain = (*schema.weights.whole[:-1], last)
+        self.chain = (*schema.weights.whole[:-1], last)
         self.theta_std, self.f_std, self.l_std = (scaler.std[s].astype(dtype) for s in (theta, f, length))
-        self._f_mean = scaler.mean[f].astype(dtype)
+        self.f_mean = scaler.mean[f].astype(dtype)
 
     def missing(self, posture: np.ndarray, tension: np.ndarray, torque: np.ndarray) -> "Missing":
         """What the muscles lack, torque + G^T f.
@@ -148,7 +159,7 @@ class MuscleModel:
             torque: tau_ext [N m], shape (candidates or 1, joints).
         """
         muscles = self._at(posture, tension)
-        rest = torque.astype(self._base.dtype) + muscles.gradient[:, self.theta] / self.theta_std
+        rest = torque.astype(self.base.dtype) + muscles.gradient[:, self.theta] / self.theta_std
         norm = np.sqrt(np.einsum("ij,ij->i", rest, rest))
         return Missing(norm, rest / np.maximum(norm, TINY)[:, None], self, muscles)
 
@@ -157,11 +168,11 @@ class MuscleModel:
         return self._at(posture, tension).gradient[:, self.theta] / self.theta_std
 
     def _at(self, posture: np.ndarray, tension: np.ndarray) -> Curvature:
-        inputs = np.repeat(self._base[None], len(tension), axis=0)
+        inputs = np.repeat(self.base[None], len(tension), axis=0)
         inputs[:, self.theta] = posture
         inputs[:, self.f] = tension
-        w = (inputs[:, self.f] * self.f_std + self._f_mean) * self.l_std
-        return Curvature(self._chain, inputs, w)
+        w = (inputs[:, self.f] * self.f_std + self.f_mean) * self.l_std
+        return Curvature(self.chain, inputs, w)
 
 
 @dataclass(frozen=True, slots=True)

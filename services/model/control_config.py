@@ -5,7 +5,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from gemuco.control import Controller
-from gemuco.descent import DescentConfig
+from gemuco.descent import DescentConfig, NewtonConfig
 from gemuco.losses import Hold, Match, StayNear, StaySmall, Term
 from gemuco.schema import BodySchema
 from gemuco.simulate import Simulator
@@ -114,7 +114,10 @@ def terms_of(config: ControlConfig | SimulationConfig) -> tuple[Term | Hold, ...
 
 
 def controller_of(
-    schema: BodySchema, robot: RobotConfig, config: ControlConfig, search: DescentConfig | None = None
+    schema: BodySchema,
+    robot: RobotConfig,
+    config: ControlConfig,
+    search: DescentConfig | NewtonConfig | None = None,
 ) -> Controller:
     """The robot file's controller, which stays inside the limits of the commanded signal.
 

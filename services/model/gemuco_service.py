@@ -1,5 +1,6 @@
 """The body schema as a service: estimation, control, anomaly and update, four loops on the newest sample."""
 
+import logging
 import threading
 import time
 from collections.abc import Iterable, Mapping
@@ -10,9 +11,10 @@ from typing import Any
 import numpy as np
 
 from gemuco import adapt
-from gemuco.descent import DescentConfig
+from gemuco.descent import NewtonConfig
 from gemuco.errors import SchemaError
 from gemuco.schema import BodySchema
+from gemuco.warm import warm
 from hal.clock import SystemClock
 from hal.config import RobotConfig
 from services.model.anomaly_loop import AnomalyWatch
@@ -34,11 +36,16 @@ from services.wire.history import HistoryRing
 from services.wire.messages import Anomaly, Applied, Command, Estimates, Holder, Sample, Status, Update
 from services.wire.streams import Newest
 
-SEARCH = DescentConfig(gamma_max=0.1, candidates=10, iterations=8)
-"""Losses that are norms have gradients that do not fade; with larger steps the torque balance gets stuck. Each tick
-goes on where the last one ended, so few suffice."""
+log = logging.getLogger(__name__)
+
+SEARCH = NewtonConfig(iterations=12)
+"""Each tick goes on where the last one ended, so few steps suffice."""
+SHARE = 0.5
+"""Part of its period that a solve may take; then the best command found so far is sent, and counted as late."""
 SETTLED = 50
 """After so many solves for the same reference with the same model, the command stays as it is."""
+PATIENCE = 3.0
+"""Compiling is told about this often [s]; loading what was compiled before takes less."""
 NETWORK_PRIORITY = 45
 PRIORITIES = {"estimation": 40, "control": 35, "anomaly": 30, "update": 10}
 """SCHED_FIFO where the system allows it; the update is lowest but not without, or it would hold the interpreter up."""
@@ -63,6 +70,9 @@ class ModelSolver:
         self._solved = 0
         self._command = np.zeros(0)
         self._target = config.target
+        self._within = SHARE / robot.rates.control
+        self.late = 0
+        """Solves that ran out of time."""
 
     def __call__(self, target: Mapping[str, np.ndarray], now: Mapping[str, np.ndarray]) -> np.ndarray:
         """The command [its unit], shape (n,), that brings about a target."""
@@ -71,8 +81,10 @@ class ModelSolver:
             self._controller.swap(schema)
             self._reference, self._solved = reference, 0
         if self._solved < SETTLED:
-            self._command = self._controller.solve(target, now).command
+            solution = self._controller.solve(target, now, self._within)
+            self._command = solution.command
             self._solved += 1
+            self.late += solution.is_late
         return self._command
 
 
@@ -115,7 +127,9 @@ class GemucoService:
             lambda: self.control is not None and self.control.engaged,
             service.publisher(keys.update(robot.robot), Update).put,
             self.clock,
+            self._others_keep_time,
         )
+        self._solver: ModelSolver | None = None
         self.control, self.no_control = self._make_control(self.config)
         rates = robot.rates
         ticks = {
@@ -165,7 +179,9 @@ class GemucoService:
                 "model_version": self.living.version,
                 "camera": bool(self.robot.seen),
                 "adapting": self.update.is_active,
+                "update_waited": self.update.waited,
                 "control": self.no_control if self.control is None else self.control.facts(),
+                "late_solves": 0 if self._solver is None else self._solver.late,
                 "scheduling": {loop.name: loop.scheduling for loop in self.loops},
                 "rejected": self._targets.rejected + sum(reader.rejected for reader in self._readers()),
                 "signals": self.estimation.counts(),
@@ -202,6 +218,10 @@ class GemucoService:
     def _schema(self) -> BodySchema:
         return self.living.schema
 
+    def _others_keep_time(self) -> bool:
+        """Whether learning takes nothing from the other loops: the update is the first to give way."""
+        return not any(loop.is_slow for loop in self.loops if loop.name != "update")
+
     def _learner(self, schema: BodySchema) -> adapt.Updater:
         config = self.config.update
         return adapt.Updater(schema, adapt.UpdateConfig(**config.model_dump(exclude={"interval"})))
@@ -211,7 +231,7 @@ class GemucoService:
         if config.control is None:
             return None, f"The robot file of '{self.robot.robot}' has no model.control section."
         try:
-            solver = ModelSolver(self.living, self.robot, config.control)
+            solver = self._solver = ModelSolver(self.living, self.robot, config.control)
         except SchemaError as error:
             return None, f"This model cannot control: {error}"
         commands = self.service.publisher(keys.command(self.robot.robot), Command)
@@ -240,6 +260,19 @@ class GemucoService:
         control.tick()
 
 
+def make_ready() -> None:
+    """Have all compiled code before the first tick; says so where that means to wait for the compiler."""
+    said = time.monotonic()
+
+    def tell(done: float, what: str) -> None:
+        nonlocal said
+        if time.monotonic() - said > PATIENCE:
+            said = time.monotonic()
+            log.warning("Compiling for this machine, once: %d %% done, now %s", round(100 * done), what)
+
+    warm(tell)
+
+
 def serve(robot: RobotConfig, folder: Path, connect: Iterable[str] = (), stop: threading.Event | None = None) -> None:
     """Run the model service of a robot until SIGTERM, SIGINT or `stop`.
 
@@ -255,6 +288,7 @@ def serve(robot: RobotConfig, folder: Path, connect: Iterable[str] = (), stop: t
     """
     prepare_process()
     schema = load_model(robot, folder)
+    make_ready()
     made: list[GemucoService] = []
     service = Service(robot.robot, "model", connect, lambda: made[0].verbs.describe() if made else {})
     with until_told(stop) as told, service:

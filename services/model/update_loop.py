@@ -4,6 +4,7 @@ import math
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -52,11 +53,16 @@ class OnlineUpdate:
         is_engaged: Callable[[], bool],
         publish: Callable[[Update], None],
         clock: Clock,
+        may_learn: Callable[[], bool] = lambda: True,
     ) -> None:
         """`learner` makes an updater that starts from a schema, with an empty window.
 
-        `is_engaged` tells whether the robot is being moved; a robot at rest is of interest only then.
+        `is_engaged` tells whether the robot is being moved; a robot at rest is of interest only then. While `may_learn`
+        says no, samples are taken and nothing is learned from them.
         """
+        self._may_learn = may_learn
+        self.waited = 0
+        """Ticks in which it might not learn."""
         self._freshness, self._living, self._config = freshness, living, config
         self._is_engaged = is_engaged
         self._make_learner, self._publish, self._clock = learner, publish, clock
@@ -117,7 +123,12 @@ class OnlineUpdate:
             sample, moved = self._newest()
             if sample is not None and _is_whole(sample) and (moved or self._is_engaged()):
                 self._since_change.append(sample)
-            if self._learner is None:
+            if self._learner is not None and not self._may_learn():
+                self.waited += 1
+                if moved and sample is not None:
+                    self._learner.add(sample)
+                told = replace(self._told, stamp_ns=self._clock.now_ns(), active=True)
+            elif self._learner is None:
                 told = Update(
                     stamp_ns=self._clock.now_ns(),
                     active=False,

@@ -90,6 +90,11 @@ class Loop:
         return self.error or self._slow
 
     @property
+    def is_slow(self) -> bool:
+        """Whether it did not keep its rate when `statistics` was last asked for."""
+        return bool(self._slow)
+
+    @property
     def done(self) -> int:
         """Ticks that ended without raising; where this stands still, the loop is stuck."""
         return self._ticks - self.failed

@@ -163,3 +163,19 @@ def test_a_target_that_cannot_be_is_refused_in_a_sentence(signal: str, values: l
     bench.control.try_target(target)
     assert bench.control.facts()["target"] == before
     assert bench.control.counters["refused_targets"] == 1
+
+
+def test_a_solve_that_runs_out_of_time_sends_the_best_so_far_and_is_counted() -> None:
+    robot = arm()
+    config = model_config(robot).control
+    assert config is not None
+    solver = ModelSolver(LivingModel(small_model()), robot, config)
+    target = {config.target: np.full(robot.signals[config.target].size, 0.1)}
+    in_time = solver(target, {})
+    assert solver.late == 0
+    solver._within = -1.0
+    solver._controller.restart()
+    late = solver({config.target: target[config.target] + 0.01}, {})
+    assert solver.late == 1
+    assert late.shape == in_time.shape
+    assert np.isfinite(late).all()

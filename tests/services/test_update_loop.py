@@ -132,3 +132,22 @@ def test_the_interval_is_between_samples_that_are_learned_from() -> None:
     for index in range(80, 100):
         told = bench.turn(index)
     assert told.window == 5
+
+
+def test_learning_gives_way_and_goes_on() -> None:
+    """While another loop is slow samples are kept and W stays; afterwards they are learned from."""
+    bench, may = Bench(), [True]
+    bench.update._may_learn = lambda: may[0]
+    bench.turn(0)
+    bench.update.adapt(True)
+    for index in range(1, 15):
+        bench.turn(index)
+    may[0] = False
+    version, window = bench.living.version, bench.told[-1].window
+    for index in range(15, 20):
+        told = bench.turn(index)
+    assert (told.active, bench.living.version, bench.update.waited) == (True, version, 5)
+    may[0] = True
+    told = bench.turn(20)
+    assert told.window == window + 6
+    assert bench.living.version > version

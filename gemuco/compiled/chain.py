@@ -1,0 +1,210 @@
+"""A chain of layers as compiled code takes it, and its passes; `gemuco.kernels` has the same in numpy, and says more.
+
+Values of all layers lie one behind the other in one array, so that a pass allocates nothing per layer. Loops are
+written out and products go through two functions: the compiler takes seconds for every array expression.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from gemuco.compiled.bend import CODES, bend, bends, slopes
+from gemuco.compiled.jit import jit
+from gemuco.kernels import Chain
+
+
+class Packed(NamedTuple):
+    """A chain of layers.
+
+    Attributes:
+        flat: Matrix (n_in, n_out) and offset (n_out,) of every layer, one behind the other.
+        form: For every layer its width n_in, n_out, where its matrix begins in `flat`, the widths of all that lies
+            before its output, and its activation (`bend.CODES`), shape (layers, 5).
+    """
+
+    flat: np.ndarray
+    form: np.ndarray
+
+
+WIDE, NARROW, PLACE, BEFORE, CODE = range(5)
+
+
+def pack(chain: Chain) -> Packed:
+    """Lay a chain out for compiled code."""
+    form, place, before = np.zeros((len(chain), 5), np.int64), 0, 0
+    for index, layer in enumerate(chain):
+        wide, narrow = layer.matrix.shape
+        before += wide
+        form[index] = wide, narrow, place, before, CODES[layer.activation]
+        place += (wide + 1) * narrow
+    return Packed(np.concatenate([a.ravel() for layer in chain for a in (layer.matrix, layer.offset)]), form)
+
+
+def unpack(chain: Packed) -> list[np.ndarray]:
+    """A copy of every matrix and offset, in the order of the layers."""
+    flat, found = chain.flat.copy(), []
+    for wide, narrow, place, *_ in chain.form:
+        middle = place + wide * narrow
+        found += [flat[place:middle].reshape(wide, narrow), flat[middle : middle + narrow]]
+    return found
+
+
+@jit
+def times(a, b, out):
+    """Out = a b, shapes (m, k), (k, n) and (m, n)."""
+    np.dot(a, b, out)
+
+
+@jit
+def times_turned(a, b, out):
+    """Out = a b^T, shapes (m, k), (n, k) and (m, n)."""
+    np.dot(a, b.T, out)
+
+
+@jit
+def matrix(chain, layer):
+    """W of a layer, shape (n_in, n_out)."""
+    place, wide, narrow = chain.form[layer, PLACE], chain.form[layer, WIDE], chain.form[layer, NARROW]
+    return chain.flat[place : place + wide * narrow].reshape(wide, narrow)
+
+
+@jit
+def offset(chain, layer):
+    """B of a layer, shape (n_out,)."""
+    place = chain.form[layer, PLACE] + chain.form[layer, WIDE] * chain.form[layer, NARROW]
+    return chain.flat[place : place + chain.form[layer, NARROW]]
+
+
+@jit
+def space(chain, rows):
+    """Room for the values of all layers."""
+    last = len(chain.form) - 1
+    return np.empty(rows * (chain.form[last, BEFORE] + chain.form[last, NARROW]), chain.flat.dtype)
+
+
+@jit
+def first(chain, values, rows):
+    """The input, shape (rows, n_in)."""
+    return values[: rows * chain.form[0, WIDE]].reshape(rows, chain.form[0, WIDE])
+
+
+@jit
+def after(chain, values, rows, layer):
+    """The value after a layer, shape (rows, n_out)."""
+    begin, width = rows * chain.form[layer, BEFORE], chain.form[layer, NARROW]
+    return values[begin : begin + rows * width].reshape(rows, width)
+
+
+@jit
+def forward(chain, values, rows):
+    """Fill in the value after every layer, from the input that lies in front; returns the last, shape (rows, n_out)."""
+    value = first(chain, values, rows)
+    for layer in range(len(chain.form)):
+        result = after(chain, values, rows, layer)
+        times(value, matrix(chain, layer), result)
+        bend(result, offset(chain, layer), chain.form[layer, CODE])
+        value = result
+    return value
+
+
+@jit
+def run(chain, x):
+    """Forward pass, shapes (rows, n_in) -> (rows, n_out)."""
+    values = space(chain, len(x))
+    inputs = first(chain, values, len(x))
+    for row in range(x.shape[0]):
+        for i in range(x.shape[1]):
+            inputs[row, i] = x[row, i]
+    return forward(chain, values, len(x))
+
+
+@jit
+def pull(chain, values, rows, begin, gradient):
+    """Gradient with respect to the output -> with respect to the input, shapes (some, n).
+
+    Args:
+        chain: The layers.
+        values: After `forward`.
+        rows: How many rows they are of.
+        begin: Which of them the first gradient is of; the others follow.
+        gradient: It is changed.
+    """
+    some = len(gradient)
+    for layer in range(len(chain.form) - 1, -1, -1):
+        code = chain.form[layer, CODE]
+        if code:
+            slopes(after(chain, values, rows, layer)[begin : begin + some], gradient, code)
+        below = np.empty((some, chain.form[layer, WIDE]), gradient.dtype)
+        times_turned(gradient, matrix(chain, layer), below)
+        gradient = below
+    return gradient
+
+
+@jit
+def push(chain, values, rows, row, tangents):
+    """Changes of one row's input, shape (k, n_in) -> of its output to first order, shape (k, n_out)."""
+    for layer in range(len(chain.form)):
+        above = np.empty((len(tangents), chain.form[layer, NARROW]), tangents.dtype)
+        times(tangents, matrix(chain, layer), above)
+        if chain.form[layer, CODE]:
+            slopes(after(chain, values, rows, layer)[row : row + 1], above, chain.form[layer, CODE])
+        tangents = above
+    return tangents
+
+
+@jit
+def push_all(chain, values, rows, row):
+    """Derivatives of one row's output by every number of its input, shape (n_in, n_out)."""
+    begin = matrix(chain, 0).copy()
+    if chain.form[0, CODE]:
+        slopes(after(chain, values, rows, 0)[row : row + 1], begin, chain.form[0, CODE])
+    for layer in range(1, len(chain.form)):
+        above = np.empty((len(begin), chain.form[layer, NARROW]), begin.dtype)
+        times(begin, matrix(chain, layer), above)
+        if chain.form[layer, CODE]:
+            slopes(after(chain, values, rows, layer)[row : row + 1], above, chain.form[layer, CODE])
+        begin = above
+    return begin
+
+
+@jit
+def mixed(chain, values, weights, tangents):
+    """How g = (dy/dx)^T w of a single row changes with x, seen along directions u_k; see `kernels.Curvature`.
+
+    Args:
+        chain: The layers.
+        values: Of one row, after `forward`.
+        weights: w, shape (1, n_out).
+        tangents: u, shape (k, n_in).
+
+    Returns:
+        dy/dx u, shape (k, n_out), and d(u . g)/dx, shape (k, n_in).
+    """
+    layers, count = len(chain.form), len(tangents)
+    curves = space(chain, 1)  # a''(x) times the gradient that arrives there
+    gradient = weights
+    for layer in range(layers - 1, -1, -1):
+        value, code = after(chain, values, 1, layer), chain.form[layer, CODE]
+        bends(value, gradient, after(chain, curves, 1, layer), code)
+        below = np.empty((1, chain.form[layer, WIDE]), weights.dtype)
+        inner = gradient.copy()
+        slopes(value, inner, code)
+        times_turned(inner, matrix(chain, layer), below)
+        gradient = below
+    pushed = space(chain, count)
+    for layer in range(layers):
+        above = after(chain, pushed, count, layer)
+        times(tangents, matrix(chain, layer), above)
+        tangents = above.copy()
+        slopes(after(chain, values, 1, layer), tangents, chain.form[layer, CODE])
+    second = np.zeros((count, chain.form[layers - 1, NARROW]), weights.dtype)
+    for layer in range(layers - 1, -1, -1):
+        slopes(after(chain, values, 1, layer), second, chain.form[layer, CODE])
+        moved, curve = after(chain, pushed, count, layer), after(chain, curves, 1, layer)
+        for row in range(count):
+            for i in range(second.shape[1]):
+                second[row, i] += moved[row, i] * curve[0, i]
+        below = np.empty((count, chain.form[layer, WIDE]), weights.dtype)
+        times_turned(second, matrix(chain, layer), below)
+        second = below
+    return tangents, second

@@ -1,0 +1,68 @@
+"""How everything in this package is compiled: without the GIL, and kept on disk.
+
+numba looks only at the file of the function itself to find out whether what it kept is still right, not at the
+functions that it calls. So what is kept lies in a folder named after all sources of this package together.
+"""
+
+import hashlib
+import os
+import shutil
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numba
+
+F = TypeVar("F", bound=Callable[..., object])
+
+FREE = {"nsz", "arcp", "contract", "reassoc"}
+"""Rounding may differ from the order in the source; what is not a number stays so."""
+CONFIG: Any = numba.config
+HERE = Path(__file__).parent
+
+
+def _digest() -> str:
+    sources = sorted(HERE.glob("*.py"))
+    return hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()[:16]
+
+
+def _is_own(folder: Path) -> bool:
+    """Whether this user, and nobody else, can put code there: what lies there will be run."""
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+        status = folder.stat()
+    except OSError:
+        return False
+    return status.st_uid == os.getuid() and not status.st_mode & 0o022
+
+
+def find_folder() -> Path | None:
+    """Where compiled code is kept: `$NUMBA_CACHE_DIR`, or beside the sources, or in the home or temporary directory.
+
+    What lies beside sources that cannot be written, as in a read-only image, is copied to where it can be used. None
+    if nothing can be written anywhere: then it is compiled at every start.
+    """
+    name = f"gemuco-{_digest()}"
+    beside = HERE / "__pycache__" / name
+    own = [Path(CONFIG.CACHE_DIR) / name] if CONFIG.CACHE_DIR else []
+    homes = [Path.home() / ".cache" / "gemuco" / name, Path(tempfile.gettempdir()) / f"{name}-{os.getuid()}"]
+    folder = next((folder for folder in (*own, beside, *homes) if _is_own(folder)), None)
+    if folder is not None and folder != beside and beside.is_dir() and not any(folder.iterdir()):
+        shutil.copytree(beside, folder, dirs_exist_ok=True)
+    return folder
+
+
+FOLDER = find_folder()
+
+
+def jit(function: F) -> F:
+    """Compile a function at its first call with each kind of arguments."""
+    before = CONFIG.CACHE_DIR
+    CONFIG.CACHE_DIR = str(FOLDER or before)  # read when the function is decorated
+    try:
+        options: dict[str, Any] = {"nogil": True, "cache": FOLDER is not None, "fastmath": FREE, "error_model": "numpy"}
+        return numba.njit(**options)(function)
+    finally:
+        CONFIG.CACHE_DIR = before

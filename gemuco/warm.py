@@ -1,0 +1,108 @@
+"""Makes all compiled code ready, so that the first tick of a loop does not wait for a compiler.
+
+    python -m gemuco.warm
+
+The first time on a machine this takes a minute; what was compiled is kept (`gemuco.compiled.jit`), and later it is
+loaded within a second or two. It is done by using a small body in every way that a service does.
+"""
+
+import time
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+
+import numpy as np
+
+from gemuco.adapt import UpdateConfig
+from gemuco.compiled.jit import FOLDER
+from gemuco.control import Controller
+from gemuco.descent import DescentConfig
+from gemuco.kernels import Layer, Weights
+from gemuco.losses import Match
+from gemuco.scaler import Scaler
+from gemuco.schema import BodySchema
+from gemuco.signals import Layout, Signal
+from gemuco.torque import TorqueBalance
+
+SIGNALS = {"position": (1, "rad"), "tension": (2, "N"), "length": (2, "m"), "hidden": (1, "m")}
+MASKS = (frozenset({"position", "tension"}), frozenset({"tension", "length", "hidden"}))
+OUTPUTS = ("position", "tension", "length")
+STEPS = 7
+
+
+def body() -> BodySchema:
+    """A body that knows nothing, with every kind of signal."""
+    random = np.random.default_rng(0)
+    layout = Layout(tuple(Signal(name, size, unit) for name, (size, unit) in SIGNALS.items()))
+    sizes = (layout.size + len(SIGNALS) + 2, 4, 3, 4, layout.subset(OUTPUTS).size)
+    layers = tuple(
+        Layer(
+            random.normal(size=(wide, narrow)).astype(np.float32),
+            np.zeros(narrow, np.float32),
+            "tanh" if index % 2 == 0 else "linear",
+        )
+        for index, (wide, narrow) in enumerate(pairwise(sizes))
+    )
+    zeros, ones = np.zeros(layout.size), np.ones(layout.size)
+    return BodySchema(
+        layout=layout,
+        x_in=layout.names,
+        x_out=OUTPUTS,
+        masks=MASKS,
+        scaler=Scaler(zeros, ones, -ones, ones),
+        weights=Weights(layers[:2], layers[2:]),
+        anchors=random.normal(size=(4, layout.size)).astype(np.float32),
+        anchor_conditions=np.array([0, 0, 1, 1]),
+        bias=np.zeros(2, np.float32),
+        biases={"one": np.zeros(2, np.float32), "other": np.ones(2, np.float32)},
+    )
+
+
+def steps(schema: BodySchema) -> Iterator[str]:
+    """Use the body; before each step what it is for."""
+    whole = {name: np.zeros(size) for name, (size, _) in SIGNALS.items()}
+    yield "estimation by mask"
+    schema.estimate({name: whole[name] for name in ("position", "tension")})
+    yield "estimation by descent"
+    schema.estimate({"length": whole["length"]})
+    target = {"position": np.full(1, 0.1)}
+    terms = (Match("position"), TorqueBalance(np.sin, 1.0, "position", "tension", "length"))
+    yield "control"
+    Controller(schema, terms, "tension").solve(target, whole)
+    yield "the paper's descent"
+    Controller(schema, terms, "tension", search=DescentConfig(iterations=2)).solve(target, whole)
+    yield "recognition of p"
+    schema.adapt([whole] * 2, UpdateConfig(what="bias"))
+    for optimiser in ("adam", "sgd"):
+        yield f"update of W and p by {optimiser}"
+        config = UpdateConfig(what="both", optimiser=optimiser, minimum=1, batch=4, steps=1)
+        schema.adapt([whole] * 2, config)
+
+
+def warm(tell: Callable[[float, str], None] | None = None) -> float:
+    """Make everything ready.
+
+    Args:
+        tell: Told the share that is done, 0 to 1, and what comes next.
+
+    Returns:
+        How long it took [s].
+    """
+    begun, schema = time.monotonic(), body()
+    for index, what in enumerate(steps(schema)):
+        if tell is not None:
+            tell(index / STEPS, what)
+    return time.monotonic() - begun
+
+
+def main() -> None:
+    """Compile with a bar, once."""
+    from rich.progress import BarColumn, Progress, TextColumn
+
+    with Progress(TextColumn("compiling"), BarColumn(), TextColumn("{task.description}"), transient=True) as bar:
+        task = bar.add_task("", total=1.0)
+        took = warm(lambda done, what: bar.update(task, completed=done, description=what))
+    print(f"Compiled code is ready after {took:.1f} s, {f'kept in {FOLDER}' if FOLDER else 'kept nowhere'}.")
+
+
+if __name__ == "__main__":
+    main()
