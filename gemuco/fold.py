@@ -85,7 +85,7 @@ def fitting(lines: Lines, data: np.ndarray) -> Problem:
     """How far x is from data (paper, eq. state-loss), shape (size,) [standard deviations]; NaN where none is given."""
     given = np.flatnonzero(np.isfinite(data))
     rows = np.eye(len(data))[given]
-    none = no_balance(lines.chain[0].matrix.dtype)
+    none = no_balance()
     return _problem(lines, rows, data[given], np.array([0, len(given)]), np.ones(1), none, 0)
 
 
@@ -105,7 +105,7 @@ def fold(lines: Lines, bounds: Sequence[Bound], held: np.ndarray) -> Problem | N
     parts = [norm.difference.rows(size) for norm in norms]
     ends = np.cumsum([0, *(len(wanted) for _, wanted in parts)])
     weights = np.array([norm.weight for norm in norms], float)
-    balance = no_balance(lines.chain[0].matrix.dtype)
+    balance = no_balance()
     for bound in balances:
         fed = [bound.f] if bound.posture is not None else [bound.f, bound.theta]
         first = int(ends[-1])
@@ -128,7 +128,7 @@ def _problem(
     held: int,
 ) -> Problem:
     last = lines.chain[-1]
-    dtype = last.matrix.dtype
+    dtype = np.float32
     out = rows[:, lines.outputs].T.astype(dtype)
     chain = (*lines.chain[:-1], Layer(last.matrix @ out, last.offset @ out, last.activation))
     direct = np.zeros((len(lines.low) + 1, len(rows)), dtype)
@@ -139,23 +139,22 @@ def _problem(
     return Problem(pack(chain), direct, ends, weights, balance, held, limits)
 
 
-def no_balance(dtype: np.dtype) -> Balance:
+def no_balance() -> Balance:
     """Torque balance of nothing."""
-    none = np.zeros((0, 3), dtype)
-    chain = Packed(np.zeros(0, dtype), np.zeros((0, 5), np.int64))
+    none = np.zeros((0, 3), np.float32)
+    chain = Packed(np.zeros(0, np.float32), np.zeros((0, 5), np.int64))
     return Balance(chain, none, none, none, np.zeros(0, np.int64), (-1, -1), 0.0)
 
 
 def _balance(bound: Balanced, rows: tuple[int, int]) -> Balance:
     muscles = bound.muscles
-    dtype = muscles.base.dtype
     posture = bound.mean if bound.posture is None else bound.posture
-    base = muscles.base.copy()
+    base = muscles.base.astype(np.float32)
     base[muscles.theta] = (posture - bound.mean) / bound.std
-    joints = np.zeros((len(bound.mean), 3 + len(bound.mean)), dtype)
+    joints = np.zeros((len(bound.mean), 3 + len(bound.mean)), np.float32)
     joints[:, STD], joints[:, POSTURE] = muscles.theta_std, base[muscles.theta]
     joints[:, TORQUE] = bound.torques(posture[None])[0]
-    lines = np.stack([muscles.f_std, muscles.f_mean, muscles.l_std], axis=1).astype(dtype)
+    lines = np.stack([muscles.f_std, muscles.f_mean, muscles.l_std], axis=1).astype(np.float32)
     places = np.concatenate([muscles.theta, muscles.f])
     return Balance(pack(muscles.chain), base[None], joints, lines, places, rows, float(bound.weight))
 

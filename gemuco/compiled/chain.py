@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gemuco.compiled.bend import CODES, bend, bends, slopes
+from gemuco.compiled.blas import times, times_turned
 from gemuco.compiled.jit import jit
 from gemuco.kernels import Chain
 
@@ -17,7 +18,7 @@ class Packed(NamedTuple):
     """A chain of layers.
 
     Attributes:
-        flat: Matrix (n_in, n_out) and offset (n_out,) of every layer, one behind the other.
+        flat: Matrix (n_in, n_out) and offset (n_out,) of every layer, one behind the other, float32.
         form: For every layer its width n_in, n_out, where its matrix begins in `flat`, the widths of all that lies
             before its output, and its activation (`bend.CODES`), shape (layers, 5).
     """
@@ -37,7 +38,11 @@ def pack(chain: Chain) -> Packed:
         before += wide
         form[index] = wide, narrow, place, before, CODES[layer.activation]
         place += (wide + 1) * narrow
-    return Packed(np.concatenate([a.ravel() for layer in chain for a in (layer.matrix, layer.offset)]), form)
+    flat = np.empty(place, np.float32)
+    for layer, (wide, narrow, begin, *_) in zip(chain, form, strict=True):
+        flat[begin : begin + wide * narrow].reshape(wide, narrow)[:] = layer.matrix
+        flat[begin + wide * narrow : begin + (wide + 1) * narrow] = layer.offset
+    return Packed(flat, form)
 
 
 def unpack(chain: Packed) -> list[np.ndarray]:
@@ -47,18 +52,6 @@ def unpack(chain: Packed) -> list[np.ndarray]:
         middle = place + wide * narrow
         found += [flat[place:middle].reshape(wide, narrow), flat[middle : middle + narrow]]
     return found
-
-
-@jit
-def times(a, b, out):
-    """Out = a b, shapes (m, k), (k, n) and (m, n)."""
-    np.dot(a, b, out)
-
-
-@jit
-def times_turned(a, b, out):
-    """Out = a b^T, shapes (m, k), (n, k) and (m, n)."""
-    np.dot(a, b.T, out)
 
 
 @jit

@@ -3,7 +3,8 @@
 import numpy as np
 
 from gemuco.compiled.bend import slopes
-from gemuco.compiled.chain import CODE, NARROW, after, first, forward, matrix, space, times, times_turned
+from gemuco.compiled.blas import times
+from gemuco.compiled.chain import CODE, NARROW, after, first, forward, matrix, space
 from gemuco.compiled.jit import jit
 
 
@@ -51,8 +52,8 @@ def innovations(eye, rows, biases, through, tails, index, whiten):
             for j in range(size):
                 slope[row * size + j, i] = moved[j * batch + line, element]
     errors, turned = np.empty_like(raw), np.empty_like(slope)
-    times_turned(raw, whiten, errors)
-    times_turned(slope, whiten, turned)
+    np.dot(raw, whiten.T, errors)
+    np.dot(slope, whiten.T, turned)
     found = np.empty((count, len(index), size))
     for row in range(count):
         for j in range(size):

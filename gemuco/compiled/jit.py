@@ -4,6 +4,7 @@ numba looks only at the file of the function itself to find out whether what it 
 functions that it calls. So what is kept lies in a folder named after all sources of this package together.
 """
 
+import ctypes
 import hashlib
 import os
 import shutil
@@ -13,6 +14,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numba
+import numpy as np
 
 F = TypeVar("F", bound=Callable[..., object])
 
@@ -22,9 +24,22 @@ CONFIG: Any = numba.config
 HERE = Path(__file__).parent
 
 
+def _numpys_blas() -> Path | None:
+    """The library that numpy's wheels bring along, if it is there and has the names that `blas` calls."""
+    for library in sorted((Path(np.__file__).parents[1] / "numpy.libs").glob("libscipy_openblas64_*.so")):
+        loaded = ctypes.CDLL(str(library))  # numpy has it open already
+        if hasattr(loaded, "scipy_cblas_sgemm64_") and hasattr(loaded, "scipy_cblas_sgemv64_"):
+            return library
+    return None
+
+
+NUMPYS = _numpys_blas()
+
+
 def _digest() -> str:
     sources = sorted(HERE.glob("*.py"))
-    return hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()[:16]
+    known = [str(NUMPYS).encode(), *(source.read_bytes() for source in sources)]
+    return hashlib.sha256(b"".join(known)).hexdigest()[:16]
 
 
 def _is_own(folder: Path) -> bool:

@@ -3,17 +3,12 @@
 import numpy as np
 
 from gemuco.compiled.bend import slopes
-from gemuco.compiled.chain import CODE, NARROW, PLACE, WIDE, after, first, forward, matrix, space, times_turned
+from gemuco.compiled.blas import times_turned, turned_times
+from gemuco.compiled.chain import CODE, NARROW, PLACE, WIDE, after, first, forward, matrix, space
 from gemuco.compiled.jit import jit
 
 MOMENTUM = 0.9
 SQUARES = 0.999
-
-
-@jit
-def times_first(a, b, out):
-    """Out = a^T b, shapes (m, k), (m, n) and (k, n)."""
-    np.dot(a.T, b, out)
 
 
 @jit
@@ -57,7 +52,7 @@ def gradients(chain, inputs, wanted, weights):
         below = first(chain, values, rows) if layer == 0 else after(chain, values, rows, layer - 1)
         if weights:
             place = chain.form[layer, PLACE]
-            times_first(below, gradient, found[place : place + wide * narrow].reshape(wide, narrow))
+            turned_times(below, gradient, found[place : place + wide * narrow].reshape(wide, narrow))
             offsets = found[place + wide * narrow : place + (wide + 1) * narrow]
             for row in range(rows):
                 for i in range(narrow):

@@ -10,7 +10,7 @@ from numba import types
 
 from gemuco.compiled.chain import space
 from gemuco.compiled.jit import jit
-from gemuco.compiled.problem import differences, inside, jacobian, length, losses, muscle_slopes
+from gemuco.compiled.problem import differences, inside, jacobian, length, losses, muscle_slopes, muscles
 
 DAMPINGS = 4
 """Dampings tried at once, each `APART` times the one before."""
@@ -61,8 +61,11 @@ def weighed(problem, rows, slopes, curvature, way):
     balance = problem.balance
     if balance.weight > 0.0:
         joints, lines = len(balance.joints), len(balance.lines)
-        rest = np.empty((1, joints), rows.dtype)
-        inner = muscle_slopes(balance, rows, rest)
+        values, ways = space(balance.chain, 1), np.zeros((joints, joints), rows.dtype)
+        for i in range(joints):
+            ways[i, i] = 1.0
+        rest = muscles(balance, rows, values)
+        inner = muscle_slopes(balance, values, ways)
         outer = np.zeros((count, joints), rows.dtype)
         for p in range(count):
             for j in range(joints):

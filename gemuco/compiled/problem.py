@@ -12,7 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gemuco.compiled.chain import Packed, first, forward, mixed, pull, push_all, space, times
+from gemuco.compiled.blas import times
+from gemuco.compiled.chain import Packed, first, forward, mixed, pull, push_all, space
 from gemuco.compiled.jit import jit
 
 TINY = 1e-9
@@ -140,30 +141,35 @@ def force(balance, inputs):
 
 
 @jit
-def muscle_slopes(balance, rows, rest):
-    """What they lack at one point, into `rest`, shape (1, joints), and its derivatives by f and theta.
+def muscle_slopes(balance, values, ways):
+    """How what they lack at one point changes with f and theta, seen along directions of torque.
+
+    Args:
+        balance: Torque balance.
+        values: What `muscles` left of that one point.
+        ways: Directions, shape (k, joints).
 
     Returns:
-        Derivatives [N m per standard deviation], shape (muscles + joints, joints); those by theta stay zero where the
+        Derivatives [N m per standard deviation], shape (muscles + joints, k); those by theta stay zero where the
         posture is given.
     """
-    joints, lines = len(balance.joints), len(balance.lines)
-    values = space(balance.chain, 1)
-    lack = muscles(balance, rows, values)
+    joints, lines, count = len(balance.joints), len(balance.lines), len(ways)
     inputs = first(balance.chain, values, 1)
-    tangents = np.zeros((joints, inputs.shape[1]), rows.dtype)
-    for i in range(joints):
-        rest[0, i] = lack[0, i]
-        tangents[i, balance.places[i]] = 1.0 / balance.joints[i, STD]
+    tangents = np.zeros((count, inputs.shape[1]), inputs.dtype)
+    for k in range(count):
+        for i in range(joints):
+            tangents[k, balance.places[i]] = ways[k, i] / balance.joints[i, STD]
     pushed, bent = mixed(balance.chain, values, force(balance, inputs), tangents)
-    found = np.zeros((lines + joints, joints), rows.dtype)
-    for i in range(joints):
+    found = np.zeros((lines + joints, count), inputs.dtype)
+    for k in range(count):
         for j in range(lines):
             scale = balance.lines[j, F_STD] * balance.lines[j, L_STD]
-            found[j, i] = scale * pushed[i, j] + bent[i, balance.places[joints + j]]
+            found[j, k] = scale * pushed[k, j] + bent[k, balance.places[joints + j]]
         if balance.rows[1] >= 0:
             for j in range(joints):
-                found[lines + j, i] = balance.joints[i, STIFFNESS + j] + bent[i, balance.places[j]]
+                found[lines + j, k] = bent[k, balance.places[j]]
+                for i in range(joints):
+                    found[lines + j, k] += ways[k, i] * balance.joints[i, STIFFNESS + j]
     return found
 
 
@@ -207,15 +213,17 @@ def gradient(problem, values, rows, row):
     balance = problem.balance
     if balance.weight > 0.0:
         joints, lines = len(balance.joints), len(balance.lines)
-        rest = np.empty((1, joints), rows.dtype)
-        slope = muscle_slopes(balance, rows[row : row + 1], rest)
+        inner = space(balance.chain, 1)
+        rest = muscles(balance, rows[row : row + 1], inner)
         share = balance.weight / max(length(rest[0], 0, joints), TINY)
         for i in range(joints):
-            for j in range(lines):
-                back[0, balance.rows[0] + j] += share * rest[0, i] * slope[j, i]
-            if balance.rows[1] >= 0:
-                for j in range(joints):
-                    back[0, balance.rows[1] + j] += share * rest[0, i] * slope[lines + j, i]
+            rest[0, i] *= share
+        slope = muscle_slopes(balance, inner, rest)
+        for j in range(lines):
+            back[0, balance.rows[0] + j] += slope[j, 0]
+        if balance.rows[1] >= 0:
+            for j in range(joints):
+                back[0, balance.rows[1] + j] += slope[lines + j, 0]
     found = np.zeros((1, size), rows.dtype)
     for i in range(size):
         for j in range(width):

@@ -1,0 +1,72 @@
+"""Bodies of any size with random W, and what a user would write for them in torch."""
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+import torch
+from torch import nn
+
+from gemuco.kernels import Layer, Weights
+from gemuco.scaler import Scaler
+from gemuco.schema import BodySchema
+from gemuco.signals import Layout, Signal
+
+MUSCLES = {"joint_position": (5, "rad"), "muscle_tension": (10, "N"), "muscle_length": (10, "m")}
+MASKS = (
+    frozenset({"muscle_tension", "muscle_length"}),
+    frozenset({"joint_position", "muscle_tension"}),
+    frozenset({"joint_position", "muscle_length"}),
+)
+
+
+def body(
+    hidden: Sequence[int],
+    latent: int = 15,
+    bias: int = 0,
+    signals: dict[str, tuple[int, str]] | None = None,
+    masks: Sequence[frozenset[str]] = MASKS,
+    anchors: int = 0,
+) -> BodySchema:
+    """A muscle-driven arm unless other signals are given; all signals are inputs and outputs."""
+    signals = signals or MUSCLES
+    random = np.random.default_rng(0)
+    layout = Layout(tuple(Signal(name, size, unit) for name, (size, unit) in signals.items()))
+    ends = (layout.size + len(signals) + bias, *hidden, latent, *reversed(hidden), layout.size)
+    inner = len(hidden) + 1
+    layers = tuple(
+        Layer(
+            (random.standard_normal((wide, narrow)) / np.sqrt(wide)).astype(np.float32),
+            (0.1 * random.standard_normal(narrow)).astype(np.float32),
+            "linear" if index in (inner - 1, len(ends) - 2) else "tanh",
+        )
+        for index, (wide, narrow) in enumerate(pairwise(ends))
+    )
+    zeros, ones = np.zeros(layout.size), np.ones(layout.size)
+    conditions = {name: random.standard_normal(bias).astype(np.float32) for name in ("a", "b", "c")} if bias else {}
+    return BodySchema(
+        layout,
+        layout.names,
+        layout.names,
+        tuple(masks),
+        Scaler(zeros, ones, -ones, ones),
+        Weights(layers[:inner], layers[inner:]),
+        anchors=random.standard_normal((anchors, layout.size)).astype(np.float32),
+        anchor_conditions=random.integers(0, 3, anchors) if bias else np.zeros(0, int),
+        bias=np.zeros(bias, np.float32),
+        biases=conditions,
+    )
+
+
+def modules(schema: BodySchema) -> tuple[nn.Sequential, nn.Sequential]:
+    """Encoder and decoder of a schema in torch."""
+    made = []
+    for chain in (schema.weights.encoder, schema.weights.decoder):
+        parts: list[nn.Module] = []
+        for layer in chain:
+            linear = nn.Linear(*layer.matrix.shape)
+            linear.weight.data = torch.from_numpy(layer.matrix.T.copy())
+            linear.bias.data = torch.from_numpy(layer.offset.copy())
+            parts += [linear] if layer.activation == "linear" else [linear, nn.Tanh()]
+        made.append(nn.Sequential(*parts))
+    return made[0], made[1]

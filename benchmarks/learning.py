@@ -1,0 +1,158 @@
+"""Training and structure determination beside what a user would write in torch first, one thread each.
+
+    python -m benchmarks.learning [--epochs 6]
+
+Training: epochs of a muscle-driven arm, a tool arm and a humanoid in size, ten thousand samples, random masks.
+Beside it a Dataset with a DataLoader, plain Adam and the mask drawn per sample. Structure: the errors of all masks of
+ten signals, from one network, beside a loop over masks and batches.
+"""
+
+import argparse
+import math
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+from torch import nn
+from torch.utils.data import DataLoader, Dataset
+
+from benchmarks.bodies import body, modules
+from benchmarks.table import Row, faster
+from gemuco import dataset as episodes
+from gemuco.mask_errors import MaskErrors
+from gemuco.masks import Mask, all_masks, bits
+from gemuco.schema import BodySchema
+from gemuco.signals import Layout, Signal
+from gemuco.train import TrainConfig, fit
+
+SIZES = {
+    "musashi_arm": ({"q": (5, "rad"), "f": (10, "N"), "l": (10, "m")}, (200, 30), 15, (("q", "f"), ("f", "l"))),
+    "pr2_duster": ({"q": (7, "rad"), "x": (3, "m")}, (128, 128), 32, (("q",), ("q", "x"))),
+    "kxr_humanoid": (
+        {"q": (4, "rad"), "c": (2, "m"), "x": (3, "m"), "s": (2, "px")},
+        (100, 100),
+        8,
+        (("q",), ("q", "c")),
+    ),
+}
+SAMPLES, BATCH, ROWS = 10_000, 100, 1000
+
+
+class Samples(Dataset):  # type: ignore[type-arg]
+    """One sample and one random mask at a time, as a tutorial would have it."""
+
+    def __init__(self, x: np.ndarray, inputs: np.ndarray, gates: np.ndarray, tails: np.ndarray) -> None:
+        self.x, self.inputs, self.gates, self.tails = x.astype(np.float32), inputs, gates, tails
+
+    def __len__(self) -> int:
+        return len(self.x)
+
+    def __getitem__(self, index: int) -> tuple[np.ndarray, np.ndarray]:
+        m = np.random.randint(len(self.gates))
+        return np.concatenate([self.x[index, self.inputs] * self.gates[m], self.tails[m]]), self.x[index]
+
+
+def manifold(size: int, seed: int = 0) -> np.ndarray:
+    """Samples that four numbers decide, shape (SAMPLES, size), of variance 1."""
+    random = np.random.default_rng(seed)
+    hidden = np.tanh(random.standard_normal((SAMPLES, 4)) @ random.standard_normal((4, 30)))
+    x = hidden @ random.standard_normal((30, size))
+    return (x - x.mean(axis=0)) / x.std(axis=0)
+
+
+def training(name: str, epochs: int) -> Row:
+    """Seconds of so many epochs, without what a call costs beside them."""
+    signals, hidden, latent, sets = SIZES[name]
+    masks = tuple(frozenset(one) for one in sets)
+    layout = Layout(tuple(Signal(signal, size, unit) for signal, (size, unit) in signals.items()))
+    x = manifold(layout.size)
+    parts = tuple(episodes.Episode("", layout.split(part)) for part in np.array_split(x, 20))
+    data = episodes.Dataset(layout, parts)
+    took = []
+    for count in (1, 1, epochs + 1):  # the first call imports
+        config = TrainConfig(hidden=hidden, latent=latent, epochs=count, batch=BATCH, rate=3e-3, outliers=math.inf)
+        begun = time.process_time()
+        schema, history = fit(data, config, masks)
+        took.append(time.process_time() - begun)
+    ours, mine = took[2] - took[1], history.best
+    begun = time.process_time()
+    theirs_loss = by_hand(schema, x, masks, epochs)
+    theirs = time.process_time() - begun
+    note = f"{epochs} epochs; held-out loss {mine:.4f} against {theirs_loss:.4f}"
+    return Row(f"training, {name}", "torch with DataLoader", ours, theirs, "s", theirs / ours, 4.0, note=note)
+
+
+def by_hand(schema: BodySchema, x: np.ndarray, masks: tuple[Mask, ...], epochs: int) -> float:
+    """Train the tutorial's way; its held-out loss."""
+    torch.manual_seed(0)
+    np.random.seed(0)
+    network = nn.Sequential(*modules(schema))
+    for part in network.modules():
+        if isinstance(part, nn.Linear):
+            part.reset_parameters()
+    gates, tails = (np.stack(column) for column in zip(*(schema.gate(m) for m in masks), strict=True))
+    train = DataLoader(Samples(x[:9000], schema.in_index, gates, tails), batch_size=BATCH, shuffle=True)
+    held = DataLoader(Samples(x[9000:], schema.in_index, gates, tails), batch_size=BATCH)
+    optimiser = torch.optim.Adam(network.parameters(), lr=1e-3)
+    best = np.inf
+    for _ in range(epochs):
+        for given, wanted in train:
+            optimiser.zero_grad()
+            loss = nn.functional.mse_loss(network(given), wanted)
+            loss.backward()
+            optimiser.step()
+        with torch.no_grad():
+            best = min(best, float(np.mean([float(nn.functional.mse_loss(network(g), w)) for g, w in held])))
+    return best
+
+
+def structure() -> Row:
+    """Errors of all 1023 masks of ten signals on 1000 rows."""
+    signals = {f"s{index}": (3, "1") for index in range(10)}
+    masks = all_masks(tuple(signals))
+    schema = body((200, 100), 20, signals=signals, masks=masks[:1])
+    x = manifold(30)[:ROWS].astype(np.float32)
+    ones = np.ones((len(x), 30), bool)
+    errors = MaskErrors(schema.layout, schema.weights.whole, x, ones, ones[:, ::3], np.zeros((len(x), 0)), np.ones(30))
+    chosen = np.array([bits(m, schema.layout.names) > 0 for m in masks])
+    network, data = nn.Sequential(*modules(schema)), torch.from_numpy(x)
+
+    @torch.no_grad()
+    def by_torch() -> np.ndarray:
+        found = []
+        for line in chosen:
+            gate = torch.from_numpy(np.repeat(line, 3).astype(np.float32))
+            tail = torch.from_numpy(line.astype(np.float32))
+            squared = [
+                (network(torch.cat([part * gate, tail.expand(len(part), -1)], dim=1)) - part) ** 2
+                for part in data.split(BATCH)
+            ]
+            found.append(torch.cat(squared).mean(dim=0).reshape(10, 3).mean(dim=1).numpy())
+        return np.stack(found)
+
+    np.testing.assert_allclose(errors.of(chosen)[0], by_torch(), rtol=1e-3)
+    return faster(
+        "structure, 10 signals, all 1023 masks x 1000 rows", "loop over masks in torch", lambda: errors.of(chosen),
+        by_torch, 20.0, "both are nothing but matrix products of the same size", rounds=5,
+    )  # fmt: skip
+
+
+def rows(epochs: int = 6) -> Iterator[Row]:
+    """All of them."""
+    torch.set_num_threads(1)
+    for name in SIZES:
+        yield training(name, epochs)
+    yield structure()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--epochs", type=int, default=6)
+    for row in rows(parser.parse_args().epochs):
+        figures = f"{row.ours:9.2f} {row.theirs:9.2f} {row.unit}  {row.value:6.1f} x (bar {row.bar:g})"
+        print(f"{row.what:55s} {figures}  {row.note}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,77 @@
+"""Matrix products of float32 for compiled code.
+
+numba itself calls the BLAS of scipy, whose wheels are a release behind that of numpy: on the few rows of a search it
+takes two to three times as long (4 x 200 times 200 x 200: 26 us against 10 us; `python -m benchmarks.solvers` shows
+what that makes of a search). So the one that numpy brought along is used where it is found, and scipy's elsewhere.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from llvmlite import binding
+from numba import types
+
+from gemuco.compiled.jit import NUMPYS, jit
+
+_ROWS, _PLAIN, _TURNED = 101, 111, 112
+
+
+def _is_loaded(library: Path | None) -> bool:
+    if library is None:
+        return False
+    binding.load_library_permanently(str(library))
+    return True
+
+
+FOUND = _is_loaded(NUMPYS)
+_i, _n, _f, _p = types.int32, types.int64, types.float32, types.voidptr
+_sgemm = types.ExternalFunction(
+    "scipy_cblas_sgemm64_", types.void(_i, _i, _i, _n, _n, _n, _f, _p, _n, _p, _n, _f, _p, _n)
+)
+_sgemv = types.ExternalFunction("scipy_cblas_sgemv64_", types.void(_i, _i, _n, _n, _f, _p, _n, _p, _n, _f, _p, _n))
+
+if FOUND:
+
+    @jit
+    def times(a, b, out):
+        """Out = a b, shapes (m, k), (k, n) and (m, n), rows one behind the other."""
+        m, k, n = a.shape[0], a.shape[1], b.shape[1]
+        if m == 1:
+            _sgemv(_ROWS, _TURNED, k, n, 1.0, b.ctypes.data, n, a.ctypes.data, 1, 0.0, out.ctypes.data, 1)
+        else:
+            x, y, z = a.ctypes.data, b.ctypes.data, out.ctypes.data
+            _sgemm(_ROWS, _PLAIN, _PLAIN, m, n, k, 1.0, x, k, y, n, 0.0, z, n)
+
+    @jit
+    def times_turned(a, b, out):
+        """Out = a b^T, shapes (m, k), (n, k) and (m, n)."""
+        m, k, n = a.shape[0], a.shape[1], b.shape[0]
+        if m == 1:
+            _sgemv(_ROWS, _PLAIN, n, k, 1.0, b.ctypes.data, k, a.ctypes.data, 1, 0.0, out.ctypes.data, 1)
+        else:
+            x, y, z = a.ctypes.data, b.ctypes.data, out.ctypes.data
+            _sgemm(_ROWS, _PLAIN, _TURNED, m, n, k, 1.0, x, k, y, k, 0.0, z, n)
+
+    @jit
+    def turned_times(a, b, out):
+        """Out = a^T b, shapes (m, k), (m, n) and (k, n)."""
+        m, k, n = a.shape[0], a.shape[1], b.shape[1]
+        x, y, z = a.ctypes.data, b.ctypes.data, out.ctypes.data
+        _sgemm(_ROWS, _TURNED, _PLAIN, k, n, m, 1.0, x, k, y, n, 0.0, z, n)
+
+else:
+
+    @jit
+    def times(a, b, out):
+        """Out = a b, shapes (m, k), (k, n) and (m, n), rows one behind the other."""
+        np.dot(a, b, out)
+
+    @jit
+    def times_turned(a, b, out):
+        """Out = a b^T, shapes (m, k), (n, k) and (m, n)."""
+        np.dot(a, b.T, out)
+
+    @jit
+    def turned_times(a, b, out):
+        """Out = a^T b, shapes (m, k), (m, n) and (k, n)."""
+        np.dot(a.T, b, out)
