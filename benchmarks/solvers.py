@@ -15,7 +15,8 @@ import torch
 
 from benchmarks.bodies import body, modules
 from benchmarks.table import Row, faster
-from gemuco.descent import DescentConfig, NewtonConfig
+from gemuco.compiled.problem import Problem
+from gemuco.descent import Descent, DescentConfig, NewtonConfig
 from gemuco.fold import fold
 from gemuco.losses import Match, StayNear, StaySmall, Term
 from gemuco.minimise import minimise
@@ -49,7 +50,7 @@ class Ours:
         size = self.fold().bounds.shape[1]
         self.start = np.random.default_rng(4).uniform(-0.5, 0.5, (1, size)).astype(np.float32)
 
-    def fold(self):
+    def fold(self) -> Problem:
         """The problem, as at the beginning of every solve."""
         bounds = [term.bind(self.schema, TARGET, {}) for term in self.terms]
         problem = fold(self.way.lines(), bounds, self.free)
