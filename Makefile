@@ -68,8 +68,8 @@ fuzz: $(STAMP)    ## a hundred thousand bad messages on every key of a running r
 test-network: $(STAMP)  ## HAL and model on a link that is cut, slow or lossy, over TCP and QUIC (docs/network.md); needs root
 	$(BIN)/python tests/network/campaign.py --json runs/network.json
 
-bench: $(STAMP)   ## the loops' punctuality beside bare timers, 10 minutes
-	$(BIN)/python -m benchmarks.loops
+bench: $(STAMP)   ## speed beside torch, zenoh and bare timers, a quarter of an hour; writes docs/benchmarks.md
+	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.all
 
 clean:           ## remove what make setup and the demo made
 	rm -rf .venv runs build *.egg-info

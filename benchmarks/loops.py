@@ -11,12 +11,16 @@ import argparse
 import json
 import multiprocessing
 import resource
+import tempfile
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from multiprocessing.connection import Connection
 from pathlib import Path
 
 import numpy as np
+import yaml
 from rich.console import Console
 from rich.table import Table
 
@@ -189,13 +193,29 @@ def show(found: dict, console: Console) -> None:
     console.print(f"largest process: {peak:.0f} MiB")
 
 
+@contextmanager
+def with_rates(robot_file: Path, rates: str) -> Iterator[Path]:
+    """The robot file with other rates (`estimation=500,update=20`), in a file beside it for as long as it is needed."""
+    if not rates:
+        yield robot_file
+        return
+    described = yaml.safe_load(robot_file.read_text())
+    described["rates"] |= {name: float(rate) for name, _, rate in (one.partition("=") for one in rates.split(","))}
+    with tempfile.NamedTemporaryFile("w", suffix=".yaml", dir=robot_file.parent) as file:
+        yaml.safe_dump(described, file)
+        file.flush()
+        yield Path(file.name)
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--robot", type=Path, default=Path("robots/musashi_arm.yaml"))
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--out", type=Path, default=Path("runs/loops.json"))
+    parser.add_argument("--rates", default="", help="other rates than the robot file's: estimation=500,update=20")
     options = parser.parse_args()
-    result = run(options.robot, options.minutes)
+    with with_rates(options.robot, options.rates) as file:
+        result = run(file, options.minutes)
     options.out.parent.mkdir(parents=True, exist_ok=True)
     options.out.write_text(json.dumps(result, indent=1, default=str))
     show(result, Console(width=140))

@@ -14,8 +14,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 import msgpack
@@ -28,6 +28,9 @@ from services.wire.session import CLIENT, endpoint, open_session
 
 RATE = 50.0
 KEY = "bare/echo"
+BARE = "bare zenoh query, the same bytes"
+VERB = "Client.estimate(values, hide): 3 signals"
+READ = "Client.estimate(): the newest published"
 
 
 def echo(robot: str, connect: tuple[str, ...], answer: bytes) -> None:
@@ -72,37 +75,52 @@ def imports(times: int = 7) -> dict[str, float]:
     return {statement: statistics.median(values) for statement, values in found.items()}
 
 
-def measure(robot: str, connect: tuple[str, ...], questions: int) -> None:
-    """Ask both in turn, and print."""
-    with Client(robot, connect) as client:
-        while client.estimate(timeout=60.0) is None:
-            pass
-        schema = client.describe("model", timeout=60.0)["signals"]
-        values = {name: [0.1] * len(one["elements"]) for name, one in schema.items()}
-        asked = {"values": values, "hide": ["joint_position"]}
-        question = msgpack.packb(asked)
-        answer = msgpack.packb({"ok": client.ask("model", "estimate", asked, 60.0)})
-        child = multiprocessing.get_context("spawn").Process(target=echo, args=(robot, connect, answer), daemon=True)
-        child.start()
-        places = connect or (endpoint(robot, "recorder"),)  # the client connects to the recorder by itself otherwise
-        with open_session(robot, CLIENT, places) as bare:
-            while not any(reply.ok for reply in bare.get(KEY, payload=question, timeout=1.0)):
-                time.sleep(0.05)
-            plain, verb, read = [], [], []
-            for _ in range(questions):
-                plain.append(timed(lambda: ask_bare(bare, question)))
-                verb.append(timed(lambda: client.estimate(values, ["joint_position"])))
-                read.append(timed(client.estimate))
-        child.kill()
-        print(f"{questions} questions of {len(question)} bytes, answers of {len(answer)} bytes")
-        print(line("bare zenoh query, the same bytes", plain))
-        print(line("Client.estimate(values, hide): 3 signals", verb))
-        print(line("Client.estimate(): the newest published", read))
-        time.sleep(max(0.0, 20.0 - questions * 0.005))
-        for seconds in (1.0, 60.0):
-            found = client.history(seconds)
-            took = [timed(lambda seconds=seconds: client.history(seconds)) for _ in range(20)]
-            print(line(f"Client.history({seconds:g}): {len(found.stamp_ns)} rows", took))
+def measure(client: Client, connect: tuple[str, ...], questions: int) -> dict[str, list[float]]:
+    """Ask both in turn: what was asked -> times [s]."""
+    while client.estimate(timeout=60.0) is None:
+        pass
+    schema = client.describe("model", timeout=60.0)["signals"]
+    values = {name: [0.1] * len(one["elements"]) for name, one in schema.items()}
+    asked = {"values": values, "hide": ["joint_position"]}
+    question = msgpack.packb(asked)
+    answer = msgpack.packb({"ok": client.ask("model", "estimate", asked, 60.0)})
+    child = multiprocessing.get_context("spawn").Process(target=echo, args=(client.robot, connect, answer), daemon=True)
+    child.start()
+    places = connect or (endpoint(client.robot, "recorder"),)  # the client connects to the recorder by itself otherwise
+    found: dict[str, list[float]] = {BARE: [], VERB: [], READ: []}
+    with open_session(client.robot, CLIENT, places) as bare:
+        while not any(reply.ok for reply in bare.get(KEY, payload=question, timeout=1.0)):
+            time.sleep(0.05)
+        for _ in range(questions):
+            found[BARE].append(timed(lambda: ask_bare(bare, question)))
+            found[VERB].append(timed(lambda: client.estimate(values, ["joint_position"])))
+            found[READ].append(timed(client.estimate))
+    child.kill()
+    return found
+
+
+@contextmanager
+def robot_and_client(through_router: bool) -> Iterator[tuple[Client, tuple[str, ...]]]:
+    """A light robot in a process of its own, a client, and how to get there."""
+    robot = f"remote_{os.getpid()}"
+    with tempfile.TemporaryDirectory() as folder:
+        file = light_robot.write(Path(folder), robot, RATE, with_bus=False)
+        light_robot.make_model(file, Path(folder) / "model")
+        where = f"unixsock-stream/{folder}/router" if through_router else ""
+        settings = (
+            f'{{mode: "router", listen: {{endpoints: ["{where}"]}}, scouting: {{multicast: {{enabled: false}}}}}}'
+        )
+        with zenoh.open(zenoh.Config.from_json5(settings)) if where else nullcontext():
+            process = subprocess.Popen(
+                [sys.executable, "-m", "benchmarks.fleet_robot", str(file), f"{folder}/model", "1", where]
+            )
+            try:
+                connect = (where,) if where else ()
+                with Client(robot, connect) as client:
+                    yield client, connect
+            finally:
+                process.terminate()
+                process.wait(60.0)
 
 
 def main() -> None:
@@ -111,26 +129,16 @@ def main() -> None:
     parser.add_argument("--questions", type=int, default=1000)
     parser.add_argument("--router", action="store_true")
     asked = parser.parse_args()
-    robot = f"remote_{os.getpid()}"
     for statement, seconds in imports().items():
         print(f"{statement:44s} {1e3 * seconds:.0f} ms")
-    with tempfile.TemporaryDirectory() as folder:
-        file = light_robot.write(Path(folder), robot, RATE, with_bus=False)
-        light_robot.make_model(file, Path(folder) / "model")
-        where = f"unixsock-stream/{folder}/router"
-        settings = (
-            f'{{mode: "router", listen: {{endpoints: ["{where}"]}}, scouting: {{multicast: {{enabled: false}}}}}}'
-        )
-        with zenoh.open(zenoh.Config.from_json5(settings)) if asked.router else nullcontext():
-            process = subprocess.Popen(
-                [sys.executable, "-m", "benchmarks.fleet_robot", str(file), f"{folder}/model", "1",
-                 where if asked.router else ""],
-            )  # fmt: skip
-            try:
-                measure(robot, (where,) if asked.router else (), asked.questions)
-            finally:
-                process.terminate()
-                process.wait(60.0)
+    with robot_and_client(asked.router) as (client, connect):
+        for what, times in measure(client, connect, asked.questions).items():
+            print(line(what, times))
+        time.sleep(max(0.0, 20.0 - asked.questions * 0.005))
+        for seconds in (1.0, 60.0):
+            found = client.history(seconds)
+            took = [timed(lambda seconds=seconds: client.history(seconds)) for _ in range(20)]
+            print(line(f"Client.history({seconds:g}): {len(found.stamp_ns)} rows", took))
 
 
 if __name__ == "__main__":

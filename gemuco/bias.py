@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
+from gemuco.compiled import bank
 from gemuco.innovation import Innovations
 
 if TYPE_CHECKING:
@@ -37,7 +38,9 @@ FAMILIAR = 0.9
 FAINTEST = -60.0
 """Logarithm of the smallest weight against the largest, so that no condition becomes impossible."""
 PASSES = 2
-"""How often a sample is linearised anew."""
+"""How often a sample is linearised."""
+NEAR = 0.02
+"""A belief that the sample moves less than this share of the prior's standard deviation is not linearised again."""
 SCALE_MEMORY = 50
 """Samples over which it is learned that errors are larger here than in training; at first fewer, to be there soon."""
 SCALE_FIRST = 5
@@ -132,6 +135,7 @@ class Kalman:
         self._covariance = np.repeat(NARROW**2 * self.prior.covariance[None], len(share), axis=0)
         self._weight = np.log(share)
         self._age = np.zeros(len(share))
+        self._near = NEAR * np.sqrt(np.diag(self.prior.covariance))
         self._scale = 1.0
         self._seen = 0
 
@@ -140,16 +144,11 @@ class Kalman:
         pairs = self._innovations.pairs(np.isfinite(row))
         if len(pairs.index):
             self._begin_anew()
-            rows = np.repeat(row[None], len(self._mean), axis=0)
-            at = self._mean.copy()
-            for index in range(PASSES):
-                error, slope = self._innovations.of(schema, pairs, rows, at.astype(np.float32))
-                if index == 0:  # the newcomer knows nothing: it is linearised where the sample fits best
-                    nearest = int(np.argmin(np.einsum("hn,hn->h", error, error)))
-                    at[-1], error[-1], slope[-1] = at[nearest], error[nearest], slope[nearest]
-                error = error - np.einsum("hnk,hk->hn", slope, self._mean - at)
-                at = self._moved(error, slope)
-            self._commit(error, slope, pairs.log_volume)
+            numbers = (self._known, PASSES, self._scale, FREEDOM, pairs.log_volume, FAINTEST)
+            shape = (pairs.through, pairs.tails, pairs.index, pairs.whiten)
+            seen = bank.see(schema.eye, row, self._mean, self._covariance, self._weight, shape, self._near, numbers)
+            self._seen += 1
+            self._scale = max(1.0, self._scale * (1.0 + (seen - 1.0) / min(SCALE_FIRST + self._seen, SCALE_MEMORY)))
             self._thin()
         return self._found()
 
@@ -177,44 +176,6 @@ class Kalman:
         self._covariance[known:] += DRIFT**2 * prior.covariance
         self._mean = np.concatenate([self._mean, prior.mean[None]])
         self._covariance = np.concatenate([self._covariance, prior.covariance[None]])
-
-    def _information(self, slope: np.ndarray, scale: np.ndarray) -> np.ndarray:
-        """Inverse covariance of p after a sample, shape (beliefs, bias_size, bias_size)."""
-        gained = np.einsum("hnj,hnk->hjk", slope, slope) / scale[:, None, None]
-        return np.linalg.inv(self._covariance) + gained
-
-    def _moved(self, error: np.ndarray, slope: np.ndarray) -> np.ndarray:
-        scale = np.full(len(error), self._scale)
-        pull = np.einsum("hnk,hn->hk", slope, error) / self._scale
-        return self._mean + np.linalg.solve(self._information(slope, scale), pull[..., None])[..., 0]
-
-    def _commit(self, error: np.ndarray, slope: np.ndarray, log_volume: float) -> None:
-        """Evidence of the sample for every belief, and the step, shorter where the sample is odd."""
-        count, known = error.shape[1], self._known
-        scale = np.full(len(error), self._scale)
-        information = self._information(slope, scale)
-        pull = np.einsum("hnk,hn->hk", slope, error) / self._scale
-        step = np.linalg.solve(information, pull[..., None])[..., 0]
-        odd = np.einsum("hn,hn->h", error, error) / self._scale - np.einsum("hk,hk->h", pull, step)
-        odd = np.maximum(odd, 0.0)
-        volume = (
-            log_volume
-            + count * np.log(self._scale)
-            + np.linalg.slogdet(self._covariance)[1]
-            + np.linalg.slogdet(information)[1]
-        )
-        half = 0.5 * (FREEDOM + count)
-        foretold = np.exp(self._weight)
-        self._weight = self._weight - 0.5 * volume - half * np.log1p(odd / FREEDOM)
-        self._weight = np.maximum(self._weight - self._weight.max(), FAINTEST)
-        trust = (FREEDOM + count) / (FREEDOM + odd)
-        information = self._information(slope, scale / np.minimum(trust, 1.0))
-        step = np.linalg.solve(information, (pull * np.minimum(trust, 1.0)[:, None])[..., None])[..., 0]
-        self._mean[known:] += step[known:]
-        self._covariance[known:] = np.linalg.inv(information[known:])
-        seen = float(foretold @ (trust * odd)) / float(foretold.sum()) / count
-        self._seen += 1
-        self._scale = max(1.0, self._scale * (1.0 + (seen - 1.0) / min(SCALE_FIRST + self._seen, SCALE_MEMORY)))
 
     def _thin(self) -> None:
         """Too many filters: of the two whose ages differ least in proportion, the less likely goes."""

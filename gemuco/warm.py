@@ -71,7 +71,8 @@ def steps(schema: BodySchema) -> Iterator[str]:
     yield "the paper's descent"
     Controller(schema, terms, "tension", search=DescentConfig(iterations=2)).solve(target, whole)
     yield "recognition of p"
-    schema.adapt([whole] * 2, UpdateConfig(what="bias"))
+    for method in ("ekf", "gauss_newton"):
+        schema.adapt([whole] * 2, UpdateConfig(what="bias", bias_method=method))
     for optimiser in ("adam", "sgd"):
         yield f"update of W and p by {optimiser}"
         config = UpdateConfig(what="both", optimiser=optimiser, minimum=1, batch=4, steps=1)

@@ -194,11 +194,11 @@ ALL_WAYS = """
 import numpy as np
 from gemuco import warm
 from gemuco.adapt import UpdateConfig
-from gemuco.compiled import descent, inference, innovation, learning, newton
+from gemuco.compiled import bank, descent, inference, innovation, learning, newton
 from gemuco.control import Controller
 from gemuco.losses import Match, StaySmall
 warm.warm()
-used = (newton.search, descent.descend, inference.infer, innovation.innovations, learning.gradients, learning.adam)
+used = (newton.search, descent.descend, inference.infer, bank.see, innovation.innovations, learning.gradients)
 before = [len(one.signatures) for one in used]
 body = warm.body().under("other")
 whole = {name: np.full(size, 0.1) for name, (size, _) in warm.SIGNALS.items()}

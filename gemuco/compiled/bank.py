@@ -1,0 +1,172 @@
+"""One sample for a bank of beliefs about p; see `gemuco.bias.Kalman`, which says what it means."""
+
+import numpy as np
+
+from gemuco.compiled.innovation import innovations
+from gemuco.compiled.jit import jit
+from gemuco.compiled.newton import cholesky, substitute
+
+
+@jit
+def invert(matrix, out):
+    """Out = the inverse of a positive definite matrix; returns the logarithm of its determinant."""
+    size = len(matrix)
+    lower, volume = matrix.copy(), 0.0
+    cholesky(lower)
+    for i in range(size):
+        volume += 2.0 * np.log(lower[i, i])
+        for j in range(size):
+            out[i, j] = 1.0 if i == j else 0.0
+        substitute(lower, out[i])
+    return volume
+
+
+@jit
+def gained(slope, error, information, pull):
+    """Information = S^T S and pull = S^T e of one belief, shapes (n, k), (n,), (k, k) and (k,)."""
+    for i in range(slope.shape[1]):
+        pull[i] = 0.0
+        for n in range(len(slope)):
+            pull[i] += slope[n, i] * error[n]
+        for j in range(i + 1):
+            total = 0.0
+            for n in range(len(slope)):
+                total += slope[n, i] * slope[n, j]
+            information[i, j] = information[j, i] = total
+
+
+@jit
+def linearise(eye, row, mean, pairs, near, passes, error, slope, before, scale):
+    """Errors and derivatives of every belief where the sample moves it to, as if they had been taken at `mean`.
+
+    Args:
+        eye: The network.
+        row: The sample [standard deviations], shape (size,).
+        mean: p of every belief, shape (beliefs, k).
+        pairs: `through`, `tails`, `index` and `whiten` of `innovations`.
+        near: What moves less than this, shape (k,), is not linearised again.
+        passes: How often at most.
+        error: Is filled in, shape (beliefs, n).
+        slope: Is filled in, shape (beliefs, n, k).
+        before: Inverse covariance of every belief, shape (beliefs, k, k).
+        scale: Of the errors' variance.
+    """
+    count, size = mean.shape
+    at, far = mean.copy(), np.ones(count, np.bool_)
+    raw = np.empty_like(error)
+    information, pull = np.empty((size, size)), np.empty(size)
+    for turn in range(passes):
+        chosen = np.flatnonzero(far)
+        if not len(chosen):
+            break
+        rows, biases = np.empty((len(chosen), len(row))), np.empty((len(chosen), size), np.float32)
+        for i in range(len(chosen)):
+            for j in range(len(row)):
+                rows[i, j] = row[j]
+            for j in range(size):
+                biases[i, j] = at[chosen[i], j]
+        found, moved = innovations(eye, rows, biases, *pairs)
+        for i in range(len(chosen)):
+            for n in range(error.shape[1]):
+                raw[chosen[i], n] = found[i, n]
+                for j in range(size):
+                    slope[chosen[i], n, j] = moved[i, n, j]
+        if turn == 0:  # the newcomer knows nothing: it is linearised where the sample fits best
+            nearest, least = 0, np.inf
+            for h in range(count):
+                square = 0.0
+                for n in range(error.shape[1]):
+                    square += raw[h, n] * raw[h, n]
+                if square < least:
+                    nearest, least = h, square
+            for j in range(size):
+                at[count - 1, j] = at[nearest, j]
+            for n in range(error.shape[1]):
+                raw[count - 1, n] = raw[nearest, n]
+                for j in range(size):
+                    slope[count - 1, n, j] = slope[nearest, n, j]
+        for h in range(count):
+            for n in range(error.shape[1]):
+                error[h, n] = raw[h, n]
+                for j in range(size):
+                    error[h, n] -= slope[h, n, j] * (mean[h, j] - at[h, j])
+            if not far[h]:
+                continue
+            gained(slope[h], error[h], information, pull)
+            for i in range(size):
+                pull[i] /= scale
+                for j in range(size):
+                    information[i, j] = before[h, i, j] + information[i, j] / scale
+            cholesky(information)
+            substitute(information, pull)
+            far[h] = False
+            for j in range(size):
+                there = mean[h, j] + pull[j]
+                far[h] |= abs(there - at[h, j]) > near[j]
+                at[h, j] = there
+
+
+@jit
+def see(eye, row, mean, covariance, weight, pairs, near, numbers):
+    """Weigh all beliefs by a sample, and move those that are not of a known condition.
+
+    Args:
+        eye: The network.
+        row: The sample [standard deviations], shape (size,).
+        mean: p of every belief, shape (beliefs, k); the last one is the newcomer.
+        covariance: Of every p, shape (beliefs, k, k).
+        weight: Logarithm of how likely each is, shape (beliefs,).
+        pairs: `through`, `tails`, `index` and `whiten` of `innovations`.
+        near: What moves less than this is not linearised again, shape (k,).
+        numbers: How many conditions are known, how often it is linearised, the errors' scale and degrees of freedom,
+            the logarithm of their volume, and of the smallest weight.
+
+    Returns:
+        How odd the sample was for all of them, 1 if as usual. `mean`, `covariance` and `weight` are changed in place.
+    """
+    known, passes, scale, freedom, log_volume, faintest = numbers
+    count, size = mean.shape
+    n = len(pairs[2])
+    error, slope = np.empty((count, n)), np.empty((count, n, size))
+    before, volumes = np.empty((count, size, size)), np.empty(count)
+    for h in range(count):
+        volumes[h] = invert(covariance[h], before[h])
+    linearise(eye, row, mean, pairs, near, passes, error, slope, before, scale)
+    information, pull, sum_up = np.empty((size, size)), np.empty(size), np.empty((size, size))
+    share, oddity, largest = 0.0, 0.0, -np.inf
+    half = 0.5 * (freedom + n)
+    for h in range(count):
+        gained(slope[h], error[h], information, pull)
+        step, odd = pull.copy(), 0.0
+        for i in range(size):
+            for j in range(size):
+                sum_up[i, j] = before[h, i, j] + information[i, j] / scale
+        cholesky(sum_up)
+        volume = log_volume + n * np.log(scale) + volumes[h]
+        for i in range(size):
+            volume += 2.0 * np.log(sum_up[i, i])
+        substitute(sum_up, step)
+        for i in range(n):
+            odd += error[h, i] * error[h, i] / scale
+        for i in range(size):
+            odd -= pull[i] * step[i] / (scale * scale)
+        odd = max(odd, 0.0)
+        trust = (freedom + n) / (freedom + odd)
+        foretold = np.exp(weight[h])
+        share += foretold
+        oddity += foretold * trust * odd
+        weight[h] -= 0.5 * volume + half * np.log1p(odd / freedom)
+        largest = max(largest, weight[h])
+        if h < known:
+            continue
+        counts = min(trust, 1.0) / scale
+        for i in range(size):
+            for j in range(size):
+                sum_up[i, j] = before[h, i, j] + information[i, j] * counts
+        invert(sum_up, covariance[h])
+        for i in range(size):
+            for j in range(size):
+                mean[h, i] += covariance[h, i, j] * pull[j] * counts
+    for h in range(count):
+        weight[h] = max(weight[h] - largest, faintest)
+    return oddity / share / n
