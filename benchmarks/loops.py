@@ -89,6 +89,9 @@ def engage(client: Client) -> None:
         applied = client.applied(timeout=1.0)
         if applied is not None and applied.mode in ("hold", "follow"):
             return
+        if applied is not None and applied.mode == "enabling":
+            time.sleep(0.1)
+            continue
         try:
             client.engage()
         except (CommandRefused, NotEngaged) as error:

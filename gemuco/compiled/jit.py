@@ -4,6 +4,7 @@ numba looks only at the file of the function itself to find out whether what it 
 functions that it calls. So what is kept lies in a folder named after all sources of this package together.
 """
 
+import contextlib
 import ctypes
 import hashlib
 import os
@@ -62,7 +63,9 @@ def find_folder() -> Path | None:
     name = f"gemuco-{_digest()}"
     beside = HERE / "__pycache__" / name
     own = [Path(CONFIG.CACHE_DIR) / name] if CONFIG.CACHE_DIR else []
-    homes = [Path.home() / ".cache" / "gemuco" / name, Path(tempfile.gettempdir()) / f"{name}-{os.getuid()}"]
+    homes = [Path(tempfile.gettempdir()) / f"{name}-{os.getuid()}"]
+    with contextlib.suppress(RuntimeError):  # a user without a home
+        homes.insert(0, Path.home() / ".cache" / "gemuco" / name)
     folder = next((folder for folder in (*own, beside, *homes) if _is_own(folder)), None)
     if folder is not None and folder != beside and beside.is_dir() and not any(folder.iterdir()):
         shutil.copytree(beside, folder, dirs_exist_ok=True)

@@ -7,6 +7,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
+from gemuco.warm import warm
 from hal.config import RobotConfig
 from hal.errors import ConfigError
 from services.client import Client
@@ -42,6 +43,8 @@ def play(robot: RobotConfig, path: Path, seed: int, out: Path) -> int:
     started = time.monotonic()
     target = control_of(robot).target
     make_model(robot, console)
+    with progress("compiling") as tell:  # what the processes would each wait for
+        warm(tell)
     recording = out / "story.mcap"
     recording.unlink(missing_ok=True)
     with Supervisor(out) as supervisor:
