@@ -58,8 +58,8 @@ def rows(minutes: float) -> Iterator[Row]:
         yield from loop_rows(minutes)
     yield from solvers.rows()
     yield from updates.rows()
-    yield from service_cost.rows()
     yield from learning.rows()
+    yield from service_cost.rows()
 
 
 def is_worse(row: Row, before: dict[str, float]) -> bool:

@@ -24,6 +24,7 @@ import zenoh
 
 from benchmarks import light_robot
 from services.client import Client
+from services.errors import ServiceUnavailable
 from services.wire.session import CLIENT, endpoint, open_session
 
 RATE = 50.0
@@ -88,7 +89,7 @@ def measure(client: Client, connect: tuple[str, ...], questions: int) -> dict[st
     child.start()
     places = connect or (endpoint(client.robot, "recorder"),)  # the client connects to the recorder by itself otherwise
     found: dict[str, list[float]] = {BARE: [], VERB: [], READ: []}
-    with open_session(client.robot, CLIENT, places) as bare:
+    with when_there(client.robot, places) as bare:
         while not any(reply.ok for reply in bare.get(KEY, payload=question, timeout=1.0)):
             time.sleep(0.05)
         for _ in range(questions):
@@ -97,6 +98,18 @@ def measure(client: Client, connect: tuple[str, ...], questions: int) -> dict[st
             found[READ].append(timed(client.estimate))
     child.kill()
     return found
+
+
+def when_there(robot: str, places: tuple[str, ...]) -> zenoh.Session:
+    """A session with a process that is still starting; gives up after twenty seconds."""
+    deadline = time.monotonic() + 20.0
+    while True:
+        try:
+            return open_session(robot, CLIENT, places)
+        except ServiceUnavailable:
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(0.2)
 
 
 @contextmanager
