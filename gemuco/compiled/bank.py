@@ -36,6 +36,43 @@ def gained(slope, error, information, pull):
 
 
 @jit
+def look(eye, row, at, far, pairs, raw, slope):
+    """Errors of the beliefs that are `far`, and their derivatives, at p `at`, into `raw` and `slope`."""
+    chosen = np.flatnonzero(far)
+    size = at.shape[1]
+    rows, biases = np.empty((len(chosen), len(row))), np.empty((len(chosen), size), np.float32)
+    for i in range(len(chosen)):
+        for j in range(len(row)):
+            rows[i, j] = row[j]
+        for j in range(size):
+            biases[i, j] = at[chosen[i], j]
+    found, moved = innovations(eye, rows, biases, *pairs)
+    for i in range(len(chosen)):
+        for n in range(raw.shape[1]):
+            raw[chosen[i], n] = found[i, n]
+            for j in range(size):
+                slope[chosen[i], n, j] = moved[i, n, j]
+
+
+@jit
+def place_newcomer(at, raw, slope):
+    """The last belief knows nothing: it is linearised where the sample fits best."""
+    nearest, least, last = 0, np.inf, len(at) - 1
+    for h in range(len(at)):
+        square = 0.0
+        for n in range(raw.shape[1]):
+            square += raw[h, n] * raw[h, n]
+        if square < least:
+            nearest, least = h, square
+    for j in range(at.shape[1]):
+        at[last, j] = at[nearest, j]
+    for n in range(raw.shape[1]):
+        raw[last, n] = raw[nearest, n]
+        for j in range(at.shape[1]):
+            slope[last, n, j] = slope[nearest, n, j]
+
+
+@jit
 def linearise(eye, row, mean, pairs, near, passes, error, slope, before, scale):
     """Errors and derivatives of every belief where the sample moves it to, as if they had been taken at `mean`.
 
@@ -52,58 +89,54 @@ def linearise(eye, row, mean, pairs, near, passes, error, slope, before, scale):
         scale: Of the errors' variance.
     """
     count, size = mean.shape
-    at, far = mean.copy(), np.ones(count, np.bool_)
-    raw = np.empty_like(error)
+    at, far, raw = mean.copy(), np.ones(count, np.bool_), np.empty_like(error)
     information, pull = np.empty((size, size)), np.empty(size)
     for turn in range(passes):
-        chosen = np.flatnonzero(far)
-        if not len(chosen):
+        if not far.any():
             break
-        rows, biases = np.empty((len(chosen), len(row))), np.empty((len(chosen), size), np.float32)
-        for i in range(len(chosen)):
-            for j in range(len(row)):
-                rows[i, j] = row[j]
-            for j in range(size):
-                biases[i, j] = at[chosen[i], j]
-        found, moved = innovations(eye, rows, biases, *pairs)
-        for i in range(len(chosen)):
-            for n in range(error.shape[1]):
-                raw[chosen[i], n] = found[i, n]
-                for j in range(size):
-                    slope[chosen[i], n, j] = moved[i, n, j]
-        if turn == 0:  # the newcomer knows nothing: it is linearised where the sample fits best
-            nearest, least = 0, np.inf
-            for h in range(count):
-                square = 0.0
-                for n in range(error.shape[1]):
-                    square += raw[h, n] * raw[h, n]
-                if square < least:
-                    nearest, least = h, square
-            for j in range(size):
-                at[count - 1, j] = at[nearest, j]
-            for n in range(error.shape[1]):
-                raw[count - 1, n] = raw[nearest, n]
-                for j in range(size):
-                    slope[count - 1, n, j] = slope[nearest, n, j]
+        look(eye, row, at, far, pairs, raw, slope)
+        if turn == 0:
+            place_newcomer(at, raw, slope)
         for h in range(count):
+            if not far[h]:
+                continue
             for n in range(error.shape[1]):
                 error[h, n] = raw[h, n]
                 for j in range(size):
                     error[h, n] -= slope[h, n, j] * (mean[h, j] - at[h, j])
-            if not far[h]:
-                continue
             gained(slope[h], error[h], information, pull)
-            for i in range(size):
-                pull[i] /= scale
-                for j in range(size):
-                    information[i, j] = before[h, i, j] + information[i, j] / scale
+            add(before[h], information, 1.0 / scale, information)
             cholesky(information)
             substitute(information, pull)
             far[h] = False
             for j in range(size):
-                there = mean[h, j] + pull[j]
+                there = mean[h, j] + pull[j] / scale
                 far[h] |= abs(there - at[h, j]) > near[j]
                 at[h, j] = there
+
+
+@jit
+def add(one, other, share, out):
+    """Out = one + share * other, shapes (k, k)."""
+    for i in range(len(one)):
+        for j in range(len(one)):
+            out[i, j] = one[i, j] + share * other[i, j]
+
+
+@jit
+def oddness(before, information, pull, error, scale):
+    """How badly a belief foretold the sample, and the logarithm of the determinant of what is known of p after it."""
+    size = len(pull)
+    known, step, odd, volume = np.empty((size, size)), pull.copy(), 0.0, 0.0
+    add(before, information, 1.0 / scale, known)
+    cholesky(known)
+    substitute(known, step)
+    for n in range(len(error)):
+        odd += error[n] * error[n] / scale
+    for i in range(size):
+        odd -= pull[i] * step[i] / (scale * scale)
+        volume += 2.0 * np.log(known[i, i])
+    return max(odd, 0.0), volume
 
 
 @jit
@@ -132,41 +165,25 @@ def see(eye, row, mean, covariance, weight, pairs, near, numbers):
     for h in range(count):
         volumes[h] = invert(covariance[h], before[h])
     linearise(eye, row, mean, pairs, near, passes, error, slope, before, scale)
-    information, pull, sum_up = np.empty((size, size)), np.empty(size), np.empty((size, size))
-    share, oddity, largest = 0.0, 0.0, -np.inf
-    half = 0.5 * (freedom + n)
+    information, pull = np.empty((size, size)), np.empty(size)
+    share, oddity = 0.0, 0.0
     for h in range(count):
         gained(slope[h], error[h], information, pull)
-        step, odd = pull.copy(), 0.0
-        for i in range(size):
-            for j in range(size):
-                sum_up[i, j] = before[h, i, j] + information[i, j] / scale
-        cholesky(sum_up)
-        volume = log_volume + n * np.log(scale) + volumes[h]
-        for i in range(size):
-            volume += 2.0 * np.log(sum_up[i, i])
-        substitute(sum_up, step)
-        for i in range(n):
-            odd += error[h, i] * error[h, i] / scale
-        for i in range(size):
-            odd -= pull[i] * step[i] / (scale * scale)
-        odd = max(odd, 0.0)
+        odd, gain = oddness(before[h], information, pull, error[h], scale)
         trust = (freedom + n) / (freedom + odd)
         foretold = np.exp(weight[h])
         share += foretold
         oddity += foretold * trust * odd
-        weight[h] -= 0.5 * volume + half * np.log1p(odd / freedom)
-        largest = max(largest, weight[h])
-        if h < known:
-            continue
-        counts = min(trust, 1.0) / scale
-        for i in range(size):
-            for j in range(size):
-                sum_up[i, j] = before[h, i, j] + information[i, j] * counts
-        invert(sum_up, covariance[h])
-        for i in range(size):
-            for j in range(size):
-                mean[h, i] += covariance[h, i, j] * pull[j] * counts
+        volume = log_volume + n * np.log(scale) + volumes[h] + gain
+        weight[h] -= 0.5 * volume + 0.5 * (freedom + n) * np.log1p(odd / freedom)
+        if h >= known:
+            counts = min(trust, 1.0) / scale
+            add(before[h], information, counts, information)
+            invert(information, covariance[h])
+            for i in range(size):
+                for j in range(size):
+                    mean[h, i] += covariance[h, i, j] * pull[j] * counts
+    largest = weight.max()
     for h in range(count):
         weight[h] = max(weight[h] - largest, faintest)
     return oddity / share / n
