@@ -157,7 +157,7 @@ class Run:
         bench.until(self._is_settled, "settling after the fault")
         if bench.robot.mode in ("off", "fault"):
             bench.robot.reset()
-            bench.until(lambda: bench.states() == {"ready"} and bench.sample.complete, "ready after reset")
+            bench.until(self._is_ready, "ready after reset")
             bench.enable()
         for _ in range(300):
             bench.ask(REST)
@@ -165,6 +165,12 @@ class Run:
         assert bench.robot.mode == "follow", f"mode {bench.robot.mode}: {bench.robot.fault_text}"
         np.testing.assert_allclose(bench.world.length, REST, atol=1e-5)
         self.outcome.recovered = True
+
+    def _is_ready(self) -> bool:
+        """Every device is ready, and has said where it is since: one that was just opened has not."""
+        bench = self.bench
+        is_known = all(valid.all() for valid in bench.sample.valid.values())
+        return bench.states() == {"ready"} and bench.sample.complete and is_known
 
     def _is_settled(self) -> bool:
         bench = self.bench
