@@ -25,9 +25,10 @@ RATES = "estimation=500,control=100,anomaly=200,update=20"
 WORSE = 4.0 / 3.0
 INTRODUCTION = """# Benchmarks
 
-`make bench` on {machine}, {day}; one thread each unless said otherwise. Ours and the peer are measured in turn in the
-same run; what is compared is their ratio in each round, and the table has the median. Microseconds do not travel
-between machines, ratios nearly do. Torch is eager, float32, on one thread: what a user writes first.
+`python -m benchmarks.all --minutes {minutes:g}` on {machine}, {day}; the loops ran for so many minutes (0: not at
+all), and `make bench` lets them run for ten. One thread each unless said otherwise. Ours and the peer are measured in
+turn in the same run; what is compared is their ratio in each round, and the table has the median. Microseconds do not
+travel between machines, ratios nearly do. Torch is eager, float32, on one thread: what a user writes first.
 
 | what | against | ours | theirs | result | bar | |
 |---|---|---|---|---|---|---|
@@ -93,7 +94,7 @@ def main() -> None:
         console.print(" | ".join(text(row)), style="red" if is_worse(row, before) else "")
     sizes.draw()
     machine = f"{os.cpu_count()} cores of {platform.machine()}, Python {platform.python_version()}"
-    lines = [INTRODUCTION.format(machine=machine, day=datetime.date.today())]
+    lines = [INTRODUCTION.format(machine=machine, day=datetime.date.today(), minutes=options.minutes)]
     lines += [f"| {' | '.join(text(row))} |\n" for row in found]
     noted = [f"- {row.what}: {row.note}.\n" for row in found if row.note]
     lines += ["\n", *noted]

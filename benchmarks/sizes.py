@@ -37,9 +37,13 @@ def by_hidden() -> dict[str, list[float]]:
         joined = np.zeros(schema.layout.size)
         gate = schema.gate(schema.masks[0])
         plain, balanced = Ours(schema, "e", TERMS), Ours(schema, "e", (*TERMS, BALANCE))
-        eye = schema.eye
+        predictor = schema.predictor
         for name, job, calls in (
-            ("estimate by mask", lambda eye=eye, joined=joined, gate=gate: infer(eye, joined, *gate), 300),
+            (
+                "estimate by mask",
+                lambda predictor=predictor, joined=joined, gate=gate: infer(predictor, joined, *gate),
+                300,
+            ),
             ("default search", lambda plain=plain: plain.solve(NewtonConfig()), 30),
             ("default search, torque balance", lambda balanced=balanced: balanced.solve(NewtonConfig()), 15),
             ("descent 20 x 30", lambda plain=plain: plain.solve(PAPER), 15),

@@ -46,12 +46,12 @@ def inference() -> Iterator[Row]:
         given = np.concatenate([np.where(gate > 0, (joined - mean) / std, 0.0), tail]).astype(np.float32)
         return network(torch.from_numpy(given)).numpy() * std + mean
 
-    eye = schema.eye
-    np.testing.assert_allclose(infer(eye, joined, gate, tail)[0], by_torch(), rtol=1e-3, atol=1e-4)
+    predictor = schema.predictor
+    np.testing.assert_allclose(infer(predictor, joined, gate, tail)[0], by_torch(), rtol=1e-3, atol=1e-4)
     row = faster(
         "estimate by mask, hidden 200, arrays in and out",
         "torch nn.Module",
-        lambda: infer(eye, joined, gate, tail),
+        lambda: infer(predictor, joined, gate, tail),
         by_torch,
         6.0,
     )

@@ -105,7 +105,7 @@ def _route(schema: "BodySchema", name: str, whole: Mask, finite: np.ndarray) -> 
 
 def _guess(schema: "BodySchema", method: str, mask: Mask, joined: np.ndarray) -> _Guess:
     if method == "mask":
-        value, residual = infer(schema.eye, joined, *schema.gate(mask))
+        value, residual = infer(schema.predictor, joined, *schema.gate(mask))
         return _Guess(value, _std(schema, method, mask), method, mask, residual)
     x = np.where(np.isfinite(joined), schema.scaler.normalise(joined), np.nan)
     full = np.full(schema.layout.size, np.nan)

@@ -84,20 +84,6 @@ def pull(chain: Chain, values: Trace, gradient: np.ndarray) -> np.ndarray:
     return gradient
 
 
-def pull_weights(chain: Chain, values: Trace, gradient: np.ndarray) -> list[np.ndarray]:
-    """Gradient with respect to the output -> with respect to every matrix and offset, summed over the samples."""
-    found: list[np.ndarray] = []
-    for index in range(len(chain) - 1, -1, -1):
-        matrix, _, activation = chain[index]
-        if activation != LINEAR:
-            gradient = gradient * ACTIVATIONS[activation].slope(values[index + 1])
-        found.append(gradient.sum(axis=0))
-        found.append(values[index].T @ gradient)
-        if index:
-            gradient = gradient @ matrix.T
-    return found[::-1]
-
-
 def push(chain: Chain, values: Trace, tangent: np.ndarray) -> np.ndarray:
     """Change of the input -> change of the output to first order, shapes (samples, n)."""
     for (matrix, _, activation), value in zip(chain, values[1:], strict=True):

@@ -14,7 +14,7 @@ import numpy as np
 from gemuco import anomaly, checkpoint
 from gemuco.anomaly import AnomalyScore, Normal
 from gemuco.compiled.chain import pack
-from gemuco.compiled.inference import Eye
+from gemuco.compiled.inference import Predictor
 from gemuco.errors import NotFinite, UnknownCondition, UnknownSignal, WrongSize
 from gemuco.estimate import Estimate, estimate, mask_error
 from gemuco.kernels import Chain, Weights, run
@@ -80,7 +80,7 @@ class BodySchema:
     _gates: dict[Mask, tuple[np.ndarray, np.ndarray]] = field(init=False, repr=False)
     _ranked: dict[str, tuple[Mask, ...]] = field(init=False, repr=False)
     _chain: Chain = field(init=False, repr=False)
-    _eyes: list[Eye] = field(init=False, repr=False)
+    _predictors: list[Predictor] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         set_field = object.__setattr__
@@ -96,7 +96,7 @@ class BodySchema:
         set_field(self, "_gates", {})
         set_field(self, "_ranked", {})
         set_field(self, "_chain", self.weights.whole)
-        set_field(self, "_eyes", [])
+        set_field(self, "_predictors", [])
         for mask in self.masks:
             self.gate(mask)
         set_field(self, "judges", anomaly.judging_masks(self))
@@ -116,12 +116,12 @@ class BodySchema:
         return found
 
     @property
-    def eye(self) -> Eye:
+    def predictor(self) -> Predictor:
         """The network as compiled code takes it; laid out when first asked for."""
-        if not self._eyes:
+        if not self._predictors:
             scale = np.stack([self.scaler.mean, self.scaler.std])
-            self._eyes.append(Eye(pack(self._chain), self.in_index, self.out_index, scale, CLIP))
-        return self._eyes[0]
+            self._predictors.append(Predictor(pack(self._chain), self.in_index, self.out_index, scale, CLIP))
+        return self._predictors[0]
 
     def ranked(self, name: str) -> tuple[Mask, ...]:
         """The feasible masks, the one that infers a signal of x_out best first."""

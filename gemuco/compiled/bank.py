@@ -9,7 +9,7 @@ from gemuco.compiled.newton import cholesky, substitute
 
 @jit
 def invert(matrix, out):
-    """Out = the inverse of a positive definite matrix; returns the logarithm of its determinant."""
+    """The inverse of a positive definite matrix (k, k) into `out`; returns the logarithm of its determinant."""
     size = len(matrix)
     lower, volume = matrix.copy(), 0.0
     cholesky(lower)
@@ -23,7 +23,7 @@ def invert(matrix, out):
 
 @jit
 def gained(slope, error, information, pull):
-    """Information = S^T S and pull = S^T e of one belief, shapes (n, k), (n,), (k, k) and (k,)."""
+    """S^T S into `information` (k, k) and S^T e into `pull` (k,), of one belief's slope S (n, k) and error e (n,)."""
     for i in range(slope.shape[1]):
         pull[i] = 0.0
         for n in range(len(slope)):
@@ -36,7 +36,7 @@ def gained(slope, error, information, pull):
 
 
 @jit
-def look(eye, row, at, far, pairs, raw, slope):
+def errors_at(predictor, row, at, far, pairs, raw, slope):
     """Errors of the beliefs that are `far`, and their derivatives, at p `at`, into `raw` and `slope`."""
     chosen = np.flatnonzero(far)
     size = at.shape[1]
@@ -46,7 +46,7 @@ def look(eye, row, at, far, pairs, raw, slope):
             rows[i, j] = row[j]
         for j in range(size):
             biases[i, j] = at[chosen[i], j]
-    found, moved = innovations(eye, rows, biases, *pairs)
+    found, moved = innovations(predictor, rows, biases, *pairs)
     for i in range(len(chosen)):
         for n in range(raw.shape[1]):
             raw[chosen[i], n] = found[i, n]
@@ -73,11 +73,11 @@ def place_newcomer(at, raw, slope):
 
 
 @jit
-def linearise(eye, row, mean, pairs, near, passes, error, slope, before, scale):
+def linearise(predictor, row, mean, pairs, near, passes, error, slope, before, scale):
     """Errors and derivatives of every belief where the sample moves it to, as if they had been taken at `mean`.
 
     Args:
-        eye: The network.
+        predictor: The network.
         row: The sample [standard deviations], shape (size,).
         mean: p of every belief, shape (beliefs, k).
         pairs: `through`, `tails`, `index` and `whiten` of `innovations`.
@@ -94,7 +94,7 @@ def linearise(eye, row, mean, pairs, near, passes, error, slope, before, scale):
     for turn in range(passes):
         if not far.any():
             break
-        look(eye, row, at, far, pairs, raw, slope)
+        errors_at(predictor, row, at, far, pairs, raw, slope)
         if turn == 0:
             place_newcomer(at, raw, slope)
         for h in range(count):
@@ -117,7 +117,7 @@ def linearise(eye, row, mean, pairs, near, passes, error, slope, before, scale):
 
 @jit
 def add(one, other, share, out):
-    """Out = one + share * other, shapes (k, k)."""
+    """The sum one + share * other into `out`, shapes (k, k)."""
     for i in range(len(one)):
         for j in range(len(one)):
             out[i, j] = one[i, j] + share * other[i, j]
@@ -140,11 +140,11 @@ def oddness(before, information, pull, error, scale):
 
 
 @jit
-def see(eye, row, mean, covariance, weight, pairs, near, numbers):
+def see(predictor, row, mean, covariance, weight, pairs, near, numbers):
     """Weigh all beliefs by a sample, and move those that are not of a known condition.
 
     Args:
-        eye: The network.
+        predictor: The network.
         row: The sample [standard deviations], shape (size,).
         mean: p of every belief, shape (beliefs, k); the last one is the newcomer.
         covariance: Of every p, shape (beliefs, k, k).
@@ -164,7 +164,7 @@ def see(eye, row, mean, covariance, weight, pairs, near, numbers):
     before, volumes = np.empty((count, size, size)), np.empty(count)
     for h in range(count):
         volumes[h] = invert(covariance[h], before[h])
-    linearise(eye, row, mean, pairs, near, passes, error, slope, before, scale)
+    linearise(predictor, row, mean, pairs, near, passes, error, slope, before, scale)
     information, pull = np.empty((size, size)), np.empty(size)
     share, oddity = 0.0, 0.0
     for h in range(count):

@@ -35,7 +35,7 @@ def tanh(x):
 
 @jit
 def bend(values, offset, code):
-    """Values += offset, then the activation; shapes (rows, n) and (n,)."""
+    """Add the offset, then the activation, in place; shapes (rows, n) and (n,)."""
     rows, width = values.shape
     for row in range(rows):
         line = values[row]
@@ -63,7 +63,7 @@ def bend(values, offset, code):
 
 @jit
 def slopes(values, out, code):
-    """Out *= da/dx at values y = a(x), shapes (rows, n), or (1, n) for all rows; see `Activation.slope`."""
+    """Multiply `out` by da/dx at values y = a(x), shapes (rows, n), or (1, n) for all rows; see `Activation.slope`."""
     shared = len(values) == 1
     for row in range(len(out)):
         line, target = values[0 if shared else row], out[row]
@@ -86,7 +86,7 @@ def slopes(values, out, code):
 
 @jit
 def bends(values, factor, out, code):
-    """Out = factor * d2a/dx2 at values y = a(x), shapes (1, n); see `Activation.bend`."""
+    """Product of a factor and d2a/dx2 at values y = a(x) into `out`, shapes (1, n); see `Activation.bend`."""
     line = values[0]
     for i in range(len(line)):
         y = line[i]

@@ -34,7 +34,7 @@ if FOUND:
 
     @jit
     def times(a, b, out):
-        """Out = a b, shapes (m, k), (k, n) and (m, n), rows one behind the other."""
+        """The product a b into `out`, shapes (m, k), (k, n) and (m, n), rows one behind the other."""
         m, k, n = a.shape[0], a.shape[1], b.shape[1]
         if m == 1:
             _sgemv(_ROWS, _TURNED, k, n, 1.0, b.ctypes.data, n, a.ctypes.data, 1, 0.0, out.ctypes.data, 1)
@@ -44,7 +44,7 @@ if FOUND:
 
     @jit
     def times_turned(a, b, out):
-        """Out = a b^T, shapes (m, k), (n, k) and (m, n)."""
+        """The product a b^T into `out`, shapes (m, k), (n, k) and (m, n)."""
         m, k, n = a.shape[0], a.shape[1], b.shape[0]
         if m == 1:
             _sgemv(_ROWS, _PLAIN, n, k, 1.0, b.ctypes.data, k, a.ctypes.data, 1, 0.0, out.ctypes.data, 1)
@@ -54,7 +54,7 @@ if FOUND:
 
     @jit
     def turned_times(a, b, out):
-        """Out = a^T b, shapes (m, k), (m, n) and (k, n)."""
+        """The product a^T b into `out`, shapes (m, k), (m, n) and (k, n)."""
         m, k, n = a.shape[0], a.shape[1], b.shape[1]
         x, y, z = a.ctypes.data, b.ctypes.data, out.ctypes.data
         _sgemm(_ROWS, _TURNED, _PLAIN, k, n, m, 1.0, x, k, y, n, 0.0, z, n)
@@ -63,15 +63,15 @@ else:
 
     @jit
     def times(a, b, out):
-        """Out = a b, shapes (m, k), (k, n) and (m, n), rows one behind the other."""
+        """The product a b into `out`, shapes (m, k), (k, n) and (m, n), rows one behind the other."""
         np.dot(a, b, out)
 
     @jit
     def times_turned(a, b, out):
-        """Out = a b^T, shapes (m, k), (n, k) and (m, n)."""
+        """The product a b^T into `out`, shapes (m, k), (n, k) and (m, n)."""
         np.dot(a, b.T, out)
 
     @jit
     def turned_times(a, b, out):
-        """Out = a^T b, shapes (m, k), (m, n) and (k, n)."""
+        """The product a^T b into `out`, shapes (m, k), (m, n) and (k, n)."""
         np.dot(a.T, b, out)

@@ -56,14 +56,14 @@ def unpack(chain: Packed) -> list[np.ndarray]:
 
 @jit
 def matrix(chain, layer):
-    """W of a layer, shape (n_in, n_out)."""
+    """Matrix W of a layer, shape (n_in, n_out)."""
     place, wide, narrow = chain.form[layer, PLACE], chain.form[layer, WIDE], chain.form[layer, NARROW]
     return chain.flat[place : place + wide * narrow].reshape(wide, narrow)
 
 
 @jit
 def offset(chain, layer):
-    """B of a layer, shape (n_out,)."""
+    """Offset b of a layer, shape (n_out,)."""
     place = chain.form[layer, PLACE] + chain.form[layer, WIDE] * chain.form[layer, NARROW]
     return chain.flat[place : place + chain.form[layer, NARROW]]
 
@@ -101,17 +101,6 @@ def forward(chain, values, rows):
 
 
 @jit
-def run(chain, x):
-    """Forward pass, shapes (rows, n_in) -> (rows, n_out)."""
-    values = space(chain, len(x))
-    inputs = first(chain, values, len(x))
-    for row in range(x.shape[0]):
-        for i in range(x.shape[1]):
-            inputs[row, i] = x[row, i]
-    return forward(chain, values, len(x))
-
-
-@jit
 def pull(chain, values, rows, begin, gradient):
     """Gradient with respect to the output -> with respect to the input, shapes (some, n).
 
@@ -131,18 +120,6 @@ def pull(chain, values, rows, begin, gradient):
         times_turned(gradient, matrix(chain, layer), below)
         gradient = below
     return gradient
-
-
-@jit
-def push(chain, values, rows, row, tangents):
-    """Changes of one row's input, shape (k, n_in) -> of its output to first order, shape (k, n_out)."""
-    for layer in range(len(chain.form)):
-        above = np.empty((len(tangents), chain.form[layer, NARROW]), tangents.dtype)
-        times(tangents, matrix(chain, layer), above)
-        if chain.form[layer, CODE]:
-            slopes(after(chain, values, rows, layer)[row : row + 1], above, chain.form[layer, CODE])
-        tangents = above
-    return tangents
 
 
 @jit

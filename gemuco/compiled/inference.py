@@ -8,7 +8,7 @@ from gemuco.compiled.chain import Packed, first, forward, space
 from gemuco.compiled.jit import jit
 
 
-class Eye(NamedTuple):
+class Predictor(NamedTuple):
     """A network with what stands around it.
 
     Attributes:
@@ -27,11 +27,11 @@ class Eye(NamedTuple):
 
 
 @jit
-def infer(eye, joined, through, tail):
+def infer(predictor, joined, through, tail):
     """What the network says of one sample.
 
     Args:
-        eye: The network.
+        predictor: The network.
         joined: Every element of the layout [its unit], shape (size,); NaN where masked.
         through: 1 for elements of x_in that the mask lets through, else 0, shape (in_size,).
         tail: m and p, shape (masks + bias_size,).
@@ -40,23 +40,23 @@ def infer(eye, joined, through, tail):
         Every element of x_out [its unit], NaN for others, shape (size,); and the root mean square of what was given
         minus what the network says of it [standard deviations], NaN if it says nothing.
     """
-    values = space(eye.chain, 1)
-    inputs = first(eye.chain, values, 1)[0]
-    count = len(eye.inputs)
+    values = space(predictor.chain, 1)
+    inputs = first(predictor.chain, values, 1)[0]
+    count = len(predictor.inputs)
     for i in range(count):
         inputs[i] = 0.0
         if through[i] > 0.0:
-            element = eye.inputs[i]
-            x = (joined[element] - eye.scale[0, element]) / eye.scale[1, element]
-            inputs[i] = min(max(x, -eye.clip), eye.clip)
+            element = predictor.inputs[i]
+            x = (joined[element] - predictor.scale[0, element]) / predictor.scale[1, element]
+            inputs[i] = min(max(x, -predictor.clip), predictor.clip)
     for i in range(len(tail)):
         inputs[count + i] = tail[i]
-    told = forward(eye.chain, values, 1)[0]
+    told = forward(predictor.chain, values, 1)[0]
     found = np.full(len(joined), np.nan)
     square, given = 0.0, 0
-    for i in range(len(eye.outputs)):
-        element = eye.outputs[i]
-        mean, std = eye.scale[0, element], eye.scale[1, element]
+    for i in range(len(predictor.outputs)):
+        element = predictor.outputs[i]
+        mean, std = predictor.scale[0, element], predictor.scale[1, element]
         found[element] = told[i] * std + mean
         if np.isfinite(joined[element]):
             amiss = told[i] - (joined[element] - mean) / std

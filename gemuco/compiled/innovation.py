@@ -9,11 +9,11 @@ from gemuco.compiled.jit import jit
 
 
 @jit
-def innovations(eye, rows, biases, through, tails, index, whiten):
+def innovations(predictor, rows, biases, through, tails, index, whiten):
     """Whitened errors of samples under several masks and p, and their derivatives: error(p + dp) = error - slope dp.
 
     Args:
-        eye: The network (`inference.Eye`).
+        predictor: The network (`inference.Predictor`).
         rows: Samples [standard deviations], shape (rows, size).
         biases: p of every row, shape (rows, bias_size).
         through: 1 for elements of x_in that each mask lets through, else 0, shape (masks, in_size).
@@ -24,7 +24,7 @@ def innovations(eye, rows, biases, through, tails, index, whiten):
     Returns:
         Errors, shape (rows, n), and derivatives, shape (rows, n, bias_size).
     """
-    chain = eye.chain
+    chain = predictor.chain
     count, size = biases.shape
     masks, wide = through.shape
     batch, width = count * masks, tails.shape[1]
@@ -36,19 +36,19 @@ def innovations(eye, rows, biases, through, tails, index, whiten):
             for i in range(wide):
                 line[i] = 0.0
                 if through[m, i] > 0.0:
-                    line[i] = min(max(rows[row, eye.inputs[i]], -eye.clip), eye.clip)
+                    line[i] = min(max(rows[row, predictor.inputs[i]], -predictor.clip), predictor.clip)
             for i in range(width - size):
                 line[wide + i] = tails[m, i]
             for i in range(size):
                 line[wide + width - size + i] = biases[row, i]
     told = forward(chain, values, batch)
     moved = tangents(chain, values, batch, size)
-    outputs = len(eye.outputs)
+    outputs = len(predictor.outputs)
     raw, slope = np.empty((count, len(index))), np.empty((count * size, len(index)))
     for row in range(count):
         for i in range(len(index)):
             line, element = row * masks + index[i] // outputs, index[i] % outputs
-            raw[row, i] = rows[row, eye.outputs[element]] - told[line, element]
+            raw[row, i] = rows[row, predictor.outputs[element]] - told[line, element]
             for j in range(size):
                 slope[row * size + j, i] = moved[j * batch + line, element]
     errors, turned = np.empty_like(raw), np.empty_like(slope)

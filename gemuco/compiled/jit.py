@@ -68,7 +68,9 @@ def find_folder() -> Path | None:
         homes.insert(0, Path.home() / ".cache" / "gemuco" / name)
     folder = next((folder for folder in (*own, beside, *homes) if _is_own(folder)), None)
     if folder is not None and folder != beside and beside.is_dir() and not any(folder.iterdir()):
-        shutil.copytree(beside, folder, dirs_exist_ok=True)
+        with contextlib.suppress(OSError), tempfile.TemporaryDirectory(dir=folder.parent) as staging:
+            shutil.copytree(beside, Path(staging) / name)
+            (Path(staging) / name).rename(folder)  # whole, or not at all where another process was first
     return folder
 
 

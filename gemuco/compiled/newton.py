@@ -20,7 +20,8 @@ FIRST = 1e-4
 LEAST, MOST = 1e-9, 1e9
 """Between them the damping moves; where even the largest lowers nothing, the search has ended."""
 STRIDE = 1.0
-"""No number moves further than this [standard deviations] in one step: far from the data a network says anything."""
+"""No number moves further than this in one step, inputs in standard deviations and z as it is: far from the data a
+network says anything."""
 FLOOR = 1e-4
 """A norm below this is weighed as if it were this large: at zero its weight would be infinite."""
 BREACH = 100.0

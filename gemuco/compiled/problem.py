@@ -80,7 +80,7 @@ def inside(problem, points):
 
 @jit
 def differences(problem, points, values):
-    """R at points, shape (points, rows); the network's values stay in `values`."""
+    """The rows r at points, shape (points, rows); the network's values stay in `values`."""
     count, size = points.shape
     inputs = first(problem.chain, values, count)
     for row in range(count):
@@ -130,7 +130,7 @@ def muscles(balance, rows, values):
 
 @jit
 def force(balance, inputs):
-    """F times the scale of l [N m per standard deviation of l], shape (points, muscles)."""
+    """Tension f times the scale of l [N m per standard deviation of l], shape (points, muscles)."""
     joints, lines = len(balance.joints), len(balance.lines)
     found = np.empty((len(inputs), lines), inputs.dtype)
     for row in range(len(inputs)):

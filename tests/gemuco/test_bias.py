@@ -1,7 +1,10 @@
+import copy
+
 import numpy as np
 import pytest
 from tool_arm import MASKS, ToolArm, dataset, tools
 
+from gemuco import bias
 from gemuco.adapt import UpdateConfig, Updater
 from gemuco.bias import GaussNewton, Kalman, Prior
 from gemuco.errors import SchemaError
@@ -49,13 +52,13 @@ def test_derivatives_by_bias_are_finite_differences(grips):
     pairs = innovations.pairs(np.isfinite(row))
     assert len(pairs.masks) == 3  # the fourth has every signal and foretells none
     assert len(pairs.index) == 3 + 2 + 1  # only what the mask does not contain
-    bias = grips.bias.astype(float)
-    error, slope = innovations.of(exact, pairs, row[None], bias[None])
+    p = grips.bias.astype(float)
+    error, slope = innovations.of(exact, pairs, row[None], p[None])
     for j in range(2):
         step = np.zeros(2)
         step[j] = 2.0**-10
-        beyond, _ = innovations.of(exact, pairs, row[None], (bias + step)[None])
-        before, _ = innovations.of(exact, pairs, row[None], (bias - step)[None])
+        beyond, _ = innovations.of(exact, pairs, row[None], (p + step)[None])
+        before, _ = innovations.of(exact, pairs, row[None], (p - step)[None])
         np.testing.assert_allclose((before - beyond)[0] / 2.0**-9, slope[0, :, j], rtol=2e-3, atol=2e-2)
     assert error.dtype == slope.dtype == np.float64
 
@@ -192,3 +195,50 @@ def test_what_was_predicted_is_what_the_network_says(grips):
     expected = row[grips.out_index] - run(grips.weights.whole, grips.network_input(row, pairs.masks[0]))
     inside = pairs.index[pairs.index < len(grips.out_index)]
     np.testing.assert_allclose(plain[: len(inside)], expected[inside], atol=1e-5)
+
+
+def plain_see(kalman, schema, row):
+    """`Kalman.see` in numpy, as it is derived: the oracle of the compiled one."""
+    pairs = kalman._innovations.pairs(np.isfinite(row))
+    kalman._begin_anew()
+    rows, at, scale = np.repeat(row[None], len(kalman._mean), axis=0), kalman._mean.copy(), kalman._scale
+    known, count = kalman._known, len(pairs.index)
+    before = np.linalg.inv(kalman._covariance)
+    for turn in range(bias.PASSES):
+        error, slope = kalman._innovations.of(schema, pairs, rows, at.astype(np.float32))
+        if turn == 0:
+            nearest = int(np.argmin((error**2).sum(axis=1)))
+            at[-1], error[-1], slope[-1] = at[nearest], error[nearest], slope[nearest]
+        error = error - np.einsum("hnk,hk->hn", slope, kalman._mean - at)
+        gained, pull = np.einsum("hnj,hnk->hjk", slope, slope), np.einsum("hnk,hn->hk", slope, error)
+        step = np.linalg.solve(before + gained / scale, pull[..., None] / scale)[..., 0]
+        at = kalman._mean + step
+    odd = np.maximum((error**2).sum(axis=1) / scale - (pull * step).sum(axis=1) / scale, 0.0)
+    volume = pairs.log_volume + count * np.log(scale) + np.linalg.slogdet(kalman._covariance)[1]
+    volume = volume + np.linalg.slogdet(before + gained / scale)[1]
+    weight = kalman._weight - 0.5 * volume - 0.5 * (bias.FREEDOM + count) * np.log1p(odd / bias.FREEDOM)
+    trust = np.minimum((bias.FREEDOM + count) / (bias.FREEDOM + odd), 1.0)
+    after = np.linalg.inv(before + gained * (trust / scale)[:, None, None])
+    mean, covariance = kalman._mean.copy(), kalman._covariance.copy()
+    mean[known:] += np.einsum("hjk,hk->hj", after, pull * (trust / scale)[:, None])[known:]
+    covariance[known:] = after[known:]
+    return mean, covariance, np.maximum(weight - weight.max(), bias.FAINTEST)
+
+
+@pytest.mark.parametrize("near", [0.0, bias.NEAR])
+def test_the_compiled_bank_is_the_derived_one(grips, near):
+    """Where all is linearised twice; and nearly so where what hardly moves is not linearised again."""
+    schema = grips.under(LONG)
+    compiled, tight = Kalman(schema), near == 0.0
+    compiled._near = compiled._near * (near / bias.NEAR)
+    compiled._thin = lambda: None  # so that both have the same beliefs afterwards
+    walk = TOOLS[BENT].walk(6, 3)
+    spread = np.sqrt(np.diag(compiled.prior.covariance))
+    for index in range(6):
+        row = schema.normalise_one({name: array[index] for name, array in walk.items()})
+        mean, covariance, weight = plain_see(copy.deepcopy(compiled), schema, row)
+        compiled.see(schema, row)
+        assert np.abs((compiled._mean - mean) / spread).max() < (1e-3 if tight else 0.05)
+        if tight:
+            np.testing.assert_allclose(compiled._covariance, covariance, rtol=1e-3, atol=1e-6)
+            np.testing.assert_allclose(compiled._weight, weight, atol=0.02)
