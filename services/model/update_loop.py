@@ -4,10 +4,10 @@ import math
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
+from msgspec.structs import replace
 
 from gemuco.anomaly import Normal
 from gemuco.errors import NotEnoughData

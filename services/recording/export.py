@@ -15,13 +15,14 @@ import numpy as np
 
 from services.errors import RecordingError
 from services.recording.reading import Paths, Recorded, about, one_robot, read
-from services.recording.schema import TRUTHS, UNITS, Form
+from services.recording.schema import UNITS, Form
 from services.wire import keys
-from services.wire.records import Message
+from services.wire.records import Message, Numbers, Truths
 
 ROWS = 4096
 """Rows that are written together."""
 FIRST = ("received [ns]", "stamp [ns]", "seq", "boot")
+HEADER = ("v", "stamp_ns", "seq", "boot")
 PLAIN = "values"
 """The field whose columns need no prefix: what it is about."""
 
@@ -184,28 +185,28 @@ def _cells(one: Recorded, typed: bool = False) -> Iterator[tuple[str, Any]]:
     message, form = one.message, one.form
     yield from zip(FIRST, (one.received_ns, message.stamp_ns, message.seq, message.boot), strict=True)
     for name, hint in form.hints.items():
-        if name in ("stamp_ns", "seq", "boot", "TYPE"):
-            continue
-        yield from _columns(name, hint, message, form, typed)
+        if name not in HEADER:
+            yield from _columns(name, hint, message, form, typed)
 
 
 def _columns(name: str, hint: Any, message: Message, form: Form, typed: bool) -> Iterator[tuple[str, Any]]:
     value = getattr(message, name)
     signals = form.catalogue.signals
-    if hint is np.ndarray and not form.by_signal:
+    if hint == Numbers and not form.by_signal:
         yield name, json.dumps(value.tolist())
-    elif hint is np.ndarray or hint == dict[str, np.ndarray]:
+    elif hint in (Numbers, dict[str, Numbers], dict[str, Truths]):
         only = getattr(message, "signal", "")
-        found = {only: value} if hint is np.ndarray else value
+        found = {only: value} if hint == Numbers else value
         for signal, listed in signals.items():
             if only and signal != only:
                 continue
-            unit = UNITS.get(name, listed.unit)
+            is_truth = hint == dict[str, Truths]
+            unit = "" if is_truth else UNITS.get(name, listed.unit)
             prefix = "" if name == PLAIN else f"{name}."
-            suffix = f" [{unit}]" if unit and name not in TRUTHS else ""
+            suffix = f" [{unit}]" if unit else ""
             numbers = found.get(signal)
             for index, element in enumerate(listed.elements):
-                yield f"{prefix}{signal}.{element}{suffix}", _cell(name, numbers, index, typed)
+                yield f"{prefix}{signal}.{element}{suffix}", _cell(is_truth, numbers, index, typed)
     elif hint in (dict[str, float], dict[str, str]):
         empty: Any = "" if hint == dict[str, str] else math.nan
         for signal in signals:
@@ -216,8 +217,8 @@ def _columns(name: str, hint: Any, message: Message, form: Form, typed: bool) ->
         yield name, value if isinstance(value, bool | int | str) else json.dumps(value)
 
 
-def _cell(name: str, numbers: np.ndarray | None, index: int, typed: bool) -> bool | float | None:
-    if name in TRUTHS:
+def _cell(is_truth: bool, numbers: np.ndarray | None, index: int, typed: bool) -> bool | float | None:
+    if is_truth:
         return bool(numbers[index]) if numbers is not None else (False if typed else None)
     return None if numbers is None else _number(float(numbers[index]))
 

@@ -12,21 +12,19 @@ import re
 import struct
 import typing
 from collections.abc import Callable, Mapping
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import dataclass
 from typing import Any, Self
 
-import msgpack
 import msgspec
 import numpy as np
 
 from hal.config import RobotConfig
 from services.wire.messages import VERSION, MessageError
-from services.wire.records import Message
+from services.wire.records import Message, Numbers, Truths
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 ABSENT = {"age": math.inf}
 """What an absent number of a field stands for, where that is not NaN."""
-TRUTHS = ("valid", "estimated")
 UNITS = {"age": "s", "contribution": "1", "left": "s"}
 """Units of fields that do not have the signal's."""
 TYPES: dict[Any, str] = {int: "integer", float: "number", bool: "boolean", str: "string"}
@@ -112,17 +110,15 @@ class Form:
 
     def __init__(self, record: type[Message], catalogue: Catalogue) -> None:
         self.record, self.catalogue = record, catalogue
-        self.hints = typing.get_type_hints(record)
-        self._fields = fields(record)
+        self._fields = msgspec.structs.fields(record)
+        self.hints = {item.name: item.type for item in self._fields}
         self._packed = {
             name: (listed.elements, struct.Struct(f"<{len(listed.elements)}d"))
             for name, listed in catalogue.signals.items()
         }
         self.by_signal = any(item.name == "signal" for item in self._fields)
         self._plan = [(item.name, self._writer(item.name, self.hints[item.name])) for item in self._fields]
-        self._required = frozenset(
-            item.name for item in self._fields if item.default is MISSING and item.default_factory is MISSING
-        )
+        self._required = frozenset(item.name for item in self._fields if item.required)
         self.schema = self._schema()
 
     def write(self, payload: bytes) -> tuple[bytes, dict[str, Any]]:
@@ -133,7 +129,7 @@ class Form:
             MessageError: It is not such a message, or JSON cannot hold it.
         """
         try:
-            body = msgpack.unpackb(payload)
+            body = msgspec.msgpack.decode(payload)
             if body["type"] != self.record.TYPE or body["v"] != VERSION:
                 raise MessageError(f"It is no {self.record.TYPE} message of version {VERSION}.")
             if not self._required <= body.keys():
@@ -152,7 +148,7 @@ class Form:
         except MessageError:
             raise
         except (ValueError, TypeError, LookupError, AttributeError, struct.error, OverflowError, RecursionError,
-                msgpack.UnpackException, msgspec.MsgspecError) as error:  # fmt: skip
+                msgspec.MsgspecError) as error:  # fmt: skip
             raise MessageError(f"It is no {self.record.TYPE} message: {error or type(error).__name__}.") from None
 
     def read(self, data: bytes) -> Message:
@@ -173,7 +169,7 @@ class Form:
 
     def _writer(self, name: str, hint: Any) -> Convert:
         """What turns a field of the wire into JSON; None from it means that the field is absent."""
-        if hint is np.ndarray:
+        if hint == Numbers:
             if not self.by_signal:
                 return _list_of_numbers
             return lambda value, body: {body["signal"]: self._numbers(body["signal"], value)}
@@ -181,8 +177,8 @@ class Form:
             return _finite
         if typing.get_origin(hint) is dict:
             inner = typing.get_args(hint)[1]
-            if inner is np.ndarray:
-                one = self._truths if name in TRUTHS else self._numbers
+            if inner in (Numbers, Truths):
+                one = self._truths if inner == Truths else self._numbers
                 return lambda value, _: {signal: one(signal, part) for signal, part in value.items()}
             if inner is float:
                 return _map_of_numbers
@@ -213,7 +209,7 @@ class Form:
     def _read(self, name: str, body: dict[str, Any]) -> Any:
         hint: Any = self.hints[name]
         value: Any = body.get(name)
-        if hint is np.ndarray:
+        if hint == Numbers:
             if not self.by_signal:
                 return np.array(value, float)
             return self._array(name, body["signal"], value[body["signal"]])
@@ -221,22 +217,25 @@ class Form:
             return math.nan if value is None else float(value)
         if typing.get_origin(hint) is dict:
             inner = typing.get_args(hint)[1]
-            if inner is np.ndarray:
+            if inner in (Numbers, Truths):
                 return {signal: self._array(name, signal, part) for signal, part in value.items()}
             if inner is float:
                 return dict.fromkeys(body.get("values", ()), math.nan) | value
         return value
 
+    def _is_truth(self, name: str) -> bool:
+        return Truths in typing.get_args(self.hints[name])
+
     def _array(self, name: str, signal: str, part: dict[str, Any]) -> np.ndarray:
         elements = self.catalogue.signals[signal].elements
-        if name in TRUTHS:
+        if self._is_truth(name):
             return np.array([part[element] for element in elements], bool)
         absent = ABSENT.get(name, math.nan)
         return np.array([part.get(element, absent) for element in elements], float)
 
     def _schema(self) -> dict[str, Any]:
         told = _told(self.record)
-        properties = {"type": {"const": self.record.TYPE, "type": "string"}, "v": {"type": "integer"}}
+        properties: dict[str, Any] = {"type": {"const": self.record.TYPE, "type": "string"}}
         for item in self._fields:
             properties[item.name] = self._schema_of(item.name, self.hints[item.name])
             if item.name in told:
@@ -255,10 +254,10 @@ class Form:
         }
 
     def _schema_of(self, name: str, hint: Any) -> dict[str, Any]:
-        if hint is np.ndarray and not self.by_signal:
+        if hint == Numbers and not self.by_signal:
             return {"type": "array", "items": {"type": "number"}}
         origin, inner = typing.get_origin(hint), (typing.get_args(hint) or (None,))[-1]
-        if hint is np.ndarray or inner is np.ndarray:
+        if hint == Numbers or inner in (Numbers, Truths):
             return _object({signal: self._elements(name, listed) for signal, listed in self.catalogue.signals.items()})
         if origin is list:
             return {"type": "array", "items": {"type": TYPES[inner]}}
@@ -268,7 +267,7 @@ class Form:
         return {"type": TYPES[hint]} | ({"unit": UNITS[name]} if name in UNITS else {})
 
     def _elements(self, name: str, listed: Listed) -> dict[str, Any]:
-        if name in TRUTHS:
+        if self._is_truth(name):
             return _object({element: {"type": "boolean"} for element in listed.elements})
         unit = UNITS.get(name, listed.unit)
         one = {"type": "number"} | ({"description": f"[{unit}]", "unit": unit} if unit else {})

@@ -4,19 +4,27 @@ On the wire a message is one msgpack map: `type`, `v`, `stamp_ns`, `seq`, `boot`
 of numbers is a msgpack binary of little-endian float64; an array of truth values is a binary of one byte each.
 """
 
-import dataclasses
-import functools
-import types
-import typing
-from collections.abc import Callable, Mapping
-from typing import Any, TypeVar
+from collections.abc import Mapping
+from typing import Any, TypeVar, Union
 
-import msgpack
+import msgspec
 import numpy as np
 
 from services.errors import ServiceError
 from services.wire.plain_text import plain, shown
-from services.wire.records import Anomaly, Applied, Command, Estimates, Holder, Message, Sample, Status, Target, Update
+from services.wire.records import (
+    Anomaly,
+    Applied,
+    Command,
+    Estimates,
+    Holder,
+    Message,
+    Sample,
+    Status,
+    Target,
+    Truths,
+    Update,
+)
 
 __all__ = [
     "Anomaly", "Applied", "Command", "Estimates", "Holder", "Message", "MessageError", "Sample", "Status", "Target",
@@ -25,6 +33,9 @@ __all__ = [
 
 VERSION = 1
 MAX_BYTES = 1 << 20
+NUMBER, TRUTH = np.dtype("<f8"), np.dtype("?")
+UNREADABLE = (msgspec.MsgspecError, UnicodeDecodeError, RecursionError)
+"""What msgspec raises of bytes that are not msgpack, or not what they should be."""
 
 
 class MessageError(ServiceError, ValueError):
@@ -39,28 +50,42 @@ RECORDS: dict[str, type[Message]] = {
     record.TYPE: record for record in (Sample, Command, Holder, Applied, Estimates, Anomaly, Update, Target, Status)
 }
 M = TypeVar("M", bound=Message)
-_fields: Callable[[Any], tuple[dataclasses.Field[Any], ...]] = functools.cache(dataclasses.fields)
-_hints: Callable[[Any], dict[str, Any]] = functools.cache(typing.get_type_hints)
-"""Resolving the annotations anew would cost more than all the rest of `decode`."""
+
+
+def _packed(value: Any) -> Any:
+    """What msgpack has no word for, in its words."""
+    if isinstance(value, np.ndarray):
+        if value.dtype is not NUMBER and value.dtype is not TRUTH:
+            value = value.astype(NUMBER, copy=False)
+        return value.tobytes()
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"A message cannot carry {type(value).__name__}.")
+
+
+def _array(kind: Any, value: Any) -> np.ndarray:
+    if kind is Truths:
+        if type(value) is not bytes:
+            raise ValueError("Expected a binary of bytes")
+        return np.frombuffer(value, "u1") != 0 if value.strip(b"\0\1") else np.frombuffer(value, TRUTH)
+    if type(value) is not bytes or len(value) % 8:
+        raise ValueError("Expected a binary of little-endian float64")
+    return np.frombuffer(value, NUMBER)
+
+
+_encoder = msgspec.msgpack.Encoder(enc_hook=_packed)
+_decoders: dict[type[Message], msgspec.msgpack.Decoder[Any]] = {
+    record: msgspec.msgpack.Decoder(record, dec_hook=_array) for record in RECORDS.values()
+}
+_any_decoder: msgspec.msgpack.Decoder[Any] = msgspec.msgpack.Decoder(
+    Union[tuple(RECORDS.values())],  # noqa: UP007 - made of a list
+    dec_hook=_array,
+)
 
 
 def encode(message: Message, **header: int) -> bytes:
     """The wire form of a message; `header` replaces `seq` and `boot`, which the publisher knows."""
-    body: dict[str, Any] = {"type": message.TYPE, "v": VERSION}
-    for item in _fields(type(message)):
-        body[item.name] = _pack(getattr(message, item.name))
-    body.update(header)
-    return msgpack.packb(body)
-
-
-def _pack(value: Any) -> Any:
-    if isinstance(value, np.ndarray):
-        return value.astype("?" if value.dtype == bool else "<f8", copy=False).tobytes()
-    if isinstance(value, dict):
-        return {key: _pack(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_pack(item) for item in value]
-    return value.item() if isinstance(value, np.generic) else value
+    return _encoder.encode(msgspec.structs.replace(message, v=VERSION, **header))
 
 
 def decode(data: bytes, expected: type[M]) -> M:
@@ -70,10 +95,8 @@ def decode(data: bytes, expected: type[M]) -> M:
         MessageError: Too long, not msgpack, another type, a field missing or of a wrong kind.
         OtherVersion: Of another version.
     """
-    body = _body(data, expected.TYPE)
-    if body.get("type") != expected.TYPE:
-        raise MessageError(f"Expected a {expected.TYPE} message, got {shown(body.get('type'))}.")
-    return _record(expected, body)
+    message: M = _decoded(data, _decoders[expected], expected.TYPE)
+    return message
 
 
 def decode_any(data: bytes) -> Message:
@@ -82,87 +105,61 @@ def decode_any(data: bytes) -> Message:
     Raises:
         MessageError: As `decode`, or the type is not known.
     """
-    body = _body(data, "gemuco")
-    kind = body.get("type")
-    if not isinstance(kind, str) or kind not in RECORDS:
-        raise MessageError(f"There is no message type {shown(kind)}. Known types: {', '.join(RECORDS)}.")
-    return _record(RECORDS[kind], body)
+    message: Message = _decoded(data, _any_decoder, None)
+    return message
 
 
-def _body(data: bytes, what: str) -> dict[str, Any]:
+def _decoded(data: bytes, decoder: msgspec.msgpack.Decoder[Any], wanted: str | None) -> Any:
     if len(data) > MAX_BYTES:
-        raise MessageError(f"A {what} message of {len(data)} bytes is over the limit of {MAX_BYTES}.")
+        raise MessageError(f"A {wanted or 'gemuco'} message of {len(data)} bytes is over the limit of {MAX_BYTES}.")
     try:
-        body = msgpack.unpackb(data)
-    except (ValueError, msgpack.UnpackException) as error:
-        raise MessageError(f"A {what} message is not msgpack: {error or type(error).__name__}.") from None
+        message = decoder.decode(data)
+    except UNREADABLE as error:
+        raise _refusal(data, wanted, error) from None
+    if message.v != VERSION:
+        raise _other_version(message.TYPE, message.v)
+    _check_alike(message)
+    return message
+
+
+def _refusal(data: bytes, wanted: str | None, error: Exception) -> MessageError:
+    """Why bytes could not be read: what is most wrong with them, and no other fault that follows from it."""
+    what = wanted or "gemuco"
+    try:
+        body = msgspec.msgpack.decode(data)
+    except UNREADABLE as reason:
+        return MessageError(f"A {what} message is not msgpack: {plain(str(reason))}.")
     if not isinstance(body, dict):
-        raise MessageError(f"Expected a {what} message, got {type(body).__name__}.")
-    return body
-
-
-def _record(expected: type[M], body: dict[str, Any]) -> M:
-    version = body.get("v")
+        return MessageError(f"Expected a {what} message, got {type(body).__name__}.")
+    kind, version = body.get("type"), body.get("v")
+    if not isinstance(kind, str) or kind != (wanted or kind):
+        return MessageError(f"Expected a {what} message, got {shown(kind)}.")
+    if kind not in RECORDS:
+        return MessageError(f"There is no message type {shown(kind)}. Known types: {', '.join(RECORDS)}.")
     if type(version) is not int or version != VERSION:
-        raise OtherVersion(f"A {expected.TYPE} message has version {shown(version)}; this program reads {VERSION}.")
-    hints = _hints(expected)
-    fields: dict[str, Any] = {}
-    for item in _fields(expected):
-        if item.name in body:
-            fields[item.name] = _unpack(body[item.name], hints[item.name], f"{expected.TYPE}.{item.name}")
-        elif item.default is dataclasses.MISSING and item.default_factory is dataclasses.MISSING:
-            raise MessageError(f"A {expected.TYPE} message lacks '{item.name}'.")
-    _check_alike(expected, fields)
-    return expected(**fields)
+        return _other_version(kind, version)
+    return MessageError(f"A {kind} message is malformed: {plain(str(error))}.")
 
 
-def _check_alike(expected: type[Message], fields: Mapping[str, Any]) -> None:
+def _other_version(kind: str, version: Any) -> OtherVersion:
+    return OtherVersion(f"A {kind} message has version {shown(version)}; this program reads {VERSION}.")
+
+
+def _check_alike(message: Message) -> None:
     """Raise `MessageError` unless all that is told by signal is told of the same signals, with as many elements."""
-    if not expected.PER_SIGNAL:
+    if not message.PER_SIGNAL:
         return
-    first, *others = expected.PER_SIGNAL
-    sizes = {name: array.size for name, array in fields[first].items()}
+    first, *others = message.PER_SIGNAL
+    sizes = {name: array.size for name, array in getattr(message, first).items()}
     if not all(sizes.values()):
-        raise MessageError(f"A {expected.TYPE} message has a signal without elements.")
+        raise MessageError(f"A {message.TYPE} message has a signal without elements.")
     for other in others:
-        found = fields[other]
+        found: Mapping[str, Any] = getattr(message, other)
         if found.keys() != sizes.keys():
-            raise MessageError(f"A {expected.TYPE} message names other signals in '{other}' than in '{first}'.")
+            raise MessageError(f"A {message.TYPE} message names other signals in '{other}' than in '{first}'.")
         for name, array in found.items():
-            if isinstance(array, np.ndarray) and array.size != sizes[name]:
+            if type(array) is np.ndarray and array.size != sizes[name]:
                 raise MessageError(
-                    f"A {expected.TYPE} message has {array.size} elements in '{other}.{plain(name, 60)}' and "
+                    f"A {message.TYPE} message has {array.size} elements in '{other}.{plain(name, 60)}' and "
                     f"{sizes[name]} in '{first}'."
                 )
-
-
-def _unpack(value: Any, hint: Any, where: str) -> Any:
-    if hint is np.ndarray:
-        return _array(value, where, truth=where.endswith((".valid", ".estimated")))
-    origin = typing.get_origin(hint)
-    if origin is dict:
-        if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
-            raise MessageError(f"{where} is not a map with names as keys.")
-        inner = typing.get_args(hint)[1]
-        if inner is np.ndarray:
-            truth = where.endswith((".valid", ".estimated"))
-            return {key: _array(item, f"{where}.{plain(key, 60)}", truth) for key, item in value.items()}
-        return value if inner is Any else {k: _unpack(v, inner, f"{where}.{plain(k, 60)}") for k, v in value.items()}
-    if origin is list:
-        if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
-            raise MessageError(f"{where} is not a list of names.")
-        return value
-    wanted: Any = (int, float) if hint is float else (origin or hint)
-    if (
-        isinstance(wanted, types.GenericAlias)
-        or not isinstance(value, wanted)
-        or (isinstance(value, bool) and hint is not bool)
-    ):
-        raise MessageError(f"{where} is {type(value).__name__}, not {getattr(hint, '__name__', hint)}.")
-    return float(value) if hint is float else value
-
-
-def _array(value: Any, where: str, truth: bool) -> np.ndarray:
-    if not isinstance(value, bytes) or (not truth and len(value) % 8):
-        raise MessageError(f"{where} is not a binary of {'bytes' if truth else 'little-endian float64'}.")
-    return np.frombuffer(value, "u1") != 0 if truth else np.frombuffer(value, "<f8")

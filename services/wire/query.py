@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict
 from typing import Any
 
-import msgpack
+import msgspec
 import numpy as np
 import zenoh
 
@@ -22,7 +22,7 @@ from services.errors import NoAnswer, RemoteError, ServiceError, ServiceUnavaila
 from services.wire import keys
 from services.wire.absence import instead, starter
 from services.wire.caller import ASKING, LONGEST_NAME, NOBODY, Caller
-from services.wire.messages import MAX_BYTES, VERSION, MessageError
+from services.wire.messages import MAX_BYTES, UNREADABLE, VERSION, MessageError
 from services.wire.plain_text import plain, shown
 
 log = logging.getLogger(__name__)
@@ -278,7 +278,7 @@ def _family(base: type[Exception]) -> Iterator[type[Exception]]:
 
 
 def _pack(value: Any) -> bytes:
-    return msgpack.packb(value, default=_plain)
+    return _encoder.encode(value)
 
 
 def _plain(value: Any) -> Any:
@@ -289,13 +289,16 @@ def _plain(value: Any) -> Any:
     return str(value)
 
 
+_encoder = msgspec.msgpack.Encoder(enc_hook=_plain)
+
+
 def _unpack(data: bytes, what: str) -> dict[str, Any]:
     if len(data) > MAX_BYTES:
         raise MessageError(f"{what} of {len(data)} bytes are over the limit of {MAX_BYTES}.")
     try:
-        body = msgpack.unpackb(data)
-    except (ValueError, msgpack.UnpackException) as error:
-        raise MessageError(f"{what} are not msgpack: {error or type(error).__name__}.") from None
+        body = msgspec.msgpack.decode(data)
+    except UNREADABLE as error:
+        raise MessageError(f"{what} are not msgpack: {plain(str(error))}.") from None
     if not isinstance(body, dict):
         raise MessageError(f"{what} are {type(body).__name__}, not a map.")
     return body

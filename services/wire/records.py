@@ -1,18 +1,20 @@
 """What travels between the processes, as typed records; `services.wire.messages` puts them on the wire."""
 
-from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
+import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
-Arrays = dict[str, np.ndarray]
+Numbers = NDArray[np.float64]
+Truths = NDArray[np.bool_]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Message:
-    """What every message carries.
+class Message(msgspec.Struct, frozen=True, kw_only=True, tag_field="type", tag=str.lower):
+    """What every message carries, beside its type, which is the name of its class in lower case.
 
     Attributes:
+        v: Version of the wire format it came in.
         stamp_ns: The sender's wall clock when the content was true [ns since 1970].
         seq: Counts up by one per message of this key and sender; a gap is a loss.
         boot: Random number of the sending process; another one means it was restarted.
@@ -21,13 +23,13 @@ class Message:
     TYPE: ClassVar[str]
     PER_SIGNAL: ClassVar[tuple[str, ...]] = ()
     """Fields that tell something of each signal: of the same ones, with as many elements."""
+    v: int = 0
     stamp_ns: int = 0
     seq: int = 0
     boot: int = 0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Sample(Message):
+class Sample(Message, frozen=True, kw_only=True):
     """One coherent cycle of the robot's sensors, or one frame of a camera.
 
     Attributes:
@@ -44,13 +46,12 @@ class Sample(Message):
     cycle: int
     source: str
     complete: bool
-    values: Arrays
-    age: Arrays
-    valid: Arrays
+    values: dict[str, Numbers]
+    age: dict[str, Numbers]
+    valid: dict[str, Truths]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Command(Message):
+class Command(Message, frozen=True, kw_only=True):
     """What is desired of the drives.
 
     Attributes:
@@ -63,14 +64,13 @@ class Command(Message):
 
     TYPE: ClassVar[str] = "command"
     signal: str
-    values: np.ndarray
+    values: Numbers
     cycle: int
     hal_boot: int
     name: str = ""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Holder(Message):
+class Holder(Message, frozen=True, kw_only=True):
     """Who commands the robot.
 
     Attributes:
@@ -87,8 +87,7 @@ class Holder(Message):
     left: float = 0.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Applied(Message):
+class Applied(Message, frozen=True, kw_only=True):
     """What was really sent to the drives in a cycle.
 
     Attributes:
@@ -105,14 +104,13 @@ class Applied(Message):
     cycle: int
     mode: str
     signal: str
-    desired: np.ndarray
-    values: np.ndarray
+    desired: Numbers
+    values: Numbers
     limited_by: list[str]
     sender: int
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Estimates(Message):
+class Estimates(Message, frozen=True, kw_only=True):
     """Every signal of the body, measured where it can be and estimated where it cannot.
 
     Attributes:
@@ -130,16 +128,15 @@ class Estimates(Message):
     TYPE: ClassVar[str] = "estimates"
     PER_SIGNAL: ClassVar[tuple[str, ...]] = ("values", "estimated", "std", "method", "mask", "residual")
     cycle: int
-    values: Arrays
-    estimated: Arrays
-    std: Arrays
+    values: dict[str, Numbers]
+    estimated: dict[str, Truths]
+    std: dict[str, Numbers]
     method: dict[str, str]
     mask: dict[str, str]
     residual: dict[str, float]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Anomaly(Message):
+class Anomaly(Message, frozen=True, kw_only=True):
     """How unlike normal the body is.
 
     Attributes:
@@ -160,12 +157,11 @@ class Anomaly(Message):
     threshold: float
     is_anomaly: bool
     blamed: str
-    contribution: Arrays
+    contribution: dict[str, Numbers]
     verdict: str = ""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Update(Message):
+class Update(Message, frozen=True, kw_only=True):
     """What the online update does.
 
     Attributes:
@@ -185,13 +181,12 @@ class Update(Message):
     window: int
     dropped: int
     loss: float
-    bias: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    bias: Numbers = msgspec.field(default_factory=lambda: np.zeros(0))
     settled: bool = True
     rolled_back: int = 0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Target(Message):
+class Target(Message, frozen=True, kw_only=True):
     """Where the controller shall bring the body.
 
     Attributes:
@@ -203,13 +198,12 @@ class Target(Message):
 
     TYPE: ClassVar[str] = "target"
     signal: str
-    values: np.ndarray
+    values: Numbers
     cycle: int = 0
     hal_boot: int = 0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Status(Message):
+class Status(Message, frozen=True, kw_only=True):
     """Health of one service, once a second.
 
     Attributes:
@@ -224,5 +218,5 @@ class Status(Message):
     service: str
     state: str
     text: str = ""
-    loops: dict[str, dict[str, float]] = field(default_factory=dict)
-    facts: dict[str, Any] = field(default_factory=dict)
+    loops: dict[str, dict[str, float]] = msgspec.field(default_factory=dict)
+    facts: dict[str, Any] = msgspec.field(default_factory=dict)

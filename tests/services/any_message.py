@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from services.recording.schema import Catalogue, Listed
-from services.wire.records import Message
+from services.wire.messages import VERSION
+from services.wire.records import Message, Numbers, Truths
 
 ARM = Catalogue({"joint_position": Listed("rad", ("elbow", "wrist")), "muscle_tension": Listed("N", ("biceps",))})
 BY_SIGNAL = {"joint_position": 2, "muscle_tension": 1}
@@ -17,16 +18,18 @@ def a_message(record: type[Message], number: float = 0.1) -> Message:
     """One of every type, its arrays filled with a number."""
     arrays = {name: np.full(size, number) for name, size in BY_SIGNAL.items()}
     truths = {name: np.arange(size) == 0 for name, size in BY_SIGNAL.items()}
-    fields: dict[str, Any] = {"stamp_ns": time.time_ns(), "seq": 7, "boot": 2**53 - 1}
+    fields: dict[str, Any] = {"stamp_ns": time.time_ns(), "seq": 7, "boot": 2**53 - 1, "v": VERSION}
     for name, hint in typing.get_type_hints(record).items():
         if name in fields or typing.get_origin(hint) is typing.ClassVar:
             continue
         if name == "signal":
             fields[name] = "joint_position"
-        elif hint is np.ndarray:
+        elif hint == Numbers:
             fields[name] = np.full(2, 0.25 if name == "bias" else number)
-        elif hint == dict[str, np.ndarray]:
-            fields[name] = truths if name in ("valid", "estimated") else arrays
+        elif hint == dict[str, Numbers]:
+            fields[name] = arrays
+        elif hint == dict[str, Truths]:
+            fields[name] = truths
         elif hint == dict[str, float]:
             fields[name] = dict.fromkeys(BY_SIGNAL, number)
         elif hint == dict[str, str]:

@@ -1,8 +1,8 @@
 import math
-from dataclasses import replace
 
 import numpy as np
 from arm_model import arm, fresh, sample_of, small_model
+from msgspec.structs import replace
 
 from hal.clock import ManualClock
 from services.model.anomaly_loop import AnomalyWatch

@@ -1,4 +1,3 @@
-import dataclasses
 from typing import Any
 
 import msgpack
@@ -65,12 +64,28 @@ def test_every_message_comes_back(message: Message) -> None:
         messages.decode_any(messages.encode(message)),
     ):
         assert type(back) is type(message)
-        for item in dataclasses.fields(message):
-            assert _same(getattr(message, item.name), getattr(back, item.name)), item.name
+        assert back.v == messages.VERSION
+        for name in set(message.__struct_fields__) - {"v"}:
+            assert _same(getattr(message, name), getattr(back, name)), name
 
 
 def test_there_is_an_example_of_every_message() -> None:
     assert {message.TYPE for message in EXAMPLES} == set(messages.RECORDS)
+
+
+def test_the_type_on_the_wire_is_the_record_s() -> None:
+    for message in EXAMPLES:
+        assert msgpack.unpackb(messages.encode(message))["type"] == message.TYPE
+
+
+@pytest.mark.parametrize(("wire", "read"), [(b"\0\1\1", [False, True, True]), (b"\0\2\xff", [False, True, True])])
+def test_any_byte_but_zero_is_true(wire: bytes, read: list[bool]) -> None:
+    body = msgpack.unpackb(messages.encode(EXAMPLES[0])) | {"valid": {"joint_position": wire}}
+    body |= {part: {"joint_position": bytes(24)} for part in ("values", "age")}
+    valid = messages.decode(msgpack.packb(body), Sample).valid["joint_position"]
+    assert valid.dtype == bool
+    assert valid.tolist() == read
+    assert valid.sum() == 2
 
 
 def test_numpy_scalars_travel_as_numbers() -> None:
@@ -97,18 +112,19 @@ def _command(**change: object) -> bytes:
         (b"\xc1", "not msgpack"),
         (b"\x81\xa1a", "not msgpack"),
         (b"\x91" * 5000, "not msgpack"),
-        (msgpack.packb({1: 2}), "not msgpack"),
+        (msgpack.packb({1: 2}), "got None"),
+        (msgpack.packb({"type": "command", "v": 1, 1: 2}), "malformed: Expected `str`"),
         (msgpack.packb([1, 2]), "got list"),
         (msgpack.packb({}), "got None"),
         (messages.encode(EXAMPLES[6]), "got 'target'"),
         (_command(v=2), "has version 2; this program reads 1"),
-        (_command(v=None), "has version None"),
-        (_command(values=None), "lacks 'values'"),
-        (_command(values=[1.0, 2.0]), "not a binary"),
-        (_command(values=b"1234567"), "not a binary"),
-        (_command(signal=3), "command.signal is int, not str"),
-        (_command(cycle=True), "command.cycle is bool, not int"),
-        (_command(cycle=1.0), "command.cycle is float, not int"),
+        (_command(v=None), "has version 0; this program reads 1"),
+        (_command(values=None), "missing required field `values`"),
+        (_command(values=[1.0, 2.0]), r"Expected a binary of little-endian float64 - at `\$.values`"),
+        (_command(values=b"1234567"), "Expected a binary of little-endian float64"),
+        (_command(signal=3), r"Expected `str`, got `int` - at `\$.signal`"),
+        (_command(cycle=True), "Expected `int`, got `bool`"),
+        (_command(cycle=1.0), "Expected `int`, got `float`"),
         (b"\x00" * (MAX_BYTES + 1), "over the limit"),
     ],
 )

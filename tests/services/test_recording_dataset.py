@@ -1,11 +1,11 @@
 import math
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from any_message import ARM
+from msgspec.structs import replace
 from recorded_arm import BEGIN, SECOND, a_sample, position, record
 
 from gemuco.errors import DatasetError

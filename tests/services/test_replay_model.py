@@ -2,12 +2,12 @@
 
 import threading
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from arm_model import arm, sample_of, small_model
+from msgspec.structs import replace
 from recorded_arm import BEGIN, SECOND
 from small_arm import eventually
 
