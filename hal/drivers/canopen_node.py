@@ -40,6 +40,9 @@ _REPEAT, _LATE, _TWINS = 3, 3, 40
 """A frame too many weighs 3, one that is explained by a late one -3, one as it should be -1; at 40 (times the frames of
 a cycle) there are two nodes. So two nodes are told after 20 cycles, and a bus that doubles a quarter of its frames is
 not mistaken for them."""
+_FORGET = 1 / 16
+"""What a late frame explains is forgotten by so much per cycle: whoever answers may run behind for seconds, one SYNC
+more now and then, and catch up all at once."""
 _BACKLOG = 200
 """So many cycles may be answered all at once, when whoever answers was held up."""
 _STRAYS = 3
@@ -96,7 +99,7 @@ class CanopenNode(CanDevice):
         self._all = sum(1 << pdo.number for pdo in self._pdos.sends if pdo.answers_sync)
         self._count = self._all.bit_count()
         self._pending, self._since = self._all, 0
-        self._doubt = 0
+        self._doubt = 0.0
         self._strays = -math.inf
         self._twin = ""
         for pdo in self._pdos.sends:
@@ -138,7 +141,7 @@ class CanopenNode(CanDevice):
         nmt(self._bus, NmtCommand.PRE_OPERATIONAL, self.node)
         self._calibrate()
         commission(self._sdo, self._plan(), self.node, str(self._place))
-        self._strays, self._doubt, self._pending = -math.inf, 0, self._all
+        self._strays, self._doubt, self._pending = -math.inf, 0.0, self._all
         self._started.clear()
         nmt(self._bus, NmtCommand.START, self.node)
         if not self._started.wait(START_TIMEOUT):
@@ -158,7 +161,7 @@ class CanopenNode(CanDevice):
 
     def reset(self) -> None:
         """See `Device.reset`; an emergency that persists is reported again by the device."""
-        self._emergency, self._twin, self._doubt = None, "", 0
+        self._emergency, self._twin, self._doubt = None, "", 0.0
 
     def _release(self) -> None:
         """Leave the node pre-operational, and not looking for our heartbeat."""
@@ -202,7 +205,7 @@ class CanopenNode(CanDevice):
             self._pending = pending
             return
         if self._doubt and missed == 1:
-            self._doubt -= self._count if self._doubt > 0 else -self._count
+            self._doubt += self._count * (-1 if self._doubt > 0 else _FORGET)
         elif missed > 1:
             late = min(missed - 1, _BACKLOG) * self._count
             self._doubt = max(self._doubt - _LATE * late, -_LATE * _BACKLOG)

@@ -139,6 +139,25 @@ def test_late_answers_are_no_twin(joint):
     assert bench.device("elbow")["state"] == "ready"
 
 
+def test_one_that_falls_behind_for_seconds_and_catches_up_at_once_is_no_twin(joint):
+    bench = joint("csp", quantities=("position",)).open()
+    bench.cycle(3)
+    bench.rig.fault("sensor_silent elbow")
+
+    def cycle(answers: int) -> None:
+        bench.cycle()
+        for _ in range(answers):
+            bench.send("can0", 0x180 + NODE, struct.pack("<Hi", 0x0250, 1234))
+        bench.flush()
+        assert bench.device("elbow")["state"] == "ready"
+
+    for number in range(300):
+        cycle(0 if number % 12 == 0 else 1)
+    for _ in range(25):
+        cycle(2)
+    assert bench.device("elbow")["counters"]["doubled"] == 25
+
+
 def test_a_boot_up_message_while_process_data_goes_on_is_another_node(joint):
     bench = joint("csp", quantities=("position",)).open()
     bench.cycle(3)
