@@ -83,22 +83,22 @@ def measures(client: Client) -> bool:
 
 
 def engage(client: Client) -> None:
-    """Engage the controller, out of a fault too; gives up after ten seconds."""
-    deadline = time.monotonic() + 10.0
+    """Engage the controller, out of a fault too; gives up after fifteen seconds."""
+    deadline, refusal = time.monotonic() + 15.0, ""
     while time.monotonic() < deadline:
         applied = client.applied(timeout=1.0)
-        if applied is not None and applied.mode in ("hold", "follow"):
+        mode = "unheard" if applied is None else applied.mode
+        if mode in ("hold", "follow"):
             return
-        if applied is not None and applied.mode == "enabling":
-            time.sleep(0.1)
-            continue
         try:
-            client.engage()
+            if mode == "fault":
+                client.reset()
+            if mode != "enabling":
+                client.engage()
         except (CommandRefused, NotEngaged) as error:
-            print(f"not engaged yet: {error}")
-            client.reset()  # drives whose HAL died latch a fault
+            refusal = str(error)
         time.sleep(0.3)
-    raise TimeoutError("The controller was not engaged within ten seconds.")
+    raise TimeoutError(f"The controller was not engaged within fifteen seconds. {refusal}")
 
 
 def move(client: Client, robot: RobotConfig, duration: float) -> int:

@@ -13,8 +13,8 @@ from services.errors import NotEngaged, ServiceError
 NOTICED_WITHIN = 3.0
 """Time [s] within which what happens must be told."""
 ENGAGED_WITHIN = 1.0
-RECOVERED_WITHIN = 8.0
-"""Time [s] that nodes have to come back after a fault."""
+FOLLOWS_WITHIN = 15.0
+"""Time [s] that it may take to be followed: drives let go, nodes come back, and what refused once is asked again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,17 +46,20 @@ class Actor:
         """How often the HAL stopped the robot by itself."""
 
     def engage(self) -> None:
-        """Engage, again if the moment was a bad one: on a busy machine a sample may be late just then.
+        """Engage, out of a fault too, and again if the moment was a bad one: a sample may be late just then.
 
         Raises:
             ServiceError: The robot does not follow.
         """
         refusal = ""
-        deadline = time.monotonic() + NOTICED_WITHIN
+        deadline = time.monotonic() + FOLLOWS_WITHIN
         while not self._follows():
             if time.monotonic() > deadline:
                 raise ServiceError(f"The arm did not begin to follow. {refusal or 'See the logs beside the plot.'}")
             try:
+                if self._mode() == "fault":
+                    self._client.reset()
+                    self.wait(lambda: self._mode() == "off" and self._is_healthy(), ENGAGED_WITHIN)
                 self._client.engage()
             except (NotEngaged, CommandRefused) as error:
                 refusal = str(error)
@@ -106,8 +109,6 @@ class Actor:
         why = f"({mode}). {fault or 'Commands came too late.'}"
         self._tell(f"    [yellow]The HAL stopped the arm {why} It is reset and engaged again.[/]")
         self.stops += 1
-        self._client.reset()
-        self.wait(lambda: self._mode() == "off" and self._is_healthy(), RECOVERED_WITHIN)
         self.engage()
 
     def _is_healthy(self) -> bool:

@@ -80,8 +80,9 @@ def line_of(answer: dict[str, Any]) -> str:
     if answer["method"] == "none":
         return f"{answer['signal']} [{unit}]  {values}  neither measured nor estimable"
     spread = float(np.sqrt(np.mean(std[np.asarray(answer["estimated"], bool)] ** 2)))
-    source = answer["mask"].replace("+", ", ")
-    return f"{answer['signal']} [{unit}]  {values}  * estimated from {source}, expected error {spread:.3f} {unit}"
+    source = answer["mask"].replace("+", ", ") or "single elements"
+    error = f"{spread:.3f} {unit}" if np.isfinite(spread) else "unknown"
+    return f"{answer['signal']} [{unit}]  {values}  * estimated from {source}, expected error {error}"
 
 
 def _estimate(client: Client, signal: str, hide: Sequence[str]) -> dict[str, Any]:
