@@ -128,7 +128,7 @@ def run(robot_file: Path, minutes: float) -> dict[str, object]:
     """The whole measurement; loop name -> statistics of ours and of the bare loop, process -> share of a core."""
     robot = load_robot(robot_file)
     model(robot, Console())
-    rates = {"hal": robot.rates.hal} | {name: getattr(robot.rates, name) for name in PRIORITIES}
+    rates = {name: rate for name, rate in robot.rates.model_dump().items() if name in ("hal", *PRIORITIES)}
     context = multiprocessing.get_context("spawn")
     pipe, other = context.Pipe()
     bare = context.Process(target=bare_process, args=(rates, other), daemon=True)

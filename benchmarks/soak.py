@@ -215,7 +215,7 @@ def run(minutes: int, out: Path) -> dict[str, Any]:
     light_robot.make_model(file, model)
     robot, where = load_robot(file), f"tcp/127.0.0.1:{free_port()}"
     priorities = {"hal": CYCLE_PRIORITY, **PRIORITIES}
-    rates = {name: getattr(robot.rates, name) for name in priorities}
+    rates = {name: rate for name, rate in robot.rates.model_dump().items() if name in priorities}
     bare = BareLoops({name: (rate, priorities[name]) for name, rate in rates.items()})
     found: dict[str, Any] = {"minutes": minutes, "rates": rates, "rows": []}
     with Supervisor(folder) as supervisor:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gemuco.blame import suspects
-from gemuco.normal import Normal, judging_masks, prediction_errors
+from gemuco.normal import Normal, judging_masks, prediction_error_of, prediction_errors
 
 if TYPE_CHECKING:
     from gemuco.schema import BodySchema
@@ -52,15 +52,16 @@ def score(schema: "BodySchema", values: Mapping[str, np.ndarray], blame: bool = 
         blame: Whether to find what is most likely wrong, which costs many times the score; else the element that
             contributes most is named.
     """
-    x = schema.normalise_one(values)
+    joined = schema.layout.join_one(values)
+    joined[np.isinf(joined)] = np.nan
     if schema.normal is None:
         unknown = np.full(schema.out_layout.size, np.nan)
         return AnomalyScore(float("nan"), float("nan"), schema.out_layout.split(unknown), "")
-    distance, contribution, judged = schema.normal.distance(prediction_errors(schema, x))
+    distance, contribution, judged = schema.normal.distance(prediction_error_of(schema, joined))
     threshold = float(schema.normal.threshold_of(judged))
     blamed = ""
     if blame and distance > threshold:
-        blamed = suspects(schema, x[None])[0].name
+        blamed = suspects(schema, schema.scaler.normalise(joined)[None])[0].name
     elif judged:
-        blamed = schema.out_layout.element(int(np.nanargmax(contribution)))
+        blamed = schema.out_layout.element(int(np.fmax(contribution, -1.0).argmax()))
     return AnomalyScore(distance, threshold, schema.out_layout.split(contribution), blamed)

@@ -150,15 +150,10 @@ def latent_search(schema: "BodySchema", x: np.ndarray) -> np.ndarray:
         schema: The body schema.
         x: Every signal [standard deviations], shape (size,), NaN where nothing was measured.
     """
-    decoder = schema.weights.decoder
-    anchors = schema.anchors[:STARTS]
-    if len(anchors):
-        starts = run(schema.weights.encoder, schema.network_input(anchors, schema.masks[0]))
-    else:
-        starts = np.zeros((1, decoder[0].matrix.shape[0]), np.float32)
     data = np.full(len(x), np.nan)
     data[schema.out_index] = x[schema.out_index]
-    return run(decoder, minimise(fitting(latent_lines(schema), data), starts, SEARCH).point)
+    found = minimise(fitting(latent_lines(schema), data), schema.latent_starts, SEARCH)
+    return run(schema.weights.decoder, found.point)
 
 
 def input_search(schema: "BodySchema", x: np.ndarray, available: Mask) -> np.ndarray:

@@ -1,11 +1,12 @@
 """What prediction errors are like on a healthy body: their mean, covariance and usual distance (paper, II-K)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from statistics import NormalDist
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from gemuco.compiled.inference import infer
 from gemuco.errors import NotEnoughData
 from gemuco.estimate import mask_error
 from gemuco.masks import Mask
@@ -18,6 +19,9 @@ SHRINK = 0.05
 
 FLOOR = 0.01
 """Smallest standard deviation of an error, as a share of the signal's own standard deviation."""
+
+PATTERNS = 64
+"""Inverse covariances kept, one for every set of elements that were judged of late."""
 
 HELD_OUT = 0.3
 """Share of the normal data, its end, that sets the threshold and is not used for mean and covariance."""
@@ -32,12 +36,18 @@ class Normal:
         covariance: Regularised covariance [unit^2], shape (out_size, out_size).
         threshold: Score that a healthy body exceeds with the wanted false alarm rate.
         false_alarm: That rate, per sample.
+        usual: How many elements are judged when nothing is missing.
     """
 
     mean: np.ndarray
     covariance: np.ndarray
     threshold: float
     false_alarm: float
+    usual: int = field(init=False, repr=False)
+    _precisions: dict[bytes, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "usual", int(np.isfinite(self.mean).sum()))
 
     @classmethod
     def fit(cls, errors: np.ndarray, spread: np.ndarray, false_alarm: float = 1e-3) -> "Normal":
@@ -84,7 +94,7 @@ class Normal:
             return float("nan"), contribution, 0
         e = error[index] - self.mean[index]
         weighted = precision @ e
-        contribution[index] = weighted**2 / np.diag(precision)
+        contribution[index] = weighted**2 / precision.diagonal()
         return float(np.sqrt(max(0.0, float(e @ weighted)))), contribution, len(index)
 
     def distances(self, errors: np.ndarray) -> np.ndarray:
@@ -99,14 +109,20 @@ class Normal:
         Args:
             judged: How many elements, one number or shape (samples,); NaN where none.
         """
-        usual = int(np.isfinite(self.mean).sum())
-        share = np.asarray(judged, float) / usual
+        share = np.asarray(judged, float) / self.usual
         return np.where(share > 0.0, self.threshold * np.sqrt(share), np.nan)
 
     def _precision(self, error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Which elements of an error are there, and the inverse covariance of those."""
-        index = np.flatnonzero(np.isfinite(error) & np.isfinite(self.mean))
-        return index, np.linalg.inv(self.covariance[np.ix_(index, index)])
+        there = np.isfinite(error - self.mean)
+        found = self._precisions.get(there.tobytes())
+        if found is None:
+            index = np.flatnonzero(there)
+            found = index, np.linalg.inv(self.covariance[np.ix_(index, index)])
+            if len(self._precisions) >= PATTERNS:
+                self._precisions.clear()
+            self._precisions[there.tobytes()] = found
+        return found
 
 
 def _tail(scores: np.ndarray, false_alarm: float) -> float:
@@ -143,4 +159,18 @@ def prediction_errors(schema: "BodySchema", x: np.ndarray) -> np.ndarray:
             predicted[mask] = prediction
         span, out = schema.layout.slice(name), schema.out_layout.slice(name)
         error[..., out] = (x[..., span] - predicted[mask][..., out]) * schema.scaler.std[span]
+    return error
+
+
+def prediction_error_of(schema: "BodySchema", joined: np.ndarray) -> np.ndarray:
+    """`prediction_errors` of one sample [unit], shape (size,) -> (out_size,), in compiled code."""
+    error = np.full(schema.out_layout.size, np.nan)
+    whole = schema.layout.whole(np.isfinite(joined))
+    predicted: dict[Mask, np.ndarray] = {}
+    for name, mask in schema.judges.items():
+        if mask <= whole:
+            if mask not in predicted:
+                predicted[mask] = infer(schema.predictor, joined, *schema.gate(mask))[0]
+            span = schema.layout.slices[name]
+            error[schema.out_layout.slices[name]] = joined[span] - predicted[mask][span]
     return error

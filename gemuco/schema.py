@@ -16,7 +16,7 @@ from gemuco.anomaly import AnomalyScore, Normal
 from gemuco.compiled.chain import pack
 from gemuco.compiled.inference import Predictor
 from gemuco.errors import NotFinite, UnknownCondition, UnknownSignal, WrongSize
-from gemuco.estimate import Estimate, estimate, mask_error
+from gemuco.estimate import STARTS, Estimate, estimate, mask_error
 from gemuco.kernels import Chain, Weights, run
 from gemuco.masks import Mask, bits, label
 from gemuco.scaler import CLIP, Scaler
@@ -81,6 +81,7 @@ class BodySchema:
     _ranked: dict[str, tuple[Mask, ...]] = field(init=False, repr=False)
     _chain: Chain = field(init=False, repr=False)
     _predictors: list[Predictor] = field(init=False, repr=False)
+    _starts: list[np.ndarray] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         set_field = object.__setattr__
@@ -97,6 +98,7 @@ class BodySchema:
         set_field(self, "_ranked", {})
         set_field(self, "_chain", self.weights.whole)
         set_field(self, "_predictors", [])
+        set_field(self, "_starts", [])
         for mask in self.masks:
             self.gate(mask)
         set_field(self, "judges", anomaly.judging_masks(self))
@@ -122,6 +124,17 @@ class BodySchema:
             scale = np.stack([self.scaler.mean, self.scaler.std])
             self._predictors.append(Predictor(pack(self._chain), self.in_index, self.out_index, scale, CLIP))
         return self._predictors[0]
+
+    @property
+    def latent_starts(self) -> np.ndarray:
+        """The z of some anchors, of which a descent on z chooses its start, shape (n, latent), n at least 1."""
+        if not self._starts:
+            if len(self.anchors):
+                first = self.anchors[:STARTS]
+                self._starts.append(run(self.weights.encoder, self.network_input(first, self.masks[0])))
+            else:
+                self._starts.append(np.zeros((1, self.weights.decoder[0].matrix.shape[0]), np.float32))
+        return self._starts[0]
 
     def ranked(self, name: str) -> tuple[Mask, ...]:
         """The feasible masks, the one that infers a signal of x_out best first."""

@@ -18,12 +18,17 @@ ODD = 10
 """Newest samples above the threshold that a verdict is made from."""
 JUDGE_EVERY = 0.3
 """Time [s] between two verdicts; one costs as much as some hundred scores."""
+VERDICTS = 10.0
+"""How often [Hz] it is looked whether a verdict is due."""
+PATIENCE = 1.0
+"""An anomaly that nobody came to judge within this time [s] is told without a verdict."""
 
 
 class AnomalyWatch:
     """Makes one `Anomaly` per tick; an anomaly is one only after it has lasted.
 
-    While scores are above the threshold the samples are kept, and a verdict is made from all of them now and then.
+    While scores are above the threshold the samples are kept, and a verdict is made from all of them now and then: by
+    `judge`, which is slow and belongs into a loop of its own.
     """
 
     def __init__(
@@ -45,8 +50,8 @@ class AnomalyWatch:
         self._above_since = math.inf
         self._odd: deque[dict[str, np.ndarray]] = deque(maxlen=ODD)
         self._last_cycle = -1
-        self._verdict: Verdict | None = None
-        self._judged_at = -math.inf
+        self._judged: tuple[float, float, Verdict] | None = None
+        """When the scores that were judged rose above the threshold, when the verdict was made, and the verdict."""
         self.latest: Anomaly | None = None
 
     def tick(self) -> None:
@@ -60,13 +65,17 @@ class AnomalyWatch:
             if cycle != self._last_cycle or not self._odd:
                 self._odd.append(values)
         else:
-            self._above_since, self._verdict, self._judged_at = math.inf, None, -math.inf
+            self._above_since = math.inf
             self._odd.clear()
         self._last_cycle = cycle
-        has_lasted = now - self._above_since >= self._after
-        if has_lasted and now - self._judged_at >= JUDGE_EVERY:
-            self._verdict, self._judged_at = judge(self._schema(), self._odd), now
-        self._tell(found, cycle, has_lasted)
+        self._tell(found, cycle, now)
+
+    def judge(self) -> None:
+        """Make a verdict if one is due: the score has been above the threshold for long enough, and the last is old."""
+        since, now = self._above_since, self._clock.monotonic()
+        is_judged = self._judged is not None and self._judged[0] == since and now - self._judged[1] < JUDGE_EVERY
+        if now - since >= self._after and not is_judged:
+            self._judged = since, now, judge(self._schema(), list(self._odd))
 
     def summary(self) -> dict[str, Any]:
         """What the last tick found, without the parts of each signal; empty before the first."""
@@ -75,9 +84,11 @@ class AnomalyWatch:
             return {}
         return {name: getattr(latest, name) for name in ("score", "threshold", "is_anomaly", "verdict", "blamed")}
 
-    def _tell(self, found: AnomalyScore, cycle: int, has_lasted: bool) -> None:
-        verdict = self._verdict
+    def _tell(self, found: AnomalyScore, cycle: int, now: float) -> None:
+        judged = self._judged
+        verdict = judged[2] if judged is not None and judged[0] == self._above_since else None
         kind = "normal" if found.score <= found.threshold else "" if verdict is None else verdict.kind
+        has_lasted = now - self._above_since >= self._after + (PATIENCE if verdict is None else 0.0)
         self.latest = Anomaly(
             stamp_ns=self._clock.now_ns(),
             cycle=cycle,

@@ -34,6 +34,8 @@ class Fresh:
 
 
 Newest = Callable[[], Fresh | None]
+Usable = dict[str, np.ndarray]
+"""Signal -> values [unit], shape (n,); NaN where they must not be used."""
 
 
 class Freshness:
@@ -56,30 +58,49 @@ class Freshness:
         self._signals = [(name, robot.signals[name]) for name in layout_of(robot).names]
         self._newest: dict[str, Newest | None] = {"hal": newest, "vision": seen}
         self._clock = clock
+        self._absent = {name: _unwritable(np.full(signal.size, np.nan)) for name, signal in self._signals}
+        self._read: dict[str, tuple[Sample, Usable]] = {}
+        """For each source the sample that was read last, and what of it could be used when it was published."""
 
     def take(self) -> tuple[Fresh | None, dict[str, np.ndarray]]:
         """The HAL's newest sample, and all usable values [unit], shapes (n,); NaN where invalid or stale by now.
 
-        The sample is None if nothing of it is usable; what the camera sees may be usable then.
+        The sample is None if nothing of it is usable; what the camera sees may be usable then. Nobody may write into
+        the arrays: they are the same until another sample comes.
         """
         newest = {source: None if take is None else take() for source, take in self._newest.items()}
+        usable = {source: {} if fresh is None else self._usable(source, fresh) for source, fresh in newest.items()}
         now = self._clock.monotonic()
-        values = {name: _usable(name, signal, newest[signal.source], now) for name, signal in self._signals}
-        alive = any(np.isfinite(values[name]).any() for name, signal in self._signals if signal.source == "hal")
+        values, alive = dict(self._absent), False
+        for name, signal in self._signals:
+            fresh, found = newest[signal.source], usable[signal.source].get(name)
+            if fresh is not None and found is not None and now - fresh.received <= signal.stale_after:
+                values[name] = found
+                alive = alive or signal.source == "hal"
         return newest["hal"] if alive else None, values
 
+    def _usable(self, source: str, fresh: Fresh) -> Usable:
+        """The signals of which something could be used when a sample was published, NaN where it could not."""
+        read = self._read.get(source)
+        if read is None or read[0] is not fresh.sample:
+            found = {name: _valid(name, signal, fresh.sample) for name, signal in self._signals}
+            read = fresh.sample, {name: value for name, value in found.items() if np.isfinite(value).any()}
+            self._read[source] = read
+        return read[1]
 
-def _usable(name: str, signal: SignalConfig, fresh: Fresh | None, now: float) -> np.ndarray:
-    """The values of one signal at monotonic time `now` [s], NaN where they must not be used."""
-    if fresh is None:
-        return np.full(signal.size, np.nan)
-    sample = fresh.sample
+
+def _valid(name: str, signal: SignalConfig, sample: Sample) -> np.ndarray:
+    """The values of one signal, NaN where they were not valid or too old already when they were published."""
     value, valid, age = sample.values.get(name), sample.valid.get(name), sample.age.get(name)
     shape = (signal.size,)
     if value is None or valid is None or age is None or not value.shape == valid.shape == age.shape == shape:
         return np.full(signal.size, np.nan)
-    waited = now - fresh.received
-    return np.where(valid & (np.maximum(age, waited) <= signal.stale_after), value, np.nan)
+    return _unwritable(np.where(valid & (age <= signal.stale_after), value, np.nan))
+
+
+def _unwritable(array: np.ndarray) -> np.ndarray:
+    array.setflags(write=False)
+    return array
 
 
 class Estimation:

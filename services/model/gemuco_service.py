@@ -17,7 +17,7 @@ from gemuco.schema import BodySchema
 from gemuco.warm import warm
 from hal.clock import SystemClock
 from hal.config import RobotConfig
-from services.model.anomaly_loop import AnomalyWatch
+from services.model.anomaly_loop import VERDICTS, AnomalyWatch
 from services.model.control_config import ControlConfig, controller_of
 from services.model.control_loop import Control
 from services.model.directing import Directing
@@ -47,8 +47,9 @@ SETTLED = 50
 PATIENCE = 3.0
 """Compiling is told about this often [s]; loading what was compiled before takes less."""
 NETWORK_PRIORITY = 45
-PRIORITIES = {"estimation": 40, "control": 35, "anomaly": 30, "update": 10}
-"""SCHED_FIFO where the system allows it; the update is lowest but not without, or it would hold the interpreter up."""
+PRIORITIES = {"estimation": 40, "control": 35, "anomaly": 30, "update": 10, "verdict": 10}
+"""SCHED_FIFO where the system allows it; learning and judging are lowest but not without, or they would hold the
+interpreter up."""
 
 
 class ModelSolver:
@@ -137,6 +138,7 @@ class GemucoService:
             "control": (rates.control, self._control_tick),
             "anomaly": (rates.anomaly, self.anomaly.tick),
             "update": (rates.update, self.update.tick),
+            "verdict": (VERDICTS, self.anomaly.judge),
         }
         self.loops = [Loop(name, rate, tick, self.clock, PRIORITIES[name]) for name, (rate, tick) in ticks.items()]
         service.watch(*self.loops)
@@ -219,8 +221,8 @@ class GemucoService:
         return self.living.schema
 
     def _others_keep_time(self) -> bool:
-        """Whether learning takes nothing from the other loops: the update is the first to give way."""
-        return not any(loop.is_slow for loop in self.loops if loop.name != "update")
+        """Whether learning takes nothing from the loops that keep time: the update is the first to give way."""
+        return not any(loop.is_slow for loop in self.loops if PRIORITIES[loop.name] > PRIORITIES["update"])
 
     def _learner(self, schema: BodySchema) -> adapt.Updater:
         config = self.config.update

@@ -1,5 +1,6 @@
 """How late the ticks of a loop begin, in bounded memory however long it runs."""
 
+import math
 from collections import deque
 
 import numpy as np
@@ -45,13 +46,13 @@ class Lateness:
         return {"total_p50": p50, "total_p99": p99, "total_max": self._worst}
 
 
-_LOG_GROWTH = float(np.log(GROWTH))
+_LOG_GROWTH = math.log(GROWTH)
 
 
 def _bin(late: float) -> int:
     if late <= RESOLUTION:
         return 0
-    return min(BINS - 1, 1 + int(np.log(late / RESOLUTION) / _LOG_GROWTH))
+    return min(BINS - 1, 1 + int(math.log(late / RESOLUTION) / _LOG_GROWTH))
 
 
 def _upper_edge(counts: np.ndarray, share: float) -> float:

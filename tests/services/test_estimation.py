@@ -7,7 +7,7 @@ from msgspec.structs import replace
 from hal.clock import ManualClock
 from services.model.anomaly_loop import AnomalyWatch
 from services.model.estimation import Estimation, Fresh, Freshness
-from services.wire.messages import Anomaly, Estimates
+from services.wire.messages import Anomaly, Estimates, Sample
 
 
 class Bench:
@@ -83,18 +83,45 @@ def test_an_anomaly_must_last() -> None:
     tension = sample.values["muscle_tension"].copy()
     tension[1] += 150.0  # N
     cut = replace(sample, values=sample.values | {"muscle_tension": tension})
-    for _ in range(4):
+    for _ in range(5):
         bench.newest = Fresh(cut, bench.clock.monotonic())
         watch.tick()
+        watch.judge()
         bench.clock.advance(0.02)
     assert all(one.score > one.threshold for one in told)
-    assert [one.is_anomaly for one in told] == [False, False, False, True]
-    assert [one.verdict for one in told] == ["", "", "", "anomaly"]
+    assert [one.is_anomaly for one in told] == [False, False, False, False, True]
+    assert [one.verdict for one in told] == ["", "", "", "", "anomaly"]
     assert told[-1].blamed.split(".")[0] in arm().signals
     bench.newest = fresh(5, bench.clock.monotonic())
     watch.tick()
     assert not told[-1].is_anomaly
     assert told[-1].verdict == "normal"
+
+
+def test_a_verdict_is_of_what_is_odd_now_and_never_of_what_was() -> None:
+    bench = Bench()
+    told: list[Anomaly] = []
+    watch = AnomalyWatch(bench.freshness, small_model, 0.05, told.append, bench.clock)
+    sample = sample_of(5)
+    tension = sample.values["muscle_tension"] + 150.0  # N
+    odd = replace(sample, values=sample.values | {"muscle_tension": tension})
+
+    def tick(sample: Sample) -> Anomaly:
+        bench.clock.advance(0.06)
+        bench.newest = Fresh(sample, bench.clock.monotonic())
+        watch.tick()
+        return told[-1]
+
+    tick(odd)
+    tick(odd)
+    watch.judge()
+    assert tick(odd).verdict == "anomaly"
+    assert tick(sample).verdict == "normal"
+    assert tick(odd).verdict == ""
+    assert not told[-1].is_anomaly
+    bench.clock.advance(1.0)  # nobody judges: it is told all the same
+    assert tick(odd).is_anomaly
+    assert told[-1].verdict == ""
 
 
 def test_without_a_sample_nothing_is_judged() -> None:
