@@ -36,9 +36,9 @@ travel between machines, ratios nearly do. Torch is eager, float32, on one threa
 
 
 def loop_rows(minutes: float) -> Iterator[Row]:
-    """The four loops of the service, in the whole stack, beside bare timer loops."""
+    """The four loops of the service on an arm without a bus, beside bare timer loops."""
     with loops.with_rates(ROBOT, RATES) as file:
-        found = loops.run(file, minutes)
+        found = loops.run(file, minutes, with_bus=False)
     for name in ("estimation", "control", "anomaly", "update"):
         one = found["loops"][name]
         bare = one["bare"]

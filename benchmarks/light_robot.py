@@ -20,6 +20,7 @@ from simulators.direct import DirectDevice
 from simulators.faults import UnknownPart
 from simulators.rig import Rig
 from simulators.robots.bench.equipment import hardware
+from simulators.world import World
 
 ROOT = Path(__file__).resolve().parents[1]
 JOINTS = ("shoulder", "elbow")
@@ -96,7 +97,7 @@ class LightWorld:
 class LiveDevice(DirectDevice):
     """The world in real time: it goes on by itself between two looks."""
 
-    def __init__(self, config: RobotConfig, world: LightWorld) -> None:
+    def __init__(self, config: RobotConfig, world: World) -> None:
         super().__init__(config, world, _Wall())  # type: ignore[arg-type]
         self._live, self._before = world, time.monotonic()
 

@@ -1,16 +1,19 @@
 """How the loops of HAL and service keep time, beside bare timer loops of the same rates at the same time.
 
-    python -m benchmarks.loops --minutes 10
+    python -m benchmarks.loops --minutes 10 [--without-bus]
 
 The whole stack runs as in life: simulated nodes on the hub, HAL, service; a client engages the controller, sends a new
 target every second and keeps the online update on. A process of its own ticks four times nothing, at the same rates and
-with the same scheduling, and says how punctual this machine was meanwhile.
+with the same scheduling, and says how punctual this machine was meanwhile. Without a bus the arm's physics lies in the
+HAL's own process: 25 simulated nodes and the frames between them want more of a machine than the service that is
+measured, and no robot has them.
 """
 
 import argparse
 import json
 import multiprocessing
 import resource
+import sys
 import tempfile
 import threading
 import time
@@ -124,7 +127,19 @@ def cpu_share(pid: int, since: tuple[float, float] | None = None) -> tuple[float
     return (int(fields[11]) + int(fields[12])) / 100, time.monotonic()
 
 
-def run(robot_file: Path, minutes: float) -> dict[str, object]:
+def stack(robot_file: Path, with_bus: bool) -> dict[str, list[str]]:
+    """Process -> how to start it."""
+    file = str(robot_file)
+    if not with_bus:
+        return {"hal": [sys.executable, "-m", "benchmarks.without_bus", file], "serve": gemuco_command("serve", file)}
+    return {
+        "simulate": gemuco_command("simulate", file, "--variant", "actual", "--seed", "1"),
+        "hal": gemuco_command("hal", file),
+        "serve": gemuco_command("serve", file),
+    }
+
+
+def run(robot_file: Path, minutes: float, with_bus: bool = True) -> dict[str, object]:
     """The whole measurement; loop name -> statistics of ours and of the bare loop, process -> share of a core."""
     robot = load_robot(robot_file)
     model(robot, Console())
@@ -133,13 +148,7 @@ def run(robot_file: Path, minutes: float) -> dict[str, object]:
     pipe, other = context.Pipe()
     bare = context.Process(target=bare_process, args=(rates, other), daemon=True)
     with Supervisor(Path("runs/loops")) as supervisor, Client(robot.robot) as client:
-        children = {
-            "simulate": supervisor.start(
-                "simulate", gemuco_command("simulate", str(robot_file), "--variant", "actual", "--seed", "1")
-            ),
-            "hal": supervisor.start("hal", gemuco_command("hal", str(robot_file))),
-            "serve": supervisor.start("serve", gemuco_command("serve", str(robot_file))),
-        }
+        children = {name: supervisor.start(name, command) for name, command in stack(robot_file, with_bus).items()}
         supervisor.wait_ready("serve", lambda: measures(client), 60)
         engage(client)
         client.adapt(True)
@@ -216,9 +225,10 @@ if __name__ == "__main__":
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--out", type=Path, default=Path("runs/loops.json"))
     parser.add_argument("--rates", default="", help="other rates than the robot file's: estimation=500,update=20")
+    parser.add_argument("--without-bus", action="store_true", help="the arm's physics in the HAL's own process")
     options = parser.parse_args()
     with with_rates(options.robot, options.rates) as file:
-        result = run(file, options.minutes)
+        result = run(file, options.minutes, not options.without_bus)
     options.out.parent.mkdir(parents=True, exist_ok=True)
     options.out.write_text(json.dumps(result, indent=1, default=str))
     show(result, Console(width=140))

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gemuco.blame import suspects
-from gemuco.normal import Normal, judging_masks, prediction_error_of, prediction_errors
+from gemuco.compiled.score import errors
+from gemuco.normal import Normal, judging_masks, prediction_errors
 
 if TYPE_CHECKING:
     from gemuco.schema import BodySchema
@@ -57,7 +58,7 @@ def score(schema: "BodySchema", values: Mapping[str, np.ndarray], blame: bool = 
     if schema.normal is None:
         unknown = np.full(schema.out_layout.size, np.nan)
         return AnomalyScore(float("nan"), float("nan"), schema.out_layout.split(unknown), "")
-    distance, contribution, judged = schema.normal.distance(prediction_error_of(schema, joined))
+    distance, contribution, judged = schema.normal.distance(errors(schema.predictor, schema.judging, joined))
     threshold = float(schema.normal.threshold_of(judged))
     blamed = ""
     if blame and distance > threshold:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gemuco.compiled.inference import infer
+from gemuco.compiled import score
 from gemuco.errors import NotEnoughData
 from gemuco.estimate import mask_error
 from gemuco.masks import Mask
@@ -89,13 +89,10 @@ class Normal:
             element alone is left out: (P e)_i^2 / P_ii), and how many elements were judged.
         """
         index, precision = self._precision(error)
-        contribution = np.full(len(error), np.nan)
         if not len(index):
-            return float("nan"), contribution, 0
-        e = error[index] - self.mean[index]
-        weighted = precision @ e
-        contribution[index] = weighted**2 / precision.diagonal()
-        return float(np.sqrt(max(0.0, float(e @ weighted)))), contribution, len(index)
+            return float("nan"), np.full(len(error), np.nan), 0
+        found, contribution = score.distance(error, self.mean, index, precision)
+        return found, contribution, len(index)
 
     def distances(self, errors: np.ndarray) -> np.ndarray:
         """Distances of errors that lack the same elements, shape (samples, out_size) -> (samples,)."""
@@ -159,18 +156,4 @@ def prediction_errors(schema: "BodySchema", x: np.ndarray) -> np.ndarray:
             predicted[mask] = prediction
         span, out = schema.layout.slice(name), schema.out_layout.slice(name)
         error[..., out] = (x[..., span] - predicted[mask][..., out]) * schema.scaler.std[span]
-    return error
-
-
-def prediction_error_of(schema: "BodySchema", joined: np.ndarray) -> np.ndarray:
-    """`prediction_errors` of one sample [unit], shape (size,) -> (out_size,), in compiled code."""
-    error = np.full(schema.out_layout.size, np.nan)
-    whole = schema.layout.whole(np.isfinite(joined))
-    predicted: dict[Mask, np.ndarray] = {}
-    for name, mask in schema.judges.items():
-        if mask <= whole:
-            if mask not in predicted:
-                predicted[mask] = infer(schema.predictor, joined, *schema.gate(mask))[0]
-            span = schema.layout.slices[name]
-            error[schema.out_layout.slices[name]] = joined[span] - predicted[mask][span]
     return error

@@ -15,6 +15,7 @@ from gemuco import anomaly, checkpoint
 from gemuco.anomaly import AnomalyScore, Normal
 from gemuco.compiled.chain import pack
 from gemuco.compiled.inference import Predictor
+from gemuco.compiled.score import Judges
 from gemuco.errors import NotFinite, UnknownCondition, UnknownSignal, WrongSize
 from gemuco.estimate import STARTS, Estimate, estimate, mask_error
 from gemuco.kernels import Chain, Weights, run
@@ -81,6 +82,7 @@ class BodySchema:
     _ranked: dict[str, tuple[Mask, ...]] = field(init=False, repr=False)
     _chain: Chain = field(init=False, repr=False)
     _predictors: list[Predictor] = field(init=False, repr=False)
+    _judging: list[Judges] = field(init=False, repr=False)
     _starts: list[np.ndarray] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -98,6 +100,7 @@ class BodySchema:
         set_field(self, "_ranked", {})
         set_field(self, "_chain", self.weights.whole)
         set_field(self, "_predictors", [])
+        set_field(self, "_judging", [])
         set_field(self, "_starts", [])
         for mask in self.masks:
             self.gate(mask)
@@ -124,6 +127,16 @@ class BodySchema:
             scale = np.stack([self.scaler.mean, self.scaler.std])
             self._predictors.append(Predictor(pack(self._chain), self.in_index, self.out_index, scale, CLIP))
         return self._predictors[0]
+
+    @property
+    def judging(self) -> Judges:
+        """`judges` as compiled code takes them."""
+        if not self._judging:
+            masks = list(dict.fromkeys(self.judges.values()))
+            through, tails = (np.stack(column) for column in zip(*(self.gate(m) for m in masks), strict=True))
+            order = [masks.index(self.judges[s.name]) for s in self.out_layout.signals for _ in range(s.size)]
+            self._judging.append(Judges(through, tails, np.array(order)))
+        return self._judging[0]
 
     @property
     def latent_starts(self) -> np.ndarray:

@@ -18,6 +18,7 @@ from gemuco.control import Controller
 from gemuco.descent import DescentConfig
 from gemuco.kernels import Layer, Weights
 from gemuco.losses import Match
+from gemuco.normal import Normal
 from gemuco.scaler import Scaler
 from gemuco.schema import BodySchema
 from gemuco.signals import Layout, Signal
@@ -26,7 +27,7 @@ from gemuco.torque import TorqueBalance
 SIGNALS = {"position": (1, "rad"), "tension": (2, "N"), "length": (2, "m"), "hidden": (1, "m")}
 MASKS = (frozenset({"position", "tension"}), frozenset({"tension", "length", "hidden"}))
 OUTPUTS = ("position", "tension", "length")
-STEPS = 7
+STEPS = 8
 
 
 def body() -> BodySchema:
@@ -64,6 +65,9 @@ def steps(schema: BodySchema) -> Iterator[str]:
     schema.estimate({name: whole[name] for name in ("position", "tension")})
     yield "estimation by descent"
     schema.estimate({"length": whole["length"]})
+    yield "anomaly"
+    size = schema.out_layout.size
+    schema.with_normal(Normal(np.zeros(size), np.eye(size), 1.0, 1e-3)).anomaly(whole)
     target = {"position": np.full(1, 0.1)}
     terms = (Match("position"), TorqueBalance(np.sin, 1.0, "position", "tension", "length"))
     yield "control"

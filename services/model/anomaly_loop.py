@@ -3,6 +3,7 @@
 import math
 from collections import deque
 from collections.abc import Callable
+from operator import is_
 from typing import Any
 
 import numpy as np
@@ -50,6 +51,7 @@ class AnomalyWatch:
         self._above_since = math.inf
         self._odd: deque[dict[str, np.ndarray]] = deque(maxlen=ODD)
         self._last_cycle = -1
+        self._scored: tuple[BodySchema, tuple[np.ndarray, ...], AnomalyScore] | None = None
         self._judged: tuple[float, float, Verdict] | None = None
         """When the scores that were judged rose above the threshold, when the verdict was made, and the verdict."""
         self.latest: Anomaly | None = None
@@ -57,7 +59,7 @@ class AnomalyWatch:
     def tick(self) -> None:
         """Score the newest sample; NaN, and nobody is blamed, without a fresh one or without normal data."""
         fresh, values = self._freshness.take()
-        found = score(self._schema(), values, blame=False)
+        found = self._score(self._schema(), values)
         now = self._clock.monotonic()
         cycle = -1 if fresh is None else fresh.sample.cycle
         if found.score > found.threshold:
@@ -76,6 +78,13 @@ class AnomalyWatch:
         is_judged = self._judged is not None and self._judged[0] == since and now - self._judged[1] < JUDGE_EVERY
         if now - since >= self._after and not is_judged:
             self._judged = since, now, judge(self._schema(), list(self._odd))
+
+    def _score(self, schema: BodySchema, values: dict[str, np.ndarray]) -> AnomalyScore:
+        """The score of a sample; computed once, however often the loop sees it."""
+        arrays, known = tuple(values.values()), self._scored
+        if known is None or known[0] is not schema or not all(map(is_, known[1], arrays)):
+            known = self._scored = schema, arrays, score(schema, values, blame=False)
+        return known[2]
 
     def summary(self) -> dict[str, Any]:
         """What the last tick found, without the parts of each signal; empty before the first."""
