@@ -156,7 +156,7 @@ def _balance(bound: Balanced, rows: tuple[int, int]) -> Balance:
     joints[:, TORQUE] = bound.torques(posture[None])[0]
     lines = np.stack([muscles.f_std, muscles.f_mean, muscles.l_std], axis=1).astype(np.float32)
     places = np.concatenate([muscles.theta, muscles.f])
-    return Balance(pack(muscles.chain), base[None], joints, lines, places, rows, float(bound.weight))
+    return Balance(muscles.packed, base[None], joints, lines, places, rows, float(bound.weight))
 
 
 def around(problem: Problem, bound: Balanced, x: np.ndarray) -> Problem:

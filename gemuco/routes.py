@@ -106,8 +106,10 @@ class InputRoute:
         self.free = inside[~np.isfinite(given[inside])]
         self._known = np.where(np.isfinite(given), given, 0.0)
         self._base = schema.network_input(self._known, mask).astype(self._chain[0].matrix.dtype)
-        self._columns = np.flatnonzero(np.isin(schema.in_index, self.free))
-        self._inferred = np.isin(schema.out_index, inside, invert=True)
+        is_free, is_inside = np.zeros((2, schema.layout.size), bool)
+        is_free[self.free] = is_inside[inside] = True
+        self._columns = np.flatnonzero(is_free[schema.in_index])
+        self._inferred = ~is_inside[schema.out_index]
         self._outputs = schema.out_index[self._inferred]
         self._runs = any(name not in mask for name in needed)
         low, high = bounds_of(schema, limits)

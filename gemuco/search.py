@@ -96,19 +96,19 @@ class Search:
         starts = self._warm[None] if self._warm is not None and self._way == (route, mask, size) else None
         if starts is None:
             starts = way.starts(begin, only_there)
-        point, is_late = starts[0], False
+        ended = Descent(starts[0], math.nan, ())
         if size:
             ended = self._minimise(way, bounds, held, starts, time.monotonic() + within)
-            point, is_late = ended.point, ended.is_late
-        x = way.final(point)
+        x = way.final(ended.point)
         for element in np.flatnonzero(np.abs(x - held) > SLIPPED):
             reached, asked = schema.scaler.restore(x)[element], schema.scaler.restore(held)[element]
             raise NotObservable(
                 f"'{schema.layout.element(int(element))}' cannot be held at {asked:.4g}: the nearest found is "
                 f"{reached:.4g}. Is it within what the body can do, and within the limits?"
             )
-        self._warm, self._way = point, (route, mask, size)
-        return Found(x, float(total(bounds, np.nan_to_num(x)[None])[0][0]), is_late)
+        self._warm, self._way = ended.point, (route, mask, size)
+        loss = ended.loss if size else float(total(bounds, np.nan_to_num(x)[None], False)[0][0])
+        return Found(x, loss, ended.is_late)
 
     def _minimise(
         self,

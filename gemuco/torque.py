@@ -2,10 +2,12 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from gemuco.compiled.chain import pack
 from gemuco.errors import NotFinite, NotObservable, SchemaError
 from gemuco.kernels import Curvature, Layer
 from gemuco.losses import TINY, Bound, Values, check_weight
@@ -54,7 +56,7 @@ class TorqueBalance:
 
     def bind(self, schema: "BodySchema", target: Values, now: Values) -> Bound:
         """See `Term.bind`."""
-        muscles = MuscleModel(schema, self)
+        muscles = muscle_model(schema, self)
         theta, f = schema.layout.slice(self.position), schema.layout.slice(self.tension)
         mean, std = schema.scaler.mean[theta], schema.scaler.std[theta]
         if self.at == "predicted":
@@ -123,7 +125,7 @@ class Balanced:
 class MuscleModel:
     """The muscles as the network knows them under the mask (position, tension)."""
 
-    __slots__ = ("base", "chain", "f", "f_mean", "f_std", "l_std", "theta", "theta_std")
+    __slots__ = ("base", "chain", "f", "f_mean", "f_std", "l_std", "packed", "theta", "theta_std")
 
     def __init__(self, schema: "BodySchema", names: TorqueBalance) -> None:
         """Prepare the network.
@@ -147,6 +149,7 @@ class MuscleModel:
         columns = _columns(schema.out_index, length)
         last = Layer(np.ascontiguousarray(last.matrix[:, columns]), last.offset[columns], last.activation)
         self.chain = (*schema.weights.whole[:-1], last)
+        self.packed = pack(self.chain)
         self.theta_std, self.f_std, self.l_std = (scaler.std[s].astype(dtype) for s in (theta, f, length))
         self.f_mean = scaler.mean[f].astype(dtype)
 
@@ -173,6 +176,16 @@ class MuscleModel:
         inputs[:, self.f] = tension
         w = (inputs[:, self.f] * self.f_std + self.f_mean) * self.l_std
         return Curvature(self.chain, inputs, w)
+
+
+@lru_cache(maxsize=4)
+def muscle_model(schema: "BodySchema", names: TorqueBalance) -> MuscleModel:
+    """The muscles of a schema; those of the newest schemas are kept, for a solve takes less time than to lay them out.
+
+    Raises:
+        NotObservable: The schema does not infer length from position and tension.
+    """
+    return MuscleModel(schema, names)
 
 
 @dataclass(frozen=True, slots=True)

@@ -42,8 +42,9 @@ SEARCH = NewtonConfig(iterations=12)
 """Each tick goes on where the last one ended, so few steps suffice."""
 SHARE = 0.5
 """Part of its period that a solve may take; then the best command found so far is sent, and counted as late."""
-SETTLED = 50
-"""After so many solves for the same reference with the same model, the command stays as it is."""
+SETTLED = 1e-3
+"""A solve that moves the command by less than this share of its range (of 1 where it has none) has found it; it stays
+until the reference or the model is another."""
 PATIENCE = 3.0
 """Compiling is told about this often [s]; loading what was compiled before takes less."""
 NETWORK_PRIORITY = 45
@@ -68,8 +69,10 @@ class ModelSolver:
         self._controller.solve({config.target: middle[config.target]}, {})
         self._controller.restart()
         self._reference = np.zeros(0)
-        self._solved = 0
-        self._command = np.zeros(0)
+        low, high = robot.bounds(robot.command.signal)
+        self._range = np.where(np.isfinite(high - low), high - low, 1.0)
+        self._is_found = False
+        self._command = np.full(len(low), np.nan)
         self._target = config.target
         self._within = SHARE / robot.rates.control
         self.late = 0
@@ -80,11 +83,12 @@ class ModelSolver:
         schema, reference = self._living.schema, target[self._target]
         if self._controller.schema is not schema or not np.array_equal(reference, self._reference):
             self._controller.swap(schema)
-            self._reference, self._solved = reference, 0
-        if self._solved < SETTLED:
+            self._reference, self._is_found, self._command = reference, False, np.full_like(self._command, np.nan)
+        if not self._is_found:
             solution = self._controller.solve(target, now, self._within)
+            moved = np.abs(solution.command - self._command) / self._range
+            self._is_found = not solution.is_late and bool((moved < SETTLED).all())
             self._command = solution.command
-            self._solved += 1
             self.late += solution.is_late
         return self._command
 
