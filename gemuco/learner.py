@@ -5,19 +5,19 @@ that a step is nothing but the network. Suspected outliers are looked for anew f
 """
 
 import math
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import torch
-from torch.nn import functional
 
 from gemuco import outliers
+from gemuco.compiled.chain import pack, unpack
+from gemuco.compiled.learning import SQUARED, gradients, loss
 from gemuco.draft import Draft
+from gemuco.kernels import Weights
 from gemuco.material import Batch, Material
-from gemuco.network import Network
+from gemuco.optimiser import Optimiser
 from gemuco.train_config import TrainConfig
 
 Progress = Callable[[float, str], None]
@@ -39,17 +39,6 @@ MOST_HELD = 4000
 """Pairs of held-out sample and mask that are measured after every epoch, at most."""
 
 
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Torch on one thread: on layers this small a second one only waits (256 samples: 1.7 ms against 42 ms)."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
 def one_cycle(share: float) -> float:
     """Learning rate as a share of its peak when a share of the steps is done: up for a quarter, then down."""
     if share < 0.25:
@@ -65,14 +54,14 @@ class Course:
         train: Loss while learning, one per epoch.
         held_out: Held-out loss, one per epoch.
         best_epoch: Epoch of the best held-out loss.
-        best: Its W and p.
+        best: Its W, as compiled code has it, and p.
         resumed: At which epoch it went on after an interruption.
     """
 
     train: list[float] = field(default_factory=list)
     held_out: list[float] = field(default_factory=list)
     best_epoch: int = 0
-    best: dict[str, torch.Tensor] = field(default_factory=dict)
+    best: dict[str, np.ndarray] = field(default_factory=dict)
     resumed: int = 0
 
 
@@ -81,35 +70,40 @@ class Learner:
 
     Args:
         config: How.
-        network: Where W starts; it is changed.
+        weights: Where W starts.
         biases: Where every p starts, shape (conditions, bias_size).
         frozen: Which of them stay, shape (conditions,).
         material: What is learned from.
         held: What only measures.
+
+    Attributes:
+        biases: Every p as it is now, shape (conditions, bias_size).
     """
 
     def __init__(
         self,
         config: TrainConfig,
-        network: Network,
+        weights: Weights,
         biases: np.ndarray,
         frozen: np.ndarray,
         material: Material,
         held: Material,
     ) -> None:
-        self.config, self.network, self.material, self.held = config, network, material, held
+        self.config, self.material, self.held = config, material, held
         self.task = material.task
-        self.biases = torch.nn.Parameter(torch.from_numpy(np.array(biases, np.float32)))
-        if frozen.any():
-            stays = torch.from_numpy((~frozen).astype(np.float32))[:, None]
-            self.biases.register_hook(lambda gradient: gradient * stays)
+        self.biases = np.array(biases, np.float32)
+        self._start, self._chain = weights, pack(weights.whole)
+        self._moves = ~frozen[:, None]
         self.random = np.random.default_rng(config.seed)
-        groups = [{"params": list(network.parameters()), "lr": config.rate, "peak": config.rate}]
-        if self.biases.numel():
-            groups.append({"params": [self.biases], "lr": config.bias_rate, "peak": config.bias_rate})
-        self.optimiser = torch.optim.Adam(groups, fused=True)
+        self._optimiser = Optimiser("adam", config.rate, len(self._chain.flat))
+        self._bias_optimiser = Optimiser("adam", config.bias_rate, self.biases.size)
         self.course = Course()
         self._measure = self.held.every(MOST_HELD)
+
+    @property
+    def weights(self) -> Weights:
+        """W as it is now."""
+        return self._start.replaced(unpack(self._chain))
 
     def run(self, progress: Progress | None, title: str, draft: Draft) -> Course:
         """Train to the end or until nothing gets better; leaves the best W and p in place."""
@@ -130,9 +124,8 @@ class Learner:
                 progress((epoch + 1) / config.epochs, f"{title}: held-out loss {best:.4f}")
             if (epoch + 1) % max(1, config.epochs // DRAFTS) == 0 or epoch + 1 == config.epochs:
                 draft.save(*self._written())
-        with torch.no_grad():
-            for name, parameter in self._parameters().items():
-                parameter.copy_(course.best[name])
+        for name, numbers in self._numbers().items():
+            numbers[...] = course.best[name]
         self._look()
         return course
 
@@ -140,39 +133,44 @@ class Learner:
         """One epoch; returns the mean loss of its steps."""
         rows, chosen = self.material.draw(self.random, self.config.replay)
         batches = list(self.material.cut(self.material.take(rows, chosen), self.config.batch))
-        total = torch.zeros(())
+        total = 0.0
         for index, batch in enumerate(batches):
-            pace = one_cycle((epoch + index / len(batches)) / self.config.epochs)
-            for group in self.optimiser.param_groups:
-                group["lr"] = pace * group["peak"]
-            self.optimiser.zero_grad(set_to_none=True)
-            loss = self._loss(batch, straight)
-            loss.backward()
-            self.optimiser.step()
-            total += loss.detach()
-        return float(total) / len(batches)
+            total += self._step(batch, one_cycle((epoch + index / len(batches)) / self.config.epochs), straight)
+        return total / len(batches)
 
-    def _loss(self, batch: Batch, straight: float) -> torch.Tensor:
-        """Mean squared miss over what was measured; in proportion beyond `straight` standard deviations."""
-        inputs = batch.inputs
-        if self.biases.numel():
-            inputs = torch.cat([inputs, self.biases[batch.condition]], dim=1)
-        told = self.network(inputs)
-        count: float | torch.Tensor = float(told.numel())
-        if batch.there is not None:
-            told, count = told * batch.there, batch.there.sum().clamp(min=1.0)
-        if math.isinf(self.config.outliers):
-            return functional.mse_loss(told, batch.wanted, reduction="sum") / count
-        return 2.0 * functional.huber_loss(told, batch.wanted, reduction="sum", delta=straight) / count
+    def _step(self, batch: Batch, pace: float, straight: float) -> float:
+        """One step of Adam; returns the loss before it."""
+        missed, by_weights, by_input = gradients(
+            self._chain, self._inputs(batch), batch.wanted, self._straight(straight), True
+        )
+        self._optimiser.rate = pace * self.config.rate
+        self._optimiser.move(self._chain.flat, by_weights)
+        if self.biases.size:
+            by_bias = np.zeros_like(self.biases)
+            np.add.at(by_bias, batch.condition, by_input[:, -self.biases.shape[1] :])
+            self._bias_optimiser.rate = pace * self.config.bias_rate
+            self._bias_optimiser.move(self.biases.reshape(-1), (by_bias * self._moves).reshape(-1))
+        return float(missed)
 
-    @torch.no_grad()
+    def _inputs(self, batch: Batch) -> np.ndarray:
+        return (
+            np.concatenate([batch.inputs, self.biases[batch.condition]], axis=1) if self.biases.size else batch.inputs
+        )
+
+    def _straight(self, usual: float) -> np.float32:
+        """Misses above this many standard deviations count in proportion; none, where nothing is rejected either."""
+        return SQUARED if math.isinf(self.config.outliers) else np.float32(usual)
+
     def _held_out(self) -> float:
         rows, chosen = self._measure
-        return float(self._loss(self.held.take(rows, chosen), HUBER[1])) if len(rows) else math.inf
+        if not len(rows):
+            return math.inf
+        batch = self.held.take(rows, chosen)
+        return float(loss(self._chain, self._inputs(batch), batch.wanted, self._straight(HUBER[1])))
 
     def _look(self, patient: bool = False) -> None:
         """Suspect outliers anew, in what is learned and in what measures."""
-        weights, p, limit = self.network.weights(), self.biases.detach().numpy(), self.config.outliers
+        weights, p, limit = self.weights, self.biases, self.config.outliers
         for part in (self.material, self.held):
             found = outliers.find(part, weights, p[part.condition], limit)
             if patient:  # several signals are far out together: perhaps a rare motion that is yet to be learned
@@ -180,42 +178,42 @@ class Learner:
             part.hide(found)
         self._measure = self.held.every(MOST_HELD)
 
-    def _parameters(self) -> dict[str, torch.nn.Parameter]:
-        """W and every p, by name."""
-        return {**dict(self.network.named_parameters()), "biases": self.biases}
+    def _numbers(self) -> dict[str, np.ndarray]:
+        """W and every p."""
+        return {"weights": self._chain.flat, "biases": self.biases}
 
-    def _copy(self) -> dict[str, torch.Tensor]:
-        return {name: parameter.detach().clone() for name, parameter in self._parameters().items()}
+    def _copy(self) -> dict[str, np.ndarray]:
+        return {name: numbers.copy() for name, numbers in self._numbers().items()}
 
     def _written(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """All that the next epoch depends on: arrays and facts."""
-        arrays = {f"now.{name}": tensor.numpy() for name, tensor in self._copy().items()}
-        arrays |= {f"best.{name}": tensor.numpy() for name, tensor in self.course.best.items()}
-        for name, parameter in self._parameters().items():
-            for kind, tensor in self.optimiser.state[parameter].items():
-                arrays[f"adam.{kind}.{name}"] = tensor.numpy()
+        arrays = {f"now.{name}": numbers for name, numbers in self._numbers().items()}
+        arrays |= {f"best.{name}": numbers for name, numbers in self.course.best.items()}
+        arrays |= {f"adam.weights.{name}": numbers for name, numbers in self._optimiser.state().items()}
+        arrays |= {f"adam.biases.{name}": numbers for name, numbers in self._bias_optimiser.state().items()}
         arrays["suspected"], arrays["held_suspected"] = self.material.suspected, self.held.suspected
         facts = {
             "train": self.course.train,
             "held_out": self.course.held_out,
             "best_epoch": self.course.best_epoch,
+            "steps": self._optimiser.time,
             "random": self.random.bit_generator.state,
         }
         return arrays, facts
 
-    @torch.no_grad()
     def _restore(self, draft: Draft) -> None:
         """Go on where an interrupted training was written down, if it was."""
         found = draft.load()
         if found is None:
             return
         arrays, facts = found
-        tensors = {name: torch.from_numpy(array.copy()) for name, array in arrays.items()}
-        for name, parameter in self._parameters().items():
-            parameter.copy_(tensors[f"now.{name}"])
-            kept = {kind: f"adam.{kind}.{name}" for kind in ("step", "exp_avg", "exp_avg_sq")}
-            self.optimiser.state[parameter] = {k: tensors[n] for k, n in kept.items() if n in tensors}
-            self.course.best[name] = tensors[f"best.{name}"]
+        for name, numbers in self._numbers().items():
+            numbers[...] = arrays[f"now.{name}"]
+            self.course.best[name] = arrays[f"best.{name}"].copy()
+        for name, optimiser in (("weights", self._optimiser), ("biases", self._bias_optimiser)):
+            for kind, numbers in optimiser.state().items():
+                numbers[...] = arrays[f"adam.{name}.{kind}"]
+            optimiser.time = facts["steps"]
         self.material.hide(arrays["suspected"])
         self.held.hide(arrays["held_suspected"])
         self._measure = self.held.every(MOST_HELD)

@@ -4,7 +4,6 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-import torch
 
 from gemuco.scaler import CLIP, Scaler
 from gemuco.task import Task
@@ -16,14 +15,12 @@ class Batch(NamedTuple):
     Attributes:
         inputs: x_in under its mask, and m, shape (n, in_size + signals of x_in).
         condition: Whose p goes with it, shape (n,).
-        wanted: x_out, 0 where it was not measured, shape (n, out_size).
-        there: 1 where x_out was measured, shape (n, out_size); None if it was everywhere.
+        wanted: x_out, NaN where it was not measured, shape (n, out_size).
     """
 
-    inputs: torch.Tensor
-    condition: torch.Tensor
-    wanted: torch.Tensor
-    there: torch.Tensor | None
+    inputs: np.ndarray
+    condition: np.ndarray
+    wanted: np.ndarray
 
 
 class Material:
@@ -53,10 +50,8 @@ class Material:
         alive = np.delete(task.signal_of, dead)
         self.granted[:, dead[np.isin(task.signal_of[dead], alive)]] = True
         filled = np.where(self._measured, rows, 0.0)
-        self._x_in = torch.from_numpy(np.clip(filled[:, task.in_index], -CLIP, CLIP).astype(np.float32))
-        self._x_out = torch.from_numpy(filled[:, task.out_index].astype(np.float32))
-        self._owner = torch.from_numpy(condition.astype(np.int64))
-        self._through, self._tails = torch.from_numpy(task.through), torch.from_numpy(task.tails)
+        self._x_in = np.clip(filled[:, task.in_index], -CLIP, CLIP).astype(np.float32)
+        self._x_out = filled[:, task.out_index].astype(np.float32)
         self.hide(np.zeros((len(rows), len(task.layout.names)), bool))
 
     def hide(self, suspected: np.ndarray) -> None:
@@ -64,10 +59,9 @@ class Material:
         self.suspected = suspected
         hidden = suspected[:, self.task.signal_of]
         there = (self._measured & ~hidden)[:, self.task.out_index]
-        self._there = torch.from_numpy(there.astype(np.float32))
+        self._wanted = np.where(there, self._x_out, np.float32(np.nan))
         self.allowed = self.task.allowed(self.granted & ~hidden)
         self.usable = np.flatnonzero(self.allowed.any(axis=1) & there.any(axis=1))
-        self._complete = bool(there.all())
 
     @property
     def skipped(self) -> int:
@@ -99,21 +93,11 @@ class Material:
 
     def take(self, rows: np.ndarray, chosen: np.ndarray) -> Batch:
         """Samples under masks, ready for the network."""
-        row, mask = torch.from_numpy(rows), torch.from_numpy(chosen)
-        inputs = torch.cat([self._x_in[row] * self._through[mask], self._tails[mask]], dim=1)
-        if self._complete:
-            return Batch(inputs, self._owner[row], self._x_out[row], None)
-        there = self._there[row]
-        return Batch(inputs, self._owner[row], self._x_out[row] * there, there)
+        inputs = np.concatenate([self._x_in[rows] * self.task.through[chosen], self.task.tails[chosen]], axis=1)
+        return Batch(inputs, self.condition[rows], self._wanted[rows])
 
     @staticmethod
     def cut(batch: Batch, size: int) -> Iterator[Batch]:
         """A long batch in pieces."""
         for start in range(0, len(batch.inputs), size):
-            part = slice(start, start + size)
-            yield Batch(
-                batch.inputs[part],
-                batch.condition[part],
-                batch.wanted[part],
-                None if batch.there is None else batch.there[part],
-            )
+            yield Batch(*(part[start : start + size] for part in batch))

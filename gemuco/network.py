@@ -72,16 +72,3 @@ class Network(nn.Module):
             )
 
         return Weights(export(self.encoder), export(self.decoder))
-
-    @classmethod
-    def of(cls, weights: Weights) -> "Network":
-        """The network that has a given W, to train it further."""
-        widths = [layer.matrix.shape[0] for layer in weights.encoder]
-        names = {layer.activation for layer in weights.whole} - {LINEAR}
-        latent, outputs = weights.decoder[0].matrix.shape[0], weights.decoder[-1].matrix.shape[1]
-        network = cls(widths[0], outputs, widths[1:], latent, names.pop() if names else "tanh")
-        with torch.no_grad():
-            for layer, (matrix, offset, _) in zip(network.linear, weights.whole, strict=True):
-                layer.weight.copy_(torch.from_numpy(matrix.T.copy()))
-                layer.bias.copy_(torch.from_numpy(offset.copy()))
-        return network

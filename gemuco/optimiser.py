@@ -14,17 +14,24 @@ class Optimiser:
         kind: `adam` or `sgd` (with momentum 0.9).
         rate: Learning rate.
         size: How many numbers it will move.
+
+    Attributes:
+        time: Steps so far.
     """
 
     def __init__(self, kind: str, rate: float, size: int) -> None:
         self.kind, self.rate = kind, rate
         self._slow, self._square = np.zeros((2, size), np.float32)
-        self._time = 0
+        self.time = 0
 
     def move(self, numbers: np.ndarray, gradient: np.ndarray) -> None:
         """One step; both of shape (size,), float32."""
-        self._time += 1
+        self.time += 1
         if self.kind == "sgd":
             momentum(numbers, gradient, self._slow, float(self.rate))
         else:
-            adam(numbers, gradient, self._slow, self._square, float(self.rate), self._time)
+            adam(numbers, gradient, self._slow, self._square, float(self.rate), self.time)
+
+    def state(self) -> dict[str, np.ndarray]:
+        """What the next step depends on beside `time`; to be kept, or written into."""
+        return {"slow": self._slow, "square": self._square}

@@ -6,7 +6,7 @@ import numpy as np
 
 from gemuco.bias import Prior
 from gemuco.compiled.chain import pack, unpack
-from gemuco.compiled.learning import gradients
+from gemuco.compiled.learning import SQUARED, gradients
 from gemuco.innovation import own_bias
 from gemuco.kernels import run
 from gemuco.optimiser import Optimiser
@@ -91,7 +91,7 @@ class Relearner:
     def _descend(self, schema: "BodySchema", weights: bool, bias: bool) -> float:
         """One gradient step in place; returns the loss before it."""
         inputs, wanted, present = self._batch(schema)
-        loss, by_weights, by_input = gradients(self._chain, inputs, wanted, weights)
+        loss, by_weights, by_input = gradients(self._chain, inputs, wanted, SQUARED, weights)
         if weights:
             self._optimiser.move(self._chain.flat, by_weights)
         if bias:

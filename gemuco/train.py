@@ -11,7 +11,8 @@ from gemuco.dataset import Dataset
 from gemuco.draft import Draft, key_of
 from gemuco.errors import NotEnoughData
 from gemuco.history import History
-from gemuco.learner import Learner, Progress, one_thread
+from gemuco.kernels import Weights
+from gemuco.learner import Learner, Progress
 from gemuco.masks import Mask, label, mask
 from gemuco.material import Material
 from gemuco.network import Network
@@ -69,15 +70,14 @@ def fit(
             "stays 0 and has no effect. Collect other conditions, or set `bias: 0`."
         )
     draft = Draft(None if resume is None else Path(resume), _key(config, task, dataset))
-    with one_thread():
-        torch.manual_seed(config.seed)
-        size = len(task.in_index) + len(task.x_in) + config.bias_size
-        network = Network(size, len(task.out_index), config.hidden, config.latent, config.activation)
-        _mute(network, task, scaler.dead, config.bias_size if frozen.all() else 0)
-        biases = np.zeros((len(conditions), config.bias_size), np.float32)
-        learner = Learner(config, network, biases, frozen, material, held)
-        learner.run(progress, title, draft)
-        schema = _assessed(_schema(learner, scaler, conditions), learner, conditions)
+    torch.manual_seed(config.seed)
+    size = len(task.in_index) + len(task.x_in) + config.bias_size
+    drawn = Network(size, len(task.out_index), config.hidden, config.latent, config.activation).weights()
+    _mute(drawn, task, scaler.dead, config.bias_size if frozen.all() else 0)
+    biases = np.zeros((len(conditions), config.bias_size), np.float32)
+    learner = Learner(config, drawn, biases, frozen, material, held)
+    learner.run(progress, title, draft)
+    schema = _assessed(_schema(learner, scaler, conditions), learner, conditions)
     return schema, _history(learner, scaler, notes)
 
 
@@ -122,10 +122,9 @@ def fine_tune(
     held = _material(task, schema.scaler, held_data, fresh)
     key = _key(config, task, dataset, *schema.weights.arrays(), start, schema.anchors, schema.scaler.std)
     draft = Draft(None if resume is None else Path(resume), key)
-    with one_thread():
-        learner = Learner(config, Network.of(schema.weights), start, frozen, material, held)
-        learner.run(progress, title, draft)
-        tuned = _assessed(_schema(learner, schema.scaler, fresh, schema), learner, fresh)
+    learner = Learner(config, schema.weights, start, frozen, material, held)
+    learner.run(progress, title, draft)
+    tuned = _assessed(_schema(learner, schema.scaler, fresh, schema), learner, fresh)
     return tuned, _history(learner, Scaler.fit(schema.layout, train_data.rows()), [])
 
 
@@ -168,18 +167,17 @@ def _material(
     return material
 
 
-def _mute(network: Network, task: Task, dead: np.ndarray, unused: int) -> None:
+def _mute(weights: Weights, task: Task, dead: np.ndarray, unused: int) -> None:
     """Let dead elements and an unused p have no effect, and a dead output be its mean.
 
     What enters with weight 0 and is always 0 gets no gradient, so it stays muted through all of the training.
     """
-    first, last = network.linear[0], network.linear[-1]
-    with torch.no_grad():
-        first.weight[:, np.flatnonzero(np.isin(task.in_index, dead))] = 0.0
-        first.weight[:, first.in_features - unused :] = 0.0
-        outputs = np.flatnonzero(np.isin(task.out_index, dead))
-        last.weight[outputs] = 0.0
-        last.bias[outputs] = 0.0
+    first, last = weights.encoder[0], weights.decoder[-1]
+    first.matrix[np.flatnonzero(np.isin(task.in_index, dead))] = 0.0
+    first.matrix[len(first.matrix) - unused :] = 0.0
+    outputs = np.flatnonzero(np.isin(task.out_index, dead))
+    last.matrix[:, outputs] = 0.0
+    last.offset[outputs] = 0.0
 
 
 def _key(config: TrainConfig, task: Task, dataset: Dataset, *arrays: np.ndarray) -> str:
@@ -193,7 +191,7 @@ def _schema(
 ) -> BodySchema:
     """What was learned, without errors and normal statistics."""
     material, task = learner.material, learner.task
-    learned = learner.biases.detach().numpy()[: len(conditions)].copy()
+    learned = learner.biases[: len(conditions)].copy()
     known = {} if before is None else dict(before.biases)
     biases = {**known, **dict(zip(conditions, learned, strict=True))} if learned.shape[1] else {}
     rows = np.where(material.suspected[:, task.signal_of], np.nan, material.rows)[: material.new]
@@ -212,7 +210,7 @@ def _schema(
         x_out=task.x_out,
         masks=task.masks,
         scaler=scaler,
-        weights=learner.network.weights(),
+        weights=learner.weights,
         anchors=anchors.astype(np.float32),
         anchor_conditions=owner,
         bias=learned.mean(axis=0),

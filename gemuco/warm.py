@@ -13,7 +13,9 @@ from itertools import pairwise
 import numpy as np
 
 from gemuco.adapt import UpdateConfig
+from gemuco.compiled.chain import NARROW, WIDE, pack
 from gemuco.compiled.jit import FOLDER
+from gemuco.compiled.learning import SQUARED, loss
 from gemuco.control import Controller
 from gemuco.descent import DescentConfig
 from gemuco.kernels import Layer, Weights
@@ -27,7 +29,7 @@ from gemuco.torque import TorqueBalance
 SIGNALS = {"position": (1, "rad"), "tension": (2, "N"), "length": (2, "m"), "hidden": (1, "m")}
 MASKS = (frozenset({"position", "tension"}), frozenset({"tension", "length", "hidden"}))
 OUTPUTS = ("position", "tension", "length")
-STEPS = 8
+STEPS = 9
 
 
 def body() -> BodySchema:
@@ -81,6 +83,10 @@ def steps(schema: BodySchema) -> Iterator[str]:
         yield f"update of W and p by {optimiser}"
         config = UpdateConfig(what="both", optimiser=optimiser, minimum=1, batch=4, steps=1)
         schema.adapt([whole] * 2, config)
+    yield "training"
+    chain = pack(schema.weights.whole)
+    inputs, outputs = (int(size) for size in (chain.form[0, WIDE], chain.form[-1, NARROW]))
+    loss(chain, np.zeros((1, inputs), np.float32), np.zeros((1, outputs), np.float32), SQUARED)
 
 
 def warm(tell: Callable[[float, str], None] | None = None) -> float:

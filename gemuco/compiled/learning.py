@@ -9,40 +9,67 @@ from gemuco.compiled.jit import jit
 
 MOMENTUM = 0.9
 SQUARES = 0.999
+SQUARED = np.float32(np.inf)
+"""No miss is too large to count squared."""
 
 
 @jit
-def gradients(chain, inputs, wanted, weights):
-    """Mean squared error of a batch, and its derivatives.
+def missed(told, wanted, straight, gradient):
+    """Mean loss of what was told, and its derivatives by that into `gradient`.
+
+    Args:
+        told: Shape (rows, n_out).
+        wanted: The same shape; NaN where nothing is known.
+        straight: Misses above this count in proportion and no longer squared (Huber); infinite: all are squared.
+        gradient: Shape (rows, n_out), or (0, 0) if nobody asks.
+    """
+    total, count = 0.0, 0
+    for row in range(len(told)):
+        for i in range(told.shape[1]):
+            miss = told[row, i] - wanted[row, i]
+            known = np.isfinite(wanted[row, i])
+            bound = min(max(miss, -straight), straight) if known else np.float32(0.0)
+            if known:
+                total += bound * (miss + miss - bound)
+                count += 1
+            if len(gradient):
+                gradient[row, i] = bound
+    share = np.float32(2.0 / max(count, 1))
+    for row in range(len(gradient)):
+        for i in range(gradient.shape[1]):
+            gradient[row, i] *= share
+    return total / max(count, 1)
+
+
+@jit
+def loss(chain, inputs, wanted, straight):
+    """Mean loss of a batch; see `missed`."""
+    values = space(chain, len(inputs))
+    first(chain, values, len(inputs))[:] = inputs
+    told = forward(chain, values, len(inputs))
+    return missed(told, wanted, straight, np.empty((0, 0), told.dtype))
+
+
+@jit
+def gradients(chain, inputs, wanted, straight, weights):
+    """Mean loss of a batch, and its derivatives.
 
     Args:
         chain: The network.
         inputs: Shape (rows, n_in).
         wanted: Shape (rows, n_out); NaN where nothing is known.
+        straight: See `missed`.
         weights: Whether derivatives by W are wanted.
 
     Returns:
-        The error, its gradient by W in the order of `chain.flat`, and by the inputs, shape (rows, n_in).
+        The loss, its gradient by W in the order of `chain.flat`, and by the inputs, shape (rows, n_in).
     """
     rows = len(inputs)
     values = space(chain, rows)
-    begin = first(chain, values, rows)
-    for row in range(rows):
-        for i in range(inputs.shape[1]):
-            begin[row, i] = inputs[row, i]
+    first(chain, values, rows)[:] = inputs
     told = forward(chain, values, rows)
-    gradient = np.zeros_like(told)
-    total, count = 0.0, 0
-    for row in range(rows):
-        for i in range(told.shape[1]):
-            if np.isfinite(wanted[row, i]):
-                gradient[row, i] = told[row, i] - wanted[row, i]
-                total += gradient[row, i] * gradient[row, i]
-                count += 1
-    share = 2.0 / max(count, 1)
-    for row in range(rows):
-        for i in range(told.shape[1]):
-            gradient[row, i] *= share
+    gradient = np.empty_like(told)
+    total = missed(told, wanted, straight, gradient)
     found = np.zeros(len(chain.flat) if weights else 0, chain.flat.dtype)
     for layer in range(len(chain.form) - 1, -1, -1):
         code = chain.form[layer, CODE]
@@ -60,7 +87,7 @@ def gradients(chain, inputs, wanted, weights):
         pulled = np.empty((rows, wide), gradient.dtype)
         times_turned(gradient, matrix(chain, layer), pulled)
         gradient = pulled
-    return total / max(count, 1), found, gradient
+    return total, found, gradient
 
 
 @jit

@@ -14,7 +14,7 @@ from muscle_arm import gravity
 from gemuco.activation import ACTIVATIONS
 from gemuco.compiled import descent, newton
 from gemuco.compiled.chain import pack, unpack
-from gemuco.compiled.learning import gradients
+from gemuco.compiled.learning import SQUARED, gradients, loss
 from gemuco.descent import DescentConfig, NewtonConfig, descend
 from gemuco.fold import Lines, around, fold
 from gemuco.kernels import Layer
@@ -66,8 +66,8 @@ def once(problem, point):
 
 
 @settings(max_examples=25, deadline=None)
-@given(SHAPES, st.sampled_from(sorted(ACTIVATIONS)), st.integers(0, 99))
-def test_every_shape_agrees_with_torch(shape, activation, seed):
+@given(SHAPES, st.sampled_from(sorted(ACTIVATIONS)), st.sampled_from([0.3, 1.0, np.inf]), st.integers(0, 99))
+def test_every_shape_agrees_with_torch(shape, activation, straight, seed):
     inputs, hidden, latent, outputs, rows = shape
     torch.manual_seed(seed)
     network = Network(inputs, outputs, hidden, latent, activation)
@@ -76,13 +76,18 @@ def test_every_shape_agrees_with_torch(shape, activation, seed):
     wanted = random.standard_normal((rows, outputs)).astype(np.float32)
     wanted[random.random(wanted.shape) < 0.2] = np.nan
     chain = pack(network.weights().whole)
-    loss, by_weights, by_input = gradients(chain, x, wanted, True)
+    found_loss, by_weights, by_input = gradients(chain, x, wanted, np.float32(straight), True)
     given_x, there = torch.from_numpy(x).double().requires_grad_(), torch.from_numpy(np.isfinite(wanted))
     network = network.double()
     missed = torch.where(there, network(given_x) - torch.from_numpy(np.nan_to_num(wanted)), 0.0)
-    truth = (missed**2).sum() / max(int(there.sum()), 1)
+    if np.isinf(straight):
+        each = missed**2
+    else:
+        each = 2.0 * torch.nn.functional.huber_loss(missed, torch.zeros_like(missed), reduction="none", delta=straight)
+    truth = each.sum() / max(int(there.sum()), 1)
     truth.backward()
-    assert loss == pytest.approx(truth.item(), rel=1e-5)
+    assert found_loss == pytest.approx(truth.item(), rel=1e-5)
+    assert loss(chain, x, wanted, np.float32(straight)) == found_loss
     flat = [g.numpy().ravel() for m in network.linear for g in (m.weight.grad.T, m.bias.grad)]
     for found, expected in ((by_weights, np.concatenate(flat)), (by_input, given_x.grad.numpy())):
         np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5 * max(np.abs(expected).max(), 1e-3))
@@ -186,8 +191,8 @@ def test_time_that_is_up_ends_the_search_with_the_best_so_far(schema):
 def test_what_is_no_number_is_not_hidden():
     layers = tuple(Layer(np.ones((2, 2), np.float32), np.zeros(2, np.float32), name) for name in ("tanh", "linear"))
     x = np.array([[np.nan, 0.0], [1e30, 0.0]], np.float32)
-    loss, _, _ = gradients(pack(layers), x, np.zeros((2, 2), np.float32), False)
-    assert np.isnan(loss)
+    begun, _, _ = gradients(pack(layers), x, np.zeros((2, 2), np.float32), SQUARED, False)
+    assert np.isnan(begun)
 
 
 ALL_WAYS = """
