@@ -11,6 +11,7 @@ from pathlib import Path
 import msgpack
 import numpy as np
 
+from benchmarks import highest_rate, way_through
 from benchmarks.publish import examples
 from benchmarks.remote_client import BARE, VERB, measure, robot_and_client
 from benchmarks.table import Row, faster
@@ -81,6 +82,8 @@ def rows() -> Iterator[Row]:
     yield codec()
     yield memory()
     yield question()
+    yield way_through.row()
+    yield highest_rate.row(2.0)
 
 
 def main() -> None:

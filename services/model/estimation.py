@@ -119,11 +119,16 @@ class Estimation:
         self._freshness, self._schema, self._publish, self._clock = freshness, schema, publish, clock
         self._told: tuple[BodySchema, tuple[np.ndarray, ...]] | None = None
         """The schema and the values that `latest` was made from."""
+        self._newest: Sample | None = None
+        self._waited: float | None = None
         self.latest: Estimates | None = None
 
     def tick(self) -> None:
         """Publish what is measured, and estimates in place of what is not; nothing is computed twice."""
+        now = self._clock.monotonic()
         fresh, values = self._freshness.take()
+        self._waited = None if fresh is None or fresh.sample is self._newest else now - fresh.received
+        self._newest = None if fresh is None else fresh.sample
         schema, stamp_ns = self._schema(), self._clock.now_ns()
         cycle = -1 if fresh is None else fresh.sample.cycle
         arrays = tuple(values.values())
@@ -133,6 +138,10 @@ class Estimation:
         else:
             self.latest, self._told = _estimates(schema, values, stamp_ns, cycle), (schema, arrays)
         self._publish(self.latest)
+
+    def waited(self) -> float | None:
+        """How long [s] the HAL's sample had waited when the last tick began; None if it was not a new one."""
+        return self._waited
 
     def counts(self) -> dict[str, int]:
         """How many signals were `measured`, `estimated` and `none` of both in the last tick."""

@@ -144,7 +144,11 @@ class GemucoService:
             "update": (rates.update, self.update.tick),
             "verdict": (VERDICTS, self.anomaly.judge),
         }
-        self.loops = [Loop(name, rate, tick, self.clock, PRIORITIES[name]) for name, (rate, tick) in ticks.items()]
+        follows = {"estimation": self.estimation.waited}
+        self.loops = [
+            Loop(name, rate, tick, self.clock, PRIORITIES[name], follows.get(name))
+            for name, (rate, tick) in ticks.items()
+        ]
         service.watch(*self.loops)
 
     def newest_sample(self) -> Fresh | None:

@@ -19,6 +19,10 @@ KEPT = 0.9
 """Share of its rate below which a loop, beside one tick, is told as too slow."""
 FULL = 0.9
 """Share of the time inside the tick from which on it is the tick that is too long, and not the machine that is busy."""
+MARGIN = 0.1
+"""A loop that follows what it works on begins this share of its period after that has come."""
+EARLIER, LATER = 1 / 500, 4 / 500
+"""By how much of a period such a loop moves at once: four of five times all has then come before, however it varies."""
 
 
 class Grid:
@@ -39,6 +43,15 @@ class Grid:
             self._index += behind
         return self._start + self._index * self.period
 
+    def follow(self, waited: float) -> None:
+        """Move the start a little, so that what a tick works on has waited for `MARGIN` of a period when it begins.
+
+        Args:
+            waited: How long that had waited at the last tick [s]; any number of periods more means the same.
+        """
+        away = (waited / self.period - MARGIN + 0.5) % 1.0 - 0.5
+        self._start += self.period * (LATER if away < 0.0 else -EARLIER)
+
 
 class Loop:
     """Calls `tick` at a fixed rate from a thread of its own.
@@ -53,10 +66,18 @@ class Loop:
         tick: What to do; takes nothing, returns nothing.
         clock: What time it is.
         priority: SCHED_FIFO priority to try, 0 for none.
+        waited: Tells after a tick how long [s] what it worked on had waited when it began, None if that was nothing
+            new; the grid moves slowly until that is short. By itself it stays where it is.
     """
 
     def __init__(
-        self, name: str, rate: float, tick: Callable[[], None], clock: Clock | None = None, priority: int = 0
+        self,
+        name: str,
+        rate: float,
+        tick: Callable[[], None],
+        clock: Clock | None = None,
+        priority: int = 0,
+        waited: Callable[[], float | None] | None = None,
     ) -> None:
         self.name = name
         self.rate = rate
@@ -67,6 +88,7 @@ class Loop:
         self._tick = tick
         self._clock = clock or SystemClock()
         self._priority = priority
+        self._waited = waited
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
         self._lateness = Lateness(round(rate))
@@ -170,6 +192,8 @@ class Loop:
             now = clock.monotonic()
             self._busy += now - begun
             self._ticks += 1
+            if self._waited is not None and (waited := self._waited()) is not None:
+                self._grid.follow(waited)
 
     def _turn(self) -> None:
         try:

@@ -178,3 +178,24 @@ def test_a_loop_that_does_not_keep_its_rate_says_why(takes: float, delayed: floa
     loop = _Busy(100.0, takes, delayed).loop
     assert said in loop.trouble if said else not loop.trouble
     assert bool(said) == ("of 100 Hz" in loop.trouble) == loop.is_slow
+
+
+@pytest.mark.parametrize("phase", [0.0001, 0.0013, 0.0026, 0.0048])
+@pytest.mark.parametrize("times", [1, 2])
+def test_a_loop_that_follows_begins_shortly_after_what_it_works_on_has_come(phase: float, times: int) -> None:
+    """Samples of 200 Hz with jitter, and a loop of once or twice the rate that begins anywhere."""
+    random = np.random.default_rng(1)
+    period = 0.005 / times
+    grid, now, waits, taken = Grid(period, 0.0), 0.0, [], 0
+    for _ in range(4000 * times):
+        now = max(now, grid.next(now))
+        arrived = np.floor((now - phase) / 0.005)
+        came = phase + 0.005 * arrived + abs(random.normal(0.0, 0.0001))
+        if arrived > taken and came <= now:
+            taken = arrived
+            waits.append(now - came)
+            grid.follow(now - came)
+    late = np.array(waits[-1000:])
+    assert np.median(late) < 0.3 * period
+    assert (late < 0.5 * period).mean() > 0.95
+    assert grid.skipped == 0

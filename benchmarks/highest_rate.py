@@ -1,0 +1,155 @@
+"""The highest rate at which estimates are published in time, by ours and by torch eager.
+
+    python -m benchmarks.highest_rate [--seconds 3]
+
+One loop of the service as it is (absolute grid, real-time scheduling where allowed) publishes estimates of an arm of
+which one encoder is silent, from a sample that is another one at every tick. The peer's tick does the same with a torch
+nn.Module: take the sample, infer, put what was measured over it, encode, publish. A rate is held if at most 0.1 % of
+its ticks are skipped beyond those of a loop that does nothing at that rate, before it, in one of three tries: a machine
+that stands still for a moment says nothing of either. Each runs in a process of its own, and rates go up by a quarter
+until two in a row are not held.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.bodies import MASKS, body, modules
+from benchmarks.table import Row
+from gemuco.schema import BodySchema
+from gemuco.warm import warm
+from hal.clock import SystemClock
+from hal.config import load_robot
+from services.model.estimation import Estimation, Fresh, Freshness
+from services.process.loop import Loop
+from services.process.realtime import freeze, prepare_process
+from services.wire.messages import Estimates, Sample
+from services.wire.session import new_boot, open_session
+from services.wire.streams import Publisher
+
+ROBOT = Path("robots/musashi_arm.yaml")
+SILENT = ("joint_position", 3)
+RATES = [round(250.0 * 1.25**step) for step in range(20)]
+MISSED, TRIES = 0.001, 3
+
+
+def skipped(rate: float, tick: Callable[[], None], seconds: float) -> float:
+    """Share of the ticks that were skipped at a rate [Hz]."""
+    loop = Loop("estimation", rate, tick, priority=40)
+    loop.start()
+    time.sleep(seconds)
+    counted = loop.statistics()
+    loop.stop()
+    return counted["skipped"] / max(counted["ticks"] + counted["skipped"], 1)
+
+
+def samples(schema: BodySchema, clock: SystemClock) -> Callable[[], Fresh]:
+    """Another sample every time."""
+    random, number = np.random.default_rng(0), 0
+    sizes = {one.name: one.size for one in schema.layout.signals}
+    valid = {name: np.ones(size, bool) for name, size in sizes.items()}
+    valid[SILENT[0]][SILENT[1]] = False
+    age = {name: np.zeros(size) for name, size in sizes.items()}
+    known = [{name: random.standard_normal(size) for name, size in sizes.items()} for _ in range(16)]
+
+    def newest() -> Fresh:
+        nonlocal number
+        number += 1
+        values = known[number % len(known)]
+        return Fresh(
+            Sample(cycle=number, source="can", complete=False, values=values, age=age, valid=valid), clock.monotonic()
+        )
+
+    return newest
+
+
+def torch_tick(
+    schema: BodySchema, newest: Callable[[], Fresh], publish: Callable[[Estimates], None], clock: SystemClock
+) -> Callable[[], None]:
+    """What a user would write."""
+    import torch
+    from torch import nn
+
+    torch.set_num_threads(1)
+    network = nn.Sequential(*modules(schema))
+    layout, mean, std = schema.layout, schema.scaler.mean, schema.scaler.std
+    gate, tail = schema.gate(MASKS[0])
+    names = layout.names
+
+    @torch.inference_mode()
+    def tick() -> None:
+        sample = newest().sample
+        x = np.concatenate([sample.values[name] for name in names])
+        there = np.concatenate([sample.valid[name] for name in names])
+        given = np.concatenate([np.where(gate > 0, (x - mean) / std, 0.0), tail]).astype(np.float32)
+        told = network(torch.from_numpy(given)).numpy() * std + mean
+        values = np.where(there, x, told)
+        publish(
+            Estimates(
+                stamp_ns=clock.now_ns(), cycle=sample.cycle,
+                values={name: values[span] for name, span in layout.slices.items()},
+                estimated={name: ~there[span] for name, span in layout.slices.items()},
+                std={name: np.zeros(span.stop - span.start) for name, span in layout.slices.items()},
+                method=dict.fromkeys(names, "mask"), mask=dict.fromkeys(names, ""), residual=dict.fromkeys(names, 0.0),
+            )
+        )  # fmt: skip
+
+    return tick
+
+
+def highest(way: str, seconds: float) -> dict[str, float]:
+    """The highest rate [Hz] that one way holds."""
+    prepare_process()
+    warm()
+    robot, schema, clock = load_robot(ROBOT), body((200, 200)), SystemClock()
+    with open_session(f"highest_rate_{new_boot()}", "model", ()) as session:
+        publisher = Publisher(session, "gemuco/highest_rate/model/estimate", Estimates, new_boot())
+        newest = samples(schema, clock)
+        if way == "ours":
+            tick = Estimation(Freshness(robot, newest, clock), lambda: schema, publisher.put, clock).tick
+        else:
+            tick = torch_tick(schema, newest, publisher.put, clock)
+        for _ in range(50):
+            tick()
+        freeze()
+        best, misses = 0.0, 0
+        for rate in RATES:
+            if any(skipped(rate, lambda: None, seconds) + MISSED >= skipped(rate, tick, seconds) for _ in range(TRIES)):
+                best, misses = rate, 0
+            else:
+                misses += 1
+                if misses == 2:
+                    break
+    return {"rate": best}
+
+
+def row(seconds: float = 3.0) -> Row:
+    """Both."""
+    found = {}
+    for way in ("ours", "torch"):
+        command = [sys.executable, "-m", "benchmarks.highest_rate", "--way", way, "--seconds", str(seconds)]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        found[way] = float(json.loads(done.stdout.splitlines()[-1])["rate"])
+    ratio = found["ours"] / max(found["torch"], RATES[0] / 1.25)
+    return Row(
+        "highest estimation rate held, one encoder silent", "the same loop with torch eager", found["ours"],
+        found["torch"], "Hz", ratio, 4.0, note=f"in steps of a quarter, {seconds:g} s each; {RATES[-1]} is the last",
+    )  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=3.0)
+    parser.add_argument("--way", choices=("ours", "torch"), help="only one of them, as JSON")
+    options = parser.parse_args()
+    print(json.dumps(highest(options.way, options.seconds)) if options.way else row(options.seconds))
+
+
+if __name__ == "__main__":
+    main()
