@@ -37,7 +37,7 @@ def by_hidden() -> dict[str, list[float]]:
         joined = np.zeros(schema.layout.size)
         gate = schema.gate(schema.masks[0])
         plain, balanced = Ours(schema, "e", TERMS), Ours(schema, "e", (*TERMS, BALANCE))
-        predictor = schema.predictor
+        predictor = schema.ready.predictor
         for name, job, calls in (
             (
                 "estimate by mask",

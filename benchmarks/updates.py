@@ -46,7 +46,7 @@ def inference() -> Iterator[Row]:
         given = np.concatenate([np.where(gate > 0, (joined - mean) / std, 0.0), tail]).astype(np.float32)
         return network(torch.from_numpy(given)).numpy() * std + mean
 
-    predictor = schema.predictor
+    predictor = schema.ready.predictor
     np.testing.assert_allclose(infer(predictor, joined, gate, tail)[0], by_torch(), rtol=1e-3, atol=1e-4)
     row = faster(
         "estimate by mask, hidden 200, arrays in and out",

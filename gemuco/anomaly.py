@@ -58,7 +58,7 @@ def score(schema: "BodySchema", values: Mapping[str, np.ndarray], blame: bool = 
     if schema.normal is None:
         unknown = np.full(schema.out_layout.size, np.nan)
         return AnomalyScore(float("nan"), float("nan"), schema.out_layout.split(unknown), "")
-    distance, contribution, judged = schema.normal.distance(errors(schema.predictor, schema.judging, joined))
+    distance, contribution, judged = schema.normal.distance(errors(schema.ready.predictor, schema.ready.judges, joined))
     threshold = float(schema.normal.threshold_of(judged))
     blamed = ""
     if blame and distance > threshold:

@@ -147,7 +147,7 @@ class Kalman:
             numbers = (self._known, PASSES, self._scale, FREEDOM, pairs.log_volume, FAINTEST)
             shape = (pairs.through, pairs.tails, pairs.index, pairs.whiten)
             beliefs = (self._mean, self._covariance, self._weight)
-            seen = bank.see(schema.predictor, row, *beliefs, shape, self._near, numbers)
+            seen = bank.see(schema.ready.predictor, row, *beliefs, shape, self._near, numbers)
             self._seen += 1
             self._scale = max(1.0, self._scale * (1.0 + (seen - 1.0) / min(SCALE_FIRST + self._seen, SCALE_MEMORY)))
             self._thin()

@@ -105,7 +105,7 @@ def _route(schema: "BodySchema", name: str, whole: Mask, finite: np.ndarray) -> 
 
 def _guess(schema: "BodySchema", method: str, mask: Mask, joined: np.ndarray) -> _Guess:
     if method == "mask":
-        value, residual = infer(schema.predictor, joined, *schema.gate(mask))
+        value, residual = infer(schema.ready.predictor, joined, *schema.gate(mask))
         return _Guess(value, _std(schema, method, mask), method, mask, residual)
     x = np.where(np.isfinite(joined), schema.scaler.normalise(joined), np.nan)
     full = np.full(schema.layout.size, np.nan)
@@ -152,7 +152,7 @@ def latent_search(schema: "BodySchema", x: np.ndarray) -> np.ndarray:
     """
     data = np.full(len(x), np.nan)
     data[schema.out_index] = x[schema.out_index]
-    found = minimise(fitting(latent_lines(schema), data), schema.latent_starts, SEARCH)
+    found = minimise(fitting(latent_lines(schema), data), schema.ready.latent_starts, SEARCH)
     return run(schema.weights.decoder, found.point)
 
 

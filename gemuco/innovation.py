@@ -132,7 +132,7 @@ class Innovations:
         """
         p = np.ascontiguousarray(biases, np.float32)
         x = np.ascontiguousarray(rows, float)
-        return innovations(schema.predictor, x, p, pairs.through, pairs.tails, pairs.index, pairs.whiten)
+        return innovations(schema.ready.predictor, x, p, pairs.through, pairs.tails, pairs.index, pairs.whiten)
 
 
 def own_bias(schema: "BodySchema", count: int) -> np.ndarray:

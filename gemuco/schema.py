@@ -13,13 +13,11 @@ import numpy as np
 
 from gemuco import anomaly, checkpoint
 from gemuco.anomaly import AnomalyScore, Normal
-from gemuco.compiled.chain import pack
-from gemuco.compiled.inference import Predictor
-from gemuco.compiled.score import Judges
 from gemuco.errors import NotFinite, UnknownCondition, UnknownSignal, WrongSize
-from gemuco.estimate import STARTS, Estimate, estimate, mask_error
+from gemuco.estimate import Estimate, estimate, mask_error
 from gemuco.kernels import Chain, Weights, run
 from gemuco.masks import Mask, bits, label
+from gemuco.ready import Ready
 from gemuco.scaler import CLIP, Scaler
 from gemuco.signals import Layout
 
@@ -59,6 +57,7 @@ class BodySchema:
         in_index: Where the elements of x_in lie in the layout, shape (in_size,).
         out_index: Where the elements of x_out lie in the layout, shape (out_size,).
         judges: Signal of x_out -> the mask that predicts it for the sake of anomaly detection.
+        ready: What compiled code takes of it.
     """
 
     layout: Layout
@@ -81,9 +80,7 @@ class BodySchema:
     _gates: dict[Mask, tuple[np.ndarray, np.ndarray]] = field(init=False, repr=False)
     _ranked: dict[str, tuple[Mask, ...]] = field(init=False, repr=False)
     _chain: Chain = field(init=False, repr=False)
-    _predictors: list[Predictor] = field(init=False, repr=False)
-    _judging: list[Judges] = field(init=False, repr=False)
-    _starts: list[np.ndarray] = field(init=False, repr=False)
+    ready: Ready = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         set_field = object.__setattr__
@@ -99,9 +96,7 @@ class BodySchema:
         set_field(self, "_gates", {})
         set_field(self, "_ranked", {})
         set_field(self, "_chain", self.weights.whole)
-        set_field(self, "_predictors", [])
-        set_field(self, "_judging", [])
-        set_field(self, "_starts", [])
+        set_field(self, "ready", Ready(self))
         for mask in self.masks:
             self.gate(mask)
         set_field(self, "judges", anomaly.judging_masks(self))
@@ -119,35 +114,6 @@ class BodySchema:
             found = np.repeat(m, sizes).astype(np.float32), np.concatenate([m, self.bias]).astype(np.float32)
             self._gates[mask] = found
         return found
-
-    @property
-    def predictor(self) -> Predictor:
-        """The network as compiled code takes it; laid out when first asked for."""
-        if not self._predictors:
-            scale = np.stack([self.scaler.mean, self.scaler.std])
-            self._predictors.append(Predictor(pack(self._chain), self.in_index, self.out_index, scale, CLIP))
-        return self._predictors[0]
-
-    @property
-    def judging(self) -> Judges:
-        """`judges` as compiled code takes them."""
-        if not self._judging:
-            masks = list(dict.fromkeys(self.judges.values()))
-            through, tails = (np.stack(column) for column in zip(*(self.gate(m) for m in masks), strict=True))
-            order = [masks.index(self.judges[s.name]) for s in self.out_layout.signals for _ in range(s.size)]
-            self._judging.append(Judges(through, tails, np.array(order)))
-        return self._judging[0]
-
-    @property
-    def latent_starts(self) -> np.ndarray:
-        """The z of some anchors, of which a descent on z chooses its start, shape (n, latent), n at least 1."""
-        if not self._starts:
-            if len(self.anchors):
-                first = self.anchors[:STARTS]
-                self._starts.append(run(self.weights.encoder, self.network_input(first, self.masks[0])))
-            else:
-                self._starts.append(np.zeros((1, self.weights.decoder[0].matrix.shape[0]), np.float32))
-        return self._starts[0]
 
     def ranked(self, name: str) -> tuple[Mask, ...]:
         """The feasible masks, the one that infers a signal of x_out best first."""

@@ -3,7 +3,7 @@
 import logging
 import threading
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -136,20 +136,22 @@ class GemucoService:
         )
         self._solver: ModelSolver | None = None
         self.control, self.no_control = self._make_control(self.config)
-        rates = robot.rates
-        ticks = {
-            "estimation": (rates.estimation, self.estimation.tick),
-            "control": (rates.control, self._control_tick),
-            "anomaly": (rates.anomaly, self.anomaly.tick),
-            "update": (rates.update, self.update.tick),
-            "verdict": (VERDICTS, self.anomaly.judge),
-        }
-        follows = {"estimation": self.estimation.waited}
-        self.loops = [
-            Loop(name, rate, tick, self.clock, PRIORITIES[name], follows.get(name))
-            for name, (rate, tick) in ticks.items()
-        ]
+        self.loops = self._make_loops()
         service.watch(*self.loops)
+
+    def _make_loops(self) -> list[Loop]:
+        rates, estimation, anomaly = self.robot.rates, self.estimation, self.anomaly
+
+        def loop(name: str, rate: float, tick: Callable[[], None], **options: Any) -> Loop:
+            return Loop(name, rate, tick, self.clock, PRIORITIES[name], **options)
+
+        return [
+            loop("estimation", rates.estimation, estimation.tick, waited=estimation.waited),
+            loop("control", rates.control, self._control_tick),
+            loop("anomaly", rates.anomaly, anomaly.tick),
+            loop("update", rates.update, self.update.tick),
+            loop("verdict", VERDICTS, anomaly.judge),
+        ]
 
     def newest_sample(self) -> Fresh | None:
         """The last sample that arrived, however old."""
