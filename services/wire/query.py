@@ -284,8 +284,6 @@ def _pack(value: Any) -> bytes:
 def _plain(value: Any) -> Any:
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
-    if isinstance(value, set | frozenset):
-        return sorted(value)
     return str(value)
 
 
