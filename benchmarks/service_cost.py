@@ -83,7 +83,7 @@ def rows() -> Iterator[Row]:
     yield memory()
     yield question()
     yield way_through.row()
-    yield highest_rate.row(2.0)
+    yield highest_rate.row()
 
 
 def main() -> None:
