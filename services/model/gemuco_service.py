@@ -141,12 +141,15 @@ class GemucoService:
 
     def _make_loops(self) -> list[Loop]:
         rates, estimation, anomaly = self.robot.rates, self.estimation, self.anomaly
+        times = max(rates.estimation, rates.hal) / min(rates.estimation, rates.hal)
+        # Of rates that do not divide each other samples come at every moment of a period: there is nothing to keep to.
+        waited = estimation.waited if times.is_integer() else None
 
         def loop(name: str, rate: float, tick: Callable[[], None], **options: Any) -> Loop:
             return Loop(name, rate, tick, self.clock, PRIORITIES[name], **options)
 
         return [
-            loop("estimation", rates.estimation, estimation.tick, waited=estimation.waited),
+            loop("estimation", rates.estimation, estimation.tick, waited=waited),
             loop("control", rates.control, self._control_tick),
             loop("anomaly", rates.anomaly, anomaly.tick),
             loop("update", rates.update, self.update.tick),

@@ -1,4 +1,4 @@
-"""The rule by which the model service degrades: learning gives way to every loop that keeps time, and only to them."""
+"""The rules between loops: learning gives way to those that keep time, and estimation keeps in step with the HAL."""
 
 import pytest
 from arm_model import arm, small_model
@@ -17,3 +17,16 @@ def test_learning_waits_for_each_of_the_other_loops(robot: str, slow: str) -> No
         assert made.update._may_learn() == (slow in ("update", "verdict"))
         loops[slow]._slow = ""
         assert made.update._may_learn()
+
+
+@pytest.mark.parametrize(
+    ("rate", "follows"), [(200.0, True), (400.0, True), (100.0, True), (500.0, False), (300.0, False)]
+)
+def test_estimation_keeps_in_step_only_with_samples_of_a_rate_that_divides(
+    robot: str, rate: float, follows: bool
+) -> None:
+    body = arm()
+    rates = body.rates.model_copy(update={"estimation": rate, "hal": 200.0})
+    with Service(robot, "model", (), dict) as service:
+        made = GemucoService(body.model_copy(update={"robot": robot, "rates": rates}), small_model(), service)
+        assert (made.loops[0]._waited is not None) == follows
