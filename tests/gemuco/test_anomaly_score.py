@@ -2,7 +2,9 @@ import numpy as np
 import pytest
 
 from gemuco.anomaly import Normal
+from gemuco.compiled.score import errors
 from gemuco.errors import NotEnoughData
+from gemuco.normal import prediction_errors
 
 
 def rows(values):
@@ -48,6 +50,24 @@ def test_contribution_is_the_drop_without_the_element():
         without = error.copy()
         without[index] = np.nan
         assert distance**2 - normal.distance(without)[0] ** 2 == pytest.approx(contribution[index], rel=1e-6)
+
+
+@pytest.mark.parametrize("missing", [None, ("muscle_tension", 2), ("muscle_length", 0), ("joint_position", 1)])
+def test_compiled_errors_and_distance_are_those_of_numpy(schema, arm, missing):
+    for row in rows(arm.sample(20, 6)):
+        if missing is not None:
+            row[missing[0]][missing[1]] = np.nan
+        joined = schema.layout.join_one(row)
+        found = errors(schema.ready.predictor, schema.ready.judges, joined)
+        expected = prediction_errors(schema, schema.normalise_one(row))
+        np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-5 * schema.scaler.std[schema.out_index].max())
+        judged = np.isfinite(expected)
+        distance, _, count = schema.normal.distance(found)
+        assert count == judged.sum()
+        if count:
+            away = (expected - schema.normal.mean)[judged]
+            square = away @ np.linalg.solve(schema.normal.covariance[np.ix_(judged, judged)], away)
+            assert distance == pytest.approx(np.sqrt(square), rel=1e-3)
 
 
 def test_judges_by_what_is_there(schema, arm):
