@@ -278,7 +278,14 @@ def _family(base: type[Exception]) -> Iterator[type[Exception]]:
 
 
 def _pack(value: Any) -> bytes:
-    return _encoder.encode(value)
+    return _encoder.encode(_ordered(value))
+
+
+def _ordered(value: Any) -> Any:
+    """With lists, sorted, in place of sets: msgspec would write them in any order."""
+    if isinstance(value, dict):
+        return {key: _ordered(item) for key, item in value.items()}
+    return sorted(value) if isinstance(value, set | frozenset) else value
 
 
 def _plain(value: Any) -> Any:

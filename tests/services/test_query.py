@@ -41,9 +41,9 @@ def pair(robot: str) -> Iterator[Pair]:
 
 
 def test_arguments_and_answer_arrive(pair: Pair) -> None:
-    key = pair.serve("echo", lambda arguments: arguments | {"array": np.arange(2.0), "names": {"a"}})
+    key = pair.serve("echo", lambda arguments: arguments | {"array": np.arange(2.0), "names": {"b", "a"}})
     assert pair.ask(key, {"x": np.array([1.5]), "n": np.int64(2)}) == {
-        "x": [1.5], "n": 2, "array": [0.0, 1.0], "names": ["a"],
+        "x": [1.5], "n": 2, "array": [0.0, 1.0], "names": ["a", "b"],
     }  # fmt: skip
 
 
