@@ -16,5 +16,8 @@ config.insert_json5("connect/endpoints", json.dumps([endpoint]))
 config.insert_json5("scouting/multicast/enabled", "false")
 with zenoh.open(config) as session, session.declare_subscriber(f"gemuco/{robot}/hal/sample") as samples:
     body = msgpack.unpackb(samples.recv().payload.to_bytes())
-for signal, binary in body["values"].items():
-    print(signal, np.frombuffer(binary, "<f8").round(4), np.frombuffer(body["valid"][signal], "?"))
+values, valid = np.frombuffer(body["values"], "<f8"), np.frombuffer(body["valid"], "?")
+start = 0
+for signal, count in body["elements"].items():
+    print(signal, values[start : start + count].round(4), valid[start : start + count])
+    start += count

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gemuco.blame import suspects
-from gemuco.compiled.score import errors
+from gemuco.compiled.score import deviation
 from gemuco.normal import Normal, judging_masks, prediction_errors
 
 if TYPE_CHECKING:
@@ -54,15 +54,40 @@ def score(schema: "BodySchema", values: Mapping[str, np.ndarray], blame: bool = 
             contributes most is named.
     """
     joined = schema.layout.join_one(values)
-    joined[np.isinf(joined)] = np.nan
-    if schema.normal is None:
-        unknown = np.full(schema.out_layout.size, np.nan)
-        return AnomalyScore(float("nan"), float("nan"), schema.out_layout.split(unknown), "")
-    distance, contribution, judged = schema.normal.distance(errors(schema.ready.predictor, schema.ready.judges, joined))
-    threshold = float(schema.normal.threshold_of(judged))
-    blamed = ""
-    if blame and distance > threshold:
-        blamed = suspects(schema, schema.scaler.normalise(joined)[None])[0].name
-    elif judged:
-        blamed = schema.out_layout.element(int(np.fmax(contribution, -1.0).argmax()))
-    return AnomalyScore(distance, threshold, schema.out_layout.split(contribution), blamed)
+    found = judged(schema, joined)
+    blamed = found.blamed(schema)
+    if blame and found.distance > found.threshold:
+        blamed = suspects(schema, schema.normalise_one(values)[None])[0].name
+    return AnomalyScore(found.distance, found.threshold, schema.out_layout.split(found.contribution), blamed)
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """The score of a sample; see `AnomalyScore`.
+
+    Attributes:
+        distance: Mahalanobis distance.
+        threshold: Above which it counts as an anomaly.
+        contribution: Of every element of x_out, shape (out_size,).
+    """
+
+    distance: float
+    threshold: float
+    contribution: np.ndarray
+
+    def blamed(self, schema: "BodySchema") -> str:
+        """`signal.element` that contributes most; empty if nothing was judged."""
+        if np.isnan(self.distance):
+            return ""
+        return schema.out_layout.element(int(np.fmax(self.contribution, -1.0).argmax()))
+
+
+def judged(schema: "BodySchema", joined: np.ndarray) -> Judged:
+    """The score of a sample in one array [unit of each element], shape (size,); NaN where missing."""
+    by = schema.ready.judgement(np.isfinite(joined))
+    if schema.normal is None or not len(by.index):
+        return Judged(float("nan"), float("nan"), np.full(schema.out_layout.size, np.nan))
+    distance, contribution = deviation(
+        schema.ready.predictor, schema.ready.judges, joined, schema.normal.mean, by.index, by.precision
+    )
+    return Judged(distance, by.threshold, contribution)

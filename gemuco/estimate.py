@@ -10,7 +10,7 @@ from gemuco.compiled.inference import infer
 from gemuco.descent import NewtonConfig
 from gemuco.fold import fitting, input_lines, latent_lines
 from gemuco.kernels import run
-from gemuco.masks import Mask, covered_by
+from gemuco.masks import Mask, covered_by, label
 from gemuco.minimise import minimise
 
 if TYPE_CHECKING:
@@ -45,41 +45,95 @@ class Estimate:
 
 
 @dataclass(frozen=True, slots=True)
-class _Guess:
-    """A vector with every element filled in: values and std in units of the layout, shape (size,)."""
+class Filled:
+    """Every element of a layout as well as it can be known; see `Estimate` for what is told of each signal.
+
+    Attributes:
+        value: Shape (size,).
+        std: Shape (size,).
+        estimated: Shape (size,).
+        method: By signal.
+        mask: By signal.
+        label: By signal, the mask as text.
+        residual: By signal.
+    """
 
     value: np.ndarray
     std: np.ndarray
-    method: str
-    mask: Mask
-    residual: float
+    estimated: np.ndarray
+    method: Mapping[str, str]
+    mask: Mapping[str, Mask]
+    label: Mapping[str, str]
+    residual: dict[str, float]
 
-    def where(self, missing: np.ndarray, joined: np.ndarray) -> "_Guess":
-        """With what was measured in place of what was guessed."""
-        value, std = np.where(missing, self.value, joined), np.where(missing, self.std, 0.0)
-        return _Guess(value, std, self.method, self.mask, self.residual)
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """How a schema fills in samples that lack the same elements; all but the numbers is known beforehand.
+
+    Attributes:
+        ways: Method, mask, for which elements of the layout, shape (size,), and for which signals.
+        std: As of `Filled`, and so are the others.
+        estimated: Which elements are.
+        method: By signal.
+        mask: By signal.
+        label: By signal.
+    """
+
+    ways: tuple[tuple[str, Mask, np.ndarray, tuple[str, ...]], ...]
+    std: np.ndarray
+    estimated: np.ndarray
+    method: Mapping[str, str]
+    mask: Mapping[str, Mask]
+    label: Mapping[str, str]
+
+    @classmethod
+    def of(cls, schema: "BodySchema", finite: np.ndarray) -> "Plan":
+        """For samples of which these elements are there, truth values, shape (size,)."""
+        slices, whole = schema.layout.slices, schema.layout.whole(finite)
+        named: dict[tuple[str, Mask], list[str]] = {}
+        for name in slices:
+            way = ("measured", frozenset()) if name in whole else _route(schema, name, whole, finite)
+            named.setdefault(way, []).append(name)
+        std, estimated = np.zeros(len(finite)), np.zeros(len(finite), bool)
+        ways = []
+        for (method, mask), names in named.items():
+            missing = np.zeros(len(finite), bool)
+            for name in names:
+                missing[slices[name]] = ~finite[slices[name]]
+            std[missing] = _std(schema, method, mask)[missing]
+            estimated |= missing & (method != "none")
+            if method != "measured":
+                ways.append((method, mask, missing, tuple(names)))
+        of_signal = {name: way for way, names in named.items() for name in names}
+        std.setflags(write=False)
+        estimated.setflags(write=False)
+        masks = {name: of_signal[name][1] for name in slices}
+        labels = {name: label(mask, schema.layout.names) for name, mask in masks.items()}
+        return cls(tuple(ways), std, estimated, {name: of_signal[name][0] for name in slices}, masks, labels)
 
 
 def estimate(schema: "BodySchema", values: Mapping[str, np.ndarray]) -> dict[str, Estimate]:
     """Every signal of the layout; see `BodySchema.estimate`."""
-    joined = schema.layout.join_one(values)
-    finite = np.isfinite(joined)
-    whole = schema.layout.whole(finite)
-    missing = ~finite
-    measured = _Guess(joined, np.zeros(len(joined)), "measured", frozenset(), 0.0)
-    guesses: dict[tuple[str, Mask], _Guess] = {}
-    found: dict[str, Estimate] = {}
-    for name, span in schema.layout.slices.items():
-        guess, gone = measured, missing
-        if name not in whole:
-            way = _route(schema, name, whole, finite)
-            if way not in guesses:
-                guesses[way] = _guess(schema, *way, joined).where(missing, joined)
-            guess = guesses[way]
-            if guess.method == "none":
-                gone = np.zeros(len(joined), bool)
-        found[name] = Estimate(guess.value[span], guess.std[span], gone[span], guess.method, guess.mask, guess.residual)
-    return found
+    found = fill(schema, schema.layout.join_one(values))
+    return {
+        name: Estimate(
+            found.value[span], found.std[span], found.estimated[span],
+            found.method[name], found.mask[name], found.residual[name],
+        )
+        for name, span in schema.layout.slices.items()
+    }  # fmt: skip
+
+
+def fill(schema: "BodySchema", joined: np.ndarray) -> Filled:
+    """What `estimate` tells, of a sample in one array [unit of each element], shape (size,); NaN where missing."""
+    plan = schema.ready.plan(np.isfinite(joined))
+    value, residual = joined, dict.fromkeys(plan.method, 0.0)
+    for method, mask, missing, names in plan.ways:
+        told, amiss = _guess(schema, method, mask, joined)
+        value = np.where(missing, told, value)
+        residual |= dict.fromkeys(names, amiss)
+    return Filled(value, plan.std, plan.estimated, plan.method, plan.mask, plan.label, residual)
 
 
 def mask_error(schema: "BodySchema", mask: Mask, name: str) -> float:
@@ -103,10 +157,11 @@ def _route(schema: "BodySchema", name: str, whole: Mask, finite: np.ndarray) -> 
     return "none", frozenset()
 
 
-def _guess(schema: "BodySchema", method: str, mask: Mask, joined: np.ndarray) -> _Guess:
+def _guess(schema: "BodySchema", method: str, mask: Mask, joined: np.ndarray) -> tuple[np.ndarray, float]:
+    """Every element as the model says [unit], shape (size,), NaN where it says nothing; and the residual."""
     if method == "mask":
-        value, residual = infer(schema.ready.predictor, joined, *schema.gate(mask))
-        return _Guess(value, _std(schema, method, mask), method, mask, residual)
+        told, amiss = infer(schema.ready.predictor, joined, *schema.gate(mask))
+        return told, amiss
     x = np.where(np.isfinite(joined), schema.scaler.normalise(joined), np.nan)
     full = np.full(schema.layout.size, np.nan)
     if method == "latent":
@@ -116,7 +171,7 @@ def _guess(schema: "BodySchema", method: str, mask: Mask, joined: np.ndarray) ->
     residual = _residual(x, full)
     if method == "latent":
         residual = max(residual, _residual(x, _again(schema, full)))
-    return _Guess(schema.scaler.restore(full), _std(schema, method, mask), method, mask, residual)
+    return schema.scaler.restore(full), residual
 
 
 def _std(schema: "BodySchema", method: str, mask: Mask) -> np.ndarray:

@@ -88,7 +88,7 @@ class Normal:
             The Mahalanobis distance, each element's contribution to its square (the drop of the square when that
             element alone is left out: (P e)_i^2 / P_ii), and how many elements were judged.
         """
-        index, precision = self._precision(error)
+        index, precision = self.precision(np.isfinite(error - self.mean))
         if not len(index):
             return float("nan"), np.full(len(error), np.nan), 0
         found, contribution = score.distance(error, self.mean, index, precision)
@@ -96,7 +96,7 @@ class Normal:
 
     def distances(self, errors: np.ndarray) -> np.ndarray:
         """Distances of errors that lack the same elements, shape (samples, out_size) -> (samples,)."""
-        index, precision = self._precision(errors[0])
+        index, precision = self.precision(np.isfinite(errors[0] - self.mean))
         e = errors[:, index] - self.mean[index]
         return np.sqrt(np.einsum("ij,jk,ik->i", e, precision, e).clip(min=0.0))
 
@@ -109,9 +109,12 @@ class Normal:
         share = np.asarray(judged, float) / self.usual
         return np.where(share > 0.0, self.threshold * np.sqrt(share), np.nan)
 
-    def _precision(self, error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Which elements of an error are there, and the inverse covariance of those."""
-        there = np.isfinite(error - self.mean)
+    def precision(self, there: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The elements that are judged, positions, shape (n,), and the inverse of their covariance, shape (n, n).
+
+        Args:
+            there: Of which there is an error, and a mean one, truth values, shape (out_size,).
+        """
         found = self._precisions.get(there.tobytes())
         if found is None:
             index = np.flatnonzero(there)
@@ -120,6 +123,35 @@ class Normal:
                 self._precisions.clear()
             self._precisions[there.tobytes()] = found
         return found
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """How a schema judges samples that lack the same elements.
+
+    Attributes:
+        index: The elements of x_out that are judged, positions, shape (n,).
+        precision: The inverse covariance of their errors, shape (n, n).
+        threshold: The score above which such a sample is an anomaly; NaN if nothing is judged.
+    """
+
+    index: np.ndarray
+    precision: np.ndarray
+    threshold: float
+
+    @classmethod
+    def of(cls, schema: "BodySchema", finite: np.ndarray) -> "Judgement":
+        """For samples of which these elements are there, truth values, shape (size,).
+
+        A schema without statistics of the normal judges nothing.
+        """
+        if schema.normal is None:
+            return cls(np.zeros(0, int), np.zeros((0, 0)), float("nan"))
+        judges = schema.ready.judges
+        complete = np.array([finite[schema.in_index[through > 0]].all() for through in judges.through])
+        there = finite[schema.out_index] & complete[judges.mask] & np.isfinite(schema.normal.mean)
+        index, precision = schema.normal.precision(there)
+        return cls(index, precision, float(schema.normal.threshold_of(len(index))))
 
 
 def _tail(scores: np.ndarray, false_alarm: float) -> float:

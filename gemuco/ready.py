@@ -1,19 +1,30 @@
 """What a body schema is made into for compiled code, each when it is first asked for and then kept with the schema."""
 
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from gemuco.compiled.chain import pack
 from gemuco.compiled.inference import Predictor
 from gemuco.compiled.score import Judges
-from gemuco.estimate import STARTS
+from gemuco.estimate import STARTS, Plan
 from gemuco.kernels import run
+from gemuco.normal import Judgement
 from gemuco.scaler import CLIP
 
 if TYPE_CHECKING:
     from gemuco.schema import BodySchema
+
+PATTERNS = 64
+"""Sets of missing elements for which plans are kept."""
+
+
+def _keep(kept: dict[bytes, Any], key: bytes, value: Any) -> None:
+    """Keep it; whoever asks in another thread at the same moment makes the same."""
+    if len(kept) >= PATTERNS:
+        kept.clear()
+    kept[key] = value
 
 
 class Ready:
@@ -21,6 +32,26 @@ class Ready:
 
     def __init__(self, schema: "BodySchema") -> None:
         self._schema = schema
+        self._plans: dict[bytes, Plan] = {}
+        self._judgements: dict[bytes, Judgement] = {}
+
+    def plan(self, finite: np.ndarray) -> Plan:
+        """How samples are filled in of which these elements are there, truth values, shape (size,)."""
+        key = finite.tobytes()
+        found = self._plans.get(key)
+        if found is None:
+            found = Plan.of(self._schema, finite)
+            _keep(self._plans, key, found)
+        return found
+
+    def judgement(self, finite: np.ndarray) -> Judgement:
+        """How samples are judged of which these elements are there, truth values, shape (size,)."""
+        key = finite.tobytes()
+        found = self._judgements.get(key)
+        if found is None:
+            found = Judgement.of(self._schema, finite)
+            _keep(self._judgements, key, found)
+        return found
 
     @cached_property
     def predictor(self) -> Predictor:

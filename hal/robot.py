@@ -7,6 +7,7 @@ from typing import Any, Self
 import numpy as np
 
 from hal.actuators import Actuators, find
+from hal.by_signal import Numbers
 from hal.caretaker import Caretaker
 from hal.clock import BusClock, Clock, SystemClock
 from hal.config import RobotConfig
@@ -71,7 +72,9 @@ class Robot:
         self._nothing = np.full(config.signals[config.command.signal].size, np.nan)
         self._nothing.flags.writeable = False
         self._desired: tuple[np.ndarray, float] | None = None
-        self._measured = {name: np.full(config.signals[name].size, np.nan) for name in self._assembler.signals}
+        self._measured = Numbers.of(
+            {name: np.full(config.signals[name].size, np.nan) for name in self._assembler.signals}
+        )
         self._number = self._incomplete = 0
         self._is_open = False
         self._stop_reason = ""

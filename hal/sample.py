@@ -5,12 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hal.by_signal import Elements, Numbers, Truths
 from hal.computed import function_of
 from hal.config import RobotConfig
 from hal.device import Device
 from hal.errors import ConfigError
-
-Arrays = dict[str, np.ndarray]
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,9 +30,9 @@ class Sample:
     stamp_ns: int
     source: str
     complete: bool
-    values: Arrays
-    age: Arrays
-    valid: Arrays
+    values: Numbers
+    age: Numbers
+    valid: Truths
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,12 +60,17 @@ class Applied:
 
 @dataclass(frozen=True, slots=True)
 class _Computed:
-    """A signal that is computed: from which slice of what was measured, how, and until what age [s]."""
+    """A signal that is computed: how, from which elements, where it belongs, and until what age [s]."""
 
     function: Callable[[np.ndarray], np.ndarray]
     inputs: slice
-    size: int
+    place: slice
     stale_after: float
+
+    @property
+    def size(self) -> int:
+        """How many elements it has."""
+        return self.place.stop - self.place.start
 
 
 class Assembler:
@@ -99,26 +103,22 @@ class Assembler:
         self._stale_after = np.repeat(
             [config.signals[name].stale_after for name in direct], [config.signals[name].size for name in direct]
         )
-        slices: dict[str, slice] = {}
-        start = 0
-        for name in direct:
-            slices[name] = slice(start, start + config.signals[name].size)
-            start += config.signals[name].size
-        self._parts: dict[str, slice | _Computed] = {}
-        for name, signal in config.signals.items():
-            if name in slices:
-                self._parts[name] = slices[name]
-            elif signal.computed is not None:
-                inputs = slices[signal.computed.inputs]
-                function = function_of(config, name)
-                self._parts[name] = _Computed(function, inputs, signal.size, signal.stale_after)
+        has = [name for name, signal in config.signals.items() if name in direct or signal.computed is not None]
+        self._elements = Elements.of({name: config.signals[name].size for name in has})
+        places = self._elements.places
+        self._direct = np.concatenate([np.r_[places[name]] for name in direct] or [np.zeros(0, int)])
+        self._computed = [
+            _Computed(function_of(config, name), places[signal.computed.inputs], places[name], signal.stale_after)
+            for name, signal in config.signals.items()
+            if name not in direct and signal.computed is not None
+        ]
 
     @property
     def signals(self) -> tuple[str, ...]:
         """Signals that a sample has, in the order of the robot file."""
-        return tuple(self._parts)
+        return tuple(self._elements.counts)
 
-    def assemble(self, now: float) -> tuple[Arrays, Arrays, Arrays]:
+    def assemble(self, now: float) -> tuple[Numbers, Numbers, Truths]:
         """Values, ages [s] and validity of every signal at monotonic time `now` [s], in fresh arrays."""
         readings = [device.read() for device in self._devices]
         # The times first: a value that arrives in between then looks older than it is, never newer.
@@ -129,16 +129,21 @@ class Assembler:
         age = np.maximum(now - received, 0.0)
         valid = (age <= self._stale_after) & np.isfinite(values)
         np.copyto(values, np.nan, where=~valid)
-        values_of: Arrays = {}
-        age_of: Arrays = {}
-        valid_of: Arrays = {}
-        for name, part in self._parts.items():
-            if isinstance(part, slice):
-                values_of[name], age_of[name], valid_of[name] = values[part], age[part], valid[part]
-            else:
-                inputs = part.inputs
-                values_of[name], age_of[name], valid_of[name] = _compute(part, values[inputs], age[inputs])
-        return values_of, age_of, valid_of
+        if self._computed:
+            values, age, valid = self._with_computed(values, age, valid)
+        return Numbers(values, self._elements), Numbers(age, self._elements), Truths(valid, self._elements)
+
+    def _with_computed(self, values: np.ndarray, age: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, ...]:
+        """With what is computed put between what was measured."""
+        size, direct = self._elements.size, self._direct
+        all_values, all_ages, all_valid = np.empty(size), np.empty(size), np.zeros(size, bool)
+        all_values[direct], all_ages[direct], all_valid[direct] = values, age, valid
+        for one in self._computed:
+            into = one.place
+            all_values[into], all_ages[into], all_valid[into] = _compute(
+                one, all_values[one.inputs], all_ages[one.inputs]
+            )
+        return all_values, all_ages, all_valid
 
 
 def _compute(part: _Computed, values: np.ndarray, age: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -79,3 +79,9 @@ def distance(error, mean, index, precision):
         total += weighted * (error[index[i]] - mean[index[i]])
         contribution[index[i]] = weighted * weighted / precision[i, i]
     return np.sqrt(max(total, 0.0)), contribution
+
+
+@jit
+def deviation(predictor, judges, joined, mean, index, precision):
+    """`distance` of the `errors` of a sample; see both."""
+    return distance(errors(predictor, judges, joined), mean, index, precision)

@@ -1,11 +1,12 @@
 """What a limit is: it takes a wanted set-point and returns one that it can answer for."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
-Arrays = dict[str, np.ndarray]
+Arrays = Mapping[str, np.ndarray]
 
 
 @dataclass(slots=True)

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from hal.by_signal import Numbers, Truths
 from services.client import description
 from services.client.commanding import SECONDS, Commanding
 from services.client.link import TIMEOUT
@@ -67,9 +68,9 @@ class Client(Listening):
         signals: dict[str, dict[str, Any]] = found["signals"]
         return Estimates(
             cycle=found["cycle"],
-            values={name: np.array(one["values"], float) for name, one in signals.items()},
-            estimated={name: np.array(one["estimated"], bool) for name, one in signals.items()},
-            std={name: np.array(one["std"], float) for name, one in signals.items()},
+            values=Numbers.of({name: one["values"] for name, one in signals.items()}),
+            estimated=Truths.of({name: one["estimated"] for name, one in signals.items()}),
+            std=Numbers.of({name: one["std"] for name, one in signals.items()}),
             method={name: one["method"] for name, one in signals.items()},
             mask={name: one["mask"] for name, one in signals.items()},
             residual={name: one["residual"] for name, one in signals.items()},
@@ -92,7 +93,7 @@ class Client(Listening):
         if values is None and not hidden:
             return self.fresh(keys.anomaly(self.robot), Anomaly, max_age, timeout)
         found = self.ask("model", "anomaly", _given(values) | {"hide": hidden}, SLOW_TIMEOUT)
-        contribution = {name: np.array(part, float) for name, part in found["contribution"].items()}
+        contribution = Numbers.of(found["contribution"])
         names = ("cycle", "score", "threshold", "is_anomaly", "blamed")
         return Anomaly(contribution=contribution, **{name: found[name] for name in names})
 

@@ -123,6 +123,7 @@ class HalService:
                 cycle=sample.cycle,
                 source=sample.source,
                 complete=sample.complete,
+                elements=sample.values.elements,
                 values=sample.values,
                 age=sample.age,
                 valid=sample.valid,

@@ -8,6 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from hal.by_signal import Numbers, Truths
 from hal.config import RobotConfig
 from services.hardware.stand_in import condition_of, simulator_of, variant_of
 from services.process import realtime
@@ -89,7 +90,7 @@ class SimulatorService:
 
     def tick(self) -> None:
         """Publish what is true now."""
-        values = {name: np.asarray(value, float) for name, value in self._rig.truth().items()}
+        values = Numbers.of(self._rig.truth())
         self._cycle += 1
         self._truth.put(
             messages.Sample(
@@ -97,9 +98,10 @@ class SimulatorService:
                 cycle=self._cycle,
                 source="truth",
                 complete=True,
+                elements=values.elements,
                 values=values,
-                age={name: np.zeros(value.shape) for name, value in values.items()},
-                valid={name: np.ones(value.shape, bool) for name, value in values.items()},
+                age=Numbers(np.zeros_like(values.flat), values.elements),
+                valid=Truths(np.ones(len(values.flat), bool), values.elements),
             )
         )
 

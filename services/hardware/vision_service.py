@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from hal.by_signal import Numbers, Truths
 from hal.clock import SystemClock
 from hal.config import RobotConfig
 from hal.errors import ConfigError
@@ -69,7 +70,7 @@ class VisionService:
         received, truth = last
         with self._lock:
             seen = self._camera.see(truth.values)
-        values = {name: np.asarray(seen[name], float) for name in self._robot.seen}
+        values = Numbers.of({name: seen[name] for name in self._robot.seen})
         now = self._clock.monotonic()
         age = max(now - received, 0.0)
         self._looked_at, self._looked_when = truth, now
@@ -81,9 +82,10 @@ class VisionService:
                 cycle=self._cycle,
                 source="simulated",
                 complete=True,
+                elements=values.elements,
                 values=values,
-                age={name: np.full(value.shape, age) for name, value in values.items()},
-                valid={name: np.isfinite(value) for name, value in values.items()},
+                age=Numbers(np.full_like(values.flat, age), values.elements),
+                valid=Truths(np.isfinite(values.flat), values.elements),
             )
         )
 

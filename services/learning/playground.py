@@ -1,7 +1,7 @@
 """A robot that can be moved and looked at: without a bus as fast as it computes, or a running one in its own time."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Protocol
 
 import numpy as np
@@ -18,7 +18,7 @@ from services.wire.messages import Sample
 ENABLE_WITHIN = 5.0
 """Time [s] within which the drives must be enabled."""
 
-Values = dict[str, np.ndarray]
+Values = Mapping[str, np.ndarray]
 
 
 class CollectionStopped(ServiceError):

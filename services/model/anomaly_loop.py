@@ -3,16 +3,14 @@
 import math
 from collections import deque
 from collections.abc import Callable
-from operator import is_
 from typing import Any
 
-import numpy as np
-
-from gemuco.anomaly import AnomalyScore, score
+from gemuco.anomaly import Judged, judged
 from gemuco.schema import BodySchema
 from gemuco.verdict import Verdict, judge
+from hal.by_signal import Elements, Numbers
 from hal.clock import Clock
-from services.model.estimation import Freshness
+from services.model.estimation import Freshness, in_order
 from services.wire.messages import Anomaly
 
 ODD = 10
@@ -49,9 +47,9 @@ class AnomalyWatch:
             clock,
         )
         self._above_since = math.inf
-        self._odd: deque[dict[str, np.ndarray]] = deque(maxlen=ODD)
+        self._odd: deque[Numbers] = deque(maxlen=ODD)
         self._last_cycle = -1
-        self._scored: tuple[BodySchema, tuple[np.ndarray, ...], AnomalyScore] | None = None
+        self._scored: tuple[BodySchema, Numbers, Judged, str] | None = None
         self._judged: tuple[float, float, Verdict] | None = None
         """When the scores that were judged rose above the threshold, when the verdict was made, and the verdict."""
         self.latest: Anomaly | None = None
@@ -59,10 +57,14 @@ class AnomalyWatch:
     def tick(self) -> None:
         """Score the newest sample; NaN, and nobody is blamed, without a fresh one or without normal data."""
         fresh, values = self._freshness.take()
-        found = self._score(self._schema(), values)
+        schema, known = self._schema(), self._scored
+        if known is None or known[0] is not schema or known[1] is not values:  # a sample is scored once
+            score = judged(schema, in_order(schema, values).flat)
+            known = self._scored = schema, values, score, score.blamed(schema)
+        found = known[2]
         now = self._clock.monotonic()
         cycle = -1 if fresh is None else fresh.sample.cycle
-        if found.score > found.threshold:
+        if found.distance > found.threshold:
             self._above_since = min(self._above_since, now)
             if cycle != self._last_cycle or not self._odd:
                 self._odd.append(values)
@@ -70,7 +72,7 @@ class AnomalyWatch:
             self._above_since = math.inf
             self._odd.clear()
         self._last_cycle = cycle
-        self._tell(found, cycle, now)
+        self._tell(schema, found, known[3], cycle, now)
 
     def judge(self) -> None:
         """Make a verdict if one is due: the score has been above the threshold for long enough, and the last is old."""
@@ -79,13 +81,6 @@ class AnomalyWatch:
         if now - since >= self._after and not is_judged:
             self._judged = since, now, judge(self._schema(), list(self._odd))
 
-    def _score(self, schema: BodySchema, values: dict[str, np.ndarray]) -> AnomalyScore:
-        """The score of a sample; computed once, however often the loop sees it."""
-        arrays, known = tuple(values.values()), self._scored
-        if known is None or known[0] is not schema or not all(map(is_, known[1], arrays)):
-            known = self._scored = schema, arrays, score(schema, values, blame=False)
-        return known[2]
-
     def summary(self) -> dict[str, Any]:
         """What the last tick found, without the parts of each signal; empty before the first."""
         latest = self.latest
@@ -93,19 +88,21 @@ class AnomalyWatch:
             return {}
         return {name: getattr(latest, name) for name in ("score", "threshold", "is_anomaly", "verdict", "blamed")}
 
-    def _tell(self, found: AnomalyScore, cycle: int, now: float) -> None:
-        judged = self._judged
-        verdict = judged[2] if judged is not None and judged[0] == self._above_since else None
-        kind = "normal" if found.score <= found.threshold else "" if verdict is None else verdict.kind
+    def _tell(self, schema: BodySchema, found: Judged, largest: str, cycle: int, now: float) -> None:
+        known = self._judged
+        verdict = known[2] if known is not None and known[0] == self._above_since else None
+        kind = "normal" if found.distance <= found.threshold else "" if verdict is None else verdict.kind
         has_lasted = now - self._above_since >= self._after + (PATIENCE if verdict is None else 0.0)
+        elements = Elements.of({one.name: one.size for one in schema.out_layout.signals})
         self.latest = Anomaly(
             stamp_ns=self._clock.now_ns(),
             cycle=cycle,
-            score=float(found.score),
-            threshold=float(found.threshold),
+            score=found.distance,
+            threshold=found.threshold,
             is_anomaly=has_lasted and kind != "environment",
-            blamed=verdict.blamed if verdict is not None and verdict.blamed else found.blamed,
-            contribution={name: np.asarray(part, float) for name, part in found.contribution.items()},
+            blamed=verdict.blamed if verdict is not None and verdict.blamed else largest,
+            elements=elements,
+            contribution=Numbers(found.contribution, elements),
             verdict=kind,
         )
         self._publish(self.latest)

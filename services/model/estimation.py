@@ -1,19 +1,23 @@
 """The estimation loop: stale is masked, estimated, and marked as estimated."""
 
-from collections.abc import Callable, Mapping
+import math
+from bisect import bisect_left
+from collections.abc import Callable
 from dataclasses import dataclass
-from operator import is_
 
 import numpy as np
 from msgspec.structs import replace
 
-from gemuco.masks import label
+from gemuco.estimate import fill
 from gemuco.schema import BodySchema
+from hal.by_signal import Elements, Numbers, Truths
 from hal.clock import Clock
-from hal.config import RobotConfig, SignalConfig
+from hal.config import RobotConfig
 from services.model.living_model import layout_of
 from services.wire.messages import Estimates, Sample
 from services.wire.streams import Newest as Reader
+
+Places = tuple[np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,8 +40,6 @@ class Fresh:
 
 
 Newest = Callable[[], Fresh | None]
-Usable = dict[str, np.ndarray]
-"""Signal -> values [unit], shape (n,); NaN where they must not be used."""
 
 
 class Freshness:
@@ -57,52 +59,91 @@ class Freshness:
             clock: Of this process.
             seen: Returns the last sample of the camera's process, however old.
         """
-        self._signals = [(name, robot.signals[name]) for name in layout_of(robot).names]
-        self._newest: dict[str, Newest | None] = {"hal": newest, "vision": seen}
-        self._clock = clock
-        self._absent = {name: _unwritable(np.full(signal.size, np.nan)) for name, signal in self._signals}
-        self._read: dict[str, tuple[Sample, Usable]] = {}
-        """For each source the sample that was read last, and what of it could be used when it was published."""
+        names = layout_of(robot).names
+        self.elements = Elements.of({name: robot.signals[name].size for name in names})
+        self._hal = _Source(robot, self.elements, "hal")
+        self._vision = None if seen is None else _Source(robot, self.elements, "vision")
+        self._newest, self._seen, self._clock = newest, seen, clock
+        nothing = _unwritable(np.full(self.elements.size, np.nan))
+        self._nothing = nothing, False
+        self._told: tuple[np.ndarray, np.ndarray, Numbers] = nothing, nothing, Numbers(nothing, self.elements)
 
-    def take(self) -> tuple[Fresh | None, dict[str, np.ndarray]]:
+    def take(self) -> tuple[Fresh | None, Numbers]:
         """The HAL's newest sample, and all usable values [unit], shapes (n,); NaN where invalid or stale by now.
 
         The sample is None if nothing of it is usable; what the camera sees may be usable then. Nobody may write into
-        the arrays: they are the same until another sample comes.
+        the arrays: they are the same, in the same object, until another sample comes or something becomes stale. Any
+        thread may ask.
         """
-        newest = {source: None if take is None else take() for source, take in self._newest.items()}
-        usable = {source: {} if fresh is None else self._usable(source, fresh) for source, fresh in newest.items()}
-        now = self._clock.monotonic()
-        values, alive = dict(self._absent), False
-        for name, signal in self._signals:
-            fresh, found = newest[signal.source], usable[signal.source].get(name)
-            if fresh is not None and found is not None and now - fresh.received <= signal.stale_after:
-                values[name] = found
-                alive = alive or signal.source == "hal"
-        return newest["hal"] if alive else None, values
+        now, fresh = self._clock.monotonic(), self._newest()
+        measured, is_there = self._nothing if fresh is None else self._hal.usable(fresh, now)
+        seen = self._nothing[0]
+        if self._vision is not None and self._seen is not None and (shot := self._seen()) is not None:
+            seen, _ = self._vision.usable(shot, now)
+        told = self._told
+        if told[0] is not measured or told[1] is not seen:
+            both = measured if seen is self._nothing[0] else np.where(np.isnan(measured), seen, measured)
+            told = self._told = measured, seen, Numbers(_unwritable(both), self.elements)
+        return (fresh if is_there else None), told[2]
 
-    def _usable(self, source: str, fresh: Fresh) -> Usable:
-        """The signals of which something could be used when a sample was published, NaN where it could not."""
-        read = self._read.get(source)
+
+class _Source:
+    """What may be used of the samples of one process."""
+
+    def __init__(self, robot: RobotConfig, elements: Elements, source: str) -> None:
+        self._elements, self._names = elements, [n for n in elements.counts if robot.signals[n].source == source]
+        stale = [np.full(count, robot.signals[name].stale_after) for name, count in elements.counts.items()]
+        self._stale_after = np.concatenate(stale)
+        self._limits = sorted({robot.signals[name].stale_after for name in self._names})
+        """After these times [s] of waiting some of it becomes stale."""
+        self._layout: tuple[Elements, Places] | None = None
+        self._read: tuple[Sample, np.ndarray] | None = None
+        """The sample that was read last, and what of it could be used when it was published."""
+        self._kept: tuple[np.ndarray, int, np.ndarray, bool] | None = None
+
+    def usable(self, fresh: Fresh, now: float) -> tuple[np.ndarray, bool]:
+        """Every element of the model [unit], shape (size,), NaN where it must not be used now; and whether any may."""
+        read, kept = self._read, self._kept
         if read is None or read[0] is not fresh.sample:
-            found = {name: _valid(name, signal, fresh.sample) for name, signal in self._signals}
-            read = fresh.sample, {name: value for name, value in found.items() if np.isfinite(value).any()}
-            self._read[source] = read
-        return read[1]
+            read = self._read = fresh.sample, self._published(fresh.sample)
+        published, passed = read[1], bisect_left(self._limits, now - fresh.received)
+        if kept is None or kept[0] is not published or kept[1] != passed:
+            found = published
+            if passed:
+                left = self._limits[passed] if passed < len(self._limits) else math.inf
+                found = _unwritable(np.where(self._stale_after >= left, published, np.nan))
+            kept = self._kept = published, passed, found, bool(np.isfinite(found).any())
+        return kept[2], kept[3]
 
+    def _published(self, sample: Sample) -> np.ndarray:
+        """What could be used when a sample was published."""
+        layout = self._layout
+        if layout is None or layout[0] is not sample.elements:
+            layout = self._layout = sample.elements, self._places(sample.elements)
+        to, of = layout[1]
+        found = np.full(self._elements.size, np.nan)
+        is_usable = sample.valid.flat[of] & (sample.age.flat[of] <= self._stale_after[to])
+        found[to] = np.where(is_usable, sample.values.flat[of], np.nan)
+        return _unwritable(found)
 
-def _valid(name: str, signal: SignalConfig, sample: Sample) -> np.ndarray:
-    """The values of one signal, NaN where they were not valid or too old already when they were published."""
-    value, valid, age = sample.values.get(name), sample.valid.get(name), sample.age.get(name)
-    shape = (signal.size,)
-    if value is None or valid is None or age is None or not value.shape == valid.shape == age.shape == shape:
-        return np.full(signal.size, np.nan)
-    return _unwritable(np.where(valid & (age <= signal.stale_after), value, np.nan))
+    def _places(self, theirs: Elements) -> Places:
+        """Where the model's elements lie, and where in a sample; a signal of another size is as good as silent."""
+        names = [name for name in self._names if theirs.counts.get(name) == self._elements.counts[name]]
+        to, of = ([np.r_[all_of.places[name]] for name in names] for all_of in (self._elements, theirs))
+        empty = [np.zeros(0, int)]
+        return np.concatenate(to or empty), np.concatenate(of or empty)
 
 
 def _unwritable(array: np.ndarray) -> np.ndarray:
     array.setflags(write=False)
     return array
+
+
+def in_order(schema: BodySchema, values: Numbers) -> Numbers:
+    """The same values in the order of the schema's layout, which may be another one than the robot file's."""
+    if tuple(values.elements.counts) == schema.layout.names:
+        return values
+    return Numbers.of(values, Elements.of({one.name: one.size for one in schema.layout.signals}))
 
 
 class Estimation:
@@ -117,7 +158,7 @@ class Estimation:
     ) -> None:
         """`schema` returns the body schema in use at the moment."""
         self._freshness, self._schema, self._publish, self._clock = freshness, schema, publish, clock
-        self._told: tuple[BodySchema, tuple[np.ndarray, ...]] | None = None
+        self._told: tuple[BodySchema, Numbers] | None = None
         """The schema and the values that `latest` was made from."""
         self._newest: Sample | None = None
         self._waited: float | None = None
@@ -131,12 +172,11 @@ class Estimation:
         self._newest = None if fresh is None else fresh.sample
         schema, stamp_ns = self._schema(), self._clock.now_ns()
         cycle = -1 if fresh is None else fresh.sample.cycle
-        arrays = tuple(values.values())
         told = self._told
-        if self.latest is not None and told is not None and told[0] is schema and all(map(is_, told[1], arrays)):
+        if self.latest is not None and told is not None and told[0] is schema and told[1] is values:
             self.latest = replace(self.latest, stamp_ns=stamp_ns, cycle=cycle)
         else:
-            self.latest, self._told = _estimates(schema, values, stamp_ns, cycle), (schema, arrays)
+            self.latest, self._told = _estimates(schema, in_order(schema, values), stamp_ns, cycle), (schema, values)
         self._publish(self.latest)
 
     def waited(self) -> float | None:
@@ -150,16 +190,16 @@ class Estimation:
         return {"measured": measured, "estimated": len(methods) - measured - none, "none": none}
 
 
-def _estimates(schema: BodySchema, values: Mapping[str, np.ndarray], stamp_ns: int, cycle: int) -> Estimates:
-    found = schema.estimate(values)
-    names = tuple(found)
+def _estimates(schema: BodySchema, values: Numbers, stamp_ns: int, cycle: int) -> Estimates:
+    found, elements = fill(schema, values.flat), values.elements
     return Estimates(
         stamp_ns=stamp_ns,
         cycle=cycle,
-        values={name: one.value for name, one in found.items()},
-        estimated={name: one.estimated for name, one in found.items()},
-        std={name: one.std for name, one in found.items()},
-        method={name: one.method for name, one in found.items()},
-        mask={name: label(one.mask, names) for name, one in found.items()},
-        residual={name: float(one.residual) for name, one in found.items()},
+        elements=elements,
+        values=Numbers(found.value, elements),
+        estimated=Truths(found.estimated, elements),
+        std=Numbers(found.std, elements),
+        method=dict(found.method),
+        mask=dict(found.label),
+        residual=found.residual,
     )

@@ -206,8 +206,8 @@ class ModelVerbs:
         """What to judge by, without what is hidden, and its cycle; -1 when it was given or nothing is fresh."""
         given, cycle = arguments.get("values"), -1
         if given is None:
-            fresh, values = self._service.freshness.take()
-            cycle = -1 if fresh is None else fresh.sample.cycle
+            fresh, newest = self._service.freshness.take()
+            values, cycle = dict(newest), -1 if fresh is None else fresh.sample.cycle
         else:
             values = _signals(given, "values")
         hidden = arguments.get("hide") or []

@@ -23,6 +23,10 @@ SPREAD = 0.1
 that rests would fill it with one posture."""
 
 
+Values = Mapping[str, np.ndarray]
+"""Signal -> value [its unit], shape (n,)."""
+
+
 class Learner(Protocol):
     """An updater of p and W with a window of its own (`gemuco.adapt.Updater`)."""
 
@@ -68,7 +72,7 @@ class OnlineUpdate:
         self._make_learner, self._publish, self._clock = learner, publish, clock
         self._lock = threading.Lock()
         self._learner: Learner | None = None
-        self._since_change: deque[dict[str, np.ndarray]] = deque(maxlen=config.window)
+        self._since_change: deque[Values] = deque(maxlen=config.window)
         self._last: np.ndarray | None = None
         self._awaits_first = False
         self._taken_at = -math.inf
@@ -144,7 +148,7 @@ class OnlineUpdate:
             self._told = told
         self._publish(told)
 
-    def _newest(self) -> tuple[dict[str, np.ndarray] | None, bool]:
+    def _newest(self) -> tuple[Values | None, bool]:
         """The newest sample, and whether it is far and late enough to be learned from.
 
         A sample that lacks something still tells p, from whatever is left. Where there is no p it is not taken: W would
@@ -167,7 +171,7 @@ class OnlineUpdate:
         self._awaits_first, self._last, self._taken_at = False, row, now
         return values, moved
 
-    def _learn(self, learner: Learner, sample: dict[str, np.ndarray] | None) -> Update:
+    def _learn(self, learner: Learner, sample: Values | None) -> Update:
         if sample is not None:
             learner.add(sample)
         result = learner.step()

@@ -17,7 +17,7 @@ from services.errors import RecordingError
 from services.recording.reading import Paths, Recorded, about, one_robot, read
 from services.recording.schema import UNITS, Form
 from services.wire import keys
-from services.wire.records import Message, Numbers, Truths
+from services.wire.records import Array, Message, Numbers, Truths
 
 ROWS = 4096
 """Rows that are written together."""
@@ -192,15 +192,15 @@ def _cells(one: Recorded, typed: bool = False) -> Iterator[tuple[str, Any]]:
 def _columns(name: str, hint: Any, message: Message, form: Form, typed: bool) -> Iterator[tuple[str, Any]]:
     value = getattr(message, name)
     signals = form.catalogue.signals
-    if hint == Numbers and not form.by_signal:
+    if hint == Array and not form.by_signal:
         yield name, json.dumps(value.tolist())
-    elif hint in (Numbers, dict[str, Numbers], dict[str, Truths]):
+    elif hint in (Array, Numbers, Truths):
         only = getattr(message, "signal", "")
-        found = {only: value} if hint == Numbers else value
+        found = {only: value} if hint == Array else value
         for signal, listed in signals.items():
             if only and signal != only:
                 continue
-            is_truth = hint == dict[str, Truths]
+            is_truth = hint is Truths
             unit = "" if is_truth else UNITS.get(name, listed.unit)
             prefix = "" if name == PLAIN else f"{name}."
             suffix = f" [{unit}]" if unit else ""

@@ -6,12 +6,11 @@ number is NaN again, and an absent age is infinite: never measured. All other nu
 """
 
 import inspect
-import itertools
 import math
 import re
 import struct
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -20,7 +19,7 @@ import numpy as np
 
 from hal.config import RobotConfig
 from services.wire.messages import VERSION, MessageError
-from services.wire.records import Message, Numbers, Truths
+from services.wire.records import Array, Elements, Message, Numbers, OfSignals, Truths
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 ABSENT = {"age": math.inf}
@@ -110,12 +109,13 @@ class Form:
 
     def __init__(self, record: type[Message], catalogue: Catalogue) -> None:
         self.record, self.catalogue = record, catalogue
-        self._fields = msgspec.structs.fields(record)
+        self._fields = [item for item in msgspec.structs.fields(record) if item.type is not Elements]
         self.hints = {item.name: item.type for item in self._fields}
         self._packed = {
             name: (listed.elements, struct.Struct(f"<{len(listed.elements)}d"))
             for name, listed in catalogue.signals.items()
         }
+        self._is_of_signals = issubclass(record, OfSignals)
         self.by_signal = any(item.name == "signal" for item in self._fields)
         self._plan = [(item.name, self._writer(item.name, self.hints[item.name])) for item in self._fields]
         self._required = frozenset(item.name for item in self._fields if item.required)
@@ -134,16 +134,14 @@ class Form:
                 raise MessageError(f"It is no {self.record.TYPE} message of version {VERSION}.")
             if not self._required <= body.keys():
                 raise MessageError(f"A {self.record.TYPE} message lacks '{min(self._required - body.keys())}'.")
-            for one, other in itertools.pairwise(self.record.PER_SIGNAL):
-                if body[one].keys() != body[other].keys():
-                    raise MessageError(
-                        f"A {self.record.TYPE} message names other signals in '{other}' than in '{one}'."
-                    )
+            if self._is_of_signals:
+                self._check(body)
             for name, write in self._plan:
                 if name in body and (found := write(body[name], body)) is not None:
                     body[name] = found
                 else:
                     body.pop(name, None)
+            body.pop("elements", None)  # every element stands beside its name
             return _encoder.encode(body), body
         except MessageError:
             raise
@@ -169,7 +167,9 @@ class Form:
 
     def _writer(self, name: str, hint: Any) -> Convert:
         """What turns a field of the wire into JSON; None from it means that the field is absent."""
-        if hint == Numbers:
+        if hint in (Numbers, Truths):
+            return self._of_numbers if hint is Numbers else self._of_truths
+        if hint == Array:
             if not self.by_signal:
                 return _list_of_numbers
             return lambda value, body: {body["signal"]: self._numbers(body["signal"], value)}
@@ -177,9 +177,6 @@ class Form:
             return _finite
         if typing.get_origin(hint) is dict:
             inner = typing.get_args(hint)[1]
-            if inner in (Numbers, Truths):
-                one = self._truths if inner == Truths else self._numbers
-                return lambda value, _: {signal: one(signal, part) for signal, part in value.items()}
             if inner is float:
                 return _map_of_numbers
             if typing.get_origin(inner) is dict:
@@ -195,21 +192,42 @@ class Form:
         if signal not in self._packed or len(data) != self._packed[signal][1].size:
             raise OtherLayout(_checked(str, signal), len(_checked(bytes, data)) // 8)
         elements, packed = self._packed[signal]
-        values = packed.unpack(data)
-        total = sum(values)
-        if total - total == 0.0:  # all finite
-            return dict(zip(elements, values, strict=True))
-        return {element: x for element, x in zip(elements, values, strict=True) if math.isfinite(x)}
+        return _named(elements, packed.unpack(data))
 
-    def _truths(self, signal: str, data: bytes) -> dict[str, bool]:
-        if signal not in self._packed or len(data) != len(self._packed[signal][0]):
-            raise OtherLayout(_checked(str, signal), len(_checked(bytes, data)))
-        return {element: byte != 0 for element, byte in zip(self._packed[signal][0], data, strict=True)}
+    def _check(self, body: dict[str, Any]) -> None:
+        """Raise unless a message tells everything of the same signals, all of them in the catalogue."""
+        counts = _checked(dict, body["elements"])
+        for signal, count in counts.items():
+            if signal not in self._packed or len(self._packed[signal][0]) != count:
+                raise OtherLayout(_checked(str, signal), _checked(int, count))
+        for name in self.record.BY_SIGNAL:  # type: ignore[attr-defined]
+            if body[name].keys() != counts.keys():
+                raise MessageError(f"A {self.record.TYPE} message names other signals in '{name}' than in 'elements'.")
+
+    def _of_numbers(self, data: bytes, body: dict[str, Any]) -> dict[str, dict[str, float]]:
+        return self._split(struct.unpack(f"<{len(data) // 8}d", data), body, _named)
+
+    def _of_truths(self, data: bytes, body: dict[str, Any]) -> dict[str, dict[str, bool]]:
+        return self._split(_checked(bytes, data), body, _named_truths)
+
+    def _split(self, values: Sequence[Any], body: dict[str, Any], named: Callable[..., dict[str, Any]]) -> Any:
+        """Parts of what is told of all signals, by signal."""
+        named_size = sum(body["elements"].values())
+        if named_size != len(values):
+            raise MessageError(f"{named_size} elements are named, and {len(values)} are there.")
+        found, start = {}, 0
+        for signal in body["elements"]:
+            elements = self._packed[signal][0]
+            found[signal] = named(elements, values[start : start + len(elements)])
+            start += len(elements)
+        return found
 
     def _read(self, name: str, body: dict[str, Any]) -> Any:
         hint: Any = self.hints[name]
         value: Any = body.get(name)
-        if hint == Numbers:
+        if hint in (Numbers, Truths):
+            return {signal: self._array(name, signal, part) for signal, part in value.items()}
+        if hint == Array:
             if not self.by_signal:
                 return np.array(value, float)
             return self._array(name, body["signal"], value[body["signal"]])
@@ -217,14 +235,12 @@ class Form:
             return math.nan if value is None else float(value)
         if typing.get_origin(hint) is dict:
             inner = typing.get_args(hint)[1]
-            if inner in (Numbers, Truths):
-                return {signal: self._array(name, signal, part) for signal, part in value.items()}
             if inner is float:
                 return dict.fromkeys(body.get("values", ()), math.nan) | value
         return value
 
     def _is_truth(self, name: str) -> bool:
-        return Truths in typing.get_args(self.hints[name])
+        return self.hints[name] is Truths
 
     def _array(self, name: str, signal: str, part: dict[str, Any]) -> np.ndarray:
         elements = self.catalogue.signals[signal].elements
@@ -254,10 +270,10 @@ class Form:
         }
 
     def _schema_of(self, name: str, hint: Any) -> dict[str, Any]:
-        if hint == Numbers and not self.by_signal:
+        if hint == Array and not self.by_signal:
             return {"type": "array", "items": {"type": "number"}}
         origin, inner = typing.get_origin(hint), (typing.get_args(hint) or (None,))[-1]
-        if hint == Numbers or inner in (Numbers, Truths):
+        if hint in (Array, Numbers, Truths):
             return _object({signal: self._elements(name, listed) for signal, listed in self.catalogue.signals.items()})
         if origin is list:
             return {"type": "array", "items": {"type": TYPES[inner]}}
@@ -277,6 +293,18 @@ class Form:
 def _object(properties: dict[str, Any]) -> dict[str, Any]:
     """Foxglove refuses an object without `properties`."""
     return {"type": "object", "properties": properties}
+
+
+def _named(elements: Sequence[str], values: Sequence[float]) -> dict[str, float]:
+    """The finite ones."""
+    total = sum(values)
+    if total - total == 0.0:  # all finite
+        return dict(zip(elements, values, strict=True))
+    return {element: x for element, x in zip(elements, values, strict=True) if math.isfinite(x)}
+
+
+def _named_truths(elements: Sequence[str], values: Sequence[int]) -> dict[str, bool]:
+    return {element: byte != 0 for element, byte in zip(elements, values, strict=True)}
 
 
 def _finite(value: Any, _: dict[str, Any]) -> float | None:

@@ -12,7 +12,7 @@ from gemuco.signals import Layout, Signal
 from hal import registry
 from hal.config import RobotConfig
 from services.hardware.stand_in import simulator_of
-from services.learning.playground import CollectionStopped, DirectPlayground
+from services.learning.playground import CollectionStopped, DirectPlayground, Values
 from services.model.living_model import layout_of
 
 POSITION, TENSION, LENGTH = "joint_position", "muscle_tension", "muscle_length"
@@ -50,7 +50,7 @@ class ActualArm:
     ) -> None:
         self._body.close()
 
-    def play(self, command: np.ndarray, duration: float) -> Iterator[dict[str, np.ndarray]]:
+    def play(self, command: np.ndarray, duration: float) -> Iterator[Values]:
         """Hold wire lengths [m], shape (10,), for so long [s]; yields samples [unit].
 
         Raises:
@@ -132,7 +132,7 @@ def go(body: ActualArm, controller: Controller, start: np.ndarray, target: np.nd
     """
     duration = max(0.5, 1.9 * float(np.abs(target - start).max()) / SPEED)
     count = round(duration / SET_POINT)
-    now: dict[str, np.ndarray] = {}
+    now: Values = {}
     for index in range(1, count + 1):
         share = (index / count) ** 3 * (10.0 - 15.0 * index / count + 6.0 * (index / count) ** 2)
         command = controller.solve({POSITION: start + share * (target - start)}, now).command

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from hal.by_signal import Elements, Numbers, Truths
 from services.errors import BadArguments, ServiceUnavailable, TooSlow
 from services.wire.messages import Estimates
 
@@ -49,10 +50,8 @@ class HistoryRing:
         self._estimated = np.zeros((self.capacity, width), bool)
         self._stamps = np.zeros(self.capacity, "<i8")
         self._arrived = np.zeros(self.capacity)
-        ends = np.cumsum(list(signals.values()))
-        self._places = {
-            name: slice(int(end) - size, int(end)) for (name, size), end in zip(signals.items(), ends, strict=True)
-        }
+        self._elements = Elements.of(signals)
+        self._places = self._elements.places
         self._begun = self._done = 0
         """Rows whose writing began, and ended; equal but for a moment."""
 
@@ -70,9 +69,10 @@ class HistoryRing:
         """Write a row at monotonic time `now` [s]."""
         row = self._done % self.capacity
         self._begun = self._done + 1
-        for name, place in self._places.items():
-            self._values[row, place] = estimates.values[name]
-            self._estimated[row, place] = estimates.estimated[name]
+        values, estimated = estimates.values, estimates.estimated
+        if estimates.elements is not self._elements:
+            values, estimated = Numbers.of(values, self._elements), Truths.of(estimated, self._elements)
+        self._values[row], self._estimated[row] = values.flat, estimated.flat
         self._stamps[row] = estimates.stamp_ns
         self._arrived[row] = now
         self._done = self._begun

@@ -1,24 +1,29 @@
 """Typed records <-> msgpack, with type, version, stamp and sequence in each.
 
 On the wire a message is one msgpack map: `type`, `v`, `stamp_ns`, `seq`, `boot`, then the record's own fields. An array
-of numbers is a msgpack binary of little-endian float64; an array of truth values is a binary of one byte each.
+of numbers is a msgpack binary of little-endian float64; an array of truth values is a binary of one byte each. What is
+told of all signals is one array, in the order of the map `elements`, which says how many of them are whose.
 """
 
-from collections.abc import Mapping
+import operator
 from typing import Any, TypeVar, Union
 
 import msgspec
 import numpy as np
+from msgspec.structs import force_setattr
 
+from hal.by_signal import OPEN
 from services.errors import ServiceError
 from services.wire.plain_text import plain, shown
 from services.wire.records import (
     Anomaly,
     Applied,
     Command,
+    Elements,
     Estimates,
     Holder,
     Message,
+    Numbers,
     Sample,
     Status,
     Target,
@@ -31,8 +36,10 @@ __all__ = [
     "Update", "decode", "decode_any", "encode",
 ]  # fmt: skip
 
-VERSION = 1
+VERSION = 2
 MAX_BYTES = 1 << 20
+copied = operator.methodcaller("__copy__")
+_frombuffer = np.frombuffer
 NUMBER, TRUTH = np.dtype("<f8"), np.dtype("?")
 UNREADABLE = (msgspec.MsgspecError, UnicodeDecodeError, RecursionError)
 """What msgspec raises of bytes that are not msgpack, or not what they should be."""
@@ -54,38 +61,51 @@ M = TypeVar("M", bound=Message)
 
 def _packed(value: Any) -> Any:
     """What msgpack has no word for, in its words."""
+    kind = type(value)
+    if kind is Numbers or kind is Truths:
+        flat = value.flat
+        return flat.tobytes() if flat.dtype is kind.DTYPE else flat.astype(kind.DTYPE).tobytes()
+    if kind is Elements:
+        return value.counts
     if isinstance(value, np.ndarray):
-        if value.dtype is not NUMBER and value.dtype is not TRUTH:
-            value = value.astype(NUMBER, copy=False)
-        return value.tobytes()
+        return value.astype(NUMBER, copy=False).tobytes()
     if isinstance(value, np.generic):
         return value.item()
-    raise TypeError(f"A message cannot carry {type(value).__name__}.")
+    raise TypeError(f"A message cannot carry {kind.__name__}.")
 
 
-def _array(kind: Any, value: Any) -> np.ndarray:
+def _read(kind: Any, value: Any) -> Any:
+    """What `_packed` made of something that is not msgpack's."""
+    if kind is Elements:
+        return Elements.of(value) if type(value) is dict else _amiss("a map from signal to its number of elements")
+    if type(value) is not bytes or (kind is not Truths and len(value) % 8):
+        return _amiss("a binary of bytes" if kind is Truths else "a binary of little-endian float64")
     if kind is Truths:
-        if type(value) is not bytes:
-            raise ValueError("Expected a binary of bytes")
-        return np.frombuffer(value, "u1") != 0 if value.strip(b"\0\1") else np.frombuffer(value, TRUTH)
-    if type(value) is not bytes or len(value) % 8:
-        raise ValueError("Expected a binary of little-endian float64")
-    return np.frombuffer(value, NUMBER)
+        return Truths(_frombuffer(value, "u1") != 0 if value.strip(b"\0\1") else _frombuffer(value, TRUTH), OPEN)
+    return Numbers(_frombuffer(value, NUMBER), OPEN) if kind is Numbers else _frombuffer(value, NUMBER)
+
+
+def _amiss(wanted: str) -> Any:
+    raise ValueError(f"Expected {wanted}")
 
 
 _encoder = msgspec.msgpack.Encoder(enc_hook=_packed)
 _decoders: dict[type[Message], msgspec.msgpack.Decoder[Any]] = {
-    record: msgspec.msgpack.Decoder(record, dec_hook=_array) for record in RECORDS.values()
+    record: msgspec.msgpack.Decoder(record, dec_hook=_read) for record in RECORDS.values()
 }
 _any_decoder: msgspec.msgpack.Decoder[Any] = msgspec.msgpack.Decoder(
     Union[tuple(RECORDS.values())],  # noqa: UP007 - made of a list
-    dec_hook=_array,
+    dec_hook=_read,
 )
 
 
 def encode(message: Message, **header: int) -> bytes:
     """The wire form of a message; `header` replaces `seq` and `boot`, which the publisher knows."""
-    return _encoder.encode(msgspec.structs.replace(message, v=VERSION, **header))
+    filled = copied(message)  # `replace` would check it all again
+    force_setattr(filled, "v", VERSION)
+    for name, value in header.items():
+        force_setattr(filled, name, value)
+    return _encoder.encode(filled)
 
 
 def decode(data: bytes, expected: type[M]) -> M:
@@ -118,7 +138,6 @@ def _decoded(data: bytes, decoder: msgspec.msgpack.Decoder[Any], wanted: str | N
         raise _refusal(data, wanted, error) from None
     if message.v != VERSION:
         raise _other_version(message.TYPE, message.v)
-    _check_alike(message)
     return message
 
 
@@ -143,23 +162,3 @@ def _refusal(data: bytes, wanted: str | None, error: Exception) -> MessageError:
 
 def _other_version(kind: str, version: Any) -> OtherVersion:
     return OtherVersion(f"A {kind} message has version {shown(version)}; this program reads {VERSION}.")
-
-
-def _check_alike(message: Message) -> None:
-    """Raise `MessageError` unless all that is told by signal is told of the same signals, with as many elements."""
-    if not message.PER_SIGNAL:
-        return
-    first, *others = message.PER_SIGNAL
-    sizes = {name: array.size for name, array in getattr(message, first).items()}
-    if not all(sizes.values()):
-        raise MessageError(f"A {message.TYPE} message has a signal without elements.")
-    for other in others:
-        found: Mapping[str, Any] = getattr(message, other)
-        if found.keys() != sizes.keys():
-            raise MessageError(f"A {message.TYPE} message names other signals in '{other}' than in '{first}'.")
-        for name, array in found.items():
-            if type(array) is np.ndarray and array.size != sizes[name]:
-                raise MessageError(
-                    f"A {message.TYPE} message has {array.size} elements in '{other}.{plain(name, 60)}' and "
-                    f"{sizes[name]} in '{first}'."
-                )

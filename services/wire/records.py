@@ -4,10 +4,17 @@ from typing import Any, ClassVar
 
 import msgspec
 import numpy as np
+from msgspec.structs import force_setattr
 from numpy.typing import NDArray
 
-Numbers = NDArray[np.float64]
-Truths = NDArray[np.bool_]
+from hal.by_signal import NOTHING, OPEN, BySignal, Elements, Numbers, Truths
+
+__all__ = [
+    "Anomaly", "Applied", "Array", "Command", "Elements", "Estimates", "Holder", "Message", "Numbers", "OfSignals",
+    "Sample", "Status", "Target", "Truths", "Update",
+]  # fmt: skip
+
+Array = NDArray[np.float64]
 
 
 class Message(msgspec.Struct, frozen=True, kw_only=True, tag_field="type", tag=str.lower):
@@ -21,15 +28,51 @@ class Message(msgspec.Struct, frozen=True, kw_only=True, tag_field="type", tag=s
     """
 
     TYPE: ClassVar[str]
-    PER_SIGNAL: ClassVar[tuple[str, ...]] = ()
-    """Fields that tell something of each signal: of the same ones, with as many elements."""
     v: int = 0
     stamp_ns: int = 0
     seq: int = 0
     boot: int = 0
 
 
-class Sample(Message, frozen=True, kw_only=True):
+class OfSignals(Message, frozen=True, kw_only=True):
+    """A message that tells several things of the same signals. One array per signal is taken too, and joined.
+
+    Attributes:
+        elements: Signal -> how many elements it has, in the order in which they lie in the arrays.
+    """
+
+    BY_ELEMENT: ClassVar[tuple[tuple[str, type[BySignal]], ...]] = ()
+    """Fields that have a value for each element."""
+    BY_SIGNAL: ClassVar[tuple[str, ...]] = ()
+    """Fields that have one for each signal."""
+    elements: Elements = NOTHING
+
+    def __post_init__(self) -> None:
+        elements = self.elements
+        for name, kind in self.BY_ELEMENT:
+            found = getattr(self, name)
+            if type(found) is kind and found.elements is OPEN and len(found.flat) == elements.size:
+                found.elements = elements  # as it comes from the wire
+            elif type(found) is not kind or found.elements is not elements:
+                elements = self._joined(name, kind, found, elements)
+        for name in self.BY_SIGNAL:
+            if getattr(self, name).keys() != elements.counts.keys():
+                raise ValueError(f"Expected the same signals in '{name}' as in 'elements'")
+
+    def _joined(self, name: str, kind: type[BySignal], found: BySignal, elements: Elements) -> Elements:
+        """Make a field what it should be, of the same elements as the others; returns those."""
+        if type(found) is kind and found.elements is OPEN:
+            raise ValueError(f"Expected {elements.size} elements in '{name}', found {len(found.flat)}")
+        try:
+            joined = kind.of(found, elements if elements.size else None)
+        except ValueError as error:
+            raise ValueError(f"{error} in '{name}'") from None
+        force_setattr(self, name, joined)
+        force_setattr(self, "elements", joined.elements)
+        return joined.elements
+
+
+class Sample(OfSignals, frozen=True, kw_only=True):
     """One coherent cycle of the robot's sensors, or one frame of a camera.
 
     Attributes:
@@ -42,13 +85,15 @@ class Sample(Message, frozen=True, kw_only=True):
     """
 
     TYPE: ClassVar[str] = "sample"
-    PER_SIGNAL: ClassVar[tuple[str, ...]] = ("values", "age", "valid")
+    BY_ELEMENT: ClassVar[tuple[tuple[str, type[BySignal]], ...]] = (
+        ("values", Numbers), ("age", Numbers), ("valid", Truths),
+    )  # fmt: skip
     cycle: int
     source: str
     complete: bool
-    values: dict[str, Numbers]
-    age: dict[str, Numbers]
-    valid: dict[str, Truths]
+    values: Numbers
+    age: Numbers
+    valid: Truths
 
 
 class Command(Message, frozen=True, kw_only=True):
@@ -64,7 +109,7 @@ class Command(Message, frozen=True, kw_only=True):
 
     TYPE: ClassVar[str] = "command"
     signal: str
-    values: Numbers
+    values: Array
     cycle: int
     hal_boot: int
     name: str = ""
@@ -104,13 +149,13 @@ class Applied(Message, frozen=True, kw_only=True):
     cycle: int
     mode: str
     signal: str
-    desired: Numbers
-    values: Numbers
+    desired: Array
+    values: Array
     limited_by: list[str]
     sender: int
 
 
-class Estimates(Message, frozen=True, kw_only=True):
+class Estimates(OfSignals, frozen=True, kw_only=True):
     """Every signal of the body, measured where it can be and estimated where it cannot.
 
     Attributes:
@@ -126,17 +171,20 @@ class Estimates(Message, frozen=True, kw_only=True):
     """
 
     TYPE: ClassVar[str] = "estimates"
-    PER_SIGNAL: ClassVar[tuple[str, ...]] = ("values", "estimated", "std", "method", "mask", "residual")
+    BY_ELEMENT: ClassVar[tuple[tuple[str, type[BySignal]], ...]] = (
+        ("values", Numbers), ("estimated", Truths), ("std", Numbers),
+    )  # fmt: skip
+    BY_SIGNAL: ClassVar[tuple[str, ...]] = ("method", "mask", "residual")
     cycle: int
-    values: dict[str, Numbers]
-    estimated: dict[str, Truths]
-    std: dict[str, Numbers]
+    values: Numbers
+    estimated: Truths
+    std: Numbers
     method: dict[str, str]
     mask: dict[str, str]
     residual: dict[str, float]
 
 
-class Anomaly(Message, frozen=True, kw_only=True):
+class Anomaly(OfSignals, frozen=True, kw_only=True):
     """How unlike normal the body is.
 
     Attributes:
@@ -152,12 +200,13 @@ class Anomaly(Message, frozen=True, kw_only=True):
     """
 
     TYPE: ClassVar[str] = "anomaly"
+    BY_ELEMENT: ClassVar[tuple[tuple[str, type[BySignal]], ...]] = (("contribution", Numbers),)
     cycle: int
     score: float
     threshold: float
     is_anomaly: bool
     blamed: str
-    contribution: dict[str, Numbers]
+    contribution: Numbers
     verdict: str = ""
 
 
@@ -181,7 +230,7 @@ class Update(Message, frozen=True, kw_only=True):
     window: int
     dropped: int
     loss: float
-    bias: Numbers = msgspec.field(default_factory=lambda: np.zeros(0))
+    bias: Array = msgspec.field(default_factory=lambda: np.zeros(0))
     settled: bool = True
     rolled_back: int = 0
 
@@ -198,7 +247,7 @@ class Target(Message, frozen=True, kw_only=True):
 
     TYPE: ClassVar[str] = "target"
     signal: str
-    values: Numbers
+    values: Array
     cycle: int = 0
     hal_boot: int = 0
 

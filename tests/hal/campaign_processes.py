@@ -111,7 +111,7 @@ class Stage:
 
     def fastest(self):
         """Highest mean speed [m/s] over a window of the remembered motion."""
-        rows = [row[:3] for row in self.world.history]
+        rows = [row[:3] for row in list(self.world.history)]  # the world goes on meanwhile
         return max(
             abs(later[k] - sooner[k]) / max(later[0] - sooner[0], 1e-9)
             for sooner, later in zip(rows, rows[WINDOW:], strict=False)

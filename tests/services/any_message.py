@@ -8,7 +8,7 @@ import numpy as np
 
 from services.recording.schema import Catalogue, Listed
 from services.wire.messages import VERSION
-from services.wire.records import Message, Numbers, Truths
+from services.wire.records import Array, Elements, Message, Numbers, Truths
 
 ARM = Catalogue({"joint_position": Listed("rad", ("elbow", "wrist")), "muscle_tension": Listed("N", ("biceps",))})
 BY_SIGNAL = {"joint_position": 2, "muscle_tension": 1}
@@ -24,11 +24,13 @@ def a_message(record: type[Message], number: float = 0.1) -> Message:
             continue
         if name == "signal":
             fields[name] = "joint_position"
-        elif hint == Numbers:
+        elif hint is Elements:
+            continue
+        elif hint == Array:
             fields[name] = np.full(2, 0.25 if name == "bias" else number)
-        elif hint == dict[str, Numbers]:
+        elif hint is Numbers:
             fields[name] = arrays
-        elif hint == dict[str, Truths]:
+        elif hint is Truths:
             fields[name] = truths
         elif hint == dict[str, float]:
             fields[name] = dict.fromkeys(BY_SIGNAL, number)

@@ -20,11 +20,11 @@ def bad_commands(sample: Sample) -> dict[str, tuple[bytes, str, str]]:
         fields = {"signal": "muscle_length", "cycle": sample.cycle, "hal_boot": sample.boot, "boot": 5, **change}
         return messages.encode(Command(values=np.asarray(values, float), **fields))
 
-    later: bytes = msgpack.packb(msgpack.unpackb(command()) | {"v": 2})
+    later: bytes = msgpack.packb(msgpack.unpackb(command()) | {"v": 3})
     return {
         "not msgpack": (b"\xc1\x00", "malformed", "not msgpack"),
         "another type": (messages.encode(sample), "malformed", "Expected a command message"),
-        "a later version": (later, "malformed", "has version 2"),
+        "a later version": (later, "malformed", "has version 3"),
         "far too long": (command(np.zeros(200_000)), "malformed", "over the limit"),
         "not finite": (command((np.nan, 0.1)), "refused", "muscle_length.biceps is nan"),
         "infinite": (command((0.1, np.inf)), "refused", "muscle_length.triceps is inf"),

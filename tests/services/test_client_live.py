@@ -118,7 +118,7 @@ def test_nobody_there_is_told_and_the_same_iterator_goes_on(client: Client, robo
 
 
 def test_messages_of_another_version_are_an_error_and_not_silence(client: Client, robot: str) -> None:
-    body = {**msgpack.unpackb(messages.encode(anomaly(1))), "v": 2}
+    body = {**msgpack.unpackb(messages.encode(anomaly(1))), "v": 3}
     with Service(robot, "model") as service:
         reader = client.reader(keys.anomaly(robot), Anomaly)
 
@@ -127,11 +127,11 @@ def test_messages_of_another_version_are_an_error_and_not_silence(client: Client
             return reader.rejected > 0
 
         eventually(came)
-        with pytest.raises(WrongVersion, match=r"has version 2; this program reads 1\. Update the older"):
+        with pytest.raises(WrongVersion, match=r"has version 3; this program reads 2\. Update the older"):
             client.anomaly()
         live = client.anomalies(deadline=1.0)
         service.session.put(keys.anomaly(robot), msgpack.packb(body))
-        with pytest.raises(WrongVersion, match="has version 2"):
+        with pytest.raises(WrongVersion, match="has version 3"):
             next(live)
         service.session.put(keys.anomaly(robot), messages.encode(anomaly(7)))
         assert next(client.anomalies(deadline=20.0)).cycle == 7
@@ -293,9 +293,9 @@ def test_a_service_that_speaks_another_version_says_so(client: Client, robot: st
 
     def speak(query: zenoh.Query) -> None:
         with query:
-            query.reply(query.key_expr, answer, attachment=msgpack.packb({"v": 2}))
+            query.reply(query.key_expr, answer, attachment=msgpack.packb({"v": 3}))
 
     session.declare_queryable(keys.verb(robot, "hal", "describe"), speak)
-    with pytest.raises(WrongVersion, match="version 2 of the wire format; this program speaks 1"):
+    with pytest.raises(WrongVersion, match="version 3 of the wire format; this program speaks 2"):
         client.ask("hal", "describe", timeout=10.0)
     close_session(session)

@@ -216,7 +216,7 @@ NASTY = {
     "nothing": b"",
     "no msgpack": b"\xc1\xff",
     "a list": msgpack.packb([1, 2]),
-    "a later version": msgpack.packb({"v": 2}),
+    "a later version": msgpack.packb({"v": 3}),
     "a version that is none": msgpack.packb({"v": {"a": [1]}}),
     "nested": _nested(400),
     "nested without end": _nested(100_000),
@@ -274,7 +274,7 @@ def test_whatever_comes_as_a_command_moves_nothing_and_the_cycle_turns(hal: Hal,
     wrong += [
         msgpack.packb(body | change)
         for change in (
-            {"cycle": 2**64 - 1}, {"cycle": -1}, {"v": True}, {"v": 1.0}, {"signal": "\x1b[2J" * 9999},
+            {"cycle": 2**64 - 1}, {"cycle": -1}, {"v": True}, {"v": 2.0}, {"signal": "\x1b[2J" * 9999},
             {"values": np.full(2, np.inf).tobytes()}, {"values": b""}, {"name": ["anna"]}, {"cycle": 1.5},
         )
     ]  # fmt: skip

@@ -70,7 +70,10 @@ def test_a_sample_that_waited_too_long_is_no_sample() -> None:
 def test_a_sample_of_wrong_shape_is_as_good_as_silent() -> None:
     bench = Bench()
     sample = sample_of(3)
-    broken = replace(sample, values=sample.values | {"joint_position": np.zeros(4)}, valid=dict(sample.valid))
+    broken = Sample(
+        cycle=1, source="simulated", complete=True, values=sample.values | {"joint_position": np.zeros(4)},
+        age=sample.age | {"joint_position": np.zeros(4)}, valid=sample.valid | {"joint_position": np.ones(4, bool)},
+    )  # fmt: skip
     bench.newest = Fresh(broken, bench.clock.monotonic())
     assert bench.tick().method["joint_position"] == "mask"
 

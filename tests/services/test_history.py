@@ -25,10 +25,10 @@ def estimates(row: int) -> Estimates:
         cycle=row,
         values={name: row + np.arange(size) / 10 for name, size in SIGNALS.items()},
         estimated={name: np.arange(size) == row % size for name, size in SIGNALS.items()},
-        std={},
-        method={},
-        mask={},
-        residual={},
+        std={name: np.zeros(size) for name, size in SIGNALS.items()},
+        method=dict.fromkeys(SIGNALS, "measured"),
+        mask=dict.fromkeys(SIGNALS, ""),
+        residual=dict.fromkeys(SIGNALS, 0.0),
     )
 
 

@@ -1,3 +1,4 @@
+from collections.abc import Mapping
 from typing import Any
 
 import msgpack
@@ -50,7 +51,7 @@ EXAMPLES: list[Message] = [
 
 
 def _same(left: object, right: object) -> bool:
-    if isinstance(left, dict) and isinstance(right, dict):
+    if isinstance(left, Mapping) and isinstance(right, Mapping):
         return left.keys() == right.keys() and all(_same(left[key], right[key]) for key in left)
     if isinstance(left, np.ndarray | float) and isinstance(right, np.ndarray | float):
         return np.array_equal(left, right, equal_nan=True)
@@ -80,9 +81,8 @@ def test_the_type_on_the_wire_is_the_record_s() -> None:
 
 @pytest.mark.parametrize(("wire", "read"), [(b"\0\1\1", [False, True, True]), (b"\0\2\xff", [False, True, True])])
 def test_any_byte_but_zero_is_true(wire: bytes, read: list[bool]) -> None:
-    body = msgpack.unpackb(messages.encode(EXAMPLES[0])) | {"valid": {"joint_position": wire}}
-    body |= {part: {"joint_position": bytes(24)} for part in ("values", "age")}
-    valid = messages.decode(msgpack.packb(body), Sample).valid["joint_position"]
+    body = msgpack.unpackb(messages.encode(EXAMPLES[0])) | {"valid": wire}
+    valid = messages.decode(msgpack.packb(body), Sample).valid.flat
     assert valid.dtype == bool
     assert valid.tolist() == read
     assert valid.sum() == 2
@@ -113,12 +113,12 @@ def _command(**change: object) -> bytes:
         (b"\x81\xa1a", "not msgpack"),
         (b"\x91" * 5000, "not msgpack"),
         (msgpack.packb({1: 2}), "got None"),
-        (msgpack.packb({"type": "command", "v": 1, 1: 2}), "malformed: Expected `str`"),
+        (msgpack.packb({"type": "command", "v": 2, 1: 2}), "malformed: Expected `str`"),
         (msgpack.packb([1, 2]), "got list"),
         (msgpack.packb({}), "got None"),
         (messages.encode(EXAMPLES[6]), "got 'target'"),
-        (_command(v=2), "has version 2; this program reads 1"),
-        (_command(v=None), "has version 0; this program reads 1"),
+        (_command(v=3), "has version 3; this program reads 2"),
+        (_command(v=None), "has version 0; this program reads 2"),
         (_command(values=None), "missing required field `values`"),
         (_command(values=[1.0, 2.0]), r"Expected a binary of little-endian float64 - at `\$.values`"),
         (_command(values=b"1234567"), "Expected a binary of little-endian float64"),
@@ -135,7 +135,7 @@ def test_what_is_no_command_says_why(data: bytes, says: str) -> None:
 
 def test_unknown_type_lists_the_known_ones() -> None:
     with pytest.raises(MessageError, match=r"no message type 'wish'. Known types: sample, command"):
-        messages.decode_any(msgpack.packb({"type": "wish", "v": 1}))
+        messages.decode_any(msgpack.packb({"type": "wish", "v": 2}))
 
 
 def test_unknown_fields_are_ignored() -> None:
@@ -162,19 +162,54 @@ def test_a_key_comes_apart_again() -> None:
 
 
 @pytest.mark.parametrize(
-    ("field", "content", "said"),
+    ("change", "said"),
     [
-        ("valid", {}, "names other signals in 'valid' than in 'values'"),
-        ("age", {"joint_position": np.zeros(2), "elbow": np.zeros(1)}, "names other signals in 'age'"),
-        ("age", {"joint_position": np.zeros(3)}, "has 3 elements in 'age.joint_position' and 2 in 'values'"),
-        ("values", {"joint_position": np.zeros(0)}, "a signal without elements"),
+        ({"valid": b""}, "Expected 3 elements in 'valid', found 0"),
+        ({"age": bytes(16)}, "Expected 3 elements in 'age', found 2"),
+        ({"age": bytes(25)}, "Expected a binary of little-endian float64"),
+        ({"elements": {"joint_position": 2}}, "Expected 2 elements in 'values', found 3"),
+        ({"elements": {}}, "Expected 0 elements in 'values', found 3"),
+        ({"elements": {"joint_position": 3, "muscle_tension": 0}}, "number of elements, at least 1"),
+        ({"elements": {"joint_position": [3]}}, "number of elements, at least 1"),
+        ({"elements": {"joint_position": 2.5}}, "number of elements, at least 1"),
+        ({"elements": {1: 3}}, "malformed"),
+        ({"elements": ["joint_position", 3]}, "map from signal to its number of elements"),
     ],
 )
-def test_a_sample_that_does_not_agree_with_itself_is_none(field: str, content: object, said: str) -> None:
-    parts: dict[str, Any] = {
-        "values": {"joint_position": np.zeros(2)},
-        "age": {"joint_position": np.zeros(2)},
-        "valid": {"joint_position": np.ones(2, bool)},
-    } | {field: content}
+def test_a_sample_that_does_not_agree_with_itself_is_none(change: dict[str, object], said: str) -> None:
+    body = msgpack.unpackb(messages.encode(EXAMPLES[0])) | change
     with pytest.raises(MessageError, match=said):
-        messages.decode(messages.encode(Sample(cycle=1, source="can", complete=True, **parts)), Sample)
+        messages.decode(msgpack.packb(body), Sample)
+
+
+@pytest.mark.parametrize("field", ["method", "mask", "residual"])
+def test_what_is_told_of_signals_is_told_of_all_of_them(field: str) -> None:
+    body = msgpack.unpackb(messages.encode(EXAMPLES[3]))
+    del body[field]["muscle_tension"]
+    with pytest.raises(MessageError, match=f"the same signals in '{field}'"):
+        messages.decode(msgpack.packb(body), Estimates)
+
+
+@pytest.mark.parametrize(
+    ("field", "content"),
+    [("valid", {}), ("age", AGES | {"elbow": np.zeros(1)}), ("age", AGES | {"joint_position": np.zeros(3)})],
+)
+def test_a_sample_is_not_made_of_what_does_not_agree(field: str, content: object) -> None:
+    parts: dict[str, Any] = {"values": VALUES, "age": AGES, "valid": TRUTH} | {field: content}
+    with pytest.raises(ValueError, match=f"in '{field}'"):
+        Sample(cycle=1, source="can", complete=True, **parts)
+
+
+def test_the_order_of_signals_is_that_of_the_values() -> None:
+    sample = Sample(
+        cycle=1, source="can", complete=True, values=VALUES, age=dict(reversed(AGES.items())),
+        valid=dict(reversed(TRUTH.items())),
+    )  # fmt: skip
+    assert sample.age.flat.tolist() == [*AGES["joint_position"], *AGES["muscle_tension"]]
+    assert sample.valid.elements is sample.values.elements is sample.elements
+
+
+def test_signals_of_the_same_sizes_are_the_same_object_in_every_message() -> None:
+    first, second = (messages.decode(messages.encode(EXAMPLES[0]), Sample) for _ in range(2))
+    assert first.elements is second.elements
+    assert first.elements.counts == {"joint_position": 2, "muscle_tension": 1}

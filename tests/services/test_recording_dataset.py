@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 import pytest
 from any_message import ARM
-from msgspec.structs import replace
 from recorded_arm import BEGIN, SECOND, a_sample, position, record
 
 from gemuco.errors import DatasetError
@@ -85,7 +84,14 @@ def test_what_a_camera_saw_is_merged_by_age_and_may_be_missing(tmp_path: Path) -
     for number in range(200):
         sample = a_sample(number)
         parts = [
-            replace(sample, **{field: {name: getattr(sample, field)[name]} for field in ("values", "age", "valid")})
+            Sample(
+                stamp_ns=sample.stamp_ns,
+                seq=number,
+                cycle=number,
+                source="can",
+                complete=True,
+                **{field: {name: getattr(sample, field)[name]} for field in ("values", "age", "valid")},
+            )
             for name in ("joint_position", "muscle_tension")
         ]
         writer.add(keys.sample("arm"), sample.stamp_ns, messages.encode(parts[0]))

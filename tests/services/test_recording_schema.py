@@ -128,7 +128,7 @@ def _body(record: type[Message]) -> dict[str, Any]:
         (Sample, {"complete": 1}),
         (Sample, {"values": [1, 2]}),
         (Sample, {"values": {"joint_position": [0.1, 0.2]}}),
-        (Sample, {"v": 2}),
+        (Sample, {"v": 3}),
         (Sample, {"type": "applied"}),
         (Applied, {"limited_by": [3]}),
         (Applied, {"signal": 3}),
@@ -180,6 +180,6 @@ def test_fields_of_a_newer_sender_are_kept() -> None:
 @pytest.mark.parametrize("field", ["age", "valid"])
 def test_a_sample_that_does_not_agree_with_itself_is_not_recorded_as_one(field: str) -> None:
     body = msgpack.unpackb(messages.encode(a_message(Sample)))
-    del body[field]["muscle_tension"]
-    with pytest.raises(MessageError, match="names other signals in"):
+    body[field] = body[field][:-8] if field == "age" else body[field][:-1]
+    with pytest.raises(MessageError, match="3 elements are named, and 2 are there"):
         Form(Sample, ARM).write(msgpack.packb(body))

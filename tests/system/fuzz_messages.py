@@ -120,7 +120,7 @@ class Mutator:
         return bytes(whole)
 
     def _future(self, body: dict[str, Any]) -> bytes:
-        return msgpack.packb(body | {"v": self.draw.choice((0, 2, 99, -1, 2**63, 1.5, "1", None, [1], b"1", {}))})
+        return msgpack.packb(body | {"v": self.draw.choice((0, 1, 3, 99, -1, 2**63, 1.5, "1", None, [1], b"1", {}))})
 
     def _wrong_field(self, body: dict[str, Any]) -> bytes:
         return msgpack.packb(body | {self.draw.choice(list(body)): self.value()})
@@ -152,13 +152,13 @@ class Mutator:
         return msgpack.packb(body)
 
     def _other_type(self, _: dict[str, Any]) -> bytes:
-        return msgpack.packb(self.draw.choice(list(self._templates.values())) | {"v": 2})
+        return msgpack.packb(self.draw.choice(list(self._templates.values())) | {"v": 3})
 
     def _not_msgpack(self, _: dict[str, Any]) -> bytes:
         return self.draw.choice(
             (b"\xc1", b"\xdd\xff\xff\xff\xff", b"\xdf\xff\xff\xff\xff", b"\xdb\xff\xff\xff\xffabc",
              b"\xc6\xff\xff\xff\xff", b"\x81\xa4type\xdd\x7f\xff\xff\xff", b"\x81\xa2\xff\xfe\x01", b"\x90",
-             b'{"type": "sample", "v": 1}', b"\xc0",
+             b'{"type": "sample", "v": 2}', b"\xc0",
              b"\x81\xc0\xc0", b"\xd4\x01\x02", b"\xd7\xff" + bytes(8), msgpack.packb({1: 2, None: 3}), b"\x80")
         )  # fmt: skip
 
@@ -301,7 +301,7 @@ class Stage:
 
     def _attachment(self, draw: random.Random, mutator: Mutator) -> bytes | None:
         """Who asks, told badly; or not at all."""
-        told = {"v": 1, "name": "fuzz", "boot": 7}
+        told = {"v": 2, "name": "fuzz", "boot": 7}
         chance = draw.random()
         if chance < 0.3:
             return None
