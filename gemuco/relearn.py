@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gemuco.bias import Prior
+from gemuco.compiled.batch import under_masks
 from gemuco.compiled.chain import pack, unpack
-from gemuco.compiled.learning import SQUARED, gradients
+from gemuco.compiled.learning import SQUARED, gradients, loss
 from gemuco.innovation import own_bias
-from gemuco.kernels import run
 from gemuco.optimiser import Optimiser
 from gemuco.window import Window
 
@@ -58,6 +58,7 @@ class Relearner:
         self._optimiser = Optimiser(config.optimiser, config.rate, len(self._chain.flat))
         self._bias_optimiser = Optimiser(config.optimiser, config.bias_rate, len(self._bias))
         self._best = schema.weights
+        self._gates = gates(schema)
         self._anchors, self._anchor_biases = _others(schema)
         self._calls = 0
         self.held_out = float("nan")
@@ -114,15 +115,8 @@ class Relearner:
         if old:
             rows = np.concatenate([rows, self._anchors[replayed]])
             biases = np.concatenate([biases, self._anchor_biases[replayed]])
-        present = np.arange(len(rows)) < len(now)
-        finite = np.isfinite(rows)
-        parts = []
-        for m in schema.masks:
-            allowed = finite[:, schema.layout.indices(m)].all(axis=1)
-            inputs = schema.network_input(rows[allowed], m, biases[allowed])
-            parts.append((inputs, rows[allowed][:, schema.out_index], present[allowed]))
-        inputs, wanted, present = (np.concatenate(column) for column in zip(*parts, strict=True))
-        return inputs, wanted.astype(np.float32), present
+        inputs, wanted, whose = under_masks(_plain(rows), _plain(biases), *self._gates, schema.ready.predictor)
+        return inputs, wanted, whose < len(now)
 
     def _judge(self, schema: "BodySchema") -> "BodySchema":
         """The schema, or the best W so far where the new one does worse on held-out samples."""
@@ -148,14 +142,19 @@ class Relearner:
 
 def mean_error(schema: "BodySchema", rows: np.ndarray) -> float:
     """Mean squared error of samples under all masks they allow [standard deviations squared]."""
-    finite = np.isfinite(rows)
-    total, count = 0.0, 0
-    for m in schema.masks:
-        allowed = finite[:, schema.layout.indices(m)].all(axis=1)
-        wrong = run(schema.weights.whole, schema.network_input(rows[allowed], m)) - rows[allowed][:, schema.out_index]
-        there = np.isfinite(wrong)
-        total, count = total + float(np.sum(wrong[there] ** 2)), count + int(there.sum())
-    return total / max(1, count)
+    biases = np.repeat(schema.bias[None], len(rows), axis=0)
+    inputs, wanted, _ = under_masks(_plain(rows), _plain(biases), *gates(schema), schema.ready.predictor)
+    return float(loss(schema.ready.predictor.chain, inputs, wanted, SQUARED))
+
+
+def _plain(rows: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(rows, np.float32)
+
+
+def gates(schema: "BodySchema") -> tuple[np.ndarray, np.ndarray]:
+    """Of every mask, which elements of x_in it lets through, shape (masks, in_size), and m, (masks, x_in)."""
+    through, tails = (np.stack(column) for column in zip(*(schema.gate(m) for m in schema.masks), strict=True))
+    return through, np.ascontiguousarray(tails[:, : len(schema.x_in)])
 
 
 def _others(schema: "BodySchema") -> tuple[np.ndarray, np.ndarray]:

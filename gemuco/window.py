@@ -16,6 +16,7 @@ class Window:
         self._rows = np.full((size, width), np.nan, np.float32)
         self._serial = np.full(size, -1)
         self._held_out = held_out
+        self._learned: np.ndarray | None = None
         self.added = 0
         self.dropped = 0
 
@@ -30,17 +31,21 @@ class Window:
         self._rows[place] = row
         self._serial[place] = self.added
         self.added += 1
+        self._learned = None
 
     def forget_before(self, serial: int) -> None:
         """Drop the samples that came before the one of a number (the first has number 0)."""
         old = (self._serial >= 0) & (self._serial < serial)
         self.dropped += int(old.sum())
         self._serial[old] = -1
+        self._learned = None
 
     def learned(self) -> np.ndarray:
         """The samples to learn from, shape (n, width), in no particular order."""
-        there = self._serial >= 0
-        return self._rows[there & ~self._held()] if self._held_out else self._rows[there]
+        if self._learned is None:
+            there = self._serial >= 0
+            self._learned = self._rows[there & ~self._held()] if self._held_out else self._rows[there]
+        return self._learned
 
     def held(self, most: int) -> np.ndarray:
         """At most so many of the newest held-out samples, newest first, shape (n, width)."""

@@ -2,7 +2,7 @@
 
 import math
 from bisect import bisect_left
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,7 +50,14 @@ class Freshness:
     40 ms. Each signal is taken from the process that the robot file says is its source, and from no other.
     """
 
-    def __init__(self, robot: RobotConfig, newest: Newest, clock: Clock, seen: Newest | None = None) -> None:
+    def __init__(
+        self,
+        robot: RobotConfig,
+        newest: Newest,
+        clock: Clock,
+        seen: Newest | None = None,
+        names: Iterable[str] = (),
+    ) -> None:
         """Prepare for the model's signals.
 
         Args:
@@ -58,9 +65,9 @@ class Freshness:
             newest: Returns the last sample of the HAL, however old.
             clock: Of this process.
             seen: Returns the last sample of the camera's process, however old.
+            names: The model's signals in its own order; in the robot file's if not given.
         """
-        names = layout_of(robot).names
-        self.elements = Elements.of({name: robot.signals[name].size for name in names})
+        self.elements = Elements.of({name: robot.signals[name].size for name in names or layout_of(robot).names})
         self._hal = _Source(robot, self.elements, "hal")
         self._vision = None if seen is None else _Source(robot, self.elements, "vision")
         self._newest, self._seen, self._clock = newest, seen, clock

@@ -113,7 +113,9 @@ class GemucoService:
             robot.rates.hal,
             self.clock,
         )
-        self.freshness = Freshness(robot, self.newest_sample, self.clock, self._newest_seen)
+        self.freshness = Freshness(
+            robot, self.newest_sample, self.clock, self._newest_seen if robot.seen else None, schema.layout.names
+        )
         self.history = HistoryRing({one.name: one.size for one in schema.layout.signals}, robot.rates.estimation)
         self._estimates = service.publisher(keys.estimate(robot.robot), Estimates)
         self.estimation = Estimation(self.freshness, self._schema, self._tell, self.clock)

@@ -61,6 +61,8 @@ class LivingModel:
 
     def swap(self, schema: BodySchema) -> int:
         """Use another schema from now on; returns its version."""
+        # Here and not in the next ticks of the loops that keep time.
+        schema.ready.prepare(self._schema.ready)
         with self._lock:
             self._schema = schema
             self.version += 1

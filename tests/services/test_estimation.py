@@ -78,6 +78,33 @@ def test_a_sample_of_wrong_shape_is_as_good_as_silent() -> None:
     assert bench.tick().method["joint_position"] == "mask"
 
 
+def test_values_come_in_the_order_of_the_model() -> None:
+    bench = Bench()
+    bench.newest = fresh(3, bench.clock.monotonic(), silent=("joint_position.elbow_pitch",))
+    names = tuple(reversed(small_model().layout.names))
+    other = Freshness(arm(), lambda: bench.newest, bench.clock, names=names)
+    _, told = other.take()
+    assert tuple(told) == names
+    for name, value in bench.freshness.take()[1].items():
+        np.testing.assert_array_equal(told[name], value)
+    estimation = Estimation(other, small_model, bench.published.append, bench.clock)  # puts them right by itself
+    estimation.tick()
+    for name, value in bench.tick().values.items():
+        np.testing.assert_array_equal(bench.published[0].values[name], value)
+
+
+def test_nothing_is_computed_twice_while_nothing_changes() -> None:
+    bench = Bench()
+    bench.newest = fresh(3, bench.clock.monotonic())
+    _, first = bench.freshness.take()
+    bench.newest = Fresh(bench.newest.sample, bench.newest.received)
+    assert bench.freshness.take()[1] is first
+    assert not first.flat.flags.writeable
+    bench.clock.advance(0.021)
+    fresh_now, later = bench.freshness.take()
+    assert later is not first and np.isnan(later.flat).all() and fresh_now is None
+
+
 def test_an_anomaly_must_last() -> None:
     bench = Bench()
     told: list[Anomaly] = []

@@ -1,0 +1,49 @@
+import numpy as np
+import pytest
+
+from gemuco.compiled.batch import under_masks
+from gemuco.relearn import gates, mean_error
+
+
+@pytest.fixture
+def rows(schema, arm):
+    """Samples of the arm [standard deviations], some of which lack something."""
+    found = schema.normalise(arm.sample(40, 3)).astype(np.float32)
+    found[np.random.default_rng(0).random(found.shape) < 0.05] = np.nan
+    return found
+
+
+def by_numpy(schema, rows, biases):
+    """Inputs, wanted outputs and samples, mask after mask."""
+    for mask in schema.masks:
+        allowed = np.flatnonzero(np.isfinite(rows[:, schema.layout.indices(mask)]).all(axis=1))
+        yield schema.network_input(rows[allowed], mask, biases[allowed]), rows[allowed][:, schema.out_index], allowed
+
+
+def test_every_sample_is_learned_once_under_every_mask_that_it_allows(schema, rows):
+    biases = np.random.default_rng(1).standard_normal((len(rows), len(schema.bias))).astype(np.float32)
+    found = under_masks(rows, biases, *gates(schema), schema.ready.predictor)
+    for ours, theirs in zip(found, zip(*by_numpy(schema, rows, biases), strict=True), strict=True):
+        np.testing.assert_array_equal(ours, np.concatenate(theirs))
+
+
+def test_the_mean_error_is_that_of_numpy(schema, rows):
+    biases = np.repeat(schema.bias[None], len(rows), axis=0)
+    wrong = np.concatenate([
+        schema.infer(rows[allowed], mask) - wanted
+        for mask, (_, wanted, allowed) in zip(schema.masks, by_numpy(schema, rows, biases), strict=True)
+    ])  # fmt: skip
+    assert mean_error(schema, rows) == pytest.approx(np.nanmean(wrong**2), rel=1e-5)
+
+
+def test_what_the_last_schema_was_asked_is_ready_in_the_next(schema, arm, monkeypatch):
+    row = {name: array[0] for name, array in arm.sample(1, 5).items()}
+    row["joint_position"][0] = np.nan
+    schema.estimate(row)
+    schema.anomaly(row)
+    after = schema.with_weights(schema.weights)
+    after.ready.prepare(schema.ready)
+    for name in ("Plan", "Judgement"):
+        monkeypatch.delattr(f"gemuco.ready.{name}")  # nothing is worked out any more
+    assert after.estimate(row)["joint_position"].method == "mask"
+    assert after.anomaly(row).score == pytest.approx(schema.anomaly(row).score)
