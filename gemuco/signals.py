@@ -143,7 +143,19 @@ class Layout:
         Raises:
             WrongSize: Several samples were given, or what `join` raises it for.
         """
-        joined = self.join(values)
+        joined = np.full(self.size, np.nan)
+        for name, value in values.items():
+            span = self.slices.get(name)
+            try:
+                array = np.asarray(value, float)
+            except (TypeError, ValueError):
+                break
+            if span is None or array.shape != (span.stop - span.start,):
+                break
+            joined[span] = array
+        else:
+            return joined
+        joined = self.join(values)  # tells what is wrong
         if joined.ndim != 1:
             raise WrongSize(
                 f"One sample at a time is taken, an array of shape (n,) per signal; here are {len(joined)}. Give them "

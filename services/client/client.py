@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from hal.by_signal import Numbers, Truths
+from hal.by_signal import Elements, Numbers, Truths
 from services.client import description
 from services.client.commanding import SECONDS, Commanding
 from services.client.link import TIMEOUT
@@ -66,11 +66,13 @@ class Client(Listening):
             return self.fresh(keys.estimate(self.robot), Estimates, max_age, timeout)
         found = self.ask("model", "estimate", _given(values) | {"hide": hidden}, SLOW_TIMEOUT)
         signals: dict[str, dict[str, Any]] = found["signals"]
+        elements = Elements.of({name: len(one["values"]) for name, one in signals.items()})
         return Estimates(
             cycle=found["cycle"],
-            values=Numbers.of({name: one["values"] for name, one in signals.items()}),
-            estimated=Truths.of({name: one["estimated"] for name, one in signals.items()}),
-            std=Numbers.of({name: one["std"] for name, one in signals.items()}),
+            elements=elements,
+            values=Numbers(_joined(signals, "values", float), elements),
+            estimated=Truths(_joined(signals, "estimated", bool), elements),
+            std=Numbers(_joined(signals, "std", float), elements),
             method={name: one["method"] for name, one in signals.items()},
             mask={name: one["mask"] for name, one in signals.items()},
             residual={name: one["residual"] for name, one in signals.items()},
@@ -272,6 +274,11 @@ class Client(Listening):
 
 def _plain(values: Values) -> dict[str, list[float]]:
     return {name: np.asarray(value, float).tolist() for name, value in values.items()}
+
+
+def _joined(signals: dict[str, dict[str, Any]], what: str, kind: type) -> np.ndarray:
+    """What an answer tells of each signal's elements, in one array."""
+    return np.array([number for one in signals.values() for number in one[what]], kind)
 
 
 def _given(values: Values | None) -> dict[str, Any]:
