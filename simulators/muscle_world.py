@@ -1,4 +1,5 @@
-"""A muscle-driven body as a World: rigid links in PyBullet, wires, elastic elements, spool servos and sensors in numpy.
+"""A muscle-driven body as a World: rigid links in PyBullet; wires, elastic elements, spool servos and friction
+in compiled loops; sensors in numpy.
 
 A wire's length is what its spool has paid out; the path is longer by what the elastic element gives. The load cell sits
 at the spool: friction on the way makes it read more than the elastic element carries when the wire was last wound in,
@@ -15,6 +16,7 @@ import numpy as np
 from simulators.bullet import BulletBody
 from simulators.faults import MUSCLE_CUT, check_part
 from simulators.muscle_body import Body, Friction, Servo
+from simulators.muscle_kernels import held, pull
 
 
 class MuscleWorld:
@@ -39,7 +41,6 @@ class MuscleWorld:
         self._servo = servo or Servo()
         joints, muscles = body.paths.chain.joints, body.paths.names
         self._bullet = BulletBody(body.urdf, joints, body.rest)
-        self._diagonal = np.diag_indices(len(joints))
         self._random = np.random.default_rng(seed)
         self._muscles = {f"muscle_length.{name}": index for index, name in enumerate(muscles)}
         self._noise = {
@@ -47,18 +48,17 @@ class MuscleWorld:
             "muscle_tension": (body.noise.get("muscle_tension", 0.0), len(muscles)),
             "muscle_length": (body.noise.get("muscle_length", 0.0), len(muscles)),
         }
-        self._pull = body.rest_tension.copy()
-        self._tension = body.rest_tension.copy()
-        self._refresh(self._longest_step)
-        self._spool = self._lengths - body.elastic.elongation(body.rest_tension)
-        self._target = self._spool.copy()
-        self._follows = np.zeros(len(muscles))
-        self._grip = np.empty(len(muscles))
-        self._hold_or_drive()
-        self._whole = np.ones(len(muscles))
+        self._wires = np.zeros((5, len(muscles)))
+        self._spool, self._pull, self._tension = self._wires[:3]
+        self._orders = np.zeros((4, len(muscles)))
+        self._target, self._follows, self._grip, self._whole = self._orders
         self._slid_joint = np.zeros(len(joints))
-        self._slid_wire = np.zeros(len(muscles))
-        self._slid_guide = np.zeros(len(muscles))
+        self._build, self._joints, self._numbers = _constants(body, self._servo)
+        self._pull[:] = self._tension[:] = body.rest_tension
+        self._refresh(self._longest_step)
+        self._spool[:] = self._target[:] = self._lengths - body.elastic.elongation(body.rest_tension)
+        self._hold_or_drive()
+        self._whole[:] = 1.0
 
     def step(self, duration: float) -> None:
         """See `World.step`."""
@@ -123,57 +123,30 @@ class MuscleWorld:
         mass, self._bias = self._bullet.inertia()
         elastic = body.elastic.stiffness(self._pull) * duration**2
         viscous = body.loss_time * body.elastic.rate * self._pull * duration
-        held = (self._arms.T * (elastic + viscous)) @ self._arms
-        held[self._diagonal] += body.joint_damping * duration
-        if body.friction is not None:
-            held[self._diagonal] += body.friction.joint_torque / body.friction.joint_presliding * duration**2
-        self._implicit = np.linalg.solve(mass + held, mass).T
+        slope = self._joints[1] / self._numbers[-1] * duration**2  # of dry friction before it slips
+        resisted = mass + held(self._arms, elastic + viscous, body.joint_damping * duration + slope)
+        self._implicit = np.linalg.solve(resisted, mass).T
 
     def _hold_or_drive(self) -> None:
         """The longest a wire's elastic element can get before its motor, or its brake, gives way [m]."""
         force = np.where(self._follows > 0, self._servo.force, self._servo.brake)
-        self._grip = self._body.elastic.elongation(force)
+        self._grip[:] = self._body.elastic.elongation(force)
 
     def _substep(self, duration: float) -> None:
-        body, servo, bullet = self._body, self._servo, self._bullet
-        ahead = bullet.position - self._solved_at + duration * bullet.velocity
-        path = self._lengths + self._arms @ ahead
-        path_rate = self._arms @ bullet.velocity
-
-        reach = servo.speed * duration
-        move = (self._target - self._spool) * (duration / (duration + servo.lag))
-        move = np.minimum(np.maximum(move, -reach), reach) * self._follows
-        spool = np.maximum(self._spool + move, path - self._grip)
-
-        paid_out = spool - self._spool
-        stretch_rate = path_rate - paid_out / duration
-        self._spool = spool
-        loss = 1.0 + body.loss_time * body.elastic.rate * stretch_rate
-        loss = np.minimum(np.maximum(loss, 0.0), 1.5)
-        self._pull = self._tension = pull = body.elastic.tension(path - spool) * loss * self._whole
-
-        torque = -body.joint_damping * bullet.velocity
-        if body.friction is not None:
-            self._tension = pull * (1.0 - self._guide_friction(body.friction, paid_out))
-            pull = pull * (1.0 + self._wire_friction(body.friction, path_rate * duration))
-            torque -= self._joint_friction(body.friction, bullet.velocity * duration)
-        torque -= pull @ self._arms
+        bullet = self._bullet
+        torque = pull(
+            duration, bullet.position, bullet.velocity, self._solved_at, self._lengths, self._arms,
+            self._wires, self._orders, self._build, self._slid_joint, self._joints, self._numbers,
+        )  # fmt: skip
         bullet.step(self._bias + self._implicit @ (torque - self._bias), duration)
 
-    def _wire_friction(self, friction: Friction, travel: np.ndarray) -> np.ndarray:
-        """Share of the tension by which a wire pulls harder where it is dragged out, shape (m,)."""
-        limit = friction.wire_presliding
-        self._slid_wire = np.minimum(np.maximum(self._slid_wire + travel, -limit), limit)
-        return friction.wire * self._slid_wire / limit
 
-    def _guide_friction(self, friction: Friction, paid_out: np.ndarray) -> np.ndarray:
-        """Share of the tension that the load cell does not see, shape (m,); negative where it sees more."""
-        limit = friction.guide_presliding
-        self._slid_guide = np.minimum(np.maximum(self._slid_guide + paid_out, -limit), limit)
-        return friction.guide * self._slid_guide / limit
-
-    def _joint_friction(self, friction: Friction, travel: np.ndarray) -> np.ndarray:
-        """Torque [N m] against the motion, shape (n,)."""
-        limit = friction.joint_presliding
-        self._slid_joint = np.minimum(np.maximum(self._slid_joint + travel, -limit), limit)
-        return friction.joint_torque * self._slid_joint / limit
+def _constants(body: Body, servo: Servo) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What `pull` is told of wires, joints and spools; shapes (4, m), (2, n), (6,)."""
+    muscles, joints = len(body.paths.names), len(body.paths.chain.joints)
+    smooth = Friction(np.zeros(joints), 1.0, np.zeros(muscles), 1.0, np.zeros(muscles), 1.0)
+    dry = body.friction or smooth
+    build = np.empty((4, muscles))
+    build[0], build[1], build[2], build[3] = body.elastic.scale, body.elastic.rate, dry.wire, dry.guide
+    numbers = (servo.speed, servo.lag, body.loss_time, dry.wire_presliding, dry.guide_presliding, dry.joint_presliding)
+    return build, np.array([body.joint_damping, dry.joint_torque]), np.array(numbers)
