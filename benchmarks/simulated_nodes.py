@@ -68,7 +68,7 @@ def main() -> None:
         waits.append(wait)
         incomplete += not is_complete
         due = max(due + CYCLE, time.monotonic())
-        time.sleep(due - time.monotonic() if due > time.monotonic() else 0.0)
+        time.sleep(max(due - time.monotonic(), 0.0))
     elapsed = time.monotonic() - began
     share = (time.process_time() - spent - (time.thread_time() - own)) / elapsed
     p99 = statistics.quantiles(waits, n=100)[-1]

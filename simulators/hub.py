@@ -70,18 +70,11 @@ class HubBus(can.BusABC):
         Raises:
             can.CanOperationError: The server is gone or takes no frames, or the frame is not a classic one.
         """
-        identifier = msg.arbitration_id
         if msg.is_fd or msg.dlc > 8 or len(msg.data) > 8:
             raise can.CanOperationError("The hub carries classic CAN frames of at most 8 bytes.")
-        if not 0 <= identifier <= (0x1FFFFFFF if msg.is_extended_id else 0x7FF):
-            raise can.CanOperationError(f"Identifier 0x{identifier:X} is out of range.")
-        if msg.is_extended_id:
-            identifier |= EXTENDED
-        if msg.is_remote_frame:
-            identifier |= REMOTE
-        if msg.is_error_frame:
-            identifier |= ERROR
-        self._put(RECORD.pack(identifier, msg.dlc, time.time(), bytes(msg.data)), timeout)
+        if not 0 <= msg.arbitration_id <= (0x1FFFFFFF if msg.is_extended_id else 0x7FF):
+            raise can.CanOperationError(f"Identifier 0x{msg.arbitration_id:X} is out of range.")
+        self._put(RECORD.pack(message_identifier(msg), msg.dlc, time.time(), bytes(msg.data)), timeout)
         if self._own:
             self._waiting.append(msg)
 
@@ -109,29 +102,35 @@ class HubBus(can.BusABC):
             except OSError:
                 raise self._gone() from None
 
+    def receive_frames(self, timeout: float | None) -> list[tuple[int, bytes]]:
+        """What waits, as identifiers with flags and data, without filters; nothing after `timeout` [s], None: never.
+
+        For who handles many frames: a `can.Message` each costs more than most of what is done with them.
+        """
+        frames = [(message_identifier(message), bytes(message.data)) for message in self._waiting]
+        self._waiting.clear()
+        packet = self._packet(0.0 if frames else timeout)
+        return frames + [(identifier, data[:length]) for identifier, length, _, data in RECORD.iter_unpack(packet)]
+
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         if not self._waiting:
-            self._fetch(timeout)
+            for identifier, length, stamp, data in RECORD.iter_unpack(self._packet(timeout)):
+                self._waiting.append(_message(identifier, length, stamp, data, self._channel))
         return (self._waiting.popleft() if self._waiting else None), False
 
-    def _fetch(self, timeout: float | None) -> None:
+    def _packet(self, timeout: float | None) -> bytes:
+        """The next packet; empty if none came."""
+        if not self._readable.poll(None if timeout is None else timeout * 1e3):
+            return b""
         try:
             packet = self._socket.recv(PACKET)
         except BlockingIOError:
-            if timeout == 0 or not self._readable.poll(None if timeout is None else timeout * 1e3):
-                return
-            try:
-                packet = self._socket.recv(PACKET)
-            except BlockingIOError:
-                return
-            except OSError:
-                raise self._gone() from None
+            return b""
         except OSError:
             raise self._gone() from None
         if not packet:
             raise self._gone()
-        for identifier, length, stamp, data in RECORD.iter_unpack(packet):
-            self._waiting.append(_message(identifier, length, stamp, data, self._channel))
+        return packet
 
     def _gone(self) -> can.CanOperationError:
         if self._is_shutdown:
@@ -167,6 +166,14 @@ def _join(channel: str, path: Path) -> socket.socket:
     raise can.CanInitializationError(
         f"Nobody serves the hub channel '{channel}' ({path}: {reason}). Is `gemuco simulate` running?"
     )
+
+
+def message_identifier(message: can.Message) -> int:
+    """A message's identifier with the flags EXTENDED, REMOTE and ERROR."""
+    identifier = message.arbitration_id
+    identifier |= EXTENDED if message.is_extended_id else 0
+    identifier |= REMOTE if message.is_remote_frame else 0
+    return identifier | (ERROR if message.is_error_frame else 0)
 
 
 def _message(identifier: int, length: int, stamp: float, data: bytes, channel: str) -> can.Message:

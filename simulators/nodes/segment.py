@@ -7,11 +7,12 @@ from collections.abc import Callable, Sequence
 
 import can
 
-from simulators.hub import HubBus
+from simulators.hub import HubBus, message_identifier
 from simulators.nodes.kinds import make
-from simulators.nodes.node import EXTENDED, REMOTE, Frame, Handler
+from simulators.nodes.node import EXTENDED, Frame, Handler
 from simulators.nodes.plant import Plant
 from simulators.nodes.spec import NodeSpec
+from simulators.wire_time import ERROR
 
 _log = logging.getLogger(__name__)
 
@@ -67,8 +68,8 @@ class Segment:
     def answer(self, now: float) -> None:
         """Take every frame that waits, and answer."""
         with self.lock:
-            while (message := self._receive(0.0)) is not None:
-                self._handle(message, now)
+            while frames := self._receive(0.0):
+                self._handle(frames, now)
             self._flush()
 
     def tick(self, now: float) -> None:
@@ -83,43 +84,46 @@ class Segment:
         due = monotonic()
         while is_running():
             try:
-                message = self._receive(max(due - monotonic(), 0.0))
-                if message is not None:
-                    self._answer_from(message, monotonic, due + MOST_ANSWERING)
+                frames = self._receive(max(due - monotonic(), 0.0))
+                if frames:
+                    self._answer_from(frames, monotonic, due + MOST_ANSWERING)
                 if monotonic() >= due:  # heartbeats that waited have been heard by now
                     self.tick(monotonic())
                     due = max(due + TICK, monotonic())
             except (can.CanError, OSError) as error:
                 self._reopen(error, is_running)
 
-    def _answer_from(self, message: can.Message | None, monotonic: Callable[[], float], until: float) -> None:
-        """Answer this frame and those that wait, but not for ever: who is busy still says that it is alive."""
+    def _answer_from(self, frames: list[Frame], monotonic: Callable[[], float], until: float) -> None:
+        """Answer these frames and those that wait, but not for ever: who is busy still says that it is alive."""
         with self.lock:
-            while message is not None:
+            while frames:
                 now = monotonic()
-                self._handle(message, now)
-                message = self._receive(0.0) if now < until else None
+                self._handle(frames, now)
+                frames = self._receive(0.0) if now < until else []
             self._flush()
 
-    def _receive(self, timeout: float) -> can.Message | None:
+    def _receive(self, timeout: float) -> list[Frame]:
+        """Frames that came, with the flags in their identifiers; none after `timeout` [s]."""
         assert self._bus is not None, "the segment is not open"
-        return self._bus.recv(timeout)
+        if isinstance(self._bus, HubBus):
+            return self._bus.receive_frames(timeout)
+        message = self._bus.recv(timeout)
+        return [] if message is None else [(message_identifier(message), bytes(message.data))]
 
-    def _handle(self, message: can.Message, now: float) -> None:
-        if message.is_error_frame:
-            return
-        self.counters["received"] += 1
-        identifier = message.arbitration_id | (EXTENDED if message.is_extended_id else 0)
-        identifier |= REMOTE if message.is_remote_frame else 0
-        if identifier == SYNC:
-            for node in self._listeners:
-                node.sync(now)
-            self._flush()
-            return
-        if not self._is_routed:
-            self._route()
-        for handler in self._routes.get(identifier, ()):
-            handler(bytes(message.data), now)
+    def _handle(self, frames: list[Frame], now: float) -> None:
+        for identifier, data in frames:
+            if identifier & ERROR:
+                continue
+            self.counters["received"] += 1
+            if identifier == SYNC:
+                for node in self._listeners:
+                    node.sync(now)
+                self._flush()
+                continue
+            if not self._is_routed:
+                self._route()
+            for handler in self._routes.get(identifier, ()):
+                handler(data, now)
 
     def _forget_routes(self) -> None:
         self._is_routed = False
