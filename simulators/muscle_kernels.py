@@ -1,7 +1,7 @@
 """What a muscle-driven body computes in every physics step, as compiled loops over a few numbers.
 
-The arrays are so small that numpy spends its time on calls, not on arithmetic: the loops take a tenth of it, and hold no
-interpreter lock, so that nodes answer meanwhile. numba keeps what it compiled beside this file.
+The arrays are so small that numpy spends its time on calls, not on arithmetic: the loops take a tenth of it, and hold
+no interpreter lock, so that nodes answer meanwhile. numba keeps what it compiled beside this file.
 """
 
 import math
@@ -165,8 +165,8 @@ def pull(
         solved_at: Joint positions [rad] of the next two, shape (n,).
         lengths: Path lengths [m], shape (m,).
         arms: Moment arms [m/rad], shape (m, n).
-        wires: Spool position [m], tension of the elastic element [N], what the load cell reads [N], and how far wire and
-            guide have slid [m], shape (5, m); moved on in place.
+        wires: Spool position [m], tension of the elastic element [N], what the load cell reads [N], and how far wire
+            and guide have slid [m], shape (5, m); moved on in place.
         orders: Target of the spool [m], whether it follows (1 or 0), the longest its elastic element can get [m], and
             whether the wire is whole (1 or 0), shape (4, m).
         build: Scale [N] and rate [1/m] of the elastic elements, friction of wires and guides (shares), shape (4, m).

@@ -15,6 +15,8 @@ NOTICED_WITHIN = 3.0
 ENGAGED_WITHIN = 1.0
 FOLLOWS_WITHIN = 15.0
 """Time [s] that it may take to be followed: drives let go, nodes come back, and what refused once is asked again."""
+TRIES = 3
+"""How often one target is given, if the HAL stops the robot on the way each time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,11 +68,14 @@ class Actor:
             self.wait(self._follows, ENGAGED_WITHIN)
 
     def go(self, signal: str, values: np.ndarray, duration: float) -> None:
-        """Give a target [its unit], shape (n,), and wait for so long [s]."""
-        if not self._follows():
-            self._recover()
-        self._client.ask("model", "target", {"signal": signal, "values": values.tolist()})
-        self.wait(lambda: False, duration)
+        """Give a target [its unit], shape (n,), and wait for so long [s]; again if the HAL stopped the robot meanwhile."""
+        for _ in range(TRIES):
+            if not self._follows():
+                self._recover()
+            self._client.ask("model", "target", {"signal": signal, "values": values.tolist()})
+            self.wait(lambda: False, duration)
+            if self._follows():
+                return
 
     def wait(self, condition: Callable[[], bool], duration: float) -> bool:
         """Wait for so long [s] or until the condition holds; whether it did."""
@@ -88,7 +93,7 @@ class Actor:
         Raises:
             ServiceError: The simulator does not tell.
         """
-        truth = self._client.truth(timeout=1.0)
+        truth = self._client.truth(timeout=NOTICED_WITHIN)
         if truth is None:
             raise ServiceError("The simulator does not tell the truth any more; see the logs beside the plot.")
         return truth.values[signal]

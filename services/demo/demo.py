@@ -1,17 +1,21 @@
 """`gemuco demo`: everything from nothing, one minute of story, and nothing left behind."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
 
 from gemuco.warm import warm
-from hal.config import RobotConfig
+from hal.config import RobotConfig, load_robot
 from hal.errors import ConfigError
 from services.client import Client
+from services.demo import pace
 from services.demo.actor import Actor, Stage
+from services.demo.pace import Pace
 from services.demo.story import MUSCLE, Story
 from services.demo.timeline import Timeline
 from services.demo.tool_story import ToolStory
@@ -45,24 +49,71 @@ def play(robot: RobotConfig, path: Path, seed: int, out: Path) -> int:
     make_model(robot, console)
     with progress("compiling") as tell:  # what the processes would each wait for
         warm(tell)
-    recording = out / "story.mcap"
-    recording.unlink(missing_ok=True)
     with Supervisor(out) as supervisor:
-        remote = RemoteClient(f"{target} [{robot.signals[target].unit}]", out / "client.log", console)
-        with Client(robot.robot) as client:
-            start(robot, path, seed, target, recording, supervisor, client, console)
+        with running(robot, path, seed, target, out, supervisor, console) as cast:
+            stages = perform(cast.robot, cast.client, target, seed, cast.actor, out / "story.png", console)
+        supervisor.stop("client", "recorder")
+        cast.remote.tell()
+    ok = summary(stages, cast.actor.stops, cast.remote, out, console)
+    if cast.robot.rates != robot.rates:
+        console.print(f"Played at {cast.robot.rates.hal:g} Hz, for this machine did not keep {robot.rates.hal:g} Hz.")
+    console.print(f"{time.monotonic() - started:.0f} s in all.")
+    return 0 if ok else 1
 
-            def idle() -> None:
+
+@dataclass(frozen=True, slots=True)
+class Cast:
+    """A robot whose processes run, and what the story needs to play with it.
+
+    Attributes:
+        robot: As it runs, with the rates that this machine keeps.
+        client: Of the robot.
+        actor: Moves it.
+        remote: What a client in a process of its own prints.
+    """
+
+    robot: RobotConfig
+    client: Client
+    actor: Actor
+    remote: "RemoteClient"
+
+
+@contextmanager
+def running(
+    robot: RobotConfig, path: Path, seed: int, target: str, out: Path, supervisor: Supervisor, console: Console
+) -> Iterator[Cast]:
+    """Start the processes; where this machine does not keep their rate, again at half of it, twice at most."""
+    rates = robot.rates
+    for halvings_left in reversed(range(pace.HALVINGS + 1)):
+        recording = out / "story.mcap"
+        recording.unlink(missing_ok=True)
+        with pace.at_rates(path, robot, rates) as file, Client(robot.robot) as client:
+            remote = RemoteClient(f"{target} [{robot.signals[target].unit}]", out / "client.log", console)
+            start(robot, file, seed, target, recording, supervisor, client, console)
+
+            def idle(remote: RemoteClient = remote) -> None:
                 supervisor.check()
                 remote.tell()
 
             actor = Actor(client, idle, console.print)
-            stages = perform(robot, client, target, seed, actor, out / "story.png", console)
-        supervisor.stop("client", "recorder")
-        remote.tell()
-    ok = summary(stages, actor.stops, remote, out, console)
-    console.print(f"{time.monotonic() - started:.0f} s in all.")
-    return 0 if ok else 1
+            found = pace.look(client, actor.wait)
+            if not found.is_kept:
+                console.print(too_slow(found, halvings_left))
+            if found.is_kept or not halvings_left:
+                yield Cast(load_robot(file), client, actor, remote)
+                return
+            supervisor.stop_all()
+        rates = pace.halved(rates)
+
+
+def too_slow(found: Pace, halvings_left: int) -> str:
+    """What was seen of a rate that is not kept, and what is done about it."""
+    then = (
+        f"All of it is started again at {found.rate / 2:g} Hz."
+        if halvings_left
+        else "The story is played all the same, and the HAL may stop the robot on the way."
+    )
+    return f"[yellow]This machine does not keep {found.rate:g} Hz: {found}. {then}[/]"
 
 
 def control_of(robot: RobotConfig) -> ControlConfig:

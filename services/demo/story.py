@@ -18,6 +18,16 @@ POSES = 6
 """Fresh poses at which the model is measured, before and after the update; none of them is learned from."""
 LEARNING_POSES = 8
 LEARNING_TIME = 2.0
+LEARNED = 80
+"""Samples that the online update takes in before it is stopped; eight poses bring about a hundred."""
+NORMAL = 100
+"""Samples of motion from which it is learned what is normal; six fresh poses bring about 150."""
+MOST_POSES = 24
+"""After so many more the samples must do: a machine may be slow, but not without end."""
+CALM_TIME = 2.0
+"""How long [s] no anomaly may be told before the muscle is cut."""
+CALM_TRIES = 3
+"""How often what is normal is learned at most, each time from more poses."""
 SILENT_POSES = 3
 CUT_POSES = 3
 INSIDE = 0.15
@@ -113,28 +123,28 @@ class Story:
         self._client.adapt(True)
         for _ in range(LEARNING_POSES):
             self._go(self._pose(), LEARNING_TIME)
-        update = self._client.update(timeout=1.0)
+        window = self._gather(LEARNED)
         self._client.adapt(False)
         self.marks.learning = (start, self._timeline.now())
         misses, errors = self._measure_poses()
         self.marks.error_after = _mean_norm(errors)
-        normal = self._client.ask("model", "normal")
+        normal = self._learn_normal()
         before, after = self.marks.error_before, self.marks.error_after
-        window = 0 if update is None else update.window
         figures = (
             f"learned for {self.marks.learning[1] - start:.0f} s from {window} samples",
             f"estimate on {POSES} fresh poses with all encoders hidden: {before:.3f} rad before, {after:.3f} rad after",
             f"distance from the targets now {_mean_norm(misses):.3f} rad",
-            f"what is normal learned anew from {normal['samples']} samples",
+            f"what is normal learned anew from {normal} samples",
         )
         return Stage("learns its own body", start, self._timeline.now(), figures, after < before)
 
     def lose_muscle(self) -> Stage:
         """(d) A muscle is cut, and the anomaly detector says which."""
+        self._become_calm()
         self._tell(f"[bold](d)[/] The wire of {MUSCLE} is cut.")
         start = self._timeline.now()
-        calm = self._timeline.between("is_anomaly", start - 2.0, start)
-        score = float(np.nanmedian(self._timeline.between("score", start - 2.0, start)))
+        calm = self._timeline.between("is_anomaly", start - CALM_TIME, start)
+        score = float(np.nanmedian(self._timeline.between("score", start - CALM_TIME, start)))
         self._client.fault(f"muscle_cut {MUSCLE}")
         self.marks.cut = start
         alarmed = self._actor.wait(self._is_alarmed, NOTICED_WITHIN)
@@ -155,6 +165,35 @@ class Story:
         right = self.marks.blamed == MUSCLE
         self._client.disengage()
         return Stage("loses a muscle", start, end, figures, alarmed and right and not calm.any())
+
+    def _gather(self, samples: int) -> int:
+        """Go on to more poses until the model's window holds so many samples; how many it does."""
+        for _ in range(MOST_POSES):
+            if self._window() >= samples:
+                break
+            self._go(self._pose(), LEARNING_TIME)
+        return self._window()
+
+    def _window(self) -> int:
+        update = self._client.update(timeout=1.0)
+        return 0 if update is None else update.window
+
+    def _learn_normal(self) -> int:
+        """Learn what is normal from motion since the model changed; from how many samples."""
+        self._gather(NORMAL)
+        return int(self._client.ask("model", "normal")["samples"])
+
+    def _become_calm(self) -> None:
+        """See that nothing is told of the whole arm; if something is, learn what is normal from more of its motion."""
+        for tries_left in reversed(range(CALM_TRIES)):
+            start = self._timeline.now()
+            self._actor.wait(lambda: False, CALM_TIME)
+            if not self._timeline.between("is_anomaly", start, self._timeline.now()).any() or not tries_left:
+                return
+            self._tell("    An anomaly is told of the whole arm: what is normal is learned from more of its motion.")
+            for _ in range(LEARNING_POSES):
+                self._go(self._pose(), LEARNING_TIME)
+            self._tell(f"    What is normal learned anew from {self._learn_normal()} samples.")
 
     def _blamed_muscle(self, anomalies: list[Anomaly]) -> str:
         """The muscle whose tension and length together contribute most; empty without anomalies."""

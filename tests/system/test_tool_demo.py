@@ -26,7 +26,7 @@ from small_hand import TOOLS, config, description, gravity_of, tip_of  # noqa: E
 
 LOW, HIGH = [-1.0, -2.2], [1.0, 2.2]
 """Of the joints [rad]: so far that the long tool comes to where the short one is."""
-PATIENCE = 30.0
+PATIENCE = 60.0
 """Longer than anything takes, on a machine with other work [s]."""
 
 
@@ -68,7 +68,8 @@ def test_an_interrupted_demo_of_tools_leaves_no_process(tmp_path: Path, monkeypa
             assert time.monotonic() < deadline
             time.sleep(0.02)
         told = log.read_text()
-        words = told[told.index("Processes:") : told.index("(a)")].replace(",", " ").split()
+        told = told[told.rindex("Processes:") : told.index("(a)")]  # the last ones, if a busy machine needed a lower rate
+        words = told.partition("This machine")[0].replace(",", " ").split()
         assert [word for word in words if word.isalpha()] == [
             "simulator", "hal", "vision", "model", "recorder", "client",
         ]  # fmt: skip

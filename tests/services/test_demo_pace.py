@@ -1,0 +1,159 @@
+"""What the demo does on a machine that does not keep a robot file's rate."""
+
+import errno
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from hal.config import RobotConfig, load_robot
+from services.demo import demo, pace
+from services.demo.pace import Pace, at_rates, halved, look
+from services.errors import ServiceError
+from services.model.artifacts import fingerprint
+from services.wire.messages import Status
+
+ARM = Path(__file__).parents[2] / "robots" / "musashi_arm.yaml"
+
+
+def status(second: int, ticks: int, skipped: int, incomplete: int, rate: float = 200.0) -> Status:
+    loop = {"rate_wanted": rate, "ticks": ticks, "skipped": skipped, "late_p99": 0.0031}
+    facts = {"incomplete": incomplete}
+    return Status(stamp_ns=second * 10**9, service="hal", state="running", loops={"hal": loop}, facts=facts)
+
+
+class Told:
+    """A client that hears these statuses, one after the other, then the last one for ever."""
+
+    def __init__(self, *statuses: Status | None) -> None:
+        self._statuses = list(statuses)
+
+    def status(self, service: str, timeout: float = 0.0) -> Status | None:
+        assert service == "hal"
+        return self._statuses.pop(0) if len(self._statuses) > 1 else self._statuses[0]
+
+
+def until(condition: Any, duration: float) -> bool:
+    return any(condition() for _ in range(10))
+
+
+@pytest.fixture
+def arm(tmp_path: Path) -> Path:
+    shutil.copytree(ARM.parent / "eds", tmp_path / "eds")
+    return Path(shutil.copy(ARM, tmp_path))
+
+
+def test_the_pace_is_what_happened_between_two_statuses() -> None:
+    client = Told(status(1, 500, 90, 40), status(1, 500, 90, 40), status(5, 1290, 100, 43), status(5, 1290, 100, 43))
+    found = look(client, until)  # type: ignore[arg-type]
+    assert found == Pace(rate=200.0, cycles=790, skipped=10, incomplete=3, late=0.0031)
+    assert found.is_kept
+    assert str(found) == "10 of 800 cycles were skipped and 3 incomplete, 99 of 100 began within 3.1 ms"
+
+
+@pytest.mark.parametrize(
+    ("cycles", "skipped", "incomplete", "is_kept"),
+    [(800, 0, 0, True), (784, 16, 39, True), (780, 20, 0, False), (800, 0, 41, False), (0, 0, 0, False)],
+)
+def test_a_rate_is_kept_if_few_cycles_are_missed(cycles: int, skipped: int, incomplete: int, is_kept: bool) -> None:
+    assert Pace(200.0, cycles, skipped, incomplete, 0.0).is_kept is is_kept
+
+
+def test_a_hal_that_says_nothing_is_told() -> None:
+    with pytest.raises(ServiceError, match="does not tell any more how it does"):
+        look(Told(None), until)  # type: ignore[arg-type]
+
+
+def test_half_the_rate_is_half_of_all_that_follows_the_cycle(arm: Path) -> None:
+    robot = load_robot(arm)
+    half, quarter = halved(robot.rates), halved(halved(robot.rates))
+    assert half.model_dump() == {"hal": 100, "estimation": 100, "anomaly": 50, "control": 50, "update": 10}
+    assert quarter.model_dump() == {"hal": 50, "estimation": 50, "anomaly": 25, "control": 50, "update": 10}
+
+
+def test_the_same_robot_at_another_rate_needs_no_other_model(arm: Path) -> None:
+    robot = load_robot(arm)
+    rates = halved(robot.rates)
+    with at_rates(arm, robot, rates) as file:
+        slower = load_robot(file)
+        assert slower.rates == rates
+        assert {signal.stale_after for signal in slower.signals.values()} == {0.04}
+        assert fingerprint(slower) == fingerprint(robot)
+        same = {"rates": robot.rates, "signals": robot.signals}
+        assert slower.model_copy(update=same) == robot
+        assert "." in file.stem  # so that no list of robot files names it
+    assert not file.exists()
+
+
+def test_the_robot_files_own_rates_need_no_other_file(arm: Path) -> None:
+    robot = load_robot(arm)
+    with at_rates(arm, robot, robot.rates) as file:
+        assert file == arm
+
+
+def test_what_cannot_be_written_is_told(monkeypatch: pytest.MonkeyPatch, arm: Path) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(pace, "NamedTemporaryFile", full)
+    robot = load_robot(arm)
+    with (
+        pytest.raises(ServiceError, match=r"100 Hz cannot be written beside .*No space left"),
+        at_rates(arm, robot, halved(robot.rates)),
+    ):
+        pass
+
+
+class Processes:
+    """Stands for the supervisor and all that it starts; keeps the highest rate that it is told to."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, highest: float) -> None:
+        self.highest, self.rates, self.stopped = highest, [], 0
+        monkeypatch.setattr(demo, "start", self._start)
+        monkeypatch.setattr(demo, "Client", self._client)
+        monkeypatch.setattr(pace, "look", self._look)
+
+    def _start(self, robot: RobotConfig, file: Path, *_: object) -> None:
+        self.rates.append(load_robot(file).rates.hal)
+
+    @contextmanager
+    def _client(self, name: str) -> Iterator[None]:
+        yield None
+
+    def _look(self, *_: object) -> Pace:
+        rate = self.rates[-1]
+        return Pace(rate, 700, 0 if rate <= self.highest else 100, 0, 0.002)
+
+    def check(self) -> None:
+        pass
+
+    def stop_all(self) -> None:
+        self.stopped += 1
+
+
+@pytest.mark.parametrize(
+    ("highest", "rates", "sentences"),
+    [
+        (200, [200], []),
+        (100, [200, 100], ["keep 200 Hz: 100 of 800", "again at 100 Hz"]),
+        (50, [200, 100, 50], ["again at 100 Hz", "again at 50 Hz"]),
+        (10, [200, 100, 50], ["again at 50 Hz", "keep 50 Hz", "played all the same"]),
+    ],
+)
+def test_a_machine_that_does_not_keep_the_rate_plays_at_half_of_it(
+    monkeypatch: pytest.MonkeyPatch, arm: Path, highest: float, rates: list[float], sentences: list[str]
+) -> None:
+    processes, console = Processes(monkeypatch, highest), Console(record=True, width=300)
+    robot = load_robot(arm)
+    with demo.running(robot, arm, 1, "joint_position", arm.parent, processes, console) as cast:  # type: ignore[arg-type]
+        assert cast.robot.rates.hal == rates[-1]
+        assert processes.stopped == len(rates) - 1
+    assert processes.rates == rates
+    told = console.export_text()
+    assert [sentence for sentence in sentences if sentence not in told] == []
+    assert bool(told) is bool(sentences)
+    assert list(arm.parent.glob("*.yaml")) == [arm]

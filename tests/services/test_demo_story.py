@@ -1,0 +1,115 @@
+"""What the demo waits for where a fast machine would have been ready by itself."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hal.config import load_robot
+from services.demo import actor as actor_module
+from services.demo.actor import TRIES, Actor
+from services.demo.story import CALM_TRIES, LEARNED, LEARNING_POSES, MOST_POSES, NORMAL, Story
+from services.wire.messages import Applied, Status, Update
+
+ROBOT = load_robot(Path(__file__).parents[2] / "robots" / "musashi_arm.yaml")
+
+
+class Machine:
+    """Client, actor and timeline of a robot whose model takes in so many samples per pose."""
+
+    def __init__(self, per_pose: int, false_alarms: int = 0) -> None:
+        self.per_pose, self.alarms_left = per_pose, false_alarms
+        self.window = self.poses = 0
+        self.said: list[str] = []
+        self.normals: list[int] = []
+
+    def story(self) -> Story:
+        return Story(ROBOT, self, self, 0, self, self.said.append)  # type: ignore[arg-type]
+
+    def update(self, timeout: float = 0.0) -> Update:
+        return Update(active=True, model_version=1, window=self.window, dropped=0, loss=0.0)
+
+    def ask(self, service: str, verb: str) -> dict[str, Any]:
+        assert (service, verb) == ("model", "normal")
+        self.normals.append(self.window)
+        return {"samples": self.window}
+
+    def go(self, signal: str, pose: np.ndarray, duration: float) -> None:
+        self.poses += 1
+        self.window += self.per_pose
+
+    def wait(self, condition: Any, duration: float) -> bool:
+        return False
+
+    def now(self) -> float:
+        return 0.0
+
+    def between(self, name: str, start: float, end: float) -> np.ndarray:
+        assert name == "is_anomaly"
+        self.alarms_left -= 1
+        return np.array([False, self.alarms_left >= 0])
+
+
+@pytest.mark.parametrize(("per_pose", "poses"), [(200, 1), (10, 8), (3, MOST_POSES), (0, MOST_POSES)])
+def test_poses_go_on_until_enough_samples_are_taken_in(per_pose: int, poses: int) -> None:
+    machine = Machine(per_pose)
+    assert machine.story()._gather(LEARNED) == per_pose * poses
+    assert machine.poses == poses
+
+
+def test_enough_samples_need_no_more_poses() -> None:
+    machine = Machine(per_pose=1)
+    machine.window = NORMAL
+    assert machine.story()._learn_normal() == NORMAL
+    assert machine.poses == 0
+
+
+@pytest.mark.parametrize(("alarms", "learned"), [(0, 0), (1, 1), (2, 2), (9, CALM_TRIES - 1)])
+def test_what_is_normal_is_learned_from_more_until_the_whole_arm_is_calm(alarms: int, learned: int) -> None:
+    machine = Machine(per_pose=10, false_alarms=alarms)
+    machine.window = NORMAL
+    machine.story()._become_calm()
+    assert len(machine.normals) == learned
+    assert machine.normals == sorted(machine.normals)
+    assert machine.poses == learned * LEARNING_POSES
+    assert sum("An anomaly is told of the whole arm" in sentence for sentence in machine.said) == learned
+
+
+class Stopping:
+    """A robot that the HAL stops on the way so many times."""
+
+    def __init__(self, stops: int) -> None:
+        self.stops_left, self.targets, self.mode = stops, 0, "follow"
+
+    def applied(self, timeout: float = 0.0) -> Applied:
+        command = np.zeros(10)
+        return Applied(
+            cycle=1, mode=self.mode, signal="muscle_length", desired=command, values=command, limited_by=[], sender=0
+        )
+
+    def status(self, service: str, timeout: float = 0.0) -> Status:
+        return Status(service="hal", state="running", facts={"fault": "Life guard or heartbeat error."})
+
+    def ask(self, service: str, verb: str, given: dict[str, Any]) -> None:
+        self.targets += 1
+        self.stops_left -= 1
+        self.mode = "fault" if self.stops_left >= 0 else "follow"
+
+    def reset(self) -> None:
+        self.mode = "off"
+
+    def engage(self) -> None:
+        self.mode = "follow"
+
+
+@pytest.mark.parametrize(("stops", "targets", "counted"), [(0, 1, 0), (1, 2, 1), (9, TRIES, TRIES - 1)])
+def test_a_target_is_given_again_when_the_hal_stopped_the_arm_on_the_way(
+    monkeypatch: pytest.MonkeyPatch, stops: int, targets: int, counted: int
+) -> None:
+    monkeypatch.setattr(actor_module, "ENGAGED_WITHIN", 0.02)
+    robot, said = Stopping(stops), []
+    mover = Actor(robot, lambda: None, said.append)  # type: ignore[arg-type]
+    mover.go("joint_position", np.zeros(5), 0.02)
+    assert (robot.targets, mover.stops) == (targets, counted)
+    assert sum("Life guard" in sentence for sentence in said) == counted
