@@ -13,7 +13,10 @@ import numpy as np
 
 
 def _compiled(function: Callable[..., Any]) -> Any:
-    return numba.njit(cache=True, nogil=True)(function)
+    try:
+        return numba.njit(cache=True, nogil=True)(function)
+    except RuntimeError:  # nowhere to keep it, as in an image that nothing can be written to: compiled at every start
+        return numba.njit(nogil=True)(function)
 
 
 @_compiled

@@ -59,6 +59,7 @@ class MuscleWorld:
         self._spool[:] = self._target[:] = self._lengths - body.elastic.elongation(body.rest_tension)
         self._hold_or_drive()
         self._whole[:] = 1.0
+        self._pulled(longest_step, self._wires.copy(), self._slid_joint.copy())  # compiled now, and not on the way
 
     def step(self, duration: float) -> None:
         """See `World.step`."""
@@ -133,12 +134,16 @@ class MuscleWorld:
         self._grip[:] = self._body.elastic.elongation(force)
 
     def _substep(self, duration: float) -> None:
-        bullet = self._bullet
-        torque = pull(
-            duration, bullet.position, bullet.velocity, self._solved_at, self._lengths, self._arms,
-            self._wires, self._orders, self._build, self._slid_joint, self._joints, self._numbers,
+        torque = self._pulled(duration, self._wires, self._slid_joint)
+        self._bullet.step(self._bias + self._implicit @ (torque - self._bias), duration)
+
+    def _pulled(self, duration: float, wires: np.ndarray, slid_joint: np.ndarray) -> np.ndarray:
+        """Torques [N m], shape (n,), of a step that moves wires and sliding joints on."""
+        torque: np.ndarray = pull(
+            duration, self._bullet.position, self._bullet.velocity, self._solved_at, self._lengths, self._arms,
+            wires, self._orders, self._build, slid_joint, self._joints, self._numbers,
         )  # fmt: skip
-        bullet.step(self._bias + self._implicit @ (torque - self._bias), duration)
+        return torque
 
 
 def _constants(body: Body, servo: Servo) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
