@@ -68,7 +68,7 @@ class Actor:
             self.wait(self._follows, ENGAGED_WITHIN)
 
     def go(self, signal: str, values: np.ndarray, duration: float) -> None:
-        """Give a target [its unit], shape (n,), and wait for so long [s]; again if the HAL stopped the robot meanwhile."""
+        """Give a target [its unit], shape (n,), wait for so long [s]; again if the HAL stopped the robot on the way."""
         for _ in range(TRIES):
             if not self._follows():
                 self._recover()

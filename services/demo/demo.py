@@ -27,7 +27,7 @@ from services.model.model_config import model_config
 from services.process.supervisor import Supervisor, gemuco_command
 from services.show import progress
 
-READY_WITHIN = 60.0
+READY_WITHIN = 180.0
 """Time [s] that a process has to come up on a busy machine."""
 CLIENT = "remote client"
 LEAST_LINES = 20
