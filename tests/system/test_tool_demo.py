@@ -69,7 +69,7 @@ def test_an_interrupted_demo_of_tools_leaves_no_process(tmp_path: Path, monkeypa
             time.sleep(0.02)
         told = log.read_text()
         told = told[told.rindex("Processes:") : told.index("(a)")]  # the last ones, if a lower rate was needed
-        words = told.partition("This machine")[0].replace(",", " ").split()
+        words = told.partition("remote client:")[0].partition("This machine")[0].replace(",", " ").split()
         assert [word for word in words if word.isalpha()] == [
             "simulator", "hal", "vision", "model", "recorder", "client",
         ]  # fmt: skip
