@@ -4,7 +4,7 @@
 
 Twenty step sizes times thirty iterations of the paper's descent, on z (e) and on x_in (f), from the same start to the
 same loss; the default search until it has that loss; and with the torque balance of muscles, a derivative of a
-derivative. Ours are whole calls: the terms are folded into the network anew each time.
+derivative. Ours are whole calls: references and what is given are written into the laid-out problem each time.
 """
 
 from collections.abc import Callable, Iterator
@@ -15,6 +15,7 @@ import torch
 
 from benchmarks.bodies import body, modules
 from benchmarks.table import Row, faster
+from gemuco.asked import Asked
 from gemuco.compiled.problem import Problem
 from gemuco.descent import Descent, DescentConfig, NewtonConfig
 from gemuco.fold import fold
@@ -41,21 +42,25 @@ class Ours:
     """One problem as the library has it."""
 
     def __init__(self, schema: BodySchema, route: str, terms: tuple[Term, ...]) -> None:
-        self.schema, self.terms = schema, terms
-        given = np.full(schema.layout.size, np.nan)
+        self.asked = Asked(schema, terms)
+        self.asked.read(TARGET, {})
+        self.given = np.full(schema.layout.size, np.nan)
         if route == "f":
-            given[schema.layout.slice("joint_position")] = TARGET["joint_position"]
-        self.way = LatentRoute(schema) if route == "e" else InputRoute(schema, MASK, given, schema.layout.names)
-        self.free = np.full(schema.layout.size, np.nan)
-        size = self.fold().bounds.shape[1]
-        self.start = np.random.default_rng(4).uniform(-0.5, 0.5, (1, size)).astype(np.float32)
+            self.given[schema.layout.slice("joint_position")] = TARGET["joint_position"]
+        names = schema.layout.names
+        self.way = LatentRoute(schema) if route == "e" else InputRoute(schema, MASK, self.given, names)
+        folded = fold(self.way.lines(), self.asked.bounds, self.asked.held)
+        assert folded is not None
+        self.folded, limits = folded, folded.problem.bounds
+        limits[:] = np.array([[-np.inf], [np.inf]])
+        self.start = np.random.default_rng(4).uniform(-0.5, 0.5, (1, limits.shape[1])).astype(np.float32)
 
     def fold(self) -> Problem:
         """The problem, as at the beginning of every solve."""
-        bounds = [term.bind(self.schema, TARGET, {}) for term in self.terms]
-        problem = fold(self.way.lines(), bounds, self.free)
-        assert problem is not None
-        return problem._replace(bounds=np.full_like(problem.bounds, np.inf) * np.array([[-1.0], [1.0]], np.float32))
+        self.asked.read(TARGET, {})
+        self.way.give(self.given)
+        self.folded.fill(self.asked.held)
+        return self.folded.problem
 
     def solve(self, config: DescentConfig | NewtonConfig) -> Descent:
         """One whole solve."""

@@ -2,43 +2,94 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
+from gemuco.asked import Asked, check_present, merged, signals_of
 from gemuco.descent import DescentConfig, NewtonConfig
 from gemuco.errors import NotFinite, NotObservable, SchemaError
 from gemuco.losses import Hold, Match, StayNear, Term
 from gemuco.masks import Mask, label
 from gemuco.routes import Limits, bounds_of, checked_mask, checked_route
 from gemuco.schema import BodySchema
-from gemuco.search import Search
+from gemuco.search import Found, Search
 
 SEARCH = NewtonConfig()
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, eq=False)
 class Solution:
-    """What to do, and what is expected of it.
+    """What to do, and what is expected of it; the latter is computed when it is looked at.
 
     Attributes:
         command: The commanded signal [its unit], shape (n,), inside its limits.
-        predicted: Signal -> its value when the command has been followed [its unit], shape (n,).
         loss: Sum of the terms.
-        residual: How far the body that the command leads to, asked of the network again, is from what was to be matched
-            (root mean square, standard deviations); NaN if no mask can tell.
         route: `mask` (usages a and b), `latent` (e) or `input` (f).
         mask: The signals that the network was given; empty for `latent`.
         is_late: Whether time was up before the search ended; the command is the best that it had found.
+        predicted: Signal -> its value when the command has been followed [its unit], shape (n,).
+        residual: How far the body that the command leads to, asked of the network again, is from what was to be matched
+            (root mean square, standard deviations); NaN if no mask can tell.
     """
 
     command: np.ndarray
-    predicted: dict[str, np.ndarray]
     loss: float
-    residual: float
     route: str
     mask: Mask
-    is_late: bool = False
+    is_late: bool
+    _outlook: "Outlook" = field(repr=False)
+
+    @cached_property
+    def predicted(self) -> dict[str, np.ndarray]:
+        """Signal -> its value when the command has been followed [its unit], shape (n,)."""
+        values = self._outlook.schema.scaler.restore(self._outlook.x)
+        parts = self._outlook.schema.layout.split(values)
+        found = {name: part for name, part in parts.items() if np.isfinite(part).all()}
+        return found | {self._outlook.command: self.command.copy()}
+
+    @cached_property
+    def residual(self) -> float:
+        """See the class."""
+        return self._outlook.residual()
+
+
+@dataclass(frozen=True, slots=True)
+class Outlook:
+    """Where a search for a command ended.
+
+    Attributes:
+        schema: Whose predictions.
+        command: The signal that is commanded.
+        x: What is predicted, shape (size,) [standard deviations]; NaN for what the route says nothing about.
+        wishes: What was to be matched.
+        target: Signal -> reference [its unit], shape (n,).
+    """
+
+    schema: BodySchema
+    command: str
+    x: np.ndarray
+    wishes: Sequence[Match]
+    target: Mapping[str, np.ndarray]
+
+    def residual(self) -> float:
+        """What was to be matched, asked of the network again, from the command and as little else as possible."""
+        schema, x = self.schema, self.x
+        matches = [wish for wish in self.wishes if wish.signal in schema.x_out]
+        judged = {wish.signal for wish in matches} - {self.command}
+        there = schema.layout.whole(np.isfinite(x))
+        blind = [m for m in schema.masks if self.command in m and m <= there and not m & judged]
+        if not blind or not judged:
+            return float("nan")
+        again = np.zeros(schema.layout.size)
+        again[schema.out_index] = schema.infer(x, min(blind, key=len))
+        amiss = [
+            replace(wish, unit="std").difference(schema, self.target).at(again[None])[0]
+            for wish in matches
+            if wish.signal in judged
+        ]
+        return float(np.sqrt(np.mean(np.concatenate(amiss) ** 2)))
 
 
 class Controller:
@@ -93,7 +144,7 @@ class Controller:
 
     def swap(self, schema: BodySchema) -> None:
         """Go on with another schema of the same body; the warm start is kept."""
-        schema.layout.slice(self.command)
+        span = schema.layout.slice(self.command)
         if self.command not in (*schema.x_in, *schema.x_out):
             raise NotObservable(
                 f"'{self.command}' is commanded, but this schema neither infers nor takes it; it takes "
@@ -105,7 +156,10 @@ class Controller:
         for term in self.terms or ():
             for name in signals_of(term):
                 schema.layout.slice(name)
-        self.schema = schema
+        self.schema, self._span = schema, span
+        self._mean, self._std = schema.scaler.mean[span], schema.scaler.std[span]
+        self._names: tuple[str, ...] | None = None
+        self._search.drop()
 
     def restart(self) -> None:
         """Forget the warm start."""
@@ -132,43 +186,28 @@ class Controller:
             NotFinite: A target is NaN or infinite.
             NotObservable: A term or the route cannot work with this schema.
         """
-        schema = self.schema
-        terms = self._terms(target)
-        present = schema.normalise_one(now or {})
-        wishes = [term for term in terms if not isinstance(term, Hold)]
-        holds = [term for term in terms if isinstance(term, Hold)]
-        held = merged(schema, [hold.wanted(schema, target) for hold in holds])
-        direct = held.copy()
-        for wish in wishes:
-            if isinstance(wish, Match) and wish.matrix is None and wish.signal != self.command:
-                direct = np.where(np.isfinite(direct), direct, schema.normalise({wish.signal: wish.reference(target)}))
-        route, mask = self._choose(wishes, schema.layout.whole(np.isfinite(direct)))
-        bounds = [wish.bind(schema, target, now or {}) for wish in wishes]
-        needed = {name for wish in wishes for name in wish.signals} | {hold.signal for hold in holds}
-        near = [
-            schema.normalise({wish.signal: wish.reference(schema, target, now or {})})
-            for wish in wishes
-            if isinstance(wish, StayNear)
-        ]
-        begin = merged(schema, [present, *near])
-        found = self._search.find(schema, route, mask, bounds, direct, held, sorted(needed), begin, bool(near), within)
-        x = self._limited(found.x)
-        values = schema.scaler.restore(x)
-        predicted = {name: part for name, part in schema.layout.split(values).items() if np.isfinite(part).all()}
-        return Solution(
-            predicted[self.command].copy(),
-            predicted,
-            found.loss,
-            self._residual(x, wishes, target),
-            route,
-            mask,
-            found.is_late,
-        )
+        schema, now = self.schema, now or {}
+        if tuple(target) != self._names:
+            self._ask(target)
+        check_present(schema, now)
+        for wish in self._matches:
+            if not np.isfinite(wish.reference(target)).all():
+                raise NotFinite(f"The target of '{wish.signal}' is not finite; every element needs a number.")
+        self._asked.read(target, now)
+        direct = self._direct(target)
+        near = [wish for wish in self._asked.wishes if isinstance(wish, StayNear)]
 
-    def _terms(self, target: Mapping[str, np.ndarray]) -> tuple[Term | Hold, ...]:
-        """The terms, after a look at whether they and the target are about the same signals."""
+        def begin() -> np.ndarray:
+            to = [schema.normalise({wish.signal: wish.reference(schema, target, now)}) for wish in near]
+            return merged(schema, [schema.normalise_one(now), *to])
+
+        return self._solution(self._search.find(self._asked, direct, self._choose, begin, bool(near), within), target)
+
+    def _ask(self, target: Mapping[str, np.ndarray]) -> None:
+        """Lay the terms out, after a look at whether they and the target are about the same signals."""
+        schema = self.schema
         for name in target:
-            self.schema.layout.slice(name)
+            schema.layout.slice(name)
         if not target and not self.terms:
             raise NotObservable("Nothing was asked: give a target, or terms with values of their own.")
         terms = tuple(Match(name) for name in target) if self.terms is None else self.terms
@@ -178,14 +217,34 @@ class Controller:
             if name not in minded:
                 known = ", ".join(sorted(minded)) or "nothing"
                 raise NotObservable(f"A target of '{name}' was given, but no term is about it; they are about {known}.")
-        for term in terms:
-            if isinstance(term, Match) and not np.isfinite(term.reference(target)).all():
-                raise NotFinite(f"The target of '{term.signal}' is not finite; every element needs a number.")
-        return terms
+        if self._names is None or self.terms is None:
+            self._asked = Asked(schema, terms)
+            self._matches = [wish for wish in self._asked.wishes if isinstance(wish, Match)]
+        self._names = tuple(target)
 
-    def _choose(self, wishes: Sequence[Term], direct: Mask) -> tuple[str, Mask]:
+    def _direct(self, target: Mapping[str, np.ndarray]) -> np.ndarray:
+        """What the asker decided, shape (size,) [standard deviations]: what is held, and what is plainly matched."""
+        direct, layout, scaler = self._asked.held.copy(), self.schema.layout, self.schema.scaler
+        for wish in self._matches:
+            if wish.matrix is None and wish.signal != self.command:
+                span = layout.slices[wish.signal]
+                value = (wish.reference(target) - scaler.mean[span]) / scaler.std[span]
+                np.copyto(direct[span], value, where=np.isnan(direct[span]))
+        return direct
+
+    def _solution(self, found: Found, target: Mapping[str, np.ndarray]) -> Solution:
+        x, span = found.x, self._span
+        command = x[span] * self._std + self._mean
+        if self.command in self.limits:
+            command = np.clip(command, *self.limits[self.command])
+            x[span] = (command - self._mean) / self._std
+        kept = {name: np.array(value, float) for name, value in target.items()}
+        outlook = Outlook(self.schema, self.command, x, self._matches, kept)
+        return Solution(command, found.loss, found.route, found.mask, found.is_late, outlook)
+
+    def _choose(self, direct: Mask) -> tuple[str, Mask]:
         """Route and mask for what is asked; `direct` are the signals whose whole value was decided by the asker."""
-        schema = self.schema
+        schema, wishes = self.schema, self._asked.wishes
         asked = {wish.signals[0] for wish in wishes if isinstance(wish, Match)}
         infers = self.command in schema.x_out
         if self.mask is not None:
@@ -225,45 +284,3 @@ class Controller:
                         f"Route latent predicts only x_out ({', '.join(self.schema.x_out)}), but a term is about "
                         f"'{name}'; use route input."
                     )
-
-    def _limited(self, x: np.ndarray) -> np.ndarray:
-        if self.command not in self.limits:
-            return x
-        span, scaler = self.schema.layout.slice(self.command), self.schema.scaler
-        low, high = (np.asarray(b, float) for b in self.limits[self.command])
-        x = x.copy()
-        x[span] = (np.clip(x[span] * scaler.std[span] + scaler.mean[span], low, high) - scaler.mean[span]) / (
-            scaler.std[span]
-        )
-        return x
-
-    def _residual(self, x: np.ndarray, wishes: Sequence[Term], target: Mapping[str, np.ndarray]) -> float:
-        """What was to be matched, asked of the network again, from the command and as little else as possible."""
-        schema = self.schema
-        matches = [wish for wish in wishes if isinstance(wish, Match) and wish.signal in schema.x_out]
-        judged = {wish.signal for wish in matches} - {self.command}
-        there = schema.layout.whole(np.isfinite(x))
-        blind = [m for m in schema.masks if self.command in m and m <= there and not m & judged]
-        if not blind or not judged:
-            return float("nan")
-        again = np.zeros(schema.layout.size)
-        again[schema.out_index] = schema.infer(x, min(blind, key=len))
-        amiss = [
-            replace(wish, unit="std").difference(schema, target).at(again[None])[0]
-            for wish in matches
-            if wish.signal in judged
-        ]
-        return float(np.sqrt(np.mean(np.concatenate(amiss) ** 2)))
-
-
-def signals_of(term: Term | Hold) -> tuple[str, ...]:
-    """The signals that a term is about."""
-    return (term.signal,) if isinstance(term, Hold) else term.signals
-
-
-def merged(schema: BodySchema, parts: Sequence[np.ndarray]) -> np.ndarray:
-    """What several holds hold together, shape (size,) [standard deviations]; NaN where free."""
-    merged = np.full(schema.layout.size, np.nan)
-    for part in parts:
-        merged = np.where(np.isfinite(part), part, merged)
-    return merged

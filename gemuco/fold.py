@@ -2,18 +2,20 @@
 
 Every term but the caller's own is a norm of something linear in the prediction, and a prediction is linear in the last
 layer of the network and in what moves. So the terms are multiplied into the last layer and what is given into the
-first, once per solve, and the search then looks at differences only.
+first, and the search then looks at differences only. What is wanted and given are numbers in a few rows of that: a
+controller lays the problem out once and writes those rows before every solve.
 """
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from gemuco.compiled.chain import Packed, pack
+from gemuco.compiled.chain import NARROW, PLACE, WIDE, Packed, pack
 from gemuco.compiled.problem import POSTURE, STD, STIFFNESS, TORQUE, Balance, Problem
 from gemuco.kernels import Chain, Layer
-from gemuco.losses import Bound, Norm
+from gemuco.norms import Bound, Norm
 from gemuco.torque import Balanced
 
 if TYPE_CHECKING:
@@ -22,6 +24,8 @@ if TYPE_CHECKING:
 
 class Lines(NamedTuple):
     """A route as straight lines and a net: x = direct^T p + constant, but x[outputs] = net(p) for what is inferred.
+
+    What is given lies in `known` and in the offset of the net's first layer, and may change from solve to solve.
 
     Attributes:
         chain: net, from p to `outputs`.
@@ -72,13 +76,29 @@ def input_lines(
     """
     chain, outputs = schema.weights.whole, schema.out_index[inferred]
     begin, end = chain[0], chain[-1]
+    first = Layer(begin.matrix[columns], np.empty_like(begin.offset), begin.activation)
+    last = Layer(end.matrix[:, inferred], end.offset[inferred], end.activation)
+    lines = Lines((first, *chain[1:-1], last), outputs, free, np.zeros(len(known)), low, high)
+    give(lines, begin, base, columns, known)
+    return lines
+
+
+def give(lines: Lines, begin: Layer, base: np.ndarray, columns: np.ndarray, known: np.ndarray) -> None:
+    """Write what is given into the lines of usage (f).
+
+    Args:
+        lines: Of `input_lines`.
+        begin: First layer of the network.
+        base: See `input_lines`.
+        columns: See `input_lines`.
+        known: See `input_lines`.
+    """
     still = base.astype(begin.matrix.dtype)
     still[columns] = 0.0
-    rest = known.copy()
-    rest[free] = rest[outputs] = 0.0
-    first = Layer(begin.matrix[columns], begin.offset + still @ begin.matrix, begin.activation)
-    last = Layer(end.matrix[:, inferred], end.offset[inferred], end.activation)
-    return Lines((first, *chain[1:-1], last), outputs, free, rest, low, high)
+    np.add(begin.offset, still @ begin.matrix, out=lines.chain[0].offset)
+    lines.known[:] = known
+    lines.known[lines.free] = 0.0
+    lines.known[lines.outputs] = 0.0
 
 
 def fitting(lines: Lines, data: np.ndarray) -> Problem:
@@ -89,7 +109,60 @@ def fitting(lines: Lines, data: np.ndarray) -> Problem:
     return _problem(lines, rows, data[given], np.array([0, len(given)]), np.ones(1), none, 0)
 
 
-def fold(lines: Lines, bounds: Sequence[Bound], held: np.ndarray) -> Problem | None:
+class Folded:
+    """The problem of a route and its terms, laid out once; `fill` writes the numbers of a solve into it.
+
+    Attributes:
+        problem: For `gemuco.minimise`.
+        moving: The torque balance at the predicted posture; None if there is none.
+    """
+
+    def __init__(self, lines: Lines, bounds: Sequence[Bound], held: np.ndarray) -> None:
+        """Lay the problem out for these terms; see `fold`."""
+        self._lines = lines
+        self._norms = [bound for bound in bounds if isinstance(bound, Norm)]
+        self._balanced = next((bound for bound in bounds if isinstance(bound, Balanced)), None)
+        self.moving = self._balanced if self._balanced is not None and self._balanced.posture is None else None
+        size = len(lines.known)
+        rows = [norm.difference.rows(size)[0] for norm in self._norms]
+        ends = np.cumsum([0, *map(len, rows)])
+        weights = np.array([norm.weight for norm in self._norms], float)
+        balance = no_balance()
+        if (bound := self._balanced) is not None:
+            fed = [bound.f] if bound.posture is not None else [bound.f, bound.theta]
+            first = int(ends[-1])
+            second = -1 if bound.posture is not None else first + bound.f.stop - bound.f.start
+            rows += [np.eye(size)[span] for span in fed]
+            balance = _balance(bound, (first, second))
+        self._index = np.flatnonzero(np.isfinite(held))
+        rows.append(np.eye(size)[self._index])
+        self._rows = np.concatenate(rows)
+        self._wanted = np.zeros(len(self._rows))
+        self._slots = [slice(begin, end) for begin, end in pairwise(ends)]
+        self.problem = _problem(lines, self._rows, self._wanted, ends, weights, balance, len(self._index))
+        wide, narrow, place = self.problem.chain.form[0, [WIDE, NARROW, PLACE]]
+        self._offset = self.problem.chain.flat[place + wide * narrow : place + (wide + 1) * narrow]
+        self.fill(held)
+
+    def fill(self, held: np.ndarray) -> None:
+        """Write what is given, wanted and held now; as many elements as before.
+
+        Args:
+            held: What predictions must equal [standard deviations], shape (size,); NaN where free.
+        """
+        for slot, norm in zip(self._slots, self._norms, strict=True):
+            difference = norm.difference
+            self._wanted[slot] = difference.wanted[difference.asked]
+        if len(self._index):
+            self._wanted[-len(self._index) :] = held[self._index]
+        np.subtract(self._rows @ self._lines.known, self._wanted, out=self.problem.direct[-1], casting="same_kind")
+        if len(self._lines.chain) > 1:  # the only layer of a net takes nothing that is given, and the terms are in it
+            self._offset[:] = self._lines.chain[0].offset
+        if self._balanced is not None and self._balanced.posture is not None:
+            _stand(self.problem.balance, self._balanced, self._balanced.posture)
+
+
+def fold(lines: Lines, bounds: Sequence[Bound], held: np.ndarray) -> Folded | None:
     """The problem of a route and its terms; None if a term is the caller's own, or two of them balance torques.
 
     Args:
@@ -97,25 +170,10 @@ def fold(lines: Lines, bounds: Sequence[Bound], held: np.ndarray) -> Problem | N
         bounds: The terms.
         held: What predictions must equal [standard deviations], shape (size,); NaN where free.
     """
-    norms = [bound for bound in bounds if isinstance(bound, Norm)]
     balances = [bound for bound in bounds if isinstance(bound, Balanced)]
-    if len(norms) + len(balances) < len(bounds) or len(balances) > 1:
+    if len(balances) > 1 or not all(isinstance(bound, Norm | Balanced) for bound in bounds):
         return None
-    size = len(lines.known)
-    parts = [norm.difference.rows(size) for norm in norms]
-    ends = np.cumsum([0, *(len(wanted) for _, wanted in parts)])
-    weights = np.array([norm.weight for norm in norms], float)
-    balance = no_balance()
-    for bound in balances:
-        fed = [bound.f] if bound.posture is not None else [bound.f, bound.theta]
-        first = int(ends[-1])
-        second = -1 if bound.posture is not None else first + bound.f.stop - bound.f.start
-        parts += [(np.eye(size)[span], np.zeros(span.stop - span.start)) for span in fed]
-        balance = _balance(bound, (first, second))
-    index = np.flatnonzero(np.isfinite(held))
-    parts.append((np.eye(size)[index], held[index]))
-    rows, wanted = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return _problem(lines, rows, wanted, ends, weights, balance, len(index))
+    return Folded(lines, bounds, held)
 
 
 def _problem(
@@ -148,15 +206,23 @@ def no_balance() -> Balance:
 
 def _balance(bound: Balanced, rows: tuple[int, int]) -> Balance:
     muscles = bound.muscles
-    posture = bound.mean if bound.posture is None else bound.posture
-    base = muscles.base.astype(np.float32)
-    base[muscles.theta] = (posture - bound.mean) / bound.std
     joints = np.zeros((len(bound.mean), 3 + len(bound.mean)), np.float32)
-    joints[:, STD], joints[:, POSTURE] = muscles.theta_std, base[muscles.theta]
-    joints[:, TORQUE] = bound.torques(posture[None])[0]
+    joints[:, STD] = muscles.theta_std
     lines = np.stack([muscles.f_std, muscles.f_mean, muscles.l_std], axis=1).astype(np.float32)
     places = np.concatenate([muscles.theta, muscles.f])
-    return Balance(muscles.packed, base[None], joints, lines, places, rows, float(bound.weight))
+    base = muscles.base.astype(np.float32)[None]
+    balance = Balance(muscles.packed, base, joints, lines, places, rows, float(bound.weight))
+    if bound.posture is None:
+        _stand(balance, bound, bound.mean)
+    return balance
+
+
+def _stand(balance: Balance, bound: Balanced, posture: np.ndarray) -> None:
+    """Write the posture [rad], shape (joints,), that torque is balanced at."""
+    base = balance.base[0]
+    base[bound.muscles.theta] = (posture - bound.mean) / bound.std
+    balance.joints[:, POSTURE] = base[bound.muscles.theta]
+    balance.joints[:, TORQUE] = bound.torques(posture[None])[0]
 
 
 def around(problem: Problem, bound: Balanced, x: np.ndarray) -> Problem:

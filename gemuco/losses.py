@@ -11,13 +11,14 @@ the signal's own unit (`unit="si"`). `StaySmall` measures from the physical zero
 `TorqueBalance` (in `gemuco.torque`) measures in N m. `Hold` has no weight: it is met exactly.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 
 from gemuco.errors import NotFinite, NotObservable, SchemaError, WrongSize
+from gemuco.norms import Bound, Difference, Norm
 
 if TYPE_CHECKING:
     from gemuco.schema import BodySchema
@@ -25,20 +26,6 @@ if TYPE_CHECKING:
 Values = Mapping[str, np.ndarray]
 
 
-class Bound(Protocol):
-    """A term bound to a schema, references and the present: a function of predictions."""
-
-    def __call__(self, x: np.ndarray, slope: bool = True) -> tuple[np.ndarray, np.ndarray]:
-        """Losses, shape (candidates,), and their gradients, shape (candidates, size).
-
-        Args:
-            x: Predictions [standard deviations], shape (candidates, size).
-            slope: Whether gradients are wanted; they may be anything if not.
-        """
-        ...
-
-
-TINY = 1e-9
 UNITS = ("std", "si")
 
 
@@ -58,6 +45,15 @@ class Term(Protocol):
             target: Signal -> reference of this solve [its unit].
             now: Signal -> measured value [its unit]; NaN where nothing was measured.
         """
+        ...
+
+
+@runtime_checkable
+class Lasting(Term, Protocol):
+    """A wish that depends on references and the present by its numbers alone: what it was bound to is kept."""
+
+    def renew(self, bound: Bound, schema: "BodySchema", target: Values, now: Values) -> None:
+        """Tell what `bind` returned other references and another present, in place; raises what `bind` does."""
         ...
 
 
@@ -102,13 +98,18 @@ class Match:
             raise NotObservable(f"Nothing was asked of '{self.signal}', but the loss wants to match it; give a target.")
         return _numbers(self.signal, target[self.signal])
 
-    def bind(self, schema: "BodySchema", target: Values, now: Values) -> Bound:
+    def bind(self, schema: "BodySchema", target: Values, now: Values) -> Norm:
         """See `Term.bind`; nothing is asked where the reference is NaN."""
-        return self.difference(schema, target).norm(self.weight)
+        return Norm(self.difference(schema, target), self.weight)
 
-    def difference(self, schema: "BodySchema", target: Values) -> "Difference":
+    def renew(self, bound: Norm, schema: "BodySchema", target: Values, now: Values) -> None:
+        """See `Lasting.renew`."""
+        if self.value is None:
+            bound.difference.ask(self.reference(target))
+
+    def difference(self, schema: "BodySchema", target: Values) -> Difference:
         """A x - reference as a function of predictions."""
-        return Difference.of(schema, self.signal, self.reference(target), self.matrix, self.unit)
+        return Difference.of(schema, self.signal, self.matrix, self.unit).ask(self.reference(target))
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,10 +137,15 @@ class StayNear:
         """The signals whose prediction the loss depends on."""
         return (self.signal,)
 
-    def bind(self, schema: "BodySchema", target: Values, now: Values) -> Bound:
+    def bind(self, schema: "BodySchema", target: Values, now: Values) -> Norm:
         """See `Term.bind`; nothing is asked where it is not known what to stay near."""
-        near = self.reference(schema, target, now)
-        return Difference.of(schema, self.signal, near, None, self.unit).norm(self.weight)
+        near = Difference.of(schema, self.signal, None, self.unit)
+        return Norm(near.ask(self.reference(schema, target, now)), self.weight)
+
+    def renew(self, bound: Norm, schema: "BodySchema", target: Values, now: Values) -> None:
+        """See `Lasting.renew`."""
+        if self.value is None:
+            bound.difference.ask(self.reference(schema, target, now))
 
     def reference(self, schema: "BodySchema", target: Values, now: Values) -> np.ndarray:
         """What to stay near [its unit], shape (n,); NaN where that is not known."""
@@ -165,10 +171,13 @@ class StaySmall:
         """The signals whose prediction the loss depends on."""
         return (self.signal,)
 
-    def bind(self, schema: "BodySchema", target: Values, now: Values) -> Bound:
+    def bind(self, schema: "BodySchema", target: Values, now: Values) -> Norm:
         """See `Term.bind`."""
         zero = np.zeros(schema.layout.signal(self.signal).size)
-        return Difference.of(schema, self.signal, zero, None, self.unit).norm(self.weight)
+        return Norm(Difference.of(schema, self.signal, None, self.unit).ask(zero), self.weight)
+
+    def renew(self, bound: Norm, schema: "BodySchema", target: Values, now: Values) -> None:
+        """See `Lasting.renew`; zero stays zero."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,106 +212,6 @@ class Hold:
         if not np.isfinite(x).any():
             raise NotFinite(f"'{self.signal}' shall be held, but no element of where is a number.")
         return x
-
-
-@dataclass(frozen=True, slots=True)
-class Difference:
-    """M x - w of one signal's prediction [standard deviations]: scaled, and zero where nothing is asked.
-
-    Attributes:
-        span: Where the signal lies in the layout.
-        matrix: M, shape (rows, n); None for one.
-        wanted: w, shape (rows,).
-        asked: Which rows count, shape (rows,).
-    """
-
-    span: slice
-    matrix: np.ndarray | None
-    wanted: np.ndarray
-    asked: np.ndarray
-
-    @classmethod
-    def of(
-        cls,
-        schema: "BodySchema",
-        signal: str,
-        reference: np.ndarray,
-        matrix: Sequence[Sequence[float]] | None,
-        unit: str,
-    ) -> "Difference":
-        """From the signal's own unit.
-
-        Raises:
-            UnknownSignal: The signal is not in the layout.
-            WrongSize: Reference and matrix do not fit the signal.
-        """
-        span = schema.layout.slice(signal)
-        mean, std = schema.scaler.mean[span], schema.scaler.std[span]
-        if matrix is None:
-            schema.layout.join({signal: reference})
-            scale = std if unit == "std" else np.ones_like(std)
-            scaled = None if unit == "std" else np.diag(std)
-            wanted = (reference - mean) / scale
-        else:
-            try:
-                rows = np.array(matrix, float)
-            except ValueError:
-                rows = np.zeros(0)
-            if rows.ndim != 2 or rows.shape[1] != len(std):
-                raise WrongSize(f"The matrix of '{signal}' needs {len(std)} columns in every row.")
-            if reference.shape != (len(rows),):
-                raise WrongSize(
-                    f"The matrix of '{signal}' has {len(rows)} rows, but its reference has shape {reference.shape}."
-                )
-            scale = np.maximum(np.sqrt(rows**2 @ std**2), TINY) if unit == "std" else np.ones(len(rows))
-            scaled = rows * std / scale[:, None]
-            wanted = (reference - rows @ mean) / scale
-        asked = np.isfinite(wanted)
-        return cls(span, scaled, np.where(asked, wanted, 0.0), asked)
-
-    def at(self, x: np.ndarray) -> np.ndarray:
-        """The difference at predictions, shape (candidates, size) -> (candidates, rows)."""
-        part = x[:, self.span]
-        return ((part if self.matrix is None else part @ self.matrix.T) - self.wanted) * self.asked
-
-    def norm(self, weight: float) -> "Norm":
-        """The loss weight * ||M x - w||."""
-        return Norm(self, weight)
-
-    def rows(self, size: int) -> tuple[np.ndarray, np.ndarray]:
-        """What is asked as rows over the whole layout, shape (asked, size), and what they shall be, shape (asked,)."""
-        found = np.zeros((len(self.wanted), size))
-        found[:, self.span] = np.eye(len(self.wanted)) if self.matrix is None else self.matrix
-        return found[self.asked], self.wanted[self.asked]
-
-
-@dataclass(frozen=True, slots=True)
-class Norm:
-    """weight * ||M x - w|| of a prediction; a `Bound` that compiled searches know (`gemuco.fold`)."""
-
-    difference: Difference
-    weight: float
-
-    def __call__(self, x: np.ndarray, slope: bool = True) -> tuple[np.ndarray, np.ndarray]:
-        """See `Bound`."""
-        difference = self.difference.at(x)
-        norm = np.sqrt(np.einsum("ij,ij->i", difference, difference))
-        gradient = np.zeros_like(x)
-        if slope:
-            way = difference * (self.weight / np.maximum(norm, TINY))[:, None]
-            matrix = self.difference.matrix
-            gradient[:, self.difference.span] = way if matrix is None else way @ matrix
-        return self.weight * norm, gradient
-
-
-def total(bounds: Sequence[Bound], x: np.ndarray, slope: bool = True) -> tuple[np.ndarray, np.ndarray]:
-    """Sum of bound terms and its gradient; nothing wanted loses nothing."""
-    loss, gradient = np.zeros(len(x), x.dtype), np.zeros_like(x)
-    for bound in bounds:
-        part, way = bound(x, slope)
-        loss = loss + part
-        gradient = gradient + way
-    return loss, gradient
 
 
 def _numbers(signal: str, value: object) -> np.ndarray:

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
+from gemuco.compiled.chain import output, pack
 from gemuco.errors import NotObservable, SchemaError, WrongSize
 from gemuco.estimate import STARTS
-from gemuco.fold import Lines, input_lines, latent_lines
+from gemuco.fold import Lines, give, input_lines, latent_lines
 from gemuco.kernels import pull, run, trace
 from gemuco.masks import Mask, label
 from gemuco.scaler import CLIP
@@ -34,6 +35,10 @@ class Route(Protocol):
         """
         ...
 
+    def give(self, given: np.ndarray) -> None:
+        """Take other values of what is given [standard deviations], shape (size,); NaN where it was NaN before."""
+        ...
+
 
 class LatentRoute:
     """Usage (e): z moves, and every x_out is decoded from it."""
@@ -41,6 +46,10 @@ class LatentRoute:
     def __init__(self, schema: "BodySchema") -> None:
         self._schema = schema
         self._decoder = schema.weights.decoder
+        self._packed, self._lines = pack(self._decoder), latent_lines(schema)
+
+    def give(self, given: np.ndarray) -> None:
+        """See `Route.give`; nothing is given to a decoder but z."""
 
     def predict(self, points: np.ndarray) -> tuple[np.ndarray, Back]:
         """See `Route.predict`."""
@@ -55,12 +64,12 @@ class LatentRoute:
 
     def lines(self) -> Lines:
         """For compiled searches."""
-        return latent_lines(self._schema)
+        return self._lines
 
     def final(self, point: np.ndarray) -> np.ndarray:
         """What was found, shape (size,) [standard deviations]; NaN for what is not in x_out."""
         x = np.full(self._schema.layout.size, np.nan)
-        x[self._schema.out_index] = run(self._decoder, point)
+        x[self._schema.out_index] = output(self._packed, point.astype(np.float32))
         return x
 
     def starts(self, begin: np.ndarray, only_there: bool = False) -> np.ndarray:
@@ -103,8 +112,9 @@ class InputRoute:
                 )
         inside = schema.layout.indices(mask)
         self.mask, self._schema, self._chain = mask, schema, schema.weights.whole
-        self.free = inside[~np.isfinite(given[inside])]
-        self._known = np.where(np.isfinite(given), given, 0.0)
+        self._inside, self._there = inside, np.isfinite(given)
+        self.free = inside[~self._there[inside]]
+        self._known = np.where(self._there, given, 0.0)
         self._base = schema.network_input(self._known, mask).astype(self._chain[0].matrix.dtype)
         is_free, is_inside = np.zeros((2, schema.layout.size), bool)
         is_free[self.free] = is_inside[inside] = True
@@ -115,6 +125,15 @@ class InputRoute:
         low, high = bounds_of(schema, limits)
         dtype = self._base.dtype
         self.low, self.high = low[self.free].astype(dtype), high[self.free].astype(dtype)
+        self._lines = input_lines(
+            schema, self._base, self._columns, self.free, self._inferred, self._known, self.low, self.high
+        )
+
+    def give(self, given: np.ndarray) -> None:
+        """See `Route.give`."""
+        np.copyto(self._known, given, where=self._there)
+        self._base[:] = self._schema.network_input(self._known, self.mask)
+        give(self._lines, self._chain[0], self._base, self._columns, self._known)
 
     def predict(self, points: np.ndarray) -> tuple[np.ndarray, Back]:
         """See `Route.predict`."""
@@ -136,19 +155,16 @@ class InputRoute:
 
     def lines(self) -> Lines:
         """For compiled searches."""
-        return input_lines(
-            self._schema, self._base, self._columns, self.free, self._inferred, self._known, self.low, self.high
-        )
+        return self._lines
 
     def final(self, point: np.ndarray) -> np.ndarray:
         """What was found, shape (size,) [standard deviations]; NaN for what is neither input nor output."""
         schema = self._schema
-        inputs = self._base.copy()
+        inputs = self._base.astype(np.float32)
         inputs[self._columns] = point
         x = np.full(schema.layout.size, np.nan)
-        x[schema.out_index] = run(self._chain, inputs)
-        inside = schema.layout.indices(self.mask)
-        x[inside] = self._known[inside]
+        x[schema.out_index] = output(schema.ready.predictor.chain, inputs)
+        x[self._inside] = self._known[self._inside]
         x[self.free] = point
         return x
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gemuco.control import merged, signals_of
+from gemuco.asked import Asked, check_present, signals_of
 from gemuco.descent import DescentConfig, NewtonConfig
 from gemuco.errors import NotFinite, NotObservable, SchemaError
 from gemuco.losses import Hold, Match, Term
@@ -98,6 +98,8 @@ class Simulator:
                 self.schema.layout.slice(name)
         is_matched = any(isinstance(term, Match | Hold) and term.signal == self.command for term in terms)
         self.terms = tuple(terms) if is_matched else (Match(self.command), *terms)
+        self._asked = Asked(self.schema, self.terms)
+        self._search.drop()
 
     def restart(self) -> None:
         """Forget the warm start."""
@@ -127,18 +129,13 @@ class Simulator:
         if not np.isfinite(sent[schema.layout.slice(self.command)]).all():
             raise NotFinite(f"The command of '{self.command}' is not finite; every element needs a number.")
         self._check(target)
-        present = schema.normalise_one(now or {})
-        wishes = [term for term in self.terms if not isinstance(term, Hold)]
-        holds = [term for term in self.terms if isinstance(term, Hold)]
-        held = merged(schema, [hold.wanted(schema, target) for hold in holds])
-        fixed = np.where(np.isfinite(sent), sent, held)
-        route, mask = self._choose(wishes, schema.layout.whole(np.isfinite(fixed)))
-        bounds = [wish.bind(schema, target, now or {}) for wish in wishes]
-        needed = sorted({name for term in self.terms for name in signals_of(term)})
-        found = self._search.find(schema, route, mask, bounds, fixed, held, needed, present)
+        check_present(schema, now or {})
+        self._asked.read(target, now or {})
+        fixed = np.where(np.isfinite(sent), sent, self._asked.held)
+        found = self._search.find(self._asked, fixed, self._choose, lambda: schema.normalise_one(now or {}))
         values = schema.layout.split(schema.scaler.restore(found.x))
         state = {name: part.copy() for name, part in values.items() if np.isfinite(part).all()}
-        return Simulated(state, found.loss, self._residual(found.x, sent, mask), route, mask)
+        return Simulated(state, found.loss, self._residual(found.x, sent, found.mask), found.route, found.mask)
 
     def run(
         self,
@@ -151,16 +148,15 @@ class Simulator:
             yield self.step(command, given, now)
 
     def _check(self, target: Mapping[str, np.ndarray]) -> None:
-        minded = {name for term in self.terms for name in signals_of(term)}
         for name in target:
             self.schema.layout.slice(name)
-            if name not in minded:
-                known = ", ".join(sorted(minded))
+            if name not in self._asked.needed:
+                known = ", ".join(self._asked.needed)
                 raise NotObservable(f"'{name}' was given, but no term is about it; they are about {known}.")
 
-    def _choose(self, wishes: Sequence[Term], fixed: Mask) -> tuple[str, Mask]:
+    def _choose(self, fixed: Mask) -> tuple[str, Mask]:
         """Route and mask; `fixed` are the signals that are commanded or held whole."""
-        schema = self.schema
+        schema, wishes = self.schema, self._asked.wishes
         if self.mask is not None:
             if self.route == "mask" and not self.mask <= fixed:
                 missing = label(self.mask - fixed, schema.layout.names)

@@ -10,7 +10,8 @@ import numpy as np
 from gemuco.compiled.chain import pack
 from gemuco.errors import NotFinite, NotObservable, SchemaError
 from gemuco.kernels import Curvature, Layer
-from gemuco.losses import TINY, Bound, Values, check_weight
+from gemuco.losses import Values, check_weight
+from gemuco.norms import TINY
 
 if TYPE_CHECKING:
     from gemuco.schema import BodySchema
@@ -54,18 +55,25 @@ class TorqueBalance:
         """The signals whose prediction the loss depends on."""
         return (self.tension,) if self.at == "reference" else (self.position, self.tension)
 
-    def bind(self, schema: "BodySchema", target: Values, now: Values) -> Bound:
+    def bind(self, schema: "BodySchema", target: Values, now: Values) -> "Balanced":
         """See `Term.bind`."""
         muscles = muscle_model(schema, self)
         theta, f = schema.layout.slice(self.position), schema.layout.slice(self.tension)
         mean, std = schema.scaler.mean[theta], schema.scaler.std[theta]
-        if self.at == "predicted":
-            return Balanced(muscles, theta, f, mean, std, self.torque, self.weight, None)
+        posture = None if self.at == "predicted" else np.empty(len(mean))
+        bound = Balanced(muscles, theta, f, mean, std, self.torque, self.weight, posture)
+        self.renew(bound, schema, target, now)
+        return bound
+
+    def renew(self, bound: "Balanced", schema: "BodySchema", target: Values, now: Values) -> None:
+        """See `Lasting.renew`; a predicted posture needs no reference."""
+        if bound.posture is None:
+            return
         if self.position not in target or not np.isfinite(target[self.position]).all():
             raise NotFinite(f"Torque balance needs a whole reference of '{self.position}'; some of it is missing.")
-        schema.layout.join({self.position: target[self.position]})
-        posture = np.asarray(target[self.position], float)
-        return Balanced(muscles, theta, f, mean, std, self.torque, self.weight, posture)
+        if np.shape(target[self.position]) != bound.posture.shape:
+            schema.layout.join_one({self.position: target[self.position]})
+        bound.posture[:] = target[self.position]
 
 
 @dataclass(frozen=True, slots=True)

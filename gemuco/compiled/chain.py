@@ -101,6 +101,16 @@ def forward(chain, values, rows):
 
 
 @jit
+def output(chain, line):
+    """The last value for a single input, shapes (n_in,) and (n_out,)."""
+    values = space(chain, 1)
+    inputs = first(chain, values, 1)[0]
+    for i in range(len(inputs)):
+        inputs[i] = line[i]
+    return forward(chain, values, 1)[0].copy()
+
+
+@jit
 def pull(chain, values, rows, begin, gradient):
     """Gradient with respect to the output -> with respect to the input, shapes (some, n).
 

@@ -81,8 +81,10 @@ class ModelSolver:
     def __call__(self, target: Mapping[str, np.ndarray], now: Mapping[str, np.ndarray]) -> np.ndarray:
         """The command [its unit], shape (n,), that brings about a target."""
         schema, reference = self._living.schema, target[self._target]
-        if self._controller.schema is not schema or not np.array_equal(reference, self._reference):
+        is_swapped = self._controller.schema is not schema
+        if is_swapped:
             self._controller.swap(schema)
+        if is_swapped or not np.array_equal(reference, self._reference):
             self._reference, self._is_found, self._command = reference, False, np.full_like(self._command, np.nan)
         if not self._is_found:
             solution = self._controller.solve(target, now, self._within)

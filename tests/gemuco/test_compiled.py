@@ -18,9 +18,10 @@ from gemuco.compiled.learning import SQUARED, gradients, loss
 from gemuco.descent import DescentConfig, NewtonConfig, descend
 from gemuco.fold import Lines, around, fold
 from gemuco.kernels import Layer
-from gemuco.losses import Match, StayNear, StaySmall, total
+from gemuco.losses import Match, StayNear, StaySmall
 from gemuco.minimise import minimise
 from gemuco.network import Network
+from gemuco.norms import total
 from gemuco.routes import InputRoute, LatentRoute
 from gemuco.torque import TorqueBalance
 
@@ -51,9 +52,9 @@ def way_of(schema, route):
 def bound_problem(schema, route, names):
     bounds = [TERMS[name].bind(schema, TARGET, NOW) for name in names]
     way = way_of(schema, route)
-    problem = fold(way.lines(), bounds, np.full(schema.layout.size, np.nan))
-    assert problem is not None
-    return way, bounds, problem
+    folded = fold(way.lines(), bounds, np.full(schema.layout.size, np.nan))
+    assert folded is not None
+    return way, bounds, folded.problem
 
 
 def once(problem, point):
@@ -161,9 +162,9 @@ def test_a_straight_problem_is_solved_within_its_bounds():
     """min ||p - (3, 0.5)|| with |p| < 1 is (1, 0.5); a row that is held at 0.2 comes before."""
     layers = (Layer(np.eye(2, dtype=np.float32), np.zeros(2, np.float32), "linear"),)
     lines = Lines(layers, np.array([0, 1]), np.zeros(0, int), np.zeros(2), -np.ones(2), np.ones(2))
-    problem = fold(lines, [], np.array([np.nan, np.nan]))
-    assert problem is not None
-    wanted = problem._replace(
+    folded = fold(lines, [], np.array([np.nan, np.nan]))
+    assert folded is not None
+    wanted = folded.problem._replace(
         chain=pack((Layer(np.eye(2, dtype=np.float32), np.zeros(2, np.float32), "linear"),)),
         direct=np.array([[0.0, 0.0], [0.0, 0.0], [-3.0, -0.5]], np.float32),
         ends=np.array([0, 2]),
@@ -199,11 +200,12 @@ ALL_WAYS = """
 import numpy as np
 from gemuco import warm
 from gemuco.adapt import UpdateConfig
-from gemuco.compiled import bank, descent, inference, innovation, learning, newton
+from gemuco.compiled import bank, chain, descent, inference, innovation, learning, newton
 from gemuco.control import Controller
 from gemuco.losses import Match, StaySmall
 warm.warm()
 used = (newton.search, descent.descend, inference.infer, bank.see, innovation.innovations, learning.gradients)
+used = (*used, chain.output)
 before = [len(one.signatures) for one in used]
 body = warm.body().under("other")
 whole = {name: np.full(size, 0.1) for name, (size, _) in warm.SIGNALS.items()}
