@@ -101,7 +101,7 @@ def recognition() -> Row:
         lambda: seen.see(schema, sample),
         by_torch,
         20.0,
-        f"a bank of {len(seen._mean)} Kalman filters, two linearisations each",
+        f"a bank of {seen._count} Kalman filters, two linearisations each",
     )
 
 

@@ -40,7 +40,8 @@ FAINTEST = -60.0
 PASSES = 2
 """How often a sample is linearised."""
 NEAR = 0.02
-"""A belief that the sample moves less than this share of the prior's standard deviation is not linearised again."""
+"""Beliefs this near to each other [share of the prior's standard deviation] are linearised at one p, and one that the
+sample moves less than this is not linearised again."""
 SCALE_MEMORY = 50
 """Samples over which it is learned that errors are larger here than in training; at first fewer, to be there soon."""
 SCALE_FIRST = 5
@@ -82,10 +83,9 @@ class Prior:
         away = np.asarray(one, float) - other
         return float(np.sqrt(away @ np.linalg.solve(self.covariance, away)))
 
-    def share(self, covariance: np.ndarray) -> float:
-        """Largest standard deviation of a p over all directions, as a share of the prior's."""
-        whiten = np.linalg.inv(np.linalg.cholesky(self.covariance))
-        return float(np.sqrt(np.linalg.eigvalsh(whiten @ covariance @ whiten.T)[-1]))
+    def is_settled(self, covariance: np.ndarray) -> bool:
+        """Whether a p of this covariance, shape (bias_size, bias_size), is well known in every direction."""
+        return bool(bank.is_below(covariance, SETTLED**2 * self.covariance))
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,18 +124,23 @@ class Kalman:
         self.prior = Prior.of(schema)
         self._innovations = Innovations(schema)
         self._known = known = len(schema.biases)
-        self._mean = self.prior.known[:known]
+        mean = self.prior.known[:known]
         share = np.full(known, (1.0 - TRUST) / max(1, known))
-        away = [self.prior.between(schema.bias, p) for p in self._mean]
+        away = [self.prior.between(schema.bias, p) for p in mean]
         if known and min(away) < NARROW:
             share[int(np.argmin(away))] += TRUST
         else:
-            self._mean = np.concatenate([self._mean, schema.bias.astype(float)[None]])
+            mean = np.concatenate([mean, schema.bias.astype(float)[None]])
             share = np.append(share, TRUST)
-        self._covariance = np.repeat(NARROW**2 * self.prior.covariance[None], len(share), axis=0)
-        self._weight = np.log(share)
-        self._age = np.zeros(len(share))
+        self._count, room, size = len(share), known + BANK + 1, len(schema.bias)
+        self._beliefs = bank.Beliefs(
+            np.zeros((room, size)), np.zeros((room, size, size)), np.zeros(room), np.zeros(room)
+        )
+        self._beliefs.mean[: len(share)] = mean
+        self._beliefs.covariance[: len(share)] = NARROW**2 * self.prior.covariance
+        self._beliefs.weight[: len(share)] = np.log(share)
         self._near = NEAR * np.sqrt(np.diag(self.prior.covariance))
+        self._rules = bank.Rules(known, PASSES, HAZARD, FAMILIAR, DRIFT**2, FREEDOM, FAINTEST)
         self._scale = 1.0
         self._seen = 0
 
@@ -143,51 +148,15 @@ class Kalman:
         """Weigh all beliefs by a sample, and move those that are not of a known condition."""
         pairs = self._innovations.pairs(np.isfinite(row))
         if len(pairs.index):
-            self._begin_anew()
-            numbers = (self._known, PASSES, self._scale, FREEDOM, pairs.log_volume, FAINTEST)
-            shape = (pairs.through, pairs.tails, pairs.index, pairs.whiten)
-            beliefs = (self._mean, self._covariance, self._weight)
-            seen = bank.see(schema.ready.predictor, row, *beliefs, shape, self._near, numbers)
+            prior, shape = self.prior, (pairs.through, pairs.tails, pairs.index, pairs.whiten)
+            seen, self._count = bank.see(
+                schema.ready.predictor, row, self._beliefs, self._count, (prior.mean, prior.covariance), shape,
+                pairs.log_volume, self._near, self._scale, self._rules,
+            )  # fmt: skip
             self._seen += 1
             self._scale = max(1.0, self._scale * (1.0 + (seen - 1.0) / min(SCALE_FIRST + self._seen, SCALE_MEMORY)))
-            self._thin()
-        return self._found()
-
-    def _found(self) -> Recognition:
-        """The mean over all beliefs; its covariance contains how far they are apart."""
-        share = np.exp(self._weight)
-        share /= share.sum()
-        mean = share @ self._mean
-        away = self._mean - mean
-        covariance = np.einsum("h,hjk->jk", share, self._covariance) + np.einsum("h,hj,hk->jk", share, away, away)
-        since = round(float(self._age[int(np.argmax(self._weight))]))
-        return Recognition(mean, covariance, since, self.prior.share(covariance) < SETTLED)
-
-    def _begin_anew(self) -> None:
-        """The body may have changed just now, to a known condition or to a new one; everybody else is less sure."""
-        prior, known = self.prior, self._known
-        total = float(np.exp(self._weight).sum())
-        stays = np.exp(self._weight) * (1.0 - HAZARD)
-        comes = np.zeros(len(stays))
-        if known:
-            comes[:known] = HAZARD * FAMILIAR * total / known
-        unknown = HAZARD * (1.0 - FAMILIAR if known else 1.0) * total
-        self._age = np.append((stays * (self._age + 1) + comes) / (stays + comes), 1.0)
-        self._weight = np.log(np.append(stays + comes, unknown))
-        self._covariance[known:] += DRIFT**2 * prior.covariance
-        self._mean = np.concatenate([self._mean, prior.mean[None]])
-        self._covariance = np.concatenate([self._covariance, prior.covariance[None]])
-
-    def _thin(self) -> None:
-        """Too many filters: of the two whose ages differ least in proportion, the less likely goes."""
-        while len(self._weight) > self._known + BANK:
-            order = self._known + np.argsort(self._age[self._known :])
-            ratio = self._age[order][1:] / self._age[order][:-1]
-            closest = int(np.argmin(ratio))
-            one, other = order[closest], order[closest + 1]
-            gone = one if self._weight[one] < self._weight[other] else other
-            for name in ("_mean", "_covariance", "_weight", "_age"):
-                setattr(self, name, np.delete(getattr(self, name), gone, axis=0))
+        mean, covariance, age = bank.summary(self._beliefs, self._count)
+        return Recognition(mean, covariance, round(age), self.prior.is_settled(covariance))
 
 
 class GaussNewton:
@@ -203,8 +172,7 @@ class GaussNewton:
         """Take a sample and find p anew."""
         self._rows = [row, *self._rows[: RECENT - 1]]
         self._bias, covariance = solve(schema, self._innovations, self.prior, np.stack(self._rows), self._bias, FADE)
-        settled = self.prior.share(covariance) < SETTLED
-        return Recognition(self._bias.copy(), covariance, len(self._rows), settled)
+        return Recognition(self._bias.copy(), covariance, len(self._rows), self.prior.is_settled(covariance))
 
 
 def solve(

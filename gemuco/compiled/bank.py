@@ -1,10 +1,50 @@
 """One sample for a bank of beliefs about p; see `gemuco.bias.Kalman`, which says what it means."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from gemuco.compiled.innovation import innovations
 from gemuco.compiled.jit import jit
 from gemuco.compiled.newton import cholesky, substitute
+
+
+class Beliefs(NamedTuple):
+    """Room for as many beliefs as there may be, and one more while a sample is looked at.
+
+    Attributes:
+        mean: p of every belief, shape (room, k); the known conditions come first.
+        covariance: Of every p, shape (room, k, k).
+        weight: Logarithm of how likely each is, shape (room,).
+        age: Samples since which each is believed, shape (room,).
+    """
+
+    mean: np.ndarray
+    covariance: np.ndarray
+    weight: np.ndarray
+    age: np.ndarray
+
+
+class Rules(NamedTuple):
+    """Numbers that do not change; see the constants of `gemuco.bias` for what they mean.
+
+    Attributes:
+        known: How many of the beliefs are known conditions.
+        passes: How often a sample is linearised at most.
+        hazard: How often the body changes, per sample.
+        familiar: How often it then is a known condition.
+        drift: Variance of p's wandering per sample, as a share of the prior's.
+        freedom: Of the errors' t-distribution.
+        faintest: Logarithm of the smallest weight against the largest.
+    """
+
+    known: int
+    passes: int
+    hazard: float
+    familiar: float
+    drift: float
+    freedom: float
+    faintest: float
 
 
 @jit
@@ -36,52 +76,93 @@ def gained(slope, error, information, pull):
 
 
 @jit
-def errors_at(predictor, row, at, far, pairs, raw, slope):
-    """Errors of the beliefs that are `far`, and their derivatives, at p `at`, into `raw` and `slope`."""
-    chosen = np.flatnonzero(far)
-    size = at.shape[1]
-    rows, biases = np.empty((len(chosen), len(row))), np.empty((len(chosen), size), np.float32)
-    for i in range(len(chosen)):
-        for j in range(len(row)):
-            rows[i, j] = row[j]
-        for j in range(size):
-            biases[i, j] = at[chosen[i], j]
-    found, moved = innovations(predictor, rows, biases, *pairs)
-    for i in range(len(chosen)):
-        for n in range(raw.shape[1]):
-            raw[chosen[i], n] = found[i, n]
-            for j in range(size):
-                slope[chosen[i], n, j] = moved[i, n, j]
+def begin_anew(beliefs, count, mean, covariance, rules):
+    """The body may have changed just now, to a known condition or to a new one; everybody else is less sure.
+
+    Args:
+        beliefs: Are changed in place; the new one comes behind the last.
+        count: How many there are.
+        mean: Of the prior, shape (k,).
+        covariance: Of the prior, shape (k, k).
+        rules: Numbers.
+    """
+    total = 0.0
+    for h in range(count):
+        total += np.exp(beliefs.weight[h])
+    for h in range(count):
+        stays = np.exp(beliefs.weight[h]) * (1.0 - rules.hazard)
+        comes = rules.hazard * rules.familiar * total / rules.known if h < rules.known else 0.0
+        beliefs.age[h] = (stays * (beliefs.age[h] + 1.0) + comes) / (stays + comes)
+        beliefs.weight[h] = np.log(stays + comes)
+        if h >= rules.known:
+            add(beliefs.covariance[h], covariance, rules.drift, beliefs.covariance[h])
+    unknown = rules.hazard * (1.0 - rules.familiar if rules.known else 1.0)
+    beliefs.age[count], beliefs.weight[count] = 1.0, np.log(unknown * total)
+    beliefs.mean[count], beliefs.covariance[count] = mean, covariance
 
 
 @jit
-def place_newcomer(at, raw, slope):
-    """The last belief knows nothing: it is linearised where the sample fits best."""
-    nearest, least, last = 0, np.inf, len(at) - 1
-    for h in range(len(at)):
+def thin(beliefs, count, most, known):
+    """Too many filters: of the two whose ages differ least in proportion, the less likely goes; returns how many stay."""
+    while count > most:
+        order = np.arange(known, count)
+        for i in range(1, len(order)):
+            j = i
+            while j and beliefs.age[order[j - 1]] > beliefs.age[order[j]]:
+                order[j - 1], order[j] = order[j], order[j - 1]
+                j -= 1
+        closest, least = 0, np.inf
+        for i in range(len(order) - 1):
+            ratio = beliefs.age[order[i + 1]] / beliefs.age[order[i]]
+            if ratio < least:
+                closest, least = i, ratio
+        one, other = order[closest], order[closest + 1]
+        gone = one if beliefs.weight[one] < beliefs.weight[other] else other
+        count -= 1
+        for h in range(gone, count):
+            beliefs.mean[h], beliefs.covariance[h] = beliefs.mean[h + 1], beliefs.covariance[h + 1]
+            beliefs.weight[h], beliefs.age[h] = beliefs.weight[h + 1], beliefs.age[h + 1]
+    return count
+
+
+@jit
+def point_near(points, at, near):
+    """The first of some points that a p, shape (k,), differs from by no more than `near`; -1 if there is none."""
+    for i in range(len(points)):
+        is_near = True
+        for j in range(len(at)):
+            is_near &= abs(points[i, j] - at[j]) <= near[j]
+        if is_near:
+            return i
+    return -1
+
+
+@jit
+def best_point(raw):
+    """Which point the sample fits best, of errors of shape (points, n)."""
+    nearest, least = 0, np.inf
+    for i in range(len(raw)):
         square = 0.0
         for n in range(raw.shape[1]):
-            square += raw[h, n] * raw[h, n]
+            square += raw[i, n] * raw[i, n]
         if square < least:
-            nearest, least = h, square
-    for j in range(at.shape[1]):
-        at[last, j] = at[nearest, j]
-    for n in range(raw.shape[1]):
-        raw[last, n] = raw[nearest, n]
-        for j in range(at.shape[1]):
-            slope[last, n, j] = slope[nearest, n, j]
+            nearest, least = i, square
+    return nearest
 
 
 @jit
 def linearise(predictor, row, mean, pairs, near, passes, error, slope, before, scale):
     """Errors and derivatives of every belief where the sample moves it to, as if they had been taken at `mean`.
 
+    A belief takes the errors and derivatives of another one's point if that is near enough. The last belief knows
+    nothing: it is linearised first where the sample fits best.
+
     Args:
         predictor: The network.
         row: The sample [standard deviations], shape (size,).
         mean: p of every belief, shape (beliefs, k).
         pairs: `through`, `tails`, `index` and `whiten` of `innovations`.
-        near: What moves less than this, shape (k,), is not linearised again.
+        near: A p that differs from a point by no more than this, shape (k,), is linearised there.
         passes: How often at most.
         error: Is filled in, shape (beliefs, n).
         slope: Is filled in, shape (beliefs, n, k).
@@ -89,30 +170,41 @@ def linearise(predictor, row, mean, pairs, near, passes, error, slope, before, s
         scale: Of the errors' variance.
     """
     count, size = mean.shape
-    at, far, raw = mean.copy(), np.ones(count, np.bool_), np.empty_like(error)
+    width = error.shape[1]
+    points, raw = np.empty((count * passes, size)), np.empty((count * passes, width))
+    moved, done = np.empty((count * passes, width, size)), 0
+    at, far, chosen = mean.copy(), np.ones(count, np.bool_), np.zeros(count, np.int64)
     information, pull = np.empty((size, size)), np.empty(size)
     for turn in range(passes):
-        if not far.any():
-            break
-        errors_at(predictor, row, at, far, pairs, raw, slope)
+        fresh = done
+        for h in range(count):
+            if far[h]:
+                chosen[h] = point_near(points[:done], at[h], near)
+                if chosen[h] < 0:
+                    points[done], chosen[h] = at[h], done
+                    done += 1
+        if done > fresh:
+            some = points[fresh:done].astype(np.float32)
+            raw[fresh:done], moved[fresh:done] = innovations(predictor, row.reshape(1, -1), some, *pairs)
         if turn == 0:
-            place_newcomer(at, raw, slope)
+            chosen[count - 1] = best_point(raw[:done])
         for h in range(count):
             if not far[h]:
                 continue
-            for n in range(error.shape[1]):
-                error[h, n] = raw[h, n]
+            point = chosen[h]
+            for n in range(width):
+                error[h, n] = raw[point, n]
                 for j in range(size):
-                    error[h, n] -= slope[h, n, j] * (mean[h, j] - at[h, j])
+                    slope[h, n, j] = moved[point, n, j]
+                    error[h, n] -= slope[h, n, j] * (mean[h, j] - points[point, j])
             gained(slope[h], error[h], information, pull)
             add(before[h], information, 1.0 / scale, information)
             cholesky(information)
             substitute(information, pull)
             far[h] = False
             for j in range(size):
-                there = mean[h, j] + pull[j] / scale
-                far[h] |= abs(there - at[h, j]) > near[j]
-                at[h, j] = there
+                at[h, j] = mean[h, j] + pull[j] / scale
+                far[h] |= abs(at[h, j] - points[point, j]) > near[j]
 
 
 @jit
@@ -140,31 +232,26 @@ def oddness(before, information, pull, error, scale):
 
 
 @jit
-def see(predictor, row, mean, covariance, weight, pairs, near, numbers):
-    """Weigh all beliefs by a sample, and move those that are not of a known condition.
+def weigh(mean, covariance, weight, error, slope, before, volumes, log_volume, scale, rules):
+    """Weigh all beliefs by a linearised sample, and move those that are not of a known condition.
 
     Args:
-        predictor: The network.
-        row: The sample [standard deviations], shape (size,).
-        mean: p of every belief, shape (beliefs, k); the last one is the newcomer.
+        mean: p of every belief, shape (beliefs, k).
         covariance: Of every p, shape (beliefs, k, k).
         weight: Logarithm of how likely each is, shape (beliefs,).
-        pairs: `through`, `tails`, `index` and `whiten` of `innovations`.
-        near: What moves less than this is not linearised again, shape (k,).
-        numbers: How many conditions are known, how often it is linearised, the errors' scale and degrees of freedom,
-            the logarithm of their volume, and of the smallest weight.
+        error: Of every belief, shape (beliefs, n).
+        slope: Of every belief, shape (beliefs, n, k).
+        before: Inverse of the covariance, shape (beliefs, k, k).
+        volumes: Logarithm of the determinant of the covariance, shape (beliefs,).
+        log_volume: Of the errors' covariance.
+        scale: Of the errors' variance.
+        rules: Numbers.
 
     Returns:
         How odd the sample was for all of them, 1 if as usual. `mean`, `covariance` and `weight` are changed in place.
     """
-    known, passes, scale, freedom, log_volume, faintest = numbers
     count, size = mean.shape
-    n = len(pairs[2])
-    error, slope = np.empty((count, n)), np.empty((count, n, size))
-    before, volumes = np.empty((count, size, size)), np.empty(count)
-    for h in range(count):
-        volumes[h] = invert(covariance[h], before[h])
-    linearise(predictor, row, mean, pairs, near, passes, error, slope, before, scale)
+    n, freedom = error.shape[1], rules.freedom
     information, pull = np.empty((size, size)), np.empty(size)
     share, oddity = 0.0, 0.0
     for h in range(count):
@@ -176,7 +263,7 @@ def see(predictor, row, mean, covariance, weight, pairs, near, numbers):
         oddity += foretold * trust * odd
         volume = log_volume + n * np.log(scale) + volumes[h] + gain
         weight[h] -= 0.5 * volume + 0.5 * (freedom + n) * np.log1p(odd / freedom)
-        if h >= known:
+        if h >= rules.known:
             counts = min(trust, 1.0) / scale
             add(before[h], information, counts, information)
             invert(information, covariance[h])
@@ -185,5 +272,81 @@ def see(predictor, row, mean, covariance, weight, pairs, near, numbers):
                     mean[h, i] += covariance[h, i, j] * pull[j] * counts
     largest = weight.max()
     for h in range(count):
-        weight[h] = max(weight[h] - largest, faintest)
+        weight[h] = max(weight[h] - largest, rules.faintest)
     return oddity / share / n
+
+
+@jit
+def see(predictor, row, beliefs, count, prior, pairs, log_volume, near, scale, rules):
+    """Weigh all beliefs by a sample, and move those that are not of a known condition.
+
+    Args:
+        predictor: The network.
+        row: The sample [standard deviations], shape (size,).
+        beliefs: Are changed in place.
+        count: How many there are.
+        prior: Mean, shape (k,), and covariance, shape (k, k), of the p of a body that is not known.
+        pairs: `through`, `tails`, `index` and `whiten` of `innovations`.
+        log_volume: Logarithm of the determinant of the errors' covariance.
+        near: See `linearise`, shape (k,).
+        scale: Of the errors' variance.
+        rules: Numbers.
+
+    Returns:
+        How odd the sample was for all of them, 1 if as usual, and how many beliefs there are now.
+    """
+    begin_anew(beliefs, count, prior[0], prior[1], rules)
+    count += 1
+    mean, covariance, weight = beliefs.mean[:count], beliefs.covariance[:count], beliefs.weight[:count]
+    size, n = mean.shape[1], len(pairs[2])
+    error, slope = np.empty((count, n)), np.empty((count, n, size))
+    before, volumes = np.empty((count, size, size)), np.empty(count)
+    for h in range(count):
+        volumes[h] = invert(covariance[h], before[h])
+    linearise(predictor, row, mean, pairs, near, rules.passes, error, slope, before, scale)
+    odd = weigh(mean, covariance, weight, error, slope, before, volumes, log_volume, scale, rules)
+    return odd, thin(beliefs, count, len(beliefs.age) - 1, rules.known)
+
+
+@jit
+def summary(beliefs, count):
+    """The mean over all beliefs, shape (k,), its covariance, which contains how far they are apart, and the age."""
+    size = beliefs.mean.shape[1]
+    mean, covariance, away = np.zeros(size), np.zeros((size, size)), np.empty(size)
+    total, likeliest = 0.0, 0
+    for h in range(count):
+        total += np.exp(beliefs.weight[h])
+        if beliefs.weight[h] > beliefs.weight[likeliest]:
+            likeliest = h
+    for h in range(count):
+        share = np.exp(beliefs.weight[h]) / total
+        for j in range(size):
+            mean[j] += share * beliefs.mean[h, j]
+    for h in range(count):
+        share = np.exp(beliefs.weight[h]) / total
+        for j in range(size):
+            away[j] = beliefs.mean[h, j] - mean[j]
+        for j in range(size):
+            for k in range(size):
+                covariance[j, k] += share * (beliefs.covariance[h, j, k] + away[j] * away[k])
+    return mean, covariance, beliefs.age[likeliest]
+
+
+@jit
+def is_below(covariance, limit):
+    """Whether a covariance is smaller than another one in every direction, shapes (k, k): their difference is positive
+    definite, so that Cholesky's method finds no number that has no root."""
+    size = len(covariance)
+    lower = np.empty((size, size))
+    for i in range(size):
+        for j in range(i + 1):
+            total = limit[i, j] - covariance[i, j]
+            for k in range(j):
+                total -= lower[i, k] * lower[j, k]
+            if i == j:
+                if not total > 0.0:
+                    return False
+                lower[i, i] = np.sqrt(total)
+            else:
+                lower[i, j] = total / lower[j, j]
+    return True

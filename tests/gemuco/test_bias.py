@@ -197,48 +197,106 @@ def test_what_was_predicted_is_what_the_network_says(grips):
     np.testing.assert_allclose(plain[: len(inside)], expected[inside], atol=1e-5)
 
 
+def plain_begin_anew(kalman, prior):
+    """Mean, covariance, weight and age of all beliefs after the body may have changed, in numpy."""
+    count, known = kalman._count, kalman._known
+    mean, covariance, log_weight, age = (array[:count].copy() for array in kalman._beliefs)
+    weight = np.exp(log_weight)
+    stays, comes = weight * (1.0 - bias.HAZARD), np.zeros(count)
+    comes[:known] = bias.HAZARD * bias.FAMILIAR * weight.sum() / known
+    unknown = bias.HAZARD * (1.0 - bias.FAMILIAR) * weight.sum()
+    covariance[known:] += bias.DRIFT**2 * prior.covariance
+    return (
+        np.concatenate([mean, prior.mean[None]]),
+        np.concatenate([covariance, prior.covariance[None]]),
+        np.log(np.append(stays + comes, unknown)),
+        np.append((stays * (age + 1) + comes) / (stays + comes), 1.0),
+    )
+
+
+def plain_thin(beliefs, known):
+    """Of two filters whose ages differ least in proportion the less likely goes, until there are few enough."""
+    mean, covariance, weight, age = beliefs
+    while len(weight) > known + bias.BANK:
+        order = known + np.argsort(age[known:])
+        closest = int(np.argmin(age[order][1:] / age[order][:-1]))
+        one, other = order[closest], order[closest + 1]
+        gone = one if weight[one] < weight[other] else other
+        mean, covariance, weight, age = (np.delete(array, gone, axis=0) for array in (mean, covariance, weight, age))
+    return mean, covariance, weight, age
+
+
 def plain_see(kalman, schema, row):
     """`Kalman.see` in numpy, as it is derived: the oracle of the compiled one."""
     pairs = kalman._innovations.pairs(np.isfinite(row))
-    kalman._begin_anew()
-    rows, at, scale = np.repeat(row[None], len(kalman._mean), axis=0), kalman._mean.copy(), kalman._scale
+    means, covariances, weights, ages = plain_begin_anew(kalman, kalman.prior)
+    rows, at, scale = np.repeat(row[None], len(means), axis=0), means.copy(), kalman._scale
     known, count = kalman._known, len(pairs.index)
-    before = np.linalg.inv(kalman._covariance)
+    before = np.linalg.inv(covariances)
     for turn in range(bias.PASSES):
         error, slope = kalman._innovations.of(schema, pairs, rows, at.astype(np.float32))
         if turn == 0:
             nearest = int(np.argmin((error**2).sum(axis=1)))
             at[-1], error[-1], slope[-1] = at[nearest], error[nearest], slope[nearest]
-        error = error - np.einsum("hnk,hk->hn", slope, kalman._mean - at)
+        error = error - np.einsum("hnk,hk->hn", slope, means - at)
         gained, pull = np.einsum("hnj,hnk->hjk", slope, slope), np.einsum("hnk,hn->hk", slope, error)
         step = np.linalg.solve(before + gained / scale, pull[..., None] / scale)[..., 0]
-        at = kalman._mean + step
+        at = means + step
     odd = np.maximum((error**2).sum(axis=1) / scale - (pull * step).sum(axis=1) / scale, 0.0)
-    volume = pairs.log_volume + count * np.log(scale) + np.linalg.slogdet(kalman._covariance)[1]
+    volume = pairs.log_volume + count * np.log(scale) + np.linalg.slogdet(covariances)[1]
     volume = volume + np.linalg.slogdet(before + gained / scale)[1]
-    weight = kalman._weight - 0.5 * volume - 0.5 * (bias.FREEDOM + count) * np.log1p(odd / bias.FREEDOM)
+    weight = weights - 0.5 * volume - 0.5 * (bias.FREEDOM + count) * np.log1p(odd / bias.FREEDOM)
     trust = np.minimum((bias.FREEDOM + count) / (bias.FREEDOM + odd), 1.0)
     after = np.linalg.inv(before + gained * (trust / scale)[:, None, None])
-    mean, covariance = kalman._mean.copy(), kalman._covariance.copy()
+    mean, covariance = means.copy(), covariances.copy()
     mean[known:] += np.einsum("hjk,hk->hj", after, pull * (trust / scale)[:, None])[known:]
     covariance[known:] = after[known:]
-    return mean, covariance, np.maximum(weight - weight.max(), bias.FAINTEST)
+    return plain_thin((mean, covariance, np.maximum(weight - weight.max(), bias.FAINTEST), ages), known)
 
 
 @pytest.mark.parametrize("near", [0.0, bias.NEAR])
 def test_the_compiled_bank_is_the_derived_one(grips, near):
-    """Where all is linearised twice; and nearly so where what hardly moves is not linearised again."""
+    """Where all is linearised twice; and nearly so where what hardly moves, or is near another, is not."""
     schema = grips.under(LONG)
     compiled, tight = Kalman(schema), near == 0.0
     compiled._near = compiled._near * (near / bias.NEAR)
-    compiled._thin = lambda: None  # so that both have the same beliefs afterwards
-    walk = TOOLS[BENT].walk(6, 3)
+    walk = TOOLS[BENT].walk(15, 3)
     spread = np.sqrt(np.diag(compiled.prior.covariance))
-    for index in range(6):
+    for index in range(15):
         row = schema.normalise_one({name: array[index] for name, array in walk.items()})
-        mean, covariance, weight = plain_see(copy.deepcopy(compiled), schema, row)
+        mean, covariance, weight, age = plain_see(copy.deepcopy(compiled), schema, row)
         compiled.see(schema, row)
-        assert np.abs((compiled._mean - mean) / spread).max() < (1e-3 if tight else 0.05)
+        found = [array[: compiled._count] for array in compiled._beliefs]
+        assert compiled._count == len(mean) <= compiled._known + bias.BANK
+        assert np.abs((found[0] - mean) / spread).max() < (1e-3 if tight else 0.05)
         if tight:
-            np.testing.assert_allclose(compiled._covariance, covariance, rtol=1e-3, atol=1e-6)
-            np.testing.assert_allclose(compiled._weight, weight, atol=0.02)
+            np.testing.assert_allclose(found[1], covariance, rtol=1e-3, atol=1e-6)
+            np.testing.assert_allclose(found[2], weight, atol=0.02)
+            np.testing.assert_allclose(found[3], age, rtol=1e-9)
+
+
+def test_what_is_believed_is_the_mean_over_all_beliefs(grips):
+    kalman = Kalman(grips.under(LONG))
+    for row in grips.normalise(NEW.walk(8, 6)):
+        found = kalman.see(grips, row)
+        mean, covariance, weight, age = (array[: kalman._count] for array in kalman._beliefs)
+        share = np.exp(weight) / np.exp(weight).sum()
+        away = mean - share @ mean
+        spread = np.einsum("h,hjk->jk", share, covariance) + np.einsum("h,hj,hk->jk", share, away, away)
+        np.testing.assert_allclose(found.bias, share @ mean, rtol=1e-9)
+        np.testing.assert_allclose(found.covariance, spread, rtol=1e-9, atol=1e-15)
+        assert found.since == round(age[np.argmax(weight)])
+        whiten = np.linalg.inv(np.linalg.cholesky(kalman.prior.covariance))
+        largest = np.sqrt(np.linalg.eigvalsh(whiten @ spread @ whiten.T)[-1])
+        assert found.is_settled == (largest < bias.SETTLED)
+
+
+def test_beliefs_that_share_a_linearisation_find_the_same(grips):
+    """On walks with one tool and then another: as far as the bank that linearises every belief by itself."""
+    shared, alone = (Kalman(grips.under(LONG)) for _ in range(2))
+    alone._near = np.zeros_like(alone._near)
+    rows = np.concatenate([grips.normalise(arm.walk(25, seed)) for seed, arm in enumerate((NEW, TOOLS[SHORT], NEW))])
+    for row in rows:
+        one, other = shared.see(grips, row), alone.see(grips, row)
+        assert Prior.of(grips).between(one.bias, other.bias) < 0.02
+        assert abs(one.since - other.since) <= 1
