@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from gemuco.compiled import bank
+from gemuco.compiled import bank, beliefs
 from gemuco.innovation import Innovations
 
 if TYPE_CHECKING:
@@ -85,7 +85,7 @@ class Prior:
 
     def is_settled(self, covariance: np.ndarray) -> bool:
         """Whether a p of this covariance, shape (bias_size, bias_size), is well known in every direction."""
-        return bool(bank.is_below(covariance, SETTLED**2 * self.covariance))
+        return bool(beliefs.is_below(covariance, SETTLED**2 * self.covariance))
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,14 +133,14 @@ class Kalman:
             mean = np.concatenate([mean, schema.bias.astype(float)[None]])
             share = np.append(share, TRUST)
         self._count, room, size = len(share), known + BANK + 1, len(schema.bias)
-        self._beliefs = bank.Beliefs(
+        self._beliefs = beliefs.Beliefs(
             np.zeros((room, size)), np.zeros((room, size, size)), np.zeros(room), np.zeros(room)
         )
         self._beliefs.mean[: len(share)] = mean
         self._beliefs.covariance[: len(share)] = NARROW**2 * self.prior.covariance
         self._beliefs.weight[: len(share)] = np.log(share)
         self._near = NEAR * np.sqrt(np.diag(self.prior.covariance))
-        self._rules = bank.Rules(known, PASSES, HAZARD, FAMILIAR, DRIFT**2, FREEDOM, FAINTEST)
+        self._rules = beliefs.Rules(known, PASSES, HAZARD, FAMILIAR, DRIFT**2, FREEDOM, FAINTEST)
         self._scale = 1.0
         self._seen = 0
 
@@ -155,7 +155,7 @@ class Kalman:
             )  # fmt: skip
             self._seen += 1
             self._scale = max(1.0, self._scale * (1.0 + (seen - 1.0) / min(SCALE_FIRST + self._seen, SCALE_MEMORY)))
-        mean, covariance, age = bank.summary(self._beliefs, self._count)
+        mean, covariance, age = beliefs.summary(self._beliefs, self._count)
         return Recognition(mean, covariance, round(age), self.prior.is_settled(covariance))
 
 

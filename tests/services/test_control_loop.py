@@ -179,3 +179,22 @@ def test_a_solve_that_runs_out_of_time_sends_the_best_so_far_and_is_counted() ->
     assert solver.late == 1
     assert late.shape == in_time.shape
     assert np.isfinite(late).all()
+
+
+def test_another_model_is_used_at_once_and_a_reference_that_moves_keeps_the_layout() -> None:
+    robot, living = arm(), LivingModel(small_model())
+    config = model_config(robot).control
+    assert config is not None
+    solver = ModelSolver(living, robot, config)
+    target = {config.target: np.full(robot.signals[config.target].size, 0.1)}
+    solver(target, {})
+    laid = list(solver._controller._search._laid.values())
+    moved = {config.target: target[config.target] + 0.01}
+    solver(moved, {})
+    assert list(solver._controller._search._laid.values()) == laid
+    arrays = [array * np.float32(1.02) for array in living.schema.weights.arrays()]
+    living.swap(living.schema.with_weights(living.schema.weights.replaced(arrays)))
+    before = solver._command
+    after = solver(moved, {})
+    assert solver._controller.schema is living.schema
+    assert np.abs(after - before).max() > 0.0
