@@ -15,8 +15,9 @@ from pathlib import Path
 import numpy as np
 
 from gemuco.dataset import Dataset, Episode
+from gemuco.mask_training import train_masks
 from gemuco.schema import BodySchema
-from gemuco.structure import Judge, Thresholds, determine, train_masks
+from gemuco.structure import Judge, Thresholds, determine
 from gemuco.train import fit
 from services.learning.measured import MeasuredConfig, load_measured, read
 from services.learning.trainer import train_config

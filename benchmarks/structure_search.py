@@ -15,8 +15,9 @@ import time
 import numpy as np
 
 from benchmarks.synthetic_body import SyntheticBody
+from gemuco.mask_training import train_masks
 from gemuco.masks import bits
-from gemuco.structure import Judge, Thresholds, search, select, train_masks
+from gemuco.structure import Judge, Thresholds, search, select
 from gemuco.train import TrainConfig
 
 CONFIG = TrainConfig(hidden=(200, 100), latent=40, activation="relu", epochs=100, batch=500, rate=3e-3)

@@ -5,8 +5,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gemuco import outliers
+from gemuco.compiled.chain import pack
+from gemuco.compiled.masks import squares, sums
 from gemuco.dataset import Dataset
-from gemuco.kernels import Chain, run
+from gemuco.kernels import Chain
 from gemuco.material import Material
 from gemuco.scaler import CLIP
 from gemuco.schema import BodySchema
@@ -15,6 +17,10 @@ from gemuco.task import Task
 
 RARE = 0.05
 """An outlier is rare: where more than this share of a signal would be, the model is wrong, and all counts."""
+TOLD = 30
+"""An error of single rows is an estimate where at least so many tell of every living element."""
+TOGETHER = 2_000_000
+"""So many squared errors of single rows are held at a time, about."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,6 +82,10 @@ class MaskErrors:
             return self
         return self._rows(np.linspace(0, len(self.x) - 1, rows).astype(int))
 
+    def drawn(self, rows: int, seed: int = 0) -> "MaskErrors":
+        """On so many rows at random; those of fewer are among those of more."""
+        return self._rows(np.random.default_rng(seed).permutation(len(self.x))[:rows])
+
     def of(self, bits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Errors under masks.
 
@@ -84,17 +94,31 @@ class MaskErrors:
 
         Returns:
             Share of the variance of every signal that every mask leaves unexplained, shape (masks, signals), NaN where
-            no row tells; and how much of each signal there is to explain, shape (signals,): its elements, if all vary.
+            no row tells; and `amounts`.
         """
-        starts = np.cumsum([0, *self._sizes[:-1]])
-        variance = np.add.reduceat(self.liveliness, starts)
-        found = np.empty((len(bits), len(starts)))
-        for index, chosen in enumerate(bits):
-            squared, count = self._squared(chosen, np.repeat(chosen, self._sizes))
-            measured = np.add.reduceat(np.where(count > 0, self.liveliness, 0.0), starts)
-            missed = np.add.reduceat(squared / np.maximum(count, 1), starts)
-            found[index] = np.where(measured > 0, missed / np.maximum(measured, 1e-12), np.nan)
-        return found, variance
+        squared, count = self._squared(bits)
+        measured = self._by_signal(np.where(count > 0, self.liveliness, 0.0))
+        missed = self._by_signal(squared / np.maximum(count, 1))
+        return np.where(measured > 0, missed / np.maximum(measured, 1e-12), np.nan), self.amounts
+
+    def by_row(self, bits: np.ndarray) -> np.ndarray:
+        """What every row adds to the errors of `of`, which are means over rows, shape (masks, rows, signals).
+
+        NaN for a signal that has a living element of which fewer than `TOLD` rows tell.
+        """
+        rows, *_ = self._arrays()
+        chain, found = pack(self.chain), np.empty((len(bits), *self.whole.shape), np.float32)
+        step = max(1, TOGETHER // max(1, self.x.size))
+        for begin in range(0, len(bits), step):
+            part = bits[begin : begin + step]
+            squared = squares(chain, rows, self.x, *self._gates(part))
+            told = self._usable(part).T[:, :, None] & self.there  # (masks, rows, size)
+            count = told.sum(axis=1, keepdims=True)
+            measured = self._by_signal(np.where(count > 0, self.liveliness, 0.0))
+            scarce = self._by_signal((count < TOLD) & (self.liveliness > 0.0)) > 0
+            shares = self._by_signal(squared * told * (len(rows) / np.maximum(count, 1)).astype(np.float32))
+            found[begin : begin + step] = np.where(scarce, np.nan, shares / np.maximum(measured, 1e-12))
+        return found
 
     def from_others(self, signal: int) -> float:
         """Error of a signal (by its index) from all others; NaN if no row tells.
@@ -110,10 +134,15 @@ class MaskErrors:
         patterns, which = np.unique(self.whole & others, axis=0, return_inverse=True)
         for index in np.flatnonzero(patterns.any(axis=1)):
             part = self._rows(np.flatnonzero(which.ravel() == index))
-            squared, rows = part._squared(patterns[index], np.repeat(patterns[index], self._sizes))
-            total, count = total + squared, count + rows
+            squared, rows = part._squared(patterns[index : index + 1])
+            total, count = total + squared[0], count + rows[0]
         known = self.liveliness[span] * (count[span] > 0)
         return float((total[span] / np.maximum(count[span], 1)).sum() / known.sum()) if known.any() else float("nan")
+
+    @property
+    def amounts(self) -> np.ndarray:
+        """How much of each signal there is to explain, shape (signals,): its elements, if all vary."""
+        return self._by_signal(self.liveliness)
 
     @property
     def _sizes(self) -> list[int]:
@@ -122,11 +151,25 @@ class MaskErrors:
     def _rows(self, chosen: np.ndarray) -> "MaskErrors":
         return replace(self, **{name: getattr(self, name)[chosen] for name in ("x", "there", "whole", "p")})
 
-    def _squared(self, chosen: np.ndarray, gate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Sum of squared errors of every element, and of how many rows, shapes (size,)."""
-        usable = self.whole[:, chosen].all(axis=1)
-        rows = slice(None) if usable.all() else usable
-        truth, there = self.x[rows], self.there[rows]
-        tail = np.broadcast_to(chosen.astype(np.float32), (len(truth), len(chosen)))
-        told = run(self.chain, np.concatenate([truth * gate, tail, self.p[rows]], axis=1, dtype=np.float32))
-        return np.where(there, (told - truth) ** 2, 0.0).sum(axis=0, dtype=float), there.sum(axis=0)
+    def _by_signal(self, elements: np.ndarray) -> np.ndarray:
+        """Sums over the elements of every signal, shape (..., size) -> (..., signals)."""
+        return np.asarray(np.add.reduceat(elements, np.cumsum([0, *self._sizes[:-1]]), axis=-1))
+
+    def _squared(self, bits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Sum of squared errors of every element, and of how many rows, shapes (masks, size)."""
+        rows, known, whole = self._arrays()
+        squared = sums(pack(self.chain), rows, self.x, known, whole, *self._gates(bits))
+        return squared, self._usable(bits).T.astype(np.float32) @ known
+
+    def _arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What the network is given of every row, which elements count (1 or 0), and which signals are whole."""
+        rows = np.ascontiguousarray(np.concatenate([self.x, self.p], axis=1, dtype=np.float32))
+        return rows, self.there.astype(np.float32), np.ascontiguousarray(self.whole)
+
+    def _gates(self, bits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Elements that masks let through, shape (masks, size), and their signals, shape (masks, signals): 1 or 0."""
+        return np.repeat(bits, self._sizes, axis=1).astype(np.float32), bits.astype(np.float32)
+
+    def _usable(self, bits: np.ndarray) -> np.ndarray:
+        """Which rows have all signals of a mask, shape (rows, masks)."""
+        return np.asarray((~self.whole).astype(np.float32) @ bits.T.astype(np.float32) < 0.5)

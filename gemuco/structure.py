@@ -2,10 +2,11 @@
 
 Up to 10 signals every mask is tried, and there are 2^n - 1 of them; with more the border between too little and enough
 is searched for (`mask_search`). Either way a mask is feasible only if its own error was measured and is small enough.
+Of many masks most can be told to be hopeless from a few of the rows (`Judge.race`); feasible ones get all rows.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,21 +16,25 @@ from gemuco.errors import NotEnoughData, SchemaError
 from gemuco.mask_choice import choose
 from gemuco.mask_errors import MaskErrors
 from gemuco.mask_search import find_border
+from gemuco.mask_training import LISTED, train_masks
 from gemuco.masks import Mask, all_masks, bits, label
-from gemuco.scaler import Scaler
 from gemuco.signals import Layout
-from gemuco.train import Progress, TrainConfig, fit
+from gemuco.train import Progress, TrainConfig
 
-LISTED = 10
-"""Up to so many signals every mask is tried."""
 MOST_MASKS = 64
 """A schema gets at most so many masks: each is trained, has its errors measured, and is looked at in every estimate."""
-TRAINED = 2000
-"""With more signals the network is trained with so many masks, and is right about the others too."""
 BUDGET = 20_000
 """About how many masks the search tries at most."""
 ROWS = 1000
 """Held-out rows that judge a mask, at most."""
+OUTRIGHT = 5
+"""Up to so many signals every mask is measured on all of them; those of more race."""
+HEATS = (64, 256)
+"""Rows of a race before all of them."""
+SURE = 4.0
+"""A mask is out of the race when its error is so many standard errors above the threshold. Were squared errors normal,
+1 of 12 000 masks that lie right at the threshold would be lost in a heat; they are skewed, and that errs the other way:
+where a sample makes a mask look too bad, a few rows do, and the standard error is large too."""
 SHOWN = 40
 """Lines of the report's table of masks."""
 
@@ -80,6 +85,8 @@ class Structure:
         L_m: Mask -> error of x_out, of every mask that was tried.
         thresholds: What the errors were compared with.
         is_whole: Whether every mask was tried, or the search ended with nothing left to look at.
+        rough: Masks whose L_m is an estimate from at least `HEATS[0]` rows of a split, in place of all that judge: it
+            is above the threshold by more than `SURE` standard errors, so they are not feasible.
     """
 
     layout: Layout
@@ -90,6 +97,7 @@ class Structure:
     L_m: dict[Mask, float]
     thresholds: Thresholds
     is_whole: bool = True
+    rough: frozenset[Mask] = frozenset()
 
     @property
     def feasible(self) -> tuple[Mask, ...]:
@@ -119,6 +127,11 @@ class Structure:
                 f"{len(self.feasible)} of {len(self.L_m)} tried masks are feasible; the {len(self.masks)} that serve "
                 "random sets of available signals best are kept."
             )
+        if self.rough:
+            found.append(
+                f"L_m of {len(self.rough)} masks, marked ~, is an estimate from few rows: they are above the threshold "
+                f"by more than {SURE:g} standard errors. That of the others is from all rows that judge."
+            )
         if not self.is_whole:
             found.append("The search stopped at its budget: there may be feasible masks that it did not see.")
         return tuple(found)
@@ -134,8 +147,9 @@ class Structure:
             lines.append(f"{name:<{width}}  {value:7.3f}  {'yes' if name in self.x_out else 'no'}")
         lines += ["", f"{'mask':<{width}}  {'L_m':>7}  feasible if below {self.thresholds.into:g}"]
         for m in shown:
-            feasible = self.L_m[m] < self.thresholds.into
-            lines.append(f"{label(m, self.layout.names):<{width}}  {self.L_m[m]:7.3f}  {'yes' if feasible else 'no'}")
+            answer = "yes" if self.L_m[m] < self.thresholds.into else "no"
+            error = f"{'~' if m in self.rough else ''}{self.L_m[m]:.3f}"
+            lines.append(f"{label(m, self.layout.names):<{width}}  {error:>7}  {answer}")
         if len(shown) < len(self.L_m):
             lines.append(f"and {len(self.L_m) - len(shown)} more")
         lines += ["", f"x_in  = {', '.join(self.x_in)}", f"x_out = {', '.join(self.x_out)}", *self.remarks]
@@ -161,15 +175,10 @@ class Judge:
         self.errors = [split.thinned(ROWS) for split in errors]
         self.tried = 0
         self.L_i = {
-            name: self._measured(float(np.mean([split.from_others(i) for split in self.errors])))
+            name: float(self._measured(float(np.mean([split.from_others(i) for split in self.errors]))))
             for i, name in enumerate(names)
         }
         self.outputs = np.array([self.L_i[name] < thresholds.out for name in self.names])
-
-    def _measured(self, squared: float) -> float:
-        if not np.isfinite(squared):
-            return float("inf")
-        return float(squared if self.thresholds.measure == "mse" else np.sqrt(squared))
 
     def is_judged(self, masks: np.ndarray) -> np.ndarray:
         """Whether a mask leaves any output to infer, shape (n,): the others are not judged (paper, II-E.3)."""
@@ -177,19 +186,69 @@ class Judge:
 
     def of(self, masks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Errors of the outputs, shape (n,), and squared errors of every signal, shape (n, signals)."""
-        found, sizes = self._mean(masks)
-        judged = np.broadcast_to(self.outputs, masks.shape)
-        if self.thresholds.over == "masked":
-            judged = judged & ~masks
-        weights = (judged & np.isfinite(found)) * sizes
-        total = weights.sum(axis=1)
-        squared = (np.nan_to_num(found) * weights).sum(axis=1) / np.where(total > 0.0, total, 1.0)
-        return np.array([self._measured(value) for value in np.where(total > 0.0, squared, np.nan)]), found
-
-    def _mean(self, masks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Squared errors of every signal over all splits, shape (n, signals), and its elements, shape (signals,)."""
         found, sizes = zip(*(errors.of(masks) for errors in self.errors), strict=True)
-        return np.mean(found, axis=0), np.max(sizes, axis=0)
+        mean = np.mean(found, axis=0)
+        return self._judged(masks, mean, np.max(sizes, axis=0))[0], mean
+
+    def race(self, masks: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """As `of`, but masks that are hopeless are measured on few rows; and which these are, shape (n,).
+
+        A heat is run on some of the rows that judge, drawn at random, so that it does not matter how rows that follow
+        one another are alike. What is surely above the threshold is out; what looks feasible gets all rows, and with
+        them the errors that `of` gives; what may be either runs the next heat, and then gets all rows too.
+        """
+        errors, squared = np.empty(len(masks)), np.empty(masks.shape)
+        is_out, running = np.zeros(len(masks), bool), np.arange(len(masks))
+        for rows in HEATS:
+            if min(len(split.x) for split in self.errors) < 2 * rows or not len(running):
+                break
+            found, mean, spread = self._heat(masks[running], rows)
+            lost = found - SURE * spread > self._limit
+            out = running[lost]
+            is_out[out], errors[out], squared[out] = True, self._measured(found[lost]), mean[lost]
+            running = running[~lost & ~(found < self._limit)]
+        if not is_out.all():
+            errors[~is_out], squared[~is_out] = self.of(masks[~is_out])
+        return errors, squared, is_out
+
+    def _heat(self, masks: np.ndarray, rows: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Squared error of the outputs (n,), of every signal (n, signals), and standard error of the former (n,)."""
+        parts = [split.drawn(rows).by_row(masks) for split in self.errors]  # (n, rows, signals)
+        sizes = np.max([split.amounts for split in self.errors], axis=0)
+        mean = np.mean([part.mean(axis=1, dtype=float) for part in parts], axis=0)
+        _, found, weights = self._judged(masks, mean, sizes)
+        variance = np.zeros(len(masks))
+        for part, split in zip(parts, self.errors, strict=True):
+            line = np.einsum("nrs,ns->nr", np.nan_to_num(part), weights, dtype=float)
+            left = 1.0 - rows / len(split.x)  # rows are drawn from so many and no more
+            variance += line.var(axis=1, ddof=1) / rows * left / len(parts) ** 2
+        unclear = (self._asked(masks) & ~np.isfinite(mean)).any(axis=1)
+        return found, mean, np.where(unclear, np.inf, np.sqrt(variance))
+
+    def _asked(self, masks: np.ndarray) -> np.ndarray:
+        """Which signals count in the error of a mask, shape (n, signals)."""
+        judged = np.broadcast_to(self.outputs, masks.shape)
+        return judged & ~masks if self.thresholds.over == "masked" else judged
+
+    def _judged(
+        self, masks: np.ndarray, mean: np.ndarray, sizes: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """From errors of signals that of the outputs, as asked for and squared, (n,), and weights (n, signals)."""
+        weights = (self._asked(masks) & np.isfinite(mean)) * sizes
+        total = weights.sum(axis=1)
+        weights = weights / np.where(total > 0.0, total, 1.0)[:, None]
+        squared = np.where(total > 0.0, (np.nan_to_num(mean) * weights).sum(axis=1), np.nan)
+        return self._measured(squared), squared, weights
+
+    def _measured(self, squared: np.ndarray | float) -> np.ndarray:
+        """Squared errors as asked for; infinite where nothing tells."""
+        return np.where(np.isfinite(squared), squared if self.thresholds.measure == "mse" else np.sqrt(squared), np.inf)
+
+    @property
+    def _limit(self) -> float:
+        """The threshold as a squared error."""
+        into = self.thresholds.into
+        return into if self.thresholds.measure == "mse" else into**2
 
 
 def determine(
@@ -244,7 +303,10 @@ def select(layout: Layout, judge: Judge, tried: np.ndarray, is_whole: bool, seed
     """
     names, thresholds = layout.names, judge.thresholds
     tried = tried[judge.is_judged(tried)]
-    L_m, squared = judge.of(tried)
+    if len(names) > OUTRIGHT:
+        L_m, squared, is_rough = judge.race(tried)
+    else:
+        (L_m, squared), is_rough = judge.of(tried), np.zeros(len(tried), bool)
     feasible = L_m < thresholds.into
     if not feasible.any():
         raise NotEnoughData(
@@ -264,57 +326,8 @@ def select(layout: Layout, judge: Judge, tried: np.ndarray, is_whole: bool, seed
         L_m={frozenset(_named(names, line)): float(value) for line, value in zip(tried, L_m, strict=True)},
         thresholds=thresholds,
         is_whole=is_whole,
+        rough=frozenset(frozenset(_named(names, line)) for line in tried[is_rough]),
     )
-
-
-def train_masks(
-    dataset: Dataset,
-    config: TrainConfig,
-    splits: int = 1,
-    progress: Progress | None = None,
-    drafts: Path | None = None,
-) -> tuple[MaskErrors, ...]:
-    """One network per split, and what it makes of masks on the episodes that it did not see."""
-    found: list[MaskErrors] = []
-    for split in range(splits):
-
-        def tell(done: float, text: str, before: int = split) -> None:
-            if progress is not None:
-                progress((before + done) / splits, text)
-
-        own = replace(config, seed=config.seed + split)
-        train, held = dataset.split(own.held_out, own.seed)
-        _check_alive(train)
-        masks = _training_masks(dataset.layout.names, own.seed)
-        resume = None if drafts is None else drafts / f"structure_{split}.safetensors"
-        schema, _ = fit(dataset, own, masks, tell, title="structure", resume=resume)
-        found.append(MaskErrors.of_schema(schema, train, held, own.outliers))
-    return tuple(found)
-
-
-def _check_alive(train: Dataset) -> None:
-    """Refuse signals about which there is nothing to say."""
-    rows = train.rows()
-    dead = np.isin(np.arange(train.layout.size), Scaler.fit(train.layout, rows).dead)
-    for name in train.layout.names:
-        span = train.layout.slice(name)
-        if dead[span].all():
-            fact = "never varies" if np.isfinite(rows[:, span]).any() else "was never measured"
-            raise NotEnoughData(
-                f"Signal '{name}' {fact} in the training data, so nothing can be learned of it; collect data in which "
-                "it moves, or leave it out of the model."
-            )
-
-
-def _training_masks(names: tuple[str, ...], seed: int) -> tuple[Mask, ...]:
-    """All masks, or `TRAINED` random ones of all sizes from which the network learns to do with any."""
-    if len(names) <= LISTED:
-        return all_masks(names)
-    random = np.random.default_rng(seed)
-    drawn = random.random((TRAINED, len(names))) < random.random((TRAINED, 1))
-    drawn[~drawn.any(axis=1), 0] = True
-    others = ~np.eye(len(names), dtype=bool)
-    return tuple(dict.fromkeys(frozenset(_named(names, line)) for line in np.concatenate([others, drawn])))
 
 
 def search(judge: Judge, seed: int) -> tuple[np.ndarray, bool]:
@@ -324,7 +337,7 @@ def search(judge: Judge, seed: int) -> tuple[np.ndarray, bool]:
     def is_enough(masks: np.ndarray) -> np.ndarray:
         judge.tried += len(masks)
         found = ~judge.is_judged(masks)  # what leaves nothing to infer is enough
-        found[~found] = judge.of(masks[~found])[0] < judge.thresholds.into
+        found[~found] = judge.race(masks[~found])[0] < judge.thresholds.into
         enough.append(masks[found])
         return found
 

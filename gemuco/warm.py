@@ -16,6 +16,7 @@ from gemuco.adapt import UpdateConfig
 from gemuco.compiled.chain import NARROW, WIDE, pack
 from gemuco.compiled.jit import FOLDER
 from gemuco.compiled.learning import SQUARED, loss
+from gemuco.compiled.masks import squares, sums
 from gemuco.control import Controller
 from gemuco.descent import DescentConfig
 from gemuco.kernels import Layer, Weights
@@ -87,6 +88,10 @@ def steps(schema: BodySchema) -> Iterator[str]:
     chain = pack(schema.weights.whole)
     inputs, outputs = (int(size) for size in (chain.form[0, WIDE], chain.form[-1, NARROW]))
     loss(chain, np.zeros((1, inputs), np.float32), np.zeros((1, outputs), np.float32), SQUARED)
+    size, ones = schema.layout.size, np.ones((1, len(SIGNALS)), np.float32)
+    rows, known = np.zeros((1, size + len(schema.bias)), np.float32), np.ones((1, size), np.float32)
+    squares(chain, rows, known, known, ones)
+    sums(chain, rows, known, known, ones > 0.0, known, ones)
 
 
 def warm(tell: Callable[[float, str], None] | None = None) -> float:

@@ -2,10 +2,15 @@ import numpy as np
 import pytest
 from muscle_arm import LAYOUT
 
+from gemuco import structure as structures
 from gemuco.dataset import Dataset, Episode
 from gemuco.errors import NotEnoughData, SchemaError
+from gemuco.kernels import run
+from gemuco.mask_errors import MaskErrors
+from gemuco.mask_training import train_masks
+from gemuco.masks import all_masks, bits
 from gemuco.signals import Layout, Signal
-from gemuco.structure import Thresholds, determine
+from gemuco.structure import Judge, Thresholds, determine, select
 from gemuco.train import TrainConfig
 
 TINY = TrainConfig(hidden=(20,), latent=5, epochs=3, batch=100)
@@ -113,3 +118,97 @@ def test_more_splits_average_over_what_is_held_out(data):
         assert value == pytest.approx((one.L_i[name] + two.L_i[name]) / 2)
     assert told == sorted(told)
     assert told[-1] == 1.0
+
+
+QUICK = TrainConfig(hidden=(40,), latent=8, epochs=12, batch=100, rate=2e-2, bias_size=1)
+
+
+def many_signals(seed: int, gaps: float = 0.0) -> Dataset:
+    """Seven signals of three hidden numbers under two conditions; a share of each is missing."""
+    random = np.random.default_rng(seed)
+    sizes = random.integers(1, 4, 7)
+    mixing = random.normal(size=(3, sizes.sum())) * (random.random((3, sizes.sum())) < 0.7)
+    layout = Layout(tuple(Signal(f"s{index}", int(size), "1") for index, size in enumerate(sizes)))
+    episodes = []
+    for index in range(16):
+        hidden = random.normal(size=(250, 3)) * (1.0 + 0.3 * (index % 2))
+        x = np.tanh(hidden @ mixing) + 0.2 * random.normal(size=(250, sizes.sum()))
+        for name in layout.names:
+            x[np.ix_(random.random(250) < gaps, np.arange(layout.size)[layout.slice(name)])] = np.nan
+        episodes.append(Episode("one" if index % 2 else "other", layout.split(x)))
+    return Dataset(layout, tuple(episodes))
+
+
+@pytest.fixture(scope="module", params=["seed 0", "seed 1", "seed 2", "gaps", "arm"])
+def measured(request, data) -> tuple[Layout, tuple[MaskErrors, ...]]:
+    """Networks that were trained for structure determination, and what they say of masks."""
+    kind, _, seed = request.param.partition(" ")
+    if kind == "arm":
+        return data.layout, train_masks(data, SHORT, 2)
+    body = many_signals(int(seed or 3), 0.02 if kind == "gaps" else 0.0)
+    return body.layout, train_masks(body, QUICK, 2 if kind == "gaps" else 1)
+
+
+def every_mask(layout: Layout) -> np.ndarray:
+    return np.array([bits(m, layout.names) > 0 for m in all_masks(layout.names)])
+
+
+def test_errors_of_masks_are_those_of_the_network(measured):
+    layout, (errors, *_) = measured
+    masks = every_mask(layout)
+    found, sizes = errors.of(masks)
+    for mask, line in zip(masks, found, strict=True):
+        rows = errors.whole[:, mask].all(axis=1)
+        truth, there = errors.x[rows], errors.there[rows]
+        tail = np.broadcast_to(mask.astype(np.float32), (len(truth), len(mask)))
+        given = np.repeat(mask, [signal.size for signal in layout.signals])
+        told = run(errors.chain, np.concatenate([truth * given, tail, errors.p[rows]], axis=1))
+        for index, name in enumerate(layout.names):
+            span = layout.slice(name)
+            missed = np.where(there[:, span], (told - truth)[:, span] ** 2, 0.0).sum(axis=0) / there[:, span].sum(
+                axis=0
+            )
+            assert line[index] == pytest.approx(missed.sum() / errors.liveliness[span].sum(), rel=1e-3, abs=1e-6)
+    np.testing.assert_allclose(errors.by_row(masks).mean(axis=1), found, rtol=1e-3, atol=1e-6)
+    assert sizes == pytest.approx([errors.liveliness[layout.slice(name)].sum() for name in layout.names])
+
+
+@pytest.mark.parametrize("measure", ["mse", "rmse"])
+@pytest.mark.parametrize("over", ["masked", "all"])
+@pytest.mark.parametrize("share", [0.2, 0.4, 0.7])
+def test_a_race_finds_what_the_full_measurement_finds(measured, measure, over, share, monkeypatch):
+    layout, errors = measured
+    judge = Judge(layout.names, errors, Thresholds(1.0, 1.0, measure, over))
+    masks = every_mask(layout)
+    masks = masks[judge.is_judged(masks)]
+    into = float(np.quantile(judge.of(masks)[0], share))  # so many are feasible
+    judge = Judge(layout.names, errors, Thresholds(1.0, into, measure, over))
+    full, squared = judge.of(masks)
+    raced, some, is_out = judge.race(masks)
+    assert (full[is_out] >= into).all()
+    np.testing.assert_array_equal(raced[~is_out], full[~is_out])
+    np.testing.assert_array_equal(some[~is_out], squared[~is_out])
+    np.testing.assert_allclose(raced[is_out], full[is_out], rtol=0.5)
+    kept = []
+    for outright in (0, 99):
+        monkeypatch.setattr(structures, "OUTRIGHT", outright)
+        kept.append(select(layout, judge, every_mask(layout), True, 0))
+    race, whole = kept
+    assert race.feasible == whole.feasible
+    assert race.masks == whole.masks
+    assert [race.L_m[m] for m in race.feasible] == [whole.L_m[m] for m in whole.feasible]
+    assert not whole.rough
+    assert race.rough == {frozenset(np.array(layout.names)[line].tolist()) for line in masks[is_out]}
+
+
+def test_most_hopeless_masks_are_told_from_few_rows_and_the_report_says_so():
+    body = many_signals(0)
+    found = determine(body, QUICK, Thresholds(0.5, 0.15))
+    others = len(found.L_m) - len(found.feasible)
+    assert len(found.rough) > 0.5 * others
+    assert not found.rough & set(found.feasible)
+    report = found.report()
+    assert f"L_m of {len(found.rough)} masks, marked ~, is an estimate from few rows" in report
+    marked = [line for line in report.splitlines() if " ~0." in line]
+    assert marked
+    assert all(line.endswith("no") for line in marked)

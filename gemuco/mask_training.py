@@ -1,0 +1,68 @@
+"""One network under all masks for each split of the data, which structure determination then asks about any mask."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from gemuco.dataset import Dataset
+from gemuco.errors import NotEnoughData
+from gemuco.mask_errors import MaskErrors
+from gemuco.masks import Mask, all_masks
+from gemuco.scaler import Scaler
+from gemuco.train import Progress, TrainConfig, fit
+
+LISTED = 10
+"""Up to so many signals every mask is tried."""
+TRAINED = 2000
+"""With more signals the network is trained with so many masks, and is right about the others too."""
+
+
+def train_masks(
+    dataset: Dataset,
+    config: TrainConfig,
+    splits: int = 1,
+    progress: Progress | None = None,
+    drafts: Path | None = None,
+) -> tuple[MaskErrors, ...]:
+    """One network per split, and what it makes of masks on the episodes that it did not see."""
+    found: list[MaskErrors] = []
+    for split in range(splits):
+
+        def tell(done: float, text: str, before: int = split) -> None:
+            if progress is not None:
+                progress((before + done) / splits, text)
+
+        own = replace(config, seed=config.seed + split)
+        train, held = dataset.split(own.held_out, own.seed)
+        _check_alive(train)
+        masks = _training_masks(dataset.layout.names, own.seed)
+        resume = None if drafts is None else drafts / f"structure_{split}.safetensors"
+        schema, _ = fit(dataset, own, masks, tell, title="structure", resume=resume)
+        found.append(MaskErrors.of_schema(schema, train, held, own.outliers))
+    return tuple(found)
+
+
+def _check_alive(train: Dataset) -> None:
+    """Refuse signals about which there is nothing to say."""
+    rows = train.rows()
+    dead = np.isin(np.arange(train.layout.size), Scaler.fit(train.layout, rows).dead)
+    for name in train.layout.names:
+        span = train.layout.slice(name)
+        if dead[span].all():
+            fact = "never varies" if np.isfinite(rows[:, span]).any() else "was never measured"
+            raise NotEnoughData(
+                f"Signal '{name}' {fact} in the training data, so nothing can be learned of it; collect data in which "
+                "it moves, or leave it out of the model."
+            )
+
+
+def _training_masks(names: tuple[str, ...], seed: int) -> tuple[Mask, ...]:
+    """All masks, or `TRAINED` random ones of all sizes from which the network learns to do with any."""
+    if len(names) <= LISTED:
+        return all_masks(names)
+    random = np.random.default_rng(seed)
+    drawn = random.random((TRAINED, len(names))) < random.random((TRAINED, 1))
+    drawn[~drawn.any(axis=1), 0] = True
+    others = ~np.eye(len(names), dtype=bool)
+    return tuple(dict.fromkeys(frozenset(np.array(names)[line].tolist()) for line in np.concatenate([others, drawn])))
