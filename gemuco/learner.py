@@ -64,6 +64,11 @@ class Course:
     best: dict[str, np.ndarray] = field(default_factory=dict)
     resumed: int = 0
 
+    @property
+    def least(self) -> float:
+        """The best held-out loss."""
+        return self.held_out[self.best_epoch]
+
 
 class Learner:
     """Network, every p, and the data, during one training.
@@ -78,6 +83,11 @@ class Learner:
 
     Attributes:
         biases: Every p as it is now, shape (conditions, bias_size).
+        chain: W as it is now.
+        moves: Which p are learned, shape (conditions, 1).
+        optimiser: What moves W.
+        bias_optimiser: What moves p.
+        measure: Held-out samples and the masks they are measured under.
     """
 
     def __init__(
@@ -92,42 +102,63 @@ class Learner:
         self.config, self.material, self.held = config, material, held
         self.task = material.task
         self.biases = np.array(biases, np.float32)
-        self._start, self._chain = weights, pack(weights.whole)
-        self._moves = ~frozen[:, None]
+        self._start, self.chain = weights, pack(weights.whole)
+        self.moves = ~frozen[:, None]
         self.random = np.random.default_rng(config.seed)
-        self._optimiser = Optimiser("adam", config.rate, len(self._chain.flat))
-        self._bias_optimiser = Optimiser("adam", config.bias_rate, self.biases.size)
+        self.optimiser = Optimiser("adam", config.rate, len(self.chain.flat))
+        self.bias_optimiser = Optimiser("adam", config.bias_rate, self.biases.size)
         self.course = Course()
-        self._measure = self.held.every(MOST_HELD)
+        self.measure = self.held.every(MOST_HELD)
 
     @property
     def weights(self) -> Weights:
         """W as it is now."""
-        return self._start.replaced(unpack(self._chain))
+        return self._start.replaced(unpack(self.chain))
 
     def run(self, progress: Progress | None, title: str, draft: Draft) -> Course:
         """Train to the end or until nothing gets better; leaves the best W and p in place."""
-        config, course = self.config, self.course
-        self._restore(draft)
-        looks = range(config.epochs // 4, config.epochs, max(1, config.epochs // LOOKS))
-        for epoch in range(len(course.train), config.epochs):
-            if epoch - course.best_epoch > config.patience:
-                break
-            if epoch in looks:
-                self._look(patient=epoch < config.epochs // 2)
-            course.train.append(self._pass(epoch, HUBER[epoch > looks.start]))
-            course.held_out.append(self._held_out())
-            if epoch == 0 or course.held_out[-1] < course.held_out[course.best_epoch]:
-                course.best_epoch, course.best = epoch, self._copy()
+        self.restore(draft)
+        while not self.is_done:
+            usual = self.begin()
+            self.end(self._pass(self.epoch, usual), self._held_out(), draft)
             if progress is not None:
-                best = course.held_out[course.best_epoch]
-                progress((epoch + 1) / config.epochs, f"{title}: held-out loss {best:.4f}")
-            if (epoch + 1) % max(1, config.epochs // DRAFTS) == 0 or epoch + 1 == config.epochs:
-                draft.save(*self._written())
+                progress(self.epoch / self.config.epochs, f"{title}: held-out loss {self.course.least:.4f}")
+        return self.close()
+
+    @property
+    def epoch(self) -> int:
+        """How many are done."""
+        return len(self.course.train)
+
+    @property
+    def is_done(self) -> bool:
+        """Whether all epochs are done, or nothing got better for long."""
+        return self.epoch >= self.config.epochs or self.epoch - self.course.best_epoch > self.config.patience
+
+    def begin(self) -> float:
+        """What comes before an epoch; returns which misses count in proportion, see `HUBER`."""
+        epochs = self.config.epochs
+        looks = range(epochs // 4, epochs, max(1, epochs // LOOKS))
+        if self.epoch in looks:
+            self._look(patient=self.epoch < epochs // 2)
+        return HUBER[self.epoch > looks.start]
+
+    def end(self, train: float, held_out: float, draft: Draft) -> None:
+        """What comes after an epoch of these losses."""
+        course, epoch = self.course, self.epoch
+        course.train.append(train)
+        course.held_out.append(held_out)
+        if epoch == 0 or held_out < course.least:
+            course.best_epoch, course.best = epoch, self._copy()
+        if (epoch + 1) % max(1, self.config.epochs // DRAFTS) == 0 or epoch + 1 == self.config.epochs:
+            draft.save(*self._written())
+
+    def close(self) -> Course:
+        """Put the best W and p in place."""
         for name, numbers in self._numbers().items():
-            numbers[...] = course.best[name]
+            numbers[...] = self.course.best[name]
         self._look()
-        return course
+        return self.course
 
     def _pass(self, epoch: int, straight: float) -> float:
         """One epoch; returns the mean loss of its steps."""
@@ -141,15 +172,15 @@ class Learner:
     def _step(self, batch: Batch, pace: float, straight: float) -> float:
         """One step of Adam; returns the loss before it."""
         missed, by_weights, by_input = gradients(
-            self._chain, self._inputs(batch), batch.wanted, self._straight(straight), True
+            self.chain, self._inputs(batch), batch.wanted, self.straight(straight), True
         )
-        self._optimiser.rate = pace * self.config.rate
-        self._optimiser.move(self._chain.flat, by_weights)
+        self.optimiser.rate = pace * self.config.rate
+        self.optimiser.move(self.chain.flat, by_weights)
         if self.biases.size:
             by_bias = np.zeros_like(self.biases)
             np.add.at(by_bias, batch.condition, by_input[:, -self.biases.shape[1] :])
-            self._bias_optimiser.rate = pace * self.config.bias_rate
-            self._bias_optimiser.move(self.biases.reshape(-1), (by_bias * self._moves).reshape(-1))
+            self.bias_optimiser.rate = pace * self.config.bias_rate
+            self.bias_optimiser.move(self.biases.reshape(-1), (by_bias * self.moves).reshape(-1))
         return float(missed)
 
     def _inputs(self, batch: Batch) -> np.ndarray:
@@ -157,16 +188,16 @@ class Learner:
             np.concatenate([batch.inputs, self.biases[batch.condition]], axis=1) if self.biases.size else batch.inputs
         )
 
-    def _straight(self, usual: float) -> np.float32:
+    def straight(self, usual: float) -> np.float32:
         """Misses above this many standard deviations count in proportion; none, where nothing is rejected either."""
         return SQUARED if math.isinf(self.config.outliers) else np.float32(usual)
 
     def _held_out(self) -> float:
-        rows, chosen = self._measure
+        rows, chosen = self.measure
         if not len(rows):
             return math.inf
         batch = self.held.take(rows, chosen)
-        return float(loss(self._chain, self._inputs(batch), batch.wanted, self._straight(HUBER[1])))
+        return float(loss(self.chain, self._inputs(batch), batch.wanted, self.straight(HUBER[1])))
 
     def _look(self, patient: bool = False) -> None:
         """Suspect outliers anew, in what is learned and in what measures."""
@@ -176,11 +207,11 @@ class Learner:
             if patient:  # several signals are far out together: perhaps a rare motion that is yet to be learned
                 found &= (part.far.sum(axis=1) < 2)[:, None]
             part.hide(found)
-        self._measure = self.held.every(MOST_HELD)
+        self.measure = self.held.every(MOST_HELD)
 
     def _numbers(self) -> dict[str, np.ndarray]:
         """W and every p."""
-        return {"weights": self._chain.flat, "biases": self.biases}
+        return {"weights": self.chain.flat, "biases": self.biases}
 
     def _copy(self) -> dict[str, np.ndarray]:
         return {name: numbers.copy() for name, numbers in self._numbers().items()}
@@ -189,19 +220,19 @@ class Learner:
         """All that the next epoch depends on: arrays and facts."""
         arrays = {f"now.{name}": numbers for name, numbers in self._numbers().items()}
         arrays |= {f"best.{name}": numbers for name, numbers in self.course.best.items()}
-        arrays |= {f"adam.weights.{name}": numbers for name, numbers in self._optimiser.state().items()}
-        arrays |= {f"adam.biases.{name}": numbers for name, numbers in self._bias_optimiser.state().items()}
+        arrays |= {f"adam.weights.{name}": numbers for name, numbers in self.optimiser.state().items()}
+        arrays |= {f"adam.biases.{name}": numbers for name, numbers in self.bias_optimiser.state().items()}
         arrays["suspected"], arrays["held_suspected"] = self.material.suspected, self.held.suspected
         facts = {
             "train": self.course.train,
             "held_out": self.course.held_out,
             "best_epoch": self.course.best_epoch,
-            "steps": self._optimiser.time,
+            "steps": self.optimiser.time,
             "random": self.random.bit_generator.state,
         }
         return arrays, facts
 
-    def _restore(self, draft: Draft) -> None:
+    def restore(self, draft: Draft) -> None:
         """Go on where an interrupted training was written down, if it was."""
         found = draft.load()
         if found is None:
@@ -210,13 +241,13 @@ class Learner:
         for name, numbers in self._numbers().items():
             numbers[...] = arrays[f"now.{name}"]
             self.course.best[name] = arrays[f"best.{name}"].copy()
-        for name, optimiser in (("weights", self._optimiser), ("biases", self._bias_optimiser)):
+        for name, optimiser in (("weights", self.optimiser), ("biases", self.bias_optimiser)):
             for kind, numbers in optimiser.state().items():
                 numbers[...] = arrays[f"adam.{name}.{kind}"]
             optimiser.time = facts["steps"]
         self.material.hide(arrays["suspected"])
         self.held.hide(arrays["held_suspected"])
-        self._measure = self.held.every(MOST_HELD)
+        self.measure = self.held.every(MOST_HELD)
         self.random.bit_generator.state = facts["random"]
         self.course.train, self.course.held_out = facts["train"], facts["held_out"]
         self.course.best_epoch, self.course.resumed = facts["best_epoch"], len(facts["train"])

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gemuco import outliers
+from gemuco import batched, devices, outliers
 from gemuco.compiled.chain import pack
 from gemuco.compiled.masks import squares, sums
 from gemuco.dataset import Dataset
@@ -158,7 +158,9 @@ class MaskErrors:
     def _squared(self, bits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Sum of squared errors of every element, and of how many rows, shapes (masks, size)."""
         rows, known, whole = self._arrays()
-        squared = sums(pack(self.chain), rows, self.x, known, whole, *self._gates(bits))
+        given = (pack(self.chain), rows, self.x, known, whole, *self._gates(bits))
+        device = devices.best()
+        squared = sums(*given) if device is None else batched.sums(device, *given)
         return squared, self._usable(bits).T.astype(np.float32) @ known
 
     def _arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -10,7 +10,7 @@ from gemuco.errors import NotEnoughData
 from gemuco.mask_errors import MaskErrors
 from gemuco.masks import Mask, all_masks
 from gemuco.scaler import Scaler
-from gemuco.train import Progress, TrainConfig, fit
+from gemuco.train import Job, Progress, TrainConfig, fit_all
 
 LISTED = 10
 """Up to so many signals every mask is tried."""
@@ -26,21 +26,17 @@ def train_masks(
     drafts: Path | None = None,
 ) -> tuple[MaskErrors, ...]:
     """One network per split, and what it makes of masks on the episodes that it did not see."""
-    found: list[MaskErrors] = []
+    jobs, parts = [], []
     for split in range(splits):
-
-        def tell(done: float, text: str, before: int = split) -> None:
-            if progress is not None:
-                progress((before + done) / splits, text)
-
         own = replace(config, seed=config.seed + split)
-        train, held = dataset.split(own.held_out, own.seed)
-        _check_alive(train)
-        masks = _training_masks(dataset.layout.names, own.seed)
+        parts.append(dataset.split(own.held_out, own.seed))
+        _check_alive(parts[-1][0])
         resume = None if drafts is None else drafts / f"structure_{split}.safetensors"
-        schema, _ = fit(dataset, own, masks, tell, title="structure", resume=resume)
-        found.append(MaskErrors.of_schema(schema, train, held, own.outliers))
-    return tuple(found)
+        jobs.append(Job(dataset, own, _training_masks(dataset.layout.names, own.seed), resume=resume))
+    trained = fit_all(jobs, progress, title="structure")
+    return tuple(
+        MaskErrors.of_schema(schema, *part, config.outliers) for (schema, _), part in zip(trained, parts, strict=True)
+    )
 
 
 def _check_alive(train: Dataset) -> None:

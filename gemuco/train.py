@@ -1,12 +1,15 @@
 """Training (paper, II-D): from episodes to a body schema, and from a schema to one that fits a few new episodes."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
 
 from gemuco.accuracy import assess
+from gemuco.batched import train
 from gemuco.dataset import Dataset
 from gemuco.draft import Draft, key_of
 from gemuco.errors import NotEnoughData
@@ -22,6 +25,25 @@ from gemuco.task import Task
 from gemuco.train_config import TrainConfig
 
 ANCHORS = 1000
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One training of several; see `fit`.
+
+    Attributes:
+        dataset: Episodes of one body.
+        config: How.
+        masks: The feasible masks.
+        x_out: What to infer; every signal if None.
+        resume: A file to keep the training in.
+    """
+
+    dataset: Dataset
+    config: TrainConfig
+    masks: tuple[Mask, ...]
+    x_out: tuple[str, ...] | None = None
+    resume: str | Path | None = None
 
 
 def fit(
@@ -52,11 +74,46 @@ def fit(
         NotEnoughData: Too few samples to hold some out, or none that fits a mask.
         UnknownSignal: A mask or x_out names a signal that is not in the layout.
     """
-    layout = dataset.layout
-    checked = tuple(mask(m, layout.names) for m in masks)
+    job = Job(dataset, config, tuple(frozenset(m) for m in masks), None if x_out is None else tuple(x_out), resume)
+    return fit_all([job], progress, title)[0]
+
+
+def fit_all(
+    jobs: Sequence[Job], progress: Progress | None = None, title: str = "training"
+) -> list[tuple[BodySchema, History]]:
+    """Several trainings, such as of several seeds: together where there is CUDA (`gemuco.batched`), else in turn.
+
+    Args:
+        jobs: What `fit` is told of each.
+        progress: Told the share done of all of them.
+        title: Begins the progress text.
+    """
+    ready = [_ready(job) for job in jobs]
+    train([one.learner for one in ready], [one.draft for one in ready], progress, title)
+    found = []
+    for one in ready:
+        conditions = one.conditions
+        schema = _assessed(_schema(one.learner, one.scaler, conditions), one.learner, conditions)
+        found.append((schema, _history(one.learner, one.scaler, one.notes)))
+    return found
+
+
+class _Ready(NamedTuple):
+    """A training that can begin."""
+
+    learner: Learner
+    draft: Draft
+    scaler: Scaler
+    conditions: tuple[str, ...]
+    notes: list[str]
+
+
+def _ready(job: Job) -> _Ready:
+    dataset, config, layout = job.dataset, job.config, job.dataset.layout
+    checked = tuple(mask(m, layout.names) for m in job.masks)
     if not checked or frozenset() in checked:
         raise NotEnoughData("Training needs at least one mask, and none of them empty.")
-    outputs = layout.subset(layout.names if x_out is None else x_out).names
+    outputs = layout.subset(layout.names if job.x_out is None else job.x_out).names
     train_data, held_data = dataset.split(config.held_out, config.seed)
     scaler = Scaler.fit(layout, train_data.rows())
     task, notes = _heard(dataset, checked, outputs)
@@ -69,16 +126,13 @@ def fit(
             f"All data are of one condition ('{conditions[0]}'), so the parametric bias has nothing to tell apart: p "
             "stays 0 and has no effect. Collect other conditions, or set `bias: 0`."
         )
-    draft = Draft(None if resume is None else Path(resume), _key(config, task, dataset))
+    draft = Draft(None if job.resume is None else Path(job.resume), _key(config, task, dataset))
     torch.manual_seed(config.seed)
     size = len(task.in_index) + len(task.x_in) + config.bias_size
     drawn = Network(size, len(task.out_index), config.hidden, config.latent, config.activation).weights()
     _mute(drawn, task, scaler.dead, config.bias_size if frozen.all() else 0)
     biases = np.zeros((len(conditions), config.bias_size), np.float32)
-    learner = Learner(config, drawn, biases, frozen, material, held)
-    learner.run(progress, title, draft)
-    schema = _assessed(_schema(learner, scaler, conditions), learner, conditions)
-    return schema, _history(learner, scaler, notes)
+    return _Ready(Learner(config, drawn, biases, frozen, material, held), draft, scaler, conditions, notes)
 
 
 def fine_tune(
@@ -123,7 +177,7 @@ def fine_tune(
     key = _key(config, task, dataset, *schema.weights.arrays(), start, schema.anchors, schema.scaler.std)
     draft = Draft(None if resume is None else Path(resume), key)
     learner = Learner(config, schema.weights, start, frozen, material, held)
-    learner.run(progress, title, draft)
+    train([learner], [draft], progress, title)
     tuned = _assessed(_schema(learner, schema.scaler, fresh, schema), learner, fresh)
     return tuned, _history(learner, Scaler.fit(schema.layout, train_data.rows()), [])
 
