@@ -57,11 +57,13 @@ def train(
         stack = [learners[index] for index in together]
         losses, held_out = _epoch(stack, device)
         for index, loss, held in zip(together, losses, held_out, strict=True):
-            learners[index].end(loss, held, drafts[index])
+            learners[index].end(loss, held)
         if progress is not None:
             shares = [1.0 if one.is_done else one.epoch / one.config.epochs for one in learners]
             least = float(np.mean([one.course.least for one in stack]))
             progress(float(np.mean(shares)), f"{title}: held-out loss {least:.4f}")
+        for index in together:
+            learners[index].keep(drafts[index])
     for learner in learners:
         learner.close()
 

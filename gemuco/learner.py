@@ -120,9 +120,10 @@ class Learner:
         self.restore(draft)
         while not self.is_done:
             usual = self.begin()
-            self.end(self._pass(self.epoch, usual), self._held_out(), draft)
+            self.end(self._pass(self.epoch, usual), self._held_out())
             if progress is not None:
                 progress(self.epoch / self.config.epochs, f"{title}: held-out loss {self.course.least:.4f}")
+            self.keep(draft)
         return self.close()
 
     @property
@@ -143,14 +144,17 @@ class Learner:
             self._look(patient=self.epoch < epochs // 2)
         return HUBER[self.epoch > looks.start]
 
-    def end(self, train: float, held_out: float, draft: Draft) -> None:
+    def end(self, train: float, held_out: float) -> None:
         """What comes after an epoch of these losses."""
         course, epoch = self.course, self.epoch
         course.train.append(train)
         course.held_out.append(held_out)
         if epoch == 0 or held_out < course.least:
             course.best_epoch, course.best = epoch, self._copy()
-        if (epoch + 1) % max(1, self.config.epochs // DRAFTS) == 0 or epoch + 1 == self.config.epochs:
+
+    def keep(self, draft: Draft) -> None:
+        """Write the training down from time to time, and at its end."""
+        if self.epoch % max(1, self.config.epochs // DRAFTS) == 0 or self.epoch == self.config.epochs:
             draft.save(*self._written())
 
     def close(self) -> Course:
