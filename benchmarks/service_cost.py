@@ -27,7 +27,7 @@ from gemuco.warm import warm
 import services.model.gemuco_service
 if sys.argv[1] == "torch":
     import torch
-warm()
+warm(is_service=True)
 print(int(open("/proc/self/statm").read().split()[1]) * 4096 / 1e6)
 """
 

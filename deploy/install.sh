@@ -23,7 +23,7 @@ else
 fi
 
 # Tests, headers, static libraries and pybullet's models of other people's robots.
-for one in numpy scipy matplotlib mpl_toolkits networkx sympy torch; do
+for one in numpy matplotlib mpl_toolkits networkx sympy torch; do
     [ ! -d "$folder/$one" ] || find "$folder/$one" -type d -name tests -prune -exec rm -rf {} +
 done
 [ ! -d "$folder/torch/bin" ] || find "$folder/torch/bin" -type f ! -name torch_shm_manager -delete # torch asks for that one

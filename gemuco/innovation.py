@@ -84,7 +84,7 @@ class Innovations:
         gates = [schema.gate(m) for m in chosen]
         through, tails = (np.stack(column) for column in zip(*gates, strict=True)) if gates else [np.zeros((0, 0))] * 2
         volume = 2.0 * float(np.log(np.diag(lower)).sum())
-        return Pairs(chosen, index, np.linalg.inv(lower), volume, through, tails)
+        return Pairs(chosen, index, np.ascontiguousarray(np.linalg.inv(lower)), volume, through, tails)
 
     def _blind(self, mask: Mask) -> np.ndarray:
         inside = [name in mask for name in self._schema.x_out]

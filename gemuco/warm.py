@@ -8,20 +8,20 @@ loaded within a second or two. It is done by using a small body in every way tha
 
 import time
 from collections.abc import Callable, Iterator
-from itertools import pairwise
+from itertools import chain, pairwise
 
 import numpy as np
 
 from gemuco.adapt import UpdateConfig
-from gemuco.compiled.chain import NARROW, WIDE, pack
+from gemuco.compiled.chain import pack
 from gemuco.compiled.jit import FOLDER
-from gemuco.compiled.learning import SQUARED, loss
 from gemuco.compiled.masks import squares, sums
 from gemuco.control import Controller
 from gemuco.descent import DescentConfig
 from gemuco.kernels import Layer, Weights
 from gemuco.losses import Match
 from gemuco.normal import Normal
+from gemuco.relearn import mean_error
 from gemuco.scaler import Scaler
 from gemuco.schema import BodySchema
 from gemuco.signals import Layout, Signal
@@ -30,7 +30,7 @@ from gemuco.torque import TorqueBalance
 SIGNALS = {"position": (1, "rad"), "tension": (2, "N"), "length": (2, "m"), "hidden": (1, "m")}
 MASKS = (frozenset({"position", "tension"}), frozenset({"tension", "length", "hidden"}))
 OUTPUTS = ("position", "tension", "length")
-STEPS = 9
+STEPS = {"running": 8, "learning": 2}
 
 
 def body() -> BodySchema:
@@ -61,8 +61,8 @@ def body() -> BodySchema:
     )
 
 
-def steps(schema: BodySchema) -> Iterator[str]:
-    """Use the body; before each step what it is for."""
+def running(schema: BodySchema) -> Iterator[str]:
+    """Use the body in every way that a service does; before each step what it is for."""
     whole = {name: np.zeros(size) for name, (size, _) in SIGNALS.items()}
     yield "estimation by mask"
     schema.estimate({name: whole[name] for name in ("position", "tension")})
@@ -75,8 +75,6 @@ def steps(schema: BodySchema) -> Iterator[str]:
     terms = (Match("position"), TorqueBalance(np.sin, 1.0, "position", "tension", "length"))
     yield "control"
     Controller(schema, terms, "tension").solve(target, whole)
-    yield "the paper's descent"
-    Controller(schema, terms, "tension", search=DescentConfig(iterations=2)).solve(target, whole)
     yield "recognition of p"
     for method in ("ekf", "gauss_newton"):
         schema.adapt([whole] * 2, UpdateConfig(what="bias", bias_method=method))
@@ -84,29 +82,36 @@ def steps(schema: BodySchema) -> Iterator[str]:
         yield f"update of W and p by {optimiser}"
         config = UpdateConfig(what="both", optimiser=optimiser, minimum=1, batch=4, steps=1)
         schema.adapt([whole] * 2, config)
-    yield "training"
-    chain = pack(schema.weights.whole)
-    inputs, outputs = (int(size) for size in (chain.form[0, WIDE], chain.form[-1, NARROW]))
-    loss(chain, np.zeros((1, inputs), np.float32), np.zeros((1, outputs), np.float32), SQUARED)
-    size, ones = schema.layout.size, np.ones((1, len(SIGNALS)), np.float32)
+    yield "judging an update"
+    mean_error(schema, np.zeros((1, schema.layout.size), np.float32))
+
+
+def learning(schema: BodySchema) -> Iterator[str]:
+    """Use it as training and the paper's experiments do."""
+    yield "the paper's descent"
+    search = DescentConfig(iterations=2)
+    Controller(schema, [Match("position")], "tension", search=search).solve({"position": np.full(1, 0.1)}, {})
+    yield "structure determination"
+    network, size, ones = pack(schema.weights.whole), schema.layout.size, np.ones((1, len(SIGNALS)), np.float32)
     rows, known = np.zeros((1, size + len(schema.bias)), np.float32), np.ones((1, size), np.float32)
-    squares(chain, rows, known, known, ones)
-    sums(chain, rows, known, known, ones > 0.0, known, ones)
+    squares(network, rows, known, known, ones)
+    sums(network, rows, known, known, ones > 0.0, known, ones)
 
 
-def warm(tell: Callable[[float, str], None] | None = None) -> float:
+def warm(tell: Callable[[float, str], None] | None = None, is_service: bool = False) -> float:
     """Make everything ready.
 
     Args:
         tell: Told the share that is done, 0 to 1, and what comes next.
+        is_service: Leave out what a service never does; it would only take memory there.
 
     Returns:
         How long it took [s].
     """
     begun, schema = time.monotonic(), body()
-    for index, what in enumerate(steps(schema)):
+    for index, what in enumerate(chain(running(schema), () if is_service else learning(schema))):
         if tell is not None:
-            tell(index / STEPS, what)
+            tell(index / (STEPS["running"] if is_service else sum(STEPS.values())), what)
     return time.monotonic() - begun
 
 

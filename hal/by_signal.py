@@ -37,6 +37,15 @@ class Elements:
             start += int(count)
         self.size = start
 
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Elements) and list(self.counts.items()) == list(other.counts.items())
+
+    def __hash__(self) -> int:
+        return hash(tuple(self.counts.items()))
+
+    def __repr__(self) -> str:
+        return f"Elements({self.counts})"
+
     @classmethod
     def of(cls, counts: Mapping[str, float]) -> "Elements":
         """The one with these counts.

@@ -7,7 +7,6 @@ from typing import Any, Self
 import numpy as np
 
 from hal.actuators import Actuators, find
-from hal.by_signal import Numbers
 from hal.caretaker import Caretaker
 from hal.clock import BusClock, Clock, SystemClock
 from hal.config import RobotConfig
@@ -72,9 +71,7 @@ class Robot:
         self._nothing = np.full(config.signals[config.command.signal].size, np.nan)
         self._nothing.flags.writeable = False
         self._desired: tuple[np.ndarray, float] | None = None
-        self._measured = Numbers.of(
-            {name: np.full(config.signals[name].size, np.nan) for name in self._assembler.signals}
-        )
+        self._measured = self._assembler.nothing
         self._number = self._incomplete = 0
         self._is_open = False
         self._stop_reason = ""

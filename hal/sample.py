@@ -118,6 +118,11 @@ class Assembler:
         """Signals that a sample has, in the order of the robot file."""
         return tuple(self._elements.counts)
 
+    @property
+    def nothing(self) -> Numbers:
+        """Values of every signal as long as nothing was measured."""
+        return Numbers(np.full(self._elements.size, np.nan), self._elements)
+
     def assemble(self, now: float) -> tuple[Numbers, Numbers, Truths]:
         """Values, ages [s] and validity of every signal at monotonic time `now` [s], in fresh arrays."""
         readings = [device.read() for device in self._devices]

@@ -1,10 +1,12 @@
-"""Matrix products of float32 for compiled code.
+"""Matrix products for compiled code: of float32, and one of float64.
 
 numba itself calls the BLAS of scipy, whose wheels are a release behind that of numpy: on the few rows of a search it
 takes two to three times as long (4 x 200 times 200 x 200: 26 us against 10 us; `python -m benchmarks.solvers` shows
-what that makes of a search). So the one that numpy brought along is used where it is found, and scipy's elsewhere.
+what that makes of a search), and takes 17 MB of memory. So the one that the wheels of numpy bring along is used; with a
+numpy from elsewhere, scipy has to be there.
 """
 
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -24,9 +26,17 @@ def _is_loaded(library: Path | None) -> bool:
 
 
 FOUND = _is_loaded(NUMPYS)
-_i, _n, _f, _p = types.int32, types.int64, types.float32, types.voidptr
+if not FOUND and find_spec("scipy") is None:
+    raise ImportError(
+        "This numpy has no BLAS that compiled code can call, for it is not a wheel of PyPI. "
+        "Install scipy beside it, or numpy by pip."
+    )
+_i, _n, _f, _d, _p = types.int32, types.int64, types.float32, types.float64, types.voidptr
 _sgemm = types.ExternalFunction(
     "scipy_cblas_sgemm64_", types.void(_i, _i, _i, _n, _n, _n, _f, _p, _n, _p, _n, _f, _p, _n)
+)
+_dgemm = types.ExternalFunction(
+    "scipy_cblas_dgemm64_", types.void(_i, _i, _i, _n, _n, _n, _d, _p, _n, _p, _n, _d, _p, _n)
 )
 _sgemv = types.ExternalFunction("scipy_cblas_sgemv64_", types.void(_i, _i, _n, _n, _f, _p, _n, _p, _n, _f, _p, _n))
 
@@ -59,6 +69,13 @@ if FOUND:
         x, y, z = a.ctypes.data, b.ctypes.data, out.ctypes.data
         _sgemm(_ROWS, _TURNED, _PLAIN, k, n, m, 1.0, x, k, y, n, 0.0, z, n)
 
+    @jit
+    def times_turned_double(a, b, out):
+        """The product a b^T of float64 into `out`, shapes (m, k), (n, k) and (m, n)."""
+        m, k, n = a.shape[0], a.shape[1], b.shape[0]
+        x, y, z = a.ctypes.data, b.ctypes.data, out.ctypes.data
+        _dgemm(_ROWS, _PLAIN, _TURNED, m, n, k, 1.0, x, k, y, k, 0.0, z, n)
+
 else:
 
     @jit
@@ -75,3 +92,8 @@ else:
     def turned_times(a, b, out):
         """The product a^T b into `out`, shapes (m, k), (m, n) and (k, n)."""
         np.dot(a.T, b, out)
+
+    @jit
+    def times_turned_double(a, b, out):
+        """The product a b^T of float64 into `out`, shapes (m, k), (n, k) and (m, n)."""
+        np.dot(a, b.T, out)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from gemuco.compiled.bend import bend, slopes
-from gemuco.compiled.blas import times
+from gemuco.compiled.blas import times, times_turned_double
 from gemuco.compiled.chain import CODE, NARROW, matrix, offset
 from gemuco.compiled.jit import jit
 
@@ -37,7 +37,8 @@ def innovations(predictor, rows, biases, through, tails, index, whiten):
             for j in range(size):
                 raw[count + row * size + j, i] = told[(1 + j) * batch + line, element]
     turned = np.empty_like(raw)
-    np.dot(raw, whiten.T, turned)
+    if len(index):
+        times_turned_double(raw, whiten, turned)
     found = np.empty((count, len(index), size))
     for row in range(count):
         for j in range(size):

@@ -29,7 +29,7 @@ def _numpys_blas() -> Path | None:
     """The library that numpy's wheels bring along, if it is there and has the names that `blas` calls."""
     for library in sorted((Path(np.__file__).parents[1] / "numpy.libs").glob("libscipy_openblas64_*.so")):
         loaded = ctypes.CDLL(str(library))  # numpy has it open already
-        if hasattr(loaded, "scipy_cblas_sgemm64_") and hasattr(loaded, "scipy_cblas_sgemv64_"):
+        if all(hasattr(loaded, f"scipy_cblas_{name}64_") for name in ("sgemm", "sgemv", "dgemm")):
             return library
     return None
 

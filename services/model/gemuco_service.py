@@ -289,7 +289,7 @@ def make_ready() -> None:
             said = time.monotonic()
             log.warning("Compiling for this machine, once: %d %% done, now %s", round(100 * done), what)
 
-    warm(tell)
+    warm(tell, is_service=True)
 
 
 def serve(robot: RobotConfig, folder: Path, connect: Iterable[str] = (), stop: threading.Event | None = None) -> None:

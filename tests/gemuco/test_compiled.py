@@ -200,12 +200,12 @@ ALL_WAYS = """
 import numpy as np
 from gemuco import warm
 from gemuco.adapt import UpdateConfig
-from gemuco.compiled import bank, chain, descent, inference, innovation, learning, newton
+from gemuco.compiled import bank, batch, chain, descent, inference, innovation, learning, newton, score
 from gemuco.control import Controller
 from gemuco.losses import Match, StaySmall
-warm.warm()
-used = (newton.search, descent.descend, inference.infer, bank.see, innovation.innovations, learning.gradients)
-used = (*used, chain.output)
+warm.warm(is_service=True)
+used = (newton.search, inference.infer, bank.see, innovation.innovations, learning.gradients, chain.output)
+used = (*used, batch.under_masks, learning.loss, score.deviation)
 before = [len(one.signatures) for one in used]
 body = warm.body().under("other")
 whole = {name: np.full(size, 0.1) for name, (size, _) in warm.SIGNALS.items()}
@@ -218,9 +218,11 @@ for what in ("weights", "bias", "both", "bias_then_weights"):
     for method in ("ekf", "gauss_newton", "gradient"):
         body = body.adapt([whole] * 12, UpdateConfig(what=what, bias_method=method, minimum=1))
     body.estimate({"length": whole["length"]})
+body.anomaly(whole)
 after = [len(one.signatures) for one in used]
 import sys
 assert before == after == [1] * len(used), (before, after)
+assert not descent.descend.signatures
 assert "torch" not in sys.modules
 """
 

@@ -43,9 +43,11 @@ def test_what_is_no_number_of_elements_is_refused(counts: dict[str, int]) -> Non
 
 def test_equal_ones_are_the_same_object_and_memory_is_bounded() -> None:
     assert Elements.of(COUNTS) is Elements.of(dict(COUNTS))
-    assert Elements.of(COUNTS) is not Elements.of(dict(reversed(COUNTS.items())))
+    assert Elements.of(COUNTS) != Elements.of(dict(reversed(COUNTS.items())))
+    before = Elements.of(COUNTS)
     for number in range(3 * KEPT):
         Elements.of({f"signal_{number}": 1})
     assert len(Elements._known) <= KEPT
+    assert Elements.of(COUNTS) == before  # but for its place in memory
     Elements.of({f"signal_{number}": 1 for number in range(LONGEST + 1)})
     assert max(map(len, Elements._known)) <= LONGEST
