@@ -156,7 +156,7 @@ def structure() -> Row:
     )
     return faster(
         "structure, 10 signals, all 1023 masks x 1000 rows", "loop over masks in torch", lambda: judge.race(masks),
-        by_torch, 20.0, note, rounds=3,
+        by_torch, 20.0, note, rounds=5,
     )  # fmt: skip
 
 
