@@ -23,6 +23,7 @@ from benchmarks.bodies import MASKS, body, modules
 from benchmarks.table import Row, faster
 from gemuco.schema import BodySchema
 from gemuco.warm import warm
+from hal.by_signal import Numbers, Truths
 from hal.clock import SystemClock
 from hal.config import load_robot
 from services.model.estimation import Estimation, Fresh, Freshness
@@ -55,15 +56,18 @@ def samples(schema: BodySchema, clock: SystemClock) -> Callable[[], Fresh]:
     valid = {name: np.ones(size, bool) for name, size in sizes.items()}
     valid[SILENT[0]][SILENT[1]] = False
     age = {name: np.zeros(size) for name, size in sizes.items()}
-    known = [{name: random.standard_normal(size) for name, size in sizes.items()} for _ in range(16)]
+    known = [
+        Sample(
+            cycle=cycle, source="can", complete=False, age=age, valid=valid,
+            values={name: random.standard_normal(size) for name, size in sizes.items()},
+        )
+        for cycle in range(16)
+    ]  # fmt: skip
 
     def newest() -> Fresh:
         nonlocal number
         number += 1
-        values = known[number % len(known)]
-        return Fresh(
-            Sample(cycle=number, source="can", complete=False, values=values, age=age, valid=valid), clock.monotonic()
-        )
+        return Fresh(known[number % len(known)], clock.monotonic())
 
     return newest
 
@@ -79,22 +83,20 @@ def torch_tick(
     network = nn.Sequential(*modules(schema))
     layout, mean, std = schema.layout, schema.scaler.mean, schema.scaler.std
     gate, tail = schema.gate(MASKS[0])
+    nothing = np.zeros(layout.size)
     names = layout.names
 
     @torch.inference_mode()
     def tick() -> None:
         sample = newest().sample
-        x = np.concatenate([sample.values[name] for name in names])
-        there = np.concatenate([sample.valid[name] for name in names])
+        x, there, elements = sample.values.flat, sample.valid.flat, sample.elements
         given = np.concatenate([np.where(gate > 0, (x - mean) / std, 0.0), tail]).astype(np.float32)
         told = network(torch.from_numpy(given)).numpy() * std + mean
         values = np.where(there, x, told)
         publish(
             Estimates(
-                stamp_ns=clock.now_ns(), cycle=sample.cycle,
-                values={name: values[span] for name, span in layout.slices.items()},
-                estimated={name: ~there[span] for name, span in layout.slices.items()},
-                std={name: np.zeros(span.stop - span.start) for name, span in layout.slices.items()},
+                stamp_ns=clock.now_ns(), cycle=sample.cycle, elements=elements,
+                values=Numbers(values, elements), estimated=Truths(~there, elements), std=Numbers(nothing, elements),
                 method=dict.fromkeys(names, "mask"), mask=dict.fromkeys(names, ""), residual=dict.fromkeys(names, 0.0),
             )
         )  # fmt: skip

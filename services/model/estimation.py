@@ -17,7 +17,8 @@ from services.model.living_model import layout_of
 from services.wire.messages import Estimates, Sample
 from services.wire.streams import Newest as Reader
 
-Places = tuple[np.ndarray, np.ndarray]
+Place = np.ndarray | slice
+Places = tuple[Place, Place]
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,8 +138,15 @@ class _Source:
         """Where the model's elements lie, and where in a sample; a signal of another size is as good as silent."""
         names = [name for name in self._names if theirs.counts.get(name) == self._elements.counts[name]]
         to, of = ([np.r_[all_of.places[name]] for name in names] for all_of in (self._elements, theirs))
-        empty = [np.zeros(0, int)]
-        return np.concatenate(to or empty), np.concatenate(of or empty)
+        return _joined(to), _joined(of)
+
+
+def _joined(places: list[np.ndarray]) -> Place:
+    """All of them, as a slice if they lie one behind the other: that takes no copy."""
+    if not places:
+        return slice(0, 0)
+    found = np.concatenate(places)
+    return slice(found[0], found[-1] + 1) if (np.diff(found) == 1).all() else found
 
 
 def _unwritable(array: np.ndarray) -> np.ndarray:
