@@ -49,7 +49,7 @@ def play(robot: RobotConfig, path: Path, seed: int, out: Path) -> int:
     make_model(robot, console)
     with progress("compiling") as tell:  # what the processes would each wait for
         warm(tell)
-    with Supervisor(out) as supervisor:
+    with Supervisor(out, at_checks=True) as supervisor:
         with running(robot, path, seed, target, out, supervisor, console) as cast:
             stages = perform(cast.robot, cast.client, target, seed, cast.actor, out / "story.png", console)
         supervisor.stop("client", "recorder")

@@ -60,18 +60,31 @@ class Supervisor:
     children in the opposite order of their start. The kernel ends a child when the supervisor dies without a word.
     """
 
-    def __init__(self, folder: Path, grace: float = 5.0) -> None:
-        """Logs go to `folder/<name>.log`; a child that ignores SIGTERM for `grace` [s] is killed."""
+    def __init__(self, folder: Path, grace: float = 5.0, at_checks: bool = False) -> None:
+        """Prepare.
+
+        Args:
+            folder: Logs go to `folder/<name>.log`.
+            grace: A child that ignores SIGTERM for so long [s] is killed.
+            at_checks: Obey Ctrl-C and SIGTERM in `check`, which must then be called all the time, and no sooner: an
+                exception in the midst of anything can leave a lock behind that another thread waits for for ever. A
+                second signal does not wait.
+        """
         self.folder = folder
         self.grace = grace
+        self.at_checks = at_checks
+        self._asked: int | None = None
         self.children: dict[str, Child] = {}
         self._handlers: dict[int, Any] = {}
 
     def __enter__(self) -> "Supervisor":
         """Turn SIGTERM and SIGHUP into `SystemExit`, so that leaving the block stops the children."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        for number in (signal.SIGTERM, signal.SIGHUP):
-            self._handlers[number] = signal.signal(number, _leave)
+        numbers = [signal.SIGTERM, signal.SIGHUP]
+        if self.at_checks and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+            numbers.append(signal.SIGINT)
+        for number in numbers:
+            self._handlers[number] = signal.signal(number, self._note if self.at_checks else _leave)
         return self
 
     def __exit__(
@@ -82,6 +95,8 @@ class Supervisor:
         finally:
             for number, handler in self._handlers.items():
                 signal.signal(number, handler)
+        if error is None:
+            self._obey()
 
     def start(self, name: str, command: Sequence[str]) -> Child:
         """Start a process; call from the main thread, whose death ends the child."""
@@ -116,10 +131,23 @@ class Supervisor:
             time.sleep(POLL)
 
     def check(self) -> None:
-        """Raise `ChildDied` if a child has ended that nobody stopped."""
+        """Raise `ChildDied` if a child has ended that nobody stopped, and what a signal asked for meanwhile."""
+        self._obey()
         for child in self.children.values():
             if said := child.ended():
                 raise ChildDied(said)
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        was_asked, self._asked = self._asked is not None, number
+        if was_asked:
+            self._obey()
+
+    def _obey(self) -> None:
+        asked, self._asked = self._asked, None
+        if asked == signal.SIGINT:
+            raise KeyboardInterrupt
+        if asked is not None:
+            raise SystemExit(128 + asked)
 
     def kill(self, name: str) -> None:
         """End a child as a crash would (SIGKILL), and forget it."""

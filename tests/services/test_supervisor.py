@@ -81,3 +81,29 @@ def test_no_child_survives_its_supervisor(tmp_path: Path, number: signal.Signals
     os.kill(parent.pid, number)
     parent.wait(10)
     wait_until(lambda: not is_running(pid))
+
+
+@pytest.mark.parametrize(
+    ("number", "raised"),
+    [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit), (signal.SIGHUP, SystemExit)],
+)
+def test_a_signal_can_wait_for_a_good_moment(
+    tmp_path: Path, number: signal.Signals, raised: type[BaseException]
+) -> None:
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(raised), Supervisor(tmp_path, at_checks=True) as supervisor:
+            child = supervisor.start("sleeper", SLEEPER)
+            os.kill(os.getpid(), number)
+            time.sleep(0.01)  # nothing is raised here
+            assert child.process.poll() is None
+            supervisor.check()
+        assert not is_running(child.process.pid)
+        with pytest.raises(raised), Supervisor(tmp_path, at_checks=True):
+            os.kill(os.getpid(), number)  # nobody checks any more, and it is obeyed at the end
+        with pytest.raises(raised), Supervisor(tmp_path, at_checks=True):
+            os.kill(os.getpid(), number)
+            os.kill(os.getpid(), number)
+            pytest.fail("the second signal was not obeyed at once")
+    finally:
+        signal.signal(signal.SIGINT, before)
