@@ -195,26 +195,31 @@ class Form:
         return _named(elements, packed.unpack(data))
 
     def _check(self, body: dict[str, Any]) -> None:
-        """Raise unless a message tells everything of the same signals, all of them in the catalogue."""
-        counts = _checked(dict, body["elements"])
-        for signal, count in counts.items():
+        """Raise unless a message tells everything of the same signals, all of them in the catalogue.
+
+        Sizes first: what `OtherLayout` tells is as much as really came.
+        """
+        elements = Elements.of(_checked(dict, body["elements"]))
+        record: Any = self.record
+        for name, kind in record.BY_ELEMENT:
+            there = len(_checked(bytes, body[name])) / kind.DTYPE.itemsize
+            if there != elements.size:
+                raise MessageError(f"{elements.size:g} elements are named, and {there:g} are there in '{name}'.")
+        for signal, count in elements.counts.items():
             if signal not in self._packed or len(self._packed[signal][0]) != count:
-                raise OtherLayout(_checked(str, signal), _checked(int, count))
-        for name in self.record.BY_SIGNAL:  # type: ignore[attr-defined]
-            if body[name].keys() != counts.keys():
+                raise OtherLayout(signal, count)
+        for name in record.BY_SIGNAL:
+            if body[name].keys() != elements.counts.keys():
                 raise MessageError(f"A {self.record.TYPE} message names other signals in '{name}' than in 'elements'.")
 
     def _of_numbers(self, data: bytes, body: dict[str, Any]) -> dict[str, dict[str, float]]:
         return self._split(struct.unpack(f"<{len(data) // 8}d", data), body, _named)
 
     def _of_truths(self, data: bytes, body: dict[str, Any]) -> dict[str, dict[str, bool]]:
-        return self._split(_checked(bytes, data), body, _named_truths)
+        return self._split(data, body, _named_truths)
 
     def _split(self, values: Sequence[Any], body: dict[str, Any], named: Callable[..., dict[str, Any]]) -> Any:
         """Parts of what is told of all signals, by signal."""
-        named_size = sum(body["elements"].values())
-        if named_size != len(values):
-            raise MessageError(f"{named_size} elements are named, and {len(values)} are there.")
         found, start = {}, 0
         for signal in body["elements"]:
             elements = self._packed[signal][0]

@@ -181,5 +181,13 @@ def test_fields_of_a_newer_sender_are_kept() -> None:
 def test_a_sample_that_does_not_agree_with_itself_is_not_recorded_as_one(field: str) -> None:
     body = msgpack.unpackb(messages.encode(a_message(Sample)))
     body[field] = body[field][:-8] if field == "age" else body[field][:-1]
-    with pytest.raises(MessageError, match="3 elements are named, and 2 are there"):
+    with pytest.raises(MessageError, match=f"3 elements are named, and 2 are there in '{field}'"):
         Form(Sample, ARM).write(msgpack.packb(body))
+
+
+@pytest.mark.parametrize("counts", [{"flood": 10**12}, {"flood": 10**12, "ebb": 3 - 10**12}, {"flood": 1e300}])
+def test_elements_that_did_not_come_are_not_taken_for_a_new_signal(counts: dict[str, float]) -> None:
+    body = _body(Sample) | {"elements": counts}
+    with pytest.raises(MessageError) as told:
+        Form(Sample, ARM).write(msgpack.packb(body))
+    assert not isinstance(told.value, OtherLayout)  # it would be listed with a name for each element
