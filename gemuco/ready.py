@@ -1,7 +1,8 @@
 """What a body schema is made into for compiled code, each when it is first asked for and then kept with the schema."""
 
+from collections.abc import Callable
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 import numpy as np
 
@@ -16,50 +17,57 @@ from gemuco.scaler import CLIP
 if TYPE_CHECKING:
     from gemuco.schema import BodySchema
 
+T = TypeVar("T")
 PATTERNS = 64
 """Sets of missing elements for which plans are kept."""
 
 
-def _keep(kept: dict[bytes, Any], key: bytes, value: Any) -> None:
-    """Keep it; whoever asks in another thread at the same moment makes the same."""
-    if len(kept) >= PATTERNS:
-        kept.clear()
-    kept[key] = value
+class ByPattern(Generic[T]):
+    """What is worked out of which elements of a sample are there, kept for at most `PATTERNS` of them.
+
+    Threads that ask at the same moment may each work it out, and find the same.
+    """
+
+    def __init__(self, work_out: Callable[[np.ndarray], T]) -> None:
+        self._work_out = work_out
+        self._kept: dict[bytes, T] = {}
+        self._last: bytes | None = None
+
+    def __call__(self, finite: np.ndarray) -> T:
+        """For these elements, truth values, shape (size,)."""
+        key = self._last = finite.tobytes()
+        found = self._kept.get(key)
+        if found is None:
+            found = self._work_out(finite)
+            if len(self._kept) >= PATTERNS:
+                self._kept.clear()
+            self._kept[key] = found
+        return found
+
+    def follow(self, other: "ByPattern[T]") -> None:
+        """Work out now what another one was asked for last."""
+        if other._last is not None:
+            self(np.frombuffer(other._last, bool))
 
 
 class Ready:
-    """A schema as compiled code takes it."""
+    """A schema as compiled code takes it.
+
+    Attributes:
+        plan: How samples are filled in of which certain elements are there.
+        judgement: How such samples are judged.
+    """
 
     def __init__(self, schema: "BodySchema") -> None:
         self._schema = schema
-        self._plans: dict[bytes, Plan] = {}
-        self._judgements: dict[bytes, Judgement] = {}
+        self.plan = ByPattern(lambda finite: Plan.of(schema, finite))
+        self.judgement = ByPattern(lambda finite: Judgement.of(schema, finite))
 
     def prepare(self, other: "Ready") -> None:
-        """Make now what the other one was asked for, before a loop that keeps time asks this one."""
+        """Make now what the other one was asked for last, before a loop that keeps time asks this one."""
         _ = self.predictor, self.judges
-        for key in list(other._plans):
-            self.plan(np.frombuffer(key, bool))
-        for key in list(other._judgements):
-            self.judgement(np.frombuffer(key, bool))
-
-    def plan(self, finite: np.ndarray) -> Plan:
-        """How samples are filled in of which these elements are there, truth values, shape (size,)."""
-        key = finite.tobytes()
-        found = self._plans.get(key)
-        if found is None:
-            found = Plan.of(self._schema, finite)
-            _keep(self._plans, key, found)
-        return found
-
-    def judgement(self, finite: np.ndarray) -> Judgement:
-        """How samples are judged of which these elements are there, truth values, shape (size,)."""
-        key = finite.tobytes()
-        found = self._judgements.get(key)
-        if found is None:
-            found = Judgement.of(self._schema, finite)
-            _keep(self._judgements, key, found)
-        return found
+        self.plan.follow(other.plan)
+        self.judgement.follow(other.judgement)
 
     @cached_property
     def predictor(self) -> Predictor:
