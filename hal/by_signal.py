@@ -7,8 +7,8 @@ import numpy as np
 
 KEPT = 256
 """Sets of signals that are kept, so that equal ones are the same object; a robot has a handful."""
-LONGEST = 256
-"""Longer ones, which no robot has, are not kept."""
+LONGEST = 1 << 14
+"""Letters of all names together; longer ones, which no robot has, are not kept."""
 
 
 class Elements:
@@ -62,7 +62,7 @@ class Elements:
             found = cls(counts) if counts else NOTHING
             if len(cls._known) >= KEPT:
                 cls._known.clear()
-            if len(key) <= LONGEST:
+            if sum(map(len, counts)) <= LONGEST:
                 cls._known[key] = found
         return found
 

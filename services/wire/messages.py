@@ -5,7 +5,7 @@ of numbers is a msgpack binary of little-endian float64; an array of truth value
 told of all signals is one array, in the order of the map `elements`, which says how many of them are whose.
 """
 
-import operator
+import copy
 from typing import Any, TypeVar, Union
 
 import msgspec
@@ -38,9 +38,6 @@ __all__ = [
 
 VERSION = 2
 MAX_BYTES = 1 << 20
-copied = operator.methodcaller("__copy__")
-_frombuffer = np.frombuffer
-NUMBER, TRUTH = np.dtype("<f8"), np.dtype("?")
 UNREADABLE = (msgspec.MsgspecError, UnicodeDecodeError, RecursionError)
 """What msgspec raises of bytes that are not msgpack, or not what they should be."""
 
@@ -68,7 +65,7 @@ def _packed(value: Any) -> Any:
     if kind is Elements:
         return value.counts
     if isinstance(value, np.ndarray):
-        return value.astype(NUMBER, copy=False).tobytes()
+        return value.astype(Numbers.DTYPE, copy=False).tobytes()
     if isinstance(value, np.generic):
         return value.item()
     raise TypeError(f"A message cannot carry {kind.__name__}.")
@@ -77,16 +74,18 @@ def _packed(value: Any) -> Any:
 def _read(kind: Any, value: Any) -> Any:
     """What `_packed` made of something that is not msgpack's."""
     if kind is Elements:
-        return Elements.of(value) if type(value) is dict else _amiss("a map from signal to its number of elements")
-    if type(value) is not bytes or (kind is not Truths and len(value) % 8):
-        return _amiss("a binary of bytes" if kind is Truths else "a binary of little-endian float64")
+        if type(value) is not dict:
+            raise ValueError("Expected a map from signal to its number of elements")
+        return Elements.of(value)
     if kind is Truths:
-        return Truths(_frombuffer(value, "u1") != 0 if value.strip(b"\0\1") else _frombuffer(value, TRUTH), OPEN)
-    return Numbers(_frombuffer(value, NUMBER), OPEN) if kind is Numbers else _frombuffer(value, NUMBER)
-
-
-def _amiss(wanted: str) -> Any:
-    raise ValueError(f"Expected {wanted}")
+        if type(value) is not bytes:
+            raise ValueError("Expected a binary of bytes")
+        is_plain = not value.strip(b"\0\1")
+        return Truths(np.frombuffer(value, Truths.DTYPE) if is_plain else np.frombuffer(value, "u1") != 0, OPEN)
+    if type(value) is not bytes or len(value) % 8:
+        raise ValueError("Expected a binary of little-endian float64")
+    numbers = np.frombuffer(value, Numbers.DTYPE)
+    return Numbers(numbers, OPEN) if kind is Numbers else numbers
 
 
 _encoder = msgspec.msgpack.Encoder(enc_hook=_packed)
@@ -101,7 +100,7 @@ _any_decoder: msgspec.msgpack.Decoder[Any] = msgspec.msgpack.Decoder(
 
 def encode(message: Message, **header: int) -> bytes:
     """The wire form of a message; `header` replaces `seq` and `boot`, which the publisher knows."""
-    filled = copied(message)  # `replace` would check it all again
+    filled = copy.copy(message)  # `replace` would check it all again
     force_setattr(filled, "v", VERSION)
     for name, value in header.items():
         force_setattr(filled, name, value)

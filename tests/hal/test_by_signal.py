@@ -49,5 +49,6 @@ def test_equal_ones_are_the_same_object_and_memory_is_bounded() -> None:
         Elements.of({f"signal_{number}": 1})
     assert len(Elements._known) <= KEPT
     assert Elements.of(COUNTS) == before  # but for its place in memory
-    Elements.of({f"signal_{number}": 1 for number in range(LONGEST + 1)})
-    assert max(map(len, Elements._known)) <= LONGEST
+    for long in ({"a" * (LONGEST + 1): 1}, {f"signal_{number}": 1 for number in range(LONGEST)}):
+        assert Elements.of(long).counts == long
+        assert tuple(long.items()) not in Elements._known
