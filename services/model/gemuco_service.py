@@ -28,6 +28,7 @@ from services.model.model_verbs import ModelVerbs
 from services.model.target_intake import TargetIntake
 from services.model.update_loop import OnlineUpdate
 from services.process.loop import Loop
+from services.process.one_core import OneCore
 from services.process.realtime import freeze, prepare_process, promote_rest
 from services.process.service import Service, until_told
 from services.wire import keys, query
@@ -51,6 +52,8 @@ NETWORK_PRIORITY = 45
 PRIORITIES = {"estimation": 40, "control": 35, "anomaly": 30, "update": 10, "verdict": 10}
 """SCHED_FIFO where the system allows it; learning and judging are lowest but not without, or they would hold the
 interpreter up."""
+OFFSETS = {"estimation": 0.0, "anomaly": 0.6e-3, "control": 1.0e-3, "update": 2.6e-3, "verdict": 28.6e-3}
+"""When they begin [s] after the multiples of their periods, so that at usual rates no two begin at once."""
 
 
 class ModelSolver:
@@ -141,6 +144,7 @@ class GemucoService:
         self._solver: ModelSolver | None = None
         self.control, self.no_control = self._make_control(self.config)
         self.loops = self._make_loops()
+        self._core = OneCore()
         service.watch(*self.loops)
 
     def _make_loops(self) -> list[Loop]:
@@ -150,7 +154,7 @@ class GemucoService:
         waited = estimation.waited if times.is_integer() else None
 
         def loop(name: str, rate: float, tick: Callable[[], None], **options: Any) -> Loop:
-            return Loop(name, rate, tick, self.clock, PRIORITIES[name], **options)
+            return Loop(name, rate, tick, self.clock, PRIORITIES[name], OFFSETS[name], **options)
 
         return [
             loop("estimation", rates.estimation, estimation.tick, waited=waited),
@@ -181,6 +185,7 @@ class GemucoService:
         missing = [name for name, value in values.items() if not np.isfinite(value).all()]
         loops = {loop.name: loop.statistics() for loop in self.loops}
         failing = [f"{loop.name}: {loop.trouble}" for loop in self.loops if loop.trouble]
+        self._core.look(any(loop.is_slow for loop in self.loops))
         text = ""
         if fresh is None:
             text = "No fresh sample comes from the HAL. Is `gemuco hal` running?"
@@ -202,6 +207,7 @@ class GemucoService:
                 "control": self.no_control if self.control is None else self.control.facts(),
                 "late_solves": 0 if self._solver is None else self._solver.late,
                 "scheduling": {loop.name: loop.scheduling for loop in self.loops},
+                "core": "any" if self._core.core is None else self._core.core,
                 "rejected": self._targets.rejected + sum(reader.rejected for reader in self._readers()),
                 "signals": self.estimation.counts(),
                 "anomaly": self.anomaly.summary(),
@@ -217,7 +223,8 @@ class GemucoService:
             loop.start()
         promote_rest(NETWORK_PRIORITY)
         try:
-            self.service.run(self.status, stop)
+            with self._core:
+                self.service.run(self.status, stop)
         finally:
             for loop in self.loops:
                 loop.stop()

@@ -34,6 +34,11 @@ class Grid:
         self._start = start
         self._index = 0
 
+    @classmethod
+    def aligned(cls, period: float, offset: float, now: float) -> "Grid":
+        """From the last moment before now that lies `offset` [s] after a multiple of the period on the clock."""
+        return cls(period, now - (now - offset) % period)
+
     def next(self, now: float) -> float:
         """The next deadline [s]: in the future, or less than one period past."""
         self._index += 1
@@ -66,6 +71,8 @@ class Loop:
         tick: What to do; takes nothing, returns nothing.
         clock: What time it is.
         priority: SCHED_FIFO priority to try, 0 for none.
+        offset: When it ticks [s] after the multiples of its period on the clock: loops of one process share one
+            interpreter, and those that begin at the same moment wait for each other.
         waited: Tells after a tick how long [s] what it worked on had waited when it began, None if that was nothing
             new; the grid moves slowly until that is short. By itself it stays where it is.
     """
@@ -77,6 +84,7 @@ class Loop:
         tick: Callable[[], None],
         clock: Clock | None = None,
         priority: int = 0,
+        offset: float = 0.0,
         waited: Callable[[], float | None] | None = None,
     ) -> None:
         self.name = name
@@ -88,6 +96,7 @@ class Loop:
         self._tick = tick
         self._clock = clock or SystemClock()
         self._priority = priority
+        self._offset = offset
         self._waited = waited
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
@@ -122,7 +131,7 @@ class Loop:
         return self._ticks - self.failed
 
     def start(self) -> None:
-        """Begin ticking; the first tick is one period from now."""
+        """Begin ticking; the first tick is at most one period from now."""
         if self._thread is not None:
             raise RuntimeError(f"Loop '{self.name}' was already started.")
         self._thread = threading.Thread(target=self._run, name=f"loop {self.name}", daemon=True)
@@ -177,7 +186,7 @@ class Loop:
         self.scheduling = prepare_thread(self._priority)
         clock = self._clock
         now = clock.monotonic()
-        self._grid = Grid(1.0 / self.rate, now)
+        self._grid = Grid.aligned(1.0 / self.rate, self._offset, now)
         self._counted = (now, 0, 0.0)
         while not self._stop.is_set():
             deadline = self._grid.next(now)

@@ -33,6 +33,15 @@ def test_grid_skips_what_was_slept_through() -> None:
     assert grid.next(7.6) == 8.0
 
 
+@given(st.floats(0.0, 1e6), st.floats(0.0, 0.02), st.sampled_from([0.002, 0.005, 0.01, 0.05]))
+def test_grids_of_one_clock_keep_their_distance(now: float, offset: float, period: float) -> None:
+    """Whenever a loop is started, it ticks at the same moments of the clock, the first of them within a period."""
+    first = Grid.aligned(period, offset, now).next(now)
+    assert now - 1e-6 < first <= now + period + 1e-6
+    away = (first - offset) % period
+    assert min(away, period - away) < 1e-6
+
+
 @given(st.lists(st.floats(0.0, 5.0), min_size=1, max_size=50))
 def test_grid_never_makes_a_burst(durations: list[float]) -> None:
     """Ticks and skips together are the periods that went by, whatever the ticks took."""
