@@ -11,7 +11,7 @@ from pathlib import Path
 
 log = logging.getLogger(__name__)
 
-SWITCH_INTERVAL = 0.0005
+SWITCH_INTERVAL = 0.0001
 """How long [s] a Python thread may keep the interpreter from a waiting loop; Python's own 5 ms is a whole cycle."""
 _PR_SET_TIMERSLACK = 29
 _said = threading.Event()
