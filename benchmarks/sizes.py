@@ -34,16 +34,11 @@ def by_hidden() -> dict[str, list[float]]:
     found: dict[str, list[float]] = {}
     for hidden in HIDDEN:
         schema = body((hidden, hidden))
-        joined = np.zeros(schema.layout.size)
-        gate = schema.gate(schema.masks[0])
+        asked = (np.zeros(schema.layout.size), *schema.gate(schema.masks[0]), np.ones(schema.layout.size, bool))
         plain, balanced = Ours(schema, "e", TERMS), Ours(schema, "e", (*TERMS, BALANCE))
-        predictor = schema.ready.predictor
+        asked = (*schema.ready.parts, *asked, np.empty(schema.layout.size))
         for name, job, calls in (
-            (
-                "estimate by mask",
-                lambda predictor=predictor, joined=joined, gate=gate: infer(predictor, joined, *gate),
-                300,
-            ),
+            ("estimate by mask", lambda asked=asked: infer(*asked), 300),
             ("default search", lambda plain=plain: plain.solve(NewtonConfig()), 30),
             ("default search, torque balance", lambda balanced=balanced: balanced.solve(NewtonConfig()), 15),
             ("descent 20 x 30", lambda plain=plain: plain.solve(PAPER), 15),

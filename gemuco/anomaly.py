@@ -54,6 +54,7 @@ def score(schema: "BodySchema", values: Mapping[str, np.ndarray], blame: bool = 
             contributes most is named.
     """
     joined = schema.layout.join_one(values)
+    joined.setflags(write=False)
     found = judged(schema, joined)
     blamed = found.blamed(schema)
     if blame and found.distance > found.threshold:
@@ -83,7 +84,7 @@ class Judged:
 
 
 def judged(schema: "BodySchema", joined: np.ndarray) -> Judged:
-    """The score of a sample in one array [unit of each element], shape (size,); NaN where missing."""
+    """The score of a sample in one array, as `estimate.fill` takes it."""
     by = schema.ready.judgement(np.isfinite(joined))
     if schema.normal is None or not len(by.index):
         return Judged(float("nan"), float("nan"), np.full(schema.out_layout.size, np.nan))

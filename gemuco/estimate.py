@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -44,8 +44,7 @@ class Estimate:
     residual: float
 
 
-@dataclass(frozen=True, slots=True)
-class Filled:
+class Filled(NamedTuple):
     """Every element of a layout as well as it can be known; see `Estimate` for what is told of each signal.
 
     Attributes:
@@ -115,7 +114,9 @@ class Plan:
 
 def estimate(schema: "BodySchema", values: Mapping[str, np.ndarray]) -> dict[str, Estimate]:
     """Every signal of the layout; see `BodySchema.estimate`."""
-    found = fill(schema, schema.layout.join_one(values))
+    joined = schema.layout.join_one(values)
+    joined.setflags(write=False)
+    found = fill(schema, joined)
     return {
         name: Estimate(
             found.value[span], found.std[span], found.estimated[span],
@@ -126,13 +127,20 @@ def estimate(schema: "BodySchema", values: Mapping[str, np.ndarray]) -> dict[str
 
 
 def fill(schema: "BodySchema", joined: np.ndarray) -> Filled:
-    """What `estimate` tells, of a sample in one array [unit of each element], shape (size,); NaN where missing."""
+    """What `estimate` tells, of a sample in one array [unit of each element], shape (size,); NaN where missing.
+
+    Nobody may write into that array: as in a service, and code is compiled for one of both kinds.
+    """
     plan = schema.ready.plan(np.isfinite(joined))
-    value, residual = joined, dict.fromkeys(plan.method, 0.0)
+    value, residual = joined.copy(), dict.fromkeys(plan.method, 0.0)
     for method, mask, missing, names in plan.ways:
-        told, amiss = _guess(schema, method, mask, joined)
-        value = np.where(missing, told, value)
-        residual |= dict.fromkeys(names, amiss)
+        if method == "mask":
+            amiss = infer(*schema.ready.parts, joined, *schema.gate(mask), missing, value)
+        else:
+            told, amiss = _guess(schema, method, mask, joined)
+            np.copyto(value, told, where=missing)
+        for name in names:
+            residual[name] = amiss
     return Filled(value, plan.std, plan.estimated, plan.method, plan.mask, plan.label, residual)
 
 
@@ -159,9 +167,6 @@ def _route(schema: "BodySchema", name: str, whole: Mask, finite: np.ndarray) -> 
 
 def _guess(schema: "BodySchema", method: str, mask: Mask, joined: np.ndarray) -> tuple[np.ndarray, float]:
     """Every element as the model says [unit], shape (size,), NaN where it says nothing; and the residual."""
-    if method == "mask":
-        told, amiss = infer(schema.ready.predictor, joined, *schema.gate(mask))
-        return told, amiss
     x = np.where(np.isfinite(joined), schema.scaler.normalise(joined), np.nan)
     full = np.full(schema.layout.size, np.nan)
     if method == "latent":

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 import numpy as np
 
 from gemuco.compiled.chain import pack
-from gemuco.compiled.inference import Predictor
+from gemuco.compiled.inference import Parts, Predictor
 from gemuco.compiled.score import Judges
 from gemuco.estimate import STARTS, Plan
 from gemuco.kernels import run
@@ -65,7 +65,7 @@ class Ready:
 
     def prepare(self, other: "Ready") -> None:
         """Make now what the other one was asked for last, before a loop that keeps time asks this one."""
-        _ = self.predictor, self.judges
+        _ = self.parts, self.judges
         self.plan.follow(other.plan)
         self.judgement.follow(other.judgement)
 
@@ -75,6 +75,11 @@ class Ready:
         schema = self._schema
         scale = np.stack([schema.scaler.mean, schema.scaler.std])
         return Predictor(pack(schema.weights.whole), schema.in_index, schema.out_index, scale, CLIP)
+
+    @cached_property
+    def parts(self) -> Parts:
+        """The network as `gemuco.compiled.inference.infer` takes it."""
+        return self.predictor.parts
 
     @cached_property
     def judges(self) -> Judges:

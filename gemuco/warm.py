@@ -16,6 +16,7 @@ from gemuco.adapt import UpdateConfig
 from gemuco.compiled.chain import pack
 from gemuco.compiled.jit import FOLDER
 from gemuco.compiled.masks import squares, sums
+from gemuco.compiled.usable import usable
 from gemuco.control import Controller
 from gemuco.descent import DescentConfig
 from gemuco.kernels import Layer, Weights
@@ -30,7 +31,7 @@ from gemuco.torque import TorqueBalance
 SIGNALS = {"position": (1, "rad"), "tension": (2, "N"), "length": (2, "m"), "hidden": (1, "m")}
 MASKS = (frozenset({"position", "tension"}), frozenset({"tension", "length", "hidden"}))
 OUTPUTS = ("position", "tension", "length")
-STEPS = {"running": 8, "learning": 2}
+STEPS = {"running": 9, "learning": 2}
 
 
 def body() -> BodySchema:
@@ -64,6 +65,9 @@ def body() -> BodySchema:
 def running(schema: BodySchema) -> Iterator[str]:
     """Use the body in every way that a service does; before each step what it is for."""
     whole = {name: np.zeros(size) for name, (size, _) in SIGNALS.items()}
+    yield "samples"
+    received = np.frombuffer(bytes(8), "<f8"), np.frombuffer(bytes(1), bool), np.frombuffer(bytes(8), "<f8")
+    usable(*received, np.zeros(1, int), np.zeros(1, int), np.ones(1), np.empty(1))
     yield "estimation by mask"
     schema.estimate({name: whole[name] for name in ("position", "tension")})
     yield "estimation by descent"

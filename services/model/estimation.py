@@ -3,11 +3,12 @@
 import math
 from bisect import bisect_left
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from msgspec.structs import replace
 
+from gemuco.compiled.usable import usable
 from gemuco.estimate import fill
 from gemuco.schema import BodySchema
 from hal.by_signal import Elements, Numbers, Truths
@@ -17,12 +18,8 @@ from services.model.living_model import layout_of
 from services.wire.messages import Estimates, Sample
 from services.wire.streams import Newest as Reader
 
-Place = np.ndarray | slice
-Places = tuple[Place, Place]
 
-
-@dataclass(frozen=True, slots=True)
-class Fresh:
+class Fresh(NamedTuple):
     """A sample and when it arrived.
 
     Attributes:
@@ -104,49 +101,42 @@ class _Source:
         self._stale_after = np.concatenate(stale)
         self._limits = sorted({robot.signals[name].stale_after for name in self._names})
         """After these times [s] of waiting some of it becomes stale."""
-        self._layout: tuple[Elements, Places] | None = None
-        self._read: tuple[Sample, np.ndarray] | None = None
-        """The sample that was read last, and what of it could be used when it was published."""
+        self._layout: tuple[Elements, tuple[np.ndarray, np.ndarray]] | None = None
+        self._read: tuple[Sample, np.ndarray, bool] | None = None
+        """The sample that was read last, what of it could be used when it was published, and whether anything could."""
         self._kept: tuple[np.ndarray, int, np.ndarray, bool] | None = None
 
     def usable(self, fresh: Fresh, now: float) -> tuple[np.ndarray, bool]:
         """Every element of the model [unit], shape (size,), NaN where it must not be used now; and whether any may."""
         read, kept = self._read, self._kept
         if read is None or read[0] is not fresh.sample:
-            read = self._read = fresh.sample, self._published(fresh.sample)
-        published, passed = read[1], bisect_left(self._limits, now - fresh.received)
+            read = self._read = fresh.sample, *self._published(fresh.sample)
+        _, published, is_any = read
+        passed = bisect_left(self._limits, now - fresh.received)
+        if not passed:
+            return published, is_any
         if kept is None or kept[0] is not published or kept[1] != passed:
-            found = published
-            if passed:
-                left = self._limits[passed] if passed < len(self._limits) else math.inf
-                found = _unwritable(np.where(self._stale_after >= left, published, np.nan))
+            left = self._limits[passed] if passed < len(self._limits) else math.inf
+            found = _unwritable(np.where(self._stale_after >= left, published, np.nan))
             kept = self._kept = published, passed, found, bool(np.isfinite(found).any())
         return kept[2], kept[3]
 
-    def _published(self, sample: Sample) -> np.ndarray:
-        """What could be used when a sample was published."""
+    def _published(self, sample: Sample) -> tuple[np.ndarray, bool]:
+        """What could be used when a sample was published, and whether anything could."""
         layout = self._layout
         if layout is None or layout[0] is not sample.elements:
             layout = self._layout = sample.elements, self._places(sample.elements)
-        to, of = layout[1]
-        found = np.full(self._elements.size, np.nan)
-        is_usable = sample.valid.flat[of] & (sample.age.flat[of] <= self._stale_after[to])
-        found[to] = np.where(is_usable, sample.values.flat[of], np.nan)
-        return _unwritable(found)
+        found = np.empty(self._elements.size)
+        values, valid, age = sample.values.flat, sample.valid.flat, sample.age.flat
+        is_any = usable(values, valid, age, *layout[1], self._stale_after, found)
+        return _unwritable(found), is_any
 
-    def _places(self, theirs: Elements) -> Places:
-        """Where the model's elements lie, and where in a sample; a signal of another size is as good as silent."""
+    def _places(self, theirs: Elements) -> tuple[np.ndarray, np.ndarray]:
+        """Where the model's elements lie in a sample, and where here; a signal of another size is as good as silent."""
         names = [name for name in self._names if theirs.counts.get(name) == self._elements.counts[name]]
-        to, of = ([np.r_[all_of.places[name]] for name in names] for all_of in (self._elements, theirs))
-        return _joined(to), _joined(of)
-
-
-def _joined(places: list[np.ndarray]) -> Place:
-    """All of them, as a slice if they lie one behind the other: that takes no copy."""
-    if not places:
-        return slice(0, 0)
-    found = np.concatenate(places)
-    return slice(found[0], found[-1] + 1) if (np.diff(found) == 1).all() else found
+        of, to = ([np.r_[all_of.places[name]] for name in names] for all_of in (theirs, self._elements))
+        nowhere = np.zeros(0, int)
+        return np.concatenate([nowhere, *of]), np.concatenate([nowhere, *to])
 
 
 def _unwritable(array: np.ndarray) -> np.ndarray:
@@ -158,7 +148,9 @@ def in_order(schema: BodySchema, values: Numbers) -> Numbers:
     """The same values in the order of the schema's layout, which may be another one than the robot file's."""
     if tuple(values.elements.counts) == schema.layout.names:
         return values
-    return Numbers.of(values, Elements.of({one.name: one.size for one in schema.layout.signals}))
+    found = Numbers.of(values, Elements.of({one.name: one.size for one in schema.layout.signals}))
+    _unwritable(found.flat)
+    return found
 
 
 class Estimation:
