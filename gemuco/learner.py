@@ -176,7 +176,7 @@ class Learner:
     def _step(self, batch: Batch, pace: float, straight: float) -> float:
         """One step of Adam; returns the loss before it."""
         missed, by_weights, by_input = gradients(
-            self.chain, self._inputs(batch), batch.wanted, self.straight(straight), True
+            self.chain, self._inputs(batch), batch.wanted, self.straight(straight), True, self.biases.size > 0
         )
         self.optimiser.rate = pace * self.config.rate
         self.optimiser.move(self.chain.flat, by_weights)

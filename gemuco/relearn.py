@@ -92,7 +92,7 @@ class Relearner:
     def _descend(self, schema: "BodySchema", weights: bool, bias: bool) -> float:
         """One gradient step in place; returns the loss before it."""
         inputs, wanted, present = self._batch(schema)
-        loss, by_weights, by_input = gradients(self._chain, inputs, wanted, SQUARED, weights)
+        loss, by_weights, by_input = gradients(self._chain, inputs, wanted, SQUARED, weights, bias)
         if weights:
             self._optimiser.move(self._chain.flat, by_weights)
         if bias:
@@ -106,7 +106,9 @@ class Relearner:
             Inputs (rows, inputs), wanted x_out (rows, out_size), and which rows are of the present body (rows,).
         """
         config = self._config
-        lived = np.concatenate([self.window.learned(), self._constraints])
+        lived = self.window.learned()
+        if len(self._constraints):
+            lived = np.concatenate([lived, self._constraints])
         old = config.replay if len(self._anchors) else 0
         drawn = self._random.random(config.batch) * (len(lived) + old)
         now = lived[drawn[drawn < len(lived)].astype(int)]

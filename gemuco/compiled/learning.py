@@ -51,7 +51,7 @@ def loss(chain, inputs, wanted, straight):
 
 
 @jit
-def gradients(chain, inputs, wanted, straight, weights):
+def gradients(chain, inputs, wanted, straight, by_weights, by_inputs):
     """Mean loss of a batch, and its derivatives.
 
     Args:
@@ -59,10 +59,12 @@ def gradients(chain, inputs, wanted, straight, weights):
         inputs: Shape (rows, n_in).
         wanted: Shape (rows, n_out); NaN where nothing is known.
         straight: See `missed`.
-        weights: Whether derivatives by W are wanted.
+        by_weights: Whether derivatives by W are wanted.
+        by_inputs: Whether derivatives by the inputs are.
 
     Returns:
-        The loss, its gradient by W in the order of `chain.flat`, and by the inputs, shape (rows, n_in).
+        The loss, its gradient by W in the order of `chain.flat`, and by the inputs, shape (rows, n_in); empty where
+        nobody wants it.
     """
     rows = len(inputs)
     values = space(chain, rows)
@@ -70,22 +72,23 @@ def gradients(chain, inputs, wanted, straight, weights):
     told = forward(chain, values, rows)
     gradient = np.empty_like(told)
     total = missed(told, wanted, straight, gradient)
-    found = np.zeros(len(chain.flat) if weights else 0, chain.flat.dtype)
+    found = np.zeros(len(chain.flat) if by_weights else 0, chain.flat.dtype)
     for layer in range(len(chain.form) - 1, -1, -1):
         code = chain.form[layer, CODE]
         if code:
             slopes(after(chain, values, rows, layer), gradient, code)
         wide, narrow = chain.form[layer, WIDE], chain.form[layer, NARROW]
         below = first(chain, values, rows) if layer == 0 else after(chain, values, rows, layer - 1)
-        if weights:
+        if by_weights:
             place = chain.form[layer, PLACE]
             turned_times(below, gradient, found[place : place + wide * narrow].reshape(wide, narrow))
             offsets = found[place + wide * narrow : place + (wide + 1) * narrow]
             for row in range(rows):
                 for i in range(narrow):
                     offsets[i] += gradient[row, i]
-        pulled = np.empty((rows, wide), gradient.dtype)
-        times_turned(gradient, matrix(chain, layer), pulled)
+        pulled = np.empty((rows if layer or by_inputs else 0, wide), gradient.dtype)
+        if len(pulled):
+            times_turned(gradient, matrix(chain, layer), pulled)
         gradient = pulled
     return total, found, gradient
 

@@ -8,7 +8,7 @@ dampings are tried at once, and the loss itself says which of them was best.
 import numpy as np
 from numba import types
 
-from gemuco.compiled.chain import space
+from gemuco.compiled.chain import after, space
 from gemuco.compiled.jit import jit
 from gemuco.compiled.problem import differences, inside, jacobian, length, losses, muscle_slopes, muscles
 
@@ -194,6 +194,36 @@ def back(problem, point):
 
 
 @jit
+def pick(problem, room, every, row, here):
+    """One of several points that were looked at: its rows, shape (1, rows); the network's values go to `here`.
+
+    Args:
+        problem: What is minimised.
+        room: Values of the network at all of them, after `differences`.
+        every: What `differences` returned.
+        row: Which.
+        here: Is filled in.
+    """
+    count = len(every)
+    for layer in range(len(problem.chain.form)):
+        of, to = after(problem.chain, room, count, layer), after(problem.chain, here, 1, layer)
+        for i in range(to.shape[1]):
+            to[0, i] = of[row, i]
+    return every[row : row + 1].copy()
+
+
+@jit
+def begin(problem, starts, here):
+    """The best of the first points, shape (1, n), its loss, and its rows; the network's values go to `here`."""
+    points, room = starts.copy(), space(problem.chain, len(starts))
+    inside(problem, points)
+    every = differences(problem, points, room)
+    found = losses(problem, every, BREACH)
+    chosen = np.argmin(found)
+    return points[chosen : chosen + 1].copy(), found[chosen], pick(problem, room, every, chosen, here)
+
+
+@jit
 def search(problem, starts, iterations, tolerance, until):
     """Minimise a problem.
 
@@ -208,23 +238,18 @@ def search(problem, starts, iterations, tolerance, until):
         The best point, shape (n,), its loss without what held rows cost, the loss after every iteration, shape
         (done + 1,), and whether time was up before the end.
     """
-    size = starts.shape[1]
-    points = starts.copy()
-    inside(problem, points)
-    found = losses(problem, differences(problem, points, space(problem.chain, len(points))), BREACH)
-    point = points[np.argmin(found)].copy().reshape(1, size)
-    loss = found.min()
+    size, here = starts.shape[1], space(problem.chain, 1)
+    point, loss, rows = begin(problem, starts, here)
     history = np.empty(iterations + 1)
     history[0] = loss
-    here, room = space(problem.chain, 1), space(problem.chain, DAMPINGS)
-    tried = np.empty((DAMPINGS, size), points.dtype)
+    room = space(problem.chain, DAMPINGS)
+    tried = np.empty((DAMPINGS, size), starts.dtype)
     curvature, way, stuck = np.empty((size, size)), np.empty(size), np.zeros(size, np.bool_)
     damping, small, done, is_late = FIRST, 0, 0, False
     while done < iterations and small < 2 and damping < MOST:
         if monotonic() > until:
             is_late = True
             break
-        rows = differences(problem, point, here)
         slopes = jacobian(problem, here, 1, 0)
         weighed(problem, rows, slopes, curvature, way)
         for i in range(size):
@@ -240,7 +265,8 @@ def search(problem, starts, iterations, tolerance, until):
                 for i in range(size):
                     tried[k, i] = point[0, i] + move[i] / stride
             inside(problem, tried)
-            found = losses(problem, differences(problem, tried, room), BREACH)
+            every = differences(problem, tried, room)
+            found = losses(problem, every, BREACH)
             chosen = np.argmin(found)
             is_better = found[chosen] < loss
             if is_better:
@@ -248,6 +274,7 @@ def search(problem, starts, iterations, tolerance, until):
                 loss = found[chosen]
                 for i in range(size):
                     point[0, i] = tried[chosen, i]
+                rows = pick(problem, room, every, chosen, here)
                 damping = max(LEAST, damping * APART ** (chosen - 1))
             else:
                 damping *= APART**DAMPINGS
@@ -255,5 +282,5 @@ def search(problem, starts, iterations, tolerance, until):
         history[done] = loss
     if problem.held:
         back(problem, point)
-    loss = losses(problem, differences(problem, point, here), 0.0)[0]
+        loss = losses(problem, differences(problem, point, here), 0.0)[0]
     return point[0], loss, history[: done + 1], is_late

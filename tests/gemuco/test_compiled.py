@@ -77,7 +77,7 @@ def test_every_shape_agrees_with_torch(shape, activation, straight, seed):
     wanted = random.standard_normal((rows, outputs)).astype(np.float32)
     wanted[random.random(wanted.shape) < 0.2] = np.nan
     chain = pack(network.weights().whole)
-    found_loss, by_weights, by_input = gradients(chain, x, wanted, np.float32(straight), True)
+    found_loss, by_weights, by_input = gradients(chain, x, wanted, np.float32(straight), True, True)
     given_x, there = torch.from_numpy(x).double().requires_grad_(), torch.from_numpy(np.isfinite(wanted))
     network = network.double()
     missed = torch.where(there, network(given_x) - torch.from_numpy(np.nan_to_num(wanted)), 0.0)
@@ -192,7 +192,7 @@ def test_time_that_is_up_ends_the_search_with_the_best_so_far(schema):
 def test_what_is_no_number_is_not_hidden():
     layers = tuple(Layer(np.ones((2, 2), np.float32), np.zeros(2, np.float32), name) for name in ("tanh", "linear"))
     x = np.array([[np.nan, 0.0], [1e30, 0.0]], np.float32)
-    begun, _, _ = gradients(pack(layers), x, np.zeros((2, 2), np.float32), SQUARED, False)
+    begun, _, _ = gradients(pack(layers), x, np.zeros((2, 2), np.float32), SQUARED, False, True)
     assert np.isnan(begun)
 
 
