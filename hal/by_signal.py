@@ -23,7 +23,7 @@ class Elements:
     """
 
     __slots__ = ("counts", "places", "size")
-    _known: ClassVar[dict[tuple[tuple[str, float], ...], "Elements"]] = {}
+    _known: ClassVar[dict[tuple[object, ...], "Elements"]] = {}
 
     def __init__(self, counts: Mapping[str, float]) -> None:
         self.counts: dict[str, int] = {}
@@ -53,7 +53,7 @@ class Elements:
         Raises:
             ValueError: They are no map from names to whole numbers above 0.
         """
-        key = tuple(counts.items())
+        key = (*counts, *counts.values())
         try:
             found = cls._known.get(key)
         except TypeError:  # what cannot be a key is no number either

@@ -65,7 +65,7 @@ def _packed(value: Any) -> Any:
     if kind is Elements:
         return value.counts
     if isinstance(value, np.ndarray):
-        return value.astype(Numbers.DTYPE, copy=False).tobytes()
+        return value.astype(_NUMBER, copy=False).tobytes()
     if isinstance(value, np.generic):
         return value.item()
     raise TypeError(f"A message cannot carry {kind.__name__}.")
@@ -73,6 +73,8 @@ def _packed(value: Any) -> Any:
 
 def _read(kind: Any, value: Any) -> Any:
     """What `_packed` made of something that is not msgpack's."""
+    if kind is Numbers and type(value) is bytes and not len(value) % 8:
+        return Numbers(np.frombuffer(value, _NUMBER), OPEN)
     if kind is Elements:
         if type(value) is not dict:
             raise ValueError("Expected a map from signal to its number of elements")
@@ -84,10 +86,10 @@ def _read(kind: Any, value: Any) -> Any:
         return Truths(np.frombuffer(value, Truths.DTYPE) if is_plain else np.frombuffer(value, "u1") != 0, OPEN)
     if type(value) is not bytes or len(value) % 8:
         raise ValueError("Expected a binary of little-endian float64")
-    numbers = np.frombuffer(value, Numbers.DTYPE)
-    return Numbers(numbers, OPEN) if kind is Numbers else numbers
+    return np.frombuffer(value, _NUMBER)
 
 
+_NUMBER = Numbers.DTYPE
 _encoder = msgspec.msgpack.Encoder(enc_hook=_packed)
 _decoders: dict[type[Message], msgspec.msgpack.Decoder[Any]] = {
     record: msgspec.msgpack.Decoder(record, dec_hook=_read) for record in RECORDS.values()
