@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict
+from functools import lru_cache
 from typing import Any
 
 import msgspec
@@ -34,6 +35,10 @@ RETRY_AFTER = 0.02
 APPEAR = 2.0
 """How long [s] nobody may be there before the answer is that nobody is; a verb that computes may take longer."""
 LONGEST_ERROR = 1000
+ASKERS = 64
+"""So many callers' attachments are kept, as they are on the wire and as they were read."""
+LONGEST_KEPT = 512
+"""Longer attachments [bytes], which no honest caller sends, are read each time."""
 LOG_EVERY = 1.0
 """A verb that keeps failing is logged this often [s]."""
 
@@ -155,7 +160,18 @@ def _caller(key: str, attachment: zenoh.ZBytes | None) -> Caller:
     """
     if attachment is None:
         return NOBODY
-    told = _unpack(attachment.to_bytes(), f"The attachment of a question to {key}")
+    told = attachment.to_bytes()
+    return _known_caller(key, told) if len(told) <= LONGEST_KEPT else _read_caller(key, told)
+
+
+@lru_cache(maxsize=ASKERS)
+def _known_caller(key: str, attachment: bytes) -> Caller:
+    """See `_caller`; most callers ask the same verb again and again."""
+    return _read_caller(key, attachment)
+
+
+def _read_caller(key: str, attachment: bytes) -> Caller:
+    told = _unpack(attachment, f"The attachment of a question to {key}")
     _check_version(told, f"The question to {key}")
     name = told.get("name", "")
     numbers = {number: told.get(number, 0) for number in ("boot", "through", "hal_boot", "cycle")}
@@ -214,7 +230,7 @@ def ask(
     payload = _pack(dict(arguments or {}))
     late = False
     while (remaining := deadline - time.monotonic()) > 0:
-        told = _pack({"v": VERSION} | _told(caller if isinstance(caller, Caller) else caller()))
+        told = _told(caller if isinstance(caller, Caller) else caller())
         for reply in session.get(key, payload=payload, attachment=told, timeout=remaining):
             if reply.ok is not None:
                 return _result(key, reply.ok)
@@ -226,9 +242,10 @@ def ask(
     raise _unanswered(session, key, timeout if late else min(timeout, APPEAR), late)
 
 
-def _told(caller: Caller) -> dict[str, Any]:
+@lru_cache(maxsize=ASKERS)
+def _told(caller: Caller) -> bytes:
     """What a caller tells beside its question; what it does not know it does not tell."""
-    return {name: value for name, value in asdict(caller).items() if value}
+    return _pack({"v": VERSION} | {name: value for name, value in asdict(caller).items() if value})
 
 
 def alive(session: zenoh.Session, robot: str, timeout: float = 0.5) -> set[str]:
