@@ -18,7 +18,8 @@ from services.model.anomaly_loop import AnomalyWatch
 from services.model.estimation import Estimation, Fresh, Freshness
 from services.wire import messages
 
-modules = [importlib.import_module(one.name) for one in pkgutil.iter_modules(gemuco.compiled.__path__, "gemuco.compiled.")]
+names = [one.name for one in pkgutil.iter_modules(gemuco.compiled.__path__, "gemuco.compiled.")]
+modules = [importlib.import_module(name) for name in names]
 kernels = {one for module in modules for one in vars(module).values() if hasattr(one, "signatures")}
 before = {one: list(one.signatures) for one in kernels}
 schema, clock, told = small_model(), ManualClock(), []
@@ -28,7 +29,8 @@ newest = None
 freshness = Freshness(arm(), lambda: newest, clock)
 estimation = Estimation(freshness, lambda: schema, told.append, clock)
 anomaly = AnomalyWatch(freshness, lambda: schema, 0.5, told.append, clock)
-for number, silent in enumerate(((), ("joint_position.elbow_pitch",), ("muscle_tension.biceps", "muscle_length.biceps"))):
+silences = ((), ("joint_position.elbow_pitch",), ("muscle_tension.biceps", "muscle_length.biceps"))
+for number, silent in enumerate(silences):
     sample = messages.decode(messages.encode(fresh(number, 0.0, silent=silent).sample), messages.Sample)
     newest = Fresh(sample, clock.monotonic())
     estimation.tick()
