@@ -14,7 +14,7 @@ import numpy as np
 
 from gemuco.adapt import UpdateConfig
 from gemuco.compiled.chain import pack
-from gemuco.compiled.jit import FOLDER
+from gemuco.compiled.jit import FOLDER, let_compiler_go
 from gemuco.compiled.masks import squares, sums
 from gemuco.compiled.usable import usable
 from gemuco.control import Controller
@@ -107,7 +107,7 @@ def warm(tell: Callable[[float, str], None] | None = None, is_service: bool = Fa
 
     Args:
         tell: Told the share that is done, 0 to 1, and what comes next.
-        is_service: Leave out what a service never does; it would only take memory there.
+        is_service: Leave out what a service never does, and let the compiler go: both only take memory there.
 
     Returns:
         How long it took [s].
@@ -116,6 +116,8 @@ def warm(tell: Callable[[float, str], None] | None = None, is_service: bool = Fa
     for index, what in enumerate(chain(running(schema), () if is_service else learning(schema))):
         if tell is not None:
             tell(index / (STEPS["running"] if is_service else sum(STEPS.values())), what)
+    if is_service:
+        let_compiler_go()
     return time.monotonic() - begun
 
 

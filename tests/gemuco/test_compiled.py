@@ -227,6 +227,34 @@ assert "torch" not in sys.modules
 """
 
 
+COMPILER = """
+import numba
+import numpy as np
+from pathlib import Path
+from gemuco import warm
+
+def resident():
+    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 1e6
+
+@numba.njit
+def twice(x):
+    return x + x
+
+warm.warm()
+before = resident()
+warm.warm(is_service=True)
+after = resident()
+assert after < before - 20.0, (before, after)
+assert twice(2.5) == 5.0 and twice(np.ones(2))[0] == 2.0
+assert resident() > after
+"""
+
+
+def test_the_compiler_gives_its_memory_back_and_comes_again_when_it_is_needed():
+    done = subprocess.run([sys.executable, "-c", COMPILER], capture_output=True, text=True, timeout=110)
+    assert not done.returncode, done.stderr
+
+
 def test_nothing_is_left_to_compile_after_the_warm_up():
     done = subprocess.run([sys.executable, "-c", ALL_WAYS], capture_output=True, text=True, timeout=110)
     assert not done.returncode, done.stderr
