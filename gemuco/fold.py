@@ -201,7 +201,7 @@ def no_balance() -> Balance:
     """Torque balance of nothing."""
     none = np.zeros((0, 3), np.float32)
     chain = Packed(np.zeros(0, np.float32), np.zeros((0, 5), np.int64))
-    return Balance(chain, none, none, none, np.zeros(0, np.int64), (-1, -1), 0.0)
+    return Balance(chain, chain.flat, none, none, (-1, -1), 0.0)
 
 
 def _balance(bound: Balanced, rows: tuple[int, int]) -> Balance:
@@ -209,9 +209,7 @@ def _balance(bound: Balanced, rows: tuple[int, int]) -> Balance:
     joints = np.zeros((len(bound.mean), 3 + len(bound.mean)), np.float32)
     joints[:, STD] = muscles.theta_std
     lines = np.stack([muscles.f_std, muscles.f_mean, muscles.l_std], axis=1).astype(np.float32)
-    places = np.concatenate([muscles.theta, muscles.f])
-    base = muscles.base.astype(np.float32)[None]
-    balance = Balance(muscles.packed, base, joints, lines, places, rows, float(bound.weight))
+    balance = Balance(muscles.packed, muscles.back, joints, lines, rows, float(bound.weight))
     if bound.posture is None:
         _stand(balance, bound, bound.mean)
     return balance
@@ -219,9 +217,7 @@ def _balance(bound: Balanced, rows: tuple[int, int]) -> Balance:
 
 def _stand(balance: Balance, bound: Balanced, posture: np.ndarray) -> None:
     """Write the posture [rad], shape (joints,), that torque is balanced at."""
-    base = balance.base[0]
-    base[bound.muscles.theta] = (posture - bound.mean) / bound.std
-    balance.joints[:, POSTURE] = base[bound.muscles.theta]
+    balance.joints[:, POSTURE] = (posture - bound.mean) / bound.std
     balance.joints[:, TORQUE] = bound.torques(posture[None])[0]
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gemuco.compiled.chain import pack
+from gemuco.compiled.chain import pack, turned
 from gemuco.errors import NotFinite, NotObservable, SchemaError
 from gemuco.kernels import Curvature, Layer
 from gemuco.losses import Values, check_weight
@@ -131,9 +131,9 @@ class Balanced:
 
 
 class MuscleModel:
-    """The muscles as the network knows them under the mask (position, tension)."""
+    """The muscles as the network knows them under the mask (position, tension): from theta and f to l, no more."""
 
-    __slots__ = ("base", "chain", "f", "f_mean", "f_std", "l_std", "packed", "theta", "theta_std")
+    __slots__ = ("back", "chain", "f", "f_mean", "f_std", "l_std", "packed", "theta", "theta_std")
 
     def __init__(self, schema: "BodySchema", names: TorqueBalance) -> None:
         """Prepare the network.
@@ -149,15 +149,20 @@ class MuscleModel:
                 f"Torque balance differentiates '{names.length}' by '{names.position}', but this schema does not infer "
                 f"it from '{names.position}' and '{names.tension}'; see the masks that structure determination found."
             )
-        dtype = schema.weights.encoder[0].matrix.dtype
-        self.base = schema.network_input(np.zeros(layout.size), mask).astype(dtype)
-        self.theta = _columns(schema.in_index, theta)
-        self.f = _columns(schema.in_index, f)
-        last = schema.weights.decoder[-1]
-        columns = _columns(schema.out_index, length)
-        last = Layer(np.ascontiguousarray(last.matrix[:, columns]), last.offset[columns], last.activation)
-        self.chain = (*schema.weights.whole[:-1], last)
+        begin, *between, end = schema.weights.whole
+        dtype = begin.matrix.dtype
+        base = schema.network_input(np.zeros(layout.size), mask).astype(dtype)
+        joints, muscles, lengths = (
+            _columns(index, span)
+            for index, span in ((schema.in_index, theta), (schema.in_index, f), (schema.out_index, length))
+        )
+        inputs = np.concatenate([joints, muscles])
+        self.theta, self.f = slice(0, len(joints)), slice(len(joints), len(inputs))
+        first = Layer(begin.matrix[inputs], begin.offset + base @ begin.matrix, begin.activation)
+        last = Layer(np.ascontiguousarray(end.matrix[:, lengths]), end.offset[lengths], end.activation)
+        self.chain = (first, *between, last)
         self.packed = pack(self.chain)
+        self.back = turned(self.packed)
         self.theta_std, self.f_std, self.l_std = (scaler.std[s].astype(dtype) for s in (theta, f, length))
         self.f_mean = scaler.mean[f].astype(dtype)
 
@@ -170,7 +175,7 @@ class MuscleModel:
             torque: tau_ext [N m], shape (candidates or 1, joints).
         """
         muscles = self._at(posture, tension)
-        rest = torque.astype(self.base.dtype) + muscles.gradient[:, self.theta] / self.theta_std
+        rest = torque.astype(self.f_std.dtype) + muscles.gradient[:, self.theta] / self.theta_std
         norm = np.sqrt(np.einsum("ij,ij->i", rest, rest))
         return Missing(norm, rest / np.maximum(norm, TINY)[:, None], self, muscles)
 
@@ -179,9 +184,7 @@ class MuscleModel:
         return self._at(posture, tension).gradient[:, self.theta] / self.theta_std
 
     def _at(self, posture: np.ndarray, tension: np.ndarray) -> Curvature:
-        inputs = np.repeat(self.base[None], len(tension), axis=0)
-        inputs[:, self.theta] = posture
-        inputs[:, self.f] = tension
+        inputs = np.concatenate([posture, tension], axis=1).astype(self.f_std.dtype)
         w = (inputs[:, self.f] * self.f_std + self.f_mean) * self.l_std
         return Curvature(self.chain, inputs, w)
 

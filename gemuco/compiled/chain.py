@@ -45,6 +45,15 @@ def pack(chain: Chain) -> Packed:
     return Packed(flat, form)
 
 
+def turned(chain: Packed) -> np.ndarray:
+    """`Packed.flat` with every matrix transposed, shape (n_out, n_in): of a few rows products take half the time."""
+    found = chain.flat.copy()
+    for wide, narrow, place, *_ in chain.form:
+        part = chain.flat[place : place + wide * narrow].reshape(wide, narrow)
+        found[place : place + wide * narrow].reshape(narrow, wide)[:] = part.T
+    return found
+
+
 def unpack(chain: Packed) -> list[np.ndarray]:
     """A copy of every matrix and offset, in the order of the layers."""
     flat, found = chain.flat.copy(), []
@@ -101,6 +110,20 @@ def forward(chain, values, rows):
 
 
 @jit
+def alone(chain, values, rows, row):
+    """Values of all layers for one of the rows, as a pass of that row alone would leave them."""
+    found = space(chain, 1)
+    of, to = first(chain, values, rows), first(chain, found, 1)
+    for i in range(to.shape[1]):
+        to[0, i] = of[row, i]
+    for layer in range(len(chain.form)):
+        of, to = after(chain, values, rows, layer), after(chain, found, 1, layer)
+        for i in range(to.shape[1]):
+            to[0, i] = of[row, i]
+    return found
+
+
+@jit
 def output(chain, line):
     """The last value for a single input, shapes (n_in,) and (n_out,)."""
     values = space(chain, 1)
@@ -128,6 +151,20 @@ def pull(chain, values, rows, begin, gradient):
             slopes(after(chain, values, rows, layer)[begin : begin + some], gradient, code)
         below = np.empty((some, chain.form[layer, WIDE]), gradient.dtype)
         times_turned(gradient, matrix(chain, layer), below)
+        gradient = below
+    return gradient
+
+
+@jit
+def pull_all(chain, back, values, gradient):
+    """`pull` of every row, with the matrices as `turned` has them."""
+    rows = len(gradient)
+    for layer in range(len(chain.form) - 1, -1, -1):
+        place, wide, narrow = chain.form[layer, PLACE], chain.form[layer, WIDE], chain.form[layer, NARROW]
+        if chain.form[layer, CODE]:
+            slopes(after(chain, values, rows, layer), gradient, chain.form[layer, CODE])
+        below = np.empty((rows, wide), gradient.dtype)
+        times(gradient, back[place : place + wide * narrow].reshape(narrow, wide), below)
         gradient = below
     return gradient
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from gemuco.compiled.chain import space
 from gemuco.compiled.jit import jit
-from gemuco.compiled.problem import differences, gradient, inside, losses
+from gemuco.compiled.problem import differences, gradient, inside, losses, room
 
 
 @jit
@@ -29,10 +29,10 @@ def descend(problem, starts, gamma_max, candidates, iterations):
         gammas[i] = gamma_max * i / (candidates - 1) if candidates > 1 else gamma_max
     history = np.empty(iterations + 1)
     best, least = points[0].copy(), np.inf
-    values = space(problem.chain, len(points))
+    values, inner = space(problem.chain, len(points)), room(problem.balance, len(points))
     for iteration in range(iterations + 1):
         rows = differences(problem, points, values)
-        found = losses(problem, rows, 0.0)
+        found, rest = losses(problem, rows, 0.0, inner)
         chosen = np.argmin(found)
         history[iteration] = found[chosen]
         if found[chosen] < least:
@@ -43,11 +43,11 @@ def descend(problem, starts, gamma_max, candidates, iterations):
         if iteration > 0 and candidates > 1 and chosen == 0:
             for i in range(candidates):
                 gammas[i] /= candidates - 1
-        slope = gradient(problem, values, rows, chosen)
+        slope = gradient(problem, values, rows, inner, rest, chosen)
         origin = points[chosen].copy()
         if iteration == 0:
             points = np.empty((candidates, size), points.dtype)
-            values = space(problem.chain, candidates)
+            values, inner = space(problem.chain, candidates), room(problem.balance, candidates)
         for row in range(candidates):
             for i in range(size):
                 points[row, i] = origin[i] - gammas[row] * slope[0, i]

@@ -8,9 +8,9 @@ dampings are tried at once, and the loss itself says which of them was best.
 import numpy as np
 from numba import types
 
-from gemuco.compiled.chain import after, space
+from gemuco.compiled.chain import alone, space
 from gemuco.compiled.jit import jit
-from gemuco.compiled.problem import differences, inside, jacobian, length, losses, muscle_slopes, muscles
+from gemuco.compiled.problem import differences, inside, jacobian, length, losses, muscle_slopes, room
 
 DAMPINGS = 4
 """Dampings tried at once, each `APART` times the one before."""
@@ -42,12 +42,14 @@ def monotonic():
 
 
 @jit
-def weighed(problem, rows, slopes, curvature, way):
+def weighed(problem, rows, rest, inner, slopes, curvature, way):
     """Curvature, shape (n, n), and gradient, shape (n,), of the squares that touch the loss at a point.
 
     Args:
         problem: What is minimised.
         rows: r at the point, shape (1, rows).
+        rest: What the muscles lack there [N m], shape (1, joints).
+        inner: Values of their network there.
         slopes: Its derivatives, shape (n, rows).
         curvature: Is filled in, its lower half.
         way: Is filled in.
@@ -62,19 +64,18 @@ def weighed(problem, rows, slopes, curvature, way):
     balance = problem.balance
     if balance.weight > 0.0:
         joints, lines = len(balance.joints), len(balance.lines)
-        values, ways = space(balance.chain, 1), np.zeros((joints, joints), rows.dtype)
+        ways = np.zeros((joints, joints), rows.dtype)
         for i in range(joints):
             ways[i, i] = 1.0
-        rest = muscles(balance, rows, values)
-        inner = muscle_slopes(balance, values, ways)
+        bent = muscle_slopes(balance, inner, ways)
         outer = np.zeros((count, joints), rows.dtype)
         for p in range(count):
             for j in range(joints):
                 for i in range(lines):
-                    outer[p, j] += slopes[p, balance.rows[0] + i] * inner[i, j]
+                    outer[p, j] += slopes[p, balance.rows[0] + i] * bent[i, j]
                 if balance.rows[1] >= 0:
                     for i in range(joints):
-                        outer[p, j] += slopes[p, balance.rows[1] + i] * inner[lines + i, j]
+                        outer[p, j] += slopes[p, balance.rows[1] + i] * bent[lines + i, j]
         share = balance.weight / np.hypot(length(rest[0], 0, joints), FLOOR)
         add(curvature, way, outer, rest, 0, joints, share)
 
@@ -194,33 +195,28 @@ def back(problem, point):
 
 
 @jit
-def pick(problem, room, every, row, here):
-    """One of several points that were looked at: its rows, shape (1, rows); the network's values go to `here`.
+def look(problem, points, values, inner):
+    """The best of several points: which, its loss, and what a step from there needs to know of it.
 
     Args:
         problem: What is minimised.
-        room: Values of the network at all of them, after `differences`.
-        every: What `differences` returned.
-        row: Which.
-        here: Is filled in.
+        points: Shape (points, n); they are moved into the bounds.
+        values: Room for the network's values at all of them.
+        inner: `room` for those of the muscles' network.
+
+    Returns:
+        Which, its loss, its rows, shape (1, rows), what its muscles lack, shape (1, joints), and the values of both
+        networks there.
     """
-    count = len(every)
-    for layer in range(len(problem.chain.form)):
-        of, to = after(problem.chain, room, count, layer), after(problem.chain, here, 1, layer)
-        for i in range(to.shape[1]):
-            to[0, i] = of[row, i]
-    return every[row : row + 1].copy()
-
-
-@jit
-def begin(problem, starts, here):
-    """The best of the first points, shape (1, n), its loss, and its rows; the network's values go to `here`."""
-    points, room = starts.copy(), space(problem.chain, len(starts))
     inside(problem, points)
-    every = differences(problem, points, room)
-    found = losses(problem, every, BREACH)
-    chosen = np.argmin(found)
-    return points[chosen : chosen + 1].copy(), found[chosen], pick(problem, room, every, chosen, here)
+    rows, count = differences(problem, points, values), len(points)
+    found, rest = losses(problem, rows, BREACH, inner)
+    best = np.argmin(found)
+    one = alone(problem.chain, values, count, best)
+    other = inner[:0]
+    if problem.balance.weight > 0.0:
+        other = alone(problem.balance.chain, inner, count, best)
+    return best, found[best], rows[best : best + 1].copy(), rest[best : best + 1].copy(), one, other
 
 
 @jit
@@ -238,11 +234,13 @@ def search(problem, starts, iterations, tolerance, until):
         The best point, shape (n,), its loss without what held rows cost, the loss after every iteration, shape
         (done + 1,), and whether time was up before the end.
     """
-    size, here = starts.shape[1], space(problem.chain, 1)
-    point, loss, rows = begin(problem, starts, here)
+    size, points = starts.shape[1], starts.copy()
+    first = look(problem, points, space(problem.chain, len(points)), room(problem.balance, len(points)))
+    chosen, loss, rows, rest, values, inner = first
+    point = points[chosen : chosen + 1].copy()
     history = np.empty(iterations + 1)
     history[0] = loss
-    room = space(problem.chain, DAMPINGS)
+    outer, within = space(problem.chain, DAMPINGS), room(problem.balance, DAMPINGS)
     tried = np.empty((DAMPINGS, size), starts.dtype)
     curvature, way, stuck = np.empty((size, size)), np.empty(size), np.zeros(size, np.bool_)
     damping, small, done, is_late = FIRST, 0, 0, False
@@ -250,8 +248,8 @@ def search(problem, starts, iterations, tolerance, until):
         if monotonic() > until:
             is_late = True
             break
-        slopes = jacobian(problem, here, 1, 0)
-        weighed(problem, rows, slopes, curvature, way)
+        slopes = jacobian(problem, values, 1, 0)
+        weighed(problem, rows, rest, inner, slopes, curvature, way)
         for i in range(size):
             low, high = problem.bounds[0, i], problem.bounds[1, i]
             stuck[i] = (point[0, i] <= low and way[i] > 0.0) or (point[0, i] >= high and way[i] < 0.0)
@@ -264,17 +262,13 @@ def search(problem, starts, iterations, tolerance, until):
                     stride = max(stride, abs(move[i]) / STRIDE)
                 for i in range(size):
                     tried[k, i] = point[0, i] + move[i] / stride
-            inside(problem, tried)
-            every = differences(problem, tried, room)
-            found = losses(problem, every, BREACH)
-            chosen = np.argmin(found)
-            is_better = found[chosen] < loss
+            chosen, least, its_rows, its_rest, its_values, its_inner = look(problem, tried, outer, within)
+            is_better = least < loss
             if is_better:
-                small = small + 1 if loss - found[chosen] < tolerance * abs(loss) else 0
-                loss = found[chosen]
+                small = small + 1 if loss - least < tolerance * abs(loss) else 0
+                loss, rows, rest, values, inner = least, its_rows, its_rest, its_values, its_inner
                 for i in range(size):
                     point[0, i] = tried[chosen, i]
-                rows = pick(problem, room, every, chosen, here)
                 damping = max(LEAST, damping * APART ** (chosen - 1))
             else:
                 damping *= APART**DAMPINGS
@@ -282,5 +276,5 @@ def search(problem, starts, iterations, tolerance, until):
         history[done] = loss
     if problem.held:
         back(problem, point)
-        loss = losses(problem, differences(problem, point, here), 0.0)[0]
+        loss = losses(problem, differences(problem, point, values), 0.0, inner)[0][0]
     return point[0], loss, history[: done + 1], is_late

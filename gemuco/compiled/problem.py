@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gemuco.compiled.blas import times
-from gemuco.compiled.chain import Packed, first, forward, mixed, pull, push_all, space
+from gemuco.compiled.chain import Packed, alone, first, forward, mixed, pull, pull_all, push_all, space
 from gemuco.compiled.jit import jit
 
 TINY = 1e-9
@@ -23,21 +23,19 @@ class Balance(NamedTuple):
     """The torque balance of muscles (`gemuco.torque`); nothing where `weight` is 0.
 
     Attributes:
-        chain: From (posture, tension) to muscle length.
-        base: Its input, shape (1, inputs), with the posture where that is given.
+        chain: From posture and tension, one behind the other, to muscle length.
+        back: Its matrices, `chain.turned`.
         joints: For every joint: theta's standard deviation [rad], tau_ext at theta_0 [N m], theta_0 [standard
             deviations], and the stiffness K [N m per standard deviation], shape (joints, 3 + joints).
         lines: For every muscle: f's standard deviation and mean [N], l's standard deviation [m], shape (muscles, 3).
-        places: Where theta and then f lie in the input, shape (joints + muscles,).
-        rows: Where f and theta begin among the rows of r; -1 for theta that is given.
+        rows: Where f and theta begin among the rows of r; -1 for theta that is given: it is theta_0.
         weight: Loss per N m.
     """
 
     chain: Packed
-    base: np.ndarray
+    back: np.ndarray
     joints: np.ndarray
     lines: np.ndarray
-    places: np.ndarray
     rows: tuple[int, int]
     weight: float
 
@@ -96,31 +94,34 @@ def differences(problem, points, values):
 
 
 @jit
+def room(balance, count):
+    """Room for the values of the muscles' network at so many points; none without a balance."""
+    return space(balance.chain, count) if balance.weight > 0.0 else np.empty(0, balance.lines.dtype)
+
+
+@jit
 def muscles(balance, rows, values):
-    """What the muscles lack [N m], shape (points, joints); values of their network are left in `values`.
+    """What the muscles lack [N m], shape (points, joints).
 
     Args:
         balance: Torque balance.
         rows: r at points, shape (points, rows).
-        values: Room for the values of their network.
+        values: Room for the values of their network, which are left there.
     """
     count, joints, lines = len(rows), len(balance.joints), len(balance.lines)
     inputs = first(balance.chain, values, count)
     f, theta = balance.rows
     for row in range(count):
-        for i in range(inputs.shape[1]):
-            inputs[row, i] = balance.base[0, i]
+        for i in range(joints):
+            inputs[row, i] = rows[row, theta + i] if theta >= 0 else balance.joints[i, POSTURE]
         for i in range(lines):
-            inputs[row, balance.places[joints + i]] = rows[row, f + i]
-        if theta >= 0:
-            for i in range(joints):
-                inputs[row, balance.places[i]] = rows[row, theta + i]
+            inputs[row, joints + i] = rows[row, f + i]
     forward(balance.chain, values, count)
-    gradient = pull(balance.chain, values, count, 0, force(balance, inputs))
+    gradient = pull_all(balance.chain, balance.back, values, force(balance, inputs))
     rest = np.empty((count, joints), rows.dtype)
     for row in range(count):
         for i in range(joints):
-            rest[row, i] = balance.joints[i, TORQUE] + gradient[row, balance.places[i]] / balance.joints[i, STD]
+            rest[row, i] = balance.joints[i, TORQUE] + gradient[row, i] / balance.joints[i, STD]
             if theta >= 0:
                 for j in range(joints):
                     moved = rows[row, theta + j] - balance.joints[j, POSTURE]
@@ -135,7 +136,7 @@ def force(balance, inputs):
     found = np.empty((len(inputs), lines), inputs.dtype)
     for row in range(len(inputs)):
         for i in range(lines):
-            newton = inputs[row, balance.places[joints + i]] * balance.lines[i, F_STD] + balance.lines[i, F_MEAN]
+            newton = inputs[row, joints + i] * balance.lines[i, F_STD] + balance.lines[i, F_MEAN]
             found[row, i] = newton * balance.lines[i, L_STD]
     return found
 
@@ -146,7 +147,7 @@ def muscle_slopes(balance, values, ways):
 
     Args:
         balance: Torque balance.
-        values: What `muscles` left of that one point.
+        values: What `muscles` left of that point (`chain.alone`).
         ways: Directions, shape (k, joints).
 
     Returns:
@@ -158,16 +159,16 @@ def muscle_slopes(balance, values, ways):
     tangents = np.zeros((count, inputs.shape[1]), inputs.dtype)
     for k in range(count):
         for i in range(joints):
-            tangents[k, balance.places[i]] = ways[k, i] / balance.joints[i, STD]
+            tangents[k, i] = ways[k, i] / balance.joints[i, STD]
     pushed, bent = mixed(balance.chain, values, force(balance, inputs), tangents)
     found = np.zeros((lines + joints, count), inputs.dtype)
     for k in range(count):
         for j in range(lines):
             scale = balance.lines[j, F_STD] * balance.lines[j, L_STD]
-            found[j, k] = scale * pushed[k, j] + bent[k, balance.places[joints + j]]
+            found[j, k] = scale * pushed[k, j] + bent[k, joints + j]
         if balance.rows[1] >= 0:
             for j in range(joints):
-                found[lines + j, k] = bent[k, balance.places[j]]
+                found[lines + j, k] = bent[k, j]
                 for i in range(joints):
                     found[lines + j, k] += ways[k, i] * balance.joints[i, STIFFNESS + j]
     return found
@@ -183,25 +184,41 @@ def length(values, begin, end):
 
 
 @jit
-def losses(problem, rows, breach):
-    """Loss of every point from its rows, shape (points,); what must be zero and is not costs `breach` per unit."""
+def losses(problem, rows, breach, inner):
+    """Loss of every point, shape (points,), and what its muscles lack [N m], shape (points, joints).
+
+    Args:
+        problem: What is minimised.
+        rows: r at points, shape (points, rows).
+        breach: What a row that must be zero and is not costs per unit.
+        inner: `room` for the values of the muscles' network, which are left there.
+    """
     count, width = rows.shape
-    found = np.zeros(count)
+    found, rest = np.zeros(count), np.empty((count, 0), rows.dtype)
     for row in range(count):
         for block in range(len(problem.weights)):
             found[row] += problem.weights[block] * length(rows[row], problem.ends[block], problem.ends[block + 1])
         for i in range(width - problem.held, width):
             found[row] += breach * abs(rows[row, i])
     if problem.balance.weight > 0.0:
-        rest = muscles(problem.balance, rows, space(problem.balance.chain, count))
+        rest = muscles(problem.balance, rows, inner)
         for row in range(count):
             found[row] += problem.balance.weight * length(rest[row], 0, rest.shape[1])
-    return found
+    return found, rest
 
 
 @jit
-def gradient(problem, values, rows, row):
-    """Gradient of the loss at one of the points by p, shape (1, n); `held` rows aside."""
+def gradient(problem, values, rows, inner, rest, row):
+    """Gradient of the loss at one of the points by p, shape (1, n); `held` rows aside.
+
+    Args:
+        problem: What is minimised.
+        values: What `differences` left.
+        rows: What it returned.
+        inner: What `losses` left.
+        rest: What the muscles lack, of `losses`.
+        row: Which point.
+    """
     count, width = rows.shape
     size = len(problem.direct) - 1
     back = np.zeros((1, width), rows.dtype)
@@ -213,12 +230,9 @@ def gradient(problem, values, rows, row):
     balance = problem.balance
     if balance.weight > 0.0:
         joints, lines = len(balance.joints), len(balance.lines)
-        inner = space(balance.chain, 1)
-        rest = muscles(balance, rows[row : row + 1], inner)
-        share = balance.weight / max(length(rest[0], 0, joints), TINY)
-        for i in range(joints):
-            rest[0, i] *= share
-        slope = muscle_slopes(balance, inner, rest)
+        share = balance.weight / max(length(rest[row], 0, joints), TINY)
+        way = rest[row : row + 1] * np.float32(share)
+        slope = muscle_slopes(balance, alone(balance.chain, inner, count, row), way)
         for j in range(lines):
             back[0, balance.rows[0] + j] += slope[j, 0]
         if balance.rows[1] >= 0:
