@@ -31,9 +31,13 @@ Busy = dict[int, float]
 
 
 def busy() -> Busy:
-    """How long every core has worked since the machine was started."""
+    """How long every core has worked since the machine was started; nothing where the system does not tell."""
     found: Busy = {}
-    for line in Path("/proc/stat").read_text().splitlines():
+    try:
+        lines = Path("/proc/stat").read_text().splitlines()
+    except OSError:
+        return found
+    for line in lines:
         name, *ticks = line.split()
         if not name.startswith("cpu"):
             break
@@ -104,5 +108,5 @@ class OneCore:
             return
         self.core = core
         for entry in Path("/proc/self/task").iterdir():
-            with contextlib.suppress(ProcessLookupError):  # a thread that has ended meanwhile
+            with contextlib.suppress(OSError):  # the thread has ended meanwhile, or the core was taken from us
                 os.sched_setaffinity(int(entry.name), self._allowed if core is None else {core})

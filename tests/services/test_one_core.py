@@ -80,6 +80,13 @@ def test_a_process_that_needs_more_gets_all_cores_for_a_while(machine: Machine, 
     assert places[-1] is not None
 
 
+def test_a_core_that_was_taken_away_is_no_error(machine: Machine) -> None:
+    machine.core._allowed = {100_000, 100_001}
+    machine.second()
+    machine.second()
+    assert os.sched_getaffinity(0) == set(ALLOWED)
+
+
 def test_two_looks_at_nearly_the_same_moment_are_one(machine: Machine) -> None:
     machine.second()
     where = machine.second()
