@@ -45,9 +45,9 @@ def _digest() -> str:
 
 
 def _is_own(folder: Path) -> bool:
-    """Whether this user, and nobody else, can put code there: what lies there will be run."""
+    """Whether this user, and nobody else, can put code there: what lies there will be run. Others may copy it."""
     try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        folder.mkdir(mode=0o755, parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()
         status = folder.stat()
     except OSError:
