@@ -16,9 +16,10 @@ COPY gemuco/ gemuco/
 COPY hal/ hal/
 COPY simulators/ simulators/
 COPY services/ services/
-# Layers keep whole seconds, and compiled code counts as old when the time of its source is another one.
+# Layers keep whole seconds, and compiled code counts as old when the time of its source is another one. -P: what is
+# installed is made ready, and not the sources that lie here.
 RUN deploy/install.sh . && find /opt/gemuco -path '*/gemuco/compiled/*.py' -exec touch --date=@1000000000 {} + \
-    && /opt/gemuco/bin/python -m gemuco.warm
+    && /opt/gemuco/bin/python -P -m gemuco.warm
 
 FROM ${PYTHON} AS services
 # Numbers, so that a host without these names can give them its volumes and devices.
