@@ -1,5 +1,5 @@
 # Two images of one file. `services` is what a robot runs: router, hal, model, recorder. `workshop` is the same with what
-# pretends to be a robot and what trains (pybullet, torch, matplotlib), which are ten times as large.
+# pretends to be a robot and what trains (pybullet, torch, matplotlib), which are twice as large as all the rest.
 ARG PYTHON=python:3.11-slim-bookworm
 
 FROM ${PYTHON} AS packages
