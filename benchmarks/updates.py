@@ -16,6 +16,7 @@ from gemuco.bias import Kalman
 from gemuco.compiled.inference import infer
 from gemuco.relearn import Relearner
 from gemuco.schema import BodySchema
+from services.process.realtime import freeze
 
 SAMPLES = 50
 STEPS = 10
@@ -24,6 +25,7 @@ STEPS = 10
 def rows() -> Iterator[Row]:
     """All of them."""
     torch.set_num_threads(1)
+    freeze()  # as the service does
     yield from inference()
     yield recognition()
     yield step_on_weights()

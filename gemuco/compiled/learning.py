@@ -72,7 +72,7 @@ def gradients(chain, inputs, wanted, straight, by_weights, by_inputs):
     told = forward(chain, values, rows)
     gradient = np.empty_like(told)
     total = missed(told, wanted, straight, gradient)
-    found = np.zeros(len(chain.flat) if by_weights else 0, chain.flat.dtype)
+    found = np.empty(len(chain.flat) if by_weights else 0, chain.flat.dtype)
     for layer in range(len(chain.form) - 1, -1, -1):
         code = chain.form[layer, CODE]
         if code:
@@ -83,6 +83,7 @@ def gradients(chain, inputs, wanted, straight, by_weights, by_inputs):
             place = chain.form[layer, PLACE]
             turned_times(below, gradient, found[place : place + wide * narrow].reshape(wide, narrow))
             offsets = found[place + wide * narrow : place + (wide + 1) * narrow]
+            offsets[:] = 0.0
             for row in range(rows):
                 for i in range(narrow):
                     offsets[i] += gradient[row, i]
