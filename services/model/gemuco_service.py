@@ -29,7 +29,7 @@ from services.model.target_intake import TargetIntake
 from services.model.update_loop import OnlineUpdate
 from services.process.loop import Loop
 from services.process.one_core import OneCore
-from services.process.realtime import freeze, prepare_process, promote_rest
+from services.process.realtime import freeze, prepare_process, prepare_thread, promote_rest
 from services.process.service import Service, until_told
 from services.wire import keys, query
 from services.wire.caller import ASKING
@@ -49,6 +49,8 @@ until the reference or the model is another."""
 PATIENCE = 3.0
 """Compiling is told about this often [s]; loading what was compiled before takes less."""
 NETWORK_PRIORITY = 45
+STATUS_PRIORITY = 10
+"""A status takes a millisecond, once a second: a loop may not wait for it."""
 PRIORITIES = {"estimation": 40, "control": 35, "anomaly": 30, "update": 10, "verdict": 10}
 """SCHED_FIFO where the system allows it; learning and judging are lowest but not without, or they would hold the
 interpreter up."""
@@ -223,6 +225,7 @@ class GemucoService:
         for loop in self.loops:
             loop.start()
         promote_rest(NETWORK_PRIORITY)
+        prepare_thread(STATUS_PRIORITY)
         try:
             with self._core:
                 self.service.run(self.status, stop)
