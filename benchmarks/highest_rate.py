@@ -35,7 +35,7 @@ from services.wire.streams import Publisher
 
 ROBOT = Path("robots/musashi_arm.yaml")
 SILENT = ("joint_position", 3)
-RATES = [round(250.0 * 1.25**step) for step in range(20)]
+RATES = [round(250.0 * 1.25**step) for step in range(25)]
 MISSED, TRIES = 0.001, 3
 
 
