@@ -34,9 +34,9 @@ def by_hidden() -> dict[str, list[float]]:
     found: dict[str, list[float]] = {}
     for hidden in HIDDEN:
         schema = body((hidden, hidden))
-        asked = (np.zeros(schema.layout.size), *schema.gate(schema.masks[0]), np.ones(schema.layout.size, bool))
+        size, gate = schema.layout.size, schema.gate(schema.masks[0])
+        asked = (*schema.ready.parts, np.zeros(size), *gate, np.ones(size, bool), np.empty(size))
         plain, balanced = Ours(schema, "e", TERMS), Ours(schema, "e", (*TERMS, BALANCE))
-        asked = (*schema.ready.parts, *asked, np.empty(schema.layout.size))
         for name, job, calls in (
             ("estimate by mask", lambda asked=asked: infer(*asked), 300),
             ("default search", lambda plain=plain: plain.solve(NewtonConfig()), 30),

@@ -10,7 +10,7 @@ def usable(values, valid, age, of, to, stale_after, found):
     """Take what is valid and not too old.
 
     Args:
-        values: Of the sample, shape (n,).
+        values: Of the sample [unit of each element], shape (n,).
         valid: Whether they may be used, shape (n,).
         age: How old they were when the sample was published [s], shape (n,).
         of: Which of them are taken, shape (k,).

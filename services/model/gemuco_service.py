@@ -188,7 +188,6 @@ class GemucoService:
         missing = [name for name, value in values.items() if not np.isfinite(value).all()]
         loops = {loop.name: loop.statistics() for loop in self.loops}
         failing = [f"{loop.name}: {loop.trouble}" for loop in self.loops if loop.trouble]
-        self._core.look(any(loop.is_slow for loop in self.loops))
         text = ""
         if fresh is None:
             text = "No fresh sample comes from the HAL. Is `gemuco hal` running?"
@@ -228,10 +227,16 @@ class GemucoService:
         prepare_thread(STATUS_PRIORITY)
         try:
             with self._core:
-                self.service.run(self.status, stop)
+                self.service.run(self._each_second, stop)
         finally:
             for loop in self.loops:
                 loop.stop()
+
+    def _each_second(self) -> Status:
+        """The status, and a look at where to run."""
+        status = self.status()
+        self._core.look(any(loop.is_slow for loop in self.loops))
+        return status
 
     def _blind(self) -> str:
         """What to check when nothing comes from the camera's process; empty when something does."""
