@@ -20,14 +20,16 @@ class Elements:
         counts: Signal -> how many elements, at least one.
         places: Signal -> where they lie.
         size: How many there are in all.
+        wire: Room for what a message has of it, so that it is made once.
     """
 
-    __slots__ = ("counts", "places", "size")
+    __slots__ = ("counts", "places", "size", "wire")
     _known: ClassVar[dict[tuple[object, ...], "Elements"]] = {}
 
     def __init__(self, counts: Mapping[str, float]) -> None:
         self.counts: dict[str, int] = {}
         self.places: dict[str, slice] = {}
+        self.wire: object = None
         start = 0
         for name, count in counts.items():
             if not isinstance(name, str) or not isinstance(count, int | float) or not count >= 1 or count % 1:
@@ -53,24 +55,19 @@ class Elements:
         Raises:
             ValueError: They are no map from names to whole numbers above 0.
         """
-        key = (*counts, *counts.values())
         try:
-            found = cls._known.get(key)
-        except TypeError:  # what cannot be a key is no number either
-            found = None
-        if found is None:
+            return cls._known[(*counts, *counts.values())]
+        except (KeyError, TypeError):  # what cannot be a key is no number either
             found = cls(counts) if counts else NOTHING
-            if len(cls._known) >= KEPT:
-                cls._known.clear()
-            if sum(map(len, counts)) <= LONGEST:
-                cls._known[key] = found
+        if len(cls._known) >= KEPT:
+            cls._known.clear()
+        if sum(map(len, counts)) <= LONGEST:
+            cls._known[(*counts, *counts.values())] = found
         return found
 
 
 NOTHING = Elements({})
 """No signal."""
-OPEN = Elements({})
-"""Of an array of which is not known yet whose its elements are."""
 
 
 class BySignal(Mapping[str, np.ndarray]):

@@ -109,8 +109,8 @@ class Form:
 
     def __init__(self, record: type[Message], catalogue: Catalogue) -> None:
         self.record, self.catalogue = record, catalogue
-        self._fields = [item for item in msgspec.structs.fields(record) if item.type is not Elements]
-        self.hints = {item.name: item.type for item in self._fields}
+        self._fields = [item for item in msgspec.structs.fields(record) if item.name != "elements"]
+        self.hints = {item.name: item.type for item in self._fields} | dict(getattr(record, "BY_ELEMENT", ()))
         self._packed = {
             name: (listed.elements, struct.Struct(f"<{len(listed.elements)}d"))
             for name, listed in catalogue.signals.items()

@@ -1,13 +1,14 @@
 """What travels between the processes, as typed records; `services.wire.messages` puts them on the wire."""
 
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import msgspec
 import numpy as np
 from msgspec.structs import force_setattr
+from numpy import frombuffer
 from numpy.typing import NDArray
 
-from hal.by_signal import NOTHING, OPEN, BySignal, Elements, Numbers, Truths
+from hal.by_signal import KEPT, LONGEST, NOTHING, BySignal, Elements, Numbers, Truths
 
 __all__ = [
     "Anomaly", "Applied", "Array", "Command", "Elements", "Estimates", "Holder", "Message", "Numbers", "OfSignals",
@@ -15,6 +16,13 @@ __all__ = [
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
+if TYPE_CHECKING:
+    WireElements = Elements
+    WireNumbers = Numbers
+    WireTruths = Truths
+else:  # the decoder leaves them as they came; `OfSignals` reads them, quicker than a hook of msgspec for each could
+    WireElements = msgspec.Raw
+    WireNumbers = WireTruths = bytes
 
 
 class Message(msgspec.Struct, frozen=True, kw_only=True, tag_field="type", tag=str.lower):
@@ -45,31 +53,73 @@ class OfSignals(Message, frozen=True, kw_only=True):
     """Fields that have a value for each element."""
     BY_SIGNAL: ClassVar[tuple[str, ...]] = ()
     """Fields that have one for each signal."""
-    elements: Elements = NOTHING
+    parts: ClassVar[tuple[tuple[str, type[BySignal], np.dtype[Any], int], ...]] = ()
+    """`BY_ELEMENT`, how their numbers lie in memory, and how many bytes each has."""
+    elements: WireElements = NOTHING
+
+    def __init_subclass__(cls, **_: Any) -> None:
+        cls.parts = tuple((name, kind, kind.DTYPE, kind.DTYPE.itemsize) for name, kind in cls.BY_ELEMENT)
 
     def __post_init__(self) -> None:
-        elements = self.elements
-        for name, kind in self.BY_ELEMENT:
-            found = getattr(self, name)
-            if type(found) is kind and found.elements is OPEN and len(found.flat) == elements.size:
-                found.elements = elements  # as it comes from the wire
-            elif type(found) is not kind or found.elements is not elements:
-                elements = self._joined(name, kind, found, elements)
+        if type(self.elements) is msgspec.Raw:
+            self._read(bytes(self.elements))
+        else:
+            self._join()
         for name in self.BY_SIGNAL:
-            if getattr(self, name).keys() != elements.counts.keys():
+            if getattr(self, name).keys() != self.elements.counts.keys():
                 raise ValueError(f"Expected the same signals in '{name}' as in 'elements'")
 
-    def _joined(self, name: str, kind: type[BySignal], found: BySignal, elements: Elements) -> Elements:
-        """Make a field what it should be, of the same elements as the others; returns those."""
-        if type(found) is kind and found.elements is OPEN:
-            raise ValueError(f"Expected {elements.size} elements in '{name}', found {len(found.flat)}")
-        try:
-            joined = kind.of(found, elements if elements.size else None)
-        except ValueError as error:
-            raise ValueError(f"{error} in '{name}'") from None
-        force_setattr(self, name, joined)
-        force_setattr(self, "elements", joined.elements)
-        return joined.elements
+    def _read(self, counts: bytes) -> None:
+        """Make of what came from the wire what it stands for; nobody can write into the arrays."""
+        elements = _read_before.get(counts) or _read_elements(counts)
+        force_setattr(self, "elements", elements)
+        size = elements.size
+        for name, kind, dtype, width in self.parts:
+            data = getattr(self, name)
+            if len(data) != size * width:
+                raise ValueError(_misfit(name, len(data), width, size))
+            flat = frombuffer(data, dtype)
+            if kind is Truths and data.strip(b"\0\1"):  # any byte but zero is true
+                flat = frombuffer(data, "u1") != 0
+            force_setattr(self, name, kind(flat, elements))
+
+    def _join(self) -> None:
+        """Make one array of a field that has one per signal."""
+        elements = self.elements
+        for name, kind in self.BY_ELEMENT:
+            found: BySignal | bytes = getattr(self, name)
+            if isinstance(found, bytes):
+                raise ValueError(f"Expected a map 'elements', which tells whose the elements in '{name}' are")
+            if type(found) is not kind or found.elements is not elements:
+                try:
+                    joined = kind.of(found, elements if elements.size else None)
+                except ValueError as error:
+                    raise ValueError(f"{error} in '{name}'") from None
+                elements = joined.elements
+                force_setattr(self, name, joined)
+                force_setattr(self, "elements", elements)
+
+
+_read_before: dict[bytes, Elements] = {}
+"""Some elements by their bytes on the wire."""
+
+
+def _read_elements(wire: bytes) -> Elements:
+    counts = msgspec.msgpack.decode(wire)
+    if not isinstance(counts, dict):
+        raise ValueError("Expected a map from signal to its number of elements in 'elements'")
+    found = Elements.of(counts)
+    if len(_read_before) >= KEPT:
+        _read_before.clear()
+    if len(wire) <= LONGEST:
+        _read_before[wire] = found
+    return found
+
+
+def _misfit(name: str, length: int, width: int, size: int) -> str:
+    if length % width:
+        return f"Expected a binary of little-endian float64 in '{name}', found {length} bytes"
+    return f"Expected {size} elements in '{name}', found {length // width}"
 
 
 class Sample(OfSignals, frozen=True, kw_only=True):
@@ -91,9 +141,9 @@ class Sample(OfSignals, frozen=True, kw_only=True):
     cycle: int
     source: str
     complete: bool
-    values: Numbers
-    age: Numbers
-    valid: Truths
+    values: WireNumbers
+    age: WireNumbers
+    valid: WireTruths
 
 
 class Command(Message, frozen=True, kw_only=True):
@@ -176,9 +226,9 @@ class Estimates(OfSignals, frozen=True, kw_only=True):
     )  # fmt: skip
     BY_SIGNAL: ClassVar[tuple[str, ...]] = ("method", "mask", "residual")
     cycle: int
-    values: Numbers
-    estimated: Truths
-    std: Numbers
+    values: WireNumbers
+    estimated: WireTruths
+    std: WireNumbers
     method: dict[str, str]
     mask: dict[str, str]
     residual: dict[str, float]
@@ -206,7 +256,7 @@ class Anomaly(OfSignals, frozen=True, kw_only=True):
     threshold: float
     is_anomaly: bool
     blamed: str
-    contribution: Numbers
+    contribution: WireNumbers
     verdict: str = ""
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from services.recording.schema import Catalogue, Listed
 from services.wire.messages import VERSION
-from services.wire.records import Array, Elements, Message, Numbers, Truths
+from services.wire.records import Array, Message, Numbers, Truths
 
 ARM = Catalogue({"joint_position": Listed("rad", ("elbow", "wrist")), "muscle_tension": Listed("N", ("biceps",))})
 BY_SIGNAL = {"joint_position": 2, "muscle_tension": 1}
@@ -19,13 +19,12 @@ def a_message(record: type[Message], number: float = 0.1) -> Message:
     arrays = {name: np.full(size, number) for name, size in BY_SIGNAL.items()}
     truths = {name: np.arange(size) == 0 for name, size in BY_SIGNAL.items()}
     fields: dict[str, Any] = {"stamp_ns": time.time_ns(), "seq": 7, "boot": 2**53 - 1, "v": VERSION}
-    for name, hint in typing.get_type_hints(record).items():
-        if name in fields or typing.get_origin(hint) is typing.ClassVar:
+    hints = typing.get_type_hints(record) | dict(getattr(record, "BY_ELEMENT", ()))
+    for name, hint in hints.items():
+        if name in (*fields, "elements") or typing.get_origin(hint) is typing.ClassVar:
             continue
         if name == "signal":
             fields[name] = "joint_position"
-        elif hint is Elements:
-            continue
         elif hint == Array:
             fields[name] = np.full(2, 0.25 if name == "bias" else number)
         elif hint is Numbers:

@@ -182,6 +182,21 @@ def test_a_sample_that_does_not_agree_with_itself_is_none(change: dict[str, obje
         messages.decode(msgpack.packb(body), Sample)
 
 
+def test_a_sample_that_does_not_tell_whose_its_elements_are_is_none() -> None:
+    body = msgpack.unpackb(messages.encode(EXAMPLES[0]))
+    del body["elements"]
+    with pytest.raises(MessageError, match="Expected a map 'elements'"):
+        messages.decode(msgpack.packb(body), Sample)
+
+
+def test_a_message_is_as_it_was_after_it_was_sent() -> None:
+    sample = EXAMPLES[0]
+    before = sample.elements, sample.values, sample.valid
+    first = messages.encode(sample)
+    assert (sample.elements, sample.values, sample.valid) == before
+    assert messages.encode(sample) == first
+
+
 @pytest.mark.parametrize("field", ["method", "mask", "residual"])
 def test_what_is_told_of_signals_is_told_of_all_of_them(field: str) -> None:
     body = msgpack.unpackb(messages.encode(EXAMPLES[3]))
