@@ -83,7 +83,7 @@ def rows() -> Iterator[Row]:
     yield memory()
     yield question()
     yield way_through.row()
-    yield highest_rate.row()
+    yield from highest_rate.rows()
 
 
 def main() -> None:
