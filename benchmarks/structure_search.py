@@ -6,7 +6,7 @@ On made-up bodies (`benchmarks.synthetic_body`). One network is trained; then al
 to 12 signals), and the search is run with the same network. A feasible mask of the exhaustive answer counts as found if
 the search returned it, or a part of it that is feasible too; it counts as served if one of the masks kept for the
 schema (at most 64) is a part of it. Beside them stands what a perfect model of that body would find. Times are those
-of the one processor core that is used.
+of all processor cores together.
 """
 
 import argparse

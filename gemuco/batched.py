@@ -1,17 +1,19 @@
-"""What CUDA is used for where there is some: several trainings as one stack of networks, and one network's many masks.
+"""Several trainings at once: on all cores, or where there is CUDA as one stack of networks; and many masks on CUDA.
 
-Each member draws what it learns from exactly as on its own (`Learner`, `Material`): the same batches, masks, looks for
-outliers, and stops. What is done together is the network: a product of the stack is one call, and so is a step of Adam
-on the stack of all W. After every epoch W, p and what Adam remembers go back into the learners, so that a training
-that was interrupted goes on with or without CUDA.
+Each member of a stack draws what it learns from exactly as on its own (`Learner`, `Material`): the same batches,
+masks, looks for outliers, and stops. What is done together is the network: a product of the stack is one call, and so
+is a step of Adam on the stack of all W. After every epoch W, p and what Adam remembers go back into the learners, so
+that a training that was interrupted goes on with or without CUDA.
 """
 
 from collections.abc import Sequence
+from functools import partial
+from threading import Event, Lock
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gemuco import devices
+from gemuco import cores, devices
 from gemuco.activation import LINEAR
 from gemuco.compiled.bend import CODES
 from gemuco.compiled.chain import CODE, NARROW, PLACE, WIDE, Packed
@@ -46,8 +48,7 @@ def train(
     """
     device = device or devices.best()
     if device is None:
-        for index, (learner, draft) in enumerate(zip(learners, drafts, strict=True)):
-            learner.run(_share(progress, index, len(learners)), title, draft)
+        _train_side_by_side(learners, drafts, progress, title)
         return
     for learner, draft in zip(learners, drafts, strict=True):
         learner.restore(draft)
@@ -68,11 +69,35 @@ def train(
         learner.close()
 
 
-def _share(progress: Progress | None, index: int, count: int) -> Progress | None:
-    """Progress of one of so many that run in turn."""
-    if progress is None or count == 1:
-        return progress
-    return lambda done, text: progress((index + done) / count, text)
+class Stopped(Exception):
+    """Another training failed, or whoever waits was interrupted."""
+
+
+def _train_side_by_side(
+    learners: Sequence[Learner], drafts: Sequence[Draft], progress: Progress | None, title: str
+) -> None:
+    """Train each in compiled code, as many at a time as there are cores; one that fails ends the others soon."""
+    if len(learners) == 1:
+        learners[0].run(progress, title, drafts[0])
+        return
+    done, stop, telling = np.zeros(len(learners)), Event(), Lock()
+
+    def follow(index: int) -> Progress:
+        def tell(share: float, text: str) -> None:
+            if stop.is_set():
+                raise Stopped
+            with telling:
+                done[index] = share
+                if progress is not None:
+                    progress(float(done.mean()), text)
+
+        return tell
+
+    def job(index: int) -> None:
+        learners[index].run(follow(index), title, drafts[index])
+        follow(index)(1.0, f"{title}: held-out loss {learners[index].course.least:.4f}")
+
+    cores.run([partial(job, index) for index in range(len(learners))], stop)
 
 
 def _shape(learner: Learner) -> tuple[Any, ...]:

@@ -1,10 +1,11 @@
 """How badly one network infers every signal from any mask, measured on held-out rows."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
-from gemuco import batched, devices, outliers
+from gemuco import batched, cores, devices, outliers
 from gemuco.compiled.chain import pack
 from gemuco.compiled.masks import squares, sums
 from gemuco.dataset import Dataset
@@ -108,16 +109,17 @@ class MaskErrors:
         """
         rows, *_ = self._arrays()
         chain, found = pack(self.chain), np.empty((len(bits), *self.whole.shape), np.float32)
-        step = max(1, TOGETHER // max(1, self.x.size))
-        for begin in range(0, len(bits), step):
-            part = bits[begin : begin + step]
-            squared = squares(chain, rows, self.x, *self._gates(part))
-            told = self._usable(part).T[:, :, None] & self.there  # (masks, rows, size)
+
+        def measure(part: slice) -> None:
+            squared = squares(chain, rows, self.x, *self._gates(bits[part]))
+            told = self._usable(bits[part]).T[:, :, None] & self.there  # (masks, rows, size)
             count = told.sum(axis=1, keepdims=True)
             measured = self._by_signal(np.where(count > 0, self.liveliness, 0.0))
             scarce = self._by_signal((count < TOLD) & (self.liveliness > 0.0)) > 0
             shares = self._by_signal(squared * told * (len(rows) / np.maximum(count, 1)).astype(np.float32))
-            found[begin : begin + step] = np.where(scarce, np.nan, shares / np.maximum(measured, 1e-12))
+            found[part] = np.where(scarce, np.nan, shares / np.maximum(measured, 1e-12))
+
+        cores.run([partial(measure, part) for part in _parts(len(bits), TOGETHER // max(1, self.x.size))])
         return found
 
     def from_others(self, signal: int) -> float:
@@ -158,9 +160,14 @@ class MaskErrors:
     def _squared(self, bits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Sum of squared errors of every element, and of how many rows, shapes (masks, size)."""
         rows, known, whole = self._arrays()
-        given = (pack(self.chain), rows, self.x, known, whole, *self._gates(bits))
-        device = devices.best()
-        squared = sums(*given) if device is None else batched.sums(device, *given)
+        chain, device = pack(self.chain), devices.best()
+
+        def measure(part: slice) -> np.ndarray:
+            given = chain, rows, self.x, known, whole, *self._gates(bits[part])
+            return sums(*given) if device is None else batched.sums(device, *given)
+
+        parts = _parts(len(bits), len(bits)) if device is None else [slice(None)]
+        squared = np.concatenate(cores.run([partial(measure, part) for part in parts]))
         return squared, self._usable(bits).T.astype(np.float32) @ known
 
     def _arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -175,3 +182,9 @@ class MaskErrors:
     def _usable(self, bits: np.ndarray) -> np.ndarray:
         """Which rows have all signals of a mask, shape (rows, masks)."""
         return np.asarray((~self.whole).astype(np.float32) @ bits.T.astype(np.float32) < 0.5)
+
+
+def _parts(count: int, most: int) -> list[slice]:
+    """So many masks cut into parts of at most `most`, and so that every core has one."""
+    step = max(1, min(most, -(-count // cores.count())))
+    return [slice(begin, begin + step) for begin in range(0, max(count, 1), step)]

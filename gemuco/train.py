@@ -81,7 +81,7 @@ def fit(
 def fit_all(
     jobs: Sequence[Job], progress: Progress | None = None, title: str = "training"
 ) -> list[tuple[BodySchema, History]]:
-    """Several trainings, such as of several seeds: together where there is CUDA (`gemuco.batched`), else in turn.
+    """Several trainings, such as of several seeds: together, see `gemuco.batched`.
 
     Args:
         jobs: What `fit` is told of each.

@@ -6,6 +6,9 @@ what that makes of a search), and takes 17 MB of memory. So the one that the whe
 numpy from elsewhere, scipy has to be there.
 """
 
+import ctypes
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -31,6 +34,26 @@ if not FOUND and find_spec("scipy") is None:
         "This numpy has no BLAS that compiled code can call, for it is not a wheel of PyPI. "
         "Install scipy beside it, or numpy by pip."
     )
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Have the whole process do each product on one thread meanwhile, for products that are done side by side.
+
+    Those of BLAS's own threads would wait for each other. Without numpy's BLAS nothing is changed.
+    """
+    if not FOUND:
+        yield
+        return
+    library = ctypes.CDLL(str(NUMPYS))
+    before = library.scipy_openblas_get_num_threads64_()
+    library.scipy_openblas_set_num_threads64_(1)
+    try:
+        yield
+    finally:
+        library.scipy_openblas_set_num_threads64_(before)
+
+
 _i, _n, _f, _d, _p = types.int32, types.int64, types.float32, types.float64, types.voidptr
 _sgemm = types.ExternalFunction(
     "scipy_cblas_sgemm64_", types.void(_i, _i, _i, _n, _n, _n, _f, _p, _n, _p, _n, _f, _p, _n)

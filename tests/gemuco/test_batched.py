@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from muscle_arm import LAYOUT, MuscleArm
 
-from gemuco import devices
+from gemuco import cores, devices
 from gemuco.activation import ACTIVATIONS
 from gemuco.dataset import Dataset, Episode
 from gemuco.mask_training import train_masks
@@ -59,6 +59,43 @@ def test_a_stack_of_trainings_is_what_they_are_one_by_one(bodies, activation, mo
     assert told == sorted(told)
     assert told[-1] == 1.0
     assert [len(history.train) for _, history in stacked] == [8, 8, 5, 8, 8, 8]
+
+
+def test_trainings_side_by_side_are_what_they_are_one_by_one(bodies, monkeypatch):
+    jobs = [Job(bodies, replace(CONFIG, seed=seed, epochs=4 + seed), MASKS) for seed in range(3)]
+    monkeypatch.setattr(cores, "count", lambda: 3)
+    told = []
+    together = on(None, monkeypatch, lambda: fit_all(jobs, lambda done, _: told.append(done)))
+    for job, (schema, history) in zip(jobs, together, strict=True):
+        alone, course = fit(job.dataset, job.config, job.masks)
+        assert history.held_out == course.held_out
+        for a, b in zip(schema.weights.arrays(), alone.weights.arrays(), strict=True):
+            np.testing.assert_array_equal(a, b)
+    assert told == sorted(told)
+    assert told[-1] == 1.0
+
+
+def test_whoever_is_told_of_trainings_side_by_side_may_end_them(bodies, monkeypatch):
+    monkeypatch.setattr(cores, "count", lambda: 2)
+    jobs = [Job(bodies, replace(CONFIG, seed=seed, epochs=100_000, patience=100_000), MASKS) for seed in range(2)]
+
+    def enough(done, text):
+        raise InterruptedError
+
+    with pytest.raises(InterruptedError):
+        on(None, monkeypatch, lambda: fit_all(jobs, enough))
+
+
+def test_masks_on_several_cores_have_the_same_errors(bodies, monkeypatch):
+    (errors,) = train_masks(bodies, replace(CONFIG, epochs=2))
+    masks = np.array([bits(m, LAYOUT.names) > 0 for m in all_masks(LAYOUT.names)])
+    found = []
+    for count in (1, 2, 5):
+        monkeypatch.setattr(cores, "count", lambda count=count: count)
+        found.append((*errors.of(masks), errors.by_row(masks)))
+    for other in found[1:]:
+        for a, b in zip(found[0], other, strict=True):
+            np.testing.assert_array_equal(a, b)
 
 
 def test_without_bias_and_with_one_condition(data, monkeypatch):
