@@ -63,6 +63,13 @@ class Ready:
         self.plan = ByPattern(lambda finite: Plan.of(schema, finite))
         self.judgement = ByPattern(lambda finite: Judgement.of(schema, finite))
 
+    def __getstate__(self) -> "BodySchema":
+        return self._schema
+
+    def __setstate__(self, schema: "BodySchema") -> None:
+        """Another process works everything out anew: arrays lose on their way that nobody may write into them."""
+        Ready.__init__(self, schema)
+
     def prepare(self, other: "Ready") -> None:
         """Make now what the other one was asked for last, before a loop that keeps time asks this one."""
         _ = self.parts, self.judges

@@ -52,15 +52,16 @@ class Outcome:
     actual: Actual
 
 
+def _of_seed(run: Run, tell: Tell) -> Outcome:
+    simulated = simulate(run, between(tell, 0.0, 0.9))
+    return Outcome(simulated, actual(run, simulated.schema, between(tell, 0.9, 1.0)))
+
+
 def reproduce(seeds: Sequence[int], folder: Path, progress: Tell, fresh: bool) -> Report:
     """See `services.reproduce.Experiment`."""
     robot = load_robot(robot_file(ROBOT))
 
-    def experiment(run: Run, tell: Tell) -> Outcome:
-        simulated = simulate(run, between(tell, 0.0, 0.9))
-        return Outcome(simulated, actual(run, simulated.schema, between(tell, 0.9, 1.0)))
-
-    outcomes = each_seed(robot, seeds, folder, progress, fresh, experiment)
+    outcomes = each_seed(robot, seeds, folder, progress, fresh, _of_seed)
     report = Report(ROBOT, tuple(seeds))
     _add_structure(report, outcomes)
     _add_recognition(report, outcomes)

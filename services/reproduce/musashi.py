@@ -4,10 +4,7 @@ Seed n stands for training n and actual arm n. What was chosen by looking at res
 weights of the simulation) was chosen on arms 11 and 13, which are not judged here.
 """
 
-import os
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -21,26 +18,18 @@ from services.reproduce.musashi_model import decay
 from services.reproduce.musashi_motion import LENGTH, POSITION, TENSION
 from services.reproduce.musashi_seed import AFTER, BEFORE, HELD, Outcome, run_seed
 from services.reproduce.report import Report, Row
+from services.reproduce.runs import each_seed
 from services.show import Tell
 
 PAPER_MASKS = {frozenset({POSITION, TENSION}), frozenset({TENSION, LENGTH})}
 LOOSE = 0.30
 """The paper's second threshold of masks."""
-WORKERS = 2
 
 
 def reproduce(seeds: Sequence[int], folder: Path, progress: Tell, fresh: bool) -> Report:
-    """Run all seeds, two at a time, draw the figures and compare with the paper; see `Experiment`."""
+    """Run all seeds, draw the figures and compare with the paper; see `Experiment`."""
     robot = load_robot(robot_file("musashi_arm"))
-    found: dict[int, Outcome] = {}
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
-    with ProcessPoolExecutor(min(WORKERS, len(seeds)), mp_context=get_context("spawn")) as pool:
-        jobs = {pool.submit(run_seed, robot, seed, folder, fresh): seed for seed in seeds}
-        progress(0.0, f"{len(seeds)} seeds, {min(WORKERS, len(seeds))} at a time")
-        for job in as_completed(jobs):
-            found[jobs[job]] = job.result()
-            progress(len(found) / len(seeds), f"seed {jobs[job]} done")
-    outcomes = [found[seed] for seed in seeds]
+    outcomes = each_seed(robot, seeds, folder, progress, fresh, run_seed)
     figures.draw(outcomes, robot, folder)
     return report(outcomes)
 

@@ -2,20 +2,19 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from gemuco.dataset import Dataset
 from gemuco.schema import BodySchema
 from gemuco.structure import Structure
-from hal.config import RobotConfig
 from services.reproduce import musashi_anomaly as anomaly
 from services.reproduce import musashi_control as control
 from services.reproduce import musashi_model as model
 from services.reproduce import musashi_simulation as simulation
 from services.reproduce.musashi_motion import TENSION, record
-from services.reproduce.runs import Run, open_run
+from services.reproduce.runs import Run
+from services.show import Tell
 
 LIVED, NORMAL, FRESH, CUT = 600.0, 240.0, 120.0, 30.0
 """Lengths of recordings [s]: learned from, what is normal, judged, and with a cut muscle."""
@@ -72,22 +71,27 @@ class Outcome:
     forced: Mapping[str, Mapping[str, np.ndarray]]
 
 
-def run_seed(robot: RobotConfig, seed: int, folder: Path, fresh: bool) -> Outcome:
+def run_seed(run: Run, tell: Tell) -> Outcome:
     """Train, move the actual arm, learn from it and use what was learned."""
-    run = open_run(robot, folder, seed, fresh)
+    robot, seed = run.robot, run.seed
+    tell(0.0, "training on the geometric model")
     data = run.dataset("geometric", lambda: model.geometric_data(robot, seed))
     structure = model.determine(robot, data, seed)
     before = run.schema(BEFORE, lambda: model.train(robot, data, structure.masks, seed))
+    tell(0.2, "moving the actual arm")
     lived = _recorded(run, "lived", 100, LIVED)
+    tell(0.4, "learning from it")
     learned = model.learn(robot, before, lived, seed)
     normal = _recorded(run, "normal", 200, NORMAL)
     schemas = {
         BEFORE: anomaly.with_normal(before, normal),
         AFTER: anomaly.with_normal(learned.schema, normal),
     }
+    tell(0.5, "moving it with a heavy object and cut muscles")
     motion, loaded = _recorded(run, "fresh", 300, FRESH), _recorded(run, "heavy", 400, FRESH, HEAVY)
     story = _story(run)
     cut = _cuts(run)
+    tell(0.7, "controlling and simulating it")
 
     def both(measure: Callable[[BodySchema, Dataset], np.ndarray], recording: Dataset) -> dict[str, np.ndarray]:
         return {name: measure(schema, recording) for name, schema in schemas.items()}

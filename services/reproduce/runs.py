@@ -1,13 +1,24 @@
-"""What an experiment collected and trained, kept per seed and made again when the robot file changes."""
+"""Experiments of several seeds side by side, and what each collected and trained, kept for the next time.
+
+It is made again when the robot file changes.
+"""
+
+from __future__ import annotations
 
 import hashlib
 import json
 import shutil
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
+from multiprocessing import Queue, get_context
+from multiprocessing.synchronize import Event
 from pathlib import Path
+from queue import Empty
 from typing import Any, TypeVar
 
+from gemuco import cores
 from gemuco.dataset import Dataset
 from gemuco.errors import CheckpointError, DatasetError
 from gemuco.schema import BodySchema
@@ -86,20 +97,58 @@ def open_run(robot: RobotConfig, folder: Path, seed: int, fresh: bool = False) -
     return Run(robot, seed, place)
 
 
+Experiment = Callable[[Run, Tell], Outcome]
+"""All of one seed, as a function of a module: a process that is started for it must find it by its name."""
+
+
 def each_seed(
-    robot: RobotConfig,
-    seeds: Sequence[int],
-    folder: Path,
-    progress: Tell,
-    fresh: bool,
-    experiment: Callable[[Run, Tell], Outcome],
+    robot: RobotConfig, seeds: Sequence[int], folder: Path, progress: Tell, fresh: bool, experiment: Experiment[Outcome]
 ) -> list[Outcome]:
-    """One experiment for every seed, one after the other; progress is told over all of them."""
-    outcomes = []
-    for index, seed in enumerate(seeds):
-        tell = between(progress, index / len(seeds), (index + 1) / len(seeds), f"seed {seed}: ")
-        outcomes.append(experiment(open_run(robot, folder, seed, fresh), tell))
-    return outcomes
+    """One experiment for every seed, as many at a time as there are cores; progress is told over all of them.
+
+    When one fails, the others end as soon as they have something to tell.
+    """
+    context, done = get_context("spawn"), dict.fromkeys(seeds, 0.0)
+    told, stop = context.Queue(), context.Event()
+    with ProcessPoolExecutor(min(cores.count(), len(seeds)), context, _join, (told, stop)) as pool:
+        running = {seed: pool.submit(_of_seed, experiment, robot, folder, seed, fresh) for seed in done}
+        try:
+            while not all(job.done() for job in running.values()):
+                for job in running.values():
+                    if job.done():
+                        job.result()  # raises what it raised
+                with suppress(Empty):
+                    seed, share, text = told.get(timeout=0.5)
+                    done[seed] = share
+                    progress(sum(done.values()) / len(done), f"seed {seed}: {text}")
+            return [running[seed].result() for seed in seeds]
+        finally:
+            stop.set()
+            pool.shutdown(cancel_futures=True)
+
+
+class Stopped(Exception):
+    """The experiment of another seed failed, or whoever waits was interrupted."""
+
+
+_ways: list[tuple[Queue[Any], Event]] = []
+"""In a process of experiments: where to tell how far one is, and whether it is to end."""
+
+
+def _join(told: Queue[Any], stop: Event) -> None:
+    told.cancel_join_thread()  # nobody reads any more when a process ends
+    _ways.append((told, stop))
+
+
+def _of_seed(experiment: Experiment[Outcome], robot: RobotConfig, folder: Path, seed: int, fresh: bool) -> Outcome:
+    told, stop = _ways[-1]
+
+    def tell(done: float, text: str) -> None:
+        if stop.is_set():
+            raise Stopped
+        told.put((seed, done, text))
+
+    return experiment(open_run(robot, folder, seed, fresh), tell)
 
 
 def between(tell: Tell, first: float, last: float, prefix: str = "") -> Tell:

@@ -1,5 +1,7 @@
 """The body schema as the face of it all, on plain arrays."""
 
+import pickle
+
 import numpy as np
 
 from gemuco.schema import BodySchema
@@ -29,3 +31,5 @@ def test_every_verb_from_arrays_to_a_stored_body(arm, data, tmp_path):
     wiser.save(tmp_path)
     again = BodySchema.load(tmp_path)
     np.testing.assert_array_equal(again.estimate(sample)[POSITION].value, wiser.estimate(sample)[POSITION].value)
+    other = pickle.loads(pickle.dumps(again))  # as to another process, after it was used
+    np.testing.assert_array_equal(other.estimate(sample)[POSITION].value, wiser.estimate(sample)[POSITION].value)

@@ -1,4 +1,5 @@
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,8 @@ from hal.config import load_robot
 from services.errors import BadArguments
 from services.reproduce import experiment, figures
 from services.reproduce.report import Report, Row
-from services.reproduce.runs import open_run
+from services.reproduce.runs import Run, each_seed, open_run
+from services.show import Tell
 
 ROBOT = Path(__file__).parents[2] / "robots" / "musashi_arm.yaml"
 
@@ -85,3 +87,30 @@ def test_two_components_are_enough_for_a_p_of_one_number(tmp_path):
     with figures.picture(tmp_path / "one.png", "one number") as axes:
         figures.bias_map(axes[0], {"light": np.array([-1.0]), "heavy": np.array([1.0])})
     assert (tmp_path / "one.png").exists()
+
+
+def _counts(run: Run, tell: Tell) -> tuple[int, int]:
+    tell(0.0, "counting")
+    if run.robot.robot == "broken":
+        if run.seed:
+            tell(0.5, "patient")
+            while True:
+                tell(0.5, "waiting")
+        raise FileNotFoundError("of seed 0")
+    tell(1.0, "done")
+    return run.seed, os.getpid()
+
+
+def test_seeds_run_side_by_side_and_are_told_of(tmp_path):
+    told: list[tuple[float, str]] = []
+    found = each_seed(load_robot(ROBOT), [3, 1, 2], tmp_path, lambda *one: told.append(one), False, _counts)
+    assert [seed for seed, _ in found] == [3, 1, 2]
+    assert os.getpid() not in {process for _, process in found}
+    assert {text for _, text in told} >= {"seed 1: counting", "seed 3: counting"}
+    assert all(0.0 <= share <= 1.0 for share, _ in told)
+
+
+def test_an_experiment_that_fails_ends_those_of_the_other_seeds(tmp_path):
+    robot = load_robot(ROBOT).model_copy(update={"robot": "broken"})
+    with pytest.raises(FileNotFoundError, match="of seed 0"):
+        each_seed(robot, [0, 1], tmp_path, lambda share, text: None, False, _counts)
