@@ -10,10 +10,12 @@ from gemuco.errors import NotEnoughData
 from gemuco.mask_errors import MaskErrors
 from gemuco.masks import Mask, all_masks
 from gemuco.scaler import Scaler
-from gemuco.train import Job, Progress, TrainConfig, fit_all
+from gemuco.train import Job, Progress, TrainConfig, Work, together
 
 LISTED = 10
 """Up to so many signals every mask is tried."""
+ROUNDS = (("structure", 1.0),)
+"""See `together`."""
 TRAINED = 2000
 """With more signals the network is trained with so many masks, and is right about the others too."""
 
@@ -26,14 +28,21 @@ def train_masks(
     drafts: Path | None = None,
 ) -> tuple[MaskErrors, ...]:
     """One network per split, and what it makes of masks on the episodes that it did not see."""
+    return together([training_masks(dataset, config, splits, drafts)], ROUNDS, progress)[0]
+
+
+def training_masks(
+    dataset: Dataset, config: TrainConfig, splits: int, drafts: Path | None
+) -> Work[tuple[MaskErrors, ...]]:
+    """`train_masks`, for whoever has the trainings done."""
     jobs, parts = [], []
     for split in range(splits):
         own = replace(config, seed=config.seed + split)
         parts.append(dataset.split(own.held_out, own.seed))
         _check_alive(parts[-1][0])
         resume = None if drafts is None else drafts / f"structure_{split}.safetensors"
-        jobs.append(Job(dataset, own, _training_masks(dataset.layout.names, own.seed), resume=resume))
-    trained = fit_all(jobs, progress, title="structure")
+        jobs.append(Job(dataset, own, _drawn_masks(dataset.layout.names, own.seed), resume=resume))
+    trained = yield jobs
     return tuple(
         MaskErrors.of_schema(schema, *part, config.outliers) for (schema, _), part in zip(trained, parts, strict=True)
     )
@@ -53,7 +62,7 @@ def _check_alive(train: Dataset) -> None:
             )
 
 
-def _training_masks(names: tuple[str, ...], seed: int) -> tuple[Mask, ...]:
+def _drawn_masks(names: tuple[str, ...], seed: int) -> tuple[Mask, ...]:
     """All masks, or `TRAINED` random ones of all sizes from which the network learns to do with any."""
     if len(names) <= LISTED:
         return all_masks(names)

@@ -1,9 +1,9 @@
 """Training (paper, II-D): from episodes to a body schema, and from a schema to one that fits a few new episodes."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Generator, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -27,6 +27,9 @@ from gemuco.train_config import TrainConfig
 ANCHORS = 1000
 
 
+Found = TypeVar("Found")
+
+
 @dataclass(frozen=True, slots=True)
 class Job:
     """One training of several; see `fit`.
@@ -46,6 +49,11 @@ class Job:
     resume: str | Path | None = None
 
 
+Fitted = tuple[BodySchema, History]
+Work = Generator[Sequence[Job], list[Fitted], Found]
+"""What needs trainings on its way: it yields them, is sent what came of them, and returns what it is about."""
+
+
 def fit(
     dataset: Dataset,
     config: TrainConfig,
@@ -54,7 +62,7 @@ def fit(
     x_out: Iterable[str] | None = None,
     title: str = "training",
     resume: str | Path | None = None,
-) -> tuple[BodySchema, History]:
+) -> Fitted:
     """Train a body schema.
 
     Args:
@@ -78,9 +86,7 @@ def fit(
     return fit_all([job], progress, title)[0]
 
 
-def fit_all(
-    jobs: Sequence[Job], progress: Progress | None = None, title: str = "training"
-) -> list[tuple[BodySchema, History]]:
+def fit_all(jobs: Sequence[Job], progress: Progress | None = None, title: str = "training") -> list[Fitted]:
     """Several trainings, such as of several seeds: together, see `gemuco.batched`.
 
     Args:
@@ -96,6 +102,33 @@ def fit_all(
         schema = _assessed(_schema(one.learner, one.scaler, conditions), one.learner, conditions)
         found.append((schema, _history(one.learner, one.scaler, one.notes)))
     return found
+
+
+def together(
+    works: Sequence[Work[Found]], rounds: Sequence[tuple[str, float]], progress: Progress | None = None
+) -> list[Found]:
+    """Several works, the trainings that they need next always together, see `fit_all`; what they return.
+
+    Args:
+        works: All of them need trainings equally often.
+        rounds: What to call the trainings of each time, and their share of it all.
+        progress: Told the share done of all of them.
+    """
+    wanted, found, begun = [next(work) for work in works], [], 0.0
+    for title, share in rounds:
+        trained = iter(fit_all([job for jobs in wanted for job in jobs], _part(progress, begun, share), title))
+        begun += share
+        for index, work in enumerate(works):
+            try:
+                wanted[index] = work.send([next(trained) for _ in wanted[index]])
+            except StopIteration as end:
+                found.append(end.value)
+    return found
+
+
+def _part(progress: Progress | None, begun: float, share: float) -> Progress | None:
+    """Progress of a part of the work, told as progress of the whole."""
+    return None if progress is None else lambda done, text: progress(begun + share * done, text)
 
 
 class _Ready(NamedTuple):
@@ -142,7 +175,7 @@ def fine_tune(
     progress: Progress | None = None,
     title: str = "fine-tuning",
     resume: str | Path | None = None,
-) -> tuple[BodySchema, History]:
+) -> Fitted:
     """Train a schema further on few samples of a body that is like the one it knows: simulation to real robot.
 
     W starts from the schema's, and so does the p of every condition it knows; others start from the p in use. The

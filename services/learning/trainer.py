@@ -2,7 +2,7 @@
 
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,7 +23,7 @@ from services.model.model_config import ModelConfig, model_config
 
 if TYPE_CHECKING:
     from gemuco.structure import Structure
-    from gemuco.train import TrainConfig
+    from gemuco.train import TrainConfig, Work
 
 Progress = Callable[[float, str], None]
 
@@ -92,26 +92,34 @@ def learn(
     Raises:
         NotEnoughData: Too few samples, or nothing can be inferred.
     """
-    from gemuco import structure
-    from gemuco import train as training
+    from gemuco.train import together
 
-    started = time.monotonic()
+    return together([learning(config, dataset, seed, drafts, **facts)], rounds(config), progress)[0]
+
+
+def train_all(
+    robot: RobotConfig, datasets: Sequence[Dataset], seeds: Sequence[int], progress: Progress
+) -> list[Trained]:
+    """The models of a robot from a dataset and a seed each, trained together; see `train`."""
+    from gemuco.train import together
+
+    config, facts = model_config(robot), {"robot": robot.robot, "fingerprint": fingerprint(robot)}
+    works = [learning(config, data, seed, None, **facts) for data, seed in zip(datasets, seeds, strict=True)]
+    return together(works, rounds(config), progress)
+
+
+def learning(config: ModelConfig, dataset: Dataset, seed: int, drafts: Path | None, **facts: str) -> "Work[Trained]":
+    """`learn`, for whoever has the trainings done."""
+    from gemuco.structure import Thresholds, determining
+    from gemuco.train import Job
+
+    started, wanted = time.monotonic(), config.structure
     first = train_config(config, config.structure.epochs, seed)
     last = train_config(config, config.training.epochs, seed)
-    wanted = config.structure
-    share = first.epochs * wanted.splits / (first.epochs * wanted.splits + last.epochs)
-    thresholds = structure.Thresholds(wanted.threshold_out, wanted.threshold_in, wanted.measure, wanted.over)
-    found = structure.determine(
-        dataset, first, thresholds, lambda done, text: progress(share * done, text), wanted.splits, drafts
-    )
-    schema, history = training.fit(
-        dataset,
-        last,
-        found.masks,
-        lambda done, text: progress(share + (1 - share) * done, text),
-        found.x_out,
-        resume=None if drafts is None else drafts / "training.safetensors",
-    )
+    thresholds = Thresholds(wanted.threshold_out, wanted.threshold_in, wanted.measure, wanted.over)
+    found = yield from determining(dataset, first, thresholds, wanted.splits, drafts)
+    draft = None if drafts is None else drafts / "training.safetensors"
+    ((schema, history),) = yield [Job(dataset, last, found.masks, found.x_out, draft)]
     names = dataset.layout.names
     schema = schema.with_manifest(
         **facts,
@@ -121,6 +129,12 @@ def learn(
         L_m={label(mask, names): found.L_m[mask] for mask in found.listed},
     )
     return Trained(schema, found, history, len(dataset), time.monotonic() - started)
+
+
+def rounds(config: ModelConfig) -> tuple[tuple[str, float], ...]:
+    """The trainings of `learning`, and their shares of it all."""
+    first, last = config.structure.epochs * config.structure.splits, config.training.epochs
+    return ("structure", first / (first + last)), ("training", last / (first + last))
 
 
 def tune(
