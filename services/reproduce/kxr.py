@@ -24,6 +24,7 @@ from services.reproduce.kxr_simulated import (
     STEPS,
     TOOLS,
     Simulated,
+    collected,
     mask_errors,
     simulate,
 )
@@ -61,7 +62,7 @@ def reproduce(seeds: Sequence[int], folder: Path, progress: Tell, fresh: bool) -
     """See `services.reproduce.Experiment`."""
     robot = load_robot(robot_file(ROBOT))
 
-    outcomes = each_seed(robot, seeds, folder, progress, fresh, _of_seed)
+    outcomes = each_seed(robot, seeds, folder, progress, fresh, _of_seed, collected)
     report = Report(ROBOT, tuple(seeds))
     _add_structure(report, outcomes)
     _add_recognition(report, outcomes)

@@ -7,6 +7,7 @@ from itertools import product
 import numpy as np
 
 from gemuco.adapt import UpdateConfig
+from gemuco.dataset import Dataset
 from gemuco.masks import all_masks, label
 from gemuco.schema import BodySchema
 from services.learning.collector import collect_direct
@@ -25,7 +26,7 @@ from services.reproduce.kxr_robot import (
     safe_postures,
 )
 from services.reproduce.kxr_trials import Course, follow, follow_blindly, recognise, samples_until
-from services.reproduce.runs import Run
+from services.reproduce.runs import MODEL, Run
 from services.show import Tell
 
 NOMINAL = "nominal"
@@ -84,14 +85,17 @@ class Simulated:
     limit: Course
 
 
+def collected(run: Run, tell: Tell) -> Dataset:
+    """What the model is trained on."""
+    tell(0.0, "collecting")
+    return run.dataset("nominal", lambda: collect_direct(run.robot, NOMINAL, run.seed).dataset)
+
+
 def simulate(run: Run, tell: Tell) -> Simulated:
     """Collect, train, and run every trial of one seed."""
     robot, seed = run.robot, run.seed
-    tell(0.0, "collecting")
-    data = run.dataset("nominal", lambda: collect_direct(robot, NOMINAL, seed).dataset)
-    schema = run.schema(
-        "nominal_model", lambda: train(robot, data, seed, lambda done, text: tell(0.2 + 0.5 * done, text)).schema
-    )
+    data = collected(run, tell)
+    schema = run.schema(MODEL, lambda: train(robot, data, seed, lambda done, text: tell(0.2 + 0.5 * done, text)).schema)
     tell(0.7, "recognising tools")
     needed, paths = recognitions(run, schema, NOMINAL, WAYS)
     tell(0.85, "reaching targets while tools change")

@@ -11,7 +11,7 @@ from services.model.artifacts import robot_file
 from services.reproduce.pr2_actual import MODELS, Actual, actual
 from services.reproduce.pr2_arm import JOINTS, TIP
 from services.reproduce.pr2_figures import draw
-from services.reproduce.pr2_simulated import CASES, POINTS, RECOGNISERS, WAYS, Simulated, simulate
+from services.reproduce.pr2_simulated import CASES, POINTS, RECOGNISERS, WAYS, Simulated, collected, simulate
 from services.reproduce.report import Report, Row, adder
 from services.reproduce.runs import Run, between, each_seed
 from services.show import Tell
@@ -41,7 +41,7 @@ def reproduce(seeds: Sequence[int], folder: Path, progress: Tell, fresh: bool) -
     """See `services.reproduce.Experiment`."""
     robot = load_robot(robot_file(ROBOT))
 
-    outcomes = each_seed(robot, seeds, folder, progress, fresh, _of_seed)
+    outcomes = each_seed(robot, seeds, folder, progress, fresh, _of_seed, collected)
     draw(folder, [outcome.simulated for outcome in outcomes], [outcome.actual for outcome in outcomes])
     return summary(seeds, outcomes)
 

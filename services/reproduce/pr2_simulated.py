@@ -14,7 +14,7 @@ from services.learning.trainer import train
 from services.model.model_config import collect_config
 from services.reproduce.pr2_arm import Arm, Geometry, duster_motion
 from services.reproduce.pr2_trials import Course, control_along, estimate_along, model_error
-from services.reproduce.runs import Run
+from services.reproduce.runs import MODEL, Run
 from services.show import Tell
 
 NOMINAL = "nominal"
@@ -105,11 +105,16 @@ class Simulated:
         return self.schema.manifest[name]
 
 
+def collected(run: Run, tell: Tell) -> Dataset:
+    """What the model is trained on."""
+    tell(0.0, "collecting")
+    return run.dataset("nominal", lambda: collect_direct(run.robot, NOMINAL, run.seed).dataset)
+
+
 def simulate(run: Run, tell: Tell) -> Simulated:
     """Collect, train, and run every trial of one seed."""
     robot, seed = run.robot, run.seed
-    tell(0.0, "collecting")
-    data = run.dataset("nominal", lambda: collect_direct(robot, NOMINAL, seed).dataset)
+    data = collected(run, tell)
     count = round(FRESH_SHARE * collect_config(robot).samples)
     fresh = run.dataset(
         "nominal_fresh",
@@ -117,7 +122,7 @@ def simulate(run: Run, tell: Tell) -> Simulated:
         samples=count,
     )
     schema = run.schema(
-        "nominal_model",
+        MODEL,
         lambda: train(robot, data, seed, lambda done, text: tell(0.3 + 0.4 * done, text)).schema,
     )
     tell(0.7, "trials")

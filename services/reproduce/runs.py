@@ -18,15 +18,18 @@ from pathlib import Path
 from queue import Empty
 from typing import Any, TypeVar
 
-from gemuco import cores
+from gemuco import cores, devices
 from gemuco.dataset import Dataset
 from gemuco.errors import CheckpointError, DatasetError
 from gemuco.schema import BodySchema
 from hal.config import RobotConfig
+from services.learning.trainer import train_all
 from services.model.artifacts import fingerprint
 from services.show import Tell
 
 Outcome = TypeVar("Outcome")
+MODEL = "nominal_model"
+"""What experiments on a simulated body call its model."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,9 +74,17 @@ class Run:
             except CheckpointError:
                 shutil.rmtree(path, ignore_errors=True)
         made = make()
-        made.save(path)
-        self._remember(name, stamp)
+        self.keep(name, made, **settings)
         return made
+
+    def keep(self, name: str, schema: BodySchema, **settings: Any) -> None:
+        """Have `schema` find this under a name."""
+        schema.save(self.folder / name)
+        self._remember(name, self._stamp(settings))
+
+    def has(self, name: str, **settings: Any) -> bool:
+        """Whether something is kept under a name; see `dataset`."""
+        return self._is_current(name, self._stamp(settings))
 
     def _stamp(self, settings: Mapping[str, Any]) -> str:
         content = json.dumps([fingerprint(self.robot), self.seed, settings], sort_keys=True)
@@ -102,12 +113,23 @@ Experiment = Callable[[Run, Tell], Outcome]
 
 
 def each_seed(
-    robot: RobotConfig, seeds: Sequence[int], folder: Path, progress: Tell, fresh: bool, experiment: Experiment[Outcome]
+    robot: RobotConfig,
+    seeds: Sequence[int],
+    folder: Path,
+    progress: Tell,
+    fresh: bool,
+    experiment: Experiment[Outcome],
+    collect: Experiment[Dataset] | None = None,
 ) -> list[Outcome]:
     """One experiment for every seed, as many at a time as there are cores; progress is told over all of them.
 
-    When one fails, the others end as soon as they have something to tell.
+    When one fails, the others end as soon as they have something to tell. Where there is CUDA, the models of all seeds
+    are trained together on what `collect` collects, and the experiments find them under the name `MODEL`.
     """
+    if collect is not None and devices.best() is not None:
+        datasets = each_seed(robot, seeds, folder, between(progress, 0.0, 0.2), fresh, collect)
+        _train_ahead([open_run(robot, folder, seed) for seed in seeds], datasets, between(progress, 0.2, 0.4))
+        progress, fresh = between(progress, 0.4, 1.0), False
     context, done = get_context("spawn"), dict.fromkeys(seeds, 0.0)
     told, stop = context.Queue(), context.Event()
     with ProcessPoolExecutor(min(cores.count(), len(seeds)), context, _join, (told, stop)) as pool:
@@ -125,6 +147,16 @@ def each_seed(
         finally:
             stop.set()
             pool.shutdown(cancel_futures=True)
+
+
+def _train_ahead(runs: Sequence[Run], datasets: Sequence[Dataset], progress: Tell) -> None:
+    missing = [(run, data) for run, data in zip(runs, datasets, strict=True) if not run.has(MODEL)]
+    if not missing:
+        return
+    seeds = [run.seed for run, _ in missing]
+    trained = train_all(runs[0].robot, [data for _, data in missing], seeds, progress)
+    for (run, _), one in zip(missing, trained, strict=True):
+        run.keep(MODEL, one.schema)
 
 
 class Stopped(Exception):
