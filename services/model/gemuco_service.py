@@ -54,9 +54,10 @@ STATUS_PRIORITY = 10
 PRIORITIES = {"estimation": 40, "control": 35, "anomaly": 30, "update": 10, "verdict": 10}
 """SCHED_FIFO where the system allows it; learning and judging are lowest but not without, or they would hold the
 interpreter up."""
-OFFSETS = {"estimation": 0.8e-3, "anomaly": 1.4e-3, "control": 1.9e-3, "update": 3.4e-3, "verdict": 29.4e-3}
-"""When they begin [s] after the multiples of their periods, so that at usual rates no two begin at once, and none with
-the HAL, which begins at those multiples."""
+OFFSETS = {"estimation": 0.8e-3, "anomaly": 1.4e-3, "control": 1.9e-3, "update": 7.4e-3, "verdict": 29.4e-3}
+"""When they begin [s] after the multiples of their periods, so that at usual rates no two begin at once, none with the
+HAL, which begins at those multiples, and learning when a solve for a command, which takes a millisecond or two, has
+ended."""
 
 
 class ModelSolver:
