@@ -10,6 +10,7 @@ import json
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing import Queue, get_context
@@ -23,6 +24,7 @@ from gemuco.dataset import Dataset
 from gemuco.errors import CheckpointError, DatasetError
 from gemuco.schema import BodySchema
 from hal.config import RobotConfig
+from services.errors import ServiceError
 from services.learning.trainer import train_all
 from services.model.artifacts import fingerprint
 from services.show import Tell
@@ -144,6 +146,11 @@ def each_seed(
                     done[seed] = share
                     progress(sum(done.values()) / len(done), f"seed {seed}: {text}")
             return [running[seed].result() for seed in seeds]
+        except BrokenProcessPool:
+            raise RunKilled(
+                "A process of the experiments was killed. Is memory enough for as many as there are cores? What was "
+                "collected and trained is kept; `taskset -c 0` in front runs one seed at a time."
+            ) from None
         finally:
             stop.set()
             pool.shutdown(cancel_futures=True)
@@ -157,6 +164,10 @@ def _train_ahead(runs: Sequence[Run], datasets: Sequence[Dataset], progress: Tel
     trained = train_all(runs[0].robot, [data for _, data in missing], seeds, progress)
     for (run, _), one in zip(missing, trained, strict=True):
         run.keep(MODEL, one.schema)
+
+
+class RunKilled(ServiceError):
+    """A process ended without telling why."""
 
 
 class Stopped(Exception):

@@ -1,5 +1,6 @@
 import json
 import os
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from hal.config import load_robot
 from services.errors import BadArguments
 from services.reproduce import experiment, figures
 from services.reproduce.report import Report, Row
-from services.reproduce.runs import Run, each_seed, open_run
+from services.reproduce.runs import Run, RunKilled, each_seed, open_run
 from services.show import Tell
 
 ROBOT = Path(__file__).parents[2] / "robots" / "musashi_arm.yaml"
@@ -91,6 +92,8 @@ def test_two_components_are_enough_for_a_p_of_one_number(tmp_path):
 
 def _counts(run: Run, tell: Tell) -> tuple[int, int]:
     tell(0.0, "counting")
+    if run.robot.robot == "killed":
+        os.kill(os.getpid(), signal.SIGKILL)
     if run.robot.robot == "broken":
         if run.seed:
             tell(0.5, "patient")
@@ -113,4 +116,10 @@ def test_seeds_run_side_by_side_and_are_told_of(tmp_path):
 def test_an_experiment_that_fails_ends_those_of_the_other_seeds(tmp_path):
     robot = load_robot(ROBOT).model_copy(update={"robot": "broken"})
     with pytest.raises(FileNotFoundError, match="of seed 0"):
+        each_seed(robot, [0, 1], tmp_path, lambda share, text: None, False, _counts)
+
+
+def test_a_process_that_is_killed_is_told_in_a_sentence(tmp_path):
+    robot = load_robot(ROBOT).model_copy(update={"robot": "killed"})
+    with pytest.raises(RunKilled, match="was killed"):
         each_seed(robot, [0, 1], tmp_path, lambda share, text: None, False, _counts)
