@@ -21,7 +21,7 @@ RARE = 0.05
 TOLD = 30
 """An error of single rows is an estimate where at least so many tell of every living element."""
 TOGETHER = 2_000_000
-"""So many squared errors of single rows are held at a time, about."""
+"""So many squared errors of single rows are held at a time by all cores, about."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,7 +119,8 @@ class MaskErrors:
             shares = self._by_signal(squared * told * (len(rows) / np.maximum(count, 1)).astype(np.float32))
             found[part] = np.where(scarce, np.nan, shares / np.maximum(measured, 1e-12))
 
-        cores.run([partial(measure, part) for part in _parts(len(bits), TOGETHER // max(1, self.x.size))])
+        most = TOGETHER // max(1, self.x.size) // cores.count()
+        cores.run([partial(measure, part) for part in _parts(len(bits), most)])
         return found
 
     def from_others(self, signal: int) -> float:
