@@ -1,6 +1,7 @@
 import json
 import os
 import signal
+import time
 from pathlib import Path
 
 import numpy as np
@@ -100,17 +101,25 @@ def _counts(run: Run, tell: Tell) -> tuple[int, int]:
             while True:
                 tell(0.5, "waiting")
         raise FileNotFoundError("of seed 0")
-    tell(1.0, "done")
+    deadline = time.monotonic() + 30.0
+    while not (run.folder / "heard").exists():
+        assert time.monotonic() < deadline, "nobody heard it"
+        time.sleep(0.01)
     return run.seed, os.getpid()
 
 
 def test_seeds_run_side_by_side_and_are_told_of(tmp_path):
-    told: list[tuple[float, str]] = []
-    found = each_seed(load_robot(ROBOT), [3, 1, 2], tmp_path, lambda *one: told.append(one), False, _counts)
+    told: list[str] = []
+
+    def hear(share: float, text: str) -> None:
+        assert 0.0 <= share <= 1.0
+        told.append(text)
+        (tmp_path / f"seed_{text[5]}" / "heard").touch()
+
+    found = each_seed(load_robot(ROBOT), [3, 1, 2], tmp_path, hear, False, _counts)
     assert [seed for seed, _ in found] == [3, 1, 2]
     assert os.getpid() not in {process for _, process in found}
-    assert {text for _, text in told} >= {"seed 1: counting", "seed 3: counting"}
-    assert all(0.0 <= share <= 1.0 for share, _ in told)
+    assert sorted(told) == ["seed 1: counting", "seed 2: counting", "seed 3: counting"]
 
 
 def test_an_experiment_that_fails_ends_those_of_the_other_seeds(tmp_path):
