@@ -158,13 +158,12 @@ def structure() -> Row:
         f"60 % on the robots), and the same L_m of these; {is_rough.mean():.0%} were out after few rows. All masks on "
         f"all rows take ours {every / 1e6:.2f} s, {whole:.2f} times as long"
     )
-    try:
-        return faster(
-            "structure, 10 signals, all 1023 masks x 1000 rows", "loop over masks in torch", lambda: judge.race(masks),
-            by_torch, 20.0, note, rounds=5,
-        )  # fmt: skip
-    finally:
-        torch.set_num_threads(1)
+    row = faster(
+        "structure, 10 signals, all 1023 masks x 1000 rows", "loop over masks in torch", lambda: judge.race(masks),
+        by_torch, 20.0, note, rounds=5,
+    )  # fmt: skip
+    torch.set_num_threads(1)
+    return row
 
 
 def torch_chain(chain: Chain) -> nn.Sequential:
