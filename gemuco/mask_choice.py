@@ -1,5 +1,7 @@
 """Which of very many feasible masks to keep: those that serve best whatever signals happen to be available."""
 
+import heapq
+
 import numpy as np
 
 SCENES = 1500
@@ -27,26 +29,32 @@ def choose(candidates: np.ndarray, errors: np.ndarray, outputs: np.ndarray, most
     if len(candidates) <= most:
         return np.arange(len(candidates))
     scenes = _scenes(candidates.shape[1], seed)
-    needed = (outputs & ~scenes).astype(float)  # (scenes, signals)
+    needed = (outputs & ~scenes).astype(np.float32)  # (scenes, signals)
     scenes, needed = scenes[needed.any(axis=1)], needed[needed.any(axis=1)]
-    lacking = (~scenes).astype(np.float32) @ candidates.T.astype(np.float32)
     # Where no row tells (NaN) the mask does not serve; an error above 1 is worse than none.
-    cost = needed @ np.clip(np.nan_to_num(errors, nan=1.0), 0.0, 1.0).T / needed.sum(axis=1, keepdims=True)
-    cost = np.where(lacking < 0.5, cost, 1.0)
-    least = np.ones(len(scenes))
+    known = np.clip(np.nan_to_num(errors, nan=1.0), 0.0, 1.0).astype(np.float32)
+    cost = known @ (needed / needed.sum(axis=1, keepdims=True)).T  # (candidates, scenes)
+    cost[candidates.astype(np.float32) @ (~scenes).T.astype(np.float32) > 0.5] = 1.0
+    least = np.ones(len(scenes), np.float32)
     smallest = (~candidates).astype(np.float32) @ candidates.T.astype(np.float32) < 0.5  # [i, j]: i contains j
     picked = np.flatnonzero(smallest.sum(axis=1) == 1).tolist()
     if len(picked) > most:
         picked = []
     elif picked:
-        least = np.minimum(least, cost[:, picked].min(axis=1))
-    while len(picked) < most:
-        gain = np.maximum(least[:, None] - cost, 0.0).sum(axis=0)
-        best = int(gain.argmax())
-        if gain[best] <= 0.0:
+        least = np.minimum(least, cost[picked].min(axis=0))
+    # The more is picked the less there is to gain of any other: what a mask gained once is the most that it can gain.
+    hopes = [(-float(gain), index) for index, gain in enumerate(np.maximum(least - cost, 0.0).sum(axis=1))]
+    heapq.heapify(hopes)
+    while len(picked) < most and hopes:
+        _, best = heapq.heappop(hopes)
+        hope = -float(np.maximum(least - cost[best], 0.0).sum()), best
+        if hopes and hope > hopes[0]:
+            heapq.heappush(hopes, hope)
+        elif hope[0] >= 0.0:
             break
-        picked.append(best)
-        least = np.minimum(least, cost[:, best])
+        else:
+            picked.append(best)
+            least = np.minimum(least, cost[best])
     return np.array(picked, int)
 
 
