@@ -9,11 +9,19 @@ from typing import TypeVar
 from gemuco.compiled.blas import one_thread
 
 Found = TypeVar("Found")
+PARTS = 4
+"""For each core, of what is cut into parts."""
 
 
 def count() -> int:
     """How many cores this process may use."""
     return len(os.sched_getaffinity(0))
+
+
+def parts(total: int, most: int) -> list[slice]:
+    """So many things cut into parts of at most `most`, and so that every core has some: one may be held up."""
+    step = max(1, min(most, -(-total // (PARTS * count()))))
+    return [slice(begin, begin + step) for begin in range(0, max(total, 1), step)]
 
 
 def run(jobs: Sequence[Callable[[], Found]], stop: Event | None = None) -> list[Found]:

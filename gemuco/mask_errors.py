@@ -20,8 +20,6 @@ RARE = 0.05
 """An outlier is rare: where more than this share of a signal would be, the model is wrong, and all counts."""
 TOLD = 30
 """An error of single rows is an estimate where at least so many tell of every living element."""
-TOGETHER = 2_000_000
-"""So many squared errors of single rows are held at a time by all cores, about."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,11 +81,11 @@ class MaskErrors:
             return self
         return self._rows(np.linspace(0, len(self.x) - 1, rows).astype(int))
 
-    def drawn(self, rows: int, seed: int = 0) -> "MaskErrors":
-        """On so many rows at random; those of fewer are among those of more."""
-        return self._rows(np.random.default_rng(seed).permutation(len(self.x))[:rows])
+    def shuffled(self, seed: int = 0) -> "MaskErrors":
+        """With the rows in a random order."""
+        return self._rows(np.random.default_rng(seed).permutation(len(self.x)))
 
-    def of(self, bits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def of(self, bits: np.ndarray) -> np.ndarray:
         """Errors under masks.
 
         Args:
@@ -95,33 +93,47 @@ class MaskErrors:
 
         Returns:
             Share of the variance of every signal that every mask leaves unexplained, shape (masks, signals), NaN where
-            no row tells; and `amounts`.
+            no row tells.
         """
-        squared, count = self._squared(bits)
+        parts = cores.parts(len(bits), len(bits)) if devices.best() is None else [slice(None)]
+        squared = np.concatenate(cores.run([partial(self.sums, bits[part]) for part in parts]))
+        return self.of_sums(bits, squared)
+
+    def of_sums(self, bits: np.ndarray, squared: np.ndarray) -> np.ndarray:
+        """The errors of `of` from `sums` over all rows, shape (masks, signals)."""
+        count = self._usable(bits).T.astype(np.float32) @ self.there.astype(np.float32)
         measured = self._by_signal(np.where(count > 0, self.liveliness, 0.0))
         missed = self._by_signal(squared / np.maximum(count, 1))
-        return np.where(measured > 0, missed / np.maximum(measured, 1e-12), np.nan), self.amounts
+        return np.where(measured > 0, missed / np.maximum(measured, 1e-12), np.nan)
 
-    def by_row(self, bits: np.ndarray) -> np.ndarray:
-        """What every row adds to the errors of `of`, which are means over rows, shape (masks, rows, signals).
+    def sums(self, bits: np.ndarray, first: int = 0) -> np.ndarray:
+        """Sum of `squares` over the rows from the first one on, on CUDA or this core, shape (masks, size)."""
+        chain, given, device = pack(self.chain), self._given(bits, slice(first, None)), devices.best()
+        return np.asarray(sums(chain, *given)) if device is None else batched.sums(device, chain, *given)
 
-        NaN for a signal that has a living element of which fewer than `TOLD` rows tell.
+    def squares(self, bits: np.ndarray, span: slice) -> np.ndarray:
+        """Squared errors of some rows under masks, shape (masks, rows, size); 0 where they do not count."""
+        return np.asarray(squares(pack(self.chain), *self._given(bits, span)))
+
+    def of_squares(self, bits: np.ndarray, squared: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Errors under masks from the first rows alone.
+
+        Args:
+            bits: One mask per line, shape (masks, signals), truth values.
+            squared: `squares` of the first rows, shape (masks, rows, size).
+
+        Returns:
+            What `of` would tell of these rows, shape (masks, signals), NaN too for a signal that has a living element
+            of which fewer than `TOLD` of them tell. And what to multiply squares by, shape (masks, size): the sum over
+            the elements of a signal is what a row adds to its error, which is the mean over rows.
         """
-        rows, *_ = self._arrays()
-        chain, found = pack(self.chain), np.empty((len(bits), *self.whole.shape), np.float32)
-
-        def measure(part: slice) -> None:
-            squared = squares(chain, rows, self.x, *self._gates(bits[part]))
-            told = self._usable(bits[part]).T[:, :, None] & self.there  # (masks, rows, size)
-            count = told.sum(axis=1, keepdims=True)
-            measured = self._by_signal(np.where(count > 0, self.liveliness, 0.0))
-            scarce = self._by_signal((count < TOLD) & (self.liveliness > 0.0)) > 0
-            shares = self._by_signal(squared * told * (len(rows) / np.maximum(count, 1)).astype(np.float32))
-            found[part] = np.where(scarce, np.nan, shares / np.maximum(measured, 1e-12))
-
-        most = TOGETHER // max(1, self.x.size) // cores.count()
-        cores.run([partial(measure, part) for part in _parts(len(bits), most)])
-        return found
+        rows = squared.shape[1]
+        count = self._usable(bits)[:rows].T.astype(np.float32) @ self.there[:rows].astype(np.float32)
+        measured = self._by_signal(np.where(count > 0, self.liveliness, 0.0))
+        scarce = self._by_signal((count < TOLD) & (self.liveliness > 0.0)) > 0
+        factor = rows / np.maximum(count, 1) / np.repeat(np.maximum(measured, 1e-12), self.sizes, axis=1)
+        shares = self._by_signal(squared.mean(axis=1, dtype=float) * factor)
+        return np.where(scarce | (measured <= 0.0), np.nan, shares), factor
 
     def from_others(self, signal: int) -> float:
         """Error of a signal (by its index) from all others; NaN if no row tells.
@@ -129,7 +141,7 @@ class MaskErrors:
         Where no row has all of them, every row that has the signal is inferred from whatever others it has.
         """
         others = np.arange(len(self.layout.names)) != signal
-        whole = float(self.of(others[None])[0][0, signal])
+        whole = float(self.of(others[None])[0, signal])
         if np.isfinite(whole):
             return whole
         span = self.layout.slice(self.layout.names[signal])
@@ -137,8 +149,8 @@ class MaskErrors:
         patterns, which = np.unique(self.whole & others, axis=0, return_inverse=True)
         for index in np.flatnonzero(patterns.any(axis=1)):
             part = self._rows(np.flatnonzero(which.ravel() == index))
-            squared, rows = part._squared(patterns[index : index + 1])
-            total, count = total + squared[0], count + rows[0]
+            total += part.sums(patterns[index : index + 1])[0]
+            count += part.there.sum(axis=0)
         known = self.liveliness[span] * (count[span] > 0)
         return float((total[span] / np.maximum(count[span], 1)).sum() / known.sum()) if known.any() else float("nan")
 
@@ -148,7 +160,8 @@ class MaskErrors:
         return self._by_signal(self.liveliness)
 
     @property
-    def _sizes(self) -> list[int]:
+    def sizes(self) -> list[int]:
+        """How many elements each signal has."""
         return [signal.size for signal in self.layout.signals]
 
     def _rows(self, chosen: np.ndarray) -> "MaskErrors":
@@ -156,36 +169,15 @@ class MaskErrors:
 
     def _by_signal(self, elements: np.ndarray) -> np.ndarray:
         """Sums over the elements of every signal, shape (..., size) -> (..., signals)."""
-        return np.asarray(np.add.reduceat(elements, np.cumsum([0, *self._sizes[:-1]]), axis=-1))
+        return np.asarray(np.add.reduceat(elements, np.cumsum([0, *self.sizes[:-1]]), axis=-1))
 
-    def _squared(self, bits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Sum of squared errors of every element, and of how many rows, shapes (masks, size)."""
-        rows, known, whole = self._arrays()
-        chain, device = pack(self.chain), devices.best()
-
-        def measure(part: slice) -> np.ndarray:
-            given = chain, rows, self.x, known, whole, *self._gates(bits[part])
-            return sums(*given) if device is None else batched.sums(device, *given)
-
-        parts = _parts(len(bits), len(bits)) if device is None else [slice(None)]
-        squared = np.concatenate(cores.run([partial(measure, part) for part in parts]))
-        return squared, self._usable(bits).T.astype(np.float32) @ known
-
-    def _arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """What the network is given of every row, which elements count (1 or 0), and which signals are whole."""
-        rows = np.ascontiguousarray(np.concatenate([self.x, self.p], axis=1, dtype=np.float32))
-        return rows, self.there.astype(np.float32), np.ascontiguousarray(self.whole)
-
-    def _gates(self, bits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Elements that masks let through, shape (masks, size), and their signals, shape (masks, signals): 1 or 0."""
-        return np.repeat(bits, self._sizes, axis=1).astype(np.float32), bits.astype(np.float32)
+    def _given(self, bits: np.ndarray, span: slice) -> tuple[np.ndarray, ...]:
+        """Of some rows and masks what compiled code is given after the network, see `gemuco.compiled.masks.sums`."""
+        rows = np.concatenate([self.x[span], self.p[span]], axis=1, dtype=np.float32)
+        known, whole = self.there[span].astype(np.float32), np.ascontiguousarray(self.whole[span])
+        gates = np.repeat(bits, self.sizes, axis=1).astype(np.float32)
+        return rows, self.x[span], known, whole, gates, bits.astype(np.float32)
 
     def _usable(self, bits: np.ndarray) -> np.ndarray:
         """Which rows have all signals of a mask, shape (rows, masks)."""
         return np.asarray((~self.whole).astype(np.float32) @ bits.T.astype(np.float32) < 0.5)
-
-
-def _parts(count: int, most: int) -> list[slice]:
-    """So many masks cut into parts of at most `most`, and so that every core has one."""
-    step = max(1, min(most, -(-count // cores.count())))
-    return [slice(begin, begin + step) for begin in range(0, max(count, 1), step)]

@@ -1,24 +1,29 @@
 """Which masks have an error that is small enough, by one network that was trained under all of them.
 
-Of many masks most can be told to be hopeless from a few of the rows (`Judge.race`); feasible ones get all rows.
+Of many masks most are far from the threshold, and a few of the rows tell on which side (`Judge.race`).
 """
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
-from gemuco import devices
+from gemuco import cores, devices
 from gemuco.errors import SchemaError
 from gemuco.mask_errors import MaskErrors
 
 ROWS = 1000
 """Held-out rows that judge a mask, at most."""
-HEATS = (64, 256)
+HEATS = (64, 128, 256, 500)
 """Rows of a race before all of them."""
 SURE = 4.0
-"""A mask is out of the race when its error is so many standard errors above the threshold. Were squared errors normal,
-1 of 12 000 masks that lie right at the threshold would be lost in a heat; they are skewed, and that errs the other way:
-where a sample makes a mask look too bad, a few rows do, and the standard error is large too."""
+"""A race is over for a mask whose error is so many standard errors from the threshold. Were squared errors normal, 1 of
+12 000 masks that lie right at the threshold would be misjudged in a heat."""
+ENOUGH = 256
+"""From so many rows on a mask may count as surely below. Squared errors are skewed: a mean that is too large comes with
+a large standard error, but where the bad rows are not among the few, both are too small."""
+TOGETHER = 4_000_000
+"""So many squared errors of single rows are held at a time by all cores, about."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,42 +89,65 @@ class Judge:
 
     def of(self, masks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Errors of the outputs, shape (n,), and squared errors of every signal, shape (n, signals)."""
-        found, sizes = zip(*(errors.of(masks) for errors in self.errors), strict=True)
-        mean = np.mean(found, axis=0)
-        return self._judged(masks, mean, np.max(sizes, axis=0))[0], mean
+        mean = np.mean([split.of(masks) for split in self.errors], axis=0)
+        return self._judged(masks, mean)[0], mean
 
     def race(self, masks: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """As `of`, but masks that are hopeless are measured on few rows; and which these are, shape (n,).
+        """As `of`, but masks that are far from the threshold are measured on few rows; and which these are, shape (n,).
 
         A heat is run on some of the rows that judge, drawn at random, so that it does not matter how rows that follow
-        one another are alike. What is surely above the threshold is out; what looks feasible gets all rows, and with
-        them the errors that `of` gives; what may be either runs the next heat, and then gets all rows too.
+        one another are alike. For what is surely above the threshold the race is over, and from `ENOUGH` rows on for
+        what is surely below; the others run the next heat, on more rows with those that they have, and at last on all.
         """
-        errors, squared = np.empty(len(masks)), np.empty(masks.shape)
-        is_out, running = np.zeros(len(masks), bool), np.arange(len(masks))
-        for rows in HEATS if devices.best() is None else ():  # CUDA has measured them all before a race is over
-            if min(len(split.x) for split in self.errors) < 2 * rows or not len(running):
-                break
-            found, mean, spread = self._heat(masks[running], rows)
-            lost = found - SURE * spread > self._limit
-            out = running[lost]
-            is_out[out], errors[out], squared[out] = True, self._measured(found[lost]), mean[lost]
-            running = running[~lost & ~(found < self._limit)]
-        if not is_out.all():
-            errors[~is_out], squared[~is_out] = self.of(masks[~is_out])
-        return errors, squared, is_out
+        least = min(len(split.x) for split in self.errors)
+        heats = [rows for rows in HEATS if 2 * rows <= least]
+        if (
+            devices.best() is not None or not heats or not len(masks)
+        ):  # CUDA has measured them all before a race is over
+            return *self.of(masks), np.zeros(len(masks), bool)
+        lots = [split.shuffled() for split in self.errors]
+        most = TOGETHER // (heats[-1] * sum(lot.x.shape[1] for lot in lots)) // cores.count()
+        parts = cores.parts(len(masks), max(1, most))
+        found = cores.run([partial(self._race, lots, heats, masks[part]) for part in parts])
+        mean, is_rough = (np.concatenate(column) for column in zip(*found, strict=True))
+        return self._judged(masks, mean)[0], mean, is_rough
 
-    def _heat(self, masks: np.ndarray, rows: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Squared error of the outputs (n,), of every signal (n, signals), and standard error of the former (n,)."""
-        parts = [split.drawn(rows).by_row(masks) for split in self.errors]  # (n, rows, signals)
-        sizes = np.max([split.amounts for split in self.errors], axis=0)
-        mean = np.mean([part.mean(axis=1, dtype=float) for part in parts], axis=0)
-        _, found, weights = self._judged(masks, mean, sizes)
+    def _race(self, lots: list[MaskErrors], heats: list[int], masks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Squared errors of every signal under some masks, shape (n, signals), and which are rough, shape (n,)."""
+        squared, is_rough = np.empty(masks.shape), np.ones(len(masks), bool)
+        running = np.arange(len(masks))
+        seen = [np.empty((len(masks), 0, lot.x.shape[1]), np.float32) for lot in lots]
+        for rows in heats:
+            seen = [
+                np.concatenate([before, lot.squares(masks[running], slice(before.shape[1], rows))], axis=1)
+                for lot, before in zip(lots, seen, strict=True)
+            ]
+            found, squared[running], spread = self._estimate(lots, masks[running], seen)
+            off = found - self._limit if rows < ENOUGH else np.abs(found - self._limit)
+            goes_on = ~(off > SURE * spread)
+            running, seen = running[goes_on], [before[goes_on] for before in seen]
+        whole = [
+            lot.of_sums(masks[running], before.sum(axis=1, dtype=float) + lot.sums(masks[running], heats[-1]))
+            for lot, before in zip(lots, seen, strict=True)
+        ]
+        squared[running], is_rough[running] = np.mean(whole, axis=0), False
+        return squared, is_rough
+
+    def _estimate(
+        self, lots: list[MaskErrors], masks: np.ndarray, seen: list[np.ndarray]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """From squares of the first rows of every lot, (n, rows, size): the squared error of the outputs (n,), that
+        of every signal (n, signals), and the standard error of the former (n,).
+        """
+        told = [lot.of_squares(masks, squares) for lot, squares in zip(lots, seen, strict=True)]
+        mean = np.mean([errors for errors, _ in told], axis=0)
+        _, found, weights = self._judged(masks, mean)
         variance = np.zeros(len(masks))
-        for part, split in zip(parts, self.errors, strict=True):
-            line = np.einsum("nrs,ns->nr", np.nan_to_num(part), weights, dtype=float)
-            left = 1.0 - rows / len(split.x)  # rows are drawn from so many and no more
-            variance += line.var(axis=1, ddof=1) / rows * left / len(parts) ** 2
+        for (_, factor), squares, lot in zip(told, seen, lots, strict=True):
+            rows, weight = squares.shape[1], np.repeat(weights, lot.sizes, axis=1) * factor
+            line = (squares @ weight[:, :, None].astype(np.float32))[:, :, 0]
+            left = 1.0 - rows / len(lot.x)  # rows are drawn from so many and no more
+            variance += line.var(axis=1, ddof=1, dtype=float) / rows * left / len(lots) ** 2
         unclear = (self._asked(masks) & ~np.isfinite(mean)).any(axis=1)
         return found, mean, np.where(unclear, np.inf, np.sqrt(variance))
 
@@ -128,11 +156,10 @@ class Judge:
         judged = np.broadcast_to(self.outputs, masks.shape)
         return judged & ~masks if self.thresholds.over == "masked" else judged
 
-    def _judged(
-        self, masks: np.ndarray, mean: np.ndarray, sizes: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _judged(self, masks: np.ndarray, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """From errors of signals that of the outputs, as asked for and squared, (n,), and weights (n, signals)."""
-        weights = (self._asked(masks) & np.isfinite(mean)) * sizes
+        amounts = np.max([split.amounts for split in self.errors], axis=0)
+        weights = (self._asked(masks) & np.isfinite(mean)) * amounts
         total = weights.sum(axis=1)
         weights = weights / np.where(total > 0.0, total, 1.0)[:, None]
         squared = np.where(total > 0.0, (np.nan_to_num(mean) * weights).sum(axis=1), np.nan)

@@ -46,7 +46,7 @@ class Structure:
         thresholds: What the errors were compared with.
         is_whole: Whether every mask was tried, or the search ended with nothing left to look at.
         rough: Masks whose L_m is an estimate from at least `HEATS[0]` rows of a split, in place of all that judge: it
-            is above the threshold by more than `SURE` standard errors, so they are not feasible.
+            is further than `SURE` standard errors from the threshold. None of `masks` is.
     """
 
     layout: Layout
@@ -89,8 +89,9 @@ class Structure:
             )
         if self.rough:
             found.append(
-                f"L_m of {len(self.rough)} masks, marked ~, is an estimate from few rows: they are above the threshold "
-                f"by more than {SURE:g} standard errors. That of the others is from all rows that judge."
+                f"L_m of {len(self.rough)} masks, marked ~, is an estimate from few rows: they are further than "
+                f"{SURE:g} standard errors from the threshold. That of the others, and so of all that are kept, is "
+                "from all rows that judge."
             )
         if not self.is_whole:
             found.append("The search stopped at its budget: there may be feasible masks that it did not see.")
@@ -180,27 +181,43 @@ def select(layout: Layout, judge: Judge, tried: np.ndarray, is_whole: bool, seed
         L_m, squared, is_rough = judge.race(tried)
     else:
         (L_m, squared), is_rough = judge.of(tried), np.zeros(len(tried), bool)
-    feasible = L_m < thresholds.into
-    if not feasible.any():
-        raise NotEnoughData(
-            f"No mask is enough to infer x_out ({', '.join(_named(names, judge.outputs))}): smallest L_m "
-            f"{L_m.min():.3f}, threshold_in {thresholds.into:g}; collect more data or raise the threshold."
-        )
-    kept = np.flatnonzero(feasible)
-    kept = kept[choose(tried[kept], squared[kept], judge.outputs, MOST_MASKS, seed)]
-    kept = kept[np.argsort(L_m[kept], kind="stable")]
-    masks = tuple(frozenset(_named(names, line)) for line in tried[kept])
+    kept = _keep(judge, tried, L_m, squared, is_rough, seed)
+    masks = [frozenset(_named(names, line)) for line in tried]
     return Structure(
         layout=layout,
         x_in=_named(names, tried[kept].any(axis=0)),
         x_out=_named(names, judge.outputs),
-        masks=masks,
+        masks=tuple(masks[index] for index in kept),
         L_i=judge.L_i,
-        L_m={frozenset(_named(names, line)): float(value) for line, value in zip(tried, L_m, strict=True)},
+        L_m={m: float(value) for m, value in zip(masks, L_m, strict=True)},
         thresholds=thresholds,
         is_whole=is_whole,
-        rough=frozenset(frozenset(_named(names, line)) for line in tried[is_rough]),
+        rough=frozenset(masks[index] for index in np.flatnonzero(is_rough)),
     )
+
+
+def _keep(
+    judge: Judge, tried: np.ndarray, L_m: np.ndarray, squared: np.ndarray, is_rough: np.ndarray, seed: int
+) -> np.ndarray:
+    """Indices of the masks to keep, the best first; those of them that were judged roughly are measured on all rows.
+
+    Raises:
+        NotEnoughData: None is enough.
+    """
+    while True:
+        feasible = np.flatnonzero(L_m < judge.thresholds.into)
+        if not len(feasible):
+            raise NotEnoughData(
+                f"No mask is enough to infer x_out ({', '.join(_named(judge.names, judge.outputs))}): smallest L_m "
+                f"{L_m.min():.3f}, threshold_in {judge.thresholds.into:g}; collect more data or raise the threshold."
+            )
+        kept = feasible[choose(tried[feasible], squared[feasible], judge.outputs, MOST_MASKS, seed)]
+        rough = kept[is_rough[kept]]
+        if len(rough):
+            L_m[rough], squared[rough] = judge.of(tried[rough])
+            is_rough[rough] = False
+        if (L_m[kept] < judge.thresholds.into).all():
+            return np.asarray(kept[np.argsort(L_m[kept], kind="stable")])
 
 
 def search(judge: Judge, seed: int) -> tuple[np.ndarray, bool]:

@@ -98,7 +98,7 @@ def learning(schema: BodySchema) -> Iterator[str]:
     yield "structure determination"
     network, size, ones = pack(schema.weights.whole), schema.layout.size, np.ones((1, len(SIGNALS)), np.float32)
     rows, known = np.zeros((1, size + len(schema.bias)), np.float32), np.ones((1, size), np.float32)
-    squares(network, rows, known, known, ones)
+    squares(network, rows, known, known, ones > 0.0, known, ones)
     sums(network, rows, known, known, ones > 0.0, known, ones)
 
 

@@ -115,19 +115,23 @@ def sums(chain, rows, wanted, known, whole, gates, masks):
 
 
 @jit
-def squares(chain, rows, wanted, gates, masks):
-    """Squared error of every element of every row under every mask, shape (masks, rows, size); see `sums`."""
+def squares(chain, rows, wanted, known, whole, gates, masks):
+    """Squared error of every element of every row under every mask, shape (masks, rows, size); see `sums`.
+
+    It is 0 where a row has not all signals of a mask, or an element does not count.
+    """
     width = widest(chain)
     one, other = np.empty(len(rows) * width, rows.dtype), np.empty(len(rows) * width, rows.dtype)
     start = np.empty((rows.shape[1], chain.form[0, NARROW]), rows.dtype)
     shift = np.empty(chain.form[0, NARROW], rows.dtype)
-    squared = np.empty((len(masks), len(rows), wanted.shape[1]), rows.dtype)
+    squared = np.zeros((len(masks), len(rows), wanted.shape[1]), rows.dtype)
     for index in range(len(masks)):
         begin(chain, gates[index], masks[index], start, shift)
         found = told(chain, rows, start, shift, one, other)
         for row in range(len(found)):
-            line, aim, out = found[row], wanted[row], squared[index, row]
-            for i in range(len(out)):
-                miss = line[i] - aim[i]
-                out[i] = miss * miss
+            if usable(whole, masks[index], row):
+                line, aim, counts, out = found[row], wanted[row], known[row], squared[index, row]
+                for i in range(len(out)):
+                    miss = line[i] - aim[i]
+                    out[i] = counts[i] * miss * miss
     return squared
