@@ -63,7 +63,8 @@ def run(signals: int, samples: int, seed: int) -> None:
     started = time.process_time()
     raced = judge.race(every)[0]
     race = time.process_time() - started
-    lost = int((errors < thresholds.into).sum() - (raced < thresholds.into).sum())
+    lost = int(((errors < thresholds.into) & (raced >= thresholds.into)).sum())
+    won = int(((errors >= thresholds.into) & (raced < thresholds.into)).sum())
     least, sizes = body.least_errors(every), np.array([signal.size for signal in body.layout.signals])
     judged = judge.outputs & ~every
     perfect = every[(least * judged * sizes).sum(axis=1) / (judged * sizes).sum(axis=1) < thresholds.into]
@@ -72,7 +73,7 @@ def run(signals: int, samples: int, seed: int) -> None:
     kept = np.array([bits(m, names) > 0 for m in structure.masks])
     print(
         f"    exhaustive: {len(known)} feasible, {len(minimal(known))} minimal, {took:.1f} s, in a race "
-        f"{race:.1f} s and {lost} lost; found "
+        f"{race:.1f} s with {lost} lost and {won} won; found "
         f"{contains(known, feasible).mean():.1%} of them, "
         f"{np.mean([m.tobytes() in {f.tobytes() for f in feasible} for m in minimal(known)]):.1%} of the minimal, "
         f"{sum(f.tobytes() not in told for f in feasible)} false; served {contains(known, kept).mean():.1%}\n"
