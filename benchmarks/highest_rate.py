@@ -18,10 +18,11 @@ import argparse
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 
 import numpy as np
+import torch
+from torch import nn
 
 from benchmarks.bodies import MASKS, body, modules
 from benchmarks.solvers import TERMS, Ours, torch_descent, torch_loss
@@ -86,9 +87,6 @@ def torch_tick(
     schema: BodySchema, newest: Callable[[], Fresh], publish: Callable[[Estimates], None], clock: SystemClock
 ) -> Callable[[], None]:
     """What a user would write."""
-    import torch
-    from torch import nn
-
     torch.set_num_threads(1)
     network = nn.Sequential(*modules(schema))
     layout, mean, std = schema.layout, schema.scaler.mean, schema.scaler.std
@@ -158,10 +156,8 @@ def highest(tick: Callable[[], None], seconds: float, others: dict[str, Callable
 
 def beside(schema: BodySchema) -> dict[str, dict[str, Callable[[], object]]]:
     """One tick of each of the other loops, both ways."""
-    import torch
-
     torch.set_num_threads(1)
-    network = torch.nn.Sequential(*modules(schema)).requires_grad_(False)
+    network = nn.Sequential(*modules(schema)).requires_grad_(False)
     given, mask = np.zeros(schema.layout.size), MASKS[0]
     row = torch.from_numpy(schema.network_input(given, mask)[None])
     search, loss = Ours(schema, "f", TERMS), torch_loss(schema, "f", False)
@@ -189,7 +185,7 @@ def running(ticks: dict[str, Callable[[], object]]) -> Iterator[list[Loop]]:
     loops = []
     for name, tick in ticks.items():
         tick()
-        loops.append(Loop(name, BESIDE[name], partial(_do, tick), priority=PRIORITIES[name], offset=OFFSETS[name]))
+        loops.append(Loop(name, BESIDE[name], tick, priority=PRIORITIES[name], offset=OFFSETS[name]))
     for loop in loops:
         loop.start()
     try:
@@ -197,10 +193,6 @@ def running(ticks: dict[str, Callable[[], object]]) -> Iterator[list[Loop]]:
     finally:
         for loop in loops:
             loop.stop()
-
-
-def _do(tick: Callable[[], object]) -> None:
-    tick()
 
 
 def rows(seconds: float = SECONDS, is_whole: bool = False) -> Iterator[Row]:

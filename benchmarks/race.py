@@ -1,11 +1,11 @@
 """How often the race of structure determination puts a mask on the wrong side of the threshold.
 
-    python -m benchmarks.race [--seeds 3]
+    python -m benchmarks.race [--seeds 3] [--enough 64]
 
 Ten signals each: made-up bodies, and the recording of the Schunk arm (folder $GEMUCO_DATA, ../shared/data if that is
 not set; left out where it is missing) with its 18 channels in random groups. One network is trained; all masks are
 measured on all rows; then thresholds are put between two masks each, anywhere from the best tenth to the worst, and
-races are run with them.
+races are run with them. `--enough` has masks called feasible from so many rows on, to see why it takes more.
 """
 
 import argparse
@@ -15,6 +15,7 @@ import numpy as np
 
 from benchmarks.measured_data import recording
 from benchmarks.synthetic_body import SyntheticBody
+from gemuco import mask_judge
 from gemuco.dataset import Dataset, Episode
 from gemuco.errors import DatasetError
 from gemuco.mask_training import train_masks
@@ -79,7 +80,10 @@ def verdicts(data: Dataset, seed: int) -> np.ndarray:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=3)
-    for name, data in bodies(parser.parse_args().seeds):
+    parser.add_argument("--enough", type=int, default=mask_judge.ENOUGH, help="rows")
+    options = parser.parse_args()
+    mask_judge.ENOUGH = options.enough
+    for name, data in bodies(options.seeds):
         masks, rough, lost, won, worst = verdicts(data, 0)
         print(
             f"{name:14s} {masks:6.0f} verdicts, {rough / max(masks, 1):.0%} from few rows, {lost:.0f} wrongly above, "

@@ -9,8 +9,6 @@ from typing import TypeVar
 from gemuco.compiled.blas import one_thread
 
 Found = TypeVar("Found")
-PARTS = 4
-"""For each core, of what is cut into parts."""
 
 
 def count() -> int:
@@ -19,8 +17,8 @@ def count() -> int:
 
 
 def parts(total: int, most: int) -> list[slice]:
-    """So many things cut into parts of at most `most`, and so that every core has some: one may be held up."""
-    step = max(1, min(most, -(-total // (PARTS * count()))))
+    """So many things cut into parts of at most `most`, and so that every core has one."""
+    step = max(1, min(most, -(-total // count())))
     return [slice(begin, begin + step) for begin in range(0, max(total, 1), step)]
 
 

@@ -75,7 +75,7 @@ class Judge:
 
     def __init__(self, names: tuple[str, ...], errors: tuple[MaskErrors, ...], thresholds: Thresholds) -> None:
         self.names, self.thresholds = names, thresholds
-        self.errors = [split.thinned(ROWS) for split in errors]
+        self.errors = [split.thinned(ROWS).shuffled() for split in errors]
         self.tried = 0
         self.L_i = {
             name: float(self._measured(float(np.mean([split.from_others(i) for split in self.errors]))))
@@ -95,59 +95,55 @@ class Judge:
     def race(self, masks: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """As `of`, but masks that are far from the threshold are measured on few rows; and which these are, shape (n,).
 
-        A heat is run on some of the rows that judge, drawn at random, so that it does not matter how rows that follow
-        one another are alike. For what is surely above the threshold the race is over, and from `ENOUGH` rows on for
-        what is surely below; the others run the next heat, on more rows with those that they have, and at last on all.
+        The rows are in a random order, so a heat on the first of them is not hurt by rows that follow one another being
+        alike. For what is surely above the threshold the race is over, and from `ENOUGH` rows on for what is surely
+        below; the others run the next heat, on more rows with those that they have, and at last on all.
         """
         least = min(len(split.x) for split in self.errors)
-        heats = [rows for rows in HEATS if 2 * rows <= least]
-        if (
-            devices.best() is not None or not heats or not len(masks)
-        ):  # CUDA has measured them all before a race is over
+        # CUDA has measured them all before a race is over.
+        heats = [rows for rows in HEATS if 2 * rows <= least] if devices.best() is None else []
+        if not heats or not len(masks):
             return *self.of(masks), np.zeros(len(masks), bool)
-        lots = [split.shuffled() for split in self.errors]
-        most = TOGETHER // (heats[-1] * sum(lot.x.shape[1] for lot in lots)) // cores.count()
+        most = TOGETHER // (heats[-1] * sum(split.x.shape[1] for split in self.errors)) // cores.count()
         parts = cores.parts(len(masks), max(1, most))
-        found = cores.run([partial(self._race, lots, heats, masks[part]) for part in parts])
+        found = cores.run([partial(self._race, heats, masks[part]) for part in parts])
         mean, is_rough = (np.concatenate(column) for column in zip(*found, strict=True))
         return self._judged(masks, mean)[0], mean, is_rough
 
-    def _race(self, lots: list[MaskErrors], heats: list[int], masks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _race(self, heats: list[int], masks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Squared errors of every signal under some masks, shape (n, signals), and which are rough, shape (n,)."""
         squared, is_rough = np.empty(masks.shape), np.ones(len(masks), bool)
         running = np.arange(len(masks))
-        seen = [np.empty((len(masks), 0, lot.x.shape[1]), np.float32) for lot in lots]
+        seen = [np.empty((len(masks), 0, split.x.shape[1]), np.float32) for split in self.errors]
         for rows in heats:
             seen = [
-                np.concatenate([before, lot.squares(masks[running], slice(before.shape[1], rows))], axis=1)
-                for lot, before in zip(lots, seen, strict=True)
+                np.concatenate([before, split.squares(masks[running], slice(before.shape[1], rows))], axis=1)
+                for split, before in zip(self.errors, seen, strict=True)
             ]
-            found, squared[running], spread = self._estimate(lots, masks[running], seen)
+            found, squared[running], spread = self._estimate(masks[running], seen)
             off = found - self._limit if rows < ENOUGH else np.abs(found - self._limit)
             goes_on = ~(off > SURE * spread)
             running, seen = running[goes_on], [before[goes_on] for before in seen]
         whole = [
-            lot.of_sums(masks[running], before.sum(axis=1, dtype=float) + lot.sums(masks[running], heats[-1]))
-            for lot, before in zip(lots, seen, strict=True)
+            split.of_sums(masks[running], before.sum(axis=1, dtype=float) + split.sums(masks[running], heats[-1]))
+            for split, before in zip(self.errors, seen, strict=True)
         ]
         squared[running], is_rough[running] = np.mean(whole, axis=0), False
         return squared, is_rough
 
-    def _estimate(
-        self, lots: list[MaskErrors], masks: np.ndarray, seen: list[np.ndarray]
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """From squares of the first rows of every lot, (n, rows, size): the squared error of the outputs (n,), that
+    def _estimate(self, masks: np.ndarray, seen: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """From squares of the first rows of every split, (n, rows, size): the squared error of the outputs (n,), that
         of every signal (n, signals), and the standard error of the former (n,).
         """
-        told = [lot.of_squares(masks, squares) for lot, squares in zip(lots, seen, strict=True)]
+        told = [split.of_squares(masks, squares) for split, squares in zip(self.errors, seen, strict=True)]
         mean = np.mean([errors for errors, _ in told], axis=0)
         _, found, weights = self._judged(masks, mean)
         variance = np.zeros(len(masks))
-        for (_, factor), squares, lot in zip(told, seen, lots, strict=True):
-            rows, weight = squares.shape[1], np.repeat(weights, lot.sizes, axis=1) * factor
+        for (_, factor), squares, split in zip(told, seen, self.errors, strict=True):
+            rows, weight = squares.shape[1], np.repeat(weights, split.sizes, axis=1) * factor
             line = (squares @ weight[:, :, None].astype(np.float32))[:, :, 0]
-            left = 1.0 - rows / len(lot.x)  # rows are drawn from so many and no more
-            variance += line.var(axis=1, ddof=1, dtype=float) / rows * left / len(lots) ** 2
+            left = 1.0 - rows / len(split.x)  # rows are drawn from so many and no more
+            variance += line.var(axis=1, ddof=1, dtype=float) / rows * left / len(self.errors) ** 2
         unclear = (self._asked(masks) & ~np.isfinite(mean)).any(axis=1)
         return found, mean, np.where(unclear, np.inf, np.sqrt(variance))
 

@@ -199,7 +199,9 @@ def select(layout: Layout, judge: Judge, tried: np.ndarray, is_whole: bool, seed
 def _keep(
     judge: Judge, tried: np.ndarray, L_m: np.ndarray, squared: np.ndarray, is_rough: np.ndarray, seed: int
 ) -> np.ndarray:
-    """Indices of the masks to keep, the best first; those of them that were judged roughly are measured on all rows.
+    """Indices of the masks to keep, the best first.
+
+    Those of them that are rough are measured on all rows, and L_m, `squared` and `is_rough` changed where they are.
 
     Raises:
         NotEnoughData: None is enough.

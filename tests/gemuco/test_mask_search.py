@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from gemuco.mask_choice import choose
+from gemuco.mask_choice import _scenes, choose
 from gemuco.mask_search import find_border
 
 
@@ -45,3 +45,25 @@ def test_the_chosen_masks_serve_whatever_is_available():
     assert {m.tobytes() for m in candidates[:2]} <= {m.tobytes() for m in chosen}
     assert len(choose(candidates, errors, outputs, 6)) == 6
     assert len(chosen) <= 3
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_each_mask_that_is_picked_gains_most(seed):
+    random = np.random.default_rng(seed)
+    candidates = np.unique(random.random((150, 8)) < 0.6, axis=0)
+    errors, outputs = random.uniform(0.0, 0.3, candidates.shape), random.random(8) < 0.8
+    picked = choose(candidates, errors, outputs, 20, seed)
+    scenes = _scenes(8, seed)
+    needed = outputs & ~scenes
+    scenes, needed = scenes[needed.any(axis=1)], needed[needed.any(axis=1)]
+    cost = (needed @ errors.T) / needed.sum(axis=1, keepdims=True)
+    cost[(~scenes).astype(int) @ candidates.T.astype(int) > 0] = 1.0
+    inside = (~candidates).astype(int) @ candidates.T.astype(int) == 0  # [i, j]: i contains j
+    first = np.flatnonzero(inside.sum(axis=1) == 1)
+    first = first if len(first) <= 20 else first[:0]
+    np.testing.assert_array_equal(picked[: len(first)], first)
+    assert len(picked) == 20
+    for count in range(len(first), 20):
+        least = cost[:, picked[:count]].min(axis=1, initial=1.0)
+        gains = np.maximum(least[:, None] - cost, 0.0).sum(axis=0)
+        assert gains[picked[count]] == pytest.approx(gains.max(), rel=1e-4)
