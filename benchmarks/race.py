@@ -5,7 +5,8 @@
 Ten signals each: made-up bodies, and the recording of the Schunk arm (folder $GEMUCO_DATA, ../shared/data if that is
 not set; left out where it is missing) with its 18 channels in random groups. One network is trained; all masks are
 measured on all rows; then thresholds are put between two masks each, anywhere from the best tenth to the worst, and
-races are run with them. `--enough` has masks called feasible from so many rows on, to see why it takes more.
+races are run with them, each on rows in another order. `--enough` has masks called feasible from so many rows on, to
+see why it takes more.
 """
 
 import argparse
@@ -69,6 +70,7 @@ def verdicts(data: Dataset, seed: int) -> np.ndarray:
         for place in random.integers(len(order) // 10, len(order), TRIED):
             into = float(order[place - 1 : place + 1].mean())
             judge.thresholds = Thresholds(out=out, into=min(into, 1.0))
+            judge.errors = [split.shuffled(int(random.integers(2**31))) for split in judge.errors]
             told, _, is_rough = judge.race(masks)
             lost, won = (truth < into) & (told >= into), (truth >= into) & (told < into)
             worst = np.abs(truth[lost | won] / into - 1.0).max(initial=0.0)
