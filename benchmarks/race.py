@@ -1,12 +1,12 @@
 """How often the race of structure determination puts a mask on the wrong side of the threshold.
 
-    python -m benchmarks.race [--seeds 3] [--enough 64]
+    python -m benchmarks.race [--seeds 3] [--sure 3.5] [--bad 3]
 
 Ten signals each: made-up bodies, and the recording of the Schunk arm (folder $GEMUCO_DATA, ../shared/data if that is
 not set; left out where it is missing) with its 18 channels in random groups. One network is trained; all masks are
 measured on all rows; then thresholds are put between two masks each, anywhere from the best tenth to the worst, and
-races are run with them, each on rows in another order. `--enough` has masks called feasible from so many rows on, to
-see why it takes more.
+races are run with them, each on another draw of rows. `--sure` and `--bad` are what a verdict takes (`SURE` and `BAD`
+of `gemuco.mask_judge`), to see what they are good for.
 """
 
 import argparse
@@ -70,7 +70,7 @@ def verdicts(data: Dataset, seed: int) -> np.ndarray:
         for place in random.integers(len(order) // 10, len(order), TRIED):
             into = float(order[place - 1 : place + 1].mean())
             judge.thresholds = Thresholds(out=out, into=min(into, 1.0))
-            judge.errors = [split.shuffled(int(random.integers(2**31))) for split in judge.errors]
+            judge.draw(int(random.integers(2**31)))
             told, _, is_rough = judge.race(masks)
             lost, won = (truth < into) & (told >= into), (truth >= into) & (told < into)
             worst = np.abs(truth[lost | won] / into - 1.0).max(initial=0.0)
@@ -82,9 +82,10 @@ def verdicts(data: Dataset, seed: int) -> np.ndarray:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--enough", type=int, default=mask_judge.ENOUGH, help="rows")
+    parser.add_argument("--sure", type=float, default=mask_judge.SURE, help="standard errors")
+    parser.add_argument("--bad", type=int, default=mask_judge.BAD, help="rows")
     options = parser.parse_args()
-    mask_judge.ENOUGH = options.enough
+    mask_judge.SURE, mask_judge.BAD = options.sure, options.bad
     for name, data in bodies(options.seeds):
         masks, rough, lost, won, worst = verdicts(data, 0)
         print(

@@ -11,6 +11,7 @@ from gemuco.compiled.masks import squares, sums
 from gemuco.dataset import Dataset
 from gemuco.kernels import Chain
 from gemuco.material import Material
+from gemuco.row_draw import RowDraw
 from gemuco.scaler import CLIP
 from gemuco.schema import BodySchema
 from gemuco.signals import Layout
@@ -81,9 +82,22 @@ class MaskErrors:
             return self
         return self._rows(np.linspace(0, len(self.x) - 1, rows).astype(int))
 
-    def shuffled(self, seed: int = 0) -> "MaskErrors":
-        """With the rows in a random order."""
-        return self._rows(np.random.default_rng(seed).permutation(len(self.x)))
+    def drawn(self, outputs: np.ndarray, seed: int) -> tuple["MaskErrors", RowDraw]:
+        """With its rows in an order of which the first tell much of how well the outputs are inferred, and this order.
+
+        It is drawn by the rows' errors under all signals but one.
+
+        Args:
+            outputs: Truth values, shape (signals,).
+            seed: Of the draw.
+        """
+        bits, judged = ~np.eye(len(outputs), dtype=bool), np.repeat(outputs, self.sizes).astype(np.float32)
+        squared, known = np.empty((1, *self.x.shape), np.float32), np.empty((len(bits), len(self.x)))
+        for index in range(len(bits)):
+            self.squares(bits[index : index + 1], slice(None), squared, np.zeros(1, int))
+            known[index] = squared[0] @ judged
+        draw = RowDraw(known, seed)
+        return self._rows(draw.order), draw
 
     def of(self, bits: np.ndarray) -> np.ndarray:
         """Errors under masks.
@@ -101,9 +115,9 @@ class MaskErrors:
 
     def of_sums(self, bits: np.ndarray, squared: np.ndarray) -> np.ndarray:
         """The errors of `of` from `sums` over all rows, shape (masks, signals)."""
-        count = self._usable(bits).T.astype(np.float32) @ self.there.astype(np.float32)
-        measured = self._by_signal(np.where(count > 0, self.liveliness, 0.0))
-        missed = self._by_signal(squared / np.maximum(count, 1))
+        count = self._usable(bits, slice(None)).T.astype(np.float32) @ self.there.astype(np.float32)
+        measured = self.by_signal(np.where(count > 0, self.liveliness, 0.0))
+        missed = self.by_signal(squared / np.maximum(count, 1))
         return np.where(measured > 0, missed / np.maximum(measured, 1e-12), np.nan)
 
     def sums(self, bits: np.ndarray, first: int = 0) -> np.ndarray:
@@ -111,29 +125,37 @@ class MaskErrors:
         chain, given, device = pack(self.chain), self._given(bits, slice(first, None)), devices.best()
         return np.asarray(sums(chain, *given)) if device is None else batched.sums(device, chain, *given)
 
-    def squares(self, bits: np.ndarray, span: slice) -> np.ndarray:
-        """Squared errors of some rows under masks, shape (masks, rows, size); 0 where they do not count."""
-        return np.asarray(squares(pack(self.chain), *self._given(bits, span)))
+    def squares(self, bits: np.ndarray, span: slice, out: np.ndarray, lines: np.ndarray) -> None:
+        """Squared errors of some rows under masks, 0 where they do not count, to these rows of `out` in these lines.
 
-    def of_squares(self, bits: np.ndarray, squared: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Errors under masks from the first rows alone.
+        Args:
+            bits: Shape (masks, signals), truth values.
+            span: The rows.
+            out: Shape (lines, rows, size), float32.
+            lines: Where each mask has its own, shape (masks,).
+        """
+        squares(pack(self.chain), out, lines, span.start or 0, *self._given(bits, span))
+
+    def factors(self, bits: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """What makes weighted sums of `squares` errors.
 
         Args:
             bits: One mask per line, shape (masks, signals), truth values.
-            squared: `squares` of the first rows, shape (masks, rows, size).
+            weights: Of the first rows, of sum 1, shape (rows,).
 
         Returns:
-            What `of` would tell of these rows, shape (masks, signals), NaN too for a signal that has a living element
-            of which fewer than `TOLD` of them tell. And what to multiply squares by, shape (masks, size): the sum over
-            the elements of a signal is what a row adds to its error, which is the mean over rows.
+            What to multiply the sum of an element's squares by, shape (masks, size): the sum over the elements of a
+            signal is its error. NaN for a signal of which nothing living is measured, or that has a living element of
+            which fewer than `TOLD` of the rows tell.
         """
-        rows = squared.shape[1]
-        count = self._usable(bits)[:rows].T.astype(np.float32) @ self.there[:rows].astype(np.float32)
-        measured = self._by_signal(np.where(count > 0, self.liveliness, 0.0))
-        scarce = self._by_signal((count < TOLD) & (self.liveliness > 0.0)) > 0
-        factor = rows / np.maximum(count, 1) / np.repeat(np.maximum(measured, 1e-12), self.sizes, axis=1)
-        shares = self._by_signal(squared.mean(axis=1, dtype=float) * factor)
-        return np.where(scarce | (measured <= 0.0), np.nan, shares), factor
+        usable, there = self._usable(bits, slice(len(weights))).T, self.there[: len(weights)].astype(np.float32)
+        count = usable.astype(np.float32) @ there
+        share = (usable * weights.astype(np.float32)) @ there
+        measured = self.by_signal(np.where(count > 0, self.liveliness, 0.0))
+        is_scarce = (count < TOLD) | (2 * len(weights) * share < count)  # what hardly weighs tells little
+        unclear = (self.by_signal(is_scarce & (self.liveliness > 0.0)) > 0) | (measured <= 0.0)
+        whole = np.repeat(np.where(unclear, np.nan, measured), self.sizes, axis=1)
+        return 1.0 / (np.where(is_scarce, 1.0, share) * whole)
 
     def from_others(self, signal: int) -> float:
         """Error of a signal (by its index) from all others; NaN if no row tells.
@@ -157,19 +179,19 @@ class MaskErrors:
     @property
     def amounts(self) -> np.ndarray:
         """How much of each signal there is to explain, shape (signals,): its elements, if all vary."""
-        return self._by_signal(self.liveliness)
+        return self.by_signal(self.liveliness)
 
     @property
     def sizes(self) -> list[int]:
         """How many elements each signal has."""
         return [signal.size for signal in self.layout.signals]
 
-    def _rows(self, chosen: np.ndarray) -> "MaskErrors":
-        return replace(self, **{name: getattr(self, name)[chosen] for name in ("x", "there", "whole", "p")})
-
-    def _by_signal(self, elements: np.ndarray) -> np.ndarray:
+    def by_signal(self, elements: np.ndarray) -> np.ndarray:
         """Sums over the elements of every signal, shape (..., size) -> (..., signals)."""
         return np.asarray(np.add.reduceat(elements, np.cumsum([0, *self.sizes[:-1]]), axis=-1))
+
+    def _rows(self, chosen: np.ndarray) -> "MaskErrors":
+        return replace(self, **{name: getattr(self, name)[chosen] for name in ("x", "there", "whole", "p")})
 
     def _given(self, bits: np.ndarray, span: slice) -> tuple[np.ndarray, ...]:
         """Of some rows and masks what compiled code is given after the network, see `gemuco.compiled.masks.sums`."""
@@ -178,6 +200,6 @@ class MaskErrors:
         gates = np.repeat(bits, self.sizes, axis=1).astype(np.float32)
         return rows, self.x[span], known, whole, gates, bits.astype(np.float32)
 
-    def _usable(self, bits: np.ndarray) -> np.ndarray:
-        """Which rows have all signals of a mask, shape (rows, masks)."""
-        return np.asarray((~self.whole).astype(np.float32) @ bits.T.astype(np.float32) < 0.5)
+    def _usable(self, bits: np.ndarray, span: slice) -> np.ndarray:
+        """Which rows of some have all signals of a mask, shape (rows, masks)."""
+        return np.asarray((~self.whole[span]).astype(np.float32) @ bits.T.astype(np.float32) < 0.5)

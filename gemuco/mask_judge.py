@@ -9,21 +9,23 @@ from functools import partial
 import numpy as np
 
 from gemuco import cores, devices
+from gemuco.compiled.masks import estimates
 from gemuco.errors import SchemaError
 from gemuco.mask_errors import MaskErrors
+from gemuco.row_draw import Heat, RowDraw
 
 ROWS = 1000
 """Held-out rows that judge a mask, at most."""
-HEATS = (64, 128, 256, 500)
+HEATS = (64, 96, 128, 192, 256, 384, 512, 700)
 """Rows of a race before all of them."""
-SURE = 4.0
+SURE = 3.5
 """A race is over for a mask whose error is so many standard errors from the threshold. Were squared errors normal, 1 of
-12 000 masks that lie right at the threshold would be misjudged in a heat."""
-ENOUGH = 256
-"""From so many rows on a mask may count as surely below. Squared errors are skewed: a mean that is too large comes with
-a large standard error, but where the bad rows are not among the few, both are too small."""
-TOGETHER = 4_000_000
-"""So many squared errors of single rows are held at a time by all cores, about."""
+4300 masks that lie right at the threshold would be put on the wrong side in a heat."""
+BAD = 3
+"""What is below must stay there were so many more rows as bad as the worst. Squared errors are skewed: a mean that is
+too large comes with a large standard error, but where bad rows are not among the few, both are too small."""
+TOGETHER = 8_000_000
+"""Of so many squared errors of single rows is kept what a race has come to, by all cores, about."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,13 +77,23 @@ class Judge:
 
     def __init__(self, names: tuple[str, ...], errors: tuple[MaskErrors, ...], thresholds: Thresholds) -> None:
         self.names, self.thresholds = names, thresholds
-        self.errors = [split.thinned(ROWS).shuffled() for split in errors]
+        self.errors = [split.thinned(ROWS) for split in errors]
         self.tried = 0
         self.L_i = {
             name: float(self._measured(float(np.mean([split.from_others(i) for split in self.errors]))))
             for i, name in enumerate(names)
         }
         self.outputs = np.array([self.L_i[name] < thresholds.out for name in self.names])
+        self._draws: list[RowDraw] = []
+
+    def draw(self, seed: int) -> None:
+        """Put the rows in the order in which they race; the first race does it if nobody has.
+
+        Args:
+            seed: Of the draw.
+        """
+        drawn = [split.drawn(self.outputs, seed) for split in self.errors]
+        self.errors, self._draws = [split for split, _ in drawn], [draw for _, draw in drawn]
 
     def is_judged(self, masks: np.ndarray) -> np.ndarray:
         """Whether a mask leaves any output to infer, shape (n,): the others are not judged (paper, II-E.3)."""
@@ -95,71 +107,95 @@ class Judge:
     def race(self, masks: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """As `of`, but masks that are far from the threshold are measured on few rows; and which these are, shape (n,).
 
-        The rows are in a random order, so a heat on the first of them is not hurt by rows that follow one another being
-        alike. For what is surely above the threshold the race is over, and from `ENOUGH` rows on for what is surely
-        below; the others run the next heat, on more rows with those that they have, and at last on all.
+        A race is over for what a heat on a few rows (`RowDraw`) puts surely on one side of the threshold; the others
+        run the next heat, on more rows with those that they have, and at last on all.
         """
         least = min(len(split.x) for split in self.errors)
         # CUDA has measured them all before a race is over.
-        heats = [rows for rows in HEATS if 2 * rows <= least] if devices.best() is None else []
+        heats = [rows for rows in HEATS if 4 * rows <= 3 * least] if devices.best() is None else []
         if not heats or not len(masks):
             return *self.of(masks), np.zeros(len(masks), bool)
+        if not self._draws:
+            self.draw(0)
         most = TOGETHER // (heats[-1] * sum(split.x.shape[1] for split in self.errors)) // cores.count()
         parts = cores.parts(len(masks), max(1, most))
-        found = cores.run([partial(self._race, heats, masks[part]) for part in parts])
+        steps = [[draw.heat(rows) for draw in self._draws] for rows in heats]
+        found = cores.run([partial(self._race, steps, masks[part]) for part in parts])
         mean, is_rough = (np.concatenate(column) for column in zip(*found, strict=True))
         return self._judged(masks, mean)[0], mean, is_rough
 
-    def _race(self, heats: list[int], masks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Squared errors of every signal under some masks, shape (n, signals), and which are rough, shape (n,)."""
+    def _race(self, heats: list[list[Heat]], masks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Squared errors of every signal under some masks, shape (n, signals), and which are rough, shape (n,).
+
+        Args:
+            heats: Of every split in every heat.
+            masks: Shape (n, signals), truth values.
+        """
         squared, is_rough = np.empty(masks.shape), np.ones(len(masks), bool)
-        running = np.arange(len(masks))
-        seen = [np.empty((len(masks), 0, split.x.shape[1]), np.float32) for split in self.errors]
-        for rows in heats:
-            seen = [
-                np.concatenate([before, split.squares(masks[running], slice(before.shape[1], rows))], axis=1)
-                for split, before in zip(self.errors, seen, strict=True)
-            ]
-            found, squared[running], spread = self._estimate(masks[running], seen)
-            off = found - self._limit if rows < ENOUGH else np.abs(found - self._limit)
-            goes_on = ~(off > SURE * spread)
-            running, seen = running[goes_on], [before[goes_on] for before in seen]
+        running, done = np.arange(len(masks)), 0
+        most = len(heats[-1][0])
+        seen = [np.empty((len(masks), most, split.x.shape[1]), np.float32) for split in self.errors]
+        for heat in heats:
+            for split, kept in zip(self.errors, seen, strict=True):
+                split.squares(masks[running], slice(done, len(heat[0])), kept, running)
+            done = len(heat[0])
+            found, squared[running], spread, hidden = self._estimate(masks[running], running, seen, heat)
+            over = found - self._limit
+            running = running[~((over > SURE * spread) | (over + BAD * hidden < -SURE * spread))]
         whole = [
-            split.of_sums(masks[running], before.sum(axis=1, dtype=float) + split.sums(masks[running], heats[-1]))
-            for split, before in zip(self.errors, seen, strict=True)
+            split.of_sums(masks[running], kept[running].sum(axis=1, dtype=float) + split.sums(masks[running], done))
+            for split, kept in zip(self.errors, seen, strict=True)
         ]
         squared[running], is_rough[running] = np.mean(whole, axis=0), False
         return squared, is_rough
 
-    def _estimate(self, masks: np.ndarray, seen: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """From squares of the first rows of every split, (n, rows, size): the squared error of the outputs (n,), that
-        of every signal (n, signals), and the standard error of the former (n,).
+    def _estimate(
+        self, masks: np.ndarray, lines: np.ndarray, seen: list[np.ndarray], heat: list[Heat]
+    ) -> tuple[np.ndarray, ...]:
+        """From squares of the first rows of every split, (lines, rows, size), of masks (n, signals) in these lines.
+
+        Returns:
+            The squared error of the outputs, shape (n,), that of every signal, shape (n, signals), and of the former
+            the standard error and how much one bad row may hide, shapes (n,).
         """
-        told = [split.of_squares(masks, squares) for split, squares in zip(self.errors, seen, strict=True)]
-        mean = np.mean([errors for errors, _ in told], axis=0)
-        _, found, weights = self._judged(masks, mean)
-        variance = np.zeros(len(masks))
-        for (_, factor), squares, split in zip(told, seen, self.errors, strict=True):
-            rows, weight = squares.shape[1], np.repeat(weights, split.sizes, axis=1) * factor
-            line = (squares @ weight[:, :, None].astype(np.float32))[:, :, 0]
-            left = 1.0 - rows / len(split.x)  # rows are drawn from so many and no more
-            variance += line.var(axis=1, ddof=1, dtype=float) / rows * left / len(self.errors) ** 2
-        unclear = (self._asked(masks) & ~np.isfinite(mean)).any(axis=1)
-        return found, mean, np.where(unclear, np.inf, np.sqrt(variance))
+        share = 1.0 / len(self.errors)
+        factors = [split.factors(masks, one.weights) for split, one in zip(self.errors, heat, strict=True)]
+        tells = np.isfinite(sum(split.by_signal(one) for split, one in zip(self.errors, factors, strict=True)))
+        weights = self._weights(masks, tells)
+        mean, variance, hidden = np.zeros(masks.shape), np.zeros(len(masks)), np.zeros(len(masks))
+        for split, kept, factor, one in zip(self.errors, seen, factors, heat, strict=True):
+            judged = np.nan_to_num(np.repeat(weights, split.sizes, axis=1) * factor)
+            told, doubt, worst = estimates(
+                kept, lines, judged, one.weights, one.known, one.project, one.doubt, one.hidden
+            )
+            mean += share * split.by_signal(told * factor)
+            variance += share**2 * doubt
+            hidden += share * worst
+        unclear = (self._asked(masks) & ~tells).any(axis=1)
+        mean = np.maximum(mean, 0.0)  # few rows may tell less than nothing
+        return self._judged(masks, mean)[1], mean, np.where(unclear, np.inf, np.sqrt(variance)), hidden
 
     def _asked(self, masks: np.ndarray) -> np.ndarray:
         """Which signals count in the error of a mask, shape (n, signals)."""
         judged = np.broadcast_to(self.outputs, masks.shape)
         return judged & ~masks if self.thresholds.over == "masked" else judged
 
-    def _judged(self, masks: np.ndarray, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """From errors of signals that of the outputs, as asked for and squared, (n,), and weights (n, signals)."""
-        amounts = np.max([split.amounts for split in self.errors], axis=0)
-        weights = (self._asked(masks) & np.isfinite(mean)) * amounts
-        total = weights.sum(axis=1)
-        weights = weights / np.where(total > 0.0, total, 1.0)[:, None]
-        squared = np.where(total > 0.0, (np.nan_to_num(mean) * weights).sum(axis=1), np.nan)
-        return self._measured(squared), squared, weights
+    def _weights(self, masks: np.ndarray, tells: np.ndarray) -> np.ndarray:
+        """How much the error of a signal adds to that of a mask, shape (n, signals).
+
+        Args:
+            masks: Truth values, shape (n, signals).
+            tells: Whether the error of the signal under the mask is known, shape (n, signals).
+        """
+        weights = (self._asked(masks) & tells) * np.max([split.amounts for split in self.errors], axis=0)
+        total = weights.sum(axis=1, keepdims=True)
+        return np.asarray(weights / np.where(total > 0.0, total, 1.0))
+
+    def _judged(self, masks: np.ndarray, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """From errors of signals that of the outputs, as asked for and squared, shapes (n,)."""
+        weights = self._weights(masks, np.isfinite(mean))
+        squared = np.where(weights.any(axis=1), (np.nan_to_num(mean) * weights).sum(axis=1), np.nan)
+        return self._measured(squared), squared
 
     def _measured(self, squared: np.ndarray | float) -> np.ndarray:
         """Squared errors as asked for; infinite where nothing tells."""

@@ -15,7 +15,7 @@ import numpy as np
 from gemuco.adapt import UpdateConfig
 from gemuco.compiled.chain import pack
 from gemuco.compiled.jit import FOLDER, let_compiler_go
-from gemuco.compiled.masks import squares, sums
+from gemuco.compiled.masks import estimates, squares, sums
 from gemuco.compiled.usable import usable
 from gemuco.control import Controller
 from gemuco.descent import DescentConfig
@@ -98,7 +98,9 @@ def learning(schema: BodySchema) -> Iterator[str]:
     yield "structure determination"
     network, size, ones = pack(schema.weights.whole), schema.layout.size, np.ones((1, len(SIGNALS)), np.float32)
     rows, known = np.zeros((1, size + len(schema.bias)), np.float32), np.ones((1, size), np.float32)
-    squares(network, rows, known, known, ones > 0.0, known, ones)
+    squared, line, one = np.empty((1, 1, size), np.float32), np.zeros(1, int), np.ones(1)
+    squares(network, squared, line, 0, rows, known, known, ones > 0.0, known, ones)
+    estimates(squared, line, np.ones((1, size)), one, one[None], one[None], one, one)
     sums(network, rows, known, known, ones > 0.0, known, ones)
 
 

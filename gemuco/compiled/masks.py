@@ -43,19 +43,21 @@ def begin(chain, gate, bits, start, shift):
 
 
 @jit
-def told(chain, rows, start, shift, one, other):
-    """What the network tells of a block of rows, shape (rows, n_out), a part of one of the two spaces."""
-    count = len(rows)
-    value = rows
-    for layer in range(len(chain.form)):
+def first(chain, rows, start, shift, out):
+    """What the first layer makes of rows under the mask of `begin`, shape (rows, n_out)."""
+    times(rows, start, out)
+    bend(out, shift, chain.form[0, CODE])
+
+
+@jit
+def told(chain, value, one, other):
+    """What the other layers make of the first one's values, in `other`; shape (rows, n_out), in one of both."""
+    count = len(value)
+    for layer in range(1, len(chain.form)):
         width = chain.form[layer, NARROW]
         result = one[: count * width].reshape(count, width)
-        if layer == 0:
-            times(value, start, result)
-            bend(result, shift, chain.form[0, CODE])
-        else:
-            times(value, matrix(chain, layer), result)
-            bend(result, offset(chain, layer), chain.form[layer, CODE])
+        times(value, matrix(chain, layer), result)
+        bend(result, offset(chain, layer), chain.form[layer, CODE])
         value = result
         one, other = other, one
     return value
@@ -92,16 +94,18 @@ def sums(chain, rows, wanted, known, whole, gates, masks):
         gates: 1 for elements that a mask lets through, else 0, shape (masks, size).
         masks: 1 for the signals of a mask, else 0, shape (masks, signals).
     """
-    size, width = wanted.shape[1], widest(chain)
+    size, width, narrow = wanted.shape[1], widest(chain), chain.form[0, NARROW]
     block = -(-len(rows) // max(1, -(-len(rows) // BLOCK)))
     one, other = np.empty(block * width, rows.dtype), np.empty(block * width, rows.dtype)
-    start = np.empty((rows.shape[1], chain.form[0, NARROW]), rows.dtype)
-    shift = np.empty(chain.form[0, NARROW], rows.dtype)
+    start, shift = np.empty((rows.shape[1], narrow), rows.dtype), np.empty(narrow, rows.dtype)
     part, squared = np.empty(size, rows.dtype), np.zeros((len(masks), size))
     for index in range(len(masks)):
         begin(chain, gates[index], masks[index], start, shift)
         for piece in range(0, len(rows), block):
-            found = told(chain, rows[piece : piece + block], start, shift, one, other)
+            given = rows[piece : piece + block]
+            value = other[: len(given) * narrow].reshape(len(given), narrow)
+            first(chain, given, start, shift, value)
+            found = told(chain, value, one, other)
             part[:] = 0.0
             for row in range(len(found)):
                 if usable(whole, masks[index], piece + row):
@@ -115,23 +119,84 @@ def sums(chain, rows, wanted, known, whole, gates, masks):
 
 
 @jit
-def squares(chain, rows, wanted, known, whole, gates, masks):
-    """Squared error of every element of every row under every mask, shape (masks, rows, size); see `sums`.
+def squares(chain, out, lines, after, rows, wanted, known, whole, gates, masks):
+    """Squared error of every element of every row under every mask.
 
-    It is 0 where a row has not all signals of a mask, or an element does not count.
+    It is 0 where a row has not all signals of a mask, or an element does not count. Masks with few rows share a block.
+
+    Args:
+        chain: The network.
+        out: Where they go, of each mask to a line, from a row on; shape (lines, rows, size).
+        lines: Shape (masks,).
+        after: The row.
+        rows: Shape (rows, size + bias_size).
+        wanted: Shape (rows, size).
+        known: Shape (rows, size).
+        whole: Shape (rows, signals).
+        gates: Shape (masks, size).
+        masks: Shape (masks, signals).
     """
-    width = widest(chain)
-    one, other = np.empty(len(rows) * width, rows.dtype), np.empty(len(rows) * width, rows.dtype)
-    start = np.empty((rows.shape[1], chain.form[0, NARROW]), rows.dtype)
-    shift = np.empty(chain.form[0, NARROW], rows.dtype)
-    squared = np.zeros((len(masks), len(rows), wanted.shape[1]), rows.dtype)
-    for index in range(len(masks)):
-        begin(chain, gates[index], masks[index], start, shift)
-        found = told(chain, rows, start, shift, one, other)
-        for row in range(len(found)):
-            if usable(whole, masks[index], row):
-                line, aim, counts, out = found[row], wanted[row], known[row], squared[index, row]
-                for i in range(len(out)):
-                    miss = line[i] - aim[i]
-                    out[i] = counts[i] * miss * miss
-    return squared
+    count, width, narrow = len(rows), widest(chain), chain.form[0, NARROW]
+    together = max(1, BLOCK // count)
+    one, other = np.empty(together * count * width, rows.dtype), np.empty(together * count * width, rows.dtype)
+    start, shift = np.empty((rows.shape[1], narrow), rows.dtype), np.empty(narrow, rows.dtype)
+    for group in range(0, len(masks), together):
+        several = min(together, len(masks) - group)
+        value = other[: several * count * narrow].reshape(several * count, narrow)
+        for index in range(several):
+            begin(chain, gates[group + index], masks[group + index], start, shift)
+            first(chain, rows, start, shift, value[index * count : (index + 1) * count])
+        found = told(chain, value, one, other)
+        for index in range(group, group + several):
+            for row in range(count):
+                line, aim, counts = found[(index - group) * count + row], wanted[row], known[row]
+                target = out[lines[index], after + row]
+                if usable(whole, masks[index], row):
+                    for i in range(len(target)):
+                        miss = line[i] - aim[i]
+                        target[i] = counts[i] * miss * miss
+                else:
+                    target[:] = 0.0
+
+
+@jit
+def estimates(squared, lines, judged, weights, known, project, doubt, hidden):
+    """What the first rows tell of all; see `gemuco.row_draw.Heat` for weights and what follows.
+
+    Args:
+        squared: Of `squares`, shape (lines, rows, size).
+        lines: Of the masks, shape (masks,).
+        judged: How much an element's error adds to that of a mask, shape (masks, size).
+        weights: Shape (rows,).
+        known: Shape (rows, k).
+        project: Shape (rows, k).
+        doubt: Shape (rows,).
+        hidden: Shape (rows,).
+
+    Returns:
+        Means of every element, shape (masks, size), and of the error of a mask the variance and what the worst unseen
+        row may hide, shapes (masks,).
+    """
+    count, k = known.shape
+    told, variance, worst = np.zeros((len(lines), squared.shape[2])), np.empty(len(lines)), np.empty(len(lines))
+    value, part = np.empty(count), np.empty(k)
+    for index in range(len(lines)):
+        whole, factor, mean = squared[lines[index]], judged[index], told[index]
+        part[:] = 0.0
+        worst[index] = 0.0
+        for row in range(count):
+            line, weight, total = whole[row], weights[row], 0.0
+            for i in range(len(mean)):
+                mean[i] += weight * line[i]
+                total += factor[i] * line[i]
+            value[row] = total
+            worst[index] = max(worst[index], hidden[row] * total)
+            for i in range(k):
+                part[i] += project[row, i] * total
+        variance[index] = 0.0
+        for row in range(count):
+            left = value[row]
+            for i in range(k):
+                left -= known[row, i] * part[i]
+            variance[index] += doubt[row] * left * left
+    return told, variance, worst
