@@ -1,7 +1,7 @@
 """One network under many masks: its squared errors on the same rows; see `gemuco.mask_errors`.
 
-What a mask keeps back is left out of the first layer's matrix in place of the rows, and its bits are added to the
-offset, so nothing of a row's size is copied. Rows go in blocks whose values stay in the second-level cache.
+What a mask keeps back is left out of the rows and of the first layer's matrix, and its bits are added to the offset.
+Rows go in blocks whose values stay in the second-level cache.
 """
 
 import numpy as np
@@ -16,36 +16,44 @@ BLOCK = 256
 
 
 @jit
-def begin(chain, gate, bits, start, shift):
-    """The first layer under one mask: its matrix for elements and p into `start`, and its offset into `shift`.
+def begin(chain, gate, bits, chosen, start, shift):
+    """The first layer under one mask: its matrix for what the mask lets through into `start`, its offset into `shift`.
 
     Args:
         chain: The network: elements, bits and p in.
         gate: 1 for elements that the mask lets through, else 0, shape (size,).
         bits: The mask, shape (signals,).
+        chosen: Which columns of the rows go in, the elements that are let through and p; shape (size + bias_size,).
         start: Shape (size + bias_size, n_out).
         shift: Shape (n_out,).
+
+    Returns:
+        How many columns go in: what lies behind them in `chosen` and `start` is of no use.
     """
     whole, plain = matrix(chain, 0), offset(chain, 0)
-    size, signals, width = len(gate), len(bits), len(shift)
-    for k in range(width):
-        shift[k] = plain[k]
+    size, signals, width, count = len(gate), len(bits), len(shift), 0
+    shift[:] = plain[:width]
     for i in range(signals):
         if bits[i] > 0.0:
             for k in range(width):
                 shift[k] += whole[size + i, k]
-    for i in range(size):
-        for k in range(width):
-            start[i, k] = whole[i, k] * gate[i]
-    for i in range(size, len(start)):
-        for k in range(width):
-            start[i, k] = whole[signals + i, k]
+    for i in range(len(start)):
+        if i >= size or gate[i] > 0.0:
+            chosen[count] = i
+            start[count] = whole[i if i < size else i + signals]
+            count += 1
+    return count
 
 
 @jit
-def first(chain, rows, start, shift, out):
-    """What the first layer makes of rows under the mask of `begin`, shape (rows, n_out)."""
-    times(rows, start, out)
+def first(chain, rows, chosen, start, shift, given, out):
+    """What the first layer makes of rows under the mask of `begin`, shape (rows, n_out); `given` has room for them."""
+    part = given[: len(rows) * len(chosen)].reshape(len(rows), len(chosen))
+    for row in range(len(rows)):
+        line, target = rows[row], part[row]
+        for i in range(len(chosen)):
+            target[i] = line[chosen[i]]
+    times(part, start, out)
     bend(out, shift, chain.form[0, CODE])
 
 
@@ -98,13 +106,14 @@ def sums(chain, rows, wanted, known, whole, gates, masks):
     block = -(-len(rows) // max(1, -(-len(rows) // BLOCK)))
     one, other = np.empty(block * width, rows.dtype), np.empty(block * width, rows.dtype)
     start, shift = np.empty((rows.shape[1], narrow), rows.dtype), np.empty(narrow, rows.dtype)
+    chosen, given = np.empty(rows.shape[1], np.int64), np.empty(block * rows.shape[1], rows.dtype)
     part, squared = np.empty(size, rows.dtype), np.zeros((len(masks), size))
     for index in range(len(masks)):
-        begin(chain, gates[index], masks[index], start, shift)
+        count = begin(chain, gates[index], masks[index], chosen, start, shift)
         for piece in range(0, len(rows), block):
-            given = rows[piece : piece + block]
-            value = other[: len(given) * narrow].reshape(len(given), narrow)
-            first(chain, given, start, shift, value)
+            some = rows[piece : piece + block]
+            value = other[: len(some) * narrow].reshape(len(some), narrow)
+            first(chain, some, chosen[:count], start[:count], shift, given, value)
             found = told(chain, value, one, other)
             part[:] = 0.0
             for row in range(len(found)):
@@ -140,12 +149,14 @@ def squares(chain, out, lines, after, rows, wanted, known, whole, gates, masks):
     together = max(1, BLOCK // count)
     one, other = np.empty(together * count * width, rows.dtype), np.empty(together * count * width, rows.dtype)
     start, shift = np.empty((rows.shape[1], narrow), rows.dtype), np.empty(narrow, rows.dtype)
+    chosen, given = np.empty(rows.shape[1], np.int64), np.empty(rows.size, rows.dtype)
     for group in range(0, len(masks), together):
         several = min(together, len(masks) - group)
         value = other[: several * count * narrow].reshape(several * count, narrow)
         for index in range(several):
-            begin(chain, gates[group + index], masks[group + index], start, shift)
-            first(chain, rows, start, shift, value[index * count : (index + 1) * count])
+            inputs = begin(chain, gates[group + index], masks[group + index], chosen, start, shift)
+            part = value[index * count : (index + 1) * count]
+            first(chain, rows, chosen[:inputs], start[:inputs], shift, given, part)
         found = told(chain, value, one, other)
         for index in range(group, group + several):
             for row in range(count):
