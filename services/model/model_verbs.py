@@ -5,10 +5,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gemuco.estimate import Estimate
+from gemuco.estimate import fill
 from gemuco.masks import label
 from gemuco.schema import BodySchema
-from gemuco.signals import Signal
 from services.errors import BadArguments, NotEngaged
 from services.model.control_config import controller_of, simulator_of
 from services.model.control_loop import Control
@@ -86,9 +85,8 @@ class ModelVerbs:
         facts = {"cycle": cycle, "model_version": self._service.living.version}
         if "signal" in arguments:
             signal = schema.layout.signal(arguments["signal"])
-            return _estimate(schema, signal, schema.estimate(values)[signal.name]) | facts
-        found = schema.estimate(values)
-        return {"signals": {s.name: _estimate(schema, s, found[s.name]) for s in schema.layout.signals}} | facts
+            return _estimates(schema, values)[signal.name] | facts
+        return {"signals": _estimates(schema, values)} | facts
 
     def solve(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """The command that the robot file's loss finds for a target; nothing is sent, nothing moves."""
@@ -219,17 +217,24 @@ class ModelVerbs:
         return values, cycle
 
 
-def _estimate(schema: BodySchema, signal: Signal, found: Estimate) -> dict[str, Any]:
+def _estimates(schema: BodySchema, values: Mapping[str, np.ndarray]) -> dict[str, dict[str, Any]]:
+    joined = schema.layout.join_one(values)
+    joined.setflags(write=False)
+    found = fill(schema, joined)
+    value, std, estimated = found.value.tolist(), found.std.tolist(), found.estimated.tolist()
     return {
-        "signal": signal.name,
-        "unit": signal.unit,
-        "elements": list(signal.elements),
-        "values": found.value.tolist(),
-        "std": found.std.tolist(),
-        "estimated": found.estimated.tolist(),
-        "method": found.method,
-        "mask": label(found.mask, schema.layout.names),
-        "residual": found.residual,
+        signal.name: {
+            "signal": signal.name,
+            "unit": signal.unit,
+            "elements": list(signal.elements),
+            "values": value[span],
+            "std": std[span],
+            "estimated": estimated[span],
+            "method": found.method[signal.name],
+            "mask": found.label[signal.name],
+            "residual": found.residual[signal.name],
+        }
+        for signal, span in zip(schema.layout.signals, schema.layout.slices.values(), strict=True)
     }
 
 

@@ -39,6 +39,8 @@ ASKERS = 64
 """So many callers' attachments are kept, as they are on the wire and as they were read."""
 LONGEST_KEPT = 512
 """Longer attachments [bytes], which no honest caller sends, are read each time."""
+UNORDERED = (dict, set, frozenset)
+"""What may hold a set, or is one."""
 LOG_EVERY = 1.0
 """A verb that keeps failing is logged this often [s]."""
 
@@ -301,7 +303,7 @@ def _pack(value: Any) -> bytes:
 def _ordered(value: Any) -> Any:
     """With lists, sorted, in place of sets: msgspec would write them in any order."""
     if isinstance(value, dict):
-        return {key: _ordered(item) for key, item in value.items()}
+        return {key: _ordered(item) if isinstance(item, UNORDERED) else item for key, item in value.items()}
     return sorted(value) if isinstance(value, set | frozenset) else value
 
 
