@@ -60,6 +60,7 @@ def test_a_robot_file_alone_gives_a_robot_that_answers_and_follows():
     try:
         with open_robot(config) as robot:
             wanted = np.mean(config.bounds("muscle_length"), axis=0) + 0.01
+            there = pytest.approx(wanted, abs=1e-3)  # m
             deadline = time.monotonic() + 30.0
             while time.monotonic() < deadline:
                 sample, _ = robot.cycle()
@@ -67,10 +68,10 @@ def test_a_robot_file_alone_gives_a_robot_that_answers_and_follows():
                     robot.enable()
                 elif robot.mode in ("hold", "follow"):
                     robot.command(wanted, sample.cycle)
-                if np.allclose(sample.values["muscle_length"], wanted, atol=1e-3):  # m
+                if sample.values["muscle_length"] == there:
                     break
                 robot.clock.sleep_until(robot.clock.monotonic() + robot.period)
-            assert sample.values["muscle_length"] == pytest.approx(wanted, abs=1e-3), robot.health()
+            assert sample.values["muscle_length"] == there, robot.health()
     finally:
         rig.stop()
     assert not rig.failure
