@@ -1,6 +1,6 @@
 """How often the race of structure determination puts a mask on the wrong side of the threshold.
 
-    python -m benchmarks.race [--seeds 3] [--sure 3.5] [--bad 3]
+    python -m benchmarks.race [--seeds 3] [--sure 4] [--bad 3]
 
 Ten signals each: made-up bodies, and the recording of the Schunk arm (folder $GEMUCO_DATA, ../shared/data if that is
 not set; left out where it is missing) with its 18 channels in random groups. One network is trained; all masks are

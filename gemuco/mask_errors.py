@@ -11,7 +11,6 @@ from gemuco.compiled.masks import squares, sums
 from gemuco.dataset import Dataset
 from gemuco.kernels import Chain
 from gemuco.material import Material
-from gemuco.row_draw import RowDraw
 from gemuco.scaler import CLIP
 from gemuco.schema import BodySchema
 from gemuco.signals import Layout
@@ -80,24 +79,11 @@ class MaskErrors:
         """On at most so many rows, evenly chosen: a quicker and rougher judgement."""
         if len(self.x) <= rows:
             return self
-        return self._rows(np.linspace(0, len(self.x) - 1, rows).astype(int))
+        return self.rows(np.linspace(0, len(self.x) - 1, rows).astype(int))
 
-    def drawn(self, outputs: np.ndarray, seed: int) -> tuple["MaskErrors", RowDraw]:
-        """With its rows in an order of which the first tell much of how well the outputs are inferred, and this order.
-
-        It is drawn by the rows' errors under all signals but one.
-
-        Args:
-            outputs: Truth values, shape (signals,).
-            seed: Of the draw.
-        """
-        bits, judged = ~np.eye(len(outputs), dtype=bool), np.repeat(outputs, self.sizes).astype(np.float32)
-        squared, known = np.empty((1, *self.x.shape), np.float32), np.empty((len(bits), len(self.x)))
-        for index in range(len(bits)):
-            self.squares(bits[index : index + 1], slice(None), squared, np.zeros(1, int))
-            known[index] = squared[0] @ judged
-        draw = RowDraw(known, seed)
-        return self._rows(draw.order), draw
+    def rows(self, chosen: np.ndarray) -> "MaskErrors":
+        """On these rows (indices) and in this order."""
+        return replace(self, **{name: getattr(self, name)[chosen] for name in ("x", "there", "whole", "p")})
 
     def of(self, bits: np.ndarray) -> np.ndarray:
         """Errors under masks.
@@ -150,27 +136,45 @@ class MaskErrors:
         """
         usable, there = self._usable(bits, slice(len(weights))).T, self.there[: len(weights)].astype(np.float32)
         count = usable.astype(np.float32) @ there
-        share = (usable * weights.astype(np.float32)) @ there
+        # Not by BLAS, whose sums depend on how many masks there are: cores are to change nothing.
+        share = np.einsum("mr,r,re->me", usable, weights, there)
         measured = self.by_signal(np.where(count > 0, self.liveliness, 0.0))
         is_scarce = (count < TOLD) | (2 * len(weights) * share < count)  # what hardly weighs tells little
         unclear = (self.by_signal(is_scarce & (self.liveliness > 0.0)) > 0) | (measured <= 0.0)
         whole = np.repeat(np.where(unclear, np.nan, measured), self.sizes, axis=1)
         return 1.0 / (np.where(is_scarce, 1.0, share) * whole)
 
-    def from_others(self, signal: int) -> float:
-        """Error of a signal (by its index) from all others; NaN if no row tells.
+    def from_others(self) -> tuple[np.ndarray, np.ndarray]:
+        """Every signal from all others.
 
-        Where no row has all of them, every row that has the signal is inferred from whatever others it has.
+        Returns:
+            Errors, shape (signals,), NaN if no row tells. And squared errors under the masks that lack one signal each,
+            of every row and signal, shape (signals, rows, signals).
+        """
+        bits, squared = ~np.eye(len(self.layout.names), dtype=bool), np.empty((1, *self.x.shape), np.float32)
+        total, by_row = (
+            np.empty((len(bits), self.layout.size)),
+            np.empty((len(bits), len(self.x), len(bits)), np.float32),
+        )
+        for index in range(len(bits)):
+            self.squares(bits[index : index + 1], slice(None), squared, np.zeros(1, int))
+            total[index], by_row[index] = squared[0].sum(axis=0, dtype=float), self.by_signal(squared[0])
+        errors = self.of_sums(bits, total).diagonal().copy()
+        for index in np.flatnonzero(np.isnan(errors)).tolist():
+            errors[index] = self._from_some(index)
+        return errors, by_row
+
+    def _from_some(self, signal: int) -> float:
+        """Error of a signal (by its index) that no row has together with all others; NaN if no row tells.
+
+        Every row that has the signal is inferred from whatever others it has.
         """
         others = np.arange(len(self.layout.names)) != signal
-        whole = float(self.of(others[None])[0, signal])
-        if np.isfinite(whole):
-            return whole
         span = self.layout.slice(self.layout.names[signal])
         total, count = np.zeros(self.layout.size), np.zeros(self.layout.size)
         patterns, which = np.unique(self.whole & others, axis=0, return_inverse=True)
         for index in np.flatnonzero(patterns.any(axis=1)):
-            part = self._rows(np.flatnonzero(which.ravel() == index))
+            part = self.rows(np.flatnonzero(which.ravel() == index))
             total += part.sums(patterns[index : index + 1])[0]
             count += part.there.sum(axis=0)
         known = self.liveliness[span] * (count[span] > 0)
@@ -189,9 +193,6 @@ class MaskErrors:
     def by_signal(self, elements: np.ndarray) -> np.ndarray:
         """Sums over the elements of every signal, shape (..., size) -> (..., signals)."""
         return np.asarray(np.add.reduceat(elements, np.cumsum([0, *self.sizes[:-1]]), axis=-1))
-
-    def _rows(self, chosen: np.ndarray) -> "MaskErrors":
-        return replace(self, **{name: getattr(self, name)[chosen] for name in ("x", "there", "whole", "p")})
 
     def _given(self, bits: np.ndarray, span: slice) -> tuple[np.ndarray, ...]:
         """Of some rows and masks what compiled code is given after the network, see `gemuco.compiled.masks.sums`."""

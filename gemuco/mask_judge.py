@@ -18,14 +18,14 @@ ROWS = 1000
 """Held-out rows that judge a mask, at most."""
 HEATS = (64, 96, 128, 192, 256, 384, 512, 700)
 """Rows of a race before all of them."""
-SURE = 3.5
+SURE = 4.0
 """A race is over for a mask whose error is so many standard errors from the threshold. Were squared errors normal, 1 of
-4300 masks that lie right at the threshold would be put on the wrong side in a heat."""
+32 000 masks that lie right at the threshold would be put on the wrong side in a heat."""
 BAD = 3
 """What is below must stay there were so many more rows as bad as the worst. Squared errors are skewed: a mean that is
 too large comes with a large standard error, but where bad rows are not among the few, both are too small."""
 TOGETHER = 8_000_000
-"""Of so many squared errors of single rows is kept what a race has come to, by all cores, about."""
+"""So many squared errors of single rows are held at a time by all cores, about."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,21 +79,23 @@ class Judge:
         self.names, self.thresholds = names, thresholds
         self.errors = [split.thinned(ROWS) for split in errors]
         self.tried = 0
-        self.L_i = {
-            name: float(self._measured(float(np.mean([split.from_others(i) for split in self.errors]))))
-            for i, name in enumerate(names)
-        }
+        told = [split.from_others() for split in self.errors]
+        mean = self._measured(np.mean([errors for errors, _ in told], axis=0))
+        self.L_i = dict(zip(names, mean.tolist(), strict=True))
         self.outputs = np.array([self.L_i[name] < thresholds.out for name in self.names])
+        self._others = [by_row for _, by_row in told]
         self._draws: list[RowDraw] = []
+        self.draw(0)
 
     def draw(self, seed: int) -> None:
-        """Put the rows in the order in which they race; the first race does it if nobody has.
+        """Put the rows in the order in which they race: by their errors under all signals but one.
 
         Args:
             seed: Of the draw.
         """
-        drawn = [split.drawn(self.outputs, seed) for split in self.errors]
-        self.errors, self._draws = [split for split, _ in drawn], [draw for _, draw in drawn]
+        self._draws = [RowDraw(others[:, :, self.outputs].sum(axis=2), seed) for others in self._others]
+        self.errors = [split.rows(draw.order) for split, draw in zip(self.errors, self._draws, strict=True)]
+        self._others = [others[:, draw.order] for others, draw in zip(self._others, self._draws, strict=True)]
 
     def is_judged(self, masks: np.ndarray) -> np.ndarray:
         """Whether a mask leaves any output to infer, shape (n,): the others are not judged (paper, II-E.3)."""
@@ -115,8 +117,6 @@ class Judge:
         heats = [rows for rows in HEATS if 4 * rows <= 3 * least] if devices.best() is None else []
         if not heats or not len(masks):
             return *self.of(masks), np.zeros(len(masks), bool)
-        if not self._draws:
-            self.draw(0)
         most = TOGETHER // (heats[-1] * sum(split.x.shape[1] for split in self.errors)) // cores.count()
         parts = cores.parts(len(masks), max(1, most))
         steps = [[draw.heat(rows) for draw in self._draws] for rows in heats]

@@ -60,9 +60,9 @@ class RowDraw:
         priority = size / (1.0 - np.random.default_rng(seed).random(len(size)))
         self.order = np.argsort(-priority)
         self._size, self._priority = size[self.order], priority[self.order]
-        known = known[:, self.order]
+        known = known[:, self.order].astype(float)
         _, spread, directions = np.linalg.svd(known - known.mean(axis=1, keepdims=True), full_matrices=False)
-        kept = directions[:MOST_KNOWN][spread[:MOST_KNOWN] > 1e-6 * spread[0]]
+        kept = directions[:MOST_KNOWN][spread[:MOST_KNOWN] > 1e-6 * spread.max(initial=0.0)]
         self._known = np.concatenate([np.ones((1, len(size))), kept * np.sqrt(len(size))]).T
 
     def heat(self, rows: int) -> Heat:

@@ -131,7 +131,7 @@ def sums(chain, rows, wanted, known, whole, gates, masks):
 def squares(chain, out, lines, after, rows, wanted, known, whole, gates, masks):
     """Squared error of every element of every row under every mask.
 
-    It is 0 where a row has not all signals of a mask, or an element does not count. Masks with few rows share a block.
+    It is 0 where a row has not all signals of a mask, or an element does not count.
 
     Args:
         chain: The network.
@@ -146,28 +146,23 @@ def squares(chain, out, lines, after, rows, wanted, known, whole, gates, masks):
         masks: Shape (masks, signals).
     """
     count, width, narrow = len(rows), widest(chain), chain.form[0, NARROW]
-    together = max(1, BLOCK // count)
-    one, other = np.empty(together * count * width, rows.dtype), np.empty(together * count * width, rows.dtype)
+    one, other = np.empty(count * width, rows.dtype), np.empty(count * width, rows.dtype)
     start, shift = np.empty((rows.shape[1], narrow), rows.dtype), np.empty(narrow, rows.dtype)
     chosen, given = np.empty(rows.shape[1], np.int64), np.empty(rows.size, rows.dtype)
-    for group in range(0, len(masks), together):
-        several = min(together, len(masks) - group)
-        value = other[: several * count * narrow].reshape(several * count, narrow)
-        for index in range(several):
-            inputs = begin(chain, gates[group + index], masks[group + index], chosen, start, shift)
-            part = value[index * count : (index + 1) * count]
-            first(chain, rows, chosen[:inputs], start[:inputs], shift, given, part)
+    value = other[: count * narrow].reshape(count, narrow)
+    for index in range(len(masks)):
+        inputs = begin(chain, gates[index], masks[index], chosen, start, shift)
+        first(chain, rows, chosen[:inputs], start[:inputs], shift, given, value)
         found = told(chain, value, one, other)
-        for index in range(group, group + several):
-            for row in range(count):
-                line, aim, counts = found[(index - group) * count + row], wanted[row], known[row]
-                target = out[lines[index], after + row]
-                if usable(whole, masks[index], row):
-                    for i in range(len(target)):
-                        miss = line[i] - aim[i]
-                        target[i] = counts[i] * miss * miss
-                else:
-                    target[:] = 0.0
+        for row in range(count):
+            line, aim, counts = found[row], wanted[row], known[row]
+            target = out[lines[index], after + row]
+            if usable(whole, masks[index], row):
+                for i in range(len(target)):
+                    miss = line[i] - aim[i]
+                    target[i] = counts[i] * miss * miss
+            else:
+                target[:] = 0.0
 
 
 @jit
