@@ -65,16 +65,17 @@ def verdicts(data: Dataset, seed: int) -> np.ndarray:
         if not judge.outputs.any():
             continue
         masks = every[judge.is_judged(every)]
-        truth = judge.of(masks)[0]
+        truth = judge.of(masks).L_m
         order = np.sort(truth)
         for place in random.integers(len(order) // 10, len(order), TRIED):
             into = float(order[place - 1 : place + 1].mean())
             judge.thresholds = Thresholds(out=out, into=min(into, 1.0))
             judge.draw(int(random.integers(2**31)))
-            told, _, is_rough = judge.race(masks)
+            judged = judge.race(masks)
+            told = judged.L_m
             lost, won = (truth < into) & (told >= into), (truth >= into) & (told < into)
             worst = np.abs(truth[lost | won] / into - 1.0).max(initial=0.0)
-            found[:4] += len(masks), is_rough.sum(), lost.sum(), won.sum()
+            found[:4] += len(masks), judged.is_rough.sum(), lost.sum(), won.sum()
             found[4] = max(found[4], worst)
     return found
 

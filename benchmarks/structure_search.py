@@ -57,11 +57,11 @@ def run(signals: int, samples: int, seed: int) -> None:
     every = (np.arange(1, 2**signals)[:, None] >> np.arange(signals) & 1) > 0
     every = every[judge.is_judged(every)]
     started = time.process_time()
-    errors = judge.of(every)[0]
+    errors = judge.of(every).L_m
     known = every[errors < thresholds.into]
     took = time.process_time() - started
     started = time.process_time()
-    raced = judge.race(every)[0]
+    raced = judge.race(every).L_m
     race = time.process_time() - started
     lost = int(((errors < thresholds.into) & (raced >= thresholds.into)).sum())
     won = int(((errors >= thresholds.into) & (raced < thresholds.into)).sum())

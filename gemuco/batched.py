@@ -18,6 +18,7 @@ from gemuco.activation import LINEAR
 from gemuco.compiled.bend import CODES
 from gemuco.compiled.chain import CODE, NARROW, PLACE, WIDE, Packed
 from gemuco.compiled.learning import MOMENTUM, SQUARES
+from gemuco.compiled.masks import Rows
 from gemuco.draft import Draft
 from gemuco.learner import HUBER, Learner, Progress, one_cycle
 from gemuco.material import Batch
@@ -282,28 +283,19 @@ def forward(flat: "torch.Tensor", form: np.ndarray, values: "torch.Tensor") -> "
     return values
 
 
-def sums(
-    device: str,
-    chain: Packed,
-    rows: np.ndarray,
-    wanted: np.ndarray,
-    known: np.ndarray,
-    whole: np.ndarray,
-    gates: np.ndarray,
-    masks: np.ndarray,
-) -> np.ndarray:
+def sums(device: str, chain: Packed, rows: Rows, gates: np.ndarray, masks: np.ndarray) -> np.ndarray:
     """What `compiled.masks.sums` gives, shape (masks, size), from a device of torch; the other arguments are its."""
     import torch
 
-    given, aim, counts = (torch.from_numpy(part).to(device) for part in (rows, wanted, known))
-    flat, lacking = (torch.from_numpy(part).to(device) for part in (chain.flat[None], (~whole).astype(np.float32)))
-    size, found = wanted.shape[1], np.empty((len(masks), wanted.shape[1]))
+    given, aim, counts = (torch.from_numpy(part).to(device) for part in rows[:3])
+    flat, lacking = (torch.from_numpy(part).to(device) for part in (chain.flat[None], (~rows.whole).astype(np.float32)))
+    size, found = aim.shape[1], np.empty((len(masks), aim.shape[1]))
     x, p = given[None, :, :size], given[None, :, size:]
-    step = max(1, TOGETHER // max(1, len(rows)))
+    step = max(1, TOGETHER // max(1, len(given)))
     with torch.no_grad():
         for begin in range(0, len(masks), step):
             gate, bits = (torch.from_numpy(part[begin : begin + step]).to(device) for part in (gates, masks))
-            shape = (len(bits), len(rows), -1)
+            shape = (len(bits), len(given), -1)
             inputs = torch.cat([x * gate[:, None], bits[:, None].expand(shape), p.expand(shape)], dim=2)
             told = forward(flat, chain.form, inputs.reshape(1, -1, inputs.shape[2])).reshape(shape)
             is_usable = (bits @ lacking.T < 0.5)[:, :, None]

@@ -1,5 +1,6 @@
 """How badly one network infers every signal from any mask, measured on held-out rows."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -7,7 +8,7 @@ import numpy as np
 
 from gemuco import batched, cores, devices, outliers
 from gemuco.compiled.chain import pack
-from gemuco.compiled.masks import squares, sums
+from gemuco.compiled.masks import Rows, squares
 from gemuco.dataset import Dataset
 from gemuco.kernels import Chain
 from gemuco.material import Material
@@ -18,8 +19,6 @@ from gemuco.task import Task
 
 RARE = 0.05
 """An outlier is rare: where more than this share of a signal would be, the model is wrong, and all counts."""
-TOLD = 30
-"""An error of single rows is an estimate where at least so many tell of every living element."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,48 +100,24 @@ class MaskErrors:
 
     def of_sums(self, bits: np.ndarray, squared: np.ndarray) -> np.ndarray:
         """The errors of `of` from `sums` over all rows, shape (masks, signals)."""
-        count = self._usable(bits, slice(None)).T.astype(np.float32) @ self.there.astype(np.float32)
+        usable = (~self.whole).astype(np.float32) @ bits.T.astype(np.float32) < 0.5  # (rows, masks)
+        count = usable.T.astype(np.float32) @ self.there.astype(np.float32)
         measured = self.by_signal(np.where(count > 0, self.liveliness, 0.0))
         missed = self.by_signal(squared / np.maximum(count, 1))
         return np.where(measured > 0, missed / np.maximum(measured, 1e-12), np.nan)
 
-    def sums(self, bits: np.ndarray, first: int = 0) -> np.ndarray:
-        """Sum of `squares` over the rows from the first one on, on CUDA or this core, shape (masks, size)."""
-        chain, given, device = pack(self.chain), self._given(bits, slice(first, None)), devices.best()
-        return np.asarray(sums(chain, *given)) if device is None else batched.sums(device, chain, *given)
+    def sums(self, bits: np.ndarray) -> np.ndarray:
+        """Sum of `squares` over all rows under every mask, on CUDA or this core, shape (masks, size)."""
+        if (device := devices.best()) is not None:
+            return batched.sums(device, pack(self.chain), self.given, *self.gates(bits))
+        found = [one.sum(axis=0, dtype=float) for one in self.squares(bits)]
+        return np.array(found).reshape(len(bits), self.layout.size)
 
-    def squares(self, bits: np.ndarray, span: slice, out: np.ndarray, lines: np.ndarray) -> None:
-        """Squared errors of some rows under masks, 0 where they do not count, to these rows of `out` in these lines.
-
-        Args:
-            bits: Shape (masks, signals), truth values.
-            span: The rows.
-            out: Shape (lines, rows, size), float32.
-            lines: Where each mask has its own, shape (masks,).
-        """
-        squares(pack(self.chain), out, lines, span.start or 0, *self._given(bits, span))
-
-    def factors(self, bits: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """What makes weighted sums of `squares` errors.
-
-        Args:
-            bits: One mask per line, shape (masks, signals), truth values.
-            weights: Of the first rows, of sum 1, shape (rows,).
-
-        Returns:
-            What to multiply the sum of an element's squares by, shape (masks, size): the sum over the elements of a
-            signal is its error. NaN for a signal of which nothing living is measured, or that has a living element of
-            which fewer than `TOLD` of the rows tell.
-        """
-        usable, there = self._usable(bits, slice(len(weights))).T, self.there[: len(weights)].astype(np.float32)
-        count = usable.astype(np.float32) @ there
-        # Not by BLAS, whose sums depend on how many masks there are: cores are to change nothing.
-        share = np.einsum("mr,r,re->me", usable, weights, there)
-        measured = self.by_signal(np.where(count > 0, self.liveliness, 0.0))
-        is_scarce = (count < TOLD) | (2 * len(weights) * share < count)  # what hardly weighs tells little
-        unclear = (self.by_signal(is_scarce & (self.liveliness > 0.0)) > 0) | (measured <= 0.0)
-        whole = np.repeat(np.where(unclear, np.nan, measured), self.sizes, axis=1)
-        return 1.0 / (np.where(is_scarce, 1.0, share) * whole)
+    def squares(self, bits: np.ndarray) -> Iterator[np.ndarray]:
+        """Squared errors of every row under every mask, 0 where they do not count, each of shape (rows, size)."""
+        chain, rows = pack(self.chain), self.given
+        for gate, mask in zip(*self.gates(bits), strict=True):
+            yield squares(chain, rows, gate, mask)
 
     def from_others(self) -> tuple[np.ndarray, np.ndarray]:
         """Every signal from all others.
@@ -151,18 +126,14 @@ class MaskErrors:
             Errors, shape (signals,), NaN if no row tells. And squared errors under the masks that lack one signal each,
             of every row and signal, shape (signals, rows, signals).
         """
-        bits, squared = ~np.eye(len(self.layout.names), dtype=bool), np.empty((1, *self.x.shape), np.float32)
-        total, by_row = (
-            np.empty((len(bits), self.layout.size)),
-            np.empty((len(bits), len(self.x), len(bits)), np.float32),
-        )
-        for index in range(len(bits)):
-            self.squares(bits[index : index + 1], slice(None), squared, np.zeros(1, int))
-            total[index], by_row[index] = squared[0].sum(axis=0, dtype=float), self.by_signal(squared[0])
-        errors = self.of_sums(bits, total).diagonal().copy()
+        bits, total, by_row = ~np.eye(len(self.layout.names), dtype=bool), [], []
+        for squared in self.squares(bits):
+            total.append(squared.sum(axis=0, dtype=float))
+            by_row.append(self.by_signal(squared))
+        errors = self.of_sums(bits, np.stack(total)).diagonal().copy()
         for index in np.flatnonzero(np.isnan(errors)).tolist():
             errors[index] = self._from_some(index)
-        return errors, by_row
+        return errors, np.stack(by_row)
 
     def _from_some(self, signal: int) -> float:
         """Error of a signal (by its index) that no row has together with all others; NaN if no row tells.
@@ -194,13 +165,12 @@ class MaskErrors:
         """Sums over the elements of every signal, shape (..., size) -> (..., signals)."""
         return np.asarray(np.add.reduceat(elements, np.cumsum([0, *self.sizes[:-1]]), axis=-1))
 
-    def _given(self, bits: np.ndarray, span: slice) -> tuple[np.ndarray, ...]:
-        """Of some rows and masks what compiled code is given after the network, see `gemuco.compiled.masks.sums`."""
-        rows = np.concatenate([self.x[span], self.p[span]], axis=1, dtype=np.float32)
-        known, whole = self.there[span].astype(np.float32), np.ascontiguousarray(self.whole[span])
-        gates = np.repeat(bits, self.sizes, axis=1).astype(np.float32)
-        return rows, self.x[span], known, whole, gates, bits.astype(np.float32)
+    @property
+    def given(self) -> Rows:
+        """What compiled code is given of the rows."""
+        rows = np.concatenate([self.x, self.p], axis=1, dtype=np.float32)
+        return Rows(rows, self.x, self.there.astype(np.float32), np.ascontiguousarray(self.whole))
 
-    def _usable(self, bits: np.ndarray, span: slice) -> np.ndarray:
-        """Which rows of some have all signals of a mask, shape (rows, masks)."""
-        return np.asarray((~self.whole[span]).astype(np.float32) @ bits.T.astype(np.float32) < 0.5)
+    def gates(self, bits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """And what of masks, shapes (masks, size) and (masks, signals)."""
+        return np.repeat(bits, self.sizes, axis=1).astype(np.float32), bits.astype(np.float32)

@@ -9,10 +9,12 @@ from functools import partial
 import numpy as np
 
 from gemuco import cores, devices
-from gemuco.compiled.masks import estimates
+from gemuco.compiled.chain import pack
+from gemuco.compiled.masks import Rows
+from gemuco.compiled.race import KNOWN, Heats, Rule, Splits, race
 from gemuco.errors import SchemaError
 from gemuco.mask_errors import MaskErrors
-from gemuco.row_draw import Heat, RowDraw
+from gemuco.row_draw import RowDraw
 
 ROWS = 1000
 """Held-out rows that judge a mask, at most."""
@@ -24,8 +26,10 @@ SURE = 4.0
 BAD = 3
 """What is below must stay there were so many more rows as bad as the worst. Squared errors are skewed: a mean that is
 too large comes with a large standard error, but where bad rows are not among the few, both are too small."""
-TOGETHER = 8_000_000
-"""So many squared errors of single rows are held at a time by all cores, about."""
+TOLD = 30
+"""An error is told by few rows where at least so many tell of every living element."""
+TOGETHER = 32
+"""So many masks are a core's next share: of too many at a time one core is left with the last."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +63,27 @@ class Thresholds:
                     f"threshold_{name} is {threshold:g}; it must be above 0, and at most 1, the error of always "
                     "guessing the mean. The paper uses 0.15."
                 )
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """Masks and their errors.
+
+    Attributes:
+        masks: Truth values, shape (n, signals).
+        L_m: Errors of the outputs under every mask, shape (n,).
+        squared: Squared errors of every signal, shape (n, signals).
+        is_rough: Which of them few rows told, shape (n,).
+        total: Of these the sums of squared errors over the rows that they were measured on, shape (n, splits, size).
+        done: And how many rows of each split these are, shape (n,).
+    """
+
+    masks: np.ndarray
+    L_m: np.ndarray
+    squared: np.ndarray
+    is_rough: np.ndarray
+    total: np.ndarray
+    done: np.ndarray
 
 
 class Judge:
@@ -101,101 +126,85 @@ class Judge:
         """Whether a mask leaves any output to infer, shape (n,): the others are not judged (paper, II-E.3)."""
         return (self.outputs & ~masks).any(axis=1)
 
-    def of(self, masks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Errors of the outputs, shape (n,), and squared errors of every signal, shape (n, signals)."""
-        mean = np.mean([split.of(masks) for split in self.errors], axis=0)
-        return self._judged(masks, mean)[0], mean
+    def of(self, masks: np.ndarray) -> Judged:
+        """Measure masks, shape (n, signals), on all rows."""
+        squared = np.mean([split.of(masks) for split in self.errors], axis=0)
+        count, nothing = len(masks), np.zeros((len(masks), len(self.errors), 0))
+        return Judged(masks, self._judged(masks, squared), squared, np.zeros(count, bool), nothing, np.full(count, -1))
 
-    def race(self, masks: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """As `of`, but masks that are far from the threshold are measured on few rows; and which these are, shape (n,).
+    def race(self, masks: np.ndarray) -> Judged:
+        """As `of`, but masks that are far from the threshold are measured on few rows.
 
         A race is over for what a heat on a few rows (`RowDraw`) puts surely on one side of the threshold; the others
         run the next heat, on more rows with those that they have, and at last on all.
         """
         least = min(len(split.x) for split in self.errors)
         # CUDA has measured them all before a race is over.
-        heats = [rows for rows in HEATS if 4 * rows <= 3 * least] if devices.best() is None else []
-        if not heats or not len(masks):
-            return *self.of(masks), np.zeros(len(masks), bool)
-        most = TOGETHER // (heats[-1] * sum(split.x.shape[1] for split in self.errors)) // cores.count()
-        parts = cores.parts(len(masks), max(1, most))
-        steps = [[draw.heat(rows) for draw in self._draws] for rows in heats]
-        found = cores.run([partial(self._race, steps, masks[part]) for part in parts])
-        mean, is_rough = (np.concatenate(column) for column in zip(*found, strict=True))
-        return self._judged(masks, mean)[0], mean, is_rough
+        rows = [count for count in HEATS if 4 * count <= 3 * least] if devices.best() is None else []
+        if not rows or not len(masks):
+            return self.of(masks)
+        total = np.zeros((len(masks), len(self.errors), self.errors[0].x.shape[1]))
+        squared, done = np.empty(masks.shape), np.zeros(len(masks), int)
+        self._run(self._heats(rows), masks, squared, total, done)
+        whole = done < 0
+        squared[whole] = self._of_sums(masks[whole], total[whole])
+        return Judged(masks, self._judged(masks, squared), squared, ~whole, total, done)
 
-    def _race(self, heats: list[list[Heat]], masks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Squared errors of every signal under some masks, shape (n, signals), and which are rough, shape (n,).
+    def finish(self, judged: Judged, chosen: np.ndarray) -> None:
+        """Measure those of some masks (indices) that few rows told on all rows; `judged` is changed."""
+        chosen = chosen[judged.is_rough[chosen]]
+        if not len(chosen):
+            return
+        masks, squared, total = judged.masks[chosen], judged.squared[chosen], judged.total[chosen]
+        self._run(self._heats([]), masks, squared, total, judged.done[chosen])
+        judged.squared[chosen] = squared = self._of_sums(masks, total)
+        judged.L_m[chosen], judged.is_rough[chosen] = self._judged(masks, squared), False
 
-        Args:
-            heats: Of every split in every heat.
-            masks: Shape (n, signals), truth values.
-        """
-        squared, is_rough = np.empty(masks.shape), np.ones(len(masks), bool)
-        running, done = np.arange(len(masks)), 0
-        most = len(heats[-1][0])
-        seen = [np.empty((len(masks), most, split.x.shape[1]), np.float32) for split in self.errors]
-        for heat in heats:
-            for split, kept in zip(self.errors, seen, strict=True):
-                split.squares(masks[running], slice(done, len(heat[0])), kept, running)
-            done = len(heat[0])
-            found, squared[running], spread, hidden = self._estimate(masks[running], running, seen, heat)
-            over = found - self._limit
-            running = running[~((over > SURE * spread) | (over + BAD * hidden < -SURE * spread))]
-        whole = [
-            split.of_sums(masks[running], kept[running].sum(axis=1, dtype=float) + split.sums(masks[running], done))
-            for split, kept in zip(self.errors, seen, strict=True)
-        ]
-        squared[running], is_rough[running] = np.mean(whole, axis=0), False
-        return squared, is_rough
+    def _run(self, heats: Heats, masks: np.ndarray, *found: np.ndarray) -> None:
+        """`race` on all cores; what is found goes to arrays with a line for each mask."""
+        amounts = np.max([split.amounts for split in self.errors], axis=0)
+        rule = Rule(self.outputs, self.thresholds.over == "masked", amounts, self._limit, SURE, BAD, TOLD)
+        run, lines = partial(race, self._splits(), heats, rule), (*self.errors[0].gates(masks), *found)
+        parts = cores.parts(len(masks), TOGETHER)
+        cores.run([partial(run, *(line[part] for line in lines)) for part in parts])
 
-    def _estimate(
-        self, masks: np.ndarray, lines: np.ndarray, seen: list[np.ndarray], heat: list[Heat]
-    ) -> tuple[np.ndarray, ...]:
-        """From squares of the first rows of every split, (lines, rows, size), of masks (n, signals) in these lines.
+    def _of_sums(self, masks: np.ndarray, total: np.ndarray) -> np.ndarray:
+        """Squared errors of every signal, shape (n, signals), from sums over all rows, shape (n, splits, size)."""
+        return np.mean([split.of_sums(masks, total[:, index]) for index, split in enumerate(self.errors)], axis=0)
 
-        Returns:
-            The squared error of the outputs, shape (n,), that of every signal, shape (n, signals), and of the former
-            the standard error and how much one bad row may hide, shapes (n,).
-        """
-        share = 1.0 / len(self.errors)
-        factors = [split.factors(masks, one.weights) for split, one in zip(self.errors, heat, strict=True)]
-        tells = np.isfinite(sum(split.by_signal(one) for split, one in zip(self.errors, factors, strict=True)))
-        weights = self._weights(masks, tells)
-        mean, variance, hidden = np.zeros(masks.shape), np.zeros(len(masks)), np.zeros(len(masks))
-        for split, kept, factor, one in zip(self.errors, seen, factors, heat, strict=True):
-            judged = np.nan_to_num(np.repeat(weights, split.sizes, axis=1) * factor)
-            told, doubt, worst = estimates(
-                kept, lines, judged, one.weights, one.known, one.project, one.doubt, one.hidden
-            )
-            mean += share * split.by_signal(told * factor)
-            variance += share**2 * doubt
-            hidden += share * worst
-        unclear = (self._asked(masks) & ~tells).any(axis=1)
-        mean = np.maximum(mean, 0.0)  # few rows may tell less than nothing
-        return self._judged(masks, mean)[1], mean, np.where(unclear, np.inf, np.sqrt(variance)), hidden
+    def _splits(self) -> Splits:
+        """Networks and rows as a race takes them."""
+        packed, given = [pack(split.chain) for split in self.errors], [split.given for split in self.errors]
+        return Splits(
+            np.stack([one.flat for one in packed]),
+            packed[0].form,
+            np.cumsum([0, *(len(split.x) for split in self.errors)]),
+            Rows(*(np.concatenate(part) for part in zip(*given, strict=True))),
+            np.stack([split.liveliness for split in self.errors]),
+            np.repeat(np.arange(len(self.names)), self.errors[0].sizes),
+        )
 
-    def _asked(self, masks: np.ndarray) -> np.ndarray:
-        """Which signals count in the error of a mask, shape (n, signals)."""
-        judged = np.broadcast_to(self.outputs, masks.shape)
-        return judged & ~masks if self.thresholds.over == "masked" else judged
+    def _heats(self, rows: list[int]) -> Heats:
+        """What the first so many rows of every split tell."""
+        heats = [[draw.heat(count) for draw in self._draws] for count in rows]
+        k = max((heat.known.shape[1] for line in heats for heat in line), default=0)
+        tell = np.zeros((len(rows), len(self._draws), max(rows, default=0), KNOWN + 2 * k))
+        for target, line in zip(tell, heats, strict=True):
+            for columns, heat in zip(target, line, strict=True):
+                columns[: len(heat), :KNOWN] = np.stack([heat.weights, heat.doubt, heat.hidden], axis=1)
+                for begin, part in (KNOWN, heat.known), (KNOWN + k, heat.project):
+                    columns[: len(heat), begin : begin + part.shape[1]] = part
+        return Heats(np.array(rows, int), tell)
 
-    def _weights(self, masks: np.ndarray, tells: np.ndarray) -> np.ndarray:
-        """How much the error of a signal adds to that of a mask, shape (n, signals).
-
-        Args:
-            masks: Truth values, shape (n, signals).
-            tells: Whether the error of the signal under the mask is known, shape (n, signals).
-        """
-        weights = (self._asked(masks) & tells) * np.max([split.amounts for split in self.errors], axis=0)
-        total = weights.sum(axis=1, keepdims=True)
-        return np.asarray(weights / np.where(total > 0.0, total, 1.0))
-
-    def _judged(self, masks: np.ndarray, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """From errors of signals that of the outputs, as asked for and squared, shapes (n,)."""
-        weights = self._weights(masks, np.isfinite(mean))
-        squared = np.where(weights.any(axis=1), (np.nan_to_num(mean) * weights).sum(axis=1), np.nan)
-        return self._measured(squared), squared
+    def _judged(self, masks: np.ndarray, mean: np.ndarray) -> np.ndarray:
+        """From squared errors of signals, shape (n, signals), those of the outputs as asked for, shape (n,)."""
+        asked = np.broadcast_to(self.outputs, masks.shape)
+        if self.thresholds.over == "masked":
+            asked = asked & ~masks
+        weights = (asked & np.isfinite(mean)) * np.max([split.amounts for split in self.errors], axis=0)
+        total = weights.sum(axis=1)
+        squared = (np.nan_to_num(mean) * weights).sum(axis=1) / np.where(total > 0.0, total, 1.0)
+        return self._measured(np.where(total > 0.0, squared, np.nan))
 
     def _measured(self, squared: np.ndarray | float) -> np.ndarray:
         """Squared errors as asked for; infinite where nothing tells."""

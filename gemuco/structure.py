@@ -4,8 +4,8 @@ Up to 10 signals every mask is tried, and there are 2^n - 1 of them; with more t
 is searched for (`mask_search`). Either way a mask is feasible only if its own error was measured and is small enough.
 """
 
-from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import compress
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,7 @@ import numpy as np
 from gemuco.dataset import Dataset
 from gemuco.errors import NotEnoughData
 from gemuco.mask_choice import choose
-from gemuco.mask_judge import SURE, Judge, Thresholds
+from gemuco.mask_judge import SURE, Judge, Judged, Thresholds
 from gemuco.mask_search import find_border
 from gemuco.mask_training import LISTED, ROUNDS, training_masks
 from gemuco.masks import Mask, all_masks, bits, label
@@ -177,11 +177,8 @@ def select(layout: Layout, judge: Judge, tried: np.ndarray, is_whole: bool, seed
     """
     names, thresholds = layout.names, judge.thresholds
     tried = tried[judge.is_judged(tried)]
-    if len(names) > OUTRIGHT:
-        L_m, squared, is_rough = judge.race(tried)
-    else:
-        (L_m, squared), is_rough = judge.of(tried), np.zeros(len(tried), bool)
-    kept = _keep(judge, tried, L_m, squared, is_rough, seed)
+    judged = judge.race(tried) if len(names) > OUTRIGHT else judge.of(tried)
+    kept = _keep(judge, judged, seed)
     masks = [frozenset(_named(names, line)) for line in tried]
     return Structure(
         layout=layout,
@@ -189,36 +186,33 @@ def select(layout: Layout, judge: Judge, tried: np.ndarray, is_whole: bool, seed
         x_out=_named(names, judge.outputs),
         masks=tuple(masks[index] for index in kept),
         L_i=judge.L_i,
-        L_m={m: float(value) for m, value in zip(masks, L_m, strict=True)},
+        L_m={m: float(value) for m, value in zip(masks, judged.L_m, strict=True)},
         thresholds=thresholds,
         is_whole=is_whole,
-        rough=frozenset(masks[index] for index in np.flatnonzero(is_rough)),
+        rough=frozenset(masks[index] for index in np.flatnonzero(judged.is_rough)),
     )
 
 
-def _keep(
-    judge: Judge, tried: np.ndarray, L_m: np.ndarray, squared: np.ndarray, is_rough: np.ndarray, seed: int
-) -> np.ndarray:
+def _keep(judge: Judge, judged: Judged, seed: int) -> np.ndarray:
     """Indices of the masks to keep, the best first.
 
-    Those of them that are rough are measured on all rows, and L_m, `squared` and `is_rough` changed where they are.
+    Those of them that few rows told are measured on all rows, and `judged` says so.
 
     Raises:
         NotEnoughData: None is enough.
     """
+    L_m, into = judged.L_m, judge.thresholds.into
     while True:
-        feasible = np.flatnonzero(L_m < judge.thresholds.into)
+        feasible = np.flatnonzero(L_m < into)
         if not len(feasible):
             raise NotEnoughData(
                 f"No mask is enough to infer x_out ({', '.join(_named(judge.names, judge.outputs))}): smallest L_m "
-                f"{L_m.min():.3f}, threshold_in {judge.thresholds.into:g}; collect more data or raise the threshold."
+                f"{L_m.min():.3f}, threshold_in {into:g}; collect more data or raise the threshold."
             )
-        kept = feasible[choose(tried[feasible], squared[feasible], judge.outputs, MOST_MASKS, seed)]
-        rough = kept[is_rough[kept]]
-        if len(rough):
-            L_m[rough], squared[rough] = judge.of(tried[rough])
-            is_rough[rough] = False
-        if (L_m[kept] < judge.thresholds.into).all():
+        candidates, errors = judged.masks[feasible], judged.squared[feasible]
+        kept = feasible[choose(candidates, errors, judge.outputs, MOST_MASKS, seed)]
+        judge.finish(judged, kept)
+        if (L_m[kept] < into).all():
             return np.asarray(kept[np.argsort(L_m[kept], kind="stable")])
 
 
@@ -229,7 +223,7 @@ def search(judge: Judge, seed: int) -> tuple[np.ndarray, bool]:
     def is_enough(masks: np.ndarray) -> np.ndarray:
         judge.tried += len(masks)
         found = ~judge.is_judged(masks)  # what leaves nothing to infer is enough
-        found[~found] = judge.race(masks[~found])[0] < judge.thresholds.into
+        found[~found] = judge.race(masks[~found]).L_m < judge.thresholds.into
         enough.append(masks[found])
         return found
 
@@ -237,5 +231,5 @@ def search(judge: Judge, seed: int) -> tuple[np.ndarray, bool]:
     return np.concatenate([border.largest, *enough]), border.is_complete
 
 
-def _named(names: tuple[str, ...], chosen: Iterable[bool]) -> tuple[str, ...]:
-    return tuple(name for name, is_chosen in zip(names, chosen, strict=True) if is_chosen)
+def _named(names: tuple[str, ...], chosen: np.ndarray) -> tuple[str, ...]:
+    return tuple(compress(names, chosen.tolist()))

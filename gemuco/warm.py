@@ -13,9 +13,7 @@ from itertools import chain, pairwise
 import numpy as np
 
 from gemuco.adapt import UpdateConfig
-from gemuco.compiled.chain import pack
 from gemuco.compiled.jit import FOLDER, let_compiler_go
-from gemuco.compiled.masks import estimates, squares, sums
 from gemuco.compiled.usable import usable
 from gemuco.control import Controller
 from gemuco.descent import DescentConfig
@@ -34,11 +32,11 @@ OUTPUTS = ("position", "tension", "length")
 STEPS = {"running": 9, "learning": 2}
 
 
-def body() -> BodySchema:
+def body(outputs: tuple[str, ...] = OUTPUTS) -> BodySchema:
     """A body that knows nothing, with every kind of signal."""
     random = np.random.default_rng(0)
     layout = Layout(tuple(Signal(name, size, unit) for name, (size, unit) in SIGNALS.items()))
-    sizes = (layout.size + len(SIGNALS) + 2, 4, 3, 4, layout.subset(OUTPUTS).size)
+    sizes = (layout.size + len(SIGNALS) + 2, 4, 3, 4, layout.subset(outputs).size)
     layers = tuple(
         Layer(
             random.normal(size=(wide, narrow)).astype(np.float32),
@@ -51,7 +49,7 @@ def body() -> BodySchema:
     return BodySchema(
         layout=layout,
         x_in=layout.names,
-        x_out=OUTPUTS,
+        x_out=outputs,
         masks=MASKS,
         scaler=Scaler(zeros, ones, -ones, ones),
         weights=Weights(layers[:2], layers[2:]),
@@ -92,16 +90,18 @@ def running(schema: BodySchema) -> Iterator[str]:
 
 def learning(schema: BodySchema) -> Iterator[str]:
     """Use it as training and the paper's experiments do."""
+    from gemuco.mask_errors import MaskErrors
+    from gemuco.mask_judge import Judge, Thresholds
+
     yield "the paper's descent"
     search = DescentConfig(iterations=2)
     Controller(schema, [Match("position")], "tension", search=search).solve({"position": np.full(1, 0.1)}, {})
     yield "structure determination"
-    network, size, ones = pack(schema.weights.whole), schema.layout.size, np.ones((1, len(SIGNALS)), np.float32)
-    rows, known = np.zeros((1, size + len(schema.bias)), np.float32), np.ones((1, size), np.float32)
-    squared, line, one = np.empty((1, 1, size), np.float32), np.zeros(1, int), np.ones(1)
-    squares(network, squared, line, 0, rows, known, known, ones > 0.0, known, ones)
-    estimates(squared, line, np.ones((1, size)), one, one[None], one[None], one, one)
-    sums(network, rows, known, known, ones > 0.0, known, ones)
+    schema, rows, size = body(tuple(SIGNALS)), 100, schema.layout.size
+    there, whole = np.ones((rows, size), bool), np.ones((rows, len(SIGNALS)), bool)
+    x, p = np.zeros((rows, size), np.float32), np.zeros((rows, len(schema.bias)), np.float32)
+    errors = MaskErrors(schema.layout, schema.weights.whole, x, there, whole, p, np.ones(size))
+    Judge(schema.layout.names, (errors,), Thresholds()).race(np.eye(len(SIGNALS), dtype=bool))
 
 
 def warm(tell: Callable[[float, str], None] | None = None, is_service: bool = False) -> float:

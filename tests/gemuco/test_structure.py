@@ -3,14 +3,14 @@ import pytest
 from muscle_arm import LAYOUT
 
 from gemuco import structure as structures
-from gemuco.compiled.masks import estimates
 from gemuco.dataset import Dataset, Episode
 from gemuco.errors import NotEnoughData, SchemaError
 from gemuco.kernels import run
 from gemuco.mask_errors import MaskErrors
+from gemuco.mask_judge import BAD, HEATS, SURE, TOLD, Judged
 from gemuco.mask_training import train_masks
 from gemuco.masks import all_masks, bits
-from gemuco.row_draw import RowDraw
+from gemuco.row_draw import Heat, RowDraw
 from gemuco.signals import Layout, Signal
 from gemuco.structure import Judge, Thresholds, determine, select
 from gemuco.train import TrainConfig
@@ -174,35 +174,36 @@ def test_errors_of_masks_are_those_of_the_network(measured):
     assert errors.amounts == pytest.approx([errors.liveliness[layout.slice(name)].sum() for name in layout.names])
 
 
-def test_all_rows_tell_in_parts_what_they_tell_at_once(measured):
-    layout, (errors, *_) = measured
-    masks, rows, first = every_mask(layout), len(errors.x), len(errors.x) // 3
-    squared = np.full((len(masks) + 1, rows, layout.size), np.nan, np.float32)
-    lines = 1 + np.random.default_rng(0).permutation(len(masks))
-    errors.squares(masks, slice(0, first), squared, lines)
-    errors.squares(masks, slice(first, rows), squared, lines)
-    assert np.isnan(squared[0]).all()
-    parts = errors.of_sums(masks, squared[lines, :first].sum(axis=1) + errors.sums(masks, first))
-    np.testing.assert_allclose(parts, errors.of(masks), rtol=1e-3, atol=1e-6)
-    whole = errors.by_signal(squared[lines].mean(axis=1) * errors.factors(masks, np.full(rows, 1.0 / rows)))
-    told = np.isfinite(whole)
-    assert told.mean() > 0.5
-    np.testing.assert_allclose(whole[told], parts[told], rtol=1e-3, atol=1e-6)
+def few_rows_tell(errors: MaskErrors, mask: np.ndarray, heat: Heat) -> tuple[np.ndarray, np.ndarray]:
+    """Squares of the first rows, shape (rows, size), and what makes weighted sums of them errors, shape (size,)."""
+    rows = len(heat)
+    (squared,) = errors.squares(mask[None])
+    counts = errors.whole[:rows, mask].all(axis=1)[:, None] & errors.there[:rows]
+    count, share = counts.sum(axis=0), heat.weights @ counts
+    factor = np.full(len(share), np.nan)
+    for name in errors.layout.names:
+        span = errors.layout.slice(name)
+        alive = errors.liveliness[span] > 0.0
+        scarce = (count[span] < TOLD) | (share[span] < 0.5 * count[span] / rows)
+        if not (scarce & alive).any() and alive.any():
+            factor[span] = 1.0 / (np.where(scarce, 1.0, share[span]) * errors.liveliness[span].sum())
+    return squared[:rows].astype(float), factor
 
 
 def test_first_rows_tell_known_means_exactly_and_all_others_nearly(measured):
     layout, (errors, *_) = measured
-    random, (_, others) = np.random.default_rng(0), errors.from_others()
+    _, others = errors.from_others()
     draw = RowDraw(others.sum(axis=2), 0)
     drawn = errors.rows(draw.order)
     heat = draw.heat(len(errors.x) // 4)
     assert heat.weights.sum() == pytest.approx(1.0)
     np.testing.assert_allclose(heat.weights @ heat.known, [1.0] + [0.0] * (heat.known.shape[1] - 1), atol=1e-9)
     masks = every_mask(layout)
-    masks = masks[random.permutation(len(masks))]
-    squared = np.empty((len(masks), len(heat.weights), layout.size), np.float32)
-    drawn.squares(masks, slice(0, len(heat.weights)), squared, np.arange(len(masks)))
-    told = drawn.by_signal(np.einsum("r,mri->mi", heat.weights, squared) * drawn.factors(masks, heat.weights))
+    told = []
+    for mask in masks:
+        squared, factor = few_rows_tell(drawn, mask, heat)
+        told.append(drawn.by_signal(heat.weights @ squared * factor))
+    told = np.array(told)
     truth = errors.of(masks)
     clear = np.isfinite(told) & (truth > 0.05)
     assert clear.mean() > 0.3
@@ -234,20 +235,6 @@ def test_estimates_of_first_rows_spread_as_they_say():
     assert ours < 0.7 * at_random
 
 
-def test_compiled_estimates_are_those_of_the_formulas():
-    random = np.random.default_rng(0)
-    heat = RowDraw(random.gamma(0.5, size=(4, 200)), 0).heat(60)
-    squared, judged = random.random((5, 80, 7)).astype(np.float32), random.random((3, 7))
-    lines = np.array([4, 0, 2])
-    found = estimates(squared, lines, judged, heat.weights, heat.known, heat.project, heat.doubt, heat.hidden)
-    drawn = squared[lines, :60].astype(float)
-    value = np.einsum("mri,mi->mr", drawn, judged)
-    left = value - value @ heat.project @ heat.known.T
-    wanted = np.einsum("r,mri->mi", heat.weights, drawn), left**2 @ heat.doubt, (value * heat.hidden).max(axis=1)
-    for one, other in zip(found, wanted, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-6)
-
-
 def test_rows_without_known_errors_are_drawn_alike():
     heat = RowDraw(np.zeros((3, 200)), 0).heat(100)
     np.testing.assert_allclose(heat.weights, 0.01)
@@ -261,15 +248,20 @@ def test_a_race_finds_what_the_full_measurement_finds(measured, measure, over, s
     judge = Judge(layout.names, errors, Thresholds(1.0, 1.0, measure, over))
     masks = every_mask(layout)
     masks = masks[judge.is_judged(masks)]
-    order, count = np.sort(judge.of(masks)[0]), int(share * len(masks))
+    order, count = np.sort(judge.of(masks).L_m), int(share * len(masks))
     into = float(order[count - 1 : count + 1].mean())  # so many are feasible
     judge = Judge(layout.names, errors, Thresholds(1.0, into, measure, over))
-    full, squared = judge.of(masks)
-    raced, some, is_rough = judge.race(masks)
-    np.testing.assert_array_equal(raced < into, full < into)
-    np.testing.assert_allclose(raced[~is_rough], full[~is_rough], rtol=1e-5)
-    np.testing.assert_allclose(some[~is_rough], squared[~is_rough], rtol=1e-4, atol=1e-7)
-    np.testing.assert_allclose(raced[is_rough], full[is_rough], rtol=0.5)
+    full, raced = judge.of(masks), judge.race(masks)
+    is_rough = raced.is_rough.copy()
+    np.testing.assert_array_equal(raced.L_m < into, full.L_m < into)
+    np.testing.assert_allclose(raced.L_m[~is_rough], full.L_m[~is_rough], rtol=1e-5)
+    np.testing.assert_allclose(raced.squared[~is_rough], full.squared[~is_rough], rtol=1e-4, atol=1e-7)
+    np.testing.assert_allclose(raced.L_m[is_rough], full.L_m[is_rough], rtol=0.5)
+    judge.finish(raced, np.arange(0, len(masks), 2))
+    np.testing.assert_array_equal(raced.is_rough[1::2], is_rough[1::2])
+    assert not raced.is_rough[::2].any()
+    np.testing.assert_allclose(raced.L_m[::2], full.L_m[::2], rtol=1e-5)
+    np.testing.assert_allclose(raced.squared[::2], full.squared[::2], rtol=1e-4, atol=1e-7)
     kept = []
     for outright in (0, 99):
         monkeypatch.setattr(structures, "OUTRIGHT", outright)
@@ -282,6 +274,39 @@ def test_a_race_finds_what_the_full_measurement_finds(measured, measure, over, s
     assert race.rough <= {frozenset(np.array(layout.names)[line].tolist()) for line in masks[is_rough]}
 
 
+def verdict(judge: Judge, mask: np.ndarray, count: int) -> tuple[np.ndarray, bool]:
+    """What so many rows tell of a mask, written out: errors of all signals, shape (signals,), and if it is out."""
+    mean, variance, hidden, heats = np.zeros(len(mask)), 0.0, 0.0, [draw.heat(count) for draw in judge._draws]
+    weight = np.where(judge.outputs & ~mask, np.max([split.amounts for split in judge.errors], axis=0), 0.0)
+    weight /= weight.sum()
+    for split, heat in zip(judge.errors, heats, strict=True):
+        squared, factor = few_rows_tell(split, mask, heat)
+        mean += split.by_signal(heat.weights @ squared * factor) / len(heats)
+        value = squared @ np.nan_to_num(np.repeat(weight, split.sizes) * factor)
+        left = value - heat.known @ (value @ heat.project)
+        variance += heat.doubt @ left**2 / len(heats) ** 2
+        hidden += (value * heat.hidden).max() / len(heats)
+    mean = np.maximum(mean, 0.0)
+    over, spread = np.nan_to_num(mean) @ weight - judge.thresholds.into, SURE * np.sqrt(variance)
+    is_known = np.isfinite(mean[weight > 0.0]).all()
+    return mean, is_known and (over > spread or over + BAD * hidden < -spread)
+
+
+def test_a_race_goes_by_the_formulas(measured):
+    layout, errors = measured
+    judge = Judge(layout.names, errors, Thresholds(1.0, 0.3))
+    masks = every_mask(layout)
+    judged = judge.race(masks[judge.is_judged(masks)])
+    heats = [rows for rows in HEATS if 4 * rows <= 3 * min(len(split.x) for split in errors)]
+    assert set(np.unique(judged.done)) <= {-1, *heats}
+    assert judged.is_rough.any()
+    for mask, squared, done in zip(judged.masks, judged.squared, judged.done, strict=True):
+        told = [verdict(judge, mask, rows) for rows in heats if done < 0 or rows <= done]
+        assert [is_out for _, is_out in told] == [False] * (len(told) - 1) + [done >= 0]
+        if done >= 0:
+            np.testing.assert_allclose(squared, told[-1][0], rtol=1e-4, atol=1e-6)
+
+
 def test_a_mask_that_a_race_misjudged_is_not_kept(measured, monkeypatch):
     layout, errors = measured
     judge = Judge(layout.names, errors, Thresholds(1.0, 0.4))
@@ -290,8 +315,9 @@ def test_a_mask_that_a_race_misjudged_is_not_kept(measured, monkeypatch):
     honest = judge.race
 
     def flattering(masks):
-        raced, squared, is_rough = honest(masks)
-        return raced * 0.01, squared * 0.01, np.ones_like(is_rough)
+        raced = honest(masks)
+        nothing, zeros = np.zeros_like(raced.done), np.zeros_like(raced.total)
+        return Judged(masks, raced.L_m * 0.01, raced.squared * 0.01, np.ones_like(raced.is_rough), zeros, nothing)
 
     monkeypatch.setattr(structures, "OUTRIGHT", 0)
     monkeypatch.setattr(judge, "race", flattering)
