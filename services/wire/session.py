@@ -37,6 +37,8 @@ OPEN_WITHIN = 3.0
 """How long [s] a client waits for its router."""
 LEASE_MS = 900
 """How long a frozen or unreachable process counts as alive; one that dies is noticed within milliseconds."""
+ANSWER_MS = 500
+"""How long to wait for the other side's part of a handshake; one that was lost is then repeated."""
 MAX_RECEIVED = 4 * MAX_BYTES
 """Longer ones are dropped before they arrive here; those in between are counted as malformed."""
 CLOSE_WITHIN = 2.0
@@ -119,8 +121,8 @@ def plain_settings() -> dict[str, Any]:
         "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "timestamping": {"enabled": True},
         "transport": {
-            # Lost handshakes are repeated after open_timeout: 10 s by default.
-            "unicast": {"open_timeout": 500, "accept_timeout": 1000},
+            # 10 s by default.
+            "unicast": {"open_timeout": ANSWER_MS, "accept_timeout": 1000},
             "link": {"tx": {"lease": LEASE_MS}, "rx": {"max_message_size": MAX_RECEIVED}},
             # A receiver that is descheduled for 100 ms loses queries that travel by shared memory.
             "shared_memory": {"enabled": False},
@@ -206,7 +208,10 @@ def _not_let_in(configuration: dict[str, Any], who: str) -> ServiceError:
         if role
         else "It may want a role file (`--connect ROLE.json`), as `gemuco security init` makes them."
     )
-    return NotAllowed(f"No zenoh session for {who}: somebody is at {', '.join(there)}, and does not let it in. {hint}")
+    return NotAllowed(
+        f"No zenoh session for {who}: somebody is at {', '.join(there)}, and does not let it in. {hint} "
+        f"If it is only starting, or its machine is busy, it took longer than {ANSWER_MS / 1e3:g} s: try again."
+    )
 
 
 def close_session(session: zenoh.Session) -> None:
