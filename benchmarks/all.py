@@ -63,6 +63,13 @@ def rows(minutes: float) -> Iterator[Row]:
     yield from service_cost.rows()
 
 
+def processor() -> str:
+    """What Linux calls it, and whether it has AVX-512, which decides what products cost."""
+    told = Path("/proc/cpuinfo").read_text()
+    name = next((line.partition(":")[2].strip() for line in told.splitlines() if line.startswith("model name")), "")
+    return f"{name or platform.machine()} {'with' if 'avx512f' in told else 'without'} AVX-512"
+
+
 def is_worse(row: Row, before: dict[str, float]) -> bool:
     """Whether a result got worse by more than a third."""
     if row.what not in before or before[row.what] <= 0.0 or row.value <= 0.0:
@@ -93,7 +100,7 @@ def main() -> None:
         table.add_row(*text(row), style="red" if is_worse(row, before) else "")
         console.print(" | ".join(text(row)), style="red" if is_worse(row, before) else "")
     sizes.draw()
-    machine = f"{os.cpu_count()} cores of {platform.machine()}, Python {platform.python_version()}"
+    machine = f"{os.cpu_count()} cores of {processor()}, Python {platform.python_version()}"
     lines = [INTRODUCTION.format(machine=machine, day=datetime.date.today(), minutes=options.minutes)]
     lines += [f"| {' | '.join(text(row))} |\n" for row in found]
     noted = [f"- {row.what}: {row.note}.\n" for row in found if row.note]

@@ -214,4 +214,4 @@ class Judge:
     def _limit(self) -> float:
         """The threshold as a squared error."""
         into = self.thresholds.into
-        return into if self.thresholds.measure == "mse" else into**2
+        return float(into if self.thresholds.measure == "mse" else into**2)
