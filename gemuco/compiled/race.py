@@ -235,10 +235,12 @@ def look(splits, gate, bits, before, now, inputs, lane):
         chain = Packed(splits.flat[split], splits.form)
         if before == 0 or len(splits.flat) > 1:
             inputs = begin(chain, gate, bits, lane.room)
-        first, count = splits.first[split] + before, now - before
-        measure(chain, splits.rows, first, count, bits, inputs, lane.room, lane.seen[split], before)
-        for row in range(count):
-            lane.uses[split, before + row] = usable(splits.rows, first + row, bits)
+        first, seen = splits.first[split], lane.seen[split]
+        for piece in range(before, now, BLOCK):
+            count = min(BLOCK, now - piece)
+            measure(chain, splits.rows, first + piece, count, bits, inputs, lane.room, seen, piece)
+        for row in range(before, now):
+            lane.uses[split, row] = usable(splits.rows, first + row, bits)
     return inputs
 
 

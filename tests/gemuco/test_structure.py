@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from muscle_arm import LAYOUT
 
+from gemuco import mask_judge
 from gemuco import structure as structures
 from gemuco.dataset import Dataset, Episode
 from gemuco.errors import NotEnoughData, SchemaError
@@ -292,12 +293,14 @@ def verdict(judge: Judge, mask: np.ndarray, count: int) -> tuple[np.ndarray, boo
     return mean, is_known and (over > spread or over + BAD * hidden < -spread)
 
 
-def test_a_race_goes_by_the_formulas(measured):
+@pytest.mark.parametrize("heats", [HEATS, (20, 290)])  # the last is longer than a block of rows
+def test_a_race_goes_by_the_formulas(measured, heats, monkeypatch):
     layout, errors = measured
+    monkeypatch.setattr(mask_judge, "HEATS", heats)
     judge = Judge(layout.names, errors, Thresholds(1.0, 0.3))
     masks = every_mask(layout)
     judged = judge.race(masks[judge.is_judged(masks)])
-    heats = [rows for rows in HEATS if 4 * rows <= 3 * min(len(split.x) for split in errors)]
+    heats = [rows for rows in heats if 4 * rows <= 3 * min(len(split.x) for split in judge.errors)]
     assert set(np.unique(judged.done)) <= {-1, *heats}
     assert judged.is_rough.any()
     for mask, squared, done in zip(judged.masks, judged.squared, judged.done, strict=True):
