@@ -284,7 +284,7 @@ def forward(flat: "torch.Tensor", form: np.ndarray, values: "torch.Tensor") -> "
 
 
 def sums(device: str, chain: Packed, rows: Rows, gates: np.ndarray, masks: np.ndarray) -> np.ndarray:
-    """What `compiled.masks.sums` gives, shape (masks, size), from a device of torch; the other arguments are its."""
+    """What `MaskErrors.sums` gives, shape (masks, size), from a device of torch; `MaskErrors.gates` for the masks."""
     import torch
 
     given, aim, counts = (torch.from_numpy(part).to(device) for part in rows[:3])

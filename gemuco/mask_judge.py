@@ -129,8 +129,9 @@ class Judge:
     def of(self, masks: np.ndarray) -> Judged:
         """Measure masks, shape (n, signals), on all rows."""
         squared = np.mean([split.of(masks) for split in self.errors], axis=0)
-        count, nothing = len(masks), np.zeros((len(masks), len(self.errors), 0))
-        return Judged(masks, self._judged(masks, squared), squared, np.zeros(count, bool), nothing, np.full(count, -1))
+        L_m, is_rough = self._of_outputs(masks, squared), np.zeros(len(masks), bool)
+        total, done = np.zeros((len(masks), len(self.errors), 0)), np.full(len(masks), -1)
+        return Judged(masks, L_m, squared, is_rough, total, done)
 
     def race(self, masks: np.ndarray) -> Judged:
         """As `of`, but masks that are far from the threshold are measured on few rows.
@@ -148,7 +149,7 @@ class Judge:
         self._run(self._heats(rows), masks, squared, total, done)
         whole = done < 0
         squared[whole] = self._of_sums(masks[whole], total[whole])
-        return Judged(masks, self._judged(masks, squared), squared, ~whole, total, done)
+        return Judged(masks, self._of_outputs(masks, squared), squared, ~whole, total, done)
 
     def finish(self, judged: Judged, chosen: np.ndarray) -> None:
         """Measure those of some masks (indices) that few rows told on all rows; `judged` is changed."""
@@ -158,7 +159,7 @@ class Judge:
         masks, squared, total = judged.masks[chosen], judged.squared[chosen], judged.total[chosen]
         self._run(self._heats([]), masks, squared, total, judged.done[chosen])
         judged.squared[chosen] = squared = self._of_sums(masks, total)
-        judged.L_m[chosen], judged.is_rough[chosen] = self._judged(masks, squared), False
+        judged.L_m[chosen], judged.is_rough[chosen] = self._of_outputs(masks, squared), False
 
     def _run(self, heats: Heats, masks: np.ndarray, *found: np.ndarray) -> None:
         """`race` on all cores; what is found goes to arrays with a line for each mask."""
@@ -196,7 +197,7 @@ class Judge:
                     columns[: len(heat), begin : begin + part.shape[1]] = part
         return Heats(np.array(rows, int), tell)
 
-    def _judged(self, masks: np.ndarray, mean: np.ndarray) -> np.ndarray:
+    def _of_outputs(self, masks: np.ndarray, mean: np.ndarray) -> np.ndarray:
         """From squared errors of signals, shape (n, signals), those of the outputs as asked for, shape (n,)."""
         asked = np.broadcast_to(self.outputs, masks.shape)
         if self.thresholds.over == "masked":
