@@ -6,10 +6,12 @@ What got worse by more than a third since it was recorded last (docs/benchmarks.
 """
 
 import argparse
+import ctypes
 import datetime
 import json
 import os
 import platform
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -18,6 +20,7 @@ from rich.table import Table
 
 from benchmarks import learning, loops, service_cost, sizes, solvers, updates
 from benchmarks.table import Row
+from gemuco.compiled.jit import NUMPYS
 
 PAGE, RECORD = Path("docs/benchmarks.md"), Path("docs/benchmarks.json")
 ROBOT = Path("robots/musashi_arm.yaml")
@@ -53,21 +56,27 @@ def loop_rows(minutes: float) -> Iterator[Row]:
     yield Row("the model service's share of a core meanwhile", "35 %", cores, 35.0, "%", cores, 35.0, True)
 
 
-def rows(minutes: float) -> Iterator[Row]:
+def chapters(minutes: float) -> dict[str, Iterator[Row]]:
     """All results; the loops first, while nothing else runs."""
-    if minutes:
-        yield from loop_rows(minutes)
-    yield from solvers.rows()
-    yield from updates.rows()
-    yield from learning.rows()
-    yield from service_cost.rows()
+    first = {"loops": loop_rows(minutes)} if minutes else {}
+    return first | {
+        "solvers": solvers.rows(),
+        "updates": updates.rows(),
+        "learning": learning.rows(),
+        "service_cost": service_cost.rows(),
+    }
 
 
 def processor() -> str:
-    """What Linux calls it, and whether it has AVX-512, which decides what products cost."""
+    """What Linux calls it, whether it has AVX-512, and as for which one OpenBLAS computes: what products cost."""
     told = Path("/proc/cpuinfo").read_text()
     name = next((line.partition(":")[2].strip() for line in told.splitlines() if line.startswith("model name")), "")
-    return f"{name or platform.machine()} {'with' if 'avx512f' in told else 'without'} AVX-512"
+    has = f"{name or platform.machine()} {'with' if 'avx512f' in told else 'without'} AVX-512"
+    if NUMPYS is None:
+        return has
+    tell = ctypes.CDLL(str(NUMPYS)).scipy_openblas_get_corename64_
+    tell.restype = ctypes.c_char_p
+    return f"{has}, OpenBLAS as for {tell().decode()}"
 
 
 def is_worse(row: Row, before: dict[str, float]) -> bool:
@@ -87,7 +96,7 @@ def text(row: Row) -> list[str]:
     return [row.what, row.against, f"{row.ours:.3g} {row.unit}", f"{row.theirs:.3g} {row.unit}", value, bar, mark]
 
 
-def main() -> None:
+def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=float, default=10.0, help="of the loops; 0 leaves them out")
     options = parser.parse_args()
@@ -95,20 +104,29 @@ def main() -> None:
     before = json.loads(RECORD.read_text()) if RECORD.exists() else {}
     table = Table("what", "against", "ours", "theirs", "result", "bar", "reached", title="benchmarks")
     found: list[Row] = []
-    for row in rows(options.minutes):
-        found.append(row)
-        table.add_row(*text(row), style="red" if is_worse(row, before) else "")
-        console.print(" | ".join(text(row)), style="red" if is_worse(row, before) else "")
+    broken: list[str] = []
+    for chapter, rows in chapters(options.minutes).items():
+        try:
+            for row in rows:
+                found.append(row)
+                table.add_row(*text(row), style="red" if is_worse(row, before) else "")
+                console.print(" | ".join(text(row)), style="red" if is_worse(row, before) else "")
+        except Exception as error:  # what was measured is kept, and what was not is named
+            console.print_exception()
+            broken.append(f"`benchmarks.{chapter}` ended early and lacks rows: {type(error).__name__}: {error}")
     sizes.draw()
     machine = f"{os.cpu_count()} cores of {processor()}, Python {platform.python_version()}"
     lines = [INTRODUCTION.format(machine=machine, day=datetime.date.today(), minutes=options.minutes)]
     lines += [f"| {' | '.join(text(row))} |\n" for row in found]
-    noted = [f"- {row.what}: {row.note}.\n" for row in found if row.note]
-    lines += ["\n", *noted]
+    noted = [f"{row.what}: {row.note}." for row in found if row.note]
+    lines += ["\n", *(f"- {line}\n" for line in broken + noted)]
     PAGE.write_text("".join(lines) + "\n![cost against size](images/cost.png)\n")
     RECORD.write_text(json.dumps(before | {row.what: row.value for row in found}, indent=1) + "\n")
     console.print(table)
+    for line in broken:
+        console.print(line, style="red")
+    return 1 if broken else 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())
