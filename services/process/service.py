@@ -25,6 +25,9 @@ M = TypeVar("M", bound=Message)
 log = logging.getLogger(__name__)
 
 STATUS_EVERY = 1.0
+STATUS_AT = 0.0472
+"""When a status is made [s], after whole seconds of the clock: at usual rates no loop of the model service begins near,
+and the HAL's turn has ended. One that met the update each second held up a twentieth of its ticks."""
 ANSWERED_WITHIN = 0.5
 """How long [s] a service that ends still answers what it was asked before."""
 
@@ -134,7 +137,7 @@ class Service:
             while not stop.wait(max(0.0, due - time.monotonic())):
                 self.publish_status(status)
                 self._statuses.done += 1
-                due = max(due + STATUS_EVERY, time.monotonic())
+                due = next_status(time.monotonic())
         self._status.put(Status(stamp_ns=time.time_ns(), service=self.name, state="stopping"))
 
     def publish_status(self, status: Callable[[], Status]) -> None:
@@ -143,6 +146,12 @@ class Service:
             self._status.put(status())
         except Exception:
             log.exception("No status of the '%s' service of robot '%s'", self.name, self.robot)
+
+
+def next_status(now: float) -> float:
+    """The moment for a status that is nearest to a period from now [monotonic s]."""
+    wanted = now + STATUS_EVERY
+    return wanted - ((wanted - STATUS_AT + 0.5 * STATUS_EVERY) % STATUS_EVERY - 0.5 * STATUS_EVERY)
 
 
 @contextmanager

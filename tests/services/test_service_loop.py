@@ -6,9 +6,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hal.clock import ManualClock
+from services.model.gemuco_service import OFFSETS
 from services.process.lateness import GROWTH, RESOLUTION, Lateness
 from services.process.loop import Grid, Loop
 from services.process.realtime import prepare_thread, promote
+from services.process.service import STATUS_AT, STATUS_EVERY, next_status
 
 
 def test_grid_stays_on_multiples_of_the_period() -> None:
@@ -208,3 +210,21 @@ def test_a_loop_that_follows_begins_shortly_after_what_it_works_on_has_come(phas
     assert np.median(late) < 0.3 * period
     assert (late < 0.5 * period).mean() > 0.95
     assert grid.skipped == 0
+
+
+@given(st.floats(0.0, 1e6))
+def test_statuses_come_at_one_moment_of_the_second_about_a_period_apart(now: float) -> None:
+    due = next_status(now)
+    assert 0.5 * STATUS_EVERY - 1e-6 <= due - now <= 1.5 * STATUS_EVERY + 1e-6
+    assert abs((due - STATUS_AT + 0.5) % STATUS_EVERY - 0.5) < 1e-6
+    assert next_status(due + 0.002) == pytest.approx(due + STATUS_EVERY)
+    assert next_status(due + 3.3) == pytest.approx(due + 4 * STATUS_EVERY)
+
+
+@pytest.mark.parametrize(
+    ("name", "rate"),
+    [("estimation", 500.0), ("estimation", 200.0), ("anomaly", 200.0), ("control", 100.0), ("update", 20.0)],
+)
+def test_a_status_has_a_millisecond_until_the_next_tick_begins(name: str, rate: float) -> None:
+    until_next = (OFFSETS[name] - STATUS_AT) % (1.0 / rate)
+    assert until_next > 0.001
