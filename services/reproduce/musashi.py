@@ -16,7 +16,7 @@ from services.reproduce import musashi_figures as figures
 from services.reproduce import musashi_simulation as simulation
 from services.reproduce.musashi_model import decay
 from services.reproduce.musashi_motion import LENGTH, POSITION, TENSION
-from services.reproduce.musashi_seed import AFTER, BEFORE, HELD, Outcome, run_seed
+from services.reproduce.musashi_seed import AFTER, BEFORE, HELD, Outcome, collected, run_seed
 from services.reproduce.report import Report, Row
 from services.reproduce.runs import each_seed
 from services.show import Tell
@@ -29,7 +29,7 @@ LOOSE = 0.30
 def reproduce(seeds: Sequence[int], folder: Path, progress: Tell, fresh: bool) -> Report:
     """Run all seeds, draw the figures and compare with the paper; see `Experiment`."""
     robot = load_robot(robot_file("musashi_arm"))
-    outcomes = each_seed(robot, seeds, folder, progress, fresh, run_seed)
+    outcomes = each_seed(robot, seeds, folder, progress, fresh, run_seed, collected)
     figures.draw(outcomes, robot, folder)
     return report(outcomes)
 

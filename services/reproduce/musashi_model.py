@@ -4,15 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gemuco import structure
 from gemuco.adapt import UpdateConfig, Updater
 from gemuco.dataset import Dataset, Episode
-from gemuco.masks import Mask
+from gemuco.masks import all_masks, label
 from gemuco.schema import BodySchema
-from gemuco.train import fit
+from gemuco.structure import Structure, Thresholds
 from hal import registry
 from hal.config import RobotConfig
-from services.learning.trainer import train_config
 from services.model.living_model import layout_of
 from services.model.model_config import model_config
 from services.reproduce.musashi_motion import LENGTH, POSITION, RATE, TENSION, signals
@@ -34,17 +32,18 @@ def geometric_data(robot: RobotConfig, seed: int) -> Dataset:
     return Dataset(layout_of(robot), episodes)
 
 
-def determine(robot: RobotConfig, data: Dataset, seed: int) -> structure.Structure:
-    """The network's structure with the settings of the robot file."""
-    config = model_config(robot)
-    thresholds = structure.Thresholds(config.structure.threshold_out, config.structure.threshold_in)
-    return structure.determine(data, train_config(config, config.structure.epochs, seed), thresholds)
-
-
-def train(robot: RobotConfig, data: Dataset, masks: tuple[Mask, ...], seed: int) -> BodySchema:
-    """A schema of the data with the settings of the robot file."""
-    config = model_config(robot)
-    return fit(data, train_config(config, config.training.epochs, seed), masks)[0]
+def structure_of(robot: RobotConfig, schema: BodySchema) -> Structure:
+    """What the training of a schema of few signals found, from its manifest and the settings of the robot file."""
+    names, wanted, L_m = schema.layout.names, model_config(robot).structure, schema.manifest["L_m"]
+    return Structure(
+        layout=schema.layout,
+        x_in=schema.x_in,
+        x_out=schema.x_out,
+        masks=schema.masks,
+        L_i=schema.manifest["L_i"],
+        L_m={mask: L_m[label(mask, names)] for mask in all_masks(names) if label(mask, names) in L_m},
+        thresholds=Thresholds(wanted.threshold_out, wanted.threshold_in),
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,12 +8,13 @@ import numpy as np
 from gemuco.dataset import Dataset
 from gemuco.schema import BodySchema
 from gemuco.structure import Structure
+from services.learning.trainer import train
 from services.reproduce import musashi_anomaly as anomaly
 from services.reproduce import musashi_control as control
 from services.reproduce import musashi_model as model
 from services.reproduce import musashi_simulation as simulation
 from services.reproduce.musashi_motion import TENSION, record
-from services.reproduce.runs import Run
+from services.reproduce.runs import MODEL, Run, between
 from services.show import Tell
 
 LIVED, NORMAL, FRESH, CUT = 600.0, 240.0, 120.0, 30.0
@@ -71,13 +72,17 @@ class Outcome:
     forced: Mapping[str, Mapping[str, np.ndarray]]
 
 
+def collected(run: Run, tell: Tell) -> Dataset:
+    """What the model is trained on: random states of the designer's model."""
+    tell(0.0, "drawing states of the geometric model")
+    return run.dataset("geometric", lambda: model.geometric_data(run.robot, run.seed))
+
+
 def run_seed(run: Run, tell: Tell) -> Outcome:
     """Train, move the actual arm, learn from it and use what was learned."""
     robot, seed = run.robot, run.seed
-    tell(0.0, "training on the geometric model")
-    data = run.dataset("geometric", lambda: model.geometric_data(robot, seed))
-    structure = model.determine(robot, data, seed)
-    before = run.schema(BEFORE, lambda: model.train(robot, data, structure.masks, seed))
+    data = collected(run, tell)
+    before = run.schema(MODEL, lambda: train(robot, data, seed, between(tell, 0.0, 0.2)).schema)
     tell(0.2, "moving the actual arm")
     lived = _recorded(run, "lived", 100, LIVED)
     tell(0.4, "learning from it")
@@ -98,7 +103,7 @@ def run_seed(run: Run, tell: Tell) -> Outcome:
 
     return Outcome(
         seed=seed,
-        structure=structure,
+        structure=model.structure_of(robot, before),
         time=learned.time,
         learning=learned.errors,
         unchanged=model.recorded_errors(before, lived),
