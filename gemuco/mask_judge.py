@@ -121,6 +121,9 @@ class Judge:
         self._draws = [RowDraw(others[:, :, self.outputs].sum(axis=2), seed) for others in self._others]
         self.errors = [split.rows(draw.order) for split, draw in zip(self.errors, self._draws, strict=True)]
         self._others = [others[:, draw.order] for others, draw in zip(self._others, self._draws, strict=True)]
+        least = min(len(split.x) for split in self.errors)
+        self._splits = self._lay_splits()
+        self._heats = self._lay_heats([count for count in HEATS if 4 * count <= 3 * least])
 
     def is_judged(self, masks: np.ndarray) -> np.ndarray:
         """Whether a mask leaves any output to infer, shape (n,): the others are not judged (paper, II-E.3)."""
@@ -139,14 +142,12 @@ class Judge:
         A race is over for what a heat on a few rows (`RowDraw`) puts surely on one side of the threshold; the others
         run the next heat, on more rows with those that they have, and at last on all.
         """
-        least = min(len(split.x) for split in self.errors)
         # CUDA has measured them all before a race is over.
-        rows = [count for count in HEATS if 4 * count <= 3 * least] if devices.best() is None else []
-        if not rows or not len(masks):
+        if not len(self._heats.rows) or not len(masks) or devices.best() is not None:
             return self.of(masks)
         total = np.zeros((len(masks), len(self.errors), self.errors[0].x.shape[1]))
         squared, done = np.empty(masks.shape), np.zeros(len(masks), int)
-        self._run(self._heats(rows), masks, squared, total, done)
+        self._run(self._heats, masks, squared, total, done)
         whole = done < 0
         squared[whole] = self._of_sums(masks[whole], total[whole])
         return Judged(masks, self._of_outputs(masks, squared), squared, ~whole, total, done)
@@ -157,7 +158,7 @@ class Judge:
         if not len(chosen):
             return
         masks, squared, total = judged.masks[chosen], judged.squared[chosen], judged.total[chosen]
-        self._run(self._heats([]), masks, squared, total, judged.done[chosen])
+        self._run(self._lay_heats([]), masks, squared, total, judged.done[chosen])
         judged.squared[chosen] = squared = self._of_sums(masks, total)
         judged.L_m[chosen], judged.is_rough[chosen] = self._of_outputs(masks, squared), False
 
@@ -165,7 +166,7 @@ class Judge:
         """`race` on all cores; what is found goes to arrays with a line for each mask."""
         amounts = np.max([split.amounts for split in self.errors], axis=0)
         rule = Rule(self.outputs, self.thresholds.over == "masked", amounts, self._limit, SURE, BAD, TOLD)
-        run, lines = partial(race, self._splits(), heats, rule), (*self.errors[0].gates(masks), *found)
+        run, lines = partial(race, self._splits, heats, rule), (*self.errors[0].gates(masks), *found)
         parts = cores.parts(len(masks), TOGETHER)
         cores.run([partial(run, *(line[part] for line in lines)) for part in parts])
 
@@ -173,7 +174,7 @@ class Judge:
         """Squared errors of every signal, shape (n, signals), from sums over all rows, shape (n, splits, size)."""
         return np.mean([split.of_sums(masks, total[:, index]) for index, split in enumerate(self.errors)], axis=0)
 
-    def _splits(self) -> Splits:
+    def _lay_splits(self) -> Splits:
         """Networks and rows as a race takes them."""
         packed, given = [pack(split.chain) for split in self.errors], [split.given for split in self.errors]
         return Splits(
@@ -185,7 +186,7 @@ class Judge:
             np.repeat(np.arange(len(self.names)), self.errors[0].sizes),
         )
 
-    def _heats(self, rows: list[int]) -> Heats:
+    def _lay_heats(self, rows: list[int]) -> Heats:
         """What the first so many rows of every split tell."""
         heats = [[draw.heat(count) for draw in self._draws] for count in rows]
         k = max((heat.known.shape[1] for line in heats for heat in line), default=0)
