@@ -42,7 +42,9 @@ def _elu(x: np.ndarray) -> None:
 
 
 def _softplus(x: np.ndarray) -> None:
-    np.logaddexp(x, x.dtype.type(0.0), out=x)
+    below = np.log1p(np.exp(-np.abs(x)))  # logaddexp warns of every missing sample
+    np.maximum(x, 0.0, out=x)
+    x += below
 
 
 ACTIVATIONS = {

@@ -33,6 +33,14 @@ def test_forward_agrees_with_torch(network, x):
     np.testing.assert_allclose(run(weights.decoder, run(weights.encoder, x[0])), wanted[0], rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.filterwarnings("error")
+def test_what_was_not_measured_stays_unknown_without_a_warning(network, x):
+    x[1, 2] = np.nan
+    found = run(network.weights().whole, x)
+    assert np.isnan(found[1]).all()
+    assert np.isfinite(np.delete(found, 1, axis=0)).all()
+
+
 def test_backward_agrees_with_torch(network, x, seed):
     weights = network.weights()
     given = torch.from_numpy(x).requires_grad_()
