@@ -42,7 +42,7 @@ def structure_of(robot: RobotConfig, schema: BodySchema) -> Structure:
         masks=schema.masks,
         L_i=schema.manifest["L_i"],
         L_m={mask: L_m[label(mask, names)] for mask in all_masks(names) if label(mask, names) in L_m},
-        thresholds=Thresholds(wanted.threshold_out, wanted.threshold_in),
+        thresholds=Thresholds(wanted.threshold_out, wanted.threshold_in, wanted.measure, wanted.over),
     )
 
 

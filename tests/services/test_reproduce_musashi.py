@@ -7,6 +7,7 @@ import pytest
 
 from gemuco.signals import Layout
 from hal.config import load_robot
+from services.learning.trainer import train
 from services.reproduce import musashi_anomaly as anomaly
 from services.reproduce import musashi_model as model
 from services.reproduce.musashi_control import OURS, WEIGHTS, ways
@@ -61,6 +62,12 @@ def test_geometric_data_are_random_states_in_episodes(monkeypatch):
     tension = data.layout.split(data.rows())[TENSION]
     assert 10.0 <= tension.min() < 15.0
     assert 175.0 < tension.max() <= 180.0
+
+
+def test_what_training_found_is_read_from_the_model_it_made(monkeypatch):
+    monkeypatch.setattr(model, "SAMPLES", 1000)
+    trained = train(ROBOT, model.geometric_data(ROBOT, 0), 0, lambda done, text: None)
+    assert model.structure_of(ROBOT, trained.schema) == trained.structure
 
 
 def test_paper_and_robot_file_differ_in_their_weights_alone():
