@@ -62,11 +62,12 @@ def best_point(raw):
 
 
 @jit
-def linearise(predictor, row, mean, pairs, near, passes, error, slope, before, scale):
+def linearise(predictor, row, mean, pairs, near, rules, error, slope, before, scale):
     """Errors and derivatives of every belief where the sample moves it to, as if they had been taken at `mean`.
 
     A belief takes the errors and derivatives of another one's point if that is near enough. The last belief knows
-    nothing: it is linearised first where the sample fits best.
+    nothing: it is linearised first where the sample fits best. Known conditions stay where they are, and a straight
+    line is enough for what little their p is in doubt.
 
     Args:
         predictor: The network.
@@ -74,7 +75,7 @@ def linearise(predictor, row, mean, pairs, near, passes, error, slope, before, s
         mean: p of every belief, shape (beliefs, k).
         pairs: `through`, `tails`, `index` and `whiten` of `innovations`.
         near: A p that differs from a point by no more than this, shape (k,), is linearised there.
-        passes: How often at most.
+        rules: Numbers.
         error: Is filled in, shape (beliefs, n).
         slope: Is filled in, shape (beliefs, n, k).
         before: Inverse covariance of every belief, shape (beliefs, k, k).
@@ -82,11 +83,11 @@ def linearise(predictor, row, mean, pairs, near, passes, error, slope, before, s
     """
     count, size = mean.shape
     width = error.shape[1]
-    points, raw = np.empty((count * passes, size)), np.empty((count * passes, width))
-    moved, done = np.empty((count * passes, width, size)), 0
+    points, raw = np.empty((count * rules.passes, size)), np.empty((count * rules.passes, width))
+    moved, done = np.empty((count * rules.passes, width, size)), 0
     at, far, chosen = mean.copy(), np.ones(count, np.bool_), np.zeros(count, np.int64)
     information, pull = np.empty((size, size)), np.empty(size)
-    for turn in range(passes):
+    for turn in range(rules.passes):
         fresh = done
         for h in range(count):
             if far[h]:
@@ -108,11 +109,13 @@ def linearise(predictor, row, mean, pairs, near, passes, error, slope, before, s
                 for j in range(size):
                     slope[h, n, j] = moved[point, n, j]
                     error[h, n] -= slope[h, n, j] * (mean[h, j] - points[point, j])
+            far[h] = False
+            if h < rules.known:
+                continue
             gained(slope[h], error[h], information, pull)
             add(before[h], information, 1.0 / scale, information)
             cholesky(information)
             substitute(information, pull)
-            far[h] = False
             for j in range(size):
                 at[h, j] = mean[h, j] + pull[j] / scale
                 far[h] |= abs(at[h, j] - points[point, j]) > near[j]
@@ -206,6 +209,6 @@ def see(predictor, row, beliefs, count, prior, pairs, log_volume, near, scale, r
     before, volumes = np.empty((count, size, size)), np.empty(count)
     for h in range(count):
         volumes[h] = invert(covariance[h], before[h])
-    linearise(predictor, row, mean, pairs, near, rules.passes, error, slope, before, scale)
+    linearise(predictor, row, mean, pairs, near, rules, error, slope, before, scale)
     odd = weigh(mean, covariance, weight, error, slope, before, volumes, log_volume, scale, rules)
     return odd, thin(beliefs, count, len(beliefs.age) - 1, rules.known)

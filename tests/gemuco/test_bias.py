@@ -242,6 +242,7 @@ def plain_see(kalman, schema, row):
         gained, pull = np.einsum("hnj,hnk->hjk", slope, slope), np.einsum("hnk,hn->hk", slope, error)
         step = np.linalg.solve(before + gained / scale, pull[..., None] / scale)[..., 0]
         at = means + step
+        at[:known] = means[:known]
     odd = np.maximum((error**2).sum(axis=1) / scale - (pull * step).sum(axis=1) / scale, 0.0)
     volume = pairs.log_volume + count * np.log(scale) + np.linalg.slogdet(covariances)[1]
     volume = volume + np.linalg.slogdet(before + gained / scale)[1]
