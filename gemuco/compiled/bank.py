@@ -66,8 +66,8 @@ def linearise(predictor, row, mean, pairs, near, rules, error, slope, before, sc
     """Errors and derivatives of every belief where the sample moves it to, as if they had been taken at `mean`.
 
     A belief takes the errors and derivatives of another one's point if that is near enough. The last belief knows
-    nothing: it is linearised first where the sample fits best. Known conditions stay where they are, and a straight
-    line is enough for what little their p is in doubt.
+    nothing: it is linearised first at that point of the others where the sample fits best. Known conditions stay where
+    they are, and a straight line is enough for what little their p is in doubt.
 
     Args:
         predictor: The network.
@@ -89,7 +89,7 @@ def linearise(predictor, row, mean, pairs, near, rules, error, slope, before, sc
     information, pull = np.empty((size, size)), np.empty(size)
     for turn in range(rules.passes):
         fresh = done
-        for h in range(count):
+        for h in range(count - (turn == 0)):
             if far[h]:
                 chosen[h] = point_near(points[:done], at[h], near)
                 if chosen[h] < 0:

@@ -236,7 +236,7 @@ def plain_see(kalman, schema, row):
     for turn in range(bias.PASSES):
         error, slope = kalman._innovations.of(schema, pairs, rows, at.astype(np.float32))
         if turn == 0:
-            nearest = int(np.argmin((error**2).sum(axis=1)))
+            nearest = int(np.argmin((error[:-1] ** 2).sum(axis=1)))
             at[-1], error[-1], slope[-1] = at[nearest], error[nearest], slope[nearest]
         error = error - np.einsum("hnk,hk->hn", slope, means - at)
         gained, pull = np.einsum("hnj,hnk->hjk", slope, slope), np.einsum("hnk,hn->hk", slope, error)
