@@ -90,7 +90,7 @@ def recognition() -> Iterator[Row]:
     for _ in range(20):  # until the bank of filters is full
         seen.see(schema, random.standard_normal(schema.layout.size))
     what, against = "p update per sample, 3 masks, hidden 200", f"torch eager, {STEPS} gradient steps"
-    note = f"a bank of {seen._count} Kalman filters, two linearisations each"
+    note = f"a bank of {seen._count} beliefs, each linearised at most twice"
     yield faster(what, against, lambda: seen.see(schema, sample), torch_recognition(schema, sample, False), 20.0, note)
     yield faster(
         "the same p update",

@@ -38,7 +38,7 @@ FAMILIAR = 0.9
 FAINTEST = -60.0
 """Logarithm of the smallest weight against the largest, so that no condition becomes impossible."""
 PASSES = 2
-"""How often a sample is linearised, but for known conditions: their p is given, and `NARROW` is hardly bent."""
+"""How often a sample is linearised at most; for known conditions once, a straight line is enough over `NARROW`."""
 NEAR = 0.02
 """Beliefs this near to each other [share of the prior's standard deviation] are linearised at one p, and one that the
 sample moves less than this is not linearised again."""

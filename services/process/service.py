@@ -25,9 +25,10 @@ M = TypeVar("M", bound=Message)
 log = logging.getLogger(__name__)
 
 STATUS_EVERY = 1.0
-STATUS_AT = 0.0472
-"""When a status is made [s], after whole seconds of the clock: at usual rates no loop of the model service begins near,
-and the HAL's turn has ended. One that met the update each second held up a twentieth of its ticks."""
+STATUS_AT, STATUS_STEP = 0.0472, 0.1
+"""A status is made so long [s] after a multiple of the step [s] on the clock: at usual rates no loop of the model
+service begins near, and the HAL's turn has ended. One that met the update each second held up a twentieth of its ticks.
+Which of the ten moments of a second it is depends on the start, so that services of a machine do not meet."""
 ANSWERED_WITHIN = 0.5
 """How long [s] a service that ends still answers what it was asked before."""
 
@@ -149,9 +150,9 @@ class Service:
 
 
 def next_status(now: float) -> float:
-    """The moment for a status that is nearest to a period from now [monotonic s]."""
+    """The moment for a status that is nearest to a period from now, both on the monotonic clock [s]."""
     wanted = now + STATUS_EVERY
-    return wanted - ((wanted - STATUS_AT + 0.5 * STATUS_EVERY) % STATUS_EVERY - 0.5 * STATUS_EVERY)
+    return wanted - ((wanted - STATUS_AT + 0.5 * STATUS_STEP) % STATUS_STEP - 0.5 * STATUS_STEP)
 
 
 @contextmanager
