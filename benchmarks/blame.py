@@ -4,7 +4,8 @@
 
 On each of several actual arms the model first learns four simulated minutes of motion, then what is normal. Then every
 muscle is cut in turn, and every encoder reads 0.3 rad too much. The first twenty samples above the threshold are judged
-one by one (`BodySchema.anomaly`) and together (`gemuco.blame`). Faults with less than three such samples are left out.
+one by one (`BodySchema.anomaly`) and together (`gemuco.anomaly.blame`). Faults with less than three such samples are
+left out.
 """
 
 import argparse
@@ -15,8 +16,8 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.actual_arms import model, record
-from gemuco.adapt import UpdateConfig, Updater
-from gemuco.blame import suspects
+from gemuco.adaption.update import UpdateConfig, Updater
+from gemuco.anomaly.blame import suspects
 from gemuco.normal import Normal, prediction_errors
 from gemuco.schema import BodySchema
 from hal.config import RobotConfig, load_robot

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from gemuco.kernels import Layer, Weights
+from gemuco.layers import Layer, Weights
 from gemuco.scaler import Scaler
 from gemuco.schema import BodySchema
 from gemuco.signals import Layout, Signal

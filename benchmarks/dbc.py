@@ -18,8 +18,8 @@ import numpy as np
 from hal.clock import SystemClock
 from hal.config import BusConfig
 from hal.drivers.can_device import CanDevice, DeviceSettings, Place
-from hal.drivers.dbc import DbcNode
-from hal.drivers.dbc_settings import DbcSettings
+from hal.drivers.dbc.sensor import DbcNode
+from hal.drivers.dbc.settings import DbcSettings
 from hal.protocols import dbc
 from hal.wire.bus import Bus
 

@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.table import Table
 from torch import nn
 
-from gemuco.kernels import Layer, Weights, run
+from gemuco.layers import Layer, Weights, run
 from gemuco.scaler import Scaler
 from gemuco.schema import BodySchema
 from gemuco.signals import Layout, Signal

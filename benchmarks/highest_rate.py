@@ -28,9 +28,9 @@ from benchmarks.bodies import MASKS, body, modules
 from benchmarks.solvers import TERMS, Ours, torch_descent, torch_loss
 from benchmarks.table import Row, faster
 from benchmarks.updates import torch_step
-from gemuco.adapt import UpdateConfig, Updater
-from gemuco.descent import NewtonConfig
+from gemuco.adaption.update import UpdateConfig, Updater
 from gemuco.schema import BodySchema
+from gemuco.search.descent import NewtonConfig
 from gemuco.warm import warm
 from hal.by_signal import Numbers, Truths
 from hal.clock import SystemClock

@@ -15,8 +15,8 @@ from rich.console import Console
 from rich.table import Table
 
 from gemuco.dataset import Dataset, Episode
+from gemuco.learning.train import fine_tune, fit
 from gemuco.schema import BodySchema
-from gemuco.train import fine_tune, fit
 from hal.config import load_robot
 from services.learning.collector import Wanted, collect_direct
 from services.learning.trainer import train_config

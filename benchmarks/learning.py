@@ -22,15 +22,15 @@ from torch.utils.data import DataLoader, Dataset
 from benchmarks.bodies import modules
 from benchmarks.synthetic_body import SyntheticBody
 from benchmarks.table import Row, faster, side_by_side
-from gemuco import cores
 from gemuco import dataset as episodes
-from gemuco.kernels import Chain
-from gemuco.mask_training import train_masks
+from gemuco.layers import Chain
+from gemuco.learning import cores
+from gemuco.learning.train import TrainConfig, fit
 from gemuco.masks import Mask, all_masks, bits
 from gemuco.schema import BodySchema
 from gemuco.signals import Layout, Signal
-from gemuco.structure import Judge, Structure, Thresholds, select
-from gemuco.train import TrainConfig, fit
+from gemuco.structure.determination import Judge, Structure, Thresholds, select
+from gemuco.structure.mask_training import train_masks
 
 SIZES = {
     "musashi_arm": ({"q": (5, "rad"), "f": (10, "N"), "l": (10, "m")}, (200, 30), 15, (("q", "f"), ("f", "l"))),

@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 
 from gemuco.dataset import Dataset, Episode
-from gemuco.mask_training import train_masks
+from gemuco.learning.train import fit
 from gemuco.schema import BodySchema
-from gemuco.structure import Judge, Thresholds, determine
-from gemuco.train import fit
+from gemuco.structure.determination import Judge, Thresholds, determine
+from gemuco.structure.mask_training import train_masks
 from services.learning.measured import MeasuredConfig, load_measured, read
 from services.learning.trainer import train_config
 

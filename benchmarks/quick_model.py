@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from gemuco.dataset import Dataset, Episode
-from gemuco.train import TrainConfig, fit
+from gemuco.learning.train import TrainConfig, fit
 from hal.config import RobotConfig
 from services.model import artifacts
 from services.model.living_model import layout_of

@@ -6,7 +6,7 @@ Ten signals each: made-up bodies, and the recording of the Schunk arm (folder $G
 not set; left out where it is missing) with its 18 channels in random groups. One network is trained; all masks are
 measured on all rows; then thresholds are put between two masks each, anywhere from the best tenth to the worst, and
 races are run with them, each on another draw of rows. `--sure` and `--bad` are what a verdict takes (`SURE` and `BAD`
-of `gemuco.mask_judge`), to see what they are good for.
+of `gemuco.structure.mask_judge`), to see what they are good for.
 """
 
 import argparse
@@ -16,14 +16,14 @@ import numpy as np
 
 from benchmarks.measured_data import recording
 from benchmarks.synthetic_body import SyntheticBody
-from gemuco import mask_judge
 from gemuco.dataset import Dataset, Episode
 from gemuco.errors import DatasetError
-from gemuco.mask_training import train_masks
+from gemuco.learning.train import TrainConfig
 from gemuco.masks import all_masks, bits
 from gemuco.signals import Layout, Signal
-from gemuco.structure import Judge, Thresholds
-from gemuco.train import TrainConfig
+from gemuco.structure import mask_judge
+from gemuco.structure.determination import Judge, Thresholds
+from gemuco.structure.mask_training import train_masks
 
 TRAINED = TrainConfig(hidden=(100, 50), latent=12, epochs=15, batch=500, rate=3e-3)
 SIGNALS, SAMPLES, TRIED = 10, 10_000, 12

@@ -17,13 +17,13 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from gemuco.adapt import UpdateConfig, Updater
-from gemuco.bias import Prior
+from gemuco.adaption.recognise import Prior
+from gemuco.adaption.update import UpdateConfig, Updater
 from gemuco.dataset import Dataset, Episode
+from gemuco.learning.config import TrainConfig
+from gemuco.learning.train import fit
 from gemuco.schema import BodySchema
 from gemuco.signals import Layout, Signal
-from gemuco.train import fit
-from gemuco.train_config import TrainConfig
 from hal import registry
 from hal.config import RobotConfig, load_robot
 from services.model.artifacts import robot_file

@@ -11,10 +11,10 @@ import numpy as np
 from benchmarks.bodies import body
 from benchmarks.solvers import BALANCE, PAPER, TERMS, Ours
 from benchmarks.table import timed
-from gemuco.adapt import UpdateConfig, Updater
-from gemuco.bias import Kalman
+from gemuco.adaption.recognise import Kalman
+from gemuco.adaption.update import UpdateConfig, Updater
 from gemuco.compiled.inference import infer
-from gemuco.descent import NewtonConfig
+from gemuco.search.descent import NewtonConfig
 
 HIDDEN = (50, 100, 200, 300, 400)
 SIGNALS = (3, 6, 10, 20, 30)

@@ -15,15 +15,15 @@ import torch
 
 from benchmarks.bodies import body, modules
 from benchmarks.table import Row, faster
-from gemuco.asked import Asked
 from gemuco.compiled.problem import Problem
-from gemuco.descent import Descent, DescentConfig, NewtonConfig
-from gemuco.fold import fold
-from gemuco.losses import Match, StayNear, StaySmall, Term
-from gemuco.minimise import minimise
-from gemuco.routes import InputRoute, LatentRoute
 from gemuco.schema import BodySchema
-from gemuco.torque import TorqueBalance
+from gemuco.search.asked import Asked
+from gemuco.search.descent import Descent, DescentConfig, NewtonConfig
+from gemuco.search.fold import fold
+from gemuco.search.losses import Match, StayNear, StaySmall, Term
+from gemuco.search.minimise import minimise
+from gemuco.search.routes import InputRoute, LatentRoute
+from gemuco.search.torque import TorqueBalance
 
 PAPER = DescentConfig(gamma_max=0.2, candidates=20, iterations=30)
 TARGET = {"joint_position": np.array([0.3, -0.2, 0.4, 0.1, -0.3])}

@@ -15,10 +15,10 @@ import time
 import numpy as np
 
 from benchmarks.synthetic_body import SyntheticBody
-from gemuco.mask_training import train_masks
+from gemuco.learning.train import TrainConfig
 from gemuco.masks import bits
-from gemuco.structure import Judge, Thresholds, search, select
-from gemuco.train import TrainConfig
+from gemuco.structure.determination import Judge, Thresholds, search, select
+from gemuco.structure.mask_training import train_masks
 
 CONFIG = TrainConfig(hidden=(200, 100), latent=40, activation="relu", epochs=100, batch=500, rate=3e-3)
 EXHAUSTIVE = 12

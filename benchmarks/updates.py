@@ -11,10 +11,10 @@ from torch import nn
 
 from benchmarks.bodies import MASKS, body, modules
 from benchmarks.table import Row, faster
-from gemuco.adapt import UpdateConfig, Updater
-from gemuco.bias import Kalman
+from gemuco.adaption.recognise import Kalman
+from gemuco.adaption.relearn import Relearner
+from gemuco.adaption.update import UpdateConfig, Updater
 from gemuco.compiled.inference import infer
-from gemuco.relearn import Relearner
 from gemuco.schema import BodySchema
 from services.process.realtime import freeze
 

@@ -5,11 +5,11 @@ Run `python examples/another_tool.py`; it takes a few seconds.
 
 import numpy as np
 
-from gemuco.adapt import UpdateConfig
+from gemuco.adaption.update import UpdateConfig
 from gemuco.dataset import Dataset, Episode
+from gemuco.learning.train import TrainConfig
 from gemuco.schema import BodySchema
 from gemuco.signals import Layout, Signal
-from gemuco.train import TrainConfig
 
 
 def body(q: np.ndarray, stick: float) -> dict[str, np.ndarray]:

@@ -6,9 +6,9 @@ python examples/lost_sensor.py
 import numpy as np
 
 from gemuco.dataset import Dataset, Episode
+from gemuco.learning.train import TrainConfig, fit
 from gemuco.signals import Layout, Signal
-from gemuco.structure import Thresholds, determine
-from gemuco.train import TrainConfig, fit
+from gemuco.structure.determination import Thresholds, determine
 
 ANCHORS = np.array([[-0.3, 0.0], [0.3, 0.0], [0.0, 0.4]])
 """Where the cables leave the frame [m]."""

@@ -13,9 +13,9 @@ from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
 from gemuco.activation import LINEAR, check
-from gemuco.anomaly import Normal
+from gemuco.anomaly.score import Normal
 from gemuco.errors import CheckpointError, SchemaError
-from gemuco.kernels import Chain, Layer, Weights
+from gemuco.layers import Chain, Layer, Weights
 from gemuco.masks import label
 from gemuco.scaler import Scaler
 from gemuco.signals import Layout, Signal

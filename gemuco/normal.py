@@ -8,7 +8,7 @@ import numpy as np
 
 from gemuco.compiled import score
 from gemuco.errors import NotEnoughData
-from gemuco.estimate import mask_error
+from gemuco.estimation import mask_error
 from gemuco.masks import Mask
 
 if TYPE_CHECKING:

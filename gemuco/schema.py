@@ -11,24 +11,25 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gemuco import anomaly, checkpoint
-from gemuco.anomaly import AnomalyScore, Normal
+from gemuco import checkpoint
+from gemuco.anomaly import score as anomaly
+from gemuco.anomaly.score import AnomalyScore, Normal
+from gemuco.derived import Ready
 from gemuco.errors import NotFinite, UnknownCondition, UnknownSignal, WrongSize
-from gemuco.estimate import Estimate, estimate, mask_error
-from gemuco.kernels import Chain, Weights, run
+from gemuco.estimation import Estimate, estimate, mask_error
+from gemuco.layers import Chain, Weights, run
 from gemuco.masks import Mask, bits, label
-from gemuco.ready import Ready
 from gemuco.scaler import CLIP, Scaler
 from gemuco.signals import Layout
 
 if TYPE_CHECKING:
-    from gemuco.adapt import UpdateConfig
-    from gemuco.control import Solution
+    from gemuco.adaption.update import UpdateConfig
+    from gemuco.controller import Solution
     from gemuco.dataset import Dataset
-    from gemuco.losses import Hold, Term
-    from gemuco.simulate import Simulated
-    from gemuco.structure import Structure, Thresholds
-    from gemuco.train import TrainConfig
+    from gemuco.learning.train import TrainConfig
+    from gemuco.search.losses import Hold, Term
+    from gemuco.simulation import Simulated
+    from gemuco.structure.determination import Structure, Thresholds
 
 ErrorTable = Mapping[tuple[str, Mask], np.ndarray]
 """(method, signals it was inferred from) -> expected error of every x_out element [unit], shape (out_size,); of every
@@ -196,7 +197,7 @@ class BodySchema:
             terms: What is asked; to match every target if not given.
             options: Of `Controller`: route, mask, search, limits.
         """
-        from gemuco.control import Controller
+        from gemuco.controller import Controller
 
         return Controller(self, terms, command, **options).solve(target, now)
 
@@ -220,7 +221,7 @@ class BodySchema:
             now: Signal -> value [its unit] of the state to begin from.
             options: Of `Simulator`: route, mask, search, limits.
         """
-        from gemuco.simulate import Simulator
+        from gemuco.simulation import Simulator
 
         return list(Simulator(self, terms, command, **options).run(commands, given, now))
 
@@ -229,9 +230,9 @@ class BodySchema:
 
         Args:
             samples: Signal -> value [its unit], shape (n,), oldest first.
-            config: How; see `gemuco.adapt`.
+            config: How; see `gemuco.adaption.update`.
         """
-        from gemuco.adapt import UpdateConfig, Updater
+        from gemuco.adaption.update import UpdateConfig, Updater
 
         updater = Updater(self, config or UpdateConfig())
         for values in samples:
@@ -244,7 +245,7 @@ class BodySchema:
         cls, dataset: "Dataset", config: "TrainConfig", thresholds: "Thresholds | None" = None
     ) -> "Structure":
         """Which signals can be inferred, and from which masks (paper, II-E); imports torch."""
-        from gemuco.structure import determine
+        from gemuco.structure.determination import determine
 
         return determine(dataset, config, thresholds)
 
@@ -256,7 +257,7 @@ class BodySchema:
         masks: Iterable[Iterable[str]] | None = None,
         x_out: Iterable[str] | None = None,
     ) -> "BodySchema":
-        """Learn a body from data (paper, II-D); imports torch. `gemuco.train.fit` also tells how training went.
+        """Learn a body from data (paper, II-D); imports torch. `gemuco.learning.train.fit` also returns the history.
 
         Args:
             dataset: Episodes of one body.
@@ -264,7 +265,7 @@ class BodySchema:
             masks: The feasible masks; determined from the data if not given, and x_out with them.
             x_out: What to infer; every signal if masks are given and this is not.
         """
-        from gemuco.train import fit
+        from gemuco.learning.train import fit
 
         if masks is None:
             structure = cls.determine(dataset, config)

@@ -12,19 +12,19 @@ from itertools import chain, pairwise
 
 import numpy as np
 
-from gemuco.adapt import UpdateConfig
+from gemuco.adaption.relearn import mean_error
+from gemuco.adaption.update import UpdateConfig
 from gemuco.compiled.jit import FOLDER, let_compiler_go
 from gemuco.compiled.usable import usable
-from gemuco.control import Controller
-from gemuco.descent import DescentConfig
-from gemuco.kernels import Layer, Weights
-from gemuco.losses import Match
+from gemuco.controller import Controller
+from gemuco.layers import Layer, Weights
 from gemuco.normal import Normal
-from gemuco.relearn import mean_error
 from gemuco.scaler import Scaler
 from gemuco.schema import BodySchema
+from gemuco.search.descent import DescentConfig
+from gemuco.search.losses import Match
+from gemuco.search.torque import TorqueBalance
 from gemuco.signals import Layout, Signal
-from gemuco.torque import TorqueBalance
 
 SIGNALS = {"position": (1, "rad"), "tension": (2, "N"), "length": (2, "m"), "hidden": (1, "m")}
 MASKS = (frozenset({"position", "tension"}), frozenset({"tension", "length", "hidden"}))
@@ -90,8 +90,8 @@ def running(schema: BodySchema) -> Iterator[str]:
 
 def learning(schema: BodySchema) -> Iterator[str]:
     """Use it as training and the paper's experiments do."""
-    from gemuco.mask_errors import MaskErrors
-    from gemuco.mask_judge import Judge, Thresholds
+    from gemuco.structure.mask_errors import MaskErrors
+    from gemuco.structure.mask_judge import Judge, Thresholds
 
     yield "the paper's descent"
     search = DescentConfig(iterations=2)

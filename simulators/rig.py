@@ -12,10 +12,10 @@ import numpy as np
 from hal.config import BusConfig, RobotConfig
 from simulators.faults import TOOL_CHANGED
 from simulators.hub import HubServer
+from simulators.nodes.canopen.segment import Segment
+from simulators.nodes.canopen.spec import NodeSpec
 from simulators.nodes.node import SimulatedDrive, SimulatedNode
 from simulators.nodes.plant import Plant, Snapshot
-from simulators.nodes.segment import Segment
-from simulators.nodes.spec import NodeSpec
 from simulators.world import World
 
 _log = logging.getLogger(__name__)

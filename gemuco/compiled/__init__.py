@@ -1,1 +1,1 @@
-"""What runs in every tick, compiled: no interpreter, no GIL, no torch. `gemuco.kernels` is the same in plain numpy."""
+"""What runs in every tick, compiled: no interpreter, no GIL, no torch. `gemuco.layers` is the same in plain numpy."""

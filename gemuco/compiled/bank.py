@@ -1,4 +1,4 @@
-"""One sample for a bank of beliefs about p; see `gemuco.bias.Kalman`, which says what it means."""
+"""One sample for a bank of beliefs about p; see `gemuco.adaption.recognise.Kalman`, which says what it means."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""The beliefs about p themselves, apart from samples; see `gemuco.bias.Kalman`, which says what they mean."""
+"""The beliefs about p, apart from samples; `gemuco.adaption.recognise.Kalman` says what they mean."""
 
 from typing import NamedTuple
 
@@ -24,7 +24,7 @@ class Beliefs(NamedTuple):
 
 
 class Rules(NamedTuple):
-    """Numbers that do not change; see the constants of `gemuco.bias` for what they mean.
+    """Numbers that do not change; see the constants of `gemuco.adaption.recognise` for what they mean.
 
     Attributes:
         known: How many of the beliefs are known conditions.

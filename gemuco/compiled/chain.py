@@ -1,4 +1,4 @@
-"""A chain of layers as compiled code takes it, and its passes; `gemuco.kernels` has the same in numpy, and says more.
+"""A chain of layers as compiled code takes it, and its passes; `gemuco.layers` has the same in numpy, and says more.
 
 Values of all layers lie one behind the other in one array, so that a pass allocates nothing per layer. Loops are
 written out and products go through two functions: the compiler takes seconds for every array expression.
@@ -11,7 +11,7 @@ import numpy as np
 from gemuco.compiled.bend import CODES, bend, bends, slopes
 from gemuco.compiled.blas import times, times_turned
 from gemuco.compiled.jit import jit
-from gemuco.kernels import Chain
+from gemuco.layers import Chain
 
 
 class Packed(NamedTuple):

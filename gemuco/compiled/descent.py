@@ -1,4 +1,4 @@
-"""The paper's descent (II-G) in one call: many step sizes at once; see `gemuco.descent`, which says more."""
+"""The paper's descent (II-G) in one call: many step sizes at once; see `gemuco.search.descent`, which says more."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Errors of everything that was predicted without being told, and how p moves them; see `gemuco.innovation`."""
+"""Errors of everything that was predicted from other signals, and how p moves them (`gemuco.adaption.innovation`)."""
 
 import numpy as np
 

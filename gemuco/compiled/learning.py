@@ -1,4 +1,4 @@
-"""One gradient step on W and p (paper, usages c and d); see `gemuco.relearn` and `gemuco.optimiser`."""
+"""One gradient step on W and p (paper, usages c and d); see `gemuco.adaption.relearn` and `gemuco.optimiser`."""
 
 import numpy as np
 

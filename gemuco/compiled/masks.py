@@ -1,4 +1,4 @@
-"""One network under many masks: its squared errors on the same rows; see `gemuco.mask_errors`.
+"""One network under many masks: its squared errors on the same rows; see `gemuco.structure.mask_errors`.
 
 What a mask keeps back is left out of the rows and of the first layer's matrix, and its bits are added to the offset.
 Rows go in blocks whose values stay in the second-level cache.

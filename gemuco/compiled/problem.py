@@ -20,7 +20,7 @@ TINY = 1e-9
 
 
 class Balance(NamedTuple):
-    """The torque balance of muscles (`gemuco.torque`); nothing where `weight` is 0.
+    """The torque balance of muscles (`gemuco.search.torque`); nothing where `weight` is 0.
 
     Attributes:
         chain: From posture and tension, one behind the other, to muscle length.

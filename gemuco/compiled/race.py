@@ -1,6 +1,6 @@
 """A race of masks: each is measured on more and more rows until it is surely on one side of the threshold.
 
-Errors are those of several splits of the data, each with a network of its own, in the mean; see `gemuco.mask_judge`.
+Errors are means over several splits of the data, each with its own network; see `gemuco.structure.mask_judge`.
 """
 
 import math
@@ -38,8 +38,8 @@ class Heats(NamedTuple):
 
     Attributes:
         rows: How many rows of each split a heat has, shape (heats,).
-        tell: What these rows tell, `gemuco.row_draw.Heat` of every split, shape (heats, splits, rows, 3 + 2 k): weight,
-            doubt, hidden, and k times known and project. What there is less of is filled up with zeros.
+        tell: What these rows tell, `gemuco.structure.row_draw.Heat` of every split, shape (heats, splits, rows, 3 + 2 k):
+            weight, doubt, hidden, and k times known and project. What there is less of is filled up with zeros.
     """
 
     rows: np.ndarray

@@ -10,8 +10,8 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field, model_validator
 
 from hal.drivers.can_device import Place
-from hal.drivers.dbc_servo import DbcServo
-from hal.drivers.dbc_settings import ServoSettings
+from hal.drivers.dbc.servo import DbcServo
+from hal.drivers.dbc.settings import ServoSettings
 from hal.errors import ConfigError
 from hal.section import Positive
 

@@ -8,8 +8,8 @@ from hal.clock import SystemClock
 from hal.commissioning.pdos import cob_id
 from hal.config import RobotConfig
 from hal.device import Device
-from hal.drivers.canopen_node import CanopenNode, data_sheet
-from hal.drivers.dbc_sequence import Address
+from hal.drivers.canopen.node import CanopenNode, data_sheet
+from hal.drivers.dbc.sequence import Address
 from hal.finding.book import EXTENDED, Book, Explain
 from hal.fleet import build
 from hal.protocols import cia301, dbc, mit

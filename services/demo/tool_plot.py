@@ -9,7 +9,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 
-from gemuco.bias import Prior
+from gemuco.adaption.recognise import Prior
 from gemuco.schema import BodySchema
 from hal.config import RobotConfig
 from services.demo.timeline import Timeline

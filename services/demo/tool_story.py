@@ -7,7 +7,7 @@ from itertools import cycle
 
 import numpy as np
 
-from gemuco.bias import Prior
+from gemuco.adaption.recognise import Prior
 from gemuco.schema import BodySchema
 from hal.config import RobotConfig
 from services.client import Client

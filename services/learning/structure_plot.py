@@ -10,7 +10,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 
-from gemuco.structure import Structure
+from gemuco.structure.determination import Structure
 
 GOOD, BAD = "tab:green", "0.6"
 

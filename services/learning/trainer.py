@@ -12,7 +12,7 @@ from rich.table import Table
 
 from gemuco.dataset import Dataset
 from gemuco.errors import CheckpointError, DatasetError, NotWritten
-from gemuco.history import History
+from gemuco.learning.history import History
 from gemuco.masks import label
 from gemuco.schema import BodySchema
 from gemuco.writing import writing
@@ -22,8 +22,8 @@ from services.model.living_model import layout_of
 from services.model.model_config import ModelConfig, model_config
 
 if TYPE_CHECKING:
-    from gemuco.structure import Structure
-    from gemuco.train import TrainConfig, Work
+    from gemuco.learning.train import TrainConfig, Work
+    from gemuco.structure.determination import Structure
 
 Progress = Callable[[float, str], None]
 
@@ -92,7 +92,7 @@ def learn(
     Raises:
         NotEnoughData: Too few samples, or nothing can be inferred.
     """
-    from gemuco.train import together
+    from gemuco.learning.train import together
 
     return together([learning(config, dataset, seed, drafts, **facts)], rounds(config), progress)[0]
 
@@ -101,7 +101,7 @@ def train_all(
     robot: RobotConfig, datasets: Sequence[Dataset], seeds: Sequence[int], progress: Progress
 ) -> list[Trained]:
     """The models of a robot from a dataset and a seed each, trained together; see `train`."""
-    from gemuco.train import together
+    from gemuco.learning.train import together
 
     config, facts = model_config(robot), {"robot": robot.robot, "fingerprint": fingerprint(robot)}
     works = [learning(config, data, seed, None, **facts) for data, seed in zip(datasets, seeds, strict=True)]
@@ -110,8 +110,8 @@ def train_all(
 
 def learning(config: ModelConfig, dataset: Dataset, seed: int, drafts: Path | None, **facts: str) -> "Work[Trained]":
     """`learn`, for whoever has the trainings done."""
-    from gemuco.structure import Thresholds, determining
-    from gemuco.train import Job
+    from gemuco.learning.train import Job
+    from gemuco.structure.determination import Thresholds, determining
 
     started, wanted = time.monotonic(), config.structure
     first = train_config(config, config.structure.epochs, seed)
@@ -161,7 +161,7 @@ def tune(
         DatasetError: The data lack a signal of the model, or are in other units.
         NotEnoughData: Too few samples.
     """
-    from gemuco.train import fine_tune
+    from gemuco.learning.train import fine_tune
 
     started = time.monotonic()
     gentle = train_config(config, config.training.epochs, seed)
@@ -242,7 +242,7 @@ def remarks(history: History) -> list[str]:
 
 def train_config(config: ModelConfig, epochs: int, seed: int) -> "TrainConfig":
     """The robot file's way to train, for so many epochs."""
-    from gemuco.train import TrainConfig
+    from gemuco.learning.train import TrainConfig
 
     return TrainConfig(
         hidden=config.network.hidden,

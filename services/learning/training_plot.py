@@ -7,7 +7,7 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-from gemuco.history import History
+from gemuco.learning.history import History
 
 
 def plot(history: History, title: str, path: Path) -> None:

@@ -5,9 +5,9 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-from gemuco.anomaly import Judged, judged
+from gemuco.anomaly.score import Judged, judged
+from gemuco.anomaly.verdict import Verdict, judge
 from gemuco.schema import BodySchema
-from gemuco.verdict import Verdict, judge
 from hal.by_signal import Elements, Numbers
 from hal.clock import Clock
 from services.model.estimation import Freshness, in_order

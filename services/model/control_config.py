@@ -4,12 +4,12 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from gemuco.control import Controller
-from gemuco.descent import DescentConfig, NewtonConfig
-from gemuco.losses import Hold, Match, StayNear, StaySmall, Term
+from gemuco.controller import Controller
 from gemuco.schema import BodySchema
-from gemuco.simulate import Simulator
-from gemuco.torque import TorqueBalance
+from gemuco.search.descent import DescentConfig, NewtonConfig
+from gemuco.search.losses import Hold, Match, StayNear, StaySmall, Term
+from gemuco.search.torque import TorqueBalance
+from gemuco.simulation import Simulator
 from hal import registry
 from hal.config import Finite, Positive, RobotConfig, Section
 
@@ -88,7 +88,7 @@ class ControlConfig(Section):
     target: str
     """The signal that targets are given for."""
     route: Route = "auto"
-    """`auto` is the paper's rule; see `gemuco.control`."""
+    """`auto` is the paper's rule; see `gemuco.controller`."""
     mask: tuple[str, ...] | None = None
     """With route mask or input: the signals the network is given."""
     terms: tuple[TermConfig, ...] = ()

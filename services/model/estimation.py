@@ -9,7 +9,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from gemuco.compiled.usable import usable
-from gemuco.estimate import fill
+from gemuco.estimation import fill
 from gemuco.schema import BodySchema
 from hal.by_signal import Elements, Numbers, Truths
 from hal.clock import Clock

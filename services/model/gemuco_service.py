@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from msgspec.structs import replace
 
-from gemuco import adapt
-from gemuco.descent import NewtonConfig
+from gemuco.adaption import update as adapt
 from gemuco.errors import SchemaError
 from gemuco.schema import BodySchema
+from gemuco.search.descent import NewtonConfig
 from gemuco.warm import warm
 from hal.clock import SystemClock
 from hal.config import RobotConfig

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gemuco.estimate import fill
+from gemuco.estimation import fill
 from gemuco.masks import label
 from gemuco.schema import BodySchema
 from services.errors import BadArguments, NotEngaged

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from msgspec.structs import replace
 
-from gemuco.anomaly import Normal
+from gemuco.anomaly.score import Normal
 from gemuco.errors import NotEnoughData
 from gemuco.schema import BodySchema
 from hal.clock import Clock
@@ -28,7 +28,7 @@ Values = Mapping[str, np.ndarray]
 
 
 class Learner(Protocol):
-    """An updater of p and W with a window of its own (`gemuco.adapt.Updater`)."""
+    """An updater of p and W with a window of its own (`gemuco.adaption.update.Updater`)."""
 
     schema: BodySchema
 
@@ -37,7 +37,7 @@ class Learner(Protocol):
         ...
 
     def step(self) -> Any:
-        """Learn a little; the result is `gemuco.adapt.UpdateResult`."""
+        """Learn a little; the result is `gemuco.adaption.update.UpdateResult`."""
         ...
 
 

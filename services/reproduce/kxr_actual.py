@@ -7,8 +7,8 @@ from itertools import product
 import numpy as np
 
 from gemuco.dataset import Dataset, Episode
+from gemuco.learning.train import fine_tune
 from gemuco.schema import BodySchema
-from gemuco.train import fine_tune
 from hal.config import RobotConfig
 from services.learning.trainer import train_config
 from services.model.living_model import layout_of

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gemuco.adapt import UpdateConfig, Updater
-from gemuco.descent import DescentConfig
+from gemuco.adaption.update import UpdateConfig, Updater
 from gemuco.schema import BodySchema
+from gemuco.search.descent import DescentConfig
 from hal.config import RobotConfig
 from services.model.control_config import ControlConfig, controller_of
 from services.reproduce.kxr_robot import CENTER, TIP, Standing

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from gemuco.anomaly import Normal
+from gemuco.anomaly.score import Normal
 from gemuco.dataset import Dataset, Episode
 from gemuco.schema import BodySchema
 from services.reproduce.musashi_model import arrays

@@ -4,11 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gemuco.adapt import UpdateConfig, Updater
+from gemuco.adaption.update import UpdateConfig, Updater
 from gemuco.dataset import Dataset, Episode
 from gemuco.masks import all_masks, label
 from gemuco.schema import BodySchema
-from gemuco.structure import Structure, Thresholds
+from gemuco.structure.determination import Structure, Thresholds
 from hal import registry
 from hal.config import RobotConfig
 from services.model.living_model import layout_of

@@ -6,7 +6,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from gemuco.control import Controller
+from gemuco.controller import Controller
 from gemuco.dataset import Dataset, Episode
 from gemuco.signals import Layout, Signal
 from hal import registry

@@ -7,7 +7,7 @@ import numpy as np
 
 from gemuco.dataset import Dataset
 from gemuco.schema import BodySchema
-from gemuco.structure import Structure
+from gemuco.structure.determination import Structure
 from services.learning.trainer import train
 from services.reproduce import musashi_anomaly as anomaly
 from services.reproduce import musashi_control as control

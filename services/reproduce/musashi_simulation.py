@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from gemuco.dataset import Dataset
-from gemuco.losses import Hold, Match, StaySmall, Term
 from gemuco.schema import BodySchema
-from gemuco.simulate import Simulator
-from gemuco.torque import TorqueBalance
+from gemuco.search.losses import Hold, Match, StaySmall, Term
+from gemuco.search.torque import TorqueBalance
+from gemuco.simulation import Simulator
 from hal import registry
 from hal.config import RobotConfig
 from services.model.control_config import controller_of, terms_of

@@ -5,10 +5,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gemuco.adapt import UpdateConfig, Updater
+from gemuco.adaption.update import UpdateConfig, Updater
 from gemuco.dataset import Dataset, Episode
+from gemuco.learning.train import fine_tune
 from gemuco.schema import BodySchema
-from gemuco.train import fine_tune
 from hal.config import RobotConfig
 from services.hardware.stand_in import simulator_of
 from services.learning.collector import Wanted, collect_direct

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gemuco.adapt import UpdateConfig, Updater
-from gemuco.control import Controller
-from gemuco.descent import DescentConfig
-from gemuco.losses import Match, StayNear
+from gemuco.adaption.update import UpdateConfig, Updater
+from gemuco.controller import Controller
 from gemuco.schema import BodySchema
+from gemuco.search.descent import DescentConfig
+from gemuco.search.losses import Match, StayNear
 from services.reproduce.pr2_arm import JOINTS, TIP, Arm, Geometry
 
 SEARCH = DescentConfig(gamma_max=0.5, candidates=20, iterations=60)

@@ -19,9 +19,9 @@ from pathlib import Path
 from queue import Empty
 from typing import Any, TypeVar
 
-from gemuco import cores, devices
 from gemuco.dataset import Dataset
 from gemuco.errors import CheckpointError, DatasetError
+from gemuco.learning import cores, devices
 from gemuco.schema import BodySchema
 from hal.config import RobotConfig
 from services.errors import ServiceError

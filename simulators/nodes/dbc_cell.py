@@ -5,9 +5,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
+from simulators.nodes.canopen.spec import NodeSpec
 from simulators.nodes.node import Frame, Handler
 from simulators.nodes.plant import Plant
-from simulators.nodes.spec import NodeSpec
 
 GOOD, OVERLOAD, UNDERLOAD, SENSOR_BROKEN = 0, 1, 2, 4
 TARE, FORGET_TARE = 1, 2

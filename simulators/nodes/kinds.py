@@ -2,16 +2,16 @@
 
 from collections.abc import Callable
 
-from simulators.nodes.analog_input import AnalogConstants, AnalogInput
+from simulators.nodes.canopen.analog_input import AnalogConstants, AnalogInput
+from simulators.nodes.canopen.encoder import JointEncoder
+from simulators.nodes.canopen.load_cell import LoadCell
+from simulators.nodes.canopen.spec import CellConstants, DriveConstants, EncoderConstants, NodeSpec
+from simulators.nodes.cia402.drive import ServoDrive
 from simulators.nodes.dbc_cell import DbcCell, DbcCellConstants
-from simulators.nodes.drive import ServoDrive
-from simulators.nodes.encoder import JointEncoder
-from simulators.nodes.load_cell import LoadCell
 from simulators.nodes.mit_drive import MitConstants, MitDriveNode
 from simulators.nodes.node import Frame, SimulatedNode
 from simulators.nodes.odrive import OdriveAxis, OdriveConstants
 from simulators.nodes.plant import Plant
-from simulators.nodes.spec import CellConstants, DriveConstants, EncoderConstants, NodeSpec
 
 KINDS: dict[type, Callable[[NodeSpec, Plant, list[Frame]], SimulatedNode]] = {
     DriveConstants: ServoDrive,

@@ -11,10 +11,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
+from simulators.nodes.canopen.spec import NodeSpec
 from simulators.nodes.node import Frame, Handler
 from simulators.nodes.plant import Plant
 from simulators.nodes.rotor import Rotor
-from simulators.nodes.spec import NodeSpec
 
 REGISTER_ID = 0x7FF
 _MASTER_ID, _OWN_ID, _TIMEOUT, _MODE, _SERIAL = 7, 8, 9, 10, 15

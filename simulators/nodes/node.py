@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from typing import Protocol, runtime_checkable
 
-from simulators.nodes.spec import NodeSpec
+from simulators.nodes.canopen.spec import NodeSpec
 
 Frame = tuple[int, bytes]
 """Identifier and data of a frame; an identifier of 29 bits has `EXTENDED` set."""

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import ClassVar
 
+from simulators.nodes.canopen.spec import NodeSpec
 from simulators.nodes.node import EXTENDED, REMOTE, Frame, Handler
 from simulators.nodes.plant import Plant
 from simulators.nodes.rotor import Rotor
-from simulators.nodes.spec import NodeSpec
 
 BROADCAST = 63
 INITIALIZING, DRV_FAULT, WATCHDOG_TIMER_EXPIRED, ESTOP_REQUESTED = 0x1, 0x20, 0x100_0000, 0x200_0000

@@ -2,9 +2,9 @@ import pytest
 from muscle_arm import MuscleArm
 
 from gemuco.dataset import Dataset
+from gemuco.learning.train import TrainConfig, fit
 from gemuco.schema import BodySchema
-from gemuco.structure import Structure, Thresholds, determine
-from gemuco.train import TrainConfig, fit
+from gemuco.structure.determination import Structure, Thresholds, determine
 
 SMALL = TrainConfig(hidden=(60, 20), latent=7, epochs=60, batch=100)
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from gemuco.anomaly import Normal
+from gemuco.anomaly.score import Normal
 from gemuco.compiled.score import errors
 from gemuco.errors import NotEnoughData
 from gemuco.normal import prediction_errors

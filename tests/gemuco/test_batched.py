@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from muscle_arm import LAYOUT, MuscleArm
 
-from gemuco import cores, devices
 from gemuco.activation import ACTIVATIONS
 from gemuco.dataset import Dataset, Episode
-from gemuco.mask_training import train_masks
+from gemuco.learning import cores, devices
+from gemuco.learning.train import Job, TrainConfig, fine_tune, fit, fit_all
 from gemuco.masks import all_masks, bits
-from gemuco.structure import Judge, Thresholds, determine
-from gemuco.train import Job, TrainConfig, fine_tune, fit, fit_all
+from gemuco.structure.determination import Judge, Thresholds, determine
+from gemuco.structure.mask_training import train_masks
 
 MASKS = (frozenset({"joint_position", "muscle_tension"}), frozenset({"muscle_tension", "muscle_length"}))
 CONFIG = TrainConfig(hidden=(30, 20), latent=6, epochs=8, batch=100, bias_size=2, patience=99)
@@ -146,7 +146,7 @@ def test_errors_of_masks(bodies, monkeypatch):
     masks = np.array([bits(m, LAYOUT.names) > 0 for m in all_masks(LAYOUT.names)])
     judge = Judge(LAYOUT.names, errors, Thresholds(1.0, 0.5))
     want = judge.of(masks)
-    monkeypatch.setattr("gemuco.batched.TOGETHER", 500)  # in several goes
+    monkeypatch.setattr("gemuco.learning.batched.TOGETHER", 500)  # in several goes
     found = on("cpu", monkeypatch, lambda: judge.race(masks))
     np.testing.assert_allclose(found.L_m, want.L_m, rtol=1e-3)
     np.testing.assert_allclose(found.squared, want.squared, rtol=1e-3)

@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 from tool_arm import MASKS, ToolArm, dataset, tools
 
-from gemuco import bias
-from gemuco.adapt import UpdateConfig, Updater
-from gemuco.bias import GaussNewton, Kalman, Prior
+from gemuco.adaption import recognise as bias
+from gemuco.adaption.innovation import Innovations
+from gemuco.adaption.recognise import GaussNewton, Kalman, Prior
+from gemuco.adaption.update import UpdateConfig, Updater
 from gemuco.errors import SchemaError
-from gemuco.innovation import Innovations
-from gemuco.kernels import run
+from gemuco.layers import run
+from gemuco.learning.config import TrainConfig
+from gemuco.learning.train import fit
 from gemuco.schema import BodySchema
-from gemuco.train import fit
-from gemuco.train_config import TrainConfig
 
 TOOLS = tools((0.2, 0.35, 0.5), (0.0, 0.8), (0.8,))
 SHORT, BENT, LONG = "0.2/0.0/0.8", "0.35/0.8/0.8", "0.5/0.0/0.8"

@@ -15,15 +15,15 @@ from gemuco.activation import ACTIVATIONS
 from gemuco.compiled import descent, newton
 from gemuco.compiled.chain import pack, unpack
 from gemuco.compiled.learning import SQUARED, gradients, loss
-from gemuco.descent import DescentConfig, NewtonConfig, descend
-from gemuco.fold import Lines, around, fold
-from gemuco.kernels import Layer
-from gemuco.losses import Match, StayNear, StaySmall
-from gemuco.minimise import minimise
-from gemuco.network import Network
-from gemuco.norms import total
-from gemuco.routes import InputRoute, LatentRoute
-from gemuco.torque import TorqueBalance
+from gemuco.layers import Layer
+from gemuco.learning.network import Network
+from gemuco.search.descent import DescentConfig, NewtonConfig, descend
+from gemuco.search.fold import Lines, around, fold
+from gemuco.search.losses import Match, StayNear, StaySmall
+from gemuco.search.minimise import minimise
+from gemuco.search.norms import total
+from gemuco.search.routes import InputRoute, LatentRoute
+from gemuco.search.torque import TorqueBalance
 
 TARGET = {"joint_position": np.array([0.3, 0.9])}
 NOW = {"muscle_length": np.full(5, 0.3), "muscle_tension": np.array([10.0, np.nan, 30.0, 40.0, 50.0])}
@@ -199,10 +199,10 @@ def test_what_is_no_number_is_not_hidden():
 ALL_WAYS = """
 import numpy as np
 from gemuco import warm
-from gemuco.adapt import UpdateConfig
+from gemuco.adaption.update import UpdateConfig
 from gemuco.compiled import bank, batch, chain, descent, inference, innovation, learning, newton, score
-from gemuco.control import Controller
-from gemuco.losses import Match, StaySmall
+from gemuco.controller import Controller
+from gemuco.search.losses import Match, StaySmall
 warm.warm(is_service=True)
 used = (newton.search, inference.infer, bank.see, innovation.innovations, learning.gradients, chain.output)
 used = (*used, batch.under_masks, learning.loss, score.deviation)

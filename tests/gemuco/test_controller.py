@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from muscle_arm import HIGH, LOW, gravity
 
-from gemuco.control import Controller
-from gemuco.descent import DescentConfig
+from gemuco.controller import Controller
 from gemuco.errors import NotFinite, NotObservable, SchemaError, UnknownSignal
-from gemuco.losses import Match, StayNear, StaySmall
-from gemuco.torque import TorqueBalance
+from gemuco.search.descent import DescentConfig
+from gemuco.search.losses import Match, StayNear, StaySmall
+from gemuco.search.torque import TorqueBalance
 
 GIVEN = frozenset({"joint_position", "muscle_tension"})
 """The target is given to the network as if it were measured, and the tensions descend."""

@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from gemuco import cores
+from gemuco.learning import cores
 
 
 @pytest.fixture(params=[1, 2, 8])

@@ -3,7 +3,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from gemuco.descent import DescentConfig, descend
+from gemuco.search.descent import DescentConfig, descend
 
 
 def valley(points, slope=True):

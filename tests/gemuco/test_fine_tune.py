@@ -8,8 +8,8 @@ from muscle_arm import LAYOUT, MuscleArm
 
 from gemuco.dataset import Dataset, Episode
 from gemuco.errors import DatasetError, NotEnoughData
+from gemuco.learning.train import TrainConfig, fine_tune, fit
 from gemuco.signals import Layout
-from gemuco.train import TrainConfig, fine_tune, fit
 
 FL = frozenset({"muscle_tension", "muscle_length"})
 MASKS = [{"joint_position", "muscle_tension"}, FL]

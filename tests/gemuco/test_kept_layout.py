@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from muscle_arm import HIGH, LOW, gravity
 
-from gemuco.control import Controller
-from gemuco.descent import DescentConfig
+from gemuco.controller import Controller
 from gemuco.errors import NotFinite, NotObservable, WrongSize
-from gemuco.losses import Hold, Match, StayNear, StaySmall
 from gemuco.schema import BodySchema
-from gemuco.simulate import Simulator
-from gemuco.torque import TorqueBalance
+from gemuco.search.descent import DescentConfig
+from gemuco.search.losses import Hold, Match, StayNear, StaySmall
+from gemuco.search.torque import TorqueBalance
+from gemuco.simulation import Simulator
 
 LENGTH, TENSION, POSITION = "muscle_length", "muscle_tension", "joint_position"
 GIVEN = frozenset({POSITION, TENSION})

@@ -4,8 +4,8 @@ import torch
 
 from gemuco.activation import ACTIVATIONS
 from gemuco.errors import SchemaError
-from gemuco.kernels import Curvature, pull, push, run, trace
-from gemuco.network import MODULES, Network
+from gemuco.layers import Curvature, pull, push, run, trace
+from gemuco.learning.network import MODULES, Network
 
 INPUTS, OUTPUTS, SAMPLES = 9, 6, 4
 

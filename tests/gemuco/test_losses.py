@@ -5,8 +5,8 @@ import pytest
 from muscle_arm import gravity
 
 from gemuco.errors import NotFinite, NotObservable, UnknownSignal, WrongSize
-from gemuco.losses import Match, StayNear, StaySmall
-from gemuco.torque import MuscleModel, TorqueBalance
+from gemuco.search.losses import Match, StayNear, StaySmall
+from gemuco.search.torque import MuscleModel, TorqueBalance
 
 TARGET = {"joint_position": np.array([0.3, 0.9])}
 NOW = {"muscle_length": np.full(5, 0.3), "muscle_tension": np.array([10.0, np.nan, 30.0, 40.0, 50.0])}

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from gemuco.mask_choice import _scenes, choose
-from gemuco.mask_search import find_border
+from gemuco.structure.mask_choice import _scenes, choose
+from gemuco.structure.mask_search import find_border
 
 
 def lines(*masks: str) -> np.ndarray:

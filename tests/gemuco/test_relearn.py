@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
+from gemuco.adaption.relearn import gates, mean_error
 from gemuco.compiled.batch import under_masks
-from gemuco.relearn import gates, mean_error
 
 
 @pytest.fixture
@@ -44,6 +44,6 @@ def test_what_the_last_schema_was_asked_is_ready_in_the_next(schema, arm, monkey
     after = schema.with_weights(schema.weights)
     after.ready.prepare(schema.ready)
     for name in ("Plan", "Judgement"):
-        monkeypatch.delattr(f"gemuco.ready.{name}")  # nothing is worked out any more
+        monkeypatch.delattr(f"gemuco.derived.{name}")  # nothing is worked out any more
     assert after.estimate(row)["joint_position"].method == "mask"
     assert after.anomaly(row).score == pytest.approx(schema.anomaly(row).score)

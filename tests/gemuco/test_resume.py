@@ -11,8 +11,8 @@ import pytest
 from muscle_arm import LAYOUT, MuscleArm
 
 from gemuco.dataset import Dataset, Episode
-from gemuco.draft import Draft
-from gemuco.train import TrainConfig, fine_tune, fit
+from gemuco.learning.draft import Draft
+from gemuco.learning.train import TrainConfig, fine_tune, fit
 
 MASKS = [{"joint_position", "muscle_tension"}, {"muscle_tension", "muscle_length"}]
 CONFIG = TrainConfig(hidden=(16,), latent=5, epochs=20, batch=100, bias_size=1, patience=99)
@@ -56,7 +56,7 @@ KILLED = """
 import os, signal, sys
 sys.path.insert(0, sys.argv[1])
 from test_resume import CONFIG, MASKS, two_bodies
-from gemuco.train import fit
+from gemuco.learning.train import fit
 def tell(done, text):
     if done >= 0.6:
         os.kill(os.getpid(), signal.SIGKILL)

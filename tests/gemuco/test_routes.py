@@ -5,11 +5,11 @@ import pytest
 from tool_arm import LAYOUT, ToolArm, dataset
 
 from gemuco.dataset import Dataset, Episode
-from gemuco.descent import DescentConfig
 from gemuco.errors import NotFinite, NotObservable, SchemaError, UnknownSignal, WrongSize
-from gemuco.losses import Hold, Match, StayNear, StaySmall
+from gemuco.learning.train import TrainConfig
 from gemuco.schema import BodySchema
-from gemuco.train import TrainConfig
+from gemuco.search.descent import DescentConfig
+from gemuco.search.losses import Hold, Match, StayNear, StaySmall
 
 ARMS = {"short": ToolArm(0.2), "long": ToolArm(0.4, mass=0.6)}
 SMALL = TrainConfig(hidden=(60, 30), latent=6, bias_size=2, epochs=60, batch=100)

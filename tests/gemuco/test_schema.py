@@ -4,8 +4,8 @@ import pickle
 
 import numpy as np
 
+from gemuco.learning.train import TrainConfig
 from gemuco.schema import BodySchema
-from gemuco.train import TrainConfig
 
 LENGTH, TENSION, POSITION = "muscle_length", "muscle_tension", "joint_position"
 

@@ -5,9 +5,9 @@ import pytest
 from muscle_arm import HIGH, LOW, gravity
 
 from gemuco.errors import NotFinite, NotObservable, SchemaError, UnknownSignal, WrongSize
-from gemuco.losses import Hold, Match, StaySmall
-from gemuco.simulate import Simulator
-from gemuco.torque import TorqueBalance
+from gemuco.search.losses import Hold, Match, StaySmall
+from gemuco.search.torque import TorqueBalance
+from gemuco.simulation import Simulator
 
 LENGTH, TENSION, POSITION = "muscle_length", "muscle_tension", "joint_position"
 MASK = frozenset({POSITION, TENSION})

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gemuco.errors import SchemaError, UnknownSignal, WrongSize
-from gemuco.train import TrainConfig, fit
+from gemuco.learning.train import TrainConfig, fit
 
 FL = frozenset({"muscle_tension", "muscle_length"})
 

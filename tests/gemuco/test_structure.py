@@ -2,19 +2,19 @@ import numpy as np
 import pytest
 from muscle_arm import LAYOUT
 
-from gemuco import mask_judge
-from gemuco import structure as structures
 from gemuco.dataset import Dataset, Episode
 from gemuco.errors import NotEnoughData, SchemaError
-from gemuco.kernels import run
-from gemuco.mask_errors import MaskErrors
-from gemuco.mask_judge import BAD, HEATS, SURE, TOLD, Judged
-from gemuco.mask_training import train_masks
+from gemuco.layers import run
+from gemuco.learning.train import TrainConfig
 from gemuco.masks import all_masks, bits
-from gemuco.row_draw import Heat, RowDraw
 from gemuco.signals import Layout, Signal
-from gemuco.structure import Judge, Thresholds, determine, select
-from gemuco.train import TrainConfig
+from gemuco.structure import determination as structures
+from gemuco.structure import mask_judge
+from gemuco.structure.determination import Judge, Thresholds, determine, select
+from gemuco.structure.mask_errors import MaskErrors
+from gemuco.structure.mask_judge import BAD, HEATS, SURE, TOLD, Judged
+from gemuco.structure.mask_training import train_masks
+from gemuco.structure.row_draw import Heat, RowDraw
 
 TINY = TrainConfig(hidden=(20,), latent=5, epochs=3, batch=100)
 SHORT = TrainConfig(hidden=(40, 20), latent=6, epochs=25, batch=100)

@@ -5,7 +5,7 @@ from muscle_arm import LAYOUT
 
 from gemuco.dataset import Dataset, Episode
 from gemuco.errors import NotEnoughData, SchemaError, UnknownSignal
-from gemuco.train import TrainConfig, fit
+from gemuco.learning.train import TrainConfig, fit
 
 MASKS = [{"joint_position", "muscle_tension"}, {"muscle_tension", "muscle_length"}]
 TINY = TrainConfig(hidden=(20,), latent=5, epochs=3, batch=100)

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from muscle_arm import LAYOUT
 
-from gemuco import outliers
 from gemuco.dataset import Dataset, Episode
 from gemuco.errors import NotEnoughData, SchemaError
-from gemuco.material import Material
+from gemuco.learning import outliers
+from gemuco.learning.material import Material
+from gemuco.learning.task import Task
+from gemuco.learning.train import TrainConfig, fit
 from gemuco.scaler import Scaler
-from gemuco.task import Task
-from gemuco.train import TrainConfig, fit
 
 MASKS = [{"joint_position", "muscle_tension"}, {"muscle_tension", "muscle_length"}]
 SMALL = TrainConfig(hidden=(40, 20), latent=7, epochs=40, batch=50, rate=1e-2, patience=99)

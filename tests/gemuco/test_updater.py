@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from muscle_arm import MuscleArm
 
-from gemuco.adapt import UpdateConfig, Updater
+from gemuco.adaption.update import UpdateConfig, Updater
 from gemuco.errors import SchemaError, UnknownSignal, WrongSize
 
 FL = frozenset({"muscle_tension", "muscle_length"})

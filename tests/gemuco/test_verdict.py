@@ -2,12 +2,12 @@ import numpy as np
 import pytest
 from tool_arm import ToolArm, dataset, tools
 
-from gemuco.anomaly import Normal
-from gemuco.blame import parts, suspects
+from gemuco.anomaly.blame import parts, suspects
+from gemuco.anomaly.score import Normal
+from gemuco.anomaly.verdict import judge, window_score
+from gemuco.learning.config import TrainConfig
+from gemuco.learning.train import fit
 from gemuco.schema import BodySchema
-from gemuco.train import fit
-from gemuco.train_config import TrainConfig
-from gemuco.verdict import judge, window_score
 
 TOOLS = tools((0.2, 0.35, 0.5), (0.0, 0.8), (0.3,))
 HELD, OTHER = "0.2/0.0/0.3", "0.5/0.8/0.3"

@@ -6,7 +6,7 @@ from typing import Any
 
 from wire_bench import PERIOD
 
-from simulators.nodes.drive_states import State
+from simulators.nodes.cia402.states import State
 from simulators.wire_faults import BUS_OFF, CONTROLLER, PASSIVE, RESTARTED, WARNING, Chances
 
 BAR = 2 * PERIOD + 0.010

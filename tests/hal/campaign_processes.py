@@ -16,7 +16,7 @@ from pathlib import Path
 from wire_bench import DRIVES, STEP, TENSION_RAMP, WINDOW, WitnessWorld, wire_description, wire_hardware
 
 from hal.config import RobotConfig
-from simulators.nodes.drive_states import State
+from simulators.nodes.cia402.states import State
 from simulators.rig import Rig
 
 MASTER = Path(__file__).with_name("master.py")

@@ -7,9 +7,9 @@ import numpy as np
 from hal_bench import ROBOTS, Bench
 
 from hal.config import RobotConfig
+from simulators.nodes.canopen.spec import NodeSpec
 from simulators.nodes.dbc_cell import DbcCellConstants
 from simulators.nodes.odrive import OdriveConstants
-from simulators.nodes.spec import NodeSpec
 from simulators.robots.bench.world import BenchWorld
 
 _numbers = itertools.count()

@@ -11,11 +11,11 @@ from hal_bench import ROBOTS
 
 from hal.config import RobotConfig
 from hal.drivers.odrive import profile
-from simulators.nodes.analog_input import AnalogConstants
+from simulators.nodes.canopen.analog_input import AnalogConstants
+from simulators.nodes.canopen.spec import CellConstants, DriveConstants, EncoderConstants, NodeSpec
 from simulators.nodes.dbc_cell import DbcCellConstants
 from simulators.nodes.mit_drive import MitConstants
 from simulators.nodes.odrive import OdriveConstants
-from simulators.nodes.spec import CellConstants, DriveConstants, EncoderConstants, NodeSpec
 
 RATE = 100.0
 STALE_AFTER = 0.02

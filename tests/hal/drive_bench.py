@@ -7,7 +7,7 @@ import numpy as np
 from hal_bench import ROBOTS, Bench
 
 from hal.config import RobotConfig
-from simulators.nodes.spec import DriveConstants, NodeSpec
+from simulators.nodes.canopen.spec import DriveConstants, NodeSpec
 
 RATE = 200.0
 _numbers = itertools.count()

@@ -11,7 +11,7 @@ import numpy as np
 from hal.clock import ManualClock
 from hal.config import RobotConfig
 from hal.robot import Robot, open_robot
-from simulators.nodes.spec import CellConstants, DriveConstants, EncoderConstants, NodeSpec
+from simulators.nodes.canopen.spec import CellConstants, DriveConstants, EncoderConstants, NodeSpec
 from simulators.rig import Rig
 
 ROBOTS = Path(__file__).resolve().parents[2] / "robots"

@@ -6,8 +6,8 @@ import numpy as np
 from hal_bench import Bench
 
 from hal.config import RobotConfig
+from simulators.nodes.canopen.spec import NodeSpec
 from simulators.nodes.mit_drive import MitConstants
-from simulators.nodes.spec import NodeSpec
 
 JOINTS = ("elbow", "wrist", "finger")
 DAMIAO = {"motor": "DM4310", "stiffness": 40.0, "damping": 2.0, "ramp": 0.1}

@@ -5,7 +5,7 @@ from hal_bench import description
 
 from hal import registry
 from hal.config import RobotConfig, load_robot
-from hal.drivers.cia402 import Cia402Drive
+from hal.drivers.cia402.drive import Cia402Drive
 from hal.errors import ConfigError
 from hal.robot import open_robot
 from hal.wire import budget
@@ -40,7 +40,7 @@ def test_a_bus_that_would_carry_too_much_is_refused_with_the_arithmetic():
 
 def test_finds_drivers_by_name_and_by_module():
     assert registry.driver("cia402") is Cia402Drive
-    assert registry.driver("hal.drivers.cia402:Cia402Drive") is Cia402Drive
+    assert registry.driver("hal.drivers.cia402.drive:Cia402Drive") is Cia402Drive
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import pytest
 from hal_bench import DRIVE, Bench, description, hardware
 
 from hal.config import RobotConfig
-from simulators.nodes.spec import EncoderConstants
+from simulators.nodes.canopen.spec import EncoderConstants
 
 
 def test_nodes_are_configured_as_the_contract_says(bench):

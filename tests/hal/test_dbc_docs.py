@@ -9,12 +9,12 @@ import yaml
 from hal_bench import Bench
 
 from hal.config import RobotConfig
-from hal.drivers.dbc_settings import DbcSettings, ServoSettings
+from hal.drivers.dbc.settings import DbcSettings, ServoSettings
 from hal.drivers.odrive import OdriveSettings
 from hal.robot import open_robot
+from simulators.nodes.canopen.spec import NodeSpec
 from simulators.nodes.dbc_cell import DbcCellConstants
 from simulators.nodes.odrive import OdriveConstants
-from simulators.nodes.spec import NodeSpec
 from simulators.robots.bench import hardware
 from simulators.robots.bench.world import BenchWorld
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from hal.config import RobotConfig
-from hal.drivers.canopen_node import data_sheet
+from hal.drivers.canopen.node import data_sheet
 from hal.finding.book import EXTENDED, Book, Frame
 from hal.finding.decode import describe
 from hal.finding.robot_book import books

@@ -8,7 +8,7 @@ from hal_bench import ROBOTS
 
 from hal.commissioning.pdo_map import PdoSettings
 from hal.config import RobotConfig
-from hal.drivers.cia402_settings import DriveSettings
+from hal.drivers.cia402.settings import DriveSettings
 from hal.robot import open_robot
 
 TEXT = (Path(__file__).parents[2] / "docs" / "devices.md").read_text()

@@ -11,12 +11,12 @@ from hal_bench import ROBOTS
 from hal.clock import SystemClock
 from hal.commissioning.sdo_client import SdoClient
 from hal.config import BusConfig
-from hal.drivers.canopen_node import data_sheet
+from hal.drivers.canopen.node import data_sheet
 from hal.errors import DeviceRefused
 from hal.protocols import cia301, cia402
 from hal.protocols.cia402 import State
 from hal.wire.bus import Bus
-from simulators.nodes import drive_states
+from simulators.nodes.cia402 import states as drive_states
 
 NODE = 5
 REQUEST, ANSWER = 0x605, 0x585

@@ -14,9 +14,9 @@ from hal.config import RobotConfig
 from hal.device import DeviceState
 from hal.fleet import build
 from hal.protocols import dbc
+from simulators.nodes.canopen.spec import NodeSpec
 from simulators.nodes.odrive import OdriveAxis, OdriveConstants
 from simulators.nodes.plant import Plant, Snapshot
-from simulators.nodes.spec import NodeSpec
 
 FILE = dbc.load(ROBOTS / "dbc" / "odrive_cansimple.dbc")
 COMMANDS = {

@@ -10,9 +10,9 @@ import math
 import pytest
 from puppet import NODE, driven, told
 
-from hal.drivers.cia401 import Cia401Input
-from hal.drivers.cia404 import Cia404Cell
-from hal.drivers.cia406 import Cia406Encoder
+from hal.drivers.canopen.cia401 import Cia401Input
+from hal.drivers.canopen.cia404 import Cia404Cell
+from hal.drivers.canopen.cia406 import Cia406Encoder
 from hal.errors import ConfigError, DeviceRefused, WrongDevice
 from hal.protocols import cia303, cia404, cia406
 

@@ -9,7 +9,7 @@ from drive_bench import CONSTANTS, ELBOW, JointWorld, joint_description
 from hal_bench import Bench
 
 from hal.config import RobotConfig
-from simulators.nodes.spec import NodeSpec
+from simulators.nodes.canopen.spec import NodeSpec
 
 POSITION = {"low": -0.5, "high": 1.0}
 LIMITS = {

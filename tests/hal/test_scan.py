@@ -12,7 +12,7 @@ from hal.config import BusConfig, RobotConfig
 from hal.errors import BusGone, ConfigError
 from hal.finding.scan import compare, scan
 from hal.finding.tap import Tap
-from simulators.nodes.spec import CellConstants, NodeSpec
+from simulators.nodes.canopen.spec import CellConstants, NodeSpec
 from simulators.rig import Rig
 
 PATIENCE = 0.5

@@ -8,7 +8,7 @@ import yaml
 from hal_bench import ROBOTS
 
 from hal.config import RobotConfig
-from hal.drivers import cia401, cia404
+from hal.drivers.canopen import cia401, cia404
 from hal.robot import open_robot
 
 TEXT = (Path(__file__).parents[2] / "docs" / "devices.md").read_text()

@@ -8,8 +8,8 @@ from hal_bench import Bench, description, hardware
 
 from hal.config import RobotConfig
 from hal.errors import CommandRefused
-from simulators.nodes.analog_input import AnalogConstants
-from simulators.nodes.spec import CellConstants, EncoderConstants, NodeSpec
+from simulators.nodes.canopen.analog_input import AnalogConstants
+from simulators.nodes.canopen.spec import CellConstants, EncoderConstants, NodeSpec
 
 BICEPS, TRICEPS, ELBOW = "muscle_tension.biceps", "muscle_tension.triceps", "joint_position.elbow"
 

@@ -11,7 +11,7 @@ from hal_bench import Bench, BenchClock, BenchWorld, description
 
 from hal.config import RobotConfig
 from hal.errors import CommandRefused
-from simulators.nodes.spec import CellConstants, DriveConstants, EncoderConstants, NodeSpec
+from simulators.nodes.canopen.spec import CellConstants, DriveConstants, EncoderConstants, NodeSpec
 from simulators.rig import Rig
 from simulators.wire_faults import FaultyWire
 

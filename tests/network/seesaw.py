@@ -67,7 +67,7 @@ def statics(lengths: np.ndarray) -> dict[str, np.ndarray]:
 def train(robot: RobotConfig, folder: Path) -> None:
     """Make a model of the robot, in seconds; torch is loaded only here, for a simulator needs none."""
     from gemuco.dataset import Dataset, Episode
-    from gemuco.train import TrainConfig, fit
+    from gemuco.learning.train import TrainConfig, fit
 
     chance = np.random.default_rng(0)
     joint, force = chance.uniform(-1, 1, 3000), chance.uniform(10, 60, 3000)

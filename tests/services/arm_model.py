@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from gemuco.dataset import Dataset, Episode
+from gemuco.learning.train import TrainConfig, fit
 from gemuco.schema import BodySchema
-from gemuco.train import TrainConfig, fit
 from hal.config import RobotConfig, load_robot
 from services.model.estimation import Fresh
 from services.model.living_model import layout_of

@@ -21,7 +21,7 @@ from services.client import Client
 from services.process.supervisor import die_with
 from services.wire import keys
 from services.wire.messages import Status
-from simulators.nodes.spec import CellConstants, DriveConstants, EncoderConstants, NodeSpec
+from simulators.nodes.canopen.spec import CellConstants, DriveConstants, EncoderConstants, NodeSpec
 from simulators.rig import Rig
 
 ROOT = Path(__file__).resolve().parents[2]

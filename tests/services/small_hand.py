@@ -13,7 +13,7 @@ from hal.config import RobotConfig
 from hal.robot import Robot
 from simulators.direct import direct_robot
 from simulators.faults import changed_tool, check_condition
-from simulators.nodes.spec import CellConstants, DriveConstants, NodeSpec
+from simulators.nodes.canopen.spec import CellConstants, DriveConstants, NodeSpec
 from simulators.rig import Rig
 
 EDS = Path(__file__).resolve().parents[2] / "robots" / "eds"

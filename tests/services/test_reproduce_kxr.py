@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from gemuco.dataset import Dataset, Episode
-from gemuco.train import fit
-from gemuco.train_config import TrainConfig
+from gemuco.learning.config import TrainConfig
+from gemuco.learning.train import fit
 from hal.config import load_robot
 from services.model.living_model import layout_of
 from services.model.model_config import collect_config, model_config

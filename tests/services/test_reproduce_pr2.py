@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gemuco import devices
-from gemuco.descent import DescentConfig
+from gemuco.learning import devices
+from gemuco.search.descent import DescentConfig
 from hal.config import RobotConfig, load_robot
 from services.learning.trainer import train
 from services.reproduce import pr2_arm, pr2_trials

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from gemuco.dataset import Dataset, Episode
 from gemuco.errors import DatasetError, NotWritten
-from gemuco.history import History
+from gemuco.learning.history import History
 from gemuco.signals import Layout
 from services.learning import trainer
 from services.model.living_model import layout_of

@@ -2,12 +2,12 @@ import numpy as np
 import pytest
 from arm_model import MASKS, arm, fresh, small_model, states
 
-from gemuco.adapt import UpdateConfig as Learning
-from gemuco.adapt import Updater
+from gemuco.adaption.update import UpdateConfig as Learning
+from gemuco.adaption.update import Updater
 from gemuco.dataset import Dataset, Episode
 from gemuco.errors import NotEnoughData
+from gemuco.learning.train import TrainConfig, fit
 from gemuco.schema import BodySchema
-from gemuco.train import TrainConfig, fit
 from hal.clock import ManualClock
 from services.model.estimation import Fresh, Freshness
 from services.model.living_model import LivingModel, layout_of

@@ -9,7 +9,7 @@ import can
 import numpy as np
 
 from hal.config import RobotConfig
-from simulators.nodes.spec import CellConstants, DriveConstants, EncoderConstants, NodeSpec
+from simulators.nodes.canopen.spec import CellConstants, DriveConstants, EncoderConstants, NodeSpec
 from simulators.rig import Rig
 
 DRIVE, CELL, ENCODER = 3, 13, 23

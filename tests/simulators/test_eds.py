@@ -4,7 +4,7 @@ import canopen
 import pytest
 from canopen.objectdictionary import ODVariable
 
-from simulators.nodes.spec import EDS_FOLDER
+from simulators.nodes.canopen.spec import EDS_FOLDER
 
 KINDS = ("servo_drive", "load_cell", "analog_input", "joint_encoder")
 

@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
+from simulators.nodes.canopen.spec import NodeSpec
 from simulators.nodes.mit_drive import MitConstants, MitDriveNode
 from simulators.nodes.plant import Plant, Snapshot
-from simulators.nodes.spec import NodeSpec
 
 ENTER, EXIT, CLEAR = (bytes.fromhex("FFFFFFFFFFFFFF") + bytes((last,)) for last in (0xFC, 0xFD, 0xFB))
 ZERO = bytes.fromhex("7FFF7FF0000007FF")

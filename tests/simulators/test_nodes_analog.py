@@ -4,8 +4,8 @@ import struct
 import pytest
 from bench import bench
 
-from simulators.nodes.analog_input import AnalogConstants
-from simulators.nodes.spec import CellConstants, NodeSpec
+from simulators.nodes.canopen.analog_input import AnalogConstants
+from simulators.nodes.canopen.spec import CellConstants, NodeSpec
 
 AMPLIFIER = 33
 FORCE = "muscle_tension.wire"

@@ -3,7 +3,7 @@ import struct
 import pytest
 from bench import DRIVE, SPECS, bench
 
-from simulators.nodes.drive_states import Command, State, command, following
+from simulators.nodes.cia402.states import Command, State, command, following
 
 MASTER = 127
 COUNTS = SPECS[0].constants.counts_per_unit

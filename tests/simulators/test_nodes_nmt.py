@@ -3,8 +3,8 @@ import struct
 import pytest
 from bench import CELL, DRIVE, ENCODER, SPECS, bench
 
-from simulators.nodes.canopen_node import Nmt
-from simulators.nodes.objects import Abort
+from simulators.nodes.canopen.node import Nmt
+from simulators.nodes.canopen.objects import Abort
 
 MASTER = 127
 OPERATIONAL, STOPPED, PRE_OPERATIONAL = b"\x05", b"\x04", b"\x7f"

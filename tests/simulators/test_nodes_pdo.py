@@ -3,7 +3,7 @@ import struct
 import pytest
 from bench import CELL, DRIVE, ENCODER, bench
 
-from simulators.nodes.objects import Abort
+from simulators.nodes.canopen.objects import Abort
 
 OFF = 1 << 31
 

@@ -6,7 +6,7 @@ import pytest
 from bench import CELL, DRIVE, ENCODER, SPECS, SpringWorld, bench, config
 from canopen.objectdictionary import ODVariable
 
-from simulators.nodes.objects import STRING_LIMIT, Abort
+from simulators.nodes.canopen.objects import STRING_LIMIT, Abort
 from simulators.rig import Rig
 
 

@@ -4,8 +4,8 @@ import struct
 import pytest
 from bench import CELL, ENCODER, bench
 
-from simulators.nodes.objects import Abort
-from simulators.nodes.spec import CellConstants, EncoderConstants, NodeSpec
+from simulators.nodes.canopen.objects import Abort
+from simulators.nodes.canopen.spec import CellConstants, EncoderConstants, NodeSpec
 
 ZERO = int.from_bytes(b"zero", "little")
 TURN = 262_144

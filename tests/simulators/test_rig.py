@@ -9,8 +9,8 @@ import pytest
 from bench import CELL, DRIVE, ENCODER, SPECS, SpringWorld, bench, config
 
 from simulators.hub import HubServer
-from simulators.nodes.segment import Segment
-from simulators.nodes.spec import CellConstants, NodeSpec
+from simulators.nodes.canopen.segment import Segment
+from simulators.nodes.canopen.spec import CellConstants, NodeSpec
 from simulators.rig import Rig, UnknownFault
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hal.config import load_robot
-from simulators.nodes.spec import CellConstants, DriveConstants
+from simulators.nodes.canopen.spec import CellConstants, DriveConstants
 from simulators.robots import kxr_humanoid, musashi_arm, pr2_duster
 from simulators.robots.kxr_humanoid import body as kxr_body
 from simulators.robots.pr2_duster import body as pr2_body

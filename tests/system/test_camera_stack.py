@@ -11,8 +11,8 @@ import pytest
 import yaml
 
 from gemuco.dataset import Dataset, Episode
+from gemuco.learning.train import TrainConfig, fit
 from gemuco.schema import BodySchema
-from gemuco.train import TrainConfig, fit
 from hal.config import load_robot
 from services.client import Client
 from services.learning.collector import Wanted, collect_bus

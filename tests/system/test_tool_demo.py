@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from gemuco.dataset import Dataset, Episode
-from gemuco.train import TrainConfig, fit
+from gemuco.learning.train import TrainConfig, fit
 from hal.config import load_robot
 from hal.errors import ConfigError
 from services.demo import demo

@@ -8,11 +8,11 @@ from hal import registry
 from hal.config import RobotConfig
 from hal.errors import ConfigError
 from hal.protocols.cia303 import UNITS
-from simulators.nodes.analog_input import AnalogConstants
+from simulators.nodes.canopen.analog_input import AnalogConstants
+from simulators.nodes.canopen.spec import CellConstants, Constants, DriveConstants, EncoderConstants, NodeSpec
 from simulators.nodes.dbc_cell import DbcCellConstants
 from simulators.nodes.mit_drive import MitConstants
 from simulators.nodes.odrive import OdriveConstants
-from simulators.nodes.spec import CellConstants, Constants, DriveConstants, EncoderConstants, NodeSpec
 
 FULL_SCALE = {"int16": 2**15, "int32": 2**31, "float32": 10.0, "zc_sg": 10.0}
 """What an analogue input tells at its end, by preset."""

@@ -4,7 +4,7 @@ Kept apart from the robot file on purpose: a robot file that disagrees with the 
 it would on a bench. tests/simulators/test_robots_hardware.py checks that ours agrees.
 """
 
-from simulators.nodes.spec import CellConstants, DriveConstants, NodeSpec
+from simulators.nodes.canopen.spec import CellConstants, DriveConstants, NodeSpec
 
 SERVOS: dict[str, tuple[int, float]] = {
     "shoulder_pitch": (1, -0.6),

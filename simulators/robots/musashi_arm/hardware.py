@@ -6,7 +6,7 @@ it would on a bench. tests/simulators/test_robots_hardware.py checks that ours a
 
 import math
 
-from simulators.nodes.spec import CellConstants, DriveConstants, EncoderConstants, NodeSpec
+from simulators.nodes.canopen.spec import CellConstants, DriveConstants, EncoderConstants, NodeSpec
 
 MUSCLES: dict[str, tuple[str, int, float]] = {
     "deltoid_front": ("can0", 1, 0.152),

@@ -1,0 +1,180 @@
+"""Gradient steps on W, on p, or on both (paper, usages (c) and (d)), with replay, and a way back from harm."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from gemuco.adaption.innovation import own_bias
+from gemuco.adaption.recognise import Prior
+from gemuco.adaption.window import Window
+from gemuco.compiled.batch import under_masks
+from gemuco.compiled.chain import pack, unpack
+from gemuco.compiled.learning import SQUARED, gradients, loss
+from gemuco.optimiser import Optimiser
+
+if TYPE_CHECKING:
+    from gemuco.adaption.update import UpdateConfig
+    from gemuco.schema import BodySchema
+
+JUDGED = 60
+"""Held-out samples that W is judged by, the newest."""
+JUDGE_EVERY = 5
+"""Calls of `step` between two judgements."""
+RECOVERY = 1.2
+"""By how much the learning rate grows with every better W, after it was halved."""
+WORSE = 1.1
+"""W goes back when its held-out squared error exceeds that of the best W so far by this factor."""
+
+
+class Relearner:
+    """Learns from a window, from constraints and from the training data of other conditions.
+
+    Every `held_out`-th sample only judges. W goes back to the best one so far when it foretells those samples worse,
+    and its learning rate is halved until it does well again.
+
+    Args:
+        schema: Where to begin.
+        config: What to update, and how.
+        constraints: Samples that never grow old [standard deviations], shape (n, size).
+
+    Attributes:
+        window: What the body lived through.
+        held_out: Mean squared error on held-out samples when last judged; NaN before.
+        rolled_back: How often W went back so far.
+    """
+
+    def __init__(self, schema: "BodySchema", config: "UpdateConfig", constraints: np.ndarray) -> None:
+        self.window = Window(config.window, schema.layout.size, config.held_out)
+        self.rolled_back = 0
+        self._config, self._constraints = config, constraints
+        self._random = np.random.default_rng(config.seed)
+        self.restart(schema)
+
+    def restart(self, schema: "BodySchema") -> None:
+        """Forget momentum and judgements, and go on from the W and p of a schema."""
+        config = self._config
+        self._chain = pack(schema.weights.whole)
+        self._bias = schema.bias.copy()
+        self._optimiser = Optimiser(config.optimiser, config.rate, len(self._chain.flat))
+        self._bias_optimiser = Optimiser(config.optimiser, config.bias_rate, len(self._bias))
+        self._best = schema.weights
+        self._gates = gates(schema)
+        self._anchors, self._anchor_biases = _others(schema)
+        self._calls = 0
+        self.held_out = float("nan")
+
+    def step(self, schema: "BodySchema", weights: bool, bias: bool) -> tuple["BodySchema", float]:
+        """A few gradient steps.
+
+        Args:
+            schema: The schema in use; its p is taken over.
+            weights: Whether W moves.
+            bias: Whether p moves.
+
+        Returns:
+            The schema after the steps, and the mean squared error of the first batch before them; the schema as it
+            was and infinity where a step led out of the numbers.
+        """
+        self._bias[:] = schema.bias
+        first = float("nan")
+        for index in range(self._config.steps):
+            loss = self._descend(schema, weights, bias)
+            first = loss if index == 0 else first
+        if not (np.isfinite(self._chain.flat).all() and np.isfinite(self._bias).all()):
+            self.restart(schema)
+            return schema, float("inf")
+        if bias:
+            schema = schema.with_bias(self._bias)
+        if weights:
+            schema = self._judge(schema.with_weights(schema.weights.replaced(unpack(self._chain))))
+        return schema, first
+
+    def _descend(self, schema: "BodySchema", weights: bool, bias: bool) -> float:
+        """One gradient step in place; returns the loss before it."""
+        inputs, wanted, present = self._batch(schema)
+        loss, by_weights, by_input = gradients(self._chain, inputs, wanted, SQUARED, weights, bias)
+        if weights:
+            self._optimiser.move(self._chain.flat, by_weights)
+        if bias:
+            self._bias_optimiser.move(self._bias, by_input[present, -len(self._bias) :].sum(axis=0))
+        return float(loss)
+
+    def _batch(self, schema: "BodySchema") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Each drawn sample once per mask it allows.
+
+        Returns:
+            Inputs (rows, inputs), wanted x_out (rows, out_size), and which rows are of the present body (rows,).
+        """
+        config = self._config
+        lived = self.window.learned()
+        if len(self._constraints):
+            lived = np.concatenate([lived, self._constraints])
+        old = config.replay if len(self._anchors) else 0
+        drawn = self._random.random(config.batch) * (len(lived) + old)
+        now = lived[drawn[drawn < len(lived)].astype(int)]
+        replayed = self._random.integers(0, max(1, len(self._anchors)), config.batch - len(now))
+        rows, biases = now, np.repeat(self._bias[None], len(now), axis=0)
+        if old:
+            rows = np.concatenate([rows, self._anchors[replayed]])
+            biases = np.concatenate([biases, self._anchor_biases[replayed]])
+        inputs, wanted, whose = under_masks(_plain(rows), _plain(biases), *self._gates, schema.ready.predictor)
+        return inputs, wanted, whose < len(now)
+
+    def _judge(self, schema: "BodySchema") -> "BodySchema":
+        """The schema, or the best W so far where the new one does worse on held-out samples."""
+        self._calls += 1
+        rows = self.window.held(JUDGED)
+        if self._calls % JUDGE_EVERY or not len(rows):
+            return schema
+        self.held_out = mean_error(schema, rows)
+        best = schema.with_weights(self._best)
+        before = mean_error(best, rows)
+        if self.held_out <= before:
+            self._best = schema.weights
+            self._optimiser.rate = min(self._config.rate, RECOVERY * self._optimiser.rate)
+        elif self.held_out > WORSE * before:
+            rate = 0.5 * self._optimiser.rate
+            self._chain = pack(self._best.whole)
+            self._optimiser = Optimiser(self._config.optimiser, rate, len(self._chain.flat))
+            self.held_out = before
+            self.rolled_back += 1
+            return best
+        return schema
+
+
+def mean_error(schema: "BodySchema", rows: np.ndarray) -> float:
+    """Mean squared error of samples under all masks they allow [standard deviations squared]."""
+    biases = np.repeat(schema.bias[None], len(rows), axis=0)
+    inputs, wanted, _ = under_masks(_plain(rows), _plain(biases), *gates(schema), schema.ready.predictor)
+    return float(loss(schema.ready.predictor.chain, inputs, wanted, SQUARED))
+
+
+def _plain(rows: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(rows, np.float32)
+
+
+def gates(schema: "BodySchema") -> tuple[np.ndarray, np.ndarray]:
+    """Of every mask, which elements of x_in it lets through, shape (masks, in_size), and m, (masks, x_in)."""
+    through, tails = (np.stack(column) for column in zip(*(schema.gate(m) for m in schema.masks), strict=True))
+    return through, np.ascontiguousarray(tails[:, : len(schema.x_in)])
+
+
+def _others(schema: "BodySchema") -> tuple[np.ndarray, np.ndarray]:
+    """The anchors of conditions other than the present one, and p of each.
+
+    A trained condition is the present one where p is nearer to it than half the way to its nearest neighbour: what was
+    learned of it then must not hold back what is learned of it now. Without parametric bias all anchors count.
+    """
+    anchors = schema.anchors
+    biases = own_bias(schema, len(anchors))
+    known = np.array(list(schema.biases.values()))
+    if not len(anchors) or len(known) < 2 or len(schema.anchor_conditions) != len(anchors):
+        return anchors, biases
+    prior = Prior.of(schema)
+    away = [prior.between(schema.bias, p) for p in known]
+    nearest = int(np.argmin(away))
+    apart = min(prior.between(known[nearest], p) for i, p in enumerate(known) if i != nearest)
+    if away[nearest] > 0.5 * apart:
+        return anchors, biases
+    others = schema.anchor_conditions != nearest
+    return anchors[others], biases[others]

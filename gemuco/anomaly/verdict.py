@@ -1,0 +1,85 @@
+"""Environment change or anomaly: the decision that the paper leaves open (II-K), by whether another p explains it."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from gemuco.adaption.innovation import Innovations
+from gemuco.adaption.recognise import Prior, solve
+from gemuco.anomaly.blame import suspects
+from gemuco.normal import prediction_errors
+
+if TYPE_CHECKING:
+    from gemuco.schema import BodySchema
+
+PLAUSIBLE = 3.0
+"""How far p may be from the mean of the trained ones [their standard deviations] to be a condition of a body."""
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What is the matter with a body, judged by its last samples.
+
+    Attributes:
+        kind: `normal`; `environment` if the body is in another condition that a p describes; `anomaly` if none does.
+            Without parametric bias every change is an anomaly. Empty without normal data or anything to judge.
+        score: Root mean square over the samples of the anomaly score as a share of its threshold, under the p in use.
+        explained: The same under the p that explains the samples best; equal to `score` if none was sought.
+        bias: That p, shape (bias_size,); the one in use if none was sought.
+        blamed: `signal.element` whose being wrong explains the samples best; empty unless an anomaly.
+    """
+
+    kind: str
+    score: float
+    explained: float
+    bias: np.ndarray
+    blamed: str
+
+
+def judge(schema: "BodySchema", samples: Iterable[Mapping[str, np.ndarray]]) -> Verdict:
+    """Normal, another condition, or something wrong.
+
+    If the samples are unlikely under the p in use, p is sought anew on all of them. If they are normal under what is
+    found and it is like the trained ones, the environment has changed (a tool, a load, a grip) and an update of p will
+    do. What no p explains is an anomaly.
+
+    Args:
+        schema: With statistics of the normal.
+        samples: The last ones, each signal -> measured array [its unit], shape (n,). All of them count alike, so they
+            should be of the time since things look odd.
+
+    Raises:
+        UnknownSignal: A name is not in the layout.
+        WrongSize: An array does not have its signal's size.
+    """
+    rows = np.array([schema.normalise_one(sample) for sample in samples]).reshape(-1, schema.layout.size)
+    score = window_score(schema, rows)
+    if not np.isfinite(score):
+        return Verdict("", score, score, schema.bias, "")
+    if score <= 1.0:
+        return Verdict("normal", score, score, schema.bias, "")
+    bias, explained = schema.bias, score
+    if len(schema.bias):
+        prior = Prior.of(schema)
+        bias, _ = solve(schema, Innovations(schema), prior, rows, schema.bias.astype(float))
+        explained = window_score(schema.with_bias(bias), rows)
+        if explained <= 1.0 and prior.between(bias, prior.mean) <= PLAUSIBLE:
+            return Verdict("environment", score, explained, bias, "")
+    return Verdict("anomaly", score, explained, bias, suspects(schema, rows)[0].name)
+
+
+def window_score(schema: "BodySchema", rows: np.ndarray) -> float:
+    """Root mean square of the scores as shares of their thresholds, of samples [standard deviations], (n, size)."""
+    normal = schema.normal
+    if normal is None or not len(rows):
+        return float("nan")
+    errors = prediction_errors(schema, rows)
+    shares = []
+    for pattern in np.unique(np.isfinite(errors), axis=0):
+        same = errors[(np.isfinite(errors) == pattern).all(axis=1)]
+        judged = int((pattern & np.isfinite(normal.mean)).sum())
+        if judged:
+            shares.append(normal.distances(same) / normal.threshold_of(judged))
+    return float(np.sqrt(np.mean(np.concatenate(shares) ** 2))) if shares else float("nan")

@@ -1,0 +1,251 @@
+"""State estimation (paper, II-G): what is missing, by a feasible mask, by descent on z, or by descent on x_in."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from gemuco.compiled.inference import infer
+from gemuco.layers import run
+from gemuco.masks import Mask, covered_by, label
+from gemuco.search.descent import NewtonConfig
+from gemuco.search.fold import fitting, input_lines, latent_lines
+from gemuco.search.minimise import minimise
+
+if TYPE_CHECKING:
+    from gemuco.schema import BodySchema
+
+SEARCH = NewtonConfig()
+STARTS = 64
+"""How many anchors of the training data a descent chooses its start from."""
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """A signal as well as it can be known.
+
+    Attributes:
+        value: Measured values, with estimates in place of missing elements [unit], shape (n,); NaN if impossible.
+        std: Expected error (1 sigma, from held-out data) [unit], shape (n,); 0 where measured, NaN where unknown.
+        estimated: Which elements were estimated, shape (n,).
+        method: `measured`, `mask` (usages a and b), `latent` (e), `input` (f) or `none`.
+        mask: The signals it was estimated from; empty where measured.
+        residual: How badly the model explains what it was given (root mean square, standard deviations of the
+            training data), for `latent` also when what was found is given to the network again: a z beside the data's
+            manifold fits what was measured, and yet its body does not exist. 0 where measured, NaN if impossible.
+    """
+
+    value: np.ndarray
+    std: np.ndarray
+    estimated: np.ndarray
+    method: str
+    mask: Mask
+    residual: float
+
+
+class Filled(NamedTuple):
+    """Every element of a layout as well as it can be known; see `Estimate` for what is told of each signal.
+
+    Attributes:
+        value: Shape (size,).
+        std: Shape (size,).
+        estimated: Shape (size,).
+        method: By signal.
+        mask: By signal.
+        label: By signal, the mask as text.
+        residual: By signal.
+    """
+
+    value: np.ndarray
+    std: np.ndarray
+    estimated: np.ndarray
+    method: Mapping[str, str]
+    mask: Mapping[str, Mask]
+    label: Mapping[str, str]
+    residual: dict[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """How a schema fills in samples that lack the same elements; all but the numbers is known beforehand.
+
+    Attributes:
+        ways: Method, mask, for which elements of the layout, shape (size,), and for which signals.
+        std: As of `Filled`, and so are the others.
+        estimated: Which elements are.
+        method: By signal.
+        mask: By signal.
+        label: By signal.
+    """
+
+    ways: tuple[tuple[str, Mask, np.ndarray, tuple[str, ...]], ...]
+    std: np.ndarray
+    estimated: np.ndarray
+    method: Mapping[str, str]
+    mask: Mapping[str, Mask]
+    label: Mapping[str, str]
+
+    @classmethod
+    def of(cls, schema: "BodySchema", finite: np.ndarray) -> "Plan":
+        """For samples of which these elements are there, truth values, shape (size,)."""
+        slices, whole = schema.layout.slices, schema.layout.whole(finite)
+        named: dict[tuple[str, Mask], list[str]] = {}
+        for name in slices:
+            way = ("measured", frozenset()) if name in whole else _route(schema, name, whole, finite)
+            named.setdefault(way, []).append(name)
+        std, estimated = np.zeros(len(finite)), np.zeros(len(finite), bool)
+        ways = []
+        for (method, mask), names in named.items():
+            missing = np.zeros(len(finite), bool)
+            for name in names:
+                missing[slices[name]] = ~finite[slices[name]]
+            std[missing] = _std(schema, method, mask)[missing]
+            estimated |= missing & (method != "none")
+            if method != "measured":
+                ways.append((method, mask, missing, tuple(names)))
+        of_signal = {name: way for way, names in named.items() for name in names}
+        std.setflags(write=False)
+        estimated.setflags(write=False)
+        masks = {name: of_signal[name][1] for name in slices}
+        labels = {name: label(mask, schema.layout.names) for name, mask in masks.items()}
+        return cls(tuple(ways), std, estimated, {name: of_signal[name][0] for name in slices}, masks, labels)
+
+
+def estimate(schema: "BodySchema", values: Mapping[str, np.ndarray]) -> dict[str, Estimate]:
+    """Every signal of the layout; see `BodySchema.estimate`."""
+    joined = schema.layout.join_one(values)
+    joined.setflags(write=False)
+    found = fill(schema, joined)
+    return {
+        name: Estimate(
+            found.value[span], found.std[span], found.estimated[span],
+            found.method[name], found.mask[name], found.residual[name],
+        )
+        for name, span in schema.layout.slices.items()
+    }  # fmt: skip
+
+
+def fill(schema: "BodySchema", joined: np.ndarray) -> Filled:
+    """What `estimate` tells, of a sample in one array [unit of each element], shape (size,); NaN where missing.
+
+    Nobody may write into that array: as in a service, and code is compiled for one of both kinds.
+    """
+    plan = schema.ready.plan(np.isfinite(joined))
+    value, residual = joined.copy(), dict.fromkeys(plan.method, 0.0)
+    for method, mask, missing, names in plan.ways:
+        if method == "mask":
+            amiss = infer(*schema.ready.parts, joined, *schema.gate(mask), missing, value)
+        else:
+            told, amiss = _guess(schema, method, mask, joined)
+            np.copyto(value, told, where=missing)
+        for name in names:
+            residual[name] = amiss
+    return Filled(value, plan.std, plan.estimated, plan.method, plan.mask, plan.label, residual)
+
+
+def mask_error(schema: "BodySchema", mask: Mask, name: str) -> float:
+    """Mean squared held-out error of a signal under a mask [standard deviations]; 1 where it was never measured."""
+    known = schema.errors.get(("mask", mask))
+    if known is None:
+        return 1.0
+    scaled = known / schema.scaler.std[schema.out_index]
+    return float(np.mean(scaled[schema.out_layout.slice(name)] ** 2))
+
+
+def _route(schema: "BodySchema", name: str, whole: Mask, finite: np.ndarray) -> tuple[str, Mask]:
+    """How to estimate a signal, and from which signals."""
+    if name in schema.x_out:
+        mask = next((m for m in schema.ranked(name) if m <= whole), None)
+        if mask is not None:
+            return "mask", mask
+        return ("latent", whole & set(schema.x_out)) if finite[schema.out_index].any() else ("none", frozenset())
+    if name in schema.x_in and finite[schema.out_index].any() and covered_by(schema.masks, whole | {name}):
+        return "input", whole & {*schema.x_in, *schema.x_out}
+    return "none", frozenset()
+
+
+def _guess(schema: "BodySchema", method: str, mask: Mask, joined: np.ndarray) -> tuple[np.ndarray, float]:
+    """Every element as the model says [unit], shape (size,), NaN where it says nothing; and the residual."""
+    x = np.where(np.isfinite(joined), schema.scaler.normalise(joined), np.nan)
+    full = np.full(schema.layout.size, np.nan)
+    if method == "latent":
+        full[schema.out_index] = latent_search(schema, x)
+    elif method == "input":
+        full = input_search(schema, x, mask)
+    residual = _residual(x, full)
+    if method == "latent":
+        residual = max(residual, _residual(x, _again(schema, full)))
+    return schema.scaler.restore(full), residual
+
+
+def _std(schema: "BodySchema", method: str, mask: Mask) -> np.ndarray:
+    """Expected error of every element of the layout [unit], shape (size,); NaN where it is not known."""
+    std = np.full(schema.layout.size, np.nan)
+    known = schema.errors.get((method, mask))
+    if known is not None:
+        std[schema.out_index if len(known) == len(schema.out_index) else slice(None)] = known
+    return std
+
+
+def _residual(x: np.ndarray, full: np.ndarray) -> float:
+    """Root mean square of what was given minus what the model says of it; NaN if it says nothing."""
+    given = np.isfinite(x) & np.isfinite(full)
+    return float(np.sqrt(np.mean((full[given] - x[given]) ** 2))) if given.any() else float("nan")
+
+
+def _again(schema: "BodySchema", full: np.ndarray) -> np.ndarray:
+    """What the network makes of a body it was given as found, by the first mask that can, shape (size,)."""
+    again = full.copy()
+    covered = covered_by(schema.masks, schema.layout.whole(np.isfinite(full)))
+    if covered:
+        again[schema.out_index] = schema.infer(full, covered[0])
+    return again
+
+
+def latent_search(schema: "BodySchema", x: np.ndarray) -> np.ndarray:
+    """Usage (e): the x_out that fits the given ones best, shape (out_size,) [standard deviations].
+
+    Args:
+        schema: The body schema.
+        x: Every signal [standard deviations], shape (size,), NaN where nothing was measured.
+    """
+    data = np.full(len(x), np.nan)
+    data[schema.out_index] = x[schema.out_index]
+    found = minimise(fitting(latent_lines(schema), data), schema.ready.latent_starts, SEARCH)
+    return run(schema.weights.decoder, found.point)
+
+
+def input_search(schema: "BodySchema", x: np.ndarray, available: Mask) -> np.ndarray:
+    """Usage (f): missing x_in that make the network's output fit what is given, shape (size,) [standard deviations].
+
+    Args:
+        schema: The body schema.
+        x: Every signal [standard deviations], shape (size,), NaN where nothing was measured.
+        available: Signals of which every element was measured.
+
+    Returns:
+        x_out as predicted and the missing x_in as found; NaN elsewhere.
+    """
+    missing = set(schema.x_in) - set(schema.x_out) - available
+    mask = max(covered_by(schema.masks, available | missing), key=lambda m: (len(m & missing), len(m)))
+    full = np.where(np.isfinite(x), x, 0.0)
+    base = schema.network_input(full, mask)
+    through, _ = schema.gate(mask)
+    sought = schema.layout.indices(mask - available)
+    sought = sought[~np.isfinite(x[sought])]
+    columns = np.flatnonzero(np.isin(schema.in_index, sought) & (through > 0))
+    data = np.full(len(x), np.nan)
+    data[schema.out_index] = x[schema.out_index]
+    far = np.full(len(columns), np.inf)
+    inferred = np.ones(len(schema.out_index), bool)
+    anchors = schema.anchors[:STARTS]
+    starts = anchors[:, sought] if len(anchors) else np.zeros((1, len(sought)))
+    lines = input_lines(schema, base, columns, np.zeros(0, int), inferred, np.zeros(len(x)), -far, far)
+    found = minimise(fitting(lines, data), starts, SEARCH).point
+    result = np.full(schema.layout.size, np.nan)
+    base[columns] = found
+    result[schema.out_index] = run(schema.weights.whole, base)
+    hidden = sought[~np.isin(sought, schema.out_index)]
+    result[hidden] = found[np.isin(sought, hidden)]
+    return result

@@ -1,0 +1,1 @@
+"""Training of the network from episodes (paper, II-D)."""

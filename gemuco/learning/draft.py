@@ -1,0 +1,73 @@
+"""A training on disk, so that an interrupted one goes on: one safetensors file, nothing pickled."""
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
+
+from gemuco.writing import writing
+
+FORMAT = "gemuco.learning.draft.2"
+
+
+def key_of(*parts: Any) -> str:
+    """Hash of all that a training depends on: arrays by their bytes, the rest by its text."""
+    digest = hashlib.sha256()
+    for part in parts:
+        array = isinstance(part, np.ndarray)
+        digest.update(f"{part.dtype}{part.shape}".encode() if array else repr(part).encode())
+        digest.update(np.ascontiguousarray(part).tobytes() if array else b"|")
+    return digest.hexdigest()
+
+
+class Draft:
+    """Where a training is kept as far as it is.
+
+    Args:
+        path: The file; nothing is kept without one.
+        key: What the training depends on; a draft of another is ignored and overwritten.
+    """
+
+    def __init__(self, path: Path | None, key: str) -> None:
+        self.path, self.key = path, key
+
+    def load(self) -> tuple[dict[str, np.ndarray], dict[str, Any]] | None:
+        """Arrays and facts; None if there is no draft of this very training, or it is damaged."""
+        if self.path is None or not self.path.exists():
+            return None
+        try:
+            with safe_open(self.path, framework="numpy") as file:
+                head = file.metadata() or {}
+                if head.get("format") != FORMAT or head.get("key") != self.key:
+                    return None
+                arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            facts = json.loads(head["facts"])
+        except (SafetensorError, OSError, ValueError, KeyError):
+            return None
+        return (arrays, facts) if head.get("sha256") == _digest(arrays.items(), head["facts"]) else None
+
+    def save(self, arrays: Mapping[str, np.ndarray], facts: Mapping[str, Any]) -> None:
+        """Replace what was kept, in one step: a process killed here leaves the draft before."""
+        if self.path is None:
+            return
+        text = json.dumps(dict(facts))
+        whole = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+        head = {"format": FORMAT, "key": self.key, "facts": text, "sha256": _digest(whole.items(), text)}
+        part = self.path.with_name(self.path.name + ".part")
+        with writing("The training", self.path):
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            save_file(whole, part, head)
+            part.replace(self.path)
+
+
+def _digest(arrays: Iterable[tuple[str, np.ndarray]], facts: str) -> str:
+    digest = hashlib.sha256(facts.encode())
+    for name, array in sorted(arrays):
+        digest.update(name.encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()

@@ -1,0 +1,74 @@
+"""z = h_enc(x_in, m, p), x_out = h_dec(z); nothing else lives here."""
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import torch
+from torch import nn
+
+from gemuco.activation import LINEAR, check
+from gemuco.layers import Chain, Layer, Weights
+
+MODULES: dict[str, type[nn.Module]] = {
+    "tanh": nn.Tanh,
+    "sigmoid": nn.Sigmoid,
+    "relu": nn.ReLU,
+    "elu": nn.ELU,
+    "softplus": nn.Softplus,
+}
+
+
+def _chain(sizes: Sequence[int], activation: str) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    for index, (wide, narrow) in enumerate(pairwise(sizes)):
+        if index:
+            layers.append(MODULES[activation]())
+        layers.append(nn.Linear(wide, narrow))
+    return nn.Sequential(*layers)
+
+
+def _linear(chain: nn.Sequential) -> list[nn.Linear]:
+    return [layer for layer in chain if isinstance(layer, nn.Linear)]
+
+
+class Network(nn.Module):
+    """Encoder and decoder, an activation between linear layers; the latent state and the output are linear.
+
+    Args:
+        inputs: Length of x_in, m and p together.
+        outputs: Length of x_out.
+        hidden: Widths from the input to the latent state; the decoder mirrors them.
+        latent: Length of z.
+        activation: Its name.
+    """
+
+    def __init__(self, inputs: int, outputs: int, hidden: Sequence[int], latent: int, activation: str = "tanh") -> None:
+        super().__init__()
+        self.activation = check(activation)
+        self.encoder = _chain([inputs, *hidden, latent], activation)
+        self.decoder = _chain([latent, *reversed(hidden), outputs], activation)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Inputs (samples, inputs) -> x_out (samples, outputs)."""
+        return self.decoder(self.encoder(x))
+
+    @property
+    def linear(self) -> list[nn.Linear]:
+        """Every affine map, from the input to the output."""
+        return _linear(self.encoder) + _linear(self.decoder)
+
+    def weights(self) -> Weights:
+        """A copy of W for the numpy kernels."""
+
+        def export(chain: nn.Sequential) -> Chain:
+            linear = _linear(chain)
+            return tuple(
+                Layer(
+                    layer.weight.detach().numpy().T.copy(),
+                    layer.bias.detach().numpy().copy(),
+                    self.activation if index < len(linear) - 1 else LINEAR,
+                )
+                for index, layer in enumerate(linear)
+            )
+
+        return Weights(export(self.encoder), export(self.decoder))

@@ -1,0 +1,329 @@
+"""Training (paper, II-D): from episodes to a body schema, and from a schema to one that fits a few new episodes."""
+
+from collections.abc import Generator, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+import torch
+
+from gemuco.dataset import Dataset
+from gemuco.errors import NotEnoughData
+from gemuco.layers import Weights
+from gemuco.learning.accuracy import assess
+from gemuco.learning.batched import train
+from gemuco.learning.config import TrainConfig
+from gemuco.learning.draft import Draft, key_of
+from gemuco.learning.history import History
+from gemuco.learning.learner import Learner, Progress
+from gemuco.learning.material import Material
+from gemuco.learning.network import Network
+from gemuco.learning.task import Task
+from gemuco.masks import Mask, label, mask
+from gemuco.scaler import Scaler
+from gemuco.schema import BodySchema
+
+ANCHORS = 1000
+
+
+Found = TypeVar("Found")
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One training of several; see `fit`.
+
+    Attributes:
+        dataset: Episodes of one body.
+        config: How.
+        masks: The feasible masks.
+        x_out: What to infer; every signal if None.
+        resume: A file to keep the training in.
+    """
+
+    dataset: Dataset
+    config: TrainConfig
+    masks: tuple[Mask, ...]
+    x_out: tuple[str, ...] | None = None
+    resume: str | Path | None = None
+
+
+Fitted = tuple[BodySchema, History]
+Work = Generator[Sequence[Job], list[Fitted], Found]
+"""What needs trainings on its way: it yields them, is sent what came of them, and returns what it is about."""
+
+
+def fit(
+    dataset: Dataset,
+    config: TrainConfig,
+    masks: Iterable[Iterable[str]],
+    progress: Progress | None = None,
+    x_out: Iterable[str] | None = None,
+    title: str = "training",
+    resume: str | Path | None = None,
+) -> Fitted:
+    """Train a body schema.
+
+    Args:
+        dataset: Episodes of one body.
+        config: How.
+        masks: The feasible masks; their union is x_in.
+        progress: Called after every epoch.
+        x_out: What to infer; every signal if not given.
+        title: Begins the progress text.
+        resume: A file to keep the training in. If it holds this very training, interrupted, that goes on and ends
+            with the same result; if it is finished there, nothing is trained. Whoever names it removes it.
+
+    Returns:
+        The schema with its held-out errors and the statistics of the normal, and how training went.
+
+    Raises:
+        NotEnoughData: Too few samples to hold some out, or none that fits a mask.
+        UnknownSignal: A mask or x_out names a signal that is not in the layout.
+    """
+    job = Job(dataset, config, tuple(frozenset(m) for m in masks), None if x_out is None else tuple(x_out), resume)
+    return fit_all([job], progress, title)[0]
+
+
+def fit_all(jobs: Sequence[Job], progress: Progress | None = None, title: str = "training") -> list[Fitted]:
+    """Several trainings, such as of several seeds: together, see `gemuco.learning.batched`.
+
+    Args:
+        jobs: What `fit` is told of each.
+        progress: Told the share done of all of them.
+        title: Begins the progress text.
+    """
+    ready = [_ready(job) for job in jobs]
+    train([one.learner for one in ready], [one.draft for one in ready], progress, title)
+    found = []
+    for one in ready:
+        conditions = one.conditions
+        schema = _assessed(_schema(one.learner, one.scaler, conditions), one.learner, conditions)
+        found.append((schema, _history(one.learner, one.scaler, one.notes)))
+    return found
+
+
+def together(
+    works: Sequence[Work[Found]], rounds: Sequence[tuple[str, float]], progress: Progress | None = None
+) -> list[Found]:
+    """Several works, the trainings that they need next always together, see `fit_all`; what they return.
+
+    Args:
+        works: All of them need trainings equally often.
+        rounds: What to call the trainings of each time, and their share of it all.
+        progress: Told the share done of all of them.
+    """
+    wanted, found, begun = [next(work) for work in works], [], 0.0
+    for title, share in rounds:
+        trained = iter(fit_all([job for jobs in wanted for job in jobs], _part(progress, begun, share), title))
+        begun += share
+        for index, work in enumerate(works):
+            try:
+                wanted[index] = work.send([next(trained) for _ in wanted[index]])
+            except StopIteration as end:
+                found.append(end.value)
+    return found
+
+
+def _part(progress: Progress | None, begun: float, share: float) -> Progress | None:
+    """Progress of a part of the work, told as progress of the whole."""
+    return None if progress is None else lambda done, text: progress(begun + share * done, text)
+
+
+class _Ready(NamedTuple):
+    """A training that can begin."""
+
+    learner: Learner
+    draft: Draft
+    scaler: Scaler
+    conditions: tuple[str, ...]
+    notes: list[str]
+
+
+def _ready(job: Job) -> _Ready:
+    dataset, config, layout = job.dataset, job.config, job.dataset.layout
+    checked = tuple(mask(m, layout.names) for m in job.masks)
+    if not checked or frozenset() in checked:
+        raise NotEnoughData("Training needs at least one mask, and none of them empty.")
+    outputs = layout.subset(layout.names if job.x_out is None else job.x_out).names
+    train_data, held_data = dataset.split(config.held_out, config.seed)
+    scaler = Scaler.fit(layout, train_data.rows())
+    task, notes = _heard(dataset, checked, outputs)
+    conditions = dataset.conditions
+    material = _material(task, scaler, train_data, conditions)
+    held = _material(task, scaler, held_data, conditions)
+    frozen = np.full(len(conditions), len(conditions) == 1)
+    if config.bias_size and frozen.all():
+        notes.append(
+            f"All data are of one condition ('{conditions[0]}'), so the parametric bias has nothing to tell apart: p "
+            "stays 0 and has no effect. Collect other conditions, or set `bias: 0`."
+        )
+    draft = Draft(None if job.resume is None else Path(job.resume), _key(config, task, dataset))
+    torch.manual_seed(config.seed)
+    size = len(task.in_index) + len(task.x_in) + config.bias_size
+    drawn = Network(size, len(task.out_index), config.hidden, config.latent, config.activation).weights()
+    _mute(drawn, task, scaler.dead, config.bias_size if frozen.all() else 0)
+    biases = np.zeros((len(conditions), config.bias_size), np.float32)
+    return _Ready(Learner(config, drawn, biases, frozen, material, held), draft, scaler, conditions, notes)
+
+
+def fine_tune(
+    schema: BodySchema,
+    dataset: Dataset,
+    config: TrainConfig,
+    progress: Progress | None = None,
+    title: str = "fine-tuning",
+    resume: str | Path | None = None,
+) -> Fitted:
+    """Train a schema further on few samples of a body that is like the one it knows: simulation to real robot.
+
+    W starts from the schema's, and so does the p of every condition it knows; others start from the p in use. The
+    scale stays. The schema's anchors are replayed under the p they had, which stays: what was known of postures that
+    the new samples do not show is kept, while the new conditions move away from the old ones. Shape and masks are the
+    schema's; `config` says the rest.
+
+    Args:
+        schema: What is known.
+        dataset: Episodes of the body as it is, with the signals of the schema.
+        config: How; `rate` is the peak, smaller than in training.
+        progress: Called after every epoch.
+        title: Begins the progress text.
+        resume: As in `fit`.
+
+    Returns:
+        The schema under the p of all conditions, old and new, with errors and normal statistics of the new data.
+
+    Raises:
+        DatasetError: A signal is missing, or has other elements or another unit.
+        NotEnoughData: Too few samples to hold some out, or none that fits a mask.
+    """
+    dataset = dataset.of(schema.layout)
+    task = Task(schema.layout, schema.masks, schema.x_out)
+    train_data, held_data = dataset.split(config.held_out, config.seed)
+    fresh = dataset.conditions
+    old = list(schema.biases.values()) if len(schema.bias) else [schema.bias]
+    start = np.stack([*(schema.biases.get(c, schema.bias) for c in fresh), *old])
+    frozen = np.arange(len(start)) >= len(fresh)
+    material = _material(task, schema.scaler, train_data, fresh, schema)
+    held = _material(task, schema.scaler, held_data, fresh)
+    key = _key(config, task, dataset, *schema.weights.arrays(), start, schema.anchors, schema.scaler.std)
+    draft = Draft(None if resume is None else Path(resume), key)
+    learner = Learner(config, schema.weights, start, frozen, material, held)
+    train([learner], [draft], progress, title)
+    tuned = _assessed(_schema(learner, schema.scaler, fresh, schema), learner, fresh)
+    return tuned, _history(learner, Scaler.fit(schema.layout, train_data.rows()), [])
+
+
+def _heard(dataset: Dataset, masks: tuple[Mask, ...], x_out: tuple[str, ...]) -> tuple[Task, list[str]]:
+    """The task without signals that were never measured, and a sentence on each of those."""
+    layout, measured = dataset.layout, np.isfinite(dataset.rows()).any(axis=0)
+    silent = [name for name in layout.names if not measured[layout.slice(name)].any()]
+    notes = [
+        f"Signal '{name}' was never measured: nothing is inferred from it, and it is not inferred. Check its sensor, "
+        "or leave it out of the model's signals."
+        for name in silent
+    ]
+    left = tuple(m for m in masks if not m & set(silent))
+    outputs = tuple(name for name in x_out if name not in silent)
+    if not left or not outputs:
+        raise NotEnoughData(f"Nothing can be learned: {', '.join(silent)} was never measured; check what was recorded.")
+    return Task(layout, left, outputs), notes
+
+
+def _material(
+    task: Task, scaler: Scaler, data: Dataset, conditions: tuple[str, ...], before: BodySchema | None = None
+) -> Material:
+    """The samples of a dataset, and behind them those that a schema brings along.
+
+    Raises:
+        NotEnoughData: None of the dataset's samples is of use.
+    """
+    rows = scaler.normalise(data.rows())
+    order = np.array([conditions.index(c) for c in data.conditions], int)
+    owner = order[data.condition_of_rows()]
+    if before is None or not len(before.anchors):
+        material = Material(task, rows, owner, scaler)
+    else:
+        old = before.anchor_conditions if len(before.anchor_conditions) else np.zeros(len(before.anchors), int)
+        both = np.concatenate([rows, before.anchors.astype(float)])
+        material = Material(task, both, np.concatenate([owner, len(conditions) + old]), scaler, len(rows))
+    if material.skipped == material.new:
+        names = ", ".join(label(m, task.layout.names) for m in task.masks)
+        raise NotEnoughData(f"No sample has all signals of any mask ({names}); check what was recorded.")
+    return material
+
+
+def _mute(weights: Weights, task: Task, dead: np.ndarray, unused: int) -> None:
+    """Let dead elements and an unused p have no effect, and a dead output be its mean.
+
+    What enters with weight 0 and is always 0 gets no gradient, so it stays muted through all of the training.
+    """
+    first, last = weights.encoder[0], weights.decoder[-1]
+    first.matrix[np.flatnonzero(np.isin(task.in_index, dead))] = 0.0
+    first.matrix[len(first.matrix) - unused :] = 0.0
+    outputs = np.flatnonzero(np.isin(task.out_index, dead))
+    last.matrix[:, outputs] = 0.0
+    last.offset[outputs] = 0.0
+
+
+def _key(config: TrainConfig, task: Task, dataset: Dataset, *arrays: np.ndarray) -> str:
+    """What tells one training from another."""
+    masks = [label(m, task.layout.names) for m in task.masks]
+    return key_of(config, task.layout, masks, task.x_out, dataset.conditions, dataset.rows(), *arrays)
+
+
+def _schema(
+    learner: Learner, scaler: Scaler, conditions: tuple[str, ...], before: BodySchema | None = None
+) -> BodySchema:
+    """What was learned, without errors and normal statistics."""
+    material, task = learner.material, learner.task
+    learned = learner.biases[: len(conditions)].copy()
+    known = {} if before is None else dict(before.biases)
+    biases = {**known, **dict(zip(conditions, learned, strict=True))} if learned.shape[1] else {}
+    rows = np.where(material.suspected[:, task.signal_of], np.nan, material.rows)[: material.new]
+    complete = np.flatnonzero(np.isfinite(np.delete(rows, scaler.dead, axis=1)).all(axis=1))
+    chosen = complete[np.random.default_rng(learner.config.seed).permutation(len(complete))[:ANCHORS]]
+    anchors, names = np.nan_to_num(rows[chosen]), list(biases)
+    owners = np.array([names.index(c) for c in conditions] if biases else [], int)
+    owner = owners[material.condition[chosen]] if biases else np.zeros(0, int)
+    if before is not None and biases:  # what is known of conditions that the new data do not show
+        others = ~np.isin(before.anchor_conditions, owners)
+        anchors = np.concatenate([anchors, before.anchors[others]])
+        owner = np.concatenate([owner, before.anchor_conditions[others]])
+    return BodySchema(
+        layout=task.layout,
+        x_in=task.x_in,
+        x_out=task.x_out,
+        masks=task.masks,
+        scaler=scaler,
+        weights=learner.weights,
+        anchors=anchors.astype(np.float32),
+        anchor_conditions=owner,
+        bias=learned.mean(axis=0),
+        biases=biases,
+    )
+
+
+def _assessed(schema: BodySchema, learner: Learner, conditions: tuple[str, ...]) -> BodySchema:
+    """The schema with errors and normal statistics of the held-out data, but for what was rejected there."""
+    held = learner.held
+    rows = schema.scaler.restore(np.where(held.suspected[:, held.task.signal_of], np.nan, held.rows))
+    names = list(schema.biases)
+    owners = np.array([names.index(c) for c in conditions] if names else [0] * len(conditions), int)
+    return assess(schema, rows, owners[held.condition])
+
+
+def _history(learner: Learner, scaler: Scaler, notes: list[str]) -> History:
+    course, material = learner.course, learner.material
+    dead = tuple(material.task.layout.element(int(index)) for index in scaler.dead)
+    return History(
+        train=tuple(course.train),
+        held_out=tuple(course.held_out),
+        best_epoch=course.best_epoch,
+        skipped=material.skipped,
+        rejected=int(material.suspected[: material.new].sum()),
+        dead=dead,
+        notes=tuple(notes),
+        resumed=course.resumed,
+    )

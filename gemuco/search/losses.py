@@ -1,0 +1,245 @@
+"""What is asked of a prediction: terms that add up to a loss (paper, II-H, II-I and III).
+
+A term says what is wanted (`Match("joint_position")`). Bound to a body schema, the references of this solve and the
+present, it becomes a function of predictions: every signal of the layout in standard deviations, shape
+(candidates, size), to losses (candidates,) and their gradients (candidates, size). A new term is a class with
+`signals` and `bind`.
+
+Units: the paper adds metres, radians and newtons and does not say how. Here `Match`, `StayNear` and `StaySmall` measure
+in standard deviations of the training data (`unit="std"`), so that one weight means the same for every signal, or in
+the signal's own unit (`unit="si"`). `StaySmall` measures from the physical zero either way, not from the mean.
+`TorqueBalance` (in `gemuco.search.torque`) measures in N m. `Hold` has no weight: it is met exactly.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
+
+import numpy as np
+
+from gemuco.errors import NotFinite, NotObservable, SchemaError, WrongSize
+from gemuco.search.norms import Bound, Difference, Norm
+
+if TYPE_CHECKING:
+    from gemuco.schema import BodySchema
+
+Values = Mapping[str, np.ndarray]
+
+
+UNITS = ("std", "si")
+
+
+class Term(Protocol):
+    """One wish."""
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """The signals whose prediction the loss depends on."""
+        ...
+
+    def bind(self, schema: "BodySchema", target: Values, now: Values) -> Bound:
+        """The wish as a function of predictions.
+
+        Args:
+            schema: Whose predictions.
+            target: Signal -> reference of this solve [its unit].
+            now: Signal -> measured value [its unit]; NaN where nothing was measured.
+        """
+        ...
+
+
+@runtime_checkable
+class Lasting(Term, Protocol):
+    """A wish that depends on references and the present by its numbers alone: what it was bound to is kept."""
+
+    def renew(self, bound: Bound, schema: "BodySchema", target: Values, now: Values) -> None:
+        """Tell what `bind` returned other references and another present, in place; raises what `bind` does."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Match:
+    """weight * ||A x - reference||: reach the reference of a signal.
+
+    Attributes:
+        signal: What to predict.
+        weight: Loss per unit of the norm.
+        matrix: Rows of A, which acts on the signal in its own unit; the signal itself if not given.
+        value: A reference that is always the same, such as (0, 0) for the center of gravity; else the target's.
+        unit: `std`: every row of A x in its own standard deviation; `si`: in the unit of A x.
+    """
+
+    signal: str
+    weight: float = 1.0
+    matrix: tuple[tuple[float, ...], ...] | None = None
+    value: tuple[float, ...] | None = None
+    unit: str = "std"
+
+    def __post_init__(self) -> None:
+        _check(self)
+        if self.matrix is not None:
+            object.__setattr__(self, "matrix", tuple(tuple(float(a) for a in row) for row in self.matrix))
+        _freeze_value(self)
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """The signals whose prediction the loss depends on."""
+        return (self.signal,)
+
+    def reference(self, target: Values) -> np.ndarray:
+        """What A x shall be [its unit], shape (rows,).
+
+        Raises:
+            NotObservable: There is neither a value nor a target.
+        """
+        if self.value is not None:
+            return np.asarray(self.value, float)
+        if self.signal not in target:
+            raise NotObservable(f"Nothing was asked of '{self.signal}', but the loss wants to match it; give a target.")
+        return _numbers(self.signal, target[self.signal])
+
+    def bind(self, schema: "BodySchema", target: Values, now: Values) -> Norm:
+        """See `Term.bind`; nothing is asked where the reference is NaN."""
+        return Norm(self.difference(schema, target), self.weight)
+
+    def renew(self, bound: Norm, schema: "BodySchema", target: Values, now: Values) -> None:
+        """See `Lasting.renew`."""
+        if self.value is None:
+            bound.difference.ask(self.reference(target))
+
+    def difference(self, schema: "BodySchema", target: Values) -> Difference:
+        """A x - reference as a function of predictions."""
+        return Difference.of(schema, self.signal, self.matrix, self.unit).ask(self.reference(target))
+
+
+@dataclass(frozen=True, slots=True)
+class StayNear:
+    """weight * ||x - near||: keep a signal near a posture, such as 0.3 ||theta - theta_orig||.
+
+    Attributes:
+        signal: What to keep.
+        weight: Loss per unit of the norm.
+        value: Where; if not given, the reference of this solve, and without one where the signal is now.
+        unit: `std` or `si`.
+    """
+
+    signal: str
+    weight: float = 1.0
+    value: tuple[float, ...] | None = None
+    unit: str = "std"
+
+    def __post_init__(self) -> None:
+        _check(self)
+        _freeze_value(self)
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """The signals whose prediction the loss depends on."""
+        return (self.signal,)
+
+    def bind(self, schema: "BodySchema", target: Values, now: Values) -> Norm:
+        """See `Term.bind`; nothing is asked where it is not known what to stay near."""
+        near = Difference.of(schema, self.signal, None, self.unit)
+        return Norm(near.ask(self.reference(schema, target, now)), self.weight)
+
+    def renew(self, bound: Norm, schema: "BodySchema", target: Values, now: Values) -> None:
+        """See `Lasting.renew`."""
+        if self.value is None:
+            bound.difference.ask(self.reference(schema, target, now))
+
+    def reference(self, schema: "BodySchema", target: Values, now: Values) -> np.ndarray:
+        """What to stay near [its unit], shape (n,); NaN where that is not known."""
+        if self.value is not None:
+            return np.asarray(self.value, float)
+        unknown = np.full(schema.layout.signal(self.signal).size, np.nan)
+        return _numbers(self.signal, target.get(self.signal, now.get(self.signal, unknown)))
+
+
+@dataclass(frozen=True, slots=True)
+class StaySmall:
+    """weight * ||x||: keep a signal near its physical zero."""
+
+    signal: str
+    weight: float = 1.0
+    unit: str = "std"
+
+    def __post_init__(self) -> None:
+        _check(self)
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """The signals whose prediction the loss depends on."""
+        return (self.signal,)
+
+    def bind(self, schema: "BodySchema", target: Values, now: Values) -> Norm:
+        """See `Term.bind`."""
+        zero = np.zeros(schema.layout.signal(self.signal).size)
+        return Norm(Difference.of(schema, self.signal, None, self.unit).ask(zero), self.weight)
+
+    def renew(self, bound: Norm, schema: "BodySchema", target: Values, now: Values) -> None:
+        """See `Lasting.renew`; zero stays zero."""
+
+
+@dataclass(frozen=True, slots=True)
+class Hold:
+    """A signal is forced to a value: a condition that every prediction meets, not a wish that others can outweigh.
+
+    Where the signal is an input of the route's mask it is given to the network and not searched for; where it is
+    predicted, the search moves only along predictions that meet it.
+
+    Attributes:
+        signal: What is held.
+        value: Where, NaN for elements that are free; the reference of this solve if not given.
+    """
+
+    signal: str
+    value: tuple[float, ...] | None = None
+
+    def __post_init__(self) -> None:
+        _freeze_value(self)
+
+    def wanted(self, schema: "BodySchema", target: Values) -> np.ndarray:
+        """Every element of the layout [standard deviations], shape (size,); NaN where nothing is held.
+
+        Raises:
+            NotObservable: There is neither a value nor a reference.
+            NotFinite: No element is held.
+        """
+        if self.value is None and self.signal not in target:
+            raise NotObservable(f"'{self.signal}' shall be held, but nobody says where; give a value or a reference.")
+        value = _numbers(self.signal, self.value if self.value is not None else target[self.signal])
+        x = schema.normalise({self.signal: value})
+        if not np.isfinite(x).any():
+            raise NotFinite(f"'{self.signal}' shall be held, but no element of where is a number.")
+        return x
+
+
+def _numbers(signal: str, value: object) -> np.ndarray:
+    try:
+        array = np.asarray(value, float)
+    except (TypeError, ValueError):
+        raise WrongSize(f"The reference of '{signal}' needs numbers; what was given are none.") from None
+    if array.ndim != 1:
+        raise WrongSize(f"The reference of '{signal}' has shape {array.shape}; it is one array, of shape (n,).")
+    return array
+
+
+def check_weight(weight: float, what: str) -> None:
+    """Refuse a weight that would reward what it should punish.
+
+    Raises:
+        SchemaError: It is negative, infinite or no number.
+    """
+    if not (np.isfinite(weight) and weight >= 0.0):
+        raise SchemaError(f"The weight of {what} is {weight}; it must be a finite number that is not negative.")
+
+
+def _check(term: Match | StayNear | StaySmall) -> None:
+    check_weight(term.weight, f"{type(term).__name__}('{term.signal}')")
+    if term.unit not in UNITS:
+        raise SchemaError(f"The unit of a term is {' or '.join(UNITS)}, not '{term.unit}'.")
+
+
+def _freeze_value(term: Match | StayNear | Hold) -> None:
+    if term.value is not None:
+        object.__setattr__(term, "value", tuple(float(v) for v in np.ravel(term.value)))

@@ -1,0 +1,228 @@
+"""What a descent moves (paper, II-C): z, from which every x_out is decoded (e), or some x_in, from which the network
+infers the rest (f). Estimation, control and simulation differ in what they ask; what moves is here for all three.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from gemuco.compiled.chain import output, pack
+from gemuco.errors import NotObservable, SchemaError, WrongSize
+from gemuco.estimation import STARTS
+from gemuco.layers import pull, run, trace
+from gemuco.masks import Mask, label
+from gemuco.scaler import CLIP
+from gemuco.search.fold import Lines, give, input_lines, latent_lines
+
+if TYPE_CHECKING:
+    from gemuco.schema import BodySchema
+
+ROUTES = ("auto", "mask", "latent", "input")
+Limits = Mapping[str, tuple[np.ndarray, np.ndarray]]
+"""Signal -> lowest and highest value [its unit], shapes (n,)."""
+Back = Callable[[np.ndarray], np.ndarray]
+"""Gradient with respect to predictions, (candidates, size) -> with respect to points, (candidates, n)."""
+
+
+class Route(Protocol):
+    """A way from points to predictions."""
+
+    def predict(self, points: np.ndarray) -> tuple[np.ndarray, Back]:
+        """Points (candidates, n) -> predictions [standard deviations], (candidates, size), and how gradients return.
+
+        A signal that the route says nothing about is 0, and gradients with respect to it are dropped.
+        """
+        ...
+
+    def give(self, given: np.ndarray) -> None:
+        """Take other values of what is given [standard deviations], shape (size,); NaN where it was NaN before."""
+        ...
+
+
+class LatentRoute:
+    """Usage (e): z moves, and every x_out is decoded from it."""
+
+    def __init__(self, schema: "BodySchema") -> None:
+        self._schema = schema
+        self._decoder = schema.weights.decoder
+        self._packed, self._lines = pack(self._decoder), latent_lines(schema)
+
+    def give(self, given: np.ndarray) -> None:
+        """See `Route.give`; nothing is given to a decoder but z."""
+
+    def predict(self, points: np.ndarray) -> tuple[np.ndarray, Back]:
+        """See `Route.predict`."""
+        values = trace(self._decoder, points)
+        x = np.zeros((len(points), self._schema.layout.size), points.dtype)
+        x[:, self._schema.out_index] = values[-1]
+
+        def back(gradient: np.ndarray) -> np.ndarray:
+            return pull(self._decoder, values, np.ascontiguousarray(gradient[:, self._schema.out_index]))
+
+        return x, back
+
+    def lines(self) -> Lines:
+        """For compiled searches."""
+        return self._lines
+
+    def final(self, point: np.ndarray) -> np.ndarray:
+        """What was found, shape (size,) [standard deviations]; NaN for what is not in x_out."""
+        x = np.full(self._schema.layout.size, np.nan)
+        x[self._schema.out_index] = output(self._packed, point.astype(np.float32))
+        return x
+
+    def starts(self, begin: np.ndarray, only_there: bool = False) -> np.ndarray:
+        """Latent states of what is known and of training data, shape (starts, latent); see `Search.find`."""
+        schema = self._schema
+        encoder = schema.weights.encoder
+        found = []
+        there = schema.layout.whole(np.isfinite(begin))
+        covered = [mask for mask in schema.masks if mask <= there]
+        if covered:
+            found.append(run(encoder, schema.network_input(begin, covered[0]))[None])
+        if len(schema.anchors) and not (found and only_there):
+            found.append(run(encoder, schema.network_input(schema.anchors[:STARTS], schema.masks[0])))
+        return np.concatenate(found) if found else np.zeros((1, self._decoder[0].matrix.shape[0]), np.float32)
+
+
+class InputRoute:
+    """Usage (f): inputs under a mask move as far as they are not given, and the network infers the rest of x_out."""
+
+    def __init__(
+        self, schema: "BodySchema", mask: Mask, given: np.ndarray, needed: Sequence[str], limits: Limits | None = None
+    ) -> None:
+        """Prepare.
+
+        Args:
+            schema: The body schema.
+            mask: The inputs.
+            given: Inputs that are not searched for [standard deviations], shape (size,); NaN where free.
+            needed: Signals whose prediction somebody looks at; the network runs if one of them is not in the mask.
+            limits: Narrower bounds of the inputs than those of the training data.
+
+        Raises:
+            NotObservable: A needed signal is neither given nor inferred.
+        """
+        for name in needed:
+            if name not in mask and name not in schema.x_out:
+                raise NotObservable(
+                    f"A term is about '{name}', which this schema does not infer ({', '.join(schema.x_out)}) and which "
+                    f"is not among the inputs {label(mask, schema.layout.names)}."
+                )
+        inside = schema.layout.indices(mask)
+        self.mask, self._schema, self._chain = mask, schema, schema.weights.whole
+        self._inside, self._there = inside, np.isfinite(given)
+        self.free = inside[~self._there[inside]]
+        self._known = np.where(self._there, given, 0.0)
+        self._base = schema.network_input(self._known, mask).astype(self._chain[0].matrix.dtype)
+        is_free, is_inside = np.zeros((2, schema.layout.size), bool)
+        is_free[self.free] = is_inside[inside] = True
+        self._columns = np.flatnonzero(is_free[schema.in_index])
+        self._inferred = ~is_inside[schema.out_index]
+        self._outputs = schema.out_index[self._inferred]
+        self._runs = any(name not in mask for name in needed)
+        low, high = bounds_of(schema, limits)
+        dtype = self._base.dtype
+        self.low, self.high = low[self.free].astype(dtype), high[self.free].astype(dtype)
+        self._lines = input_lines(
+            schema, self._base, self._columns, self.free, self._inferred, self._known, self.low, self.high
+        )
+
+    def give(self, given: np.ndarray) -> None:
+        """See `Route.give`."""
+        np.copyto(self._known, given, where=self._there)
+        self._base[:] = self._schema.network_input(self._known, self.mask)
+        give(self._lines, self._chain[0], self._base, self._columns, self._known)
+
+    def predict(self, points: np.ndarray) -> tuple[np.ndarray, Back]:
+        """See `Route.predict`."""
+        x = np.repeat(self._known[None].astype(points.dtype), len(points), axis=0)
+        x[:, self.free] = points
+        if not self._runs:
+            return x, lambda gradient: gradient[:, self.free]
+        inputs = np.repeat(self._base[None], len(points), axis=0)
+        inputs[:, self._columns] = points
+        values = trace(self._chain, inputs)
+        x[:, self._outputs] = values[-1][:, self._inferred]
+
+        def back(gradient: np.ndarray) -> np.ndarray:
+            out = np.zeros_like(values[-1])
+            out[:, self._inferred] = gradient[:, self._outputs]
+            return gradient[:, self.free] + pull(self._chain, values, out)[:, self._columns]
+
+        return x, back
+
+    def lines(self) -> Lines:
+        """For compiled searches."""
+        return self._lines
+
+    def final(self, point: np.ndarray) -> np.ndarray:
+        """What was found, shape (size,) [standard deviations]; NaN for what is neither input nor output."""
+        schema = self._schema
+        inputs = self._base.astype(np.float32)
+        inputs[self._columns] = point
+        x = np.full(schema.layout.size, np.nan)
+        x[schema.out_index] = output(schema.ready.predictor.chain, inputs)
+        x[self._inside] = self._known[self._inside]
+        x[self.free] = point
+        return x
+
+    def starts(self, begin: np.ndarray, only_there: bool = False) -> np.ndarray:
+        """What is known, and training data, shape (starts, free); see `Search.find`."""
+        found = []
+        if np.isfinite(begin[self.free]).all():
+            found.append(begin[None, self.free])
+        if len(self._schema.anchors) and not (found and only_there):
+            found.append(self._schema.anchors[:STARTS, self.free])
+        return np.concatenate(found or [np.zeros((1, len(self.free)))]).astype(np.float32)
+
+
+def bounds_of(schema: "BodySchema", limits: Limits | None) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest value of every element that a search may try [standard deviations], shapes (size,).
+
+    The range of the training data, narrowed by the limits.
+
+    Raises:
+        UnknownSignal: A limit is of a signal that is not in the layout.
+        WrongSize: A limit does not have its signal's size.
+        SchemaError: A lower limit is above its upper limit.
+    """
+    scaler = schema.scaler
+    low, high = scaler.normalise(scaler.low).clip(-CLIP, CLIP), scaler.normalise(scaler.high).clip(-CLIP, CLIP)
+    for name, pair in (limits or {}).items():
+        span = schema.layout.slice(name)
+        if len(pair) != 2:
+            raise WrongSize(f"The limits of '{name}' are a lower and an upper bound, not {len(pair)} of them.")
+        bounds = [schema.layout.join({name: np.asarray(bound, float)}) for bound in pair]
+        below, above = (scaler.normalise(bound)[span] for bound in bounds)
+        if not (below <= above).all():
+            raise SchemaError(f"A lower limit of '{name}' is above its upper limit, or one of them is no number.")
+        low[span], high[span] = low[span].clip(below, above), high[span].clip(below, above)
+    return low, high
+
+
+def checked_mask(schema: "BodySchema", mask: Mask) -> Mask:
+    """A mask that was found feasible.
+
+    Raises:
+        NotObservable: This schema was not trained with it.
+    """
+    if mask not in schema.masks:
+        known = ", ".join(label(m, schema.layout.names) for m in schema.masks)
+        raise NotObservable(
+            f"The mask {label(mask, schema.layout.names) or ', '.join(sorted(mask))} is not feasible for this schema. "
+            f"Feasible masks: {known}."
+        )
+    return mask
+
+
+def checked_route(route: str) -> str:
+    """A route that exists.
+
+    Raises:
+        SchemaError: It does not.
+    """
+    if route not in ROUTES:
+        raise SchemaError(f"Route '{route}' is not known. Known routes: {', '.join(ROUTES)}.")
+    return route

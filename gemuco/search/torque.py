@@ -1,0 +1,229 @@
+"""Torque balance of muscles (paper, III-B): the muscle Jacobian G = dl/dtheta, had by differentiating the network."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from gemuco.compiled.chain import pack, turned
+from gemuco.errors import NotFinite, NotObservable, SchemaError
+from gemuco.layers import Curvature, Layer
+from gemuco.search.losses import Values, check_weight
+from gemuco.search.norms import TINY
+
+if TYPE_CHECKING:
+    from gemuco.schema import BodySchema
+
+POSTURES = ("reference", "predicted")
+STEP = 1e-5
+"""Change of a posture [rad] by which the caller's torque is differentiated."""
+
+
+@dataclass(frozen=True, slots=True)
+class TorqueBalance:
+    """weight * ||tau_ext + G^T f||: muscle tensions that hold a posture.
+
+    G is taken at the predicted tensions, and at the reference posture (control: the posture is decided) or at the
+    predicted one (simulation: it is what is sought).
+
+    Attributes:
+        torque: Posture [rad], shape (joints,) -> tau_ext, the joint torque that the muscles must supply [N m], shape
+            (joints,): what gravity asks, minus what an external force F does already, gravity(theta) - J^T F.
+        weight: Loss per N m.
+        position: theta, rad.
+        tension: f, N.
+        length: l, m.
+        at: `reference` or `predicted`.
+    """
+
+    torque: Callable[[np.ndarray], np.ndarray]
+    weight: float = 0.01
+    position: str = "joint_position"
+    tension: str = "muscle_tension"
+    length: str = "muscle_length"
+    at: str = "reference"
+
+    def __post_init__(self) -> None:
+        check_weight(self.weight, "TorqueBalance")
+        if self.at not in POSTURES:
+            raise SchemaError(f"Torque is balanced at the posture {' or '.join(POSTURES)}, not at '{self.at}'.")
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """The signals whose prediction the loss depends on."""
+        return (self.tension,) if self.at == "reference" else (self.position, self.tension)
+
+    def bind(self, schema: "BodySchema", target: Values, now: Values) -> "Balanced":
+        """See `Term.bind`."""
+        muscles = muscle_model(schema, self)
+        theta, f = schema.layout.slice(self.position), schema.layout.slice(self.tension)
+        mean, std = schema.scaler.mean[theta], schema.scaler.std[theta]
+        posture = None if self.at == "predicted" else np.empty(len(mean))
+        bound = Balanced(muscles, theta, f, mean, std, self.torque, self.weight, posture)
+        self.renew(bound, schema, target, now)
+        return bound
+
+    def renew(self, bound: "Balanced", schema: "BodySchema", target: Values, now: Values) -> None:
+        """See `Lasting.renew`; a predicted posture needs no reference."""
+        if bound.posture is None:
+            return
+        if self.position not in target or not np.isfinite(target[self.position]).all():
+            raise NotFinite(f"Torque balance needs a whole reference of '{self.position}'; some of it is missing.")
+        if np.shape(target[self.position]) != bound.posture.shape:
+            schema.layout.join_one({self.position: target[self.position]})
+        bound.posture[:] = target[self.position]
+
+
+@dataclass(frozen=True, slots=True)
+class Balanced:
+    """Torque balance bound to a schema; a `Bound` that compiled searches know (`gemuco.search.fold`).
+
+    Attributes:
+        muscles: The muscles as the network knows them.
+        theta: Where the posture lies in the layout.
+        f: Where the tension does.
+        mean: Of the posture [rad], shape (joints,).
+        std: Of the posture [rad], shape (joints,).
+        torque: Posture [rad] -> tau_ext [N m].
+        weight: Loss per N m.
+        posture: The given posture [rad], shape (joints,); None where it is the predicted one.
+    """
+
+    muscles: "MuscleModel"
+    theta: slice
+    f: slice
+    mean: np.ndarray
+    std: np.ndarray
+    torque: Callable[[np.ndarray], np.ndarray]
+    weight: float
+    posture: np.ndarray | None
+
+    def __call__(self, x: np.ndarray, slope: bool = True) -> tuple[np.ndarray, np.ndarray]:
+        """See `Bound`."""
+        postures = x[:, self.theta] * self.std + self.mean
+        if self.posture is not None:
+            postures = np.repeat(self.posture[None], len(x), axis=0)
+        torques = self.torques(postures if self.posture is None else postures[:1])
+        missing = self.muscles.missing((postures - self.mean) / self.std, x[:, self.f], torques)
+        gradient = np.zeros_like(x)
+        if slope:
+            by_posture, by_tension = missing.slopes()
+            gradient[:, self.f] = self.weight * by_tension
+            if self.posture is None:
+                turned = np.einsum("ij,ijk->ik", missing.way, self.stiffness(postures, torques))
+                gradient[:, self.theta] = self.weight * (by_posture + turned * self.std)
+        return self.weight * missing.norm, gradient
+
+    def torques(self, postures: np.ndarray) -> np.ndarray:
+        """tau_ext at postures [N m], shape (n, joints)."""
+        return np.stack([np.asarray(self.torque(posture), float) for posture in postures])
+
+    def stiffness(self, postures: np.ndarray, torques: np.ndarray) -> np.ndarray:
+        """How tau_ext changes with the posture [N m/rad], shape (n, joints, joints), by differences."""
+        found = np.empty((*torques.shape, postures.shape[1]))
+        for joint in range(postures.shape[1]):
+            moved = postures.copy()
+            moved[:, joint] += STEP
+            found[:, :, joint] = (self.torques(moved) - torques) / STEP
+        return found
+
+
+class MuscleModel:
+    """The muscles as the network knows them under the mask (position, tension): from theta and f to l, no more."""
+
+    __slots__ = ("back", "chain", "f", "f_mean", "f_std", "l_std", "packed", "theta", "theta_std")
+
+    def __init__(self, schema: "BodySchema", names: TorqueBalance) -> None:
+        """Prepare the network.
+
+        Raises:
+            NotObservable: The schema does not infer length from position and tension.
+        """
+        layout, scaler = schema.layout, schema.scaler
+        theta, f, length = (layout.slice(n) for n in (names.position, names.tension, names.length))
+        mask = frozenset({names.position, names.tension})
+        if mask not in schema.masks or names.length not in schema.x_out:
+            raise NotObservable(
+                f"Torque balance differentiates '{names.length}' by '{names.position}', but this schema does not infer "
+                f"it from '{names.position}' and '{names.tension}'; see the masks that structure determination found."
+            )
+        begin, *between, end = schema.weights.whole
+        dtype = begin.matrix.dtype
+        base = schema.network_input(np.zeros(layout.size), mask).astype(dtype)
+        joints, muscles, lengths = (
+            _columns(index, span)
+            for index, span in ((schema.in_index, theta), (schema.in_index, f), (schema.out_index, length))
+        )
+        inputs = np.concatenate([joints, muscles])
+        self.theta, self.f = slice(0, len(joints)), slice(len(joints), len(inputs))
+        first = Layer(begin.matrix[inputs], begin.offset + base @ begin.matrix, begin.activation)
+        last = Layer(np.ascontiguousarray(end.matrix[:, lengths]), end.offset[lengths], end.activation)
+        self.chain = (first, *between, last)
+        self.packed = pack(self.chain)
+        self.back = turned(self.packed)
+        self.theta_std, self.f_std, self.l_std = (scaler.std[s].astype(dtype) for s in (theta, f, length))
+        self.f_mean = scaler.mean[f].astype(dtype)
+
+    def missing(self, posture: np.ndarray, tension: np.ndarray, torque: np.ndarray) -> "Missing":
+        """What the muscles lack, torque + G^T f.
+
+        Args:
+            posture: theta [standard deviations], shape (candidates, joints).
+            tension: f [standard deviations], shape (candidates, muscles).
+            torque: tau_ext [N m], shape (candidates or 1, joints).
+        """
+        muscles = self._at(posture, tension)
+        rest = torque.astype(self.f_std.dtype) + muscles.gradient[:, self.theta] / self.theta_std
+        norm = np.sqrt(np.einsum("ij,ij->i", rest, rest))
+        return Missing(norm, rest / np.maximum(norm, TINY)[:, None], self, muscles)
+
+    def torque(self, posture: np.ndarray, tension: np.ndarray) -> np.ndarray:
+        """G^T f [N m], shape (candidates, joints), of postures and tensions [standard deviations]."""
+        return self._at(posture, tension).gradient[:, self.theta] / self.theta_std
+
+    def _at(self, posture: np.ndarray, tension: np.ndarray) -> Curvature:
+        inputs = np.concatenate([posture, tension], axis=1).astype(self.f_std.dtype)
+        w = (inputs[:, self.f] * self.f_std + self.f_mean) * self.l_std
+        return Curvature(self.chain, inputs, w)
+
+
+@lru_cache(maxsize=4)
+def muscle_model(schema: "BodySchema", names: TorqueBalance) -> MuscleModel:
+    """The muscles of a schema; those of the newest schemas are kept, for a solve takes less time than to lay them out.
+
+    Raises:
+        NotObservable: The schema does not infer length from position and tension.
+    """
+    return MuscleModel(schema, names)
+
+
+@dataclass(frozen=True, slots=True)
+class Missing:
+    """What the muscles lack to hold a posture.
+
+    Attributes:
+        norm: ||torque + G^T f|| [N m], shape (candidates,).
+        way: Its gradient with respect to torque, shape (candidates, joints).
+        model: The muscles.
+        at: Their network where it was asked.
+    """
+
+    norm: np.ndarray
+    way: np.ndarray
+    model: MuscleModel
+    at: Curvature
+
+    def slopes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Gradients of the norm with respect to theta and to f [N m per standard deviation], torque held constant."""
+        model = self.model
+        tangent = np.zeros_like(self.at.gradient)
+        tangent[:, model.theta] = self.way / model.theta_std
+        pushed, bent = self.at.mixed(tangent)
+        return bent[:, model.theta], model.f_std * model.l_std * pushed + bent[:, model.f]
+
+
+def _columns(index: np.ndarray, span: slice) -> np.ndarray:
+    """Where the elements of a span of the layout lie among those of an index."""
+    return np.flatnonzero((index >= span.start) & (index < span.stop))

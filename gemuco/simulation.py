@@ -1,0 +1,197 @@
+"""Simulation (paper, II-J): the state of the body that a command and constraints bring about, step after step."""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gemuco.errors import NotFinite, NotObservable, SchemaError
+from gemuco.masks import Mask, best, label
+from gemuco.schema import BodySchema
+from gemuco.search.asked import Asked, check_present, signals_of
+from gemuco.search.descent import DescentConfig, NewtonConfig
+from gemuco.search.losses import Hold, Match, Term
+from gemuco.search.routes import Limits, bounds_of, checked_mask, checked_route
+from gemuco.search.search import Search
+
+SEARCH = NewtonConfig()
+
+
+@dataclass(frozen=True, slots=True)
+class Simulated:
+    """The body after a command.
+
+    Attributes:
+        values: Signal -> value [its unit], shape (n,); of the command what was reached, which may not be what was sent.
+        loss: Sum of the terms.
+        residual: How far the network, asked again, contradicts the state (root mean square over x_out, standard
+            deviations): a state beside the data's manifold, or a command that is not reached; NaN if no mask can tell.
+        route: `mask` (usages a and b), `latent` (e) or `input` (f).
+        mask: The signals that the network was given; empty for `latent`.
+    """
+
+    values: dict[str, np.ndarray]
+    loss: float
+    residual: float
+    route: str
+    mask: Mask
+
+
+class Simulator:
+    """Steps from state to state, each search beginning where the last one ended.
+
+    Route `auto` is the paper's rule, that of estimation. `mask`: without terms, and a feasible mask within what is
+    commanded and held; `latent`: z descends over terms about x_out; `input`: some x_in descend.
+
+    With route `input` a mask may be named. What is commanded is given to the network if it is in the mask, and else
+    inferred and matched, as l is under (theta, f): every state then is one that the network takes for consistent.
+    """
+
+    def __init__(
+        self,
+        schema: BodySchema,
+        terms: Sequence[Term | Hold],
+        command: str,
+        route: str = "auto",
+        search: DescentConfig | NewtonConfig | None = None,
+        mask: Mask | None = None,
+        limits: Limits | None = None,
+    ) -> None:
+        """Prepare to simulate commands of one signal.
+
+        Args:
+            schema: The body schema.
+            terms: Constraints. To match the command is added when none of them is about it.
+            command: The signal that is commanded.
+            route: `auto`, `mask`, `latent` or `input`.
+            search: How to descend.
+            mask: Signals that the network is given; chosen if not given.
+            limits: Signal -> bounds of what may be tried.
+
+        Raises:
+            SchemaError: The route is not known, or terms or limits make no sense.
+            UnknownSignal: A name is not in the layout.
+            NotObservable: The schema does not know the command, or the mask is not feasible.
+        """
+        schema.layout.slice(command)
+        self.schema, self.command, self.route, self.mask = schema, command, checked_route(route), mask
+        self.limits = dict(limits or {})
+        self._search = Search(search or SEARCH, self.limits)
+        if mask is not None:
+            checked_mask(schema, mask)
+            if route in ("latent", "auto"):
+                raise SchemaError(f"A mask goes with route mask or input, not with '{route}'.")
+        if command not in (*schema.x_in, *schema.x_out):
+            raise NotObservable(f"'{command}' is commanded, but this schema neither infers nor takes it.")
+        bounds_of(schema, self.limits)
+        self.terms: tuple[Term | Hold, ...] = ()
+        self.constrain(terms)
+
+    def constrain(self, terms: Sequence[Term | Hold]) -> None:
+        """Go on under other constraints.
+
+        Raises:
+            UnknownSignal: A term is about a signal that is not in the layout.
+        """
+        for term in terms:
+            for name in signals_of(term):
+                self.schema.layout.slice(name)
+        is_matched = any(isinstance(term, Match | Hold) and term.signal == self.command for term in terms)
+        self.terms = tuple(terms) if is_matched else (Match(self.command), *terms)
+        self._asked = Asked(self.schema, self.terms)
+        self._search.drop()
+
+    def restart(self) -> None:
+        """Forget the warm start."""
+        self._search.restart()
+
+    def step(
+        self,
+        command: np.ndarray | Sequence[float],
+        given: Mapping[str, np.ndarray] | None = None,
+        now: Mapping[str, np.ndarray] | None = None,
+    ) -> Simulated:
+        """The state that a command brings about.
+
+        Args:
+            command: What is sent [unit of the commanded signal], shape (n,).
+            given: Signal -> reference of other terms [its unit], such as the posture that `Hold` forces.
+            now: Signal -> value [its unit] of the state to begin from, at the first step.
+
+        Raises:
+            WrongSize: An array does not have its signal's size.
+            NotFinite: The command holds something that is not a number.
+            NotObservable: A term or the route cannot work with this schema.
+        """
+        schema = self.schema
+        target = {**(given or {}), self.command: np.asarray(command, float)}
+        sent = schema.normalise_one({self.command: target[self.command]})
+        if not np.isfinite(sent[schema.layout.slice(self.command)]).all():
+            raise NotFinite(f"The command of '{self.command}' is not finite; every element needs a number.")
+        self._check(target)
+        check_present(schema, now or {})
+        self._asked.read(target, now or {})
+        fixed = np.where(np.isfinite(sent), sent, self._asked.held)
+        found = self._search.find(self._asked, fixed, self._choose, lambda: schema.normalise_one(now or {}))
+        values = schema.layout.split(schema.scaler.restore(found.x))
+        state = {name: part.copy() for name, part in values.items() if np.isfinite(part).all()}
+        return Simulated(state, found.loss, self._residual(found.x, sent, found.mask), found.route, found.mask)
+
+    def run(
+        self,
+        commands: Iterable[np.ndarray | Sequence[float]],
+        given: Mapping[str, np.ndarray] | None = None,
+        now: Mapping[str, np.ndarray] | None = None,
+    ) -> Iterator[Simulated]:
+        """The states that commands bring about one after the other; see `step`."""
+        for command in commands:
+            yield self.step(command, given, now)
+
+    def _check(self, target: Mapping[str, np.ndarray]) -> None:
+        for name in target:
+            self.schema.layout.slice(name)
+            if name not in self._asked.needed:
+                known = ", ".join(self._asked.needed)
+                raise NotObservable(f"'{name}' was given, but no term is about it; they are about {known}.")
+
+    def _choose(self, fixed: Mask) -> tuple[str, Mask]:
+        """Route and mask; `fixed` are the signals that are commanded or held whole."""
+        schema, wishes = self.schema, self._asked.wishes
+        if self.mask is not None:
+            if self.route == "mask" and not self.mask <= fixed:
+                missing = label(self.mask - fixed, schema.layout.names)
+                raise NotObservable(f"Route mask needs {missing} commanded or held; use route input.")
+            return self.route, self.mask
+        free = [wish for wish in wishes if not (isinstance(wish, Match) and wish.signal == self.command)]
+        covering = best(schema.masks, fixed, lambda m: -len(m))
+        if self.route == "mask" or (self.route == "auto" and not free):
+            if covering is not None:
+                return "mask", covering
+            if self.route == "mask":
+                known = label(fixed, schema.layout.names)
+                raise NotObservable(f"Route mask needs a feasible mask within {known}; use route latent or input.")
+        about = {name for wish in wishes for name in wish.signals}
+        if self.route == "latent" or (self.route == "auto" and about <= set(schema.x_out)):
+            for name in sorted(about - set(schema.x_out)):
+                raise NotObservable(f"Route latent predicts only x_out, but a term is about '{name}'; use route input.")
+            return "latent", frozenset()
+        inferring = [m for m in schema.masks if self.command in m or self.command in schema.x_out]
+        if not inferring:
+            raise NotObservable(f"No feasible mask takes '{self.command}', and it is not inferred.")
+        return "input", max(inferring, key=lambda m: (self.command not in m, len(m)))
+
+    def _residual(self, x: np.ndarray, sent: np.ndarray, mask: Mask) -> float:
+        """The network asked again with what was sent, under the mask in use or the least one that holds the command."""
+        schema = self.schema
+        if not mask:
+            there = schema.layout.whole(np.isfinite(x))
+            mask = min(
+                (m for m in schema.masks if m <= there),
+                key=lambda m: (self.command not in m, len(m)),
+                default=frozenset(),
+            )
+            if not mask:
+                return float("nan")
+        state = np.where(np.isfinite(sent), sent, x)
+        again = schema.infer(np.where(np.isfinite(state), state, 0.0), mask)
+        return float(np.sqrt(np.mean((again - state[schema.out_index]) ** 2)))

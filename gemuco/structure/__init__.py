@@ -1,0 +1,1 @@
+"""Determination of inputs, outputs and feasible masks from data (paper, II-E)."""

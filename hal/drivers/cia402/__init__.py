@@ -1,0 +1,1 @@
+"""Servo drives of profile CiA 402."""

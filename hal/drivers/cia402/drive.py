@@ -1,0 +1,347 @@
+"""A servo drive that winds a wire [m] or turns a joint [rad]: where to be, how fast to turn, or how hard to push."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from hal.commissioning.pdo_map import Pdo
+from hal.device import Check, DeviceState
+from hal.drivers.can_device import Place
+from hal.drivers.canopen.node import HEARTBEAT, CanopenNode, Taker, data_sheet
+from hal.drivers.cia402.checks import UNWATCHED, drive_checks
+from hal.drivers.cia402.frames import CommandFrames
+from hal.drivers.cia402.modes import HomingRun, SetPointHandshake
+from hal.drivers.cia402.settings import MODES, OBJECTS, TARGETS, DriveSettings
+from hal.drivers.cia402.units import DriveUnits, drive_units
+from hal.drivers.cia402.writes import Write, check_objects, drive_writes
+from hal.errors import CommandRefused, DeviceRefused
+from hal.protocols import cia301, cia402
+from hal.protocols.cia402 import Mode, State, VelocityUnit
+
+RESET_CYCLES = 200
+"""For so many cycles a fault reset is tried,"""
+RESET_PERIOD = 4
+"""as a rising edge in every fourth."""
+STOPPING = 0.8
+"""How long [s] a quick stop, or slowing down, may take before the power is taken off."""
+RAMPED = (Mode.PROFILE_POSITION, Mode.CYCLIC_SYNCHRONOUS_VELOCITY)
+"""Modes in which a drive that is let go may be moving, and slows down first."""
+ANSWER_TIME = 1.0
+"""How long [s] a drive may take to acknowledge a set-point."""
+
+
+class Cia402Drive(CanopenNode):
+    """One drive. It is enabled only by `enable`, and stays disabled once it dropped out by itself."""
+
+    Settings = DriveSettings
+    COUNTERS = (*CanopenNode.COUNTERS, "homed")
+    MAY_RECEIVE = (cia402.MODE_OF_OPERATION,)
+
+    @classmethod
+    def quantities(cls, settings: DriveSettings) -> tuple[str, ...]:
+        """See `CanDevice.quantities`."""
+        return settings.quantities
+
+    @classmethod
+    def commanded(cls, settings: DriveSettings) -> str:
+        """See `CanDevice.commanded`."""
+        return settings.commanded
+
+    @classmethod
+    def traffic(cls, settings: DriveSettings, rate: float) -> tuple[tuple[int, float], ...]:
+        """See `CanDevice.traffic`."""
+        return cls.traffic_of(settings, rate, settings.quantities)
+
+    @classmethod
+    def traffic_of(
+        cls, settings: DriveSettings, rate: float, quantities: tuple[str, ...]
+    ) -> tuple[tuple[int, float], ...]:
+        """See `CanDevice.traffic_of`."""
+        pdos = settings.pdo.map("pdo") if settings.pdo else settings.pdos(quantities)
+        return (*pdos.frames(rate), HEARTBEAT)
+
+    def __init__(self, place: Place, settings: DriveSettings) -> None:
+        self._settings = settings
+        self._sheet = data_sheet(place.folder / settings.eds)
+        self._units: DriveUnits | None = None
+        self._state = State.NOT_READY
+        self._statusword = -1
+        """The newest; negative until one has come."""
+        self._counts: int | None = None
+        self._shown_mode = 0
+        self._velocity = math.nan
+        count = len(place.elements)
+        self._zeros, self._scales = np.zeros(count).tolist(), np.full(count, math.nan).tolist()
+        super().__init__(place, settings, cia402.PROFILE, settings.pdos(tuple(place.elements)))
+        check_objects(settings, "effort" in place.elements, self._sheet, str(place))
+        self.can_damp = settings.damping is not None
+        self._mode = MODES[settings.mode]
+        self._is_watched = self._sdo.has(cia301.CONSUMER_HEARTBEAT, 1)
+        self._handshake = SetPointHandshake()
+        self._homing: HomingRun | None = None
+        self._is_wanted = False
+        self._was_reached = False
+        self._told = ""
+        self._resetting = self._letting_go = self._slowing = 0
+        self._stopping_cycles = round(STOPPING * place.rate)
+        target = TARGETS[settings.commanded]
+        self._frames = CommandFrames(self._pdos.receives, place.node, target, str(place))
+
+    def _watch_time(self) -> float:
+        return self._settings.watch_time if self._is_watched else 0.0
+
+    def _before_commissioning(self) -> None:
+        self._forget()
+        self._sdo.write(cia402.CONTROLWORD.index, 0, cia402.DISABLE_VOLTAGE, 2)
+
+    def _calibrate(self) -> None:
+        self._check_modes()
+        settings = self._settings
+        units = self._units = drive_units(settings, self._velocity_unit(), self._rated_torque())
+        line = units.position
+        found = {
+            "position": (line.zero, line.scale),
+            "velocity": (0.0, units.velocity),
+            "effort": (0.0, units.effort),
+            "following_error": (0.0, line.scale),
+        }
+        if settings.temperature:
+            found["temperature"] = (settings.temperature.zero, settings.temperature.scale)
+        for quantity, slot in self._slots.items():
+            self._zeros[slot], self._scales[slot] = found[quantity]
+
+    def _check_modes(self) -> None:
+        if not self._sdo.has(cia402.SUPPORTED_MODES.index):
+            return
+        modes = self._sdo.read(cia402.SUPPORTED_MODES.index, 0)
+        for mode in (self._mode, *((Mode.HOMING,) if self._settings.homing else ())):
+            if not cia402.supports(modes, mode):
+                raise DeviceRefused(
+                    f"{self._place} does not have the mode {cia402.describe_mode(mode)}. By its object 6502h it has "
+                    f"{cia402.describe_modes(modes)}."
+                )
+
+    def _velocity_unit(self) -> VelocityUnit:
+        name = self._settings.velocity_unit
+        if name is None and self._sdo.has(cia402.VELOCITY_UNIT.index):
+            code = self._sdo.read(cia402.VELOCITY_UNIT.index, 0)
+            unit = cia402.velocity_unit(code)
+            if unit is not None:
+                return unit
+            if code:
+                known = ", ".join(cia402.VELOCITY_UNITS)
+                raise DeviceRefused(
+                    f"{self._place} has velocities in unit {code:08X}h (60A9h), which is not known here. "
+                    f"Give velocity_unit: {known}."
+                )
+        return cia402.VELOCITY_UNITS[name or "counts/s"]
+
+    def _rated_torque(self) -> float:
+        """[N m]; NaN if nobody asks for it."""
+        if self._settings.rated_torque is not None:
+            return self._settings.rated_torque
+        if "effort" not in self._slots:
+            return math.nan
+        found = self._sdo.read(cia402.RATED_TORQUE.index, 0) * 1e-3
+        if not found:
+            raise DeviceRefused(f"{self._place} says that its rated torque is 0 (6076h). Give rated_torque.")
+        return found
+
+    def _writes(self) -> tuple[Write, ...]:
+        assert self._units is not None
+        return drive_writes(self._settings, self._units, self._place.bounds, 1.0 / self._place.rate, self._sheet)
+
+    def _taker(self, pdo: Pdo) -> Taker:
+        places = {item: place for place, item in enumerate(pdo.objects)}
+        status, counts, velocity, mode = (
+            places.get(item, -1) for item in (cia402.STATUSWORD, cia402.POSITION, cia402.VELOCITY, cia402.MODE_DISPLAY)
+        )
+        objects = OBJECTS | ({"temperature": self._settings.temperature.mapped} if self._settings.temperature else {})
+        kept = [(places[objects[q]], slot) for q, slot in self._slots.items() if objects[q] in places]
+        zeros, scales, found, times = self._zeros, self._scales, self._values, self._received
+
+        def take(values: tuple[Any, ...], received: float) -> None:
+            if status >= 0:
+                self._statusword = word = values[status]
+                self._state = cia402.STATE_OF[word & 0x6F]
+            if counts >= 0:
+                self._counts = values[counts]
+            if velocity >= 0:
+                self._velocity = values[velocity]
+            if mode >= 0:
+                self._shown_mode = values[mode]
+            for place, slot in kept:
+                found[slot] = zeros[slot] + scales[slot] * values[place]
+                times[slot] = received
+
+        return take
+
+    def _lose(self, text: str) -> None:
+        super()._lose(text)
+        self._forget()
+
+    def _forget(self) -> None:
+        """Nothing that was asked before holds any more."""
+        self._state, self._statusword, self._counts = State.NOT_READY, -1, None
+        self._is_wanted, self._letting_go, self._slowing, self._homing = False, 0, 0, None
+
+    def _drives(self) -> bool:
+        return self._state in (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_REACTION)
+
+    def _running(self) -> tuple[DeviceState, str]:
+        state, homing = self._state, self._homing
+        if state is State.FAULT or state is State.FAULT_REACTION:
+            return DeviceState.FAULT, f"{self._place} is in its state '{state}'. Look at its display, then reset."
+        if homing is not None:
+            return DeviceState.HOMING, f"{self._place} is {homing.phase}."
+        if state is State.OPERATION_ENABLED:
+            return DeviceState.ENABLED, self._warning()
+        if state is State.QUICK_STOP_ACTIVE:
+            return DeviceState.STOPPING, self._told or f"{self._place} comes to rest by a quick stop."
+        return DeviceState.READY, self._told or self._warning()
+
+    def _warning(self) -> str:
+        if self._handshake.waited > ANSWER_TIME * self._place.rate:
+            return f"{self._place} does not acknowledge set-points (bit 12 of its statusword)."
+        if self._statusword >= 0 and not self._statusword & cia402.REMOTE:
+            return f"{self._place} is led from its own panel and takes no commands (bit 9 of its statusword)."
+        if self._statusword >= 0 and self._statusword & cia402.WARNING:
+            return f"{self._place} warns (bit 7 of its statusword). Look at its display."
+        return "" if self._is_watched else UNWATCHED.format(self._place)
+
+    def enable(self) -> None:
+        """See `Device.enable`."""
+        self._is_wanted, self._was_reached, self._told, self._letting_go = True, False, "", 0
+
+    def disable(self) -> None:
+        """See `Device.disable`."""
+        if self._is_wanted and self._mode in RAMPED:
+            self._slowing = self._stopping_cycles
+        self._is_wanted = False
+        if (homing := self._homing) is not None:
+            homing.give_up("was stopped")
+
+    def quick_stop(self) -> None:
+        """See `Device.quick_stop`; the word goes out at once, and in every cycle until the drive stands."""
+        self.disable()
+        if self._state in (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE):
+            self._letting_go = self._stopping_cycles
+            self._frames.send_anew(self._bus, cia402.QUICK_STOP, self._homing_mode(), self._rest())
+
+    def home(self) -> None:
+        """See `Device.home`.
+
+        Raises:
+            CommandRefused: There are no settings for it, or the drive is not ready.
+        """
+        if self._settings.homing is None:
+            raise CommandRefused(f"'{self.name}' has no setting `homing` in the robot file.")
+        health = self.health()
+        if health.state is not DeviceState.READY:
+            raise CommandRefused(f"'{self.name}' is {health.state}, not ready, so it cannot be homed. {health.text}")
+        self._told = ""
+        self._homing = HomingRun(self._mode, round(self._settings.homing.timeout * self._place.rate))
+
+    def reset(self) -> None:
+        """See `Device.reset`."""
+        super().reset()
+        self._told = ""
+        self._resetting = RESET_CYCLES
+
+    def apply(self, values: np.ndarray) -> None:
+        """See `Device.apply`; until the drive is enabled a velocity or torque is 0.
+
+        A position is what `Robot` asks for from the beginning, which looks whether it can be believed: a single wrong
+        frame of ours or of another node must not become the place to start from.
+        """
+        units = self._units
+        if units is None:
+            return
+        convert = {"position": units.counts, "velocity": units.speed, "effort": units.torque}[self.command_quantity]
+        target = convert(float(values[0]))
+        if not self._is_followed(target if self.command_quantity == "position" else 0):
+            return
+        bits = 0
+        if self._mode is Mode.PROFILE_POSITION:
+            bits, target = self._handshake.step(target, self._statusword)
+        self._send(cia402.ENABLE_OPERATION | bits, target, self._mode)
+
+    def damp(self) -> None:
+        """See `Device.damp`; the effort is against the velocity, and none while that is not known."""
+        if not self._is_followed(self._rest()) or self._units is None or self._settings.damping is None:
+            return
+        effort = -self._settings.damping * self._velocity * self._units.velocity
+        self._send(cia402.ENABLE_OPERATION, self._units.torque(effort) if effort == effort else 0, self._mode)
+
+    def idle(self) -> None:
+        """See `Device.idle`; the drive is led to a state without power, out of a fault, or to its zero, if asked."""
+        state = self._state
+        if self._letting_go:
+            self._letting_go -= 1
+            if state in (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE):
+                word = cia402.QUICK_STOP if self._letting_go else cia402.DISABLE_VOLTAGE
+                self._send(word, self._rest(), self._homing_mode())
+                return
+            self._letting_go = 0
+        homing = self._homing
+        if homing is not None:
+            word, mode = homing.step(state, self._statusword, self._shown_mode)
+            self._send(word, self._rest(), mode)
+            if homing.is_over:
+                self._end_homing(homing)
+            return
+        self._slowing = max(self._slowing - 1, 0) if state is State.OPERATION_ENABLED else 0
+        word = cia402.towards_disabled(state, slow_down=self._slowing > 0)
+        if self._resetting:
+            if state is State.FAULT and self._resetting % RESET_PERIOD == 0:
+                word = cia402.FAULT_RESET
+            self._resetting = self._resetting - 1 if state in (State.FAULT, State.FAULT_REACTION) else 0
+        self._send(word, self._rest(), self._mode)
+
+    def inspect(self) -> tuple[Check, ...]:
+        """See `Device.inspect`."""
+        if self._units is None:  # never opened, but asked
+            self._calibrate()
+        own = drive_checks(self._sdo, self._mode, self._is_watched, str(self._place))
+        return (*super().inspect(), *own)
+
+    def _is_followed(self, rest: int) -> bool:
+        """Whether the drive takes set-points; if not, it is led there, or let go when it has dropped out by itself.
+
+        Args:
+            rest: The target that moves nothing, as far as can be known.
+        """
+        state = self._state
+        if self._is_wanted and self._was_reached and state is not State.OPERATION_ENABLED:
+            self._is_wanted = False
+            self._told = f"{self._place} left 'operation enabled' by itself and is '{state}'."
+        if not self._is_wanted:
+            self.idle()
+            return False
+        if state is not State.OPERATION_ENABLED:
+            self._send(cia402.towards_enabled(state), rest, self._mode)
+            return False
+        if not self._was_reached:
+            self._was_reached = True
+            self._handshake.start(rest)
+        return True
+
+    def _end_homing(self, homing: HomingRun) -> None:
+        self._homing = None
+        self._told = f"{self._place}: homing {homing.problem}." if homing.problem else ""
+        if not homing.problem:
+            self._counters["homed"] += 1
+
+    def _homing_mode(self) -> Mode:
+        return self._mode if self._homing is None else Mode.HOMING
+
+    def _rest(self) -> int:
+        """The target that moves nothing: where the drive is, no velocity, no torque."""
+        return (self._counts or 0) if self.command_quantity == "position" else 0
+
+    def _send(self, word: int, target: int, mode: Mode) -> None:
+        """Put the command on the bus, if the drive has told where it is since it was commissioned."""
+        has_told = self._statusword >= 0 and (self._counts is not None or self.command_quantity != "position")
+        if self.is_commissioned and has_told:
+            self._frames.send(self._bus, word, mode, target)

@@ -1,0 +1,1 @@
+"""Sensors and servos that a DBC file describes."""

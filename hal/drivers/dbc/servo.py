@@ -1,0 +1,325 @@
+"""A servo with a DBC file: what a DBC does not say (states, sequences, watchdog) is said by the robot file."""
+
+import logging
+import time
+from collections.abc import Callable
+from typing import ClassVar
+
+import numpy as np
+
+from hal.device import UNDER_POWER, Check, DeviceState
+from hal.drivers.can_device import Place
+from hal.drivers.dbc.inbox import Letter, Raws
+from hal.drivers.dbc.sensor import FRAME_BYTES, POLL, DbcNode
+from hal.drivers.dbc.sequence import Run, Step, message_of
+from hal.drivers.dbc.settings import DbcSettings, QuantityConfig, ServoSettings, Value
+from hal.errors import ConfigError, DeviceSilent
+from hal.protocols.dbc import Writer
+
+log = logging.getLogger(__name__)
+
+FED_CYCLES = 3
+"""A watchdog that runs out within fewer cycles would stop the servo at the first late one."""
+ENABLE, DISABLE, QUICK_STOP, RESET = "enabling", "disabling", "quick stop", "reset"
+"""Names of the sequences, as a person reads them."""
+BOOTING = "booting"
+BOOT_TIME = 2.0
+"""How long [s] a servo may take to start up while it is opened."""
+
+
+class DbcServo(DbcNode):
+    """One servo. It is enabled only by `enable`, and stays disabled once it dropped out by itself."""
+
+    Settings: ClassVar[type[ServoSettings]] = ServoSettings
+    COUNTERS: ClassVar[tuple[str, ...]] = (*DbcNode.COUNTERS, "watchdog_expired")
+    doubts_in_error = False
+    _settings: ServoSettings
+
+    @classmethod
+    def commanded(cls, settings: ServoSettings) -> str:
+        """See `CanDevice.commanded`."""
+        return settings.command.quantity
+
+    @classmethod
+    def traffic(cls, settings: DbcSettings, rate: float) -> tuple[tuple[int, float, bool], ...]:
+        """See `CanDevice.traffic`."""
+        assert isinstance(settings, ServoSettings)
+        sent = (FRAME_BYTES, rate, bool(settings.extended))
+        return (*super().traffic(settings, rate), *(sent for _ in (settings.command, *settings.cyclic)))
+
+    def __init__(self, place: Place, settings: ServoSettings) -> None:
+        self._is_wanted = False
+        self._was_reached = False
+        self._ran_out = False
+        self._is_booting = False
+        self._has_expired = False
+        self._was_on = False
+        self._dropped = ""
+        self._hold = 0.0
+        super().__init__(place, settings)
+        self._activity = Run("nothing", (), place.rate)
+        self._slot = self._slots[settings.command.quantity]
+
+    def _prepare(self, settings: DbcSettings) -> None:
+        super()._prepare(settings)
+        assert isinstance(settings, ServoSettings)
+        state = settings.state
+        self._state = self._inbox.signal(state.signal)
+        self._period_of(self._state.letter)
+        self._reason = self._inbox.signal(state.reason) if state.reason else None
+        self._meaning: dict[float, DeviceState | str] = {}
+        meanings: tuple[tuple[DeviceState | str, tuple[Value, ...]], ...] = (
+            (DeviceState.READY, state.ready),
+            (DeviceState.ENABLED, state.enabled),
+            (DeviceState.HOMING, state.busy),
+            (DeviceState.FAULT, state.fault),
+            (BOOTING, state.booting),
+        )
+        for meaning, values in meanings:
+            for value in values:
+                raw = self._inbox.dbc.raw(self._state.signal, value)
+                if self._meaning.setdefault(raw, meaning) != meaning:
+                    raise ConfigError(f"the value {value} of {state.signal} has two meanings in `state`.")
+        self._sequences = {
+            ENABLE: self._steps(settings.enable),
+            DISABLE: self._steps(settings.disable),
+            QUICK_STOP: self._steps(settings.quick_stop or settings.disable),
+            RESET: self._steps(settings.reset),
+        }
+        self._cyclic = self._steps(settings.cyclic)
+        self._prepare_command(settings)
+        self._prepare_watchdog(settings)
+
+    def _prepare_command(self, settings: ServoSettings) -> None:
+        command, dbc = settings.command, self._inbox.dbc
+        message = dbc.message(command.send)
+        self._writer = Writer(dbc, message, command.values, command.signal)
+        self._frame = message_of(dbc, self._address, command.send, self._writer.data)
+        measured = settings.quantities[command.quantity]
+        config = QuantityConfig(
+            signal=f"{command.send}.{command.signal}",
+            scale=measured.scale if command.scale is None else command.scale,
+            offset=measured.offset if command.offset is None else command.offset,
+        )
+        signal = dbc.signal_of(message, command.signal)
+        scale, offset = self._line(command.quantity, config)
+        self._scale, self._offset = scale * signal.scale, offset + scale * signal.offset
+        self._is_position = command.quantity == "position"
+        self.can_damp = settings.damping is not None
+        if self.can_damp and "velocity" not in self._slots:
+            raise ConfigError("damping needs the velocity, which `elements` does not name.")
+
+    def _prepare_watchdog(self, settings: ServoSettings) -> None:
+        watchdog = settings.watchdog
+        self._no_watchdog = "" if watchdog else f"{self._place} goes on with its last set-point when the host dies."
+        self._configuring: tuple[Step, ...] = self._steps(watchdog.configure) if watchdog else ()
+        self._expired = self._inbox.condition(watchdog.expired) if watchdog and watchdog.expired else None
+        if watchdog is None:
+            return
+        for name in watchdog.fed_by:
+            self._inbox.dbc.message(name)
+        if watchdog.timeout < FED_CYCLES / self._rate:
+            raise ConfigError(
+                f"watchdog.timeout is {watchdog.timeout:g} s, which is less than {FED_CYCLES} cycles at "
+                f"{self._rate:g} Hz: the servo would stop at the first late cycle."
+            )
+
+    def _note(self, letter: Letter) -> Callable[[Raws], None] | None:
+        if letter is self._state.letter:
+            return self._on_state
+        return self._on_watchdog if self._expired and letter is self._expired.seen.letter else None
+
+    def _on_state(self, raws: Raws) -> None:
+        if self._expired and self._expired.seen.letter is self._state.letter:
+            self._on_watchdog(raws)
+        is_booting = self._meaning.get(self._state.raw) == BOOTING
+        if is_booting and not self._is_booting:
+            self._counters["boots"] += 1
+            self._lose(f"{self._place} rebooted.")
+        self._is_booting = is_booting
+        self._was_on = self._is_enabled
+
+    def _on_watchdog(self, raws: Raws) -> None:
+        has_expired = self._expired is not None and self._expired.is_met()
+        if has_expired and not self._has_expired:
+            self._counters["watchdog_expired"] += 1
+            self._ran_out = self._is_wanted or self._was_on
+        self._has_expired = has_expired
+
+    def _lose(self, text: str) -> None:
+        super()._lose(text)
+        self._is_wanted = False
+
+    @property
+    def _is_enabled(self) -> bool:
+        return self._meaning.get(self._state.raw) is DeviceState.ENABLED
+
+    def _identify(self) -> str:
+        identity = super()._identify()
+        deadline = time.monotonic() + BOOT_TIME
+        while self._is_booting:
+            if time.monotonic() > deadline:
+                raise DeviceSilent(f"{self._place} has been starting up for {BOOT_TIME:g} s.")
+            time.sleep(POLL)
+        return identity
+
+    def _commission(self) -> None:
+        self._is_wanted = False
+        self._activity = Run("nothing", (), self._rate)
+        if not self._state.letter.raws:
+            self._comes(self._state.letter)
+        if self._is_enabled:
+            self._run(DISABLE, self._sequences[DISABLE])
+        super()._commission()
+        self._run("watchdog", self._configuring)
+        if self._is_rested:
+            log.warning("%s: its watchdog ran out before it was opened; that is reset", self._place)
+            self._run(RESET, self._sequences[RESET], goes_on=True)
+
+    def _release(self) -> None:
+        if self.is_heard:
+            self._run(DISABLE, self._sequences[DISABLE], goes_on=True)
+
+    @property
+    def _is_rested(self) -> bool:
+        """Whether the watchdog ran out while nobody wanted the servo to move: nobody fed it, and it stopped nothing."""
+        return self._has_expired and not self._ran_out
+
+    def _fault(self) -> str:
+        if text := super()._fault():
+            return text
+        if self._is_rested:
+            return ""
+        if text := self._error_text():
+            return text
+        if self._meaning.get(self._state.raw, DeviceState.FAULT) is DeviceState.FAULT:
+            return f"{self._place} is in its state '{self._state.words()}' ({self._settings.state.signal})."
+        return ""
+
+    def _drives(self) -> bool:
+        return self._meaning.get(self._state.raw) in UNDER_POWER
+
+    def _standing(self) -> tuple[DeviceState, str]:
+        meaning = self._meaning.get(self._state.raw)
+        if meaning is DeviceState.ENABLED:
+            return DeviceState.ENABLED, ""
+        if meaning is DeviceState.HOMING:
+            return DeviceState.HOMING, f"{self._place} is in its state '{self._state.words()}'."
+        return DeviceState.READY, self._dropped or self._no_watchdog
+
+    def enable(self) -> None:
+        """See `Device.enable`."""
+        self._is_wanted, self._was_reached, self._dropped = True, False, ""
+        first = self._sequences[RESET] if self._has_expired else ()
+        self._activity = Run(ENABLE, (*first, *self._sequences[ENABLE]), self._rate)
+
+    def disable(self) -> None:
+        """See `Device.disable`; a quick stop that is under way goes on."""
+        self._is_wanted = False
+        if not self._is_stopping:
+            self._begin(DISABLE)
+
+    def quick_stop(self) -> None:
+        """See `Device.quick_stop`; its first frame goes out at once, for the cycle may be stuck."""
+        self._is_wanted = False
+        if not self._is_stopping:
+            self._begin(QUICK_STOP)
+            self._activity.advance(self._bus.send)
+
+    @property
+    def _is_stopping(self) -> bool:
+        return self._activity.name == QUICK_STOP and not self._activity.is_over
+
+    def reset(self) -> None:
+        """See `Device.reset`."""
+        self._ran_out = False
+        self._dropped = ""
+        self._begin(RESET)
+
+    def _begin(self, name: str) -> None:
+        self._activity = Run(name, self._sequences[name], self._rate, goes_on=True)
+
+    def apply(self, values: np.ndarray) -> None:
+        """See `Device.apply`; until the servo is enabled its target is where it is, or nothing."""
+        self._follow(float(values[0]))
+
+    def damp(self) -> None:
+        """See `Device.damp`; the effort is against the velocity, and none while that is not known."""
+        velocity = float(self._values[self._slots["velocity"]])
+        self._follow(-(self._settings.damping or 0.0) * velocity if np.isfinite(velocity) else 0.0)
+
+    def _follow(self, target: float) -> None:
+        if not self._is_wanted:
+            self.idle()
+            return
+        activity, is_enabled = self._activity, self._is_enabled
+        if activity.failure or (self._was_reached and not is_enabled):
+            self._drop(activity.failure)
+            self.idle()
+            return
+        if is_enabled and activity.is_over:
+            self._was_reached = True
+            self._send(target)
+            return
+        if not activity.has_sent_last:
+            self._hold = self._rest
+        self._send(self._hold)
+        activity.advance(self._bus.send)
+
+    def idle(self) -> None:
+        """See `Device.idle`; the servo is led to a state without power."""
+        if not self.is_commissioned:
+            return
+        activity = self._activity
+        if self._is_enabled if activity.is_over else activity.name == ENABLE:
+            self._begin(DISABLE)
+        elif activity.is_over and self._is_rested:
+            self._begin(RESET)
+        if self._settings.command.while_disabled:
+            self._send(self._rest)
+        else:
+            self._send_cyclic()
+        self._activity.advance(self._bus.send)
+
+    def _drop(self, failure: str) -> None:
+        """The servo is not enabled, or not any more, though it was to be."""
+        self._is_wanted = False
+        reason = f", {self._reason.words()}" if self._reason else ""
+        said = f"'{self._state.words()}'{reason}"
+        if failure:
+            self._dropped = f"{self._place} cannot be enabled: {failure}; its state is {said}."
+        else:
+            self._dropped = f"{self._place} left its enabled state by itself and is {said}."
+        self._begin(DISABLE)
+
+    @property
+    def _rest(self) -> float:
+        """A set-point [SI] that does not move it: where it is, or no velocity, or no effort."""
+        return float(self._values[self._slot]) if self._is_position else 0.0
+
+    def _send(self, value: float) -> None:
+        """Send the set-point [SI]; not to a servo that is not heard, whose own watchdog may then run out."""
+        if self.is_commissioned and self.is_heard and np.isfinite(value):
+            self._writer.write((value - self._offset) / self._scale)
+            self._bus.send(self._frame)
+            self._send_cyclic()
+
+    def _send_cyclic(self) -> None:
+        for step in self._cyclic:
+            if step.frame is not None:
+                self._bus.send(step.frame)
+
+    def inspect(self) -> tuple[Check, ...]:
+        """See `Device.inspect`; the watchdog is proven only by having been seen to run out."""
+        return (*super().inspect(), self._check_watchdog())
+
+    def _check_watchdog(self) -> Check:
+        watchdog = self._settings.watchdog
+        if watchdog is None:
+            return Check("watchdog", False, "There is none: it goes on with its last set-point when the host dies.")
+        if self._counters["watchdog_expired"]:
+            return Check("watchdog", True, f"It was seen to run out; {watchdog.timeout:g} s are stated.")
+        if self._expired is None:
+            return Check("watchdog", True, f"{watchdog.timeout:g} s by the robot file, which nothing here can check.")
+        text = f"It was not seen to run out. Is it switched on in the device, with {watchdog.timeout:g} s?"
+        return Check("watchdog", False, text)

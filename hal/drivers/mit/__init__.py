@@ -1,0 +1,1 @@
+"""Servo drives in MIT mode."""

@@ -1,0 +1,104 @@
+"""From set-points of a joint or wire to what a motor in MIT mode is sent, and back."""
+
+import math
+
+from hal.drivers.can_device import Place
+from hal.drivers.mit.settings import MitSettings
+from hal.errors import ConfigError
+from hal.protocols.mit import POSITION_TOP, TOP
+
+Counts = tuple[int, int, int]
+"""Position, velocity and torque of the motor as its answer has them."""
+Asked = tuple[float, float, float, float, float]
+"""Position [rad], velocity [rad/s], stiffness [N m/rad], damping [N m s/rad] and torque [N m] of the motor."""
+
+
+class Law:
+    """Gear, gains, largest effort, and the stiffness that grows after being enabled."""
+
+    def __init__(self, place: Place, settings: MitSettings) -> None:
+        """Prepare for one drive.
+
+        Raises:
+            ConfigError: The robot file's limits do not fit into the range of the motor's frames.
+        """
+        self.scale, self.zero = settings.scale, settings.zero
+        self.ranges = ranges = settings.actuator[1]
+        self.lines = (
+            (2 * self.scale * ranges.position / POSITION_TOP, self.zero - self.scale * ranges.position),
+            (2 * self.scale * ranges.velocity / TOP, -self.scale * ranges.velocity),
+            (2 / self.scale * ranges.effort / TOP, -ranges.effort / self.scale),
+        )
+        """Slope and offset of position, velocity and effort [unit of the element] over counts."""
+        self.damping = settings.damping * self.scale**2
+        self._mode = settings.mode
+        self._stiffness = settings.stiffness * self.scale**2
+        self._ramp_cycles = max(1, round(settings.ramp * place.rate))
+        self._ramped = 0
+        self._is_limited = settings.max_effort is not None
+        most = settings.max_effort * abs(self.scale) if settings.max_effort else math.inf
+        self._most = min(most, self.ranges.effort)
+        self._check_limits(place, settings.motor)
+
+    def _check_limits(self, place: Place, motor: str) -> None:
+        scale, ranges = self.scale, self.ranges
+        if self._mode == "position":
+            ends = (self.zero - scale * ranges.position, self.zero + scale * ranges.position)
+        elif self._mode == "velocity":
+            ends = (-scale * ranges.velocity, scale * ranges.velocity)
+        else:
+            ends = (-ranges.effort / scale, ranges.effort / scale)
+        low, high = place.bounds
+        if not min(ends) <= low < high <= max(ends):
+            element = place.elements[self._mode]
+            raise ConfigError(
+                f"{place}: with this gear and zero, the frames of motor '{motor}' carry a {self._mode} from "
+                f"{min(ends):.4g} to {max(ends):.4g}, and the limits of '{element}' are {low:g} to {high:g}. It would "
+                f"stop at the end of its range, or start again at the other. Narrow limits.{element.partition('.')[0]}."
+            )
+
+    def restart(self) -> None:
+        """Let the stiffness grow from 0 again."""
+        self._ramped = 0
+
+    def resting(self, counts: Counts | None) -> Asked:
+        """No torque, and the position where the motor is, in case it looks at it."""
+        return self._motor(counts)[0], 0.0, 0.0, 0.0, 0.0
+
+    def braking(self) -> Asked:
+        """Resist motion, without holding a place."""
+        return 0.0, 0.0, 0.0, self.damping, 0.0
+
+    def set_point(self, value: float, counts: Counts | None) -> Asked:
+        """What brings the motor to a set-point.
+
+        Args:
+            value: Set-point [unit of the commanded element].
+            counts: Its newest answer; the pull of stiffness or damping from there is kept below `max_effort`.
+        """
+        most = self._most
+        if self._mode == "effort":
+            return 0.0, 0.0, 0.0, 0.0, min(max(value * self.scale, -most), most)
+        if self._mode == "velocity":
+            speed = value / self.scale
+            if self._is_limited:
+                now, reach = self._motor(counts)[1], most / self.damping
+                speed = min(max(speed, now - reach), now + reach)
+            return 0.0, speed, 0.0, self.damping, 0.0
+        self._ramped = min(self._ramped + 1, self._ramp_cycles)
+        stiffness = self._stiffness * self._ramped / self._ramp_cycles
+        angle = (value - self.zero) / self.scale
+        if self._is_limited:
+            now, reach = self._motor(counts)[0], most / stiffness
+            angle = min(max(angle, now - reach), now + reach)
+        return angle, 0.0, stiffness, self.damping, 0.0
+
+    def _motor(self, counts: Counts | None) -> tuple[float, float]:
+        """Position [rad] and velocity [rad/s] of the motor; zero before its first answer."""
+        if counts is None:
+            return 0.0, 0.0
+        ranges = self.ranges
+        return (
+            counts[0] * 2 * ranges.position / POSITION_TOP - ranges.position,
+            counts[1] * 2 * ranges.velocity / TOP - ranges.velocity,
+        )

@@ -1,0 +1,1 @@
+"""Simulated CANopen nodes: what every node has, and the sensors."""

@@ -1,0 +1,81 @@
+"""A simulated input module with CiA 401 analogue inputs: load cells behind plain converters."""
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+from simulators.nodes.canopen.node import CanopenNode
+from simulators.nodes.canopen.pdo import Pdo
+from simulators.nodes.canopen.spec import NodeSpec
+from simulators.nodes.node import Frame
+from simulators.nodes.plant import Plant
+
+CHANNELS = 4
+RANGE = 10.0
+"""What the inputs read at full scale [V], in the floating point object 6403h."""
+_OVERRANGE = 0x0004
+_BROKEN = 0x0020
+"""Bits of the maker's status object 2120h."""
+
+
+@dataclass(frozen=True, slots=True)
+class AnalogConstants:
+    """Bridge amplifiers on the inputs of one converter.
+
+    Attributes:
+        full_scale: Force [N] at full scale of the converter.
+        bits: Of the converter; what it reads lies in the highest bits of 6401h and 6402h.
+        unbalance: What an unloaded cell reads [N].
+        more: `signal.element` of the forces on channels 2 and up, empty where there is no cell; the first is the
+            node's own.
+    """
+
+    kind: ClassVar[str] = "analog_input"
+
+    full_scale: float = 1000.0
+    bits: int = 16
+    unbalance: float = 0.0
+    more: tuple[str, ...] = ()
+
+
+class AnalogInput(CanopenNode):
+    """Every input is read in three types at once: 16 bit, 32 bit, and volt as a floating point number."""
+
+    def __init__(self, spec: NodeSpec, plant: Plant, outbox: list[Frame]) -> None:
+        assert isinstance(spec.constants, AnalogConstants)
+        self._constants = spec.constants
+        elements = enumerate((spec.element, *spec.constants.more), 1)
+        self._cells = [(channel, element) for channel, element in elements if element]
+        self._is_broken = False
+        super().__init__(spec, plant, outbox)
+
+    def restart(self) -> None:
+        """See `CanopenNode.restart`."""
+        self._is_broken = False
+
+    def break_down(self) -> None:
+        """See `CanopenNode.break_down`; the converter reads its lower end from now on."""
+        super().break_down()
+        self._is_broken = True
+
+    def sample(self) -> None:
+        """Every channel that has a cell; the others read zero."""
+        values = self.objects.values
+        status = _BROKEN if self._is_broken else 0
+        half = 1 << self._constants.bits - 1
+        for channel, element in self._cells:
+            share = (self.plant.read(element) + self._constants.unbalance) / self._constants.full_scale
+            if self._is_broken or math.isnan(share):
+                share = -math.inf
+            counts = round(max(-1.0, min(share, 1.0)) * half)
+            if not -half < counts < half - 1:
+                status |= _OVERRANGE
+                counts = max(-half, min(counts, half - 1))
+            values[0x6401, channel] = counts << 16 >> self._constants.bits
+            values[0x6402, channel] = counts << 32 >> self._constants.bits
+            values[0x6403, channel] = counts / half * RANGE
+        values[0x2120, 0] = status
+
+    def may_send(self, pdo: Pdo) -> bool:
+        """See `CanopenNode.may_send`; a PDO with analogue inputs only once 6423h says so (CiA 401)."""
+        return bool(self.objects.values[0x6423, 0]) or all(index >> 8 != 0x64 for index, _ in pdo.keys)

@@ -1,0 +1,1 @@
+"""Simulated servo drives of profile CiA 402."""
