@@ -1,8 +1,9 @@
 """Online update (paper, II-F): p and W follow the body, each at its own pace, on a bounded window of samples.
 
 The default has two time scales. p is recognised from every sample by an extended Kalman filter
-(`gemuco.adaption.recognise`); once it has settled W takes small gradient steps under that p, mixed with training data of the other conditions under their own,
-and goes back when it foretells held-out samples worse than it did. The paper's three ways are the other choices.
+(`gemuco.adaption.recognise`); once it has settled W takes small gradient steps under that p, mixed with training data
+of the other conditions under their own, and goes back when it predicts held-out samples worse than it did. The paper's
+three ways are the other choices.
 """
 
 from collections.abc import Mapping

@@ -38,8 +38,8 @@ class Heats(NamedTuple):
 
     Attributes:
         rows: How many rows of each split a heat has, shape (heats,).
-        tell: What these rows tell, `gemuco.structure.row_draw.Heat` of every split, shape (heats, splits, rows, 3 + 2 k):
-            weight, doubt, hidden, and k times known and project. What there is less of is filled up with zeros.
+        tell: Facts about these rows, `gemuco.structure.row_draw.Heat` of every split,
+            shape (heats, splits, rows, 3 + 2 k).
     """
 
     rows: np.ndarray
