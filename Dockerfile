@@ -16,6 +16,7 @@ COPY gemuco/ gemuco/
 COPY hal/ hal/
 COPY simulators/ simulators/
 COPY services/ services/
+COPY studies/ studies/
 # Layers keep whole seconds, and compiled code counts as old when the time of its source is another one. -P: what is
 # installed is made ready, and not the sources that lie here.
 RUN deploy/install.sh . && find /opt/gemuco -path '*/gemuco/compiled/*.py' -exec touch --date=@1000000000 {} + \

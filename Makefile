@@ -69,7 +69,7 @@ test-network: $(STAMP)  ## HAL and model on a link that is cut, slow or lossy, o
 	$(BIN)/python tests/network/campaign.py --json runs/network.json
 
 bench: $(STAMP)   ## speed beside torch, zenoh and bare timers, a quarter of an hour; writes docs/benchmarks.md
-	env -u OPENBLAS_CORETYPE OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.all  # BLAS as free as torch
+	env -u OPENBLAS_CORETYPE OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m studies.speed.all  # BLAS as free as torch
 
 clean:           ## remove what make setup and the demo made
 	rm -rf .venv runs build *.egg-info

@@ -292,10 +292,10 @@ def reproduce(
     """Run the paper's experiments on a simulated robot and print its figures beside ours."""
     from rich.console import Console
 
-    from services.reproduce import experiment
+    from hal import registry
     from services.show import progress
 
-    run = experiment(robot)
+    run = registry.load("studies.paper:experiment")(robot)  # by name: studies stand above services
     with progress(f"reproduce {robot}") as tell:
         report = run(range(seeds), out / robot, tell, fresh)
     report.save(out / robot)

@@ -1,7 +1,7 @@
 """Matrix products for compiled code: of float32, and one of float64.
 
 numba itself calls the BLAS of scipy, whose wheels are a release behind that of numpy: on the few rows of a search it
-takes two to three times as long (4 x 200 times 200 x 200: 26 us against 10 us; `python -m benchmarks.solvers` shows
+takes two to three times as long (4 x 200 times 200 x 200: 26 us against 10 us; `python -m studies.speed.solvers` shows
 what that makes of a search), and takes 17 MB of memory. So the one that the wheels of numpy bring along is used; with a
 numpy from elsewhere, scipy has to be there.
 """

@@ -28,7 +28,7 @@ HUBER = (0.3, 1.0)
 """Misses above this many standard deviations count in proportion and no longer squared, before outliers were looked for
 and after: what is not found out yet pulls at W like any large miss and not thirty times as hard. With 1 % of
 all values ten standard deviations off the PR2's tip is wrong by 141 mm with the plain square and by 14 mm so (8 mm on
-clean data; benchmarks/imperfect_data.py)."""
+clean data; studies/accuracy/imperfect_data.py)."""
 
 LOOKS = 16
 """How often outliers are looked for during a training, beginning when a quarter of it is done."""

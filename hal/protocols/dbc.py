@@ -1,8 +1,8 @@
 """DBC files: messages and signals found by name, and compiled to what is fast enough for a cycle.
 
 A message whose signals lie on whole bytes is read by `struct`, one with whole numbers elsewhere by shift and mask, any
-other, such as a multiplexed one, by cantools (benchmarks/dbc.py). What is called raw is the number in the frame, before
-the file's factor and offset.
+other, such as a multiplexed one, by cantools (studies/bus/dbc.py). What is called raw is the number in the frame,
+before the file's factor and offset.
 """
 
 import difflib

@@ -3,8 +3,8 @@
 Threads that share an interpreter run one after the other on however many cores. On several they only pay for it: to
 wake another one a thread has to interrupt a core that sleeps, and what it hands over has to come from that core's
 caches. On one core the service of a 25-element arm takes 26 % of it in place of 38 %, and its loops wait less for each
-other (`python -m benchmarks.loops --without-bus`). Compiled code of several threads could run at once on several; so a
-process that needs more than a core, or does not keep its rates, gets all of them back.
+other (`python -m studies.stack.loops --without-bus`). Compiled code of several threads could run at once on several; so
+a process that needs more than a core, or does not keep its rates, gets all of them back.
 """
 
 import contextlib

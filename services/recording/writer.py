@@ -43,7 +43,7 @@ MOST_TOPICS = 1000
 MOST_UNKNOWN = 64
 """Signals that are not in the robot's description and are recorded all the same."""
 LONGEST = 3600.0
-"""What one file covers at most [s]: the index of its parts stays in memory, 11 MB of it an hour (benchmarks.soak)."""
+"""What one file covers at most [s]: the index of its parts stays in memory, 11 MB of it an hour (stack/soak.py)."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,8 +29,6 @@ from rich.console import Console
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.append(str(ROOT))
-from benchmarks import light_robot  # noqa: E402
-from benchmarks.soak import free_port  # noqa: E402
 from gemuco.errors import SchemaError  # noqa: E402
 from hal.config import load_robot  # noqa: E402
 from hal.errors import HalError  # noqa: E402
@@ -46,6 +44,8 @@ from services.verbs import fleet_top, top  # noqa: E402
 from services.verbs.fleet_watch import FleetWatch  # noqa: E402
 from services.wire import keys, messages  # noqa: E402
 from services.wire.session import CLIENT, close_session, new_boot, open_session  # noqa: E402
+from studies.stack import light_robot  # noqa: E402
+from studies.stack.soak import free_port  # noqa: E402
 
 RATE = 50.0
 PATIENCE = 100.0

@@ -1,1 +1,0 @@
-"""Every speed and accuracy figure of the documentation, one command each."""

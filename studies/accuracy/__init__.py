@@ -1,0 +1,1 @@
+"""Accuracy of models on bodies that are simulated, measured or made up."""

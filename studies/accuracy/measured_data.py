@@ -1,0 +1,108 @@
+"""What the model makes of two recordings of real robots.
+
+    python -m studies.accuracy.measured_data [--seeds 3]
+
+The folder of the recordings is $GEMUCO_DATA, ../shared/data if that is not set. Settings are those of the descriptions
+in examples/. The joint capsule: structure; then, trained on the first 80 % of the recording and tested on the rest as
+one block, the error of the angles from all four boards and with each board lost, beside ridge regression that is fitted
+anew for the boards that are left. The Schunk arm: structure by held-out trajectories.
+"""
+
+import argparse
+import os
+from pathlib import Path
+
+import numpy as np
+
+from gemuco.dataset import Dataset, Episode
+from gemuco.learning.train import fit
+from gemuco.schema import BodySchema
+from gemuco.structure.determination import Judge, Thresholds, determine
+from gemuco.structure.mask_training import train_masks
+from services.learning.measured import MeasuredConfig, load_measured, read
+from services.learning.trainer import train_config
+
+ROOT = Path(__file__).parents[2]
+BOARDS = tuple(f"board_{i}" for i in range(4))
+ANGLES = "joint_position"
+
+
+def recording(name: str) -> tuple[MeasuredConfig, Dataset]:
+    """A description of examples/ and the data it describes."""
+    config = load_measured(ROOT / "examples" / f"{name}.yaml")
+    folder = Path(os.environ.get("GEMUCO_DATA", ROOT.parent / "shared" / "data"))
+    return config, read(config, folder / name)
+
+
+def lost_boards(config: MeasuredConfig, data: Dataset, masks: tuple[frozenset[str], ...], seed: int) -> np.ndarray:
+    """Error of the angles with no board lost and with each, last fifth held out [standard deviations], shape (5,)."""
+    rows = data.rows()
+    first = round(0.8 * len(rows))
+    known = Dataset(data.layout, (Episode("known", data.layout.split(rows[:first])),))
+    schema, _ = fit(known, train_config(config.model, config.training.epochs, seed), masks, x_out=(ANGLES,))
+    return np.array([_error(schema, rows[first:], set(BOARDS) - {lost}) for lost in ("", *BOARDS)])
+
+
+def _error(schema: BodySchema, rows: np.ndarray, given: set[str]) -> float:
+    x = schema.scaler.normalise(rows)
+    miss = schema.infer(x, frozenset(given)) - x[:, schema.out_index]
+    return float(np.sqrt(np.mean(miss**2)))
+
+
+def ridge(data: Dataset, weight: float = 10.0) -> np.ndarray:
+    """The same errors of ridge regression, fitted for each set of boards, shape (5,)."""
+    rows, layout = data.rows(), data.layout
+    first = round(0.8 * len(rows))
+    mean, std = rows[:first].mean(axis=0), rows[:first].std(axis=0)
+    x = np.clip((rows - mean) / np.where(std > 0, std, np.inf), -4.0, 4.0)
+    y = x[:, layout.slice(ANGLES)]
+    found = []
+    for lost in ("", *BOARDS):
+        given = x[:, layout.indices(set(BOARDS) - {lost})]
+        normal = given[:first].T @ given[:first] + weight * np.eye(given.shape[1])
+        told = given[first:] @ np.linalg.solve(normal, given[:first].T @ y[:first])
+        found.append(float(np.sqrt(np.mean((told - y[first:]) ** 2))))
+    return np.array(found)
+
+
+def joint_capsule(seeds: range) -> None:
+    """Print the structure and the errors with a board lost."""
+    config, data = recording("joint_capsule")
+    errors = []
+    for seed in seeds:
+        wanted = config.structure
+        thresholds = Thresholds(wanted.threshold_out, wanted.threshold_in, wanted.measure, wanted.over)
+        # Splits of other seeds overlap little.
+        training = train_config(config.model, wanted.epochs, seed * wanted.splits)
+        found = determine(data, training, thresholds, splits=wanted.splits)
+        print(f"joint capsule, seed {seed}:\n{found.report()}\n")
+        errors.append(lost_boards(config, data, found.masks, seed))
+    mean, spread = np.mean(errors, axis=0), np.std(errors, axis=0)
+    growth = np.array(errors)[:, 1:] / np.array(errors)[:, :1]
+    print("error of the angles [std], last fifth held out: all boards, board 0 to 3 lost")
+    print("    model", *(f"{m:.3f} ± {s:.3f}" for m, s in zip(mean, spread, strict=True)))
+    print("    growth", *(f"{100 * (g - 1):+.0f} %" for g in mean[1:] / mean[0]), f"worst of a seed {growth.max():.2f}")
+    print("    ridge", *(f"{e:.3f}" for e in ridge(data)))
+
+
+def schunk_arm(seeds: range) -> None:
+    """Print what can be told from what."""
+    config, data = recording("schunk_arm")
+    wanted = config.structure
+    for seed in seeds:
+        training = train_config(config.model, wanted.epochs, seed * wanted.splits)
+        judge = Judge(data.layout.names, train_masks(data, training, wanted.splits), Thresholds())
+        print(f"Schunk arm, seed {seed}: L_i", {name: round(value, 3) for name, value in judge.L_i.items()})
+
+
+def main() -> None:
+    """Run both."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, default=3)
+    seeds = range(parser.parse_args().seeds)
+    joint_capsule(seeds)
+    schunk_arm(seeds)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,98 @@
+"""How well and how fast structure determination finds the feasible masks of many signals.
+
+    python -m studies.accuracy.structure_search [--signals 12] [--seeds 3] [--samples 10000]
+
+On made-up bodies (`synthetic_body.py`). One network is trained; then all 2^n - 1 masks are measured with it (up
+to 12 signals), and the search is run with the same network. A feasible mask of the exhaustive answer counts as found if
+the search returned it, or a part of it that is feasible too; it counts as served if one of the masks kept for the
+schema (at most 64) is a part of it. Beside them stands what a perfect model of that body would find. Times are those
+of all processor cores together.
+"""
+
+import argparse
+import time
+
+import numpy as np
+
+from gemuco.learning.train import TrainConfig
+from gemuco.masks import bits
+from gemuco.structure.determination import Judge, Thresholds, search, select
+from gemuco.structure.mask_training import train_masks
+from studies.accuracy.synthetic_body import SyntheticBody
+
+CONFIG = TrainConfig(hidden=(200, 100), latent=40, activation="relu", epochs=100, batch=500, rate=3e-3)
+EXHAUSTIVE = 12
+
+
+def contains(masks: np.ndarray, parts: np.ndarray) -> np.ndarray:
+    """Whether each mask contains one of the parts, shape (masks,)."""
+    lacking = (~masks).astype(np.float32) @ parts.T.astype(np.float32)
+    return (lacking < 0.5).any(axis=1)
+
+
+def minimal(masks: np.ndarray) -> np.ndarray:
+    """The masks that contain no other of them."""
+    lacking = (~masks).astype(np.float32) @ masks.T.astype(np.float32)
+    return masks[(lacking < 0.5).sum(axis=1) == 1]
+
+
+def run(signals: int, samples: int, seed: int) -> None:
+    """One body; prints what was found and how long it took."""
+    body = SyntheticBody.random(signals, seed)
+    names, thresholds = body.layout.names, Thresholds()
+    started = time.process_time()
+    judge = Judge(names, train_masks(body.sample(samples, seed), CONFIG), thresholds)
+    trained = time.process_time()
+    tried, is_whole = search(judge, seed)
+    structure = select(body.layout, judge, tried, is_whole, seed)
+    searched = time.process_time()
+    feasible = np.array([bits(m, names) > 0 for m in structure.feasible])
+    print(
+        f"{signals} signals, body {seed}: training {trained - started:.0f} s, search {searched - trained:.1f} s, "
+        f"{judge.tried} masks tried of {2**signals - 1}, {len(feasible)} feasible, {len(minimal(feasible))} of them "
+        f"minimal, {len(structure.masks)} kept"
+    )
+    if signals > EXHAUSTIVE:
+        return
+    every = (np.arange(1, 2**signals)[:, None] >> np.arange(signals) & 1) > 0
+    every = every[judge.is_judged(every)]
+    started = time.process_time()
+    errors = judge.of(every).L_m
+    known = every[errors < thresholds.into]
+    took = time.process_time() - started
+    started = time.process_time()
+    raced = judge.race(every).L_m
+    race = time.process_time() - started
+    lost = int(((errors < thresholds.into) & (raced >= thresholds.into)).sum())
+    won = int(((errors >= thresholds.into) & (raced < thresholds.into)).sum())
+    least, sizes = body.least_errors(every), np.array([signal.size for signal in body.layout.signals])
+    judged = judge.outputs & ~every
+    perfect = every[(least * judged * sizes).sum(axis=1) / (judged * sizes).sum(axis=1) < thresholds.into]
+    told = {line.tobytes() for line in known}
+    truth = {line.tobytes() for line in perfect}
+    kept = np.array([bits(m, names) > 0 for m in structure.masks])
+    print(
+        f"    exhaustive: {len(known)} feasible, {len(minimal(known))} minimal, {took:.1f} s, in a race "
+        f"{race:.1f} s with {lost} lost and {won} won; found "
+        f"{contains(known, feasible).mean():.1%} of them, "
+        f"{np.mean([m.tobytes() in {f.tobytes() for f in feasible} for m in minimal(known)]):.1%} of the minimal, "
+        f"{sum(f.tobytes() not in told for f in feasible)} false; served {contains(known, kept).mean():.1%}\n"
+        f"    perfect model: {len(perfect)} feasible; the network finds {np.mean([k in told for k in truth]):.1%} of "
+        f"them and {sum(k not in truth for k in told)} false"
+    )
+
+
+def main() -> None:
+    """Run all bodies."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--signals", type=int, nargs="+", default=[12, 16])
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--samples", type=int, default=10_000)
+    options = parser.parse_args()
+    for signals in options.signals:
+        for seed in range(options.seeds):
+            run(signals, options.samples, seed)
+
+
+if __name__ == "__main__":
+    main()

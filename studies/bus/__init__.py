@@ -1,0 +1,1 @@
+"""Cost of frames, drivers, HAL and simulated nodes."""

@@ -1,0 +1,213 @@
+"""What the HAL costs while it runs: `python -m studies.bus.hal_load [--seconds 300] [ROBOT.yaml]`.
+
+Without a robot file: ten drives and ten load cells of the muscle-driven arm, five and five on each of two buses, at
+200 Hz. The simulated nodes run in another process behind the hub, as in the demo; this process is the HAL alone,
+enabled and following a small motion. Both are scheduled as `gemuco hal` and `gemuco simulate` are. Bars: 25 % of a
+core, 99.9 % of cycles complete, and 1 ms for a turn of the cycle beside the wait for answers. CPU is the process's own,
+so other load on the machine counts only in what it delays; what it delays a bare timer is told beside.
+"""
+
+import argparse
+import gc
+import multiprocessing
+import tempfile
+import threading
+import time
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
+from multiprocessing.synchronize import Event
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from hal import registry
+from hal.clock import SystemClock
+from hal.config import RobotConfig, load_robot
+from hal.errors import CommandRefused
+from hal.robot import ANSWER_SHARE, Robot, open_robot
+from hal.wire.budget import budgets
+from services.hardware.hal_service import CYCLE_PRIORITY, RECEIVE_PRIORITY
+from services.hardware.simulator_service import PRIORITY, THREADS
+from services.process import realtime
+
+ARM = Path(__file__).parents[2] / "robots" / "musashi_arm.yaml"
+RATE = 200.0
+WARM_UP = 2.0
+"""Not measured [s]."""
+
+
+class WaitMeter(SystemClock):
+    """The machine's clock, which knows how long the cycle waited for answers."""
+
+    def __init__(self) -> None:
+        self.waited = 0.0
+
+    def wait(self, event: threading.Event, deadline: float) -> bool:
+        """See `BusClock.wait`."""
+        before = time.perf_counter()
+        is_set = super().wait(event, deadline)
+        self.waited += time.perf_counter() - before
+        return is_set
+
+
+@dataclass
+class Turns:
+    """What every turn of the cycle took [s], and how many were incomplete, skipped, or came too late for a command."""
+
+    wall: list[float] = field(default_factory=list)
+    waited: list[float] = field(default_factory=list)
+    cpu: list[float] = field(default_factory=list)
+    late: list[float] = field(default_factory=list)
+    incomplete: int = 0
+    skipped: int = 0
+    refused: int = 0
+
+
+def drives_and_cells() -> RobotConfig:
+    """Ten drives and ten cells of the muscle-driven arm, in front of the bench."""
+    raw = yaml.safe_load(ARM.read_text())
+    del raw["signals"]["joint_position"], raw["limits"]["joint_position"], raw["collect"], raw["model"]
+    raw["devices"] = {name: entry for name, entry in raw["devices"].items() if entry["kind"] != "joint_encoder"}
+    raw["simulator"] = "simulators.robots.bench:simulator"
+    raw["rates"]["hal"] = RATE
+    return RobotConfig.model_validate({**raw, "folder": ARM.parent})
+
+
+def simulate(config: RobotConfig, ready: Event, stop: Event) -> None:
+    simulator = registry.load(str(config.simulator))
+    rig = simulator.rig(config, simulator.variants[0], 0)
+    realtime.prepare_process()
+    rig.start()
+    for prefix in THREADS:
+        realtime.promote(prefix, PRIORITY)
+    realtime.freeze()
+    ready.set()
+    stop.wait()
+    rig.stop()
+
+
+def tick(rate: float, stop: Event, late: Connection) -> None:
+    """A bare timer at the cycle's rate and priority: how late [s] the machine alone wakes a thread."""
+    realtime.prepare_thread(CYCLE_PRIORITY)
+    found = []
+    while not stop.is_set():
+        due = time.monotonic() + 1 / rate
+        time.sleep(1 / rate)
+        found.append(time.monotonic() - due)
+    late.send(found)
+
+
+def on_hub(config: RobotConfig, folder: str) -> RobotConfig:
+    buses = {
+        name: bus.model_copy(update={"interface": "hub", "channel": f"{folder}/{name}"})
+        for name, bus in config.buses.items()
+    }
+    return config.model_copy(update={"buses": buses})
+
+
+def turn(robot: Robot, clock: WaitMeter, cycles: int, turns: Turns) -> None:
+    """Follow a small motion for so many cycles, on an absolute grid as the service's loop."""
+    middle = None
+    due = time.monotonic()
+    for number in range(cycles):
+        behind = time.monotonic() - due
+        if behind > robot.period:
+            turns.skipped += int(behind / robot.period)
+            due += int(behind / robot.period) * robot.period
+        due += robot.period
+        time.sleep(max(due - time.monotonic(), 0.0))
+        turns.late.append(time.monotonic() - due)
+        clock.waited = 0.0
+        wall, cpu = time.perf_counter(), time.thread_time()
+        sample, applied = robot.cycle()
+        turns.wall.append(time.perf_counter() - wall)
+        turns.cpu.append(time.thread_time() - cpu)
+        turns.waited.append(clock.waited)
+        turns.incomplete += not sample.complete
+        if applied.mode == "hold" and middle is None:
+            middle = applied.values
+        if middle is not None:
+            try:
+                robot.command(middle + 0.001 * np.sin(0.02 * number), sample.cycle)
+            except CommandRefused:  # this machine stood still for longer than a command lives
+                turns.refused += 1
+
+
+def received(robot: Robot) -> int:
+    return sum(bus["counters"]["received"] for bus in robot.health()["buses"].values())
+
+
+def run(robot: Robot, clock: WaitMeter, seconds: float) -> None:
+    realtime.prepare_process()
+    scheduling = realtime.prepare_thread(CYCLE_PRIORITY)
+    realtime.promote("bus ", RECEIVE_PRIORITY)
+    until = time.monotonic() + 10.0
+    while not robot.cycle()[0].complete and time.monotonic() < until:
+        time.sleep(robot.period)
+    robot.enable()
+    turn(robot, clock, round(WARM_UP / robot.period), Turns())
+    realtime.freeze()
+    turns, cycles, frames = Turns(), round(seconds / robot.period), received(robot)
+    wall, process, thread = time.monotonic(), time.process_time(), time.thread_time()
+    turn(robot, clock, cycles, turns)
+    wall, process, thread = time.monotonic() - wall, time.process_time() - process, time.thread_time() - thread
+    frames = received(robot) - frames
+    busy = np.array(turns.wall) - np.array(turns.waited)
+    print(
+        f"rate           {cycles / wall:.1f} Hz of {1 / robot.period:.0f}, {turns.skipped} cycles skipped; {scheduling}"
+    )
+    print(
+        f"complete       {1 - turns.incomplete / cycles:.3%} of {cycles} (bar 99.9 %); {turns.refused} commands refused"
+    )
+    print(f"whole process  {process / wall:.1%} of a core (bar 25 %), {process / cycles * 1e6:.0f} us per cycle")
+    print(
+        f"receiving      {(process - thread) / frames * 1e6:.1f} us per frame, {frames / cycles:.1f} frames per cycle"
+    )
+    for what, found in (
+        ("turn, no wait", busy),
+        ("its CPU", np.array(turns.cpu)),
+        ("with the wait", np.array(turns.wall)),
+        ("begun late by", np.array(turns.late)),
+    ):
+        p50, p99 = np.percentile(found, [50, 99]) * 1e3
+        print(f"{what:15}{p50:.2f} ms median, {p99:.2f} ms p99, {found.max() * 1e3:.1f} ms at most")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("robot", nargs="?", type=Path)
+    parser.add_argument("--seconds", default=300.0, type=float)
+    given = parser.parse_args()
+    context = multiprocessing.get_context("spawn")
+    with tempfile.TemporaryDirectory() as folder:
+        config = on_hub(load_robot(given.robot) if given.robot else drives_and_cells(), folder)
+        for budget in budgets(config):
+            print(f"bus {budget.bus:11}{budget}")
+        ready, stop = context.Event(), context.Event()
+        nodes = context.Process(target=simulate, args=(config, ready, stop))
+        here, there = context.Pipe(False)
+        timer = context.Process(target=tick, args=(config.rates.hal, stop, there))
+        nodes.start()
+        timer.start()
+        ready.wait()
+        clock = WaitMeter()
+        try:
+            before = time.monotonic()
+            with open_robot(config, clock) as robot:
+                print(f"commissioning  {time.monotonic() - before:.2f} s for {len(config.devices)} nodes")
+                run(robot, clock, given.seconds)
+                for name, bus in robot.health()["buses"].items():
+                    print(f"bus {name:11}{bus['counters']}")
+        finally:
+            gc.unfreeze()
+            stop.set()
+            late = np.array(here.recv())
+            timer.join()
+            nodes.join()
+        share = np.mean(late > ANSWER_SHARE / config.rates.hal)
+        print(f"bare timer     later than the cycle waits in {share:.3%} of ticks, {late.max() * 1e3:.1f} ms at most")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,39 @@
+"""`gemuco reproduce`: the paper's experiments (section III) on our robots, its figures beside ours."""
+
+import importlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Protocol
+
+from services.errors import BadArguments
+from services.show import Tell
+from studies.paper.report import Report
+
+EXPERIMENTS = ("pr2", "musashi", "kxr")
+
+
+class Experiment(Protocol):
+    """What a module of this package offers under the name `reproduce`."""
+
+    def __call__(self, seeds: Sequence[int], folder: Path, progress: Tell, fresh: bool) -> Report:
+        """Run every experiment of one robot.
+
+        Args:
+            seeds: One run each, all with the same settings.
+            folder: Where data, models, figures and the report go.
+            progress: Told the share done, 0 to 1, and a line of text.
+            fresh: Collect and train again even if that was done before.
+        """
+        ...
+
+
+def experiment(name: str) -> Experiment:
+    """The experiments on a robot: `pr2`, `musashi` or `kxr`.
+
+    Raises:
+        BadArguments: There are none of this name.
+    """
+    if name not in EXPERIMENTS:
+        raise BadArguments(f"There are no experiments '{name}'. Known: {', '.join(EXPERIMENTS)}.")
+    found: Experiment = importlib.import_module(f"studies.paper.{name}.experiment").reproduce
+    return found

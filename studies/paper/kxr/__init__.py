@@ -1,0 +1,1 @@
+"""The paper's humanoid with tools (section III-C)."""

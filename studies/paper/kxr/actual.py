@@ -1,0 +1,110 @@
+"""The actual-robot experiments on the humanoid (paper, III-C): another robot, few samples, a model from simulation."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+
+from gemuco.dataset import Dataset, Episode
+from gemuco.learning.train import fine_tune
+from gemuco.schema import BodySchema
+from hal.config import RobotConfig
+from services.learning.trainer import train_config
+from services.model.living_model import layout_of
+from services.model.model_config import model_config
+from services.show import Tell
+from studies.paper.kxr.robot import JOINTS, Standing, inverse, random_targets, safe_postures, stiff
+from studies.paper.kxr.simulated import AFTER, FRESH, LEADS, TOOLS, WAYS, control_of, leads, recognitions
+from studies.paper.kxr.trials import Course, follow, follow_blindly, samples_until
+from studies.paper.runs import Run
+
+ACTUAL = "actual"
+TAUGHT_GRID = (5, 3, 2, 2)
+"""Postures that a person would choose: so many steps of shoulder pitch and yaw, elbow and ankle pitch; 60 in all."""
+TAUGHT_MARGIN = 0.15
+"""Share of a joint's range that a person keeps away from either end of it."""
+RANDOM = 20
+"""Random postures per tool, in which the designer's robot is in balance and sees its tool."""
+PER_EPISODE = 10
+EPOCHS, RATE = 300, 1e-3
+"""Of fine-tuning."""
+TARGETS = 30
+MODELS = ("geometric", "simulated", "fine-tuned")
+FOLLOWING = "simulated, p updated"
+
+
+@dataclass(frozen=True, slots=True)
+class Actual:
+    """One seed of the actual-robot experiments.
+
+    Attributes:
+        schema: Fine-tuned.
+        samples: How many it was tuned with.
+        leads: Way of p, by label, to a tool with all sensors.
+        needed: Tool -> samples until it is recognised by the default way.
+        recognised: Case -> samples until long_middle is recognised by the default way, shape (runs,).
+        controlled: Model -> targets at long_middle.
+    """
+
+    schema: BodySchema
+    samples: int
+    leads: Mapping[str, np.ndarray]
+    needed: Mapping[str, float]
+    recognised: Mapping[str, np.ndarray]
+    controlled: Mapping[str, Course]
+
+
+def actual(run: Run, simulated: BodySchema, tell: Tell) -> Actual:
+    """Collect on the actual robot, fine-tune what was learned in simulation, and run every trial of one seed."""
+    tell(0.0, "collecting on the actual robot")
+    settings = {"grid": TAUGHT_GRID, "margin": TAUGHT_MARGIN, "random": RANDOM}
+    data = run.dataset("actual", lambda: _collected(run), **settings)
+    schema = run.schema(
+        "actual_model", lambda: _tuned(run, simulated, data, tell), epochs=EPOCHS, rate=RATE, **settings
+    )
+    tell(0.8, "trials on the actual robot")
+    ways = leads(run, schema, ACTUAL)
+    needed = {tool: samples_until(ways[f"to {tool}, ekf"], schema, tool) for tool in LEADS}
+    recognised = {case: found for (case, _), found in recognitions(run, schema, ACTUAL, ["ekf"])[0].items()}
+    return Actual(schema, len(data), ways, needed, recognised, _controlled(run, simulated, schema))
+
+
+def taught_postures(robot: RobotConfig) -> np.ndarray:
+    """A grid within the limits [rad], shape (60, 4), in the order in which a person would go through it."""
+    low, high = robot.bounds(JOINTS)
+    shares = [np.linspace(TAUGHT_MARGIN, 1.0 - TAUGHT_MARGIN, count) for count in TAUGHT_GRID]
+    return low + (high - low) * np.array(list(product(*shares)))
+
+
+def _collected(run: Run) -> Dataset:
+    """One sample per posture, with whatever was out of sight missing."""
+    robot, episodes = run.robot, []
+    layout, random = layout_of(robot), np.random.default_rng([FRESH + run.seed, 200])
+    for tool in TOOLS:
+        body = Standing(robot, ACTUAL, run.seed, tool)
+        postures = [*random.permutation(taught_postures(robot)), *safe_postures(robot, tool, RANDOM, random)]
+        rows = np.stack([layout.join(body.go(posture)) for posture in postures])
+        parts = np.split(rows, range(PER_EPISODE, len(rows), PER_EPISODE))
+        episodes += [Episode(tool, layout.split(part)) for part in parts]
+    return Dataset(layout, tuple(episodes))
+
+
+def _tuned(run: Run, simulated: BodySchema, data: Dataset, tell: Tell) -> BodySchema:
+    config = replace(train_config(model_config(run.robot), EPOCHS, run.seed), rate=RATE, replay=0.0)
+    return fine_tune(simulated, data, config, lambda done, text: tell(0.1 + 0.7 * done, text))[0]
+
+
+def _controlled(run: Run, simulated: BodySchema, tuned: BodySchema) -> dict[str, Course]:
+    robot, control = run.robot, control_of(run)
+    targets = random_targets(robot, AFTER, TARGETS, np.random.default_rng([FRESH + run.seed, 300]))
+
+    def body() -> Standing:
+        return Standing(robot, ACTUAL, run.seed, AFTER)
+
+    return {
+        "geometric": follow_blindly(body(), targets, inverse(robot, stiff(robot, AFTER), targets)),
+        "simulated": follow(robot, body(), simulated.under(AFTER), control, targets),
+        FOLLOWING: follow(robot, body(), simulated.under(AFTER), control, targets, WAYS["ekf"]),
+        "fine-tuned": follow(robot, body(), tuned.under(AFTER), control, targets),
+    }

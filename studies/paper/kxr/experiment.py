@@ -1,0 +1,196 @@
+"""The paper's experiments on the humanoid with tools (section III-C), in simulation and on the actual variant."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hal.config import load_robot
+from services.model.artifacts import robot_file
+from services.model.model_config import collect_config
+from services.show import Tell
+from studies.paper.kxr.actual import FOLLOWING, MODELS, Actual, actual
+from studies.paper.kxr.figures import draw
+from studies.paper.kxr.robot import CENTER
+from studies.paper.kxr.simulated import (
+    AFTER,
+    CASES,
+    KNOWING,
+    LEADS,
+    RUNS,
+    SAMPLES,
+    SEQUENCE,
+    SETTLED,
+    STEPS,
+    TOOLS,
+    Simulated,
+    collected,
+    mask_errors,
+    simulate,
+)
+from studies.paper.kxr.trials import Course, order, steps_until
+from studies.paper.report import Report, adder
+from studies.paper.runs import Run, between, each_seed
+
+ROBOT = "kxr_humanoid"
+PAPER_MASKS = ("1110", "1101", "1011", "0111", "1010", "1100", "1001", "1000")
+"""Feasible masks of the paper in the order joints, center of gravity, tip, pixel."""
+SIGNAL_BAR, ORDER_BAR, TIP_BAR, CENTER_BAR = 0.15, 0.98, 12.0, 15.0
+RECOGNITION = {
+    "A: joints, center of gravity": "not in 35",
+    "B: and pixel": "35",
+    "C: and tip": "15",
+}
+SAMPLES_BAR, SHARE_BAR = 3.0, 89.0
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """One seed of both experiments."""
+
+    simulated: Simulated
+    actual: Actual
+
+
+def _of_seed(run: Run, tell: Tell) -> Outcome:
+    simulated = simulate(run, between(tell, 0.0, 0.9))
+    return Outcome(simulated, actual(run, simulated.schema, between(tell, 0.9, 1.0)))
+
+
+def reproduce(seeds: Sequence[int], folder: Path, progress: Tell, fresh: bool) -> Report:
+    """See `studies.paper.Experiment`."""
+    robot = load_robot(robot_file(ROBOT))
+
+    outcomes = each_seed(robot, seeds, folder, progress, fresh, _of_seed, collected)
+    report = Report(ROBOT, tuple(seeds))
+    _add_structure(report, outcomes)
+    _add_recognition(report, outcomes)
+    bounds = collect_config(robot).constraints[CENTER].bounds(2, CENTER)
+    _add_control(report, outcomes, bounds)
+    _add_actual(report, outcomes)
+    draw(folder, [outcome.simulated for outcome in outcomes], [outcome.actual for outcome in outcomes])
+    return report
+
+
+def _add_structure(report: Report, outcomes: Sequence[Outcome]) -> None:
+    row = adder(report, outcomes)
+    for signal in outcomes[0].simulated.schema.layout.names:
+        row(f"L of {signal}", "", "below 0.15", lambda o, s=signal: o.simulated.schema.manifest["L_i"][s], SIGNAL_BAR)
+    row("the paper's 8 masks that are feasible", "", "8", lambda o: len(_feasible(o) & set(PAPER_MASKS)), 7.5, "higher")
+    row("other masks that are feasible", "", "0", lambda o: len(_feasible(o) - set(PAPER_MASKS)))
+    row("of these 0110 (center of gravity, tip)", "", "0", lambda o: len(_feasible(o) & {"0110"}))
+    for mask in ("0111", "0110", "0011", "0101"):
+        paper = "below 0.15" if mask == "0111" else "above 0.15"
+        row(f"L of mask {mask}", "", paper, lambda o, mask=mask: mask_errors(o.simulated.schema).get(mask, np.nan))
+    row("R^2 of p on weight and length", "", "", lambda o: order(o.simulated.schema.biases, TOOLS), ORDER_BAR, "higher")
+
+
+def _feasible(outcome: Outcome) -> set[str]:
+    schema = outcome.simulated.schema
+    return {"".join("01"[name in mask] for name in schema.layout.names) for mask in schema.masks}
+
+
+def _add_recognition(report: Report, outcomes: Sequence[Outcome]) -> None:
+    row = adder(report, outcomes)
+    for case, paper in RECOGNITION.items():
+        if paper.isdigit():
+            row(f"recognised, {case}, samples", "", paper, lambda o, c=case: _mean(o, c, "ekf"), SAMPLES_BAR)
+    hard = next(iter(CASES))
+    row(f"recognised in {SAMPLES}, {hard}", "%", "0", lambda o: _share(o, hard, "ekf"), SHARE_BAR, "higher")
+    row(f"recognised, {hard}, samples", "", "", lambda o: _mean(o, hard, "ekf"))
+    for case, paper in RECOGNITION.items():
+        row(f"p by gauss_newton, {case}, samples", "", "", lambda o, c=case: _mean(o, c, "gauss_newton"))
+        row(f"p by gradient, {case}, samples", "", paper, lambda o, c=case: _mean(o, c, "gradient"))
+        row(f"p by gradient, {case}, recognised", "%", "", lambda o, c=case: _share(o, c, "gradient"))
+    report.note(
+        f"Recognised: p is nearest to the p of {AFTER} of all tools and within 20 % of the way from the first p, and "
+        f"stays so up to sample {SAMPLES}; a run in which it is not counts as {SAMPLES + 1}. {RUNS} runs per seed."
+    )
+
+
+def _mean(outcome: Outcome, case: str, way: str) -> float:
+    return _needed(outcome.simulated.needed[case, way])
+
+
+def _share(outcome: Outcome, case: str, way: str) -> float:
+    return _found(outcome.simulated.needed[case, way])
+
+
+def _needed(samples: np.ndarray) -> float:
+    """Mean over the runs, shape (runs,), of the samples until recognition."""
+    return float(np.minimum(samples, SAMPLES + 1).mean())
+
+
+def _found(samples: np.ndarray) -> float:
+    """Share [%] of the runs, shape (runs,), in which the tool was recognised."""
+    return 100.0 * float(np.isfinite(samples).mean())
+
+
+def _add_control(report: Report, outcomes: Sequence[Outcome], bounds: tuple[np.ndarray, np.ndarray]) -> None:
+    row = adder(report, outcomes)
+    for index, tool in enumerate(SEQUENCE):
+        begin, after = index * STEPS, slice(index * STEPS + SETTLED, (index + 1) * STEPS)
+        whole = slice(begin, (index + 1) * STEPS)
+        row(f"{tool}: tip, first step, {KNOWING}", "mm", "", lambda o, at=begin: 1e3 * _known(o).tips[at])
+        row(
+            f"{tool}: steps until the tip's average of 5 stays below {TIP_BAR:g} mm",
+            "",
+            "",
+            lambda o, at=whole: min(steps_until(1e3 * _known(o).tips[at], TIP_BAR), STEPS),
+            SETTLED + 0.5,
+        )
+        for way in outcomes[0].simulated.controlled:
+            is_asked = way == KNOWING
+            row(
+                f"{tool}: tip after {SETTLED} steps, {way}",
+                "mm",
+                "",
+                lambda o, way=way, at=after: 1e3 * o.simulated.controlled[way].tips[at].mean(),
+                TIP_BAR if is_asked else None,
+            )
+            row(
+                f"{tool}: center of gravity after {SETTLED} steps, {way}",
+                "mm",
+                "",
+                lambda o, way=way, at=after: 1e3 * o.simulated.controlled[way].off_center[at].mean(),
+                CENTER_BAR if is_asked else None,
+            )
+        row(
+            f"{tool}: center of gravity, limit (perfect model)",
+            "mm",
+            "",
+            lambda o, at=after: 1e3 * o.simulated.limit.off_center[at].mean(),
+        )
+    share = "center of gravity inside collect.constraints, steps with a known tool"
+    row(share, "%", "", lambda o: 100.0 * _inside(_known(o), bounds), 99.0, "higher")
+
+
+def _known(outcome: Outcome) -> Course:
+    return outcome.simulated.controlled[KNOWING]
+
+
+def _inside(course: Course, bounds: tuple[np.ndarray, np.ndarray]) -> float:
+    """Share of the steps with a known tool in which the center of gravity is within bounds [m]."""
+    known = np.arange(len(course.tips)) % STEPS > 0
+    inside = np.all((course.centers >= bounds[0]) & (course.centers <= bounds[1]), axis=1)
+    return float(inside[known].mean())
+
+
+def _add_actual(report: Report, outcomes: Sequence[Outcome]) -> None:
+    row = adder(report, outcomes)
+    row("actual: samples for fine-tuning", "", "480", lambda o: o.actual.samples)
+    row("actual: R^2 of p on weight and length", "", "", lambda o: order(o.actual.schema.biases, TOOLS))
+    for tool in LEADS:
+        row(f"actual: {tool} recognised, samples", "", "", lambda o, tool=tool: min(o.actual.needed[tool], SAMPLES + 1))
+    for case in CASES:
+        row(f"actual: recognised in {SAMPLES}, {case}", "%", "", lambda o, c=case: _found(o.actual.recognised[c]))
+        row(f"actual: recognised, {case}, samples", "", "", lambda o, c=case: _needed(o.actual.recognised[c]))
+    papers = dict(zip(MODELS, ("largest", "smaller", "smallest"), strict=True))
+    for model in (*MODELS, FOLLOWING):
+        row(
+            f"actual: tip at {AFTER}, {model}",
+            "mm",
+            papers.get(model, ""),
+            lambda o, model=model: 1e3 * o.actual.controlled[model].tips.mean(),
+        )

@@ -1,0 +1,185 @@
+"""The simulation experiments on the humanoid (paper, III-C): the nominal robot and its six tools."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from gemuco.adaption.update import UpdateConfig
+from gemuco.dataset import Dataset
+from gemuco.masks import all_masks, label
+from gemuco.schema import BodySchema
+from services.learning.collector import collect_direct
+from services.learning.trainer import train
+from services.model.control_config import ControlConfig
+from services.model.model_config import model_config
+from services.show import Tell
+from studies.paper.kxr.robot import (
+    CENTER,
+    JOINTS,
+    PIXEL,
+    TIP,
+    Standing,
+    designed,
+    inverse,
+    random_targets,
+    safe_postures,
+)
+from studies.paper.kxr.trials import Course, follow, follow_blindly, recognise, samples_until
+from studies.paper.runs import MODEL, Run
+
+NOMINAL = "nominal"
+TOOLS = {
+    f"{size}_{weight}": (length, mass)
+    for (size, length), (weight, mass) in product(
+        (("short", 176.0), ("long", 236.0)), (("light", 40.0), ("middle", 80.0), ("heavy", 120.0))
+    )
+}
+"""Length [mm] and weight [g] of every tool, which p is to be ordered by; the model is not told them."""
+CASES = {
+    "A: joints, center of gravity": (JOINTS, CENTER),
+    "B: and pixel": (JOINTS, CENTER, PIXEL),
+    "C: and tip": (JOINTS, CENTER, TIP, PIXEL),
+}
+BEFORE, AFTER = "short_middle", "long_middle"
+WAYS = {
+    "ekf": UpdateConfig(what="bias"),
+    "gauss_newton": UpdateConfig(what="bias", bias_method="gauss_newton"),
+    "gradient": UpdateConfig(what="bias", bias_method="gradient", minimum=1, window=10),
+}
+"""Ways to find p; the first is the default, the last the paper's."""
+KNOWING, GRADIENT, BLIND, LIGHT = "p by ekf", "p by gradient", "p not updated", "p by ekf, weight 0.01"
+"""Ways to control; the last with the paper's weight of the center of gravity."""
+LEADS = ("long_light", "short_heavy")
+"""Tools whose recognition the paper draws."""
+RUNS, SAMPLES = 10, 35
+SEQUENCE = ("long_light", "long_heavy", "short_heavy")
+STEPS = 30
+"""Of control with each tool."""
+SETTLED = 10
+"""Steps after a change within which the error is to be small."""
+PAPER_WEIGHT = 0.01
+FRESH = 1000
+"""Added to the seed for trials."""
+
+
+@dataclass(frozen=True, slots=True)
+class Simulated:
+    """One seed of the simulation experiments.
+
+    Attributes:
+        schema: As trained.
+        needed: (case, way) -> samples until the tool is recognised, shape (runs,).
+        paths: (case, way) -> p along the first run, shape (samples + 1, bias_size).
+        leads: Tool -> p on the way to it with all sensors, by the paper's way.
+        controlled: Way to control -> what happened.
+        limit: What a perfect model of the robot reaches.
+    """
+
+    schema: BodySchema
+    needed: Mapping[tuple[str, str], np.ndarray]
+    paths: Mapping[tuple[str, str], np.ndarray]
+    leads: Mapping[str, np.ndarray]
+    controlled: Mapping[str, Course]
+    limit: Course
+
+
+def collected(run: Run, tell: Tell) -> Dataset:
+    """What the model is trained on."""
+    tell(0.0, "collecting")
+    return run.dataset("nominal", lambda: collect_direct(run.robot, NOMINAL, run.seed).dataset)
+
+
+def simulate(run: Run, tell: Tell) -> Simulated:
+    """Collect, train, and run every trial of one seed."""
+    robot, seed = run.robot, run.seed
+    data = collected(run, tell)
+    schema = run.schema(MODEL, lambda: train(robot, data, seed, lambda done, text: tell(0.2 + 0.5 * done, text)).schema)
+    tell(0.7, "recognising tools")
+    needed, paths = recognitions(run, schema, NOMINAL, WAYS)
+    tell(0.85, "reaching targets while tools change")
+    controlled, limit = _controls(run, schema)
+    return Simulated(schema, needed, paths, leads(run, schema, NOMINAL), controlled, limit)
+
+
+def samples_of(run: Run, variant: str, condition: str, chance: int) -> list[Mapping[str, np.ndarray]]:
+    """What is measured in random postures with a tool."""
+    body = Standing(run.robot, variant, run.seed, condition)
+    random = np.random.default_rng([FRESH + run.seed, chance])
+    return [dict(body.go(posture)) for posture in safe_postures(run.robot, condition, SAMPLES, random)]
+
+
+def leads(run: Run, schema: BodySchema, variant: str) -> dict[str, np.ndarray]:
+    """Ways of p to two tools with all sensors."""
+    start = schema.under(BEFORE)
+    return {
+        f"to {tool}, {way}": recognise(start, samples_of(run, variant, tool, 50), (JOINTS, CENTER, TIP, PIXEL), update)
+        for tool in LEADS
+        for way, update in WAYS.items()
+        if way != "gauss_newton"
+    }
+
+
+def recognitions(
+    run: Run, schema: BodySchema, variant: str, ways: Iterable[str]
+) -> tuple[dict[tuple[str, str], np.ndarray], dict[tuple[str, str], np.ndarray]]:
+    """Samples until long_middle is recognised by some ways in every case, and p along the first run of each."""
+    needed: dict[tuple[str, str], list[float]] = {key: [] for key in product(CASES, ways)}
+    paths: dict[tuple[str, str], np.ndarray] = {}
+    for chance in range(RUNS):
+        samples = samples_of(run, variant, AFTER, chance)
+        for case, way in needed:
+            path = recognise(schema.under(BEFORE), samples, CASES[case], WAYS[way])
+            needed[case, way].append(samples_until(path, schema, AFTER))
+            paths.setdefault((case, way), path)
+    return {key: np.array(values) for key, values in needed.items()}, paths
+
+
+def _controls(run: Run, schema: BodySchema) -> tuple[dict[str, Course], Course]:
+    robot = run.robot
+    random = np.random.default_rng([FRESH + run.seed, 100])
+    targets = np.concatenate([random_targets(robot, tool, STEPS, random) for tool in SEQUENCE])
+    changes = {index * STEPS: tool for index, tool in enumerate(SEQUENCE)}
+    control = control_of(run)
+    ways = {
+        KNOWING: (control, WAYS["ekf"]),
+        GRADIENT: (control, WAYS["gradient"]),
+        BLIND: (control, None),
+        LIGHT: (with_weight(control, PAPER_WEIGHT), WAYS["ekf"]),
+    }
+    controlled = {}
+    for name, (asked, update) in ways.items():
+        body = Standing(robot, NOMINAL, run.seed, SEQUENCE[0])
+        controlled[name] = follow(robot, body, schema.under(SEQUENCE[0]), asked, targets, update, changes)
+    parts = []
+    for index, tool in changes.items():
+        mine = targets[index : index + STEPS]
+        commands = inverse(robot, designed(robot, tool), mine)
+        parts.append(follow_blindly(Standing(robot, NOMINAL, run.seed, tool), mine, commands))
+    limit = Course(
+        *(np.concatenate(part) for part in zip(*((p.tips, p.centers, p.biases) for p in parts), strict=True))
+    )
+    return controlled, limit
+
+
+def mask_errors(schema: BodySchema) -> dict[str, float]:
+    """L_m by mask, written as in the paper: 0 or 1 for joints, center of gravity, tip and pixel."""
+    names = schema.layout.names
+    by_label = {label(mask, names): "".join("01"[name in mask] for name in names) for mask in all_masks(names)}
+    return {by_label[name]: value for name, value in schema.manifest["L_m"].items()}
+
+
+def control_of(run: Run) -> ControlConfig:
+    """The robot file's control section."""
+    control = model_config(run.robot).control
+    assert control is not None
+    return control
+
+
+def with_weight(control: ControlConfig, weight: float) -> ControlConfig:
+    """The same with another weight of the center of gravity."""
+    terms = tuple(
+        term.model_copy(update={"weight": weight}) if term.match == CENTER else term for term in control.terms
+    )
+    return control.model_copy(update={"terms": terms})

@@ -1,0 +1,132 @@
+"""Trials with the humanoid: a tool recognised from samples, and targets reached while tools are changed."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gemuco.adaption.update import UpdateConfig, Updater
+from gemuco.schema import BodySchema
+from gemuco.search.descent import DescentConfig
+from hal.config import RobotConfig
+from services.model.control_config import ControlConfig, controller_of
+from studies.paper.kxr.robot import CENTER, TIP, Standing
+
+SEARCH = DescentConfig(gamma_max=0.5, candidates=10, iterations=100)
+"""The service makes fewer iterations per tick, and goes on in the next."""
+NEAR = 0.2
+"""A tool is recognised when p is nearest to its p of all, and within this share of the way that p had to go."""
+SMOOTH = 5
+"""Steps of the average that is shown beside the raw errors, as in the paper."""
+
+Sample = Mapping[str, np.ndarray]
+
+
+@dataclass(frozen=True, slots=True)
+class Course:
+    """What happened step by step while targets were given.
+
+    Attributes:
+        tips: Distance of the tool tip from its target [m], shape (n,).
+        centers: Center of gravity [m], shape (n, 2).
+        biases: p that was used, shape (n, bias_size).
+    """
+
+    tips: np.ndarray
+    centers: np.ndarray
+    biases: np.ndarray
+
+    @property
+    def off_center(self) -> np.ndarray:
+        """Distance of the center of gravity from the middle of the feet [m], shape (n,)."""
+        distance: np.ndarray = np.linalg.norm(self.centers, axis=1)
+        return distance
+
+
+def recognise(schema: BodySchema, samples: Sequence[Sample], given: Sequence[str], update: UpdateConfig) -> np.ndarray:
+    """Show samples of which only some signals are given; p before the first and after each, (n + 1, bias_size)."""
+    updater = Updater(schema, update)
+    path = [schema.bias]
+    for sample in samples:
+        updater.add({name: sample[name] for name in given})
+        path.append(updater.step().bias)
+    return np.stack(path)
+
+
+def samples_until(path: np.ndarray, schema: BodySchema, condition: str) -> float:
+    """Samples after which a tool is recognised and stays so to the end; infinite if it is not."""
+    names, known = list(schema.biases), np.stack(list(schema.biases.values()))
+    right = schema.biases[condition]
+    away = np.linalg.norm(path - right, axis=1)
+    nearest = np.argmin(np.linalg.norm(path[:, None] - known[None], axis=2), axis=1)
+    wrong = (nearest != names.index(condition)) | (away >= NEAR * away[0])
+    return float("inf") if wrong[-1] else float(np.flatnonzero(wrong)[-1] + 1)
+
+
+def follow(
+    robot: RobotConfig,
+    body: Standing,
+    schema: BodySchema,
+    control: ControlConfig,
+    targets: np.ndarray,
+    update: UpdateConfig | None = None,
+    changes: Mapping[int, str] | None = None,
+) -> Course:
+    """Bring the tool tip to targets [m], shape (n, 3), while p follows the body.
+
+    Args:
+        robot: The robot file.
+        body: What is moved.
+        schema: The model to begin with.
+        control: What else is asked.
+        targets: Of the tip.
+        update: How to follow the body; None: not at all.
+        changes: Step -> tool that is put into the hand before it.
+    """
+    updater = None if update is None else Updater(schema, update)
+    controller = controller_of(schema, robot, control, SEARCH)
+    tips, centers, biases = [], [], []
+    for index, target in enumerate(targets):
+        if changes and index in changes:
+            body.hold(changes[index])
+        found = controller.solve({TIP: target})
+        measured = body.go(found.command)
+        tips.append(np.linalg.norm(body.truth(TIP) - target))
+        centers.append(body.truth(CENTER))
+        biases.append(controller.schema.bias)
+        if updater is not None:
+            updater.add(measured)
+            updater.step()
+            controller.swap(updater.schema)
+    return Course(np.array(tips), np.stack(centers), np.stack(biases))
+
+
+def follow_blindly(body: Standing, targets: np.ndarray, commands: np.ndarray) -> Course:
+    """The same with commands [rad], shape (n, 4), that somebody else chose."""
+    tips, centers = [], []
+    for target, command in zip(targets, commands, strict=True):
+        body.go(command)
+        tips.append(np.linalg.norm(body.truth(TIP) - target))
+        centers.append(body.truth(CENTER))
+    return Course(np.array(tips), np.stack(centers), np.zeros((len(tips), 0)))
+
+
+def steps_until(errors: np.ndarray, bar: float) -> float:
+    """Steps after which the average of the last few errors stays below a bar; infinite if it does not."""
+    above = np.flatnonzero(smoothed(errors) >= bar)
+    if not len(above):
+        return 0.0
+    return float("inf") if above[-1] == len(errors) - 1 else float(above[-1] + 1)
+
+
+def smoothed(errors: np.ndarray) -> np.ndarray:
+    """Average over the last few steps, shape (n,)."""
+    return np.array([errors[max(0, index - SMOOTH + 1) : index + 1].mean() for index in range(len(errors))])
+
+
+def order(biases: Mapping[str, np.ndarray], values: Mapping[str, Sequence[float]]) -> float:
+    """R^2 of a linear fit of p on what tells the conditions apart (condition -> values)."""
+    p = np.stack([biases[name] for name in values]).astype(float)
+    columns = np.column_stack([np.array(list(values.values()), float), np.ones(len(p))])
+    left = p - columns @ np.linalg.lstsq(columns, p, rcond=None)[0]
+    return float(1.0 - np.sum(left**2) / np.sum((p - p.mean(axis=0)) ** 2))

@@ -1,0 +1,1 @@
+"""The paper's muscle-driven arm (section III-B)."""

@@ -1,0 +1,155 @@
+"""All Musashi experiments of one seed: one training, one actual arm."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from gemuco.dataset import Dataset
+from gemuco.schema import BodySchema
+from gemuco.structure.determination import Structure
+from services.learning.trainer import train
+from services.show import Tell
+from studies.paper.musashi import anomaly as anomaly
+from studies.paper.musashi import control as control
+from studies.paper.musashi import model as model
+from studies.paper.musashi import simulation as simulation
+from studies.paper.musashi.motion import TENSION, record
+from studies.paper.runs import MODEL, Run, between
+
+LIVED, NORMAL, FRESH, CUT = 600.0, 240.0, 120.0, 30.0
+"""Lengths of recordings [s]: learned from, what is normal, judged, and with a cut muscle."""
+STORY = (60.0, 120.0, 180.0)
+"""Figure (b): until when the arm is healthy, carries the heavy object, and lacks a muscle [s]."""
+STORY_MUSCLE = "biceps"
+STARTS = {control.OURS: control.STARTS, control.WEIGHTS: 1}
+"""How many starts per target are tried."""
+HELD = (1.0, 5.0, 10.0)
+"""Times over which anomaly scores are averaged [s]."""
+BEFORE, AFTER = "before", "after"
+HEAVY = ((0.0, "heavy_object"),)
+
+Pair = Mapping[str, np.ndarray]
+"""`before` and `after` the online update -> values."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What was measured.
+
+    Attributes:
+        seed: Of training and arm.
+        structure: What structure determination found on the geometric data.
+        time: Of every sample of the online update [s], shape (n,).
+        learning: Error of the estimate before each was learned from [rad], shape (n,).
+        unchanged: Errors of the model as trained on the same samples [rad], shape (n,).
+        fresh: Errors of the estimate on fresh random motion [rad].
+        heavy: The same with a heavy object in the hand [rad].
+        areas: Muscle -> area under the ROC curve of its cut, before and after.
+        areas_held: The same after the update, of scores averaged over so many seconds.
+        story: Errors of the estimate [rad] while the arm is healthy, loaded, and cut.
+        scores: Anomaly scores then.
+        threshold: Of the scores after the update.
+        control: Way -> errors [rad], shape (targets, starts), before and after.
+        courses: Loss -> simulated motion, before and after.
+        forced: Figure (f), after the update; see `musashi_simulation.forced`.
+    """
+
+    seed: int
+    structure: Structure
+    time: np.ndarray
+    learning: np.ndarray
+    unchanged: np.ndarray
+    fresh: Pair
+    heavy: Pair
+    areas: Mapping[str, Mapping[str, float]]
+    areas_held: Mapping[float, Mapping[str, float]]
+    story: Pair
+    scores: Pair
+    threshold: float
+    control: Mapping[str, Pair]
+    courses: Mapping[str, Mapping[str, simulation.Course]]
+    forced: Mapping[str, Mapping[str, np.ndarray]]
+
+
+def collected(run: Run, tell: Tell) -> Dataset:
+    """What the model is trained on: random states of the designer's model."""
+    tell(0.0, "drawing states of the geometric model")
+    return run.dataset("geometric", lambda: model.geometric_data(run.robot, run.seed))
+
+
+def run_seed(run: Run, tell: Tell) -> Outcome:
+    """Train, move the actual arm, learn from it and use what was learned."""
+    robot, seed = run.robot, run.seed
+    data = collected(run, tell)
+    before = run.schema(MODEL, lambda: train(robot, data, seed, between(tell, 0.0, 0.2)).schema)
+    tell(0.2, "moving the actual arm")
+    lived = _recorded(run, "lived", 100, LIVED)
+    tell(0.4, "learning from it")
+    learned = model.learn(robot, before, lived, seed)
+    normal = _recorded(run, "normal", 200, NORMAL)
+    schemas = {
+        BEFORE: anomaly.with_normal(before, normal),
+        AFTER: anomaly.with_normal(learned.schema, normal),
+    }
+    tell(0.5, "moving it with a heavy object and cut muscles")
+    motion, loaded = _recorded(run, "fresh", 300, FRESH), _recorded(run, "heavy", 400, FRESH, HEAVY)
+    story = _story(run)
+    cut = _cuts(run)
+    tell(0.7, "controlling and simulating it")
+
+    def both(measure: Callable[[BodySchema, Dataset], np.ndarray], recording: Dataset) -> dict[str, np.ndarray]:
+        return {name: measure(schema, recording) for name, schema in schemas.items()}
+
+    return Outcome(
+        seed=seed,
+        structure=model.structure_of(robot, before),
+        time=learned.time,
+        learning=learned.errors,
+        unchanged=model.recorded_errors(before, lived),
+        fresh=both(model.recorded_errors, motion),
+        heavy=both(model.recorded_errors, loaded),
+        areas={name: anomaly.areas(schema, [motion, loaded], cut) for name, schema in schemas.items()},
+        areas_held={over: anomaly.areas(schemas[AFTER], [motion, loaded], cut, over) for over in HELD},
+        story=both(model.recorded_errors, story),
+        scores=both(anomaly.scores, story),
+        threshold=getattr(schemas[AFTER].normal, "threshold", float("nan")),
+        control={
+            name: {which: control.errors(robot, schema, seed, way, STARTS[name]) for which, schema in schemas.items()}
+            for name, way in control.ways(robot).items()
+        },
+        courses={
+            name: {which: simulation.simulate(robot, schema, motion, terms) for which, schema in schemas.items()}
+            for name, terms in simulation.losses(robot).items()
+        },
+        forced=simulation.forced(robot, schemas[AFTER]),
+    )
+
+
+def _recorded(run: Run, name: str, motion: int, duration: float, parts: tuple[tuple[float, str], ...] = ()) -> Dataset:
+    """Random motion of the run's arm; every name has a motion of its own."""
+    seed = 1000 * motion + run.seed
+    broken = [list(part) for part in parts]
+    return run.dataset(
+        name,
+        lambda: record(run.robot, run.seed, seed, duration, parts),
+        motion=seed,
+        duration=duration,
+        broken=broken,
+    )
+
+
+def _story(run: Run) -> Dataset:
+    healthy, loaded, end = STORY
+    parts = ((healthy, "heavy_object"), (loaded, f"muscle_cut:{STORY_MUSCLE}"))
+    return _recorded(run, "story", 500, end, parts)
+
+
+def _cuts(run: Run) -> dict[str, Dataset]:
+    """Muscle -> motion after it was cut."""
+    found = {}
+    for index, muscle in enumerate(run.robot.signals[TENSION].elements):
+        parts = ((anomaly.CUT_AFTER, f"muscle_cut:{muscle}"),)
+        whole = _recorded(run, f"cut_{muscle}", 600 + index, CUT, parts)
+        found[muscle] = anomaly.since_cut(whole)
+    return found

@@ -1,0 +1,1 @@
+"""The paper's arm with seven joints and a duster (section III-A)."""

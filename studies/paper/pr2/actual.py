@@ -1,0 +1,150 @@
+"""The actual-robot experiment on the PR2 (paper, III-A): another arm, the flexible duster, a model from simulation."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gemuco.adaption.update import UpdateConfig, Updater
+from gemuco.dataset import Dataset, Episode
+from gemuco.learning.train import fine_tune
+from gemuco.schema import BodySchema
+from hal.config import RobotConfig
+from services.hardware.stand_in import simulator_of
+from services.learning.collector import Wanted, collect_direct
+from services.learning.trainer import train_config
+from services.model.model_config import collect_config, model_config
+from services.show import Tell
+from studies.paper.pr2.arm import JOINTS, TIP, Arm, Geometry, duster_motion
+from studies.paper.pr2.simulated import BELIEVED, ELEVATION, errors_by_grasp
+from studies.paper.pr2.trials import Course, control_along, follow_blindly, model_error
+from studies.paper.runs import Run
+
+ACTUAL = "actual"
+COLLECTED, LEARNED = 0.35, 0.25
+"""Per grasp, as shares of the robot file's samples: 350 are collected, and 250 of them are learned from, 1500 in all.
+The others judge."""
+EPOCHS, RATE = 2 / 3, 3e-3
+"""Of fine-tuning, as a share of the robot file's; W is learned whole, without replay of the simulated dusters."""
+STIFF = "l700"
+"""The stiff duster that the designer's geometry has in place of the flexible one: about as long from hand to tip."""
+BEGINS, HELD, CHANGED = "short_phi0", "long_phi60", "short_phi0"
+"""Control: the grasp that is believed at first, the one that is there, and the one after the change."""
+MODELS = ("geometry", "simulated", "fine-tuned")
+
+
+@dataclass(frozen=True, slots=True)
+class Actual:
+    """One seed of the actual-robot experiment.
+
+    Attributes:
+        schema: Fine-tuned; its p of the flexible duster's grasps only.
+        errors: Model -> grasp -> mean error [m] on samples that were not learned from, under the best p of each.
+        controlled: Model -> error [m] at every point of the motion, twice, with a change of the grasp between.
+        course: The fine-tuned model's course.
+        change: Point before which the grasp changed.
+        samples: How many were learned from.
+    """
+
+    schema: BodySchema
+    errors: Mapping[str, Mapping[str, float]]
+    controlled: Mapping[str, np.ndarray]
+    course: Course
+    change: int
+    samples: int
+
+
+def actual(run: Run, simulated: BodySchema, tell: Tell) -> Actual:
+    """Collect on the actual arm, fine-tune what was learned in simulation, and run every trial of one seed."""
+    tell(0.0, "collecting on the actual arm")
+    count = round(COLLECTED * collect_config(run.robot).samples)
+    wanted = Wanted(flexible(run.robot), samples=count)
+    data = run.dataset("actual", lambda: collect_direct(run.robot, ACTUAL, run.seed, wanted).dataset, samples=count)
+    learned, judged = parted(data, LEARNED / COLLECTED)
+    schema = run.schema(
+        "actual_model", lambda: _tuned(run, simulated, learned, tell), samples=len(learned), epochs=EPOCHS, rate=RATE
+    )
+    tell(0.6, "trials on the actual arm")
+    geometry = Geometry(run.robot)
+    controlled, course, change = _control(run, geometry, simulated, schema)
+    return Actual(
+        schema=schema,
+        errors=_errors(geometry, simulated, schema, learned, judged),
+        controlled=controlled,
+        course=course,
+        change=change,
+        samples=len(learned),
+    )
+
+
+def flexible(robot: RobotConfig) -> tuple[str, ...]:
+    """The grasps of the flexible duster, which the simulator knows and the robot file does not list."""
+    return tuple(name for name in simulator_of(robot).conditions if name.startswith(("short", "long")))
+
+
+def parted(data: Dataset, share: float) -> tuple[Dataset, Dataset]:
+    """The first episodes of every condition, and the last."""
+    first: list[Episode] = []
+    for condition in data.conditions:
+        episodes = [episode for episode in data.episodes if episode.condition == condition]
+        first += episodes[: round(share * len(episodes))]
+    chosen = {id(episode) for episode in first}
+    last = [episode for episode in data.episodes if id(episode) not in chosen]
+    return Dataset(data.layout, tuple(first)), Dataset(data.layout, tuple(last))
+
+
+def _tuned(run: Run, simulated: BodySchema, learned: Dataset, tell: Tell) -> BodySchema:
+    model = model_config(run.robot)
+    config = replace(train_config(model, round(EPOCHS * model.training.epochs), run.seed), rate=RATE, replay=0.0)
+    schema, _ = fine_tune(simulated, learned, config, lambda done, text: tell(0.2 + 0.4 * done, text))
+    return schema
+
+
+def _errors(
+    geometry: Geometry, simulated: BodySchema, tuned: BodySchema, learned: Dataset, judged: Dataset
+) -> dict[str, dict[str, float]]:
+    errors: dict[str, dict[str, float]] = {"geometry": {}, "simulated": {}}
+    rows, owner = judged.rows(), judged.condition_of_rows()
+    for index, condition in enumerate(judged.conditions):
+        mine = rows[(owner == index) & np.isfinite(rows).all(axis=1)]
+        away = (
+            geometry.tips(_stiff(condition), mine[:, judged.layout.slice(JOINTS)]) - mine[:, judged.layout.slice(TIP)]
+        )
+        errors["geometry"][condition] = float(np.linalg.norm(away, axis=1).mean())
+        errors["simulated"][condition] = model_error(_recognised(simulated, learned, condition), mine)
+    return errors | {"fine-tuned": errors_by_grasp(tuned, judged)}
+
+
+def _stiff(condition: str) -> str:
+    return f"{STIFF}_{condition.split('_')[1]}"
+
+
+def _recognised(schema: BodySchema, learned: Dataset, condition: str) -> BodySchema:
+    """The schema under the p that explains the samples of a grasp best, W as it is."""
+    updater = Updater(schema, UpdateConfig(what="bias"))
+    for episode in learned.episodes:
+        if episode.condition == condition:
+            for index in range(len(episode.values[JOINTS])):
+                updater.add({name: values[index] for name, values in episode.values.items()})
+    updater.step()
+    return updater.schema
+
+
+def _control(
+    run: Run, geometry: Geometry, simulated: BodySchema, tuned: BodySchema
+) -> tuple[dict[str, np.ndarray], Course, int]:
+    motion = duster_motion()
+    change = len(motion)
+    targets = np.concatenate([motion, motion])
+    origins = np.tile(geometry.follow(motion, BELIEVED, ELEVATION), (2, 1))
+    found: dict[str, np.ndarray] = {}
+    with Arm(run.robot, ACTUAL, run.seed, HELD) as arm:
+        first, second = (geometry.follow(motion, _stiff(name), ELEVATION) for name in (HELD, CHANGED))
+        before = follow_blindly(arm, motion, first)
+        arm.hold(CHANGED)
+        found["geometry"] = np.concatenate([before, follow_blindly(arm, motion, second)])
+    for name, schema in (("simulated", simulated.under(BELIEVED)), ("fine-tuned", tuned.under(BEGINS))):
+        with Arm(run.robot, ACTUAL, run.seed, HELD) as arm:
+            course = control_along(arm, schema, targets, origins, geometry, UpdateConfig(), {change: CHANGED})
+        found[name] = course.errors
+    return found, course, change

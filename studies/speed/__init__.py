@@ -1,0 +1,1 @@
+"""Speed of the model beside torch, and the report of `make bench`."""

@@ -1,0 +1,1 @@
+"""Timing, cost and endurance of the running processes."""

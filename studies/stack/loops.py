@@ -1,0 +1,237 @@
+"""How the loops of HAL and service keep time, beside bare timer loops of the same rates at the same time.
+
+    python -m studies.stack.loops --minutes 10 [--without-bus]
+
+The whole stack runs as in life: simulated nodes on the hub, HAL, service; a client engages the controller, sends a new
+target every second and keeps the online update on. A process of its own ticks four times nothing, at the same rates and
+with the same scheduling, and says how punctual this machine was meanwhile. Without a bus the arm's physics lies in the
+HAL's own process: 25 simulated nodes and the frames between them want more of a machine than the service that is
+measured, and no robot has them.
+"""
+
+import argparse
+import json
+import multiprocessing
+import resource
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import numpy as np
+import yaml
+from rich.console import Console
+from rich.table import Table
+
+from hal.config import RobotConfig, load_robot
+from hal.errors import CommandRefused
+from services.client import Client
+from services.errors import NotEngaged
+from services.model.gemuco_service import PRIORITIES
+from services.process.lateness import Lateness
+from services.process.realtime import prepare_process, prepare_thread
+from services.process.supervisor import Supervisor, gemuco_command
+from studies.accuracy.actual_arms import model
+
+TARGET_EVERY = 1.0
+REACH = 0.6
+"""Share of the joint range that targets are drawn from."""
+
+
+def bare_loop(rate: float, priority: int, stop: threading.Event, into: dict[str, float]) -> None:
+    """Tick nothing at a rate [Hz] until told to stop; count as the services count."""
+    prepare_thread(priority)
+    lateness = Lateness(1)
+    period, start, index, ticks, skipped = 1.0 / rate, time.monotonic(), 0, 0, 0
+    while not stop.is_set():
+        index += 1
+        behind = int((time.monotonic() - start) / period) - index
+        if behind > 0:
+            skipped += behind
+            index += behind
+        deadline = start + index * period
+        pause = deadline - time.monotonic()
+        if pause > 0:
+            time.sleep(pause)
+        lateness.add(time.monotonic() - deadline)
+        ticks += 1
+    into.update(lateness.total() | {"ticks": ticks, "skipped": skipped, "rate": ticks / (time.monotonic() - start)})
+
+
+def bare_process(rates: dict[str, float], pipe: Connection) -> None:
+    """All bare loops, in threads of one process as in the service, until the pipe closes."""
+    prepare_process()
+    stop, found = threading.Event(), {name: {} for name in rates}
+    threads = [
+        threading.Thread(target=bare_loop, args=(rate, PRIORITIES.get(name, 40), stop, found[name]))
+        for name, rate in rates.items()
+    ]
+    for thread in threads:
+        thread.start()
+    pipe.recv()
+    stop.set()
+    for thread in threads:
+        thread.join()
+    pipe.send(found)
+
+
+def measures(client: Client) -> bool:
+    """Whether every signal is measured and reaches this process."""
+    estimate = client.estimate()
+    return estimate is not None and set(estimate.method.values()) == {"measured"}
+
+
+def engage(client: Client) -> None:
+    """Engage the controller, out of a fault too; gives up after fifteen seconds."""
+    deadline, refusal = time.monotonic() + 15.0, ""
+    while time.monotonic() < deadline:
+        applied = client.applied(timeout=1.0)
+        mode = "unheard" if applied is None else applied.mode
+        if mode in ("hold", "follow"):
+            return
+        try:
+            if mode == "fault":
+                client.reset()
+            if mode != "enabling":
+                client.engage()
+        except (CommandRefused, NotEngaged) as error:
+            refusal = str(error)
+        time.sleep(0.3)
+    raise TimeoutError(f"The controller was not engaged within fifteen seconds. {refusal}")
+
+
+def move(client: Client, robot: RobotConfig, duration: float) -> int:
+    """Send a random target every second for `duration` [s]; how often the HAL had stopped the arm."""
+    stops = 0
+    random = np.random.default_rng(0)
+    low, high = robot.bounds("joint_position")
+    middle, half = (low + high) / 2, (high - low) / 2
+    end = time.monotonic() + duration
+    while time.monotonic() < end:
+        applied = client.applied()
+        if applied is None or applied.mode not in ("follow", "hold", "enabling"):
+            stops += 1
+            engage(client)
+        client.target("joint_position", middle + REACH * half * random.uniform(-1, 1, low.size))
+        time.sleep(TARGET_EVERY)
+    return stops
+
+
+def cpu_share(pid: int, since: tuple[float, float] | None = None) -> tuple[float, float]:
+    """CPU time [s] of a process and the time [s] it was read."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+    return (int(fields[11]) + int(fields[12])) / 100, time.monotonic()
+
+
+def stack(robot_file: Path, with_bus: bool) -> dict[str, list[str]]:
+    """Process -> how to start it."""
+    file = str(robot_file)
+    if not with_bus:
+        return {
+            "hal": [sys.executable, "-m", "studies.stack.without_bus", file],
+            "serve": gemuco_command("serve", file),
+        }
+    return {
+        "simulate": gemuco_command("simulate", file, "--variant", "actual", "--seed", "1"),
+        "hal": gemuco_command("hal", file),
+        "serve": gemuco_command("serve", file),
+    }
+
+
+def run(robot_file: Path, minutes: float, with_bus: bool = True) -> dict[str, object]:
+    """The whole measurement; loop name -> statistics of ours and of the bare loop, process -> share of a core."""
+    robot = load_robot(robot_file)
+    model(robot, Console())
+    rates = {name: rate for name, rate in robot.rates.model_dump().items() if name in ("hal", *PRIORITIES)}
+    context = multiprocessing.get_context("spawn")
+    pipe, other = context.Pipe()
+    bare = context.Process(target=bare_process, args=(rates, other), daemon=True)
+    with Supervisor(Path("runs/loops")) as supervisor, Client(robot.robot) as client:
+        children = {name: supervisor.start(name, command) for name, command in stack(robot_file, with_bus).items()}
+        supervisor.wait_ready("serve", lambda: measures(client), 60)
+        engage(client)
+        client.adapt(True)
+        time.sleep(3.0)
+        bare.start()
+        began = {name: cpu_share(child.process.pid) for name, child in children.items()}
+        before = {name: client.status(name, timeout=3.0) for name in ("hal", "model")}
+        stops = move(client, robot, 60 * minutes)
+        supervisor.check()
+        pipe.send("stop")
+        baseline = pipe.recv()
+        after = {name: client.status(name, timeout=3.0) for name in ("hal", "model")}
+        shares = {}
+        for name, child in children.items():
+            used, now = cpu_share(child.process.pid)
+            shares[name] = (used - began[name][0]) / (now - began[name][1])
+        bare.join()
+    loops = {}
+    for service in ("hal", "model"):
+        for name, end in after[service].loops.items():
+            start = before[service].loops[name]
+            counted = {key: end[key] - start[key] for key in ("ticks", "skipped", "overruns", "failed")}
+            kept = {key: end[key] for key in ("rate_wanted", "total_p50", "total_p99", "total_max")}
+            rate = counted["ticks"] / (60 * minutes)
+            loops[name] = kept | counted | {"rate": rate, "bare": baseline.get(name, {})}
+    facts = {name: status.facts for name, status in after.items()}
+    return {"minutes": minutes, "loops": loops, "cores": shares, "stops": stops, "facts": facts}
+
+
+def show(found: dict, console: Console) -> None:
+    """The table of docs/results.md."""
+    table = Table(
+        "loop",
+        "rate [Hz]",
+        "p50 [ms]",
+        "p99 [ms]",
+        "max [ms]",
+        "skipped",
+        "bare p50",
+        "bare p99",
+        "bare max",
+        "bare skipped",
+    )
+    for name, one in found["loops"].items():
+        bare = one["bare"]
+        row = [f"{one[key] * 1e3:.2f}" for key in ("total_p50", "total_p99", "total_max")]
+        skipped = f"{one['skipped']:.0f} of {one['ticks'] + one['skipped']:.0f}"
+        other = [f"{bare[key] * 1e3:.2f}" for key in ("total_p50", "total_p99", "total_max")] if bare else ["", "", ""]
+        table.add_row(name, f"{one['rate']:.2f}", *row, skipped, *other, f"{bare.get('skipped', 0):.0f}")
+    console.print(table)
+    console.print(f"the HAL stopped the arm {found['stops']} times")
+    console.print("share of a core: " + ", ".join(f"{name} {share:.0%}" for name, share in found["cores"].items()))
+    peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
+    console.print(f"largest process: {peak:.0f} MiB")
+
+
+@contextmanager
+def with_rates(robot_file: Path, rates: str) -> Iterator[Path]:
+    """The robot file with other rates (`estimation=500,update=20`), in a file beside it for as long as it is needed."""
+    if not rates:
+        yield robot_file
+        return
+    described = yaml.safe_load(robot_file.read_text())
+    described["rates"] |= {name: float(rate) for name, _, rate in (one.partition("=") for one in rates.split(","))}
+    with tempfile.NamedTemporaryFile("w", suffix=".yaml", dir=robot_file.parent) as file:
+        yaml.safe_dump(described, file)
+        file.flush()
+        yield Path(file.name)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--robot", type=Path, default=Path("robots/musashi_arm.yaml"))
+    parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--out", type=Path, default=Path("runs/loops.json"))
+    parser.add_argument("--rates", default="", help="other rates than the robot file's: estimation=500,update=20")
+    parser.add_argument("--without-bus", action="store_true", help="the arm's physics in the HAL's own process")
+    options = parser.parse_args()
+    with with_rates(options.robot, options.rates) as file:
+        result = run(file, options.minutes, not options.without_bus)
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    options.out.write_text(json.dumps(result, indent=1, default=str))
+    show(result, Console(width=140))

@@ -1,0 +1,105 @@
+"""What the live page costs a running robot: CPU and ticks of its services without a page, and with 0, 1 and 5 browsers.
+
+    python -m studies.stack.view_cost musashi_arm
+
+Needs a running stack (`gemuco hal`, `gemuco serve`) on this machine. The same run has the baseline, twice.
+"""
+
+import argparse
+import os
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import msgspec
+import viser
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import ClientConnection, connect
+
+from services.client import Client
+from services.wire.messages import Status
+
+PORT = 8093
+SERVICES = ("hal", "model")
+CAMERA = {
+    "type": "ViewerCameraMessage", "wxyz": (1.0, 0.0, 0.0, 0.0), "position": (1.0, 1.0, 1.0), "fov": 1.0, "near": 0.1,
+    "far": 10.0, "image_height": 10, "image_width": 10, "look_at": (0.0, 0.0, 0.0), "up_direction": (0.0, 0.0, 1.0),
+}  # fmt: skip
+
+
+def cpu(pid: int) -> float:
+    """CPU time of a process so far [s]."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def browser() -> tuple[ClientConnection, list[int]]:
+    """A browser that reads everything, and the bytes it got."""
+    page = connect(f"ws://127.0.0.1:{PORT}", subprotocols=[f"viser-v{viser.__version__}"], max_size=None)  # type: ignore[list-item]
+    page.send(msgspec.msgpack.encode(CAMERA))
+    got = [0]
+
+    def read() -> None:
+        while True:
+            try:
+                got[0] += len(page.recv())
+            except ConnectionClosed:
+                return
+
+    threading.Thread(target=read, daemon=True).start()
+    return page, got
+
+
+def counted(client: Client) -> tuple[dict[str, float], dict[str, float]]:
+    """Ticks and skips of all loops of each service so far."""
+    ticks, skips = {}, {}
+    for name in SERVICES:
+        status: Status | None = client.status(name, timeout=5.0)
+        loops = status.loops.values() if status else ()
+        ticks[name] = sum(loop["ticks"] for loop in loops)
+        skips[name] = sum(loop["skipped"] for loop in loops)
+    return ticks, skips
+
+
+def measure(client: Client, pids: dict[str, int], label: str, seconds: float, got: list[list[int]]) -> None:
+    ticks, skips = counted(client)
+    before, began, bytes_before = {n: cpu(p) for n, p in pids.items()}, time.monotonic(), sum(one[0] for one in got)
+    time.sleep(seconds)
+    took = time.monotonic() - began
+    used = {n: 100 * (cpu(p) - before[n]) / took for n, p in pids.items()}
+    later, skipped = counted(client)
+    cells = [f"{used[n]:5.1f} %  {later[n] - ticks[n]:6.0f} / {skipped[n] - skips[n]:3.0f}" for n in SERVICES]
+    sent = (sum(one[0] for one in got) - bytes_before) / took / 1e3 / max(1, len(got))
+    print(f"{label:16} {'   '.join(cells)}   {used.get('view', 0.0):5.1f} %   {sent:6.1f} kB/s", flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("robot")
+    parser.add_argument("--seconds", type=float, default=20.0)
+    options = parser.parse_args()
+    with Client(options.robot) as client:
+        pids = {name: int(client.describe(name, timeout=20.0)["pid"]) for name in SERVICES}
+        counted(client)
+        print(f"{'':16} {'   '.join(f'{n}: CPU, ticks / skips' for n in SERVICES)}   view     per page")
+        measure(client, pids, "no page server", options.seconds, [])
+        view = subprocess.Popen([sys.executable, "-m", "services.cli", "view", options.robot, "--port", str(PORT)])
+        pages: list[tuple[ClientConnection, list[int]]] = []
+        try:
+            time.sleep(10.0)
+            for count in (0, 1, 5):
+                pages += [browser() for _ in range(count - len(pages))]
+                time.sleep(2.0)
+                measure(client, pids | {"view": view.pid}, f"{count} browsers", options.seconds, [p[1] for p in pages])
+        finally:
+            for page, _ in pages:
+                page.close()
+            view.terminate()
+            view.wait(20.0)
+        measure(client, pids, "no page server", options.seconds, [])
+
+
+if __name__ == "__main__":
+    main()

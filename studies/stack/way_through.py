@@ -1,0 +1,83 @@
+"""From a sample of the HAL to its estimate at a client in another process, and what of that estimation takes.
+
+    python -m studies.stack.way_through [--seconds 20] [--rates estimation=500]
+
+At the robot file's rates, HAL and estimation both at 200 Hz, unless others are named.
+
+The client notes when the sample of a cycle arrives and when the first estimate from that cycle does; the difference is
+what the client waits for estimation: for the next tick of the loop, for the tick, and for one more way over the wire.
+"""
+
+import argparse
+import time
+from pathlib import Path
+
+import numpy as np
+import zenoh
+from rich.console import Console
+
+from hal.config import load_robot
+from services.client import Client
+from services.process.supervisor import Supervisor
+from services.wire import keys
+from services.wire.messages import Estimates, Sample, decode
+from studies.accuracy.actual_arms import model
+from studies.speed.table import Row
+from studies.stack.loops import measures, stack, with_rates
+
+ROBOT = Path("robots/musashi_arm.yaml")
+SETTLING = 5.0
+"""Time [s] in which the estimation loop finds out when samples come."""
+
+
+def differences(file: Path, seconds: float) -> np.ndarray:
+    """Time [s] by which the estimate of each cycle came after its sample."""
+    robot = load_robot(file)
+    model(robot, Console(stderr=True))
+    came: dict[str, dict[int, float]] = {"sample": {}, "estimates": {}}
+
+    def note(record: type[Sample] | type[Estimates]) -> object:
+        def on_message(message: zenoh.Sample) -> None:
+            now = time.perf_counter()
+            came[record.TYPE].setdefault(decode(message.payload.to_bytes(), record).cycle, now)
+
+        return on_message
+
+    with Supervisor(Path("runs/way_through")) as supervisor, Client(robot.robot) as client:
+        for name, command in stack(file, False).items():
+            supervisor.start(name, command)
+        supervisor.wait_ready("serve", lambda: measures(client), 60)
+        time.sleep(SETTLING)
+        session = client.session
+        readers = [
+            session.declare_subscriber(keys.sample(robot.robot), note(Sample)),
+            session.declare_subscriber(keys.estimate(robot.robot), note(Estimates)),
+        ]
+        time.sleep(seconds)
+        for reader in readers:
+            reader.undeclare()
+    both = sorted(came["sample"].keys() & came["estimates"].keys())
+    return np.array([came["estimates"][cycle] - came["sample"][cycle] for cycle in both])
+
+
+def row(seconds: float = 20.0, rates: str = "") -> Row:
+    """The median."""
+    with with_rates(ROBOT, rates) as file:
+        took = 1e3 * differences(file, seconds)
+    middle, late = float(np.median(took)), float(np.percentile(took, 99))
+    return Row(
+        f"sample to its estimate at a remote client{', ' if rates else ''}{rates}", "the sample at the same client",
+        middle, 0.0, "ms", middle, 1.0, is_most=True, note=f"p99 {late:.2f} ms over {len(took)} cycles",
+    )  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=20.0)
+    parser.add_argument("--rates", default="", help="other rates than the robot file's: estimation=500")
+    options = parser.parse_args()
+    print(row(options.seconds, options.rates))
+
+
+if __name__ == "__main__":
+    main()
