@@ -24,7 +24,7 @@ from services.wire.records import Anomaly, Applied, Command, Estimates, Holder, 
 log = logging.getLogger(__name__)
 
 FORMAT = "2"
-FACTS, ROBOT, LOSSES = "gemuco", "gemuco.robot", "gemuco.search.losses"
+FACTS, ROBOT, LOSSES = "gemuco", "gemuco.robot", "gemuco.losses"
 """Names of the metadata: what the recording is, the robot's description, what is missing."""
 UNREADABLE = "#unreadable"
 """Added to the topic of messages that are not what their key carries; no zenoh key has a `#`."""
