@@ -10,13 +10,13 @@ from hal.config import RobotConfig, explain
 from hal.errors import ConfigError
 
 DRIVERS = {
-    "cia402": "hal.drivers.cia402.drive:Cia402Drive",
-    "cia401": "hal.drivers.canopen.cia401:Cia401Input",
-    "cia404": "hal.drivers.canopen.cia404:Cia404Cell",
-    "cia406": "hal.drivers.canopen.cia406:Cia406Encoder",
-    "mit": "hal.drivers.mit.drive:MitDrive",
-    "dbc": "hal.drivers.dbc.sensor:DbcNode",
-    "dbc_servo": "hal.drivers.dbc.servo:DbcServo",
+    "cia402": "hal.drivers.cia402:Cia402Drive",
+    "cia401": "hal.drivers.canopen:Cia401Input",
+    "cia404": "hal.drivers.canopen:Cia404Cell",
+    "cia406": "hal.drivers.canopen:Cia406Encoder",
+    "mit": "hal.drivers.mit:MitDrive",
+    "dbc": "hal.drivers.dbc:DbcNode",
+    "dbc_servo": "hal.drivers.dbc:DbcServo",
     "odrive": "hal.drivers.odrive:Odrive",
 }
 

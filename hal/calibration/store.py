@@ -16,7 +16,7 @@ import yaml
 from pydantic import ValidationError
 
 from hal import registry
-from hal.calibration.line import Calibration
+from hal.calibration.line import Calibration, Point
 from hal.config import RobotConfig
 from hal.errors import ConfigError
 from hal.section import Section, explain
@@ -40,18 +40,6 @@ _HEAD = """\
 # What `gemuco calibrate` measured of this robot's devices. Its settings take precedence over those of the robot file.
 # Every record is sealed by its hash: calibrate again instead of editing, or delete a record to do without it.
 """
-
-
-class Point(Section):
-    """What a device read while the truth was known.
-
-    Both are in the signal's unit; what was read is without `zero`, and with a `gain` or `direction` of 1.
-    """
-
-    known: float
-    read: float
-    std: float
-    samples: int
 
 
 class Record(Section):

@@ -11,7 +11,7 @@ import numpy as np
 
 from hal import registry
 from hal.calibration import store
-from hal.calibration.fit import CalibrationRefused, Line
+from hal.calibration.line import CalibrationRefused, Line
 from hal.calibration.store import Point, Record
 from hal.clock import SystemClock
 from hal.config import RobotConfig

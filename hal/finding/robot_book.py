@@ -5,7 +5,7 @@ from typing import Any
 
 from hal import registry
 from hal.clock import SystemClock
-from hal.commissioning.pdos import cob_id
+from hal.commissioning.node import cob_id
 from hal.config import RobotConfig
 from hal.device import Device
 from hal.drivers.canopen.node import CanopenNode, data_sheet

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from hal.calibration import store
-from hal.calibration.fit import CalibrationRefused, Line, cell_line, joint_line
+from hal.calibration.line import CalibrationRefused, Line, cell_line, joint_line
 from hal.calibration.store import Point
 from hal.config import RobotConfig
 from hal.finding.measuring import Measuring, Subject, subject

@@ -9,7 +9,7 @@ import yaml
 from hal_bench import ROBOTS, BenchWorld, description, hardware
 
 from hal.calibration import store
-from hal.calibration.fit import CalibrationRefused, Line, cell_line, joint_line
+from hal.calibration.line import CalibrationRefused, Line, cell_line, joint_line
 from hal.calibration.store import Point, Record
 from hal.clock import SystemClock
 from hal.config import RobotConfig

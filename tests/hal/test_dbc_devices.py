@@ -10,9 +10,8 @@ from hal.clock import SystemClock
 from hal.config import BusConfig
 from hal.device import DeviceState
 from hal.drivers.can_device import Place
-from hal.drivers.dbc.inbox import Inbox
 from hal.drivers.dbc.sensor import DbcNode
-from hal.drivers.dbc.sequence import Address, Run, compile_steps
+from hal.drivers.dbc.sequence import Address, Inbox, Run, compile_steps
 from hal.drivers.dbc.servo import DbcServo
 from hal.drivers.dbc.settings import DbcSettings, ServoSettings, StepConfig
 from hal.errors import CommandRefused, ConfigError

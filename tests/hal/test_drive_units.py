@@ -8,8 +8,7 @@ from drive_bench import ELBOW, SETTINGS, joint_description
 from hal.config import RobotConfig
 from hal.drivers.cia402.drive import Cia402Drive
 from hal.drivers.cia402.modes import SetPointHandshake
-from hal.drivers.cia402.settings import DriveSettings
-from hal.drivers.cia402.units import drive_units
+from hal.drivers.cia402.settings import DriveSettings, drive_units
 from hal.errors import ConfigError
 from hal.protocols.cia402 import VELOCITY_UNITS
 from hal.robot import open_robot

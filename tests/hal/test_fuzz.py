@@ -10,7 +10,7 @@ from hal_bench import ROBOTS
 
 from hal.finding.book import Book, Frame
 from hal.finding.decode import describe
-from hal.protocols import cia301, cia303, cia402, cia404, cia406, dbc, mit, sdo
+from hal.protocols import analog, cia301, cia402, cia406, dbc, mit, sdo
 from hal.protocols.error_frames import error_frame
 from hal.protocols.mit import Layout, Ranges
 
@@ -38,8 +38,8 @@ PARSERS = {
     "mode": lambda data: cia402.describe_mode(int.from_bytes(data[:1], signed=True)),
     "modes": lambda data: cia402.describe_modes(int.from_bytes(data[:4])),
     "velocity unit": lambda data: cia402.velocity_unit(int.from_bytes(data[:4])),
-    "unit": lambda data: cia303.unit(int.from_bytes(data[:4])),
-    "cell status": lambda data: cia404.describe_status(int.from_bytes(data[:1])),
+    "unit": lambda data: analog.unit(int.from_bytes(data[:4])),
+    "cell status": lambda data: analog.describe_status(int.from_bytes(data[:1])),
     "encoder alarms": lambda data: cia406.describe_alarms(int.from_bytes(data[:2])),
     "error frame": lambda data: error_frame(int.from_bytes(data[:4]), data),
     "MIT command": lambda data: mit.asked(data, RANGES),

@@ -10,11 +10,10 @@ import math
 import pytest
 from puppet import NODE, driven, told
 
-from hal.drivers.canopen.cia401 import Cia401Input
-from hal.drivers.canopen.cia404 import Cia404Cell
+from hal.drivers.canopen.analog import Cia401Input, Cia404Cell
 from hal.drivers.canopen.cia406 import Cia406Encoder
 from hal.errors import ConfigError, DeviceRefused, WrongDevice
-from hal.protocols import cia303, cia404, cia406
+from hal.protocols import analog, cia406
 
 FORCE = {"force": "muscle_tension.biceps"}
 CELL = {"1000:0": "94 01 02 00", "1018:2": "04 04 00 00", "6131:1": "00 00 21 00", "6132:1": "02"}
@@ -57,14 +56,14 @@ def encoder(objects=ENCODER, elements=None, **settings):
     ],
 )
 def test_units(code, quantity, scale):
-    unit = cia303.unit(code)
+    unit = analog.unit(code)
     assert unit.quantity == quantity
     assert unit.scale == pytest.approx(scale)
 
 
 @pytest.mark.parametrize("code", [0x00000000, 0x00010000, 0x00210300, 0x00210001, 0x7F210000, 0x002D0000, 0xFA010100])
 def test_what_is_no_unit_of_force_or_pressure(code):
-    assert cia303.unit(code) is None
+    assert analog.unit(code) is None
 
 
 @pytest.mark.parametrize(
@@ -273,9 +272,9 @@ def test_another_profile_is_another_device():
 
 
 def test_bits_in_words():
-    assert cia404.describe_status(0) == ""
-    assert cia404.describe_status(0x03) == "value not valid, positive overload"
-    assert cia404.describe_status(0x80) == "status 80h"
+    assert analog.describe_status(0) == ""
+    assert analog.describe_status(0x03) == "value not valid, positive overload"
+    assert analog.describe_status(0x80) == "status 80h"
     assert cia406.describe_alarms(0x0001) == "position error"
     assert cia406.describe_alarms(0x1000) == "alarms 1000h"
     assert cia406.describe_warnings(0x0011) == "frequency exceeded, battery charge too low"

@@ -8,7 +8,7 @@ import yaml
 from hal_bench import ROBOTS
 
 from hal.config import RobotConfig
-from hal.drivers.canopen import cia401, cia404
+from hal.drivers.canopen.analog import CELL_PRESETS, INPUT_PRESETS
 from hal.robot import open_robot
 
 TEXT = (Path(__file__).parents[2] / "docs" / "devices.md").read_text()
@@ -32,7 +32,7 @@ def test_the_example_is_a_robot(title):
     assert found == SENSORS[title]
 
 
-@pytest.mark.parametrize(("title", "presets"), [("(`cia404`)", cia404.PRESETS), ("(`cia401`)", cia401.PRESETS)])
+@pytest.mark.parametrize(("title", "presets"), [("(`cia404`)", CELL_PRESETS), ("(`cia401`)", INPUT_PRESETS)])
 def test_every_preset_is_there(title, presets):
     for name, preset in presets.items():
         index = preset.form.value.index if title == "(`cia404`)" else preset.index

@@ -1,1 +1,6 @@
-"""CANopen nodes: what every node has, and sensors of the profiles CiA 401, 404 and 406."""
+"""CANopen nodes in general, and sensors of CiA 401, CiA 404 and CiA 406."""
+
+from hal.drivers.canopen.analog import Cia401Input, Cia404Cell
+from hal.drivers.canopen.cia406 import Cia406Encoder
+
+__all__ = ["Cia401Input", "Cia404Cell", "Cia406Encoder"]

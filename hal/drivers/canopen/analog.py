@@ -1,6 +1,8 @@
-"""What load cells have in common: channels of a CANopen device, each an object that is a force, torque or pressure."""
+"""Analogue channels of CANopen devices: load cells [N], torque [N m] and pressure [Pa] by CiA 401 and CiA 404."""
 
+import logging
 import math
+import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
@@ -11,8 +13,8 @@ from hal.commissioning.pdo_map import Pdo, PdoMap, lay_out
 from hal.device import DeviceState
 from hal.drivers.can_device import Place
 from hal.drivers.canopen.node import HEARTBEAT, CanopenNode, NodeSettings, Taker, data_sheet
-from hal.errors import ConfigError
-from hal.protocols import cia301
+from hal.errors import CommandRefused, ConfigError, DeviceRefused, HalError
+from hal.protocols import analog, cia301
 from hal.protocols.cia301 import Mapped
 from hal.section import Finite, Positive
 
@@ -230,3 +232,194 @@ def _map(channels: Sequence[tuple[Mapped, Mapped | None]]) -> PdoMap:
     shared = statuses[0] if statuses and len(channels) > 1 and len(set(statuses)) == 1 else None
     groups = [(value,) if status in (None, shared) else (value, status) for value, status in channels]
     return PdoMap(sends=lay_out([(shared,), *groups] if shared else groups))
+
+
+INPUT_PRESETS = dict(analog.INPUTS) | {
+    # Seneca ZC-SG strain gauge converter, user manual: 6403h:1 is the weight; overload and errors come as EMCY FF10h.
+    "zc_sg": analog.INPUTS["float32"],
+}
+
+
+class InputSettings(AnalogSettings):
+    """Settings of analogue inputs; `gain` must be given, SI units per count (or per unit of the float object)."""
+
+    preset: Literal["int16", "int32", "float32", "zc_sg"] = "int16"
+    """Which object is the value: 6401h as `int16`, 6402h as `int32`, 6403h as `float32`; or a family of converters."""
+    resolution: Annotated[int, Field(ge=2, le=32)] | None = None
+    """Bits of the converter, whose ends count as overload; absent: as many as the object has."""
+
+
+class Cia401Input(AnalogNode):
+    """Analogue inputs. The device has no unit and no tare: both are the calibration's."""
+
+    Settings = InputSettings
+
+    @classmethod
+    def _objects(cls, settings: InputSettings, channel: int) -> tuple[Mapped, Mapped | None]:
+        item = INPUT_PRESETS[settings.preset]
+        value = Mapped(item.index, channel, item.bits, item.kind)
+        if settings.value is not None:
+            value = parse(settings.value, channel, "value")
+        return value, None if settings.status is None else parse(settings.status, channel, "status")
+
+    def __init__(self, place: Place, settings: InputSettings) -> None:
+        if settings.gain is None:
+            raise ConfigError(f"{place} tells counts. Give `gain`, the {settings.measures} of one count in SI units.")
+        super().__init__(place, settings, analog.INPUT_PROFILE)
+
+    def _bounds(self, settings: Any, value: Mapped) -> tuple[float, float]:
+        low, high = super()._bounds(settings, value)
+        bits = settings.resolution
+        if bits is None or value.kind == "float" or bits >= value.bits:
+            return low, high
+        return low, high >> value.bits - bits << value.bits - bits
+
+    def _calibrate(self) -> None:
+        for channel in self._channels:
+            channel.scale = 1.0
+
+    def _writes(self) -> tuple[tuple[Mapped, int], ...]:
+        enable = analog.INTERRUPT_ENABLE
+        return ((enable, 1),) if self._sdo.has(enable.index) else ()
+
+
+log = logging.getLogger(__name__)
+
+COUNTS = "counts"
+"""In place of a unit: the device tells raw counts, and `gain` says what one of them is."""
+
+
+@dataclass(frozen=True, slots=True)
+class Preset:
+    """What is known of an amplifier, under a name for the robot file.
+
+    Attributes:
+        form: Which of the objects it offers is the value.
+        unit: What its numbers are; None: it says so itself (6131h).
+    """
+
+    form: analog.Form
+    unit: str | None = None
+
+
+CELL_PRESETS = {name: Preset(form, None if form.has_unit else COUNTS) for name, form in analog.FORMS.items()} | {
+    # Baumer StrainLink DSRT, manual V3.05, 6.3: 7130h, 6132h, 6150h, 6125h; it tells strain, which gain makes a force.
+    "strain_link": Preset(analog.FORMS["int16"], COUNTS),
+}
+PresetName = Literal["float32", "int16", "int32", "counts16", "counts32", "strain_link"]
+
+
+class CellSettings(AnalogSettings):
+    """Settings of a load cell; by default unit and decimal digits are read from the device."""
+
+    preset: PresetName = "int32"
+    """Which object is the value: 6130h as `float32`, 7130h as `int16`, 9130h as `int32`, or before any scaling 7100h as
+    `counts16`, 9100h as `counts32`; or a family of amplifiers."""
+    unit: str | None = None
+    """What the device's numbers are, in place of what it says in 6131h: `N`, `kN`, `kg`, `N m`, `bar`, ... `counts`."""
+    digits: int | None = None
+    """Decimal digits of a whole number, in place of what the device says in 6132h."""
+
+
+class Cia404Cell(AnalogNode):
+    """Channels of a measuring amplifier; a tare that the device forgets when it reboots is given back to it."""
+
+    Settings = CellSettings
+    COUNTERS = (*AnalogNode.COUNTERS, "tared")
+
+    @classmethod
+    def _objects(cls, settings: CellSettings, channel: int) -> tuple[Mapped, Mapped | None]:
+        form = CELL_PRESETS[settings.preset].form
+        value, status = (
+            Mapped(item.index, channel, item.bits, item.kind) if item else None for item in (form.value, form.status)
+        )
+        if settings.value is not None:
+            value = parse(settings.value, channel, "value")
+        if settings.status is not None:
+            status = parse(settings.status, channel, "status")
+        assert value is not None
+        return value, status
+
+    def __init__(self, place: Place, settings: CellSettings) -> None:
+        self._unit = settings.unit or CELL_PRESETS[settings.preset].unit
+        self._fixed = self._known_unit(place, settings)
+        self._cell = settings
+        self._offsets: dict[int, int] = {}
+        self._tare_text = ""
+        super().__init__(place, settings, analog.CELL_PROFILE)
+
+    def _known_unit(self, place: Place, settings: CellSettings) -> float | None:
+        """SI units per unit of the device, if the robot file or the preset says so.
+
+        Raises:
+            ConfigError: Another quantity's unit, none at all, or counts without a gain.
+        """
+        if self._unit is None:
+            return None
+        if self._unit == COUNTS:
+            if settings.gain is None:
+                raise ConfigError(f"{place} tells counts. Give `gain`, the {settings.measures} of one count, SI units.")
+            return 1.0
+        known = [name for name, unit in analog.UNITS.items() if unit.quantity == settings.measures]
+        if self._unit not in known:
+            raise ConfigError(f"{place}: '{self._unit}' is no unit of {settings.measures}. Known: {', '.join(known)}.")
+        return analog.UNITS[self._unit].scale
+
+    def _calibrate(self) -> None:
+        for channel in self._channels:
+            channel.scale = self._unit_scale(channel) * 10.0 ** -self._digits(channel)
+        for number, offset in self._offsets.items():
+            self._sdo.write_checked(analog.OFFSET, number, offset, 4)
+
+    def _unit_scale(self, channel: Channel) -> float:
+        if self._fixed is not None:
+            return self._fixed
+        code = self._sdo.read(analog.UNIT_CODE, channel.number)
+        unit = analog.unit(code)
+        if unit is None or unit.quantity != self._settings.measures:
+            raise DeviceRefused(
+                f"{self._place} measures in unit {code:08X}h (6131h:{channel.number}), which is no "
+                f"{self._settings.measures}. Is it the right device? If the unit is wrong, give `unit`."
+            )
+        return unit.scale
+
+    def _digits(self, channel: Channel) -> int:
+        if self._cell.digits is not None:
+            return self._cell.digits
+        if not CELL_PRESETS[self._cell.preset].form.has_digits or channel.value.kind == "float":
+            return 0
+        return self._sdo.read(analog.DIGITS, channel.number)
+
+    def tare(self) -> None:
+        """See `Device.tare`; `health` tells what came of it, and counts it as `tared`."""
+        if not self.is_commissioned:
+            raise CommandRefused(f"{self._place} cannot be tared: {self._trouble[1]}")
+        self._tare_text = "being tared"
+        self.errand = self._tare
+
+    def _tare(self) -> None:
+        """Have every channel take what it measures as zero, and remember what it takes to do so again."""
+        try:
+            for channel in self._channels:
+                self._sdo.write(analog.AUTOZERO, channel.number, analog.ZERO, 4)
+                if self._sdo.has(analog.OFFSET, channel.number):
+                    self._offsets[channel.number] = self._offset(channel.number)
+        except HalError as error:
+            self._tare_text = f"not tared: {str(error).rstrip('.')}"
+            return
+        self._tare_text = ""
+        self._counters["tared"] += 1
+        log.info("%s is tared", self._place)
+
+    def _offset(self, number: int) -> int:
+        """What the tare has set, as the bits of a REAL32."""
+        bits = self._sdo.read(analog.OFFSET, number)
+        if not math.isfinite(struct.unpack("<f", bits.to_bytes(4, "little"))[0]):
+            raise DeviceRefused(f"{self._place} says after the tare that its offset (6124h:{number}) is no number.")
+        return bits
+
+    def _describe(self, bad: int) -> str:
+        return analog.describe_status(bad) if self._cell.status is None else super()._describe(bad)
+
+    def _troubles(self) -> list[str]:
+        return [*super()._troubles(), *([self._tare_text] if self._tare_text else [])]

@@ -10,14 +10,11 @@ from typing import Any, ClassVar
 
 import canopen
 
-from hal.commissioning.fixed import chosen_pdos, is_fixed
-from hal.commissioning.node import HEARTBEAT_TIME, Plan, commission, identify, nmt, watch_us
-from hal.commissioning.pdo_map import Pdo, PdoMap, PdoSettings, check_map, describe
-from hal.commissioning.pdos import cob_id
+from hal.commissioning.node import HEARTBEAT_TIME, Plan, cob_id, commission, identify, inspect_node, nmt, watch_us
+from hal.commissioning.pdo_map import Pdo, PdoMap, PdoSettings, check_map, chosen_pdos, describe, is_fixed
 from hal.commissioning.sdo_client import SdoClient
 from hal.device import Check
 from hal.drivers.can_device import CanDevice, DeviceSettings, Place
-from hal.drivers.canopen.checks import inspect_node
 from hal.errors import ConfigError, DeviceRefused, HalError
 from hal.protocols import cia301
 from hal.protocols.cia301 import Emergency, Mapped, NmtCommand, NmtState

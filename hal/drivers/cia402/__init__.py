@@ -1,1 +1,5 @@
-"""Servo drives of profile CiA 402."""
+"""Servo drives of CiA 402."""
+
+from hal.drivers.cia402.drive import Cia402Drive
+
+__all__ = ["Cia402Drive"]

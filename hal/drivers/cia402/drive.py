@@ -1,23 +1,97 @@
-"""A servo drive that winds a wire [m] or turns a joint [rad]: where to be, how fast to turn, or how hard to push."""
+"""A servo drive that winds a wire [m] or turns a joint [rad]: position, velocity or effort control over CiA 402."""
 
 import math
+from collections.abc import Iterator, Sequence
 from typing import Any
 
+import can
 import numpy as np
 
-from hal.commissioning.pdo_map import Pdo
+from hal.commissioning.node import cob_id
+from hal.commissioning.pdo_map import Pdo, describe
+from hal.commissioning.sdo_client import SdoClient
 from hal.device import Check, DeviceState
 from hal.drivers.can_device import Place
 from hal.drivers.canopen.node import HEARTBEAT, CanopenNode, Taker, data_sheet
-from hal.drivers.cia402.checks import UNWATCHED, drive_checks
-from hal.drivers.cia402.frames import CommandFrames
 from hal.drivers.cia402.modes import HomingRun, SetPointHandshake
-from hal.drivers.cia402.settings import MODES, OBJECTS, TARGETS, DriveSettings
-from hal.drivers.cia402.units import DriveUnits, drive_units
+from hal.drivers.cia402.settings import MODES, OBJECTS, TARGETS, DriveSettings, DriveUnits, drive_units
 from hal.drivers.cia402.writes import Write, check_objects, drive_writes
-from hal.errors import CommandRefused, DeviceRefused
+from hal.errors import CommandRefused, ConfigError, DeviceRefused
 from hal.protocols import cia301, cia402
+from hal.protocols.cia301 import Mapped
 from hal.protocols.cia402 import Mode, State, VelocityUnit
+from hal.wire.bus import Bus
+
+UNWATCHED = "{} does not notice when the HAL is gone (no 1016h)."
+
+
+def drive_checks(sdo: SdoClient, mode: Mode, is_watched: bool, label: str) -> Iterator[Check]:
+    """Ask the drive for its mode; what its data sheet lacks is told as well.
+
+    Args:
+        sdo: Asks the drive.
+        mode: The mode that it should be in.
+        is_watched: Whether it notices when the HAL is gone.
+        label: The drive, in words.
+
+    Raises:
+        DeviceSilent: It does not answer.
+    """
+    if not is_watched:
+        yield Check("watchdog", False, f"{UNWATCHED.format(label)} Let something else cut its power.")
+    if not sdo.has(cia402.ABORT_CONNECTION.index):
+        text = "There is no object 6007h. Look up in its manual what the drive does when the heartbeat fails."
+        yield Check("abort option", False, text)
+    if sdo.has(cia402.MODE_DISPLAY.index):
+        shown = sdo.read_signed(cia402.MODE_DISPLAY.index, 0, cia402.MODE_DISPLAY.bits)
+        text = f"The drive is in mode {cia402.describe_mode(shown)}."
+        is_good = shown == mode
+        yield Check("mode", is_good, text if is_good else f"{text} Open it again, or look at its display.")
+
+
+class CommandFrames:
+    """Controlword, mode and target, in the RPDOs that carry them."""
+
+    def __init__(self, pdos: Sequence[Pdo], node: int, target: Mapped, label: str) -> None:
+        """Prepare the frames.
+
+        Args:
+            pdos: The RPDOs.
+            node: Node id.
+            target: The object that takes the set-point.
+            label: Named in what is raised.
+
+        Raises:
+            ConfigError: They carry an object that nobody here has a value for.
+        """
+        known = (cia402.CONTROLWORD, cia402.MODE_OF_OPERATION, target)
+        unknown = [item for pdo in pdos for item in pdo.objects if item not in known]
+        if unknown:
+            raise ConfigError(
+                f"{label}: pdo.receives has {describe(unknown)}, which would be sent as 0. "
+                f"In this mode it may have {describe(known)}."
+            )
+        self._frames = []
+        for pdo in pdos:
+            identifier = cob_id(cia301.RPDO1, pdo.number, node)
+            message = can.Message(arbitration_id=identifier, is_extended_id=False, data=bytearray(pdo.size))
+            places = tuple(known.index(item) for item in pdo.objects)
+            self._frames.append((message, pdo.layout, places))
+
+    def send(self, bus: Bus, word: int, mode: int, target: int) -> None:
+        """Put them on the bus; for the cycle's thread, which fills the same frames again and again."""
+        values = (word, mode, target)
+        for message, layout, places in self._frames:
+            layout.pack_into(message.data, 0, *[values[place] for place in places])
+            bus.send(message)
+
+    def send_anew(self, bus: Bus, word: int, mode: int, target: int) -> None:
+        """Put them on the bus from any thread, in frames that no other thread fills meanwhile."""
+        values = (word, mode, target)
+        for message, layout, places in self._frames:
+            data = layout.pack(*[values[place] for place in places])
+            bus.send(can.Message(arbitration_id=message.arbitration_id, is_extended_id=False, data=data))
+
 
 RESET_CYCLES = 200
 """For so many cycles a fault reset is tried,"""

@@ -5,8 +5,7 @@ from collections.abc import Iterator
 
 import canopen
 
-from hal.drivers.cia402.settings import MODES, DriveSettings
-from hal.drivers.cia402.units import LARGEST_COUNT, DriveUnits
+from hal.drivers.cia402.settings import LARGEST_COUNT, MODES, DriveSettings, DriveUnits
 from hal.errors import ConfigError
 from hal.protocols import cia301, cia402
 from hal.protocols.cia301 import Mapped

@@ -7,8 +7,7 @@ from typing import ClassVar
 
 from hal.device import Check, DeviceState
 from hal.drivers.can_device import CanDevice, Place
-from hal.drivers.dbc.inbox import Inbox, Letter, Raws
-from hal.drivers.dbc.sequence import Address, Run, Step, compile_steps
+from hal.drivers.dbc.sequence import Address, Inbox, Letter, Raws, Run, Step, compile_steps
 from hal.drivers.dbc.settings import MOTION, DbcSettings, QuantityConfig, StepConfig
 from hal.errors import ConfigError, DeviceRefused, DeviceSilent
 from hal.protocols import dbc

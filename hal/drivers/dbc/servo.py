@@ -9,9 +9,8 @@ import numpy as np
 
 from hal.device import UNDER_POWER, Check, DeviceState
 from hal.drivers.can_device import Place
-from hal.drivers.dbc.inbox import Letter, Raws
 from hal.drivers.dbc.sensor import FRAME_BYTES, POLL, DbcNode
-from hal.drivers.dbc.sequence import Run, Step, message_of
+from hal.drivers.dbc.sequence import Letter, Raws, Run, Step, message_of
 from hal.drivers.dbc.settings import DbcSettings, QuantityConfig, ServoSettings, Value
 from hal.errors import ConfigError, DeviceSilent
 from hal.protocols.dbc import Writer

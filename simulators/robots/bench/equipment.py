@@ -7,7 +7,7 @@ from typing import Any
 from hal import registry
 from hal.config import RobotConfig
 from hal.errors import ConfigError
-from hal.protocols.cia303 import UNITS
+from hal.protocols.analog import UNITS
 from simulators.nodes.canopen.analog_input import AnalogConstants
 from simulators.nodes.canopen.spec import CellConstants, Constants, DriveConstants, EncoderConstants, NodeSpec
 from simulators.nodes.dbc_cell import DbcCellConstants
