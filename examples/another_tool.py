@@ -5,11 +5,14 @@ Run `python examples/another_tool.py`; it takes a few seconds.
 
 import numpy as np
 
-from gemuco.adaption.update import UpdateConfig
+from gemuco.adaption.config import UpdateConfig
+from gemuco.adaption.update import adapt
 from gemuco.dataset import Dataset, Episode
+from gemuco.estimation import estimate
 from gemuco.learning.train import TrainConfig
 from gemuco.schema import BodySchema
 from gemuco.signals import Layout, Signal
+from gemuco.structure.determination import learn
 
 
 def body(q: np.ndarray, stick: float) -> dict[str, np.ndarray]:
@@ -31,9 +34,7 @@ def moves(count: int) -> np.ndarray:
 episodes = [
     Episode(f"stick {stick:g}", body(moves(100), stick)) for stick in (0.0, 0.1, 0.2, 0.3, 0.4) for _ in range(5)
 ]
-schema = BodySchema.fit(
-    Dataset(layout, tuple(episodes)), TrainConfig(hidden=(60, 30), latent=6, bias_size=1, epochs=120)
-)
+schema = learn(Dataset(layout, tuple(episodes)), TrainConfig(hidden=(60, 30), latent=6, bias_size=1, epochs=120))
 print("p of every stick:", ", ".join(f"{name} {p[0]:.2f}" for name, p in schema.biases.items()))
 
 now = body(moves(50), 0.25)
@@ -42,11 +43,11 @@ samples = [{name: values[i] for name, values in now.items()} for i in range(50)]
 
 def error(model: BodySchema) -> float:
     """How far from the truth the tip is estimated from the joints alone [m], over the samples after the third."""
-    found = [model.estimate({"joint_position": s["joint_position"]})["tool_tip_position"].value for s in samples[3:]]
+    found = [estimate(model, {"joint_position": s["joint_position"]})["tool_tip_position"].value for s in samples[3:]]
     return float(np.mean([np.linalg.norm(f - s["tool_tip_position"]) for f, s in zip(found, samples[3:], strict=True)]))
 
 
 believed = schema.under("stick 0")
-adapted = believed.adapt(samples[:3], UpdateConfig(what="bias"))
+adapted = adapt(believed, samples[:3], UpdateConfig(what="bias"))
 print(f"a stick of 0.25 m: tip wrong by {1e3 * error(believed):.0f} mm,", end=" ")
 print(f"after three samples by {1e3 * error(adapted):.0f} mm, p {adapted.bias.round(2)}")

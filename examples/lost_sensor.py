@@ -6,6 +6,7 @@ python examples/lost_sensor.py
 import numpy as np
 
 from gemuco.dataset import Dataset, Episode
+from gemuco.estimation import estimate
 from gemuco.learning.train import TrainConfig, fit
 from gemuco.signals import Layout, Signal
 from gemuco.structure.determination import Thresholds, determine
@@ -34,7 +35,5 @@ print(found.report())
 schema, _ = fit(Dataset(layout, episodes), config, found.masks, x_out=found.x_out)
 
 now = {name: values[0] for name, values in body(np.array([[0.4, 1.1]])).items()}
-estimate = schema.estimate(now | {"joint_position": np.full(2, np.nan)})["joint_position"]
-print(
-    f"joints {now['joint_position']}, {estimate.method} says {estimate.value.round(3)} +- {estimate.std.round(3)} rad"
-)
+joints = estimate(schema, now | {"joint_position": np.full(2, np.nan)})["joint_position"]
+print(f"joints {now['joint_position']}, {joints.method} says {joints.value.round(3)} +- {joints.std.round(3)} rad")

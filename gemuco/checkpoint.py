@@ -5,24 +5,21 @@ import json
 from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
-from gemuco.activation import LINEAR, check
-from gemuco.anomaly.score import Normal
 from gemuco.errors import CheckpointError, SchemaError
-from gemuco.layers import Chain, Layer, Weights
+from gemuco.layers import LINEAR, Chain, Layer, Weights, check_activation
 from gemuco.masks import label
+from gemuco.normal import Normal
 from gemuco.scaler import Scaler
+from gemuco.schema import BodySchema
 from gemuco.signals import Layout, Signal
 from gemuco.writing import writing
-
-if TYPE_CHECKING:
-    from gemuco.schema import BodySchema
 
 FORMAT = "gemuco.body_schema"
 VERSION = 2
@@ -31,8 +28,15 @@ MANIFEST = "manifest.json"
 SCALES = ("mean", "std", "low", "high", "dead")
 
 
-def save(schema: "BodySchema", folder: Path) -> None:
-    """Write both files; the manifest comes last with the hash of the arrays and its own, so any damage is noticed."""
+def save(schema: BodySchema, folder: str | Path) -> None:
+    """Write model.safetensors and manifest.json into a folder.
+
+    The manifest comes last, with the hash of the arrays and its own, so that any damage is noticed.
+
+    Raises:
+        NotWritten: The disk is full, or the folder may not be written to.
+    """
+    folder = Path(folder)
     data = save_tensors({name: np.ascontiguousarray(array) for name, array in _tensors(schema).items()})
     head = {
         "format": FORMAT,
@@ -75,7 +79,7 @@ def _replace(path: Path, data: bytes) -> None:
     draft.replace(path)
 
 
-def _tensors(schema: "BodySchema") -> dict[str, np.ndarray]:
+def _tensors(schema: BodySchema) -> dict[str, np.ndarray]:
     tensors: dict[str, np.ndarray] = {}
     for part, chain in (("encoder", schema.weights.encoder), ("decoder", schema.weights.decoder)):
         for index, layer in enumerate(chain):
@@ -96,8 +100,13 @@ def _tensors(schema: "BodySchema") -> dict[str, np.ndarray]:
     return tensors
 
 
-def load(folder: Path) -> "BodySchema":
-    """Read what `save` wrote; see `BodySchema.load`."""
+def load(folder: str | Path) -> BodySchema:
+    """Read what `save` wrote.
+
+    Raises:
+        CheckpointError: Nothing there, damaged, not a body schema, or of another version.
+    """
+    folder = Path(folder)
     head = _manifest(folder)
     try:
         data = (folder / TENSORS).read_bytes()
@@ -139,9 +148,7 @@ def _manifest(folder: Path) -> dict[str, Any]:
     return head
 
 
-def _schema(head: Mapping[str, Any], tensors: Mapping[str, np.ndarray]) -> "BodySchema":
-    from gemuco.schema import BodySchema
-
+def _schema(head: Mapping[str, Any], tensors: Mapping[str, np.ndarray]) -> BodySchema:
     layout = Layout(tuple(Signal(s["name"], s["size"], s["unit"], tuple(s["elements"])) for s in head["signals"]))
     for name, array in tensors.items():
         if name != "normal.mean" and not name.startswith("errors.") and not np.isfinite(array).all():
@@ -177,10 +184,10 @@ def _chain(head: Mapping[str, Any], tensors: Mapping[str, np.ndarray], part: str
 
 
 def _activation(name: Any) -> str:
-    return LINEAR if name == LINEAR else check(name)
+    return LINEAR if name == LINEAR else check_activation(name)
 
 
-def _sound(schema: "BodySchema") -> "BodySchema":
+def _sound(schema: BodySchema) -> BodySchema:
     """The schema, if its arrays fit each other.
 
     Raises:

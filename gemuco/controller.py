@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -284,3 +285,25 @@ class Controller:
                         f"Route latent predicts only x_out ({', '.join(self.schema.x_out)}), but a term is about "
                         f"'{name}'; use route input."
                     )
+
+
+def control(
+    schema: BodySchema,
+    target: Mapping[str, np.ndarray],
+    now: Mapping[str, np.ndarray] | None = None,
+    *,
+    command: str,
+    terms: Sequence[Term | Hold] | None = None,
+    **options: Any,
+) -> Solution:
+    """Find the command that brings about a target, from scratch; `Controller` goes on from its last solve.
+
+    Args:
+        schema: The body schema.
+        target: Signal -> reference [its unit].
+        now: Signal -> present value [its unit].
+        command: The signal that is commanded.
+        terms: What is asked; to match every target if not given.
+        options: Of `Controller`: route, mask, search, limits.
+    """
+    return Controller(schema, terms, command, **options).solve(target, now)

@@ -2,23 +2,21 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
 from gemuco.compiled.inference import infer
+from gemuco.derived import ByPattern
 from gemuco.layers import run
 from gemuco.masks import Mask, covered_by, label
-from gemuco.search.descent import NewtonConfig
+from gemuco.schema import BodySchema
+from gemuco.search.descent import NewtonConfig, minimise
 from gemuco.search.fold import fitting, input_lines, latent_lines
-from gemuco.search.minimise import minimise
-
-if TYPE_CHECKING:
-    from gemuco.schema import BodySchema
+from gemuco.search.routes import STARTS, latent_starts
 
 SEARCH = NewtonConfig()
-STARTS = 64
-"""How many anchors of the training data a descent chooses its start from."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +42,7 @@ class Estimate:
     residual: float
 
 
-class Filled(NamedTuple):
+class Completion(NamedTuple):
     """Every element of a layout as well as it can be known; see `Estimate` for what is told of each signal.
 
     Attributes:
@@ -67,12 +65,12 @@ class Filled(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class Recipe:
     """How a schema fills in samples that lack the same elements; all but the numbers is known beforehand.
 
     Attributes:
         ways: Method, mask, for which elements of the layout, shape (size,), and for which signals.
-        std: As of `Filled`, and so are the others.
+        std: As of `Completion`, and so are the others.
         estimated: Which elements are.
         method: By signal.
         mask: By signal.
@@ -87,7 +85,7 @@ class Plan:
     label: Mapping[str, str]
 
     @classmethod
-    def of(cls, schema: "BodySchema", finite: np.ndarray) -> "Plan":
+    def of(cls, schema: BodySchema, finite: np.ndarray) -> "Recipe":
         """For samples of which these elements are there, truth values, shape (size,)."""
         slices, whole = schema.layout.slices, schema.layout.whole(finite)
         named: dict[tuple[str, Mask], list[str]] = {}
@@ -112,8 +110,22 @@ class Plan:
         return cls(tuple(ways), std, estimated, {name: of_signal[name][0] for name in slices}, masks, labels)
 
 
-def estimate(schema: "BodySchema", values: Mapping[str, np.ndarray]) -> dict[str, Estimate]:
-    """Every signal of the layout; see `BodySchema.estimate`."""
+def recipes(schema: BodySchema) -> ByPattern[Recipe]:
+    """Return how a schema completes samples, by which of their elements were measured."""
+    return ByPattern(partial(Recipe.of, schema))
+
+
+def estimate(schema: BodySchema, values: Mapping[str, np.ndarray]) -> dict[str, Estimate]:
+    """Return every signal: measured where it can be, estimated where it cannot.
+
+    Args:
+        schema: The body schema.
+        values: Signal -> array [its unit], shape (n,). NaN elements and absent signals are estimated.
+
+    Raises:
+        UnknownSignal: A name is not in the layout.
+        WrongSize: An array does not have its signal's size.
+    """
     joined = schema.layout.join_one(values)
     joined.setflags(write=False)
     found = fill(schema, joined)
@@ -126,34 +138,25 @@ def estimate(schema: "BodySchema", values: Mapping[str, np.ndarray]) -> dict[str
     }  # fmt: skip
 
 
-def fill(schema: "BodySchema", joined: np.ndarray) -> Filled:
+def fill(schema: BodySchema, joined: np.ndarray) -> Completion:
     """What `estimate` tells, of a sample in one array [unit of each element], shape (size,); NaN where missing.
 
     Nobody may write into that array: as in a service, and code is compiled for one of both kinds.
     """
-    plan = schema.ready.plan(np.isfinite(joined))
-    value, residual = joined.copy(), dict.fromkeys(plan.method, 0.0)
-    for method, mask, missing, names in plan.ways:
+    recipe = schema.derived(recipes)(np.isfinite(joined))
+    value, residual = joined.copy(), dict.fromkeys(recipe.method, 0.0)
+    for method, mask, missing, names in recipe.ways:
         if method == "mask":
-            amiss = infer(*schema.ready.parts, joined, *schema.gate(mask), missing, value)
+            amiss = infer(*schema.parts, joined, *schema.gate(mask), missing, value)
         else:
             told, amiss = _guess(schema, method, mask, joined)
             np.copyto(value, told, where=missing)
         for name in names:
             residual[name] = amiss
-    return Filled(value, plan.std, plan.estimated, plan.method, plan.mask, plan.label, residual)
+    return Completion(value, recipe.std, recipe.estimated, recipe.method, recipe.mask, recipe.label, residual)
 
 
-def mask_error(schema: "BodySchema", mask: Mask, name: str) -> float:
-    """Mean squared held-out error of a signal under a mask [standard deviations]; 1 where it was never measured."""
-    known = schema.errors.get(("mask", mask))
-    if known is None:
-        return 1.0
-    scaled = known / schema.scaler.std[schema.out_index]
-    return float(np.mean(scaled[schema.out_layout.slice(name)] ** 2))
-
-
-def _route(schema: "BodySchema", name: str, whole: Mask, finite: np.ndarray) -> tuple[str, Mask]:
+def _route(schema: BodySchema, name: str, whole: Mask, finite: np.ndarray) -> tuple[str, Mask]:
     """How to estimate a signal, and from which signals."""
     if name in schema.x_out:
         mask = next((m for m in schema.ranked(name) if m <= whole), None)
@@ -165,7 +168,7 @@ def _route(schema: "BodySchema", name: str, whole: Mask, finite: np.ndarray) -> 
     return "none", frozenset()
 
 
-def _guess(schema: "BodySchema", method: str, mask: Mask, joined: np.ndarray) -> tuple[np.ndarray, float]:
+def _guess(schema: BodySchema, method: str, mask: Mask, joined: np.ndarray) -> tuple[np.ndarray, float]:
     """Every element as the model says [unit], shape (size,), NaN where it says nothing; and the residual."""
     x = np.where(np.isfinite(joined), schema.scaler.normalise(joined), np.nan)
     full = np.full(schema.layout.size, np.nan)
@@ -179,7 +182,7 @@ def _guess(schema: "BodySchema", method: str, mask: Mask, joined: np.ndarray) ->
     return schema.scaler.restore(full), residual
 
 
-def _std(schema: "BodySchema", method: str, mask: Mask) -> np.ndarray:
+def _std(schema: BodySchema, method: str, mask: Mask) -> np.ndarray:
     """Expected error of every element of the layout [unit], shape (size,); NaN where it is not known."""
     std = np.full(schema.layout.size, np.nan)
     known = schema.errors.get((method, mask))
@@ -194,7 +197,7 @@ def _residual(x: np.ndarray, full: np.ndarray) -> float:
     return float(np.sqrt(np.mean((full[given] - x[given]) ** 2))) if given.any() else float("nan")
 
 
-def _again(schema: "BodySchema", full: np.ndarray) -> np.ndarray:
+def _again(schema: BodySchema, full: np.ndarray) -> np.ndarray:
     """What the network makes of a body it was given as found, by the first mask that can, shape (size,)."""
     again = full.copy()
     covered = covered_by(schema.masks, schema.layout.whole(np.isfinite(full)))
@@ -203,7 +206,7 @@ def _again(schema: "BodySchema", full: np.ndarray) -> np.ndarray:
     return again
 
 
-def latent_search(schema: "BodySchema", x: np.ndarray) -> np.ndarray:
+def latent_search(schema: BodySchema, x: np.ndarray) -> np.ndarray:
     """Usage (e): the x_out that fits the given ones best, shape (out_size,) [standard deviations].
 
     Args:
@@ -212,11 +215,11 @@ def latent_search(schema: "BodySchema", x: np.ndarray) -> np.ndarray:
     """
     data = np.full(len(x), np.nan)
     data[schema.out_index] = x[schema.out_index]
-    found = minimise(fitting(latent_lines(schema), data), schema.ready.latent_starts, SEARCH)
+    found = minimise(fitting(latent_lines(schema), data), schema.derived(latent_starts), SEARCH)
     return run(schema.weights.decoder, found.point)
 
 
-def input_search(schema: "BodySchema", x: np.ndarray, available: Mask) -> np.ndarray:
+def input_search(schema: BodySchema, x: np.ndarray, available: Mask) -> np.ndarray:
     """Usage (f): missing x_in that make the network's output fit what is given, shape (size,) [standard deviations].
 
     Args:

@@ -2,17 +2,11 @@
 
 from dataclasses import dataclass, field
 from statistics import NormalDist
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from gemuco.compiled import score
 from gemuco.errors import NotEnoughData
-from gemuco.estimation import mask_error
-from gemuco.masks import Mask
-
-if TYPE_CHECKING:
-    from gemuco.schema import BodySchema
 
 SHRINK = 0.05
 """Share of the covariance that is replaced by its diagonal, so that a few samples cannot make it singular."""
@@ -125,67 +119,8 @@ class Normal:
         return found
 
 
-@dataclass(frozen=True, slots=True)
-class Judgement:
-    """How a schema judges samples that lack the same elements.
-
-    Attributes:
-        index: The elements of x_out that are judged, positions, shape (n,).
-        precision: The inverse covariance of their errors, shape (n, n).
-        threshold: The score above which such a sample is an anomaly; NaN if nothing is judged.
-    """
-
-    index: np.ndarray
-    precision: np.ndarray
-    threshold: float
-
-    @classmethod
-    def of(cls, schema: "BodySchema", finite: np.ndarray) -> "Judgement":
-        """For samples of which these elements are there, truth values, shape (size,).
-
-        A schema without statistics of the normal judges nothing.
-        """
-        if schema.normal is None:
-            return cls(np.zeros(0, int), np.zeros((0, 0)), float("nan"))
-        judges = schema.ready.judges
-        complete = np.array([finite[schema.in_index[through > 0]].all() for through in judges.through])
-        there = finite[schema.out_index] & complete[judges.mask] & np.isfinite(schema.normal.mean)
-        index, precision = schema.normal.precision(there)
-        return cls(index, precision, float(schema.normal.threshold_of(len(index))))
-
-
 def _tail(scores: np.ndarray, false_alarm: float) -> float:
     """The score that is exceeded with a small probability: observed where there is data, else by a log-normal tail."""
     logs = np.log(np.maximum(scores, 1e-9))
     z = NormalDist().inv_cdf(1.0 - false_alarm)
     return max(float(np.quantile(scores, 1.0 - false_alarm)), float(np.exp(logs.mean() + z * logs.std())))
-
-
-def judging_masks(schema: "BodySchema") -> dict[str, Mask]:
-    """Which mask predicts each signal of x_out for the sake of anomaly detection.
-
-    A mask without the signal itself where there is one, since a signal explains itself even when it is wrong.
-    """
-    chosen: dict[str, Mask] = {}
-    for name in schema.x_out:
-        blind = [mask for mask in schema.masks if name not in mask]
-        chosen[name] = min(blind or schema.masks, key=lambda m: mask_error(schema, m, name))
-    return chosen
-
-
-def prediction_errors(schema: "BodySchema", x: np.ndarray) -> np.ndarray:
-    """Measured minus predicted [unit], shape (..., out_size), of samples [standard deviations], shape (..., size).
-
-    An element's error is NaN when it was not measured or when the mask that judges its signal lacks a value: another
-    mask would make errors of another size, which the statistics of the normal do not describe.
-    """
-    error = np.full((*x.shape[:-1], schema.out_layout.size), np.nan)
-    predicted: dict[Mask, np.ndarray] = {}
-    for name, mask in schema.judges.items():
-        if mask not in predicted:
-            prediction = schema.infer(x, mask).astype(float)
-            prediction[~np.isfinite(x[..., schema.layout.indices(mask)]).all(axis=-1)] = np.nan
-            predicted[mask] = prediction
-        span, out = schema.layout.slice(name), schema.out_layout.slice(name)
-        error[..., out] = (x[..., span] - predicted[mask][..., out]) * schema.scaler.std[span]
-    return error

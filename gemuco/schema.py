@@ -4,32 +4,23 @@ Nothing here changes in place. What is learned later is another schema (`with_we
 holds one can go on with it while another thread makes the next.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, TypeVar
 
 import numpy as np
 
-from gemuco import checkpoint
-from gemuco.anomaly import score as anomaly
-from gemuco.anomaly.score import AnomalyScore, Normal
-from gemuco.derived import Ready
+from gemuco.compiled.chain import pack
+from gemuco.compiled.inference import Parts, Predictor
+from gemuco.derived import prepare
 from gemuco.errors import NotFinite, UnknownCondition, UnknownSignal, WrongSize
-from gemuco.estimation import Estimate, estimate, mask_error
 from gemuco.layers import Chain, Weights, run
 from gemuco.masks import Mask, bits, label
+from gemuco.normal import Normal
 from gemuco.scaler import CLIP, Scaler
 from gemuco.signals import Layout
 
-if TYPE_CHECKING:
-    from gemuco.adaption.update import UpdateConfig
-    from gemuco.controller import Solution
-    from gemuco.dataset import Dataset
-    from gemuco.learning.train import TrainConfig
-    from gemuco.search.losses import Hold, Term
-    from gemuco.simulation import Simulated
-    from gemuco.structure.determination import Structure, Thresholds
+T = TypeVar("T")
 
 ErrorTable = Mapping[tuple[str, Mask], np.ndarray]
 """(method, signals it was inferred from) -> expected error of every x_out element [unit], shape (out_size,); of every
@@ -38,7 +29,7 @@ element of the layout, shape (size,), for the method `input`, which finds what i
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BodySchema:
-    """Layout, masks, scaler and network weights together, and the verbs they allow.
+    """Layout, masks, scaler and network weights together: everything that the verbs of other rooms need.
 
     Attributes:
         layout: Every signal of the body.
@@ -57,8 +48,6 @@ class BodySchema:
         out_layout: The layout of x_out alone.
         in_index: Where the elements of x_in lie in the layout, shape (in_size,).
         out_index: Where the elements of x_out lie in the layout, shape (out_size,).
-        judges: Signal of x_out -> the mask that predicts it for the sake of anomaly detection.
-        ready: What compiled code takes of it.
     """
 
     layout: Layout
@@ -77,11 +66,10 @@ class BodySchema:
     out_layout: Layout = field(init=False, repr=False)
     in_index: np.ndarray = field(init=False, repr=False)
     out_index: np.ndarray = field(init=False, repr=False)
-    judges: Mapping[str, Mask] = field(init=False, repr=False)
     _gates: dict[Mask, tuple[np.ndarray, np.ndarray]] = field(init=False, repr=False)
     _ranked: dict[str, tuple[Mask, ...]] = field(init=False, repr=False)
     _chain: Chain = field(init=False, repr=False)
-    ready: Ready = field(init=False, repr=False)
+    _derived: dict[Callable[..., Any], Any] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         set_field = object.__setattr__
@@ -97,12 +85,36 @@ class BodySchema:
         set_field(self, "_gates", {})
         set_field(self, "_ranked", {})
         set_field(self, "_chain", self.weights.whole)
-        set_field(self, "ready", Ready(self))
+        set_field(self, "_derived", {})
         for mask in self.masks:
             self.gate(mask)
-        set_field(self, "judges", anomaly.judging_masks(self))
         for array in (*self.weights.arrays(), self.anchors, self.bias):
             array.setflags(write=False)
+
+    def __reduce__(self) -> tuple[type["BodySchema"], tuple[Any, ...]]:
+        """Pickle the given values only; another process derives the rest anew."""
+        return BodySchema, tuple(getattr(self, f.name) for f in fields(self) if f.init)
+
+    def derived(self, kind: Callable[["BodySchema"], T]) -> T:
+        """Return `kind(schema)`, made at the first call and then kept with the schema."""
+        kept = self._derived.get(kind)
+        if kept is None:
+            kept = self._derived[kind] = kind(self)
+        return kept
+
+    def prepare(self, before: "BodySchema") -> None:
+        """Derive now what was derived from the schema before, so that a loop that keeps time does not wait for it."""
+        prepare(before._derived, self.derived)
+
+    @property
+    def predictor(self) -> Predictor:
+        """The network for compiled code."""
+        return self.derived(_predictor)
+
+    @property
+    def parts(self) -> Parts:
+        """The network as `gemuco.compiled.inference.infer` takes it."""
+        return self.derived(_parts)
 
     def gate(self, mask: Mask) -> tuple[np.ndarray, np.ndarray]:
         """What lets a mask's signals through: (0 or 1 per x_in element, the input's tail of m and p), float32."""
@@ -120,8 +132,16 @@ class BodySchema:
         """The feasible masks, the one that infers a signal of x_out best first."""
         found = self._ranked.get(name)
         if found is None:
-            found = self._ranked[name] = tuple(sorted(self.masks, key=lambda m: mask_error(self, m, name)))
+            found = self._ranked[name] = tuple(sorted(self.masks, key=lambda m: self.mask_error(m, name)))
         return found
+
+    def mask_error(self, mask: Mask, name: str) -> float:
+        """Return the mean squared held-out error of a signal under a mask [standard deviations]; 1 if unknown."""
+        known = self.errors.get(("mask", mask))
+        if known is None:
+            return 1.0
+        scaled = known / self.scaler.std[self.out_index]
+        return float(np.mean(scaled[self.out_layout.slice(name)] ** 2))
 
     def network_input(self, normalised: np.ndarray, mask: Mask, bias: np.ndarray | None = None) -> np.ndarray:
         """x_in masked and clipped, with m and p behind it.
@@ -155,122 +175,6 @@ class BodySchema:
     def _normalised(self, joined: np.ndarray) -> np.ndarray:
         joined[~np.isfinite(joined)] = np.nan
         return self.scaler.normalise(joined)
-
-    def estimate(self, values: Mapping[str, np.ndarray]) -> dict[str, Estimate]:
-        """Every signal: measured where it can be, estimated where it cannot (paper, II-G).
-
-        Args:
-            values: Signal -> array [its unit], shape (n,). NaN elements and absent signals are what is missing.
-
-        Raises:
-            UnknownSignal: A name is not in the layout.
-            WrongSize: An array does not have its signal's size.
-        """
-        return estimate(self, values)
-
-    def predict_error(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Measured minus predicted of every x_out element [unit], shape (out_size,) or (samples, out_size).
-
-        Each signal is predicted from the others where a feasible mask allows; NaN where something is missing.
-        """
-        return anomaly.prediction_error(self, values)
-
-    def anomaly(self, values: Mapping[str, np.ndarray]) -> AnomalyScore:
-        """How unlike normal a sample is (paper, II-K)."""
-        return anomaly.score(self, values)
-
-    def control(
-        self,
-        target: Mapping[str, np.ndarray],
-        now: Mapping[str, np.ndarray] | None = None,
-        *,
-        command: str,
-        terms: Sequence["Term | Hold"] | None = None,
-        **options: Any,
-    ) -> "Solution":
-        """The command that brings about a target (paper, II-I), from scratch; `Controller` goes on from its last solve.
-
-        Args:
-            target: Signal -> reference [its unit].
-            now: Signal -> present value [its unit].
-            command: The signal that is commanded.
-            terms: What is asked; to match every target if not given.
-            options: Of `Controller`: route, mask, search, limits.
-        """
-        from gemuco.controller import Controller
-
-        return Controller(self, terms, command, **options).solve(target, now)
-
-    def simulate(
-        self,
-        commands: Iterable[np.ndarray | Sequence[float]],
-        *,
-        command: str,
-        terms: Sequence["Term | Hold"] = (),
-        given: Mapping[str, np.ndarray] | None = None,
-        now: Mapping[str, np.ndarray] | None = None,
-        **options: Any,
-    ) -> list["Simulated"]:
-        """The states that commands bring about one after the other (paper, II-J); `Simulator` takes them singly.
-
-        Args:
-            commands: What is sent [unit of the commanded signal], each of shape (n,).
-            command: The signal that is commanded.
-            terms: Constraints.
-            given: Signal -> reference of terms that take one [its unit].
-            now: Signal -> value [its unit] of the state to begin from.
-            options: Of `Simulator`: route, mask, search, limits.
-        """
-        from gemuco.simulation import Simulator
-
-        return list(Simulator(self, terms, command, **options).run(commands, given, now))
-
-    def adapt(self, samples: Iterable[Mapping[str, np.ndarray]], config: "UpdateConfig | None" = None) -> "BodySchema":
-        """The schema after the online update (paper, II-F) on samples, one step each; `Updater` takes them singly.
-
-        Args:
-            samples: Signal -> value [its unit], shape (n,), oldest first.
-            config: How; see `gemuco.adaption.update`.
-        """
-        from gemuco.adaption.update import UpdateConfig, Updater
-
-        updater = Updater(self, config or UpdateConfig())
-        for values in samples:
-            updater.add(values)
-            updater.step()
-        return updater.schema
-
-    @classmethod
-    def determine(
-        cls, dataset: "Dataset", config: "TrainConfig", thresholds: "Thresholds | None" = None
-    ) -> "Structure":
-        """Which signals can be inferred, and from which masks (paper, II-E); imports torch."""
-        from gemuco.structure.determination import determine
-
-        return determine(dataset, config, thresholds)
-
-    @classmethod
-    def fit(
-        cls,
-        dataset: "Dataset",
-        config: "TrainConfig",
-        masks: Iterable[Iterable[str]] | None = None,
-        x_out: Iterable[str] | None = None,
-    ) -> "BodySchema":
-        """Learn a body from data (paper, II-D); imports torch. `gemuco.learning.train.fit` also returns the history.
-
-        Args:
-            dataset: Episodes of one body.
-            config: How to train.
-            masks: The feasible masks; determined from the data if not given, and x_out with them.
-            x_out: What to infer; every signal if masks are given and this is not.
-        """
-        from gemuco.learning.train import fit
-
-        if masks is None:
-            structure = cls.determine(dataset, config)
-            masks, x_out = structure.masks, x_out or structure.x_out
-        return fit(dataset, config, masks, x_out=x_out)[0]
 
     def error_rows(self) -> list[tuple[str, str, str, float]]:
         """For a table: (mask, signal, unit, root mean square error over its elements) on held-out data."""
@@ -321,15 +225,11 @@ class BodySchema:
         """The same body with more facts kept beside it."""
         return replace(self, manifest={**self.manifest, **facts})
 
-    def save(self, folder: str | Path) -> None:
-        """Write model.safetensors and manifest.json into a folder."""
-        checkpoint.save(self, Path(folder))
 
-    @classmethod
-    def load(cls, folder: str | Path) -> "BodySchema":
-        """Read what `save` wrote.
+def _predictor(schema: BodySchema) -> Predictor:
+    scale = np.stack([schema.scaler.mean, schema.scaler.std])
+    return Predictor(pack(schema.weights.whole), schema.in_index, schema.out_index, scale, CLIP)
 
-        Raises:
-            CheckpointError: Nothing there, damaged, not a body schema, or of another version.
-        """
-        return checkpoint.load(Path(folder))
+
+def _parts(schema: BodySchema) -> Parts:
+    return schema.predictor.parts

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -195,3 +196,27 @@ class Simulator:
         state = np.where(np.isfinite(sent), sent, x)
         again = schema.infer(np.where(np.isfinite(state), state, 0.0), mask)
         return float(np.sqrt(np.mean((again - state[schema.out_index]) ** 2)))
+
+
+def simulate(
+    schema: BodySchema,
+    commands: Iterable[np.ndarray | Sequence[float]],
+    *,
+    command: str,
+    terms: Sequence[Term | Hold] = (),
+    given: Mapping[str, np.ndarray] | None = None,
+    now: Mapping[str, np.ndarray] | None = None,
+    **options: Any,
+) -> list[Simulated]:
+    """Return the states that commands bring about one after the other; `Simulator` takes them singly.
+
+    Args:
+        schema: The body schema.
+        commands: What is sent [unit of the commanded signal], each of shape (n,).
+        command: The signal that is commanded.
+        terms: Constraints.
+        given: Signal -> reference of terms that take one [its unit].
+        now: Signal -> value [its unit] of the state to begin from.
+        options: Of `Simulator`: route, mask, search, limits.
+    """
+    return list(Simulator(schema, terms, command, **options).run(commands, given, now))

@@ -12,11 +12,14 @@ from itertools import chain, pairwise
 
 import numpy as np
 
+from gemuco.adaption.config import UpdateConfig
 from gemuco.adaption.relearn import mean_error
-from gemuco.adaption.update import UpdateConfig
+from gemuco.adaption.update import adapt
+from gemuco.anomaly.score import score
 from gemuco.compiled.jit import FOLDER, let_compiler_go
 from gemuco.compiled.usable import usable
 from gemuco.controller import Controller
+from gemuco.estimation import estimate
 from gemuco.layers import Layer, Weights
 from gemuco.normal import Normal
 from gemuco.scaler import Scaler
@@ -67,23 +70,23 @@ def running(schema: BodySchema) -> Iterator[str]:
     received = np.frombuffer(bytes(8), "<f8"), np.frombuffer(bytes(1), bool), np.frombuffer(bytes(8), "<f8")
     usable(*received, np.zeros(1, int), np.zeros(1, int), np.ones(1), np.empty(1))
     yield "estimation by mask"
-    schema.estimate({name: whole[name] for name in ("position", "tension")})
+    estimate(schema, {name: whole[name] for name in ("position", "tension")})
     yield "estimation by descent"
-    schema.estimate({"length": whole["length"]})
+    estimate(schema, {"length": whole["length"]})
     yield "anomaly"
     size = schema.out_layout.size
-    schema.with_normal(Normal(np.zeros(size), np.eye(size), 1.0, 1e-3)).anomaly(whole)
+    score(schema.with_normal(Normal(np.zeros(size), np.eye(size), 1.0, 1e-3)), whole)
     target = {"position": np.full(1, 0.1)}
     terms = (Match("position"), TorqueBalance(np.sin, 1.0, "position", "tension", "length"))
     yield "control"
     Controller(schema, terms, "tension").solve(target, whole)
     yield "recognition of p"
     for method in ("ekf", "gauss_newton"):
-        schema.adapt([whole] * 2, UpdateConfig(what="bias", bias_method=method))
+        adapt(schema, [whole] * 2, UpdateConfig(what="bias", bias_method=method))
     for optimiser in ("adam", "sgd"):
         yield f"update of W and p by {optimiser}"
         config = UpdateConfig(what="both", optimiser=optimiser, minimum=1, batch=4, steps=1)
-        schema.adapt([whole] * 2, config)
+        adapt(schema, [whole] * 2, config)
     yield "judging an update"
     mean_error(schema, np.zeros((1, schema.layout.size), np.float32))
 

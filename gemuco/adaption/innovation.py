@@ -1,16 +1,13 @@
 """What a sample says about p: the errors of everything that was predicted without being told, and how p moves them."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from gemuco.compiled.innovation import innovations
 from gemuco.layers import run
 from gemuco.masks import Mask
-
-if TYPE_CHECKING:
-    from gemuco.schema import BodySchema
+from gemuco.schema import BodySchema
 
 SHRINK = 0.05
 """Share of the covariance that is replaced by its diagonal."""
@@ -50,7 +47,7 @@ class Innovations:
     is left out, for the network then copies it, whatever p is.
     """
 
-    def __init__(self, schema: "BodySchema") -> None:
+    def __init__(self, schema: BodySchema) -> None:
         self._schema = schema
         self._pairs: dict[bytes, Pairs] = {}
         anchors = schema.anchors
@@ -117,7 +114,7 @@ class Innovations:
         return known
 
     def of(
-        self, schema: "BodySchema", pairs: Pairs, rows: np.ndarray, biases: np.ndarray
+        self, schema: BodySchema, pairs: Pairs, rows: np.ndarray, biases: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Whitened errors and their derivatives: error(p + dp) = error - derivative dp.
 
@@ -132,10 +129,10 @@ class Innovations:
         """
         p = np.ascontiguousarray(biases, np.float32)
         x = np.ascontiguousarray(rows, float)
-        return innovations(schema.ready.predictor, x, p, pairs.through, pairs.tails, pairs.index, pairs.whiten)
+        return innovations(schema.predictor, x, p, pairs.through, pairs.tails, pairs.index, pairs.whiten)
 
 
-def own_bias(schema: "BodySchema", count: int) -> np.ndarray:
+def own_bias(schema: BodySchema, count: int) -> np.ndarray:
     """The p of the condition that every anchor was recorded under, shape (count, bias_size), or the present p."""
     if len(schema.anchor_conditions) == count and schema.biases and count:
         return np.stack(list(schema.biases.values()))[schema.anchor_conditions]

@@ -11,15 +11,13 @@ forgotten. The errors are taken as t-distributed, so one odd sample moves nothin
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 
 from gemuco.adaption.innovation import Innovations
 from gemuco.compiled import bank, beliefs
-
-if TYPE_CHECKING:
-    from gemuco.schema import BodySchema
+from gemuco.schema import BodySchema
 
 HAZARD = 0.01
 """How often the body changes, per sample."""
@@ -70,7 +68,7 @@ class Prior:
     known: np.ndarray
 
     @classmethod
-    def of(cls, schema: "BodySchema") -> "Prior":
+    def of(cls, schema: BodySchema) -> "Prior":
         """From the p of the trained conditions; from the present one alone if there are none."""
         known = np.stack([p.astype(float) for p in schema.biases.values()] or [schema.bias.astype(float)])
         away = known - known.mean(axis=0)
@@ -108,7 +106,7 @@ class Recognition:
 class Recogniser(Protocol):
     """Finds p from samples, one at a time."""
 
-    def see(self, schema: "BodySchema", row: np.ndarray) -> Recognition:
+    def see(self, schema: BodySchema, row: np.ndarray) -> Recognition:
         """Take one sample [standard deviations], shape (size,), predicted by the W of a schema."""
         ...
 
@@ -120,7 +118,7 @@ class Kalman:
     may have become a new one.
     """
 
-    def __init__(self, schema: "BodySchema") -> None:
+    def __init__(self, schema: BodySchema) -> None:
         self.prior = Prior.of(schema)
         self._innovations = Innovations(schema)
         self._known = known = len(schema.biases)
@@ -144,13 +142,13 @@ class Kalman:
         self._scale = 1.0
         self._seen = 0
 
-    def see(self, schema: "BodySchema", row: np.ndarray) -> Recognition:
+    def see(self, schema: BodySchema, row: np.ndarray) -> Recognition:
         """Weigh all beliefs by a sample, and move those that are not of a known condition."""
         pairs = self._innovations.pairs(np.isfinite(row))
         if len(pairs.index):
             prior, shape = self.prior, (pairs.through, pairs.tails, pairs.index, pairs.whiten)
             seen, self._count = bank.see(
-                schema.ready.predictor, row, self._beliefs, self._count, (prior.mean, prior.covariance), shape,
+                schema.predictor, row, self._beliefs, self._count, (prior.mean, prior.covariance), shape,
                 pairs.log_volume, self._near, self._scale, self._rules,
             )  # fmt: skip
             self._seen += 1
@@ -162,13 +160,13 @@ class Kalman:
 class GaussNewton:
     """The p that explains the newest samples best."""
 
-    def __init__(self, schema: "BodySchema") -> None:
+    def __init__(self, schema: BodySchema) -> None:
         self.prior = Prior.of(schema)
         self._innovations = Innovations(schema)
         self._rows: list[np.ndarray] = []
         self._bias = schema.bias.astype(float)
 
-    def see(self, schema: "BodySchema", row: np.ndarray) -> Recognition:
+    def see(self, schema: BodySchema, row: np.ndarray) -> Recognition:
         """Take a sample and find p anew."""
         self._rows = [row, *self._rows[: RECENT - 1]]
         self._bias, covariance = solve(schema, self._innovations, self.prior, np.stack(self._rows), self._bias, FADE)
@@ -176,7 +174,7 @@ class GaussNewton:
 
 
 def solve(
-    schema: "BodySchema",
+    schema: BodySchema,
     innovations: Innovations,
     prior: Prior,
     rows: np.ndarray,
@@ -234,4 +232,4 @@ def solve(
     return best, np.linalg.inv(curvature)
 
 
-RECOGNISERS: dict[str, Callable[["BodySchema"], Recogniser]] = {"ekf": Kalman, "gauss_newton": GaussNewton}
+RECOGNISERS: dict[str, Callable[[BodySchema], Recogniser]] = {"ekf": Kalman, "gauss_newton": GaussNewton}

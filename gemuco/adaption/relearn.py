@@ -1,20 +1,15 @@
 """Gradient steps on W, on p, or on both (paper, usages (c) and (d)), with replay, and a way back from harm."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
+from gemuco.adaption.config import UpdateConfig
 from gemuco.adaption.innovation import own_bias
 from gemuco.adaption.recognise import Prior
-from gemuco.adaption.window import Window
 from gemuco.compiled.batch import under_masks
 from gemuco.compiled.chain import pack, unpack
 from gemuco.compiled.learning import SQUARED, gradients, loss
 from gemuco.optimiser import Optimiser
-
-if TYPE_CHECKING:
-    from gemuco.adaption.update import UpdateConfig
-    from gemuco.schema import BodySchema
+from gemuco.schema import BodySchema
 
 JUDGED = 60
 """Held-out samples that W is judged by, the newest."""
@@ -24,6 +19,68 @@ RECOVERY = 1.2
 """By how much the learning rate grows with every better W, after it was halved."""
 WORSE = 1.1
 """W goes back when its held-out squared error exceeds that of the best W so far by this factor."""
+
+
+class Window:
+    """Samples [standard deviations] in a ring.
+
+    Args:
+        size: Samples kept.
+        width: Elements of a sample.
+        held_out: Every so many-th sample is for judging and never learned from; 0 holds none out.
+    """
+
+    def __init__(self, size: int, width: int, held_out: int) -> None:
+        self._rows = np.full((size, width), np.nan, np.float32)
+        self._serial = np.full(size, -1)
+        self._held_out = held_out
+        self._learned: np.ndarray | None = None
+        self.added = 0
+        self.dropped = 0
+
+    def __len__(self) -> int:
+        """Samples in the window."""
+        return int((self._serial >= 0).sum())
+
+    def add(self, row: np.ndarray) -> None:
+        """Put a sample in, shape (width,), in place of the oldest if the window is full."""
+        place = self.added % len(self._rows)
+        self.dropped += bool(self._serial[place] >= 0)
+        self._rows[place] = row
+        self._serial[place] = self.added
+        self.added += 1
+        self._learned = None
+
+    def forget_before(self, serial: int) -> None:
+        """Drop the samples that came before the one of a number (the first has number 0)."""
+        old = (self._serial >= 0) & (self._serial < serial)
+        self.dropped += int(old.sum())
+        self._serial[old] = -1
+        self._learned = None
+
+    def learned(self) -> np.ndarray:
+        """The samples to learn from, shape (n, width), in no particular order."""
+        if self._learned is None:
+            there = self._serial >= 0
+            self._learned = self._rows[there & ~self._held()] if self._held_out else self._rows[there]
+        return self._learned
+
+    def held(self, most: int) -> np.ndarray:
+        """At most so many of the newest held-out samples, newest first, shape (n, width)."""
+        if not self._held_out:
+            return self._rows[:0]
+        return self._newest((self._serial >= 0) & self._held(), most)
+
+    def newest(self, most: int) -> np.ndarray:
+        """At most so many of the newest samples, newest first, shape (n, width)."""
+        return self._newest(self._serial >= 0, most)
+
+    def _held(self) -> np.ndarray:
+        return self._serial % self._held_out == self._held_out - 1
+
+    def _newest(self, chosen: np.ndarray, most: int) -> np.ndarray:
+        index = np.flatnonzero(chosen)
+        return self._rows[index[np.argsort(self._serial[index])[::-1][:most]]]
 
 
 class Relearner:
@@ -43,14 +100,14 @@ class Relearner:
         rolled_back: How often W went back so far.
     """
 
-    def __init__(self, schema: "BodySchema", config: "UpdateConfig", constraints: np.ndarray) -> None:
+    def __init__(self, schema: BodySchema, config: UpdateConfig, constraints: np.ndarray) -> None:
         self.window = Window(config.window, schema.layout.size, config.held_out)
         self.rolled_back = 0
         self._config, self._constraints = config, constraints
         self._random = np.random.default_rng(config.seed)
         self.restart(schema)
 
-    def restart(self, schema: "BodySchema") -> None:
+    def restart(self, schema: BodySchema) -> None:
         """Forget momentum and judgements, and go on from the W and p of a schema."""
         config = self._config
         self._chain = pack(schema.weights.whole)
@@ -63,7 +120,7 @@ class Relearner:
         self._calls = 0
         self.held_out = float("nan")
 
-    def step(self, schema: "BodySchema", weights: bool, bias: bool) -> tuple["BodySchema", float]:
+    def step(self, schema: BodySchema, weights: bool, bias: bool) -> tuple[BodySchema, float]:
         """A few gradient steps.
 
         Args:
@@ -89,7 +146,7 @@ class Relearner:
             schema = self._judge(schema.with_weights(schema.weights.replaced(unpack(self._chain))))
         return schema, first
 
-    def _descend(self, schema: "BodySchema", weights: bool, bias: bool) -> float:
+    def _descend(self, schema: BodySchema, weights: bool, bias: bool) -> float:
         """One gradient step in place; returns the loss before it."""
         inputs, wanted, present = self._batch(schema)
         loss, by_weights, by_input = gradients(self._chain, inputs, wanted, SQUARED, weights, bias)
@@ -99,7 +156,7 @@ class Relearner:
             self._bias_optimiser.move(self._bias, by_input[present, -len(self._bias) :].sum(axis=0))
         return float(loss)
 
-    def _batch(self, schema: "BodySchema") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _batch(self, schema: BodySchema) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Each drawn sample once per mask it allows.
 
         Returns:
@@ -117,10 +174,10 @@ class Relearner:
         if old:
             rows = np.concatenate([rows, self._anchors[replayed]])
             biases = np.concatenate([biases, self._anchor_biases[replayed]])
-        inputs, wanted, whose = under_masks(_plain(rows), _plain(biases), *self._gates, schema.ready.predictor)
+        inputs, wanted, whose = under_masks(_plain(rows), _plain(biases), *self._gates, schema.predictor)
         return inputs, wanted, whose < len(now)
 
-    def _judge(self, schema: "BodySchema") -> "BodySchema":
+    def _judge(self, schema: BodySchema) -> BodySchema:
         """The schema, or the best W so far where the new one does worse on held-out samples."""
         self._calls += 1
         rows = self.window.held(JUDGED)
@@ -142,24 +199,24 @@ class Relearner:
         return schema
 
 
-def mean_error(schema: "BodySchema", rows: np.ndarray) -> float:
+def mean_error(schema: BodySchema, rows: np.ndarray) -> float:
     """Mean squared error of samples under all masks they allow [standard deviations squared]."""
     biases = np.repeat(schema.bias[None], len(rows), axis=0)
-    inputs, wanted, _ = under_masks(_plain(rows), _plain(biases), *gates(schema), schema.ready.predictor)
-    return float(loss(schema.ready.predictor.chain, inputs, wanted, SQUARED))
+    inputs, wanted, _ = under_masks(_plain(rows), _plain(biases), *gates(schema), schema.predictor)
+    return float(loss(schema.predictor.chain, inputs, wanted, SQUARED))
 
 
 def _plain(rows: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(rows, np.float32)
 
 
-def gates(schema: "BodySchema") -> tuple[np.ndarray, np.ndarray]:
+def gates(schema: BodySchema) -> tuple[np.ndarray, np.ndarray]:
     """Of every mask, which elements of x_in it lets through, shape (masks, in_size), and m, (masks, x_in)."""
     through, tails = (np.stack(column) for column in zip(*(schema.gate(m) for m in schema.masks), strict=True))
     return through, np.ascontiguousarray(tails[:, : len(schema.x_in)])
 
 
-def _others(schema: "BodySchema") -> tuple[np.ndarray, np.ndarray]:
+def _others(schema: BodySchema) -> tuple[np.ndarray, np.ndarray]:
     """The anchors of conditions other than the present one, and p of each.
 
     A trained condition is the present one where p is nearer to it than half the way to its nearest neighbour: what was

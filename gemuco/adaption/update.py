@@ -6,74 +6,23 @@ of the other conditions under their own, and goes back when it predicts held-out
 three ways are the other choices.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
+from gemuco.adaption.config import UpdateConfig
 from gemuco.adaption.recognise import RECOGNISERS, Prior, Recogniser
 from gemuco.adaption.relearn import Relearner
-from gemuco.errors import SchemaError, whole_number
-from gemuco.optimiser import OPTIMISERS
+from gemuco.errors import SchemaError
 from gemuco.schema import BodySchema
 
-WHAT = ("weights", "bias", "both", "bias_then_weights")
-METHODS = (*RECOGNISERS, "gradient")
 FORGET = 0.01
 """Share by which each new sample moves the running estimate of the model's errors."""
 ANOTHER = 0.3
 """The body is another one when p is this far from where it was [standard deviations of the trained p]."""
 STEADY = 0.02
 """p found by gradient is settled when a step moves it less than this [standard deviations of the trained p]."""
-
-
-@dataclass(frozen=True, slots=True)
-class UpdateConfig:
-    """What to update, and how.
-
-    Attributes:
-        what: `weights`, `bias`, `both` at once by gradient, or `bias_then_weights`: W moves only while p is settled.
-            Without parametric bias this is the same as `weights`.
-        bias_method: `ekf`, `gauss_newton` (both from the first sample), or `gradient`, the paper's.
-        window: Samples kept; the oldest are dropped.
-        minimum: Samples needed before the first gradient step.
-        batch: Samples per gradient step, drawn from window, constraints and replay; each under every mask it allows.
-        steps: Gradient steps per `Updater.step`.
-        rate: Learning rate of W.
-        bias_rate: Learning rate of p, for `gradient` and `both`.
-        optimiser: `adam` or `sgd` (with momentum 0.9), for W and p.
-        replay: As how many samples of the window the training data counts, each under the p of its own condition. A
-            young window then cannot pull W far from what was known, and a full one outweighs what is known to be old.
-        held_out: Every so many-th sample is never learned from and judges W, which goes back when it does worse there;
-            0 learns from all and never goes back.
-        seed: For the draws.
-    """
-
-    what: str = "bias_then_weights"
-    bias_method: str = "ekf"
-    window: int = 6000
-    minimum: int = 10
-    batch: int = 100
-    steps: int = 3
-    rate: float = 1e-4
-    bias_rate: float = 0.02
-    optimiser: str = "adam"
-    replay: int = 300
-    held_out: int = 5
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        for name, known in (("what", WHAT), ("bias_method", METHODS), ("optimiser", OPTIMISERS)):
-            if getattr(self, name) not in known:
-                raise SchemaError(f"{name} '{getattr(self, name)}' is not known. Known: {', '.join(known)}.")
-        for name, least in (("window", 1), ("minimum", 1), ("batch", 1), ("steps", 0), ("replay", 0), ("held_out", 0)):
-            whole_number(f"Update: {name}", getattr(self, name), least)
-        whole_number("Update: seed", self.seed, 0)
-        for name in ("rate", "bias_rate"):
-            if not 0.0 <= getattr(self, name) < float("inf"):
-                raise SchemaError(f"Update: {name} is {getattr(self, name)}; it must be 0 or a positive number.")
-        if self.held_out == 1:
-            raise SchemaError("held_out 1 holds every sample out and leaves none to learn from; use 0 or 2 and more.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,3 +191,20 @@ class Updater:
         """Back to the schema it began with; the window is kept."""
         self._begin(self._first)
         return self.schema
+
+
+def adapt(
+    schema: BodySchema, samples: Iterable[Mapping[str, np.ndarray]], config: UpdateConfig | None = None
+) -> BodySchema:
+    """Return the schema after the online update on samples, one step each; `Updater` takes them singly.
+
+    Args:
+        schema: Where to begin.
+        samples: Signal -> value [its unit], shape (n,), oldest first.
+        config: What to update, and how.
+    """
+    updater = Updater(schema, config)
+    for values in samples:
+        updater.add(values)
+        updater.step()
+    return updater.schema

@@ -10,15 +10,14 @@ length, and when it is cut neither goes with the joints any more. The others the
 what a wrong joint sensor looks like; so a part that says what training never saw (no tension at all) is preferred.
 """
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from gemuco.anomaly.prediction import judging_masks, prediction_errors
 from gemuco.layers import push, trace
-from gemuco.normal import Normal, prediction_errors
-
-if TYPE_CHECKING:
-    from gemuco.schema import BodySchema
+from gemuco.normal import Normal
+from gemuco.schema import BodySchema
 
 ANYTHING = 3.0
 """How far a wrong value may be from what is right [standard deviations of the signal]."""
@@ -43,7 +42,7 @@ class Suspect(NamedTuple):
     remains: float
 
 
-def suspects(schema: "BodySchema", rows: np.ndarray) -> list[Suspect]:
+def suspects(schema: BodySchema, rows: np.ndarray) -> list[Suspect]:
     """Every candidate, the most suspect first; empty without normal data or without anything to judge.
 
     Args:
@@ -67,7 +66,7 @@ def suspects(schema: "BodySchema", rows: np.ndarray) -> list[Suspect]:
     return sorted(found, key=lambda suspect: suspect.remains)
 
 
-def parts(schema: "BodySchema", movable: list[int]) -> list[tuple[int, ...]]:
+def parts(schema: BodySchema, movable: list[int]) -> list[tuple[int, ...]]:
     """Elements of one name in several signals, as positions in the layout; axes and numbers (`x`, `3`) are no names."""
     named: dict[str, list[int]] = {}
     for index in movable:
@@ -80,7 +79,7 @@ def parts(schema: "BodySchema", movable: list[int]) -> list[tuple[int, ...]]:
 class _Case:
     """Samples that lack the same elements, and how their errors answer to every element."""
 
-    def __init__(self, schema: "BodySchema", normal: Normal, rows: np.ndarray, judged: np.ndarray) -> None:
+    def __init__(self, schema: BodySchema, normal: Normal, rows: np.ndarray, judged: np.ndarray) -> None:
         self._schema, self._rows, self._judged = schema, rows, judged
         self._mean = normal.mean[judged]
         covariance = normal.covariance[np.ix_(judged, judged)]
@@ -93,8 +92,9 @@ class _Case:
         schema = self._schema
         error = prediction_errors(schema, rows)[:, self._judged] - self._mean
         slope = np.zeros((len(rows), schema.out_layout.size, len(elements)))
-        predicted = {mask: self._predicted(mask, rows, elements) for mask in set(schema.judges.values())}
-        for name, mask in schema.judges.items():
+        masks = schema.derived(judging_masks)
+        predicted = {mask: self._predicted(mask, rows, elements) for mask in set(masks.values())}
+        for name, mask in masks.items():
             out, span = schema.out_layout.slice(name), schema.layout.slice(name)
             slope[:, out] = -predicted[mask][:, out]
             for column, element in enumerate(elements):

@@ -2,18 +2,13 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from gemuco.anomaly.blame import suspects
+from gemuco.anomaly.prediction import judgements, judges
 from gemuco.compiled.score import deviation
-from gemuco.normal import Normal, judging_masks, prediction_errors
-
-if TYPE_CHECKING:
-    from gemuco.schema import BodySchema
-
-__all__ = ["AnomalyScore", "Normal", "judging_masks", "prediction_error", "score"]
+from gemuco.schema import BodySchema
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,13 +34,8 @@ class AnomalyScore:
         return bool(self.score > self.threshold)
 
 
-def prediction_error(schema: "BodySchema", values: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Measured minus predicted [unit]; see `BodySchema.predict_error`."""
-    return prediction_errors(schema, schema.normalise(values))
-
-
-def score(schema: "BodySchema", values: Mapping[str, np.ndarray], blame: bool = True) -> AnomalyScore:
-    """How unlike normal a sample is; see `BodySchema.anomaly`.
+def score(schema: BodySchema, values: Mapping[str, np.ndarray], blame: bool = True) -> AnomalyScore:
+    """Score how unlike normal a sample is (paper, II-K).
 
     Args:
         schema: With statistics of the normal.
@@ -76,19 +66,19 @@ class Judged:
     threshold: float
     contribution: np.ndarray
 
-    def blamed(self, schema: "BodySchema") -> str:
+    def blamed(self, schema: BodySchema) -> str:
         """`signal.element` that contributes most; empty if nothing was judged."""
         if np.isnan(self.distance):
             return ""
         return schema.out_layout.element(int(np.fmax(self.contribution, -1.0).argmax()))
 
 
-def judged(schema: "BodySchema", joined: np.ndarray) -> Judged:
+def judged(schema: BodySchema, joined: np.ndarray) -> Judged:
     """The score of a sample in one array, as `estimate.fill` takes it."""
-    by = schema.ready.judgement(np.isfinite(joined))
+    by = schema.derived(judgements)(np.isfinite(joined))
     if schema.normal is None or not len(by.index):
         return Judged(float("nan"), float("nan"), np.full(schema.out_layout.size, np.nan))
     distance, contribution = deviation(
-        schema.ready.predictor, schema.ready.judges, joined, schema.normal.mean, by.index, by.precision
+        schema.predictor, schema.derived(judges), joined, schema.normal.mean, by.index, by.precision
     )
     return Judged(distance, by.threshold, contribution)

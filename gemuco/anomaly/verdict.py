@@ -2,17 +2,14 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from gemuco.adaption.innovation import Innovations
 from gemuco.adaption.recognise import Prior, solve
 from gemuco.anomaly.blame import suspects
-from gemuco.normal import prediction_errors
-
-if TYPE_CHECKING:
-    from gemuco.schema import BodySchema
+from gemuco.anomaly.prediction import prediction_errors
+from gemuco.schema import BodySchema
 
 PLAUSIBLE = 3.0
 """How far p may be from the mean of the trained ones [their standard deviations] to be a condition of a body."""
@@ -38,7 +35,7 @@ class Verdict:
     blamed: str
 
 
-def judge(schema: "BodySchema", samples: Iterable[Mapping[str, np.ndarray]]) -> Verdict:
+def judge(schema: BodySchema, samples: Iterable[Mapping[str, np.ndarray]]) -> Verdict:
     """Normal, another condition, or something wrong.
 
     If the samples are unlikely under the p in use, p is sought anew on all of them. If they are normal under what is
@@ -70,7 +67,7 @@ def judge(schema: "BodySchema", samples: Iterable[Mapping[str, np.ndarray]]) -> 
     return Verdict("anomaly", score, explained, bias, suspects(schema, rows)[0].name)
 
 
-def window_score(schema: "BodySchema", rows: np.ndarray) -> float:
+def window_score(schema: BodySchema, rows: np.ndarray) -> float:
     """Root mean square of the scores as shares of their thresholds, of samples [standard deviations], (n, size)."""
     normal = schema.normal
     if normal is None or not len(rows):

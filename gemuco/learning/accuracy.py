@@ -4,12 +4,14 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from gemuco.anomaly.score import Normal
+from gemuco.anomaly.prediction import predict_error
 from gemuco.errors import NotEnoughData
-from gemuco.estimation import STARTS, input_search, latent_search
+from gemuco.estimation import input_search, latent_search
 from gemuco.layers import run
 from gemuco.masks import Mask, all_masks, covered_by
+from gemuco.normal import Normal
 from gemuco.schema import BodySchema
+from gemuco.search.routes import STARTS
 
 MOST_OUTPUTS = 6
 """Up to so many outputs, every set of them is tried as what a latent search is given; beyond, sets that lack one."""
@@ -32,7 +34,7 @@ def assess(schema: BodySchema, rows: np.ndarray, conditions: np.ndarray) -> Body
     schema = schema.with_weights(schema.weights, measure_errors(schema, rows, conditions))
     errors = np.full((len(rows), len(schema.out_index)), np.nan)
     for under, chosen in _by_condition(schema, conditions):
-        errors[chosen] = under.predict_error(schema.layout.split(rows[chosen]))
+        errors[chosen] = predict_error(under, schema.layout.split(rows[chosen]))
     try:
         return schema.with_normal(Normal.fit(errors, schema.scaler.std[schema.out_index]))
     except NotEnoughData:

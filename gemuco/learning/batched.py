@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gemuco.activation import LINEAR
 from gemuco.compiled.bend import CODES
 from gemuco.compiled.chain import CODE, NARROW, PLACE, WIDE, Packed
 from gemuco.compiled.learning import MOMENTUM, SQUARES
 from gemuco.compiled.masks import Rows
+from gemuco.layers import LINEAR
 from gemuco.learning import cores, devices
 from gemuco.learning.draft import Draft
 from gemuco.learning.learner import HUBER, Learner, Progress, one_cycle

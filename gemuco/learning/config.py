@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass
 
-from gemuco.activation import check
 from gemuco.errors import SchemaError, whole_number
+from gemuco.layers import check_activation
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +42,7 @@ class TrainConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        check(self.activation)
+        check_activation(self.activation)
         object.__setattr__(self, "hidden", tuple(self.hidden))
         for name, least in (("latent", 1), ("bias_size", 0), ("epochs", 1), ("batch", 1), ("patience", 1), ("seed", 0)):
             whole_number(f"Training: {name}", getattr(self, name), least)

@@ -6,8 +6,7 @@ from itertools import pairwise
 import torch
 from torch import nn
 
-from gemuco.activation import LINEAR, check
-from gemuco.layers import Chain, Layer, Weights
+from gemuco.layers import LINEAR, Chain, Layer, Weights, check_activation
 
 MODULES: dict[str, type[nn.Module]] = {
     "tanh": nn.Tanh,
@@ -44,7 +43,7 @@ class Network(nn.Module):
 
     def __init__(self, inputs: int, outputs: int, hidden: Sequence[int], latent: int, activation: str = "tanh") -> None:
         super().__init__()
-        self.activation = check(activation)
+        self.activation = check_activation(activation)
         self.encoder = _chain([inputs, *hidden, latent], activation)
         self.decoder = _chain([latent, *reversed(hidden), outputs], activation)
 

@@ -1,16 +1,13 @@
 """What is asked of predictions: terms bound to one schema, and told the references of every solve."""
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from gemuco.schema import BodySchema
 from gemuco.search.losses import Hold, Lasting, Term
 from gemuco.search.norms import Bound, Norm
 from gemuco.search.torque import Balanced
-
-if TYPE_CHECKING:
-    from gemuco.schema import BodySchema
 
 
 class Asked:
@@ -27,7 +24,7 @@ class Asked:
             anything each time.
     """
 
-    def __init__(self, schema: "BodySchema", terms: Sequence[Term | Hold]) -> None:
+    def __init__(self, schema: BodySchema, terms: Sequence[Term | Hold]) -> None:
         self.schema = schema
         self.wishes = tuple(term for term in terms if not isinstance(term, Hold))
         self.holds = tuple(term for term in terms if isinstance(term, Hold))
@@ -72,7 +69,7 @@ def signals_of(term: Term | Hold) -> tuple[str, ...]:
     return (term.signal,) if isinstance(term, Hold) else term.signals
 
 
-def merged(schema: "BodySchema", parts: Sequence[np.ndarray]) -> np.ndarray:
+def merged(schema: BodySchema, parts: Sequence[np.ndarray]) -> np.ndarray:
     """What several holds hold together, shape (size,) [standard deviations]; NaN where free."""
     merged = np.full(schema.layout.size, np.nan)
     for part in parts:
@@ -80,7 +77,7 @@ def merged(schema: "BodySchema", parts: Sequence[np.ndarray]) -> np.ndarray:
     return merged
 
 
-def check_present(schema: "BodySchema", now: Mapping[str, np.ndarray]) -> None:
+def check_present(schema: BodySchema, now: Mapping[str, np.ndarray]) -> None:
     """Refuse present values that are none of this body's.
 
     Raises:

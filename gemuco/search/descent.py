@@ -9,11 +9,14 @@ A constraint is met at every candidate, not weighed against the loss: steps go a
 from it Newton steps bring back.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
+from gemuco.compiled import descent, newton
+from gemuco.compiled.problem import Problem
 from gemuco.errors import SchemaError
 
 Objective = Callable[[np.ndarray, bool], tuple[np.ndarray, np.ndarray]]
@@ -139,6 +142,28 @@ def descend(
         last = _back(constraint, best_point[None], LAST_RETURNS, low, high)
         best_point, best_loss = last[0], float(objective(last, False)[0][0])
     return Descent(best_point, best_loss, tuple(history))
+
+
+def minimise(
+    problem: Problem, starts: np.ndarray, config: DescentConfig | NewtonConfig, until: float = math.inf
+) -> Descent:
+    """Minimise a folded problem, in one call that needs no interpreter.
+
+    Args:
+        problem: From `gemuco.search.fold`.
+        starts: First points, shape (starts, n) or (n,).
+        config: Which search, and how far.
+        until: When a second-order search ends at the latest [s of `time.monotonic`].
+    """
+    points = np.ascontiguousarray(np.atleast_2d(starts), problem.direct.dtype)
+    if isinstance(config, DescentConfig):
+        point, loss, history = descent.descend(
+            problem, points, float(config.gamma_max), config.candidates, config.iterations
+        )
+        return Descent(point, float(loss), tuple(history))
+    found = newton.search(problem, points, config.iterations, float(config.tolerance), float(until))
+    point, loss, history, is_late = found
+    return Descent(point, float(loss), tuple(history), bool(is_late))
 
 
 def _inside(points: np.ndarray, low: np.ndarray | None, high: np.ndarray | None) -> np.ndarray:

@@ -8,18 +8,16 @@ controller lays the problem out once and writes those rows before every solve.
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from gemuco.compiled.chain import NARROW, PLACE, WIDE, Packed, pack
 from gemuco.compiled.problem import POSTURE, STD, STIFFNESS, TORQUE, Balance, Problem
 from gemuco.layers import Chain, Layer
+from gemuco.schema import BodySchema
 from gemuco.search.norms import Bound, Norm
 from gemuco.search.torque import Balanced
-
-if TYPE_CHECKING:
-    from gemuco.schema import BodySchema
 
 
 class Lines(NamedTuple):
@@ -44,7 +42,7 @@ class Lines(NamedTuple):
     high: np.ndarray
 
 
-def latent_lines(schema: "BodySchema") -> Lines:
+def latent_lines(schema: BodySchema) -> Lines:
     """Usage (e): p is z, and every x_out is decoded from it."""
     decoder = schema.weights.decoder
     far = np.full(len(decoder[0].matrix), np.inf)
@@ -53,7 +51,7 @@ def latent_lines(schema: "BodySchema") -> Lines:
 
 
 def input_lines(
-    schema: "BodySchema",
+    schema: BodySchema,
     base: np.ndarray,
     columns: np.ndarray,
     free: np.ndarray,
@@ -113,7 +111,7 @@ class Folded:
     """The problem of a route and its terms, laid out once; `fill` writes the numbers of a solve into it.
 
     Attributes:
-        problem: For `gemuco.search.minimise`.
+        problem: For `gemuco.search.descent`.
         moving: The torque balance at the predicted posture; None if there is none.
     """
 

@@ -13,15 +13,13 @@ the signal's own unit (`unit="si"`). `StaySmall` measures from the physical zero
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from gemuco.errors import NotFinite, NotObservable, SchemaError, WrongSize
+from gemuco.schema import BodySchema
 from gemuco.search.norms import Bound, Difference, Norm
-
-if TYPE_CHECKING:
-    from gemuco.schema import BodySchema
 
 Values = Mapping[str, np.ndarray]
 
@@ -37,7 +35,7 @@ class Term(Protocol):
         """The signals whose prediction the loss depends on."""
         ...
 
-    def bind(self, schema: "BodySchema", target: Values, now: Values) -> Bound:
+    def bind(self, schema: BodySchema, target: Values, now: Values) -> Bound:
         """The wish as a function of predictions.
 
         Args:
@@ -52,7 +50,7 @@ class Term(Protocol):
 class Lasting(Term, Protocol):
     """A wish that depends on references and the present by its numbers alone: what it was bound to is kept."""
 
-    def renew(self, bound: Bound, schema: "BodySchema", target: Values, now: Values) -> None:
+    def renew(self, bound: Bound, schema: BodySchema, target: Values, now: Values) -> None:
         """Tell what `bind` returned other references and another present, in place; raises what `bind` does."""
         ...
 
@@ -98,16 +96,16 @@ class Match:
             raise NotObservable(f"Nothing was asked of '{self.signal}', but the loss wants to match it; give a target.")
         return _numbers(self.signal, target[self.signal])
 
-    def bind(self, schema: "BodySchema", target: Values, now: Values) -> Norm:
+    def bind(self, schema: BodySchema, target: Values, now: Values) -> Norm:
         """See `Term.bind`; nothing is asked where the reference is NaN."""
         return Norm(self.difference(schema, target), self.weight)
 
-    def renew(self, bound: Norm, schema: "BodySchema", target: Values, now: Values) -> None:
+    def renew(self, bound: Norm, schema: BodySchema, target: Values, now: Values) -> None:
         """See `Lasting.renew`."""
         if self.value is None:
             bound.difference.ask(self.reference(target))
 
-    def difference(self, schema: "BodySchema", target: Values) -> Difference:
+    def difference(self, schema: BodySchema, target: Values) -> Difference:
         """A x - reference as a function of predictions."""
         return Difference.of(schema, self.signal, self.matrix, self.unit).ask(self.reference(target))
 
@@ -137,17 +135,17 @@ class StayNear:
         """The signals whose prediction the loss depends on."""
         return (self.signal,)
 
-    def bind(self, schema: "BodySchema", target: Values, now: Values) -> Norm:
+    def bind(self, schema: BodySchema, target: Values, now: Values) -> Norm:
         """See `Term.bind`; nothing is asked where it is not known what to stay near."""
         near = Difference.of(schema, self.signal, None, self.unit)
         return Norm(near.ask(self.reference(schema, target, now)), self.weight)
 
-    def renew(self, bound: Norm, schema: "BodySchema", target: Values, now: Values) -> None:
+    def renew(self, bound: Norm, schema: BodySchema, target: Values, now: Values) -> None:
         """See `Lasting.renew`."""
         if self.value is None:
             bound.difference.ask(self.reference(schema, target, now))
 
-    def reference(self, schema: "BodySchema", target: Values, now: Values) -> np.ndarray:
+    def reference(self, schema: BodySchema, target: Values, now: Values) -> np.ndarray:
         """What to stay near [its unit], shape (n,); NaN where that is not known."""
         if self.value is not None:
             return np.asarray(self.value, float)
@@ -171,12 +169,12 @@ class StaySmall:
         """The signals whose prediction the loss depends on."""
         return (self.signal,)
 
-    def bind(self, schema: "BodySchema", target: Values, now: Values) -> Norm:
+    def bind(self, schema: BodySchema, target: Values, now: Values) -> Norm:
         """See `Term.bind`."""
         zero = np.zeros(schema.layout.signal(self.signal).size)
         return Norm(Difference.of(schema, self.signal, None, self.unit).ask(zero), self.weight)
 
-    def renew(self, bound: Norm, schema: "BodySchema", target: Values, now: Values) -> None:
+    def renew(self, bound: Norm, schema: BodySchema, target: Values, now: Values) -> None:
         """See `Lasting.renew`; zero stays zero."""
 
 
@@ -198,7 +196,7 @@ class Hold:
     def __post_init__(self) -> None:
         _freeze_value(self)
 
-    def wanted(self, schema: "BodySchema", target: Values) -> np.ndarray:
+    def wanted(self, schema: BodySchema, target: Values) -> np.ndarray:
         """Every element of the layout [standard deviations], shape (size,); NaN where nothing is held.
 
         Raises:

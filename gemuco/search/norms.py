@@ -2,14 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 
 from gemuco.errors import WrongSize
-
-if TYPE_CHECKING:
-    from gemuco.schema import BodySchema
+from gemuco.schema import BodySchema
 
 TINY = 1e-9
 
@@ -50,7 +48,7 @@ class Difference:
     asked: np.ndarray
 
     @classmethod
-    def of(cls, schema: "BodySchema", signal: str, matrix: Sequence[Sequence[float]] | None, unit: str) -> "Difference":
+    def of(cls, schema: BodySchema, signal: str, matrix: Sequence[Sequence[float]] | None, unit: str) -> "Difference":
         """From the signal's own unit; nothing is asked yet.
 
         Raises:

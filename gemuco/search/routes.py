@@ -3,21 +3,20 @@ infers the rest (f). Estimation, control and simulation differ in what they ask;
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 
 from gemuco.compiled.chain import output, pack
 from gemuco.errors import NotObservable, SchemaError, WrongSize
-from gemuco.estimation import STARTS
 from gemuco.layers import pull, run, trace
 from gemuco.masks import Mask, label
 from gemuco.scaler import CLIP
+from gemuco.schema import BodySchema
 from gemuco.search.fold import Lines, give, input_lines, latent_lines
 
-if TYPE_CHECKING:
-    from gemuco.schema import BodySchema
-
+STARTS = 64
+"""A descent chooses its start from at most this many anchors of the training data."""
 ROUTES = ("auto", "mask", "latent", "input")
 Limits = Mapping[str, tuple[np.ndarray, np.ndarray]]
 """Signal -> lowest and highest value [its unit], shapes (n,)."""
@@ -43,7 +42,7 @@ class Route(Protocol):
 class LatentRoute:
     """Usage (e): z moves, and every x_out is decoded from it."""
 
-    def __init__(self, schema: "BodySchema") -> None:
+    def __init__(self, schema: BodySchema) -> None:
         self._schema = schema
         self._decoder = schema.weights.decoder
         self._packed, self._lines = pack(self._decoder), latent_lines(schema)
@@ -75,22 +74,28 @@ class LatentRoute:
     def starts(self, begin: np.ndarray, only_there: bool = False) -> np.ndarray:
         """Latent states of what is known and of training data, shape (starts, latent); see `Search.find`."""
         schema = self._schema
-        encoder = schema.weights.encoder
         found = []
         there = schema.layout.whole(np.isfinite(begin))
         covered = [mask for mask in schema.masks if mask <= there]
         if covered:
-            found.append(run(encoder, schema.network_input(begin, covered[0]))[None])
-        if len(schema.anchors) and not (found and only_there):
-            found.append(run(encoder, schema.network_input(schema.anchors[:STARTS], schema.masks[0])))
-        return np.concatenate(found) if found else np.zeros((1, self._decoder[0].matrix.shape[0]), np.float32)
+            found.append(run(schema.weights.encoder, schema.network_input(begin, covered[0]))[None])
+        if not found or (len(schema.anchors) and not only_there):
+            found.append(schema.derived(latent_starts))
+        return np.concatenate(found)
+
+
+def latent_starts(schema: BodySchema) -> np.ndarray:
+    """Return the z of some anchors, from which a descent on z chooses its start, shape (n, latent), n at least 1."""
+    if not len(schema.anchors):
+        return np.zeros((1, schema.weights.decoder[0].matrix.shape[0]), np.float32)
+    return run(schema.weights.encoder, schema.network_input(schema.anchors[:STARTS], schema.masks[0]))
 
 
 class InputRoute:
     """Usage (f): inputs under a mask move as far as they are not given, and the network infers the rest of x_out."""
 
     def __init__(
-        self, schema: "BodySchema", mask: Mask, given: np.ndarray, needed: Sequence[str], limits: Limits | None = None
+        self, schema: BodySchema, mask: Mask, given: np.ndarray, needed: Sequence[str], limits: Limits | None = None
     ) -> None:
         """Prepare.
 
@@ -163,7 +168,7 @@ class InputRoute:
         inputs = self._base.astype(np.float32)
         inputs[self._columns] = point
         x = np.full(schema.layout.size, np.nan)
-        x[schema.out_index] = output(schema.ready.predictor.chain, inputs)
+        x[schema.out_index] = output(schema.predictor.chain, inputs)
         x[self._inside] = self._known[self._inside]
         x[self.free] = point
         return x
@@ -178,7 +183,7 @@ class InputRoute:
         return np.concatenate(found or [np.zeros((1, len(self.free)))]).astype(np.float32)
 
 
-def bounds_of(schema: "BodySchema", limits: Limits | None) -> tuple[np.ndarray, np.ndarray]:
+def bounds_of(schema: BodySchema, limits: Limits | None) -> tuple[np.ndarray, np.ndarray]:
     """Lowest and highest value of every element that a search may try [standard deviations], shapes (size,).
 
     The range of the training data, narrowed by the limits.
@@ -202,7 +207,7 @@ def bounds_of(schema: "BodySchema", limits: Limits | None) -> tuple[np.ndarray, 
     return low, high
 
 
-def checked_mask(schema: "BodySchema", mask: Mask) -> Mask:
+def checked_mask(schema: BodySchema, mask: Mask) -> Mask:
     """A mask that was found feasible.
 
     Raises:

@@ -8,21 +8,16 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from gemuco.errors import NotObservable
 from gemuco.masks import Mask
 from gemuco.search.asked import Asked
-from gemuco.search.descent import Constraint, Descent, DescentConfig, NewtonConfig, Objective, descend
+from gemuco.search.descent import Constraint, Descent, DescentConfig, NewtonConfig, Objective, descend, minimise
 from gemuco.search.fold import Folded, around, fold
-from gemuco.search.minimise import minimise
 from gemuco.search.norms import Bound, total
 from gemuco.search.routes import InputRoute, LatentRoute, Limits, Route
-
-if TYPE_CHECKING:
-    pass
 
 SLIPPED = 0.05
 """A held element this far [standard deviations] from where it shall be is not held."""

@@ -3,18 +3,15 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from gemuco.compiled.chain import pack, turned
 from gemuco.errors import NotFinite, NotObservable, SchemaError
 from gemuco.layers import Curvature, Layer
+from gemuco.schema import BodySchema
 from gemuco.search.losses import Values, check_weight
 from gemuco.search.norms import TINY
-
-if TYPE_CHECKING:
-    from gemuco.schema import BodySchema
 
 POSTURES = ("reference", "predicted")
 STEP = 1e-5
@@ -55,7 +52,7 @@ class TorqueBalance:
         """The signals whose prediction the loss depends on."""
         return (self.tension,) if self.at == "reference" else (self.position, self.tension)
 
-    def bind(self, schema: "BodySchema", target: Values, now: Values) -> "Balanced":
+    def bind(self, schema: BodySchema, target: Values, now: Values) -> "Balanced":
         """See `Term.bind`."""
         muscles = muscle_model(schema, self)
         theta, f = schema.layout.slice(self.position), schema.layout.slice(self.tension)
@@ -65,7 +62,7 @@ class TorqueBalance:
         self.renew(bound, schema, target, now)
         return bound
 
-    def renew(self, bound: "Balanced", schema: "BodySchema", target: Values, now: Values) -> None:
+    def renew(self, bound: "Balanced", schema: BodySchema, target: Values, now: Values) -> None:
         """See `Lasting.renew`; a predicted posture needs no reference."""
         if bound.posture is None:
             return
@@ -135,7 +132,7 @@ class MuscleModel:
 
     __slots__ = ("back", "chain", "f", "f_mean", "f_std", "l_std", "packed", "theta", "theta_std")
 
-    def __init__(self, schema: "BodySchema", names: TorqueBalance) -> None:
+    def __init__(self, schema: BodySchema, names: TorqueBalance) -> None:
         """Prepare the network.
 
         Raises:
@@ -190,7 +187,7 @@ class MuscleModel:
 
 
 @lru_cache(maxsize=4)
-def muscle_model(schema: "BodySchema", names: TorqueBalance) -> MuscleModel:
+def muscle_model(schema: BodySchema, names: TorqueBalance) -> MuscleModel:
     """The muscles of a schema; those of the newest schemas are kept, for a solve takes less time than to lay them out.
 
     Raises:

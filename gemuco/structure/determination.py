@@ -4,6 +4,7 @@ Up to 10 signals every mask is tried, and there are 2^n - 1 of them; with more t
 is searched for (`mask_search`). Either way a mask is feasible only if its own error was measured and is small enough.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import compress
 from pathlib import Path
@@ -12,15 +13,16 @@ import numpy as np
 
 from gemuco.dataset import Dataset
 from gemuco.errors import NotEnoughData
-from gemuco.learning.train import Progress, TrainConfig, Work, together
+from gemuco.learning.train import Progress, TrainConfig, Work, fit, together
 from gemuco.masks import Mask, all_masks, bits, label
+from gemuco.schema import BodySchema
 from gemuco.signals import Layout
 from gemuco.structure.mask_choice import choose
 from gemuco.structure.mask_judge import SURE, Judge, Judged, Thresholds
 from gemuco.structure.mask_search import find_border
 from gemuco.structure.mask_training import LISTED, ROUNDS, training_masks
 
-__all__ = ["Judge", "Structure", "Thresholds", "determine", "determining", "search", "select"]
+__all__ = ["Judge", "Structure", "Thresholds", "determine", "determining", "learn", "search", "select"]
 
 MOST_MASKS = 64
 """A schema gets at most so many masks: each is trained, has its errors measured, and is looked at in every estimate."""
@@ -140,6 +142,27 @@ def determine(
         NotEnoughData: Too few samples or signals, a signal that never varies, or no signal or mask below its threshold.
     """
     return together([determining(dataset, config, thresholds, splits, drafts)], ROUNDS, progress)[0]
+
+
+def learn(
+    dataset: Dataset,
+    config: TrainConfig | None = None,
+    masks: Iterable[Iterable[str]] | None = None,
+    x_out: Iterable[str] | None = None,
+) -> BodySchema:
+    """Learn a body from data (paper, II-D and II-E); `gemuco.learning.train.fit` also returns the history.
+
+    Args:
+        dataset: Episodes of one body.
+        config: How to train; the defaults if not given.
+        masks: The feasible masks; determined from the data if not given, and x_out with them.
+        x_out: What to infer; every signal if masks are given and this is not.
+    """
+    config = config or TrainConfig()
+    if masks is None:
+        structure = determine(dataset, config)
+        masks, x_out = structure.masks, x_out or structure.x_out
+    return fit(dataset, config, masks, x_out=x_out)[0]
 
 
 def determining(

@@ -59,7 +59,7 @@ class Client(Listening):
     ) -> Estimates | None:
         """The newest estimate of every signal, or None; see `sample`.
 
-        With values, or with signals to hide, the model estimates from those instead, as `BodySchema.estimate` does.
+        With values, or with signals to hide, the model estimates from those instead, as `gemuco.estimate` does.
         """
         hidden = list(hide)
         if values is None and not hidden:
@@ -88,7 +88,7 @@ class Client(Listening):
     ) -> Anomaly | None:
         """The newest anomaly score, or None; see `sample`.
 
-        With values, or with signals to hide, the model judges those instead, as `BodySchema.anomaly` does: one sample
+        With values, or with signals to hide, the model judges those instead, as `gemuco.anomaly.score` does: one sample
         by itself, however long.
         """
         hidden = list(hide)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.table import Table
 
+from gemuco import checkpoint
 from gemuco.dataset import Dataset
 from gemuco.errors import CheckpointError, DatasetError, NotWritten
 from gemuco.learning.history import History
@@ -175,7 +176,7 @@ def tune(
 def fits(robot: RobotConfig, folder: Path) -> bool:
     """Whether a sound model lies there that was made for this robot file."""
     try:
-        return BodySchema.load(folder).manifest.get("fingerprint") == fingerprint(robot)
+        return checkpoint.load(folder).manifest.get("fingerprint") == fingerprint(robot)
     except CheckpointError:
         return False
 
@@ -184,7 +185,7 @@ def save(trained: Trained, folder: Path) -> None:
     """Write the model, the pictures of its structure and training beside it; its drafts are of no more use."""
     from services.learning import structure_plot, training_plot
 
-    trained.schema.save(folder)
+    checkpoint.save(trained.schema, folder)
     with writing("The pictures", folder):
         if trained.structure is not None:
             structure_plot.plot(trained.structure, folder / "structure.png")

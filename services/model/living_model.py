@@ -3,6 +3,7 @@
 import threading
 from pathlib import Path
 
+from gemuco.checkpoint import load
 from gemuco.errors import CheckpointError
 from gemuco.schema import BodySchema
 from gemuco.signals import Layout, Signal
@@ -25,7 +26,7 @@ def load_model(robot: RobotConfig, folder: Path) -> BodySchema:
     """
     if not folder.exists():
         raise CheckpointError(f"There is no model in '{folder}'. Make one with `gemuco collect` and `gemuco train`.")
-    schema = BodySchema.load(folder)
+    schema = load(folder)
     if set(schema.layout.signals) != set(layout_of(robot).signals):
         theirs, ours = ", ".join(schema.layout.names), ", ".join(layout_of(robot).names)
         raise CheckpointError(
@@ -62,7 +63,7 @@ class LivingModel:
     def swap(self, schema: BodySchema) -> int:
         """Use another schema from now on; returns its version."""
         # Here and not in the next ticks of the loops that keep time.
-        schema.ready.prepare(self._schema.ready)
+        schema.prepare(self._schema)
         with self._lock:
             self._schema = schema
             self.version += 1

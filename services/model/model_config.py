@@ -58,7 +58,7 @@ class TrainingConfig(Section):
 
 
 class UpdateConfig(Section):
-    """The online update of p and W from a bounded window; see `gemuco.adaption.update.UpdateConfig`."""
+    """The online update of p and W from a bounded window; see `gemuco.adaption.config.UpdateConfig`."""
 
     what: Literal["weights", "bias", "both", "bias_then_weights"] = "bias_then_weights"
     """Without parametric bias, W alone is updated."""

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from gemuco.anomaly.score import score
 from gemuco.estimation import fill
 from gemuco.masks import label
 from gemuco.schema import BodySchema
@@ -137,7 +138,7 @@ class ModelVerbs:
         """How unlike normal the newest sample is, or given values, some of them hidden."""
         _only(arguments, "values", "hide")
         values, cycle = self._values(arguments)
-        found = self._service.living.schema.anomaly(values)
+        found = score(self._service.living.schema, values)
         return {
             "score": found.score,
             "threshold": found.threshold,

@@ -9,8 +9,9 @@ from typing import Any, Protocol
 import numpy as np
 from msgspec.structs import replace
 
-from gemuco.anomaly.score import Normal
+from gemuco.anomaly.prediction import predict_error
 from gemuco.errors import NotEnoughData
+from gemuco.normal import Normal
 from gemuco.schema import BodySchema
 from hal.clock import Clock
 from services.model.estimation import Freshness
@@ -115,7 +116,7 @@ class OnlineUpdate:
                 if not samples:
                     raise NotEnoughData("No whole sample of the moving robot came since the model last changed.")
                 rows = {name: np.stack([sample[name] for sample in samples]) for name in samples[0]}
-                normal = Normal.fit(schema.predict_error(rows), schema.scaler.std[schema.out_index])
+                normal = Normal.fit(predict_error(schema, rows), schema.scaler.std[schema.out_index])
             except NotEnoughData as error:
                 raise NotEnoughData(f"{error} Let the robot move for a while with the update stopped.") from None
             self._living.swap(schema.with_normal(normal))

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import typer
 
+from gemuco import checkpoint
 from gemuco.dataset import Dataset
 from gemuco.errors import DatasetError
-from gemuco.schema import BodySchema
 from hal.config import RobotConfig, load_robot
 from services import show
 from services.learning import measured, trainer
@@ -33,7 +33,7 @@ def run_training(
         SchemaError: Data, model or settings are not what is needed.
         RecordingError: A recording cannot be read.
     """
-    known = None if base is None else BodySchema.load(base)
+    known = None if base is None else checkpoint.load(base)
     if measured.is_description(file):
         described = measured.load_measured(file)
         folder_of_files = _only(data) or file.parent

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 from rich.console import Console
 
+from gemuco.checkpoint import save
 from gemuco.dataset import Dataset
 from gemuco.schema import BodySchema
 from hal import registry
@@ -47,5 +48,5 @@ def model(robot: RobotConfig, console: Console) -> BodySchema:
         data = artifacts.data_path(robot.robot)
         if not data.exists():
             collector.collect_direct(robot, "geometric", 0).dataset.save(data)
-        trainer.train(robot, Dataset.load(data), 0, lambda *_: None).schema.save(folder)
+        save(trainer.train(robot, Dataset.load(data), 0, lambda *_: None).schema, folder)
     return load_model(robot, folder)

@@ -4,7 +4,7 @@
 
 On each of several actual arms the model first learns four simulated minutes of motion, then what is normal. Then every
 muscle is cut in turn, and every encoder reads 0.3 rad too much. The first twenty samples above the threshold are judged
-one by one (`BodySchema.anomaly`) and together (`gemuco.anomaly.blame`). Faults with less than three such samples are
+one by one (`gemuco.anomaly.score`) and together (`gemuco.anomaly.blame`). Faults with less than three such samples are
 left out.
 """
 
@@ -15,9 +15,11 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from gemuco.adaption.update import UpdateConfig, Updater
+from gemuco.adaption.config import UpdateConfig
+from gemuco.adaption.update import Updater
 from gemuco.anomaly.blame import suspects
-from gemuco.normal import Normal, prediction_errors
+from gemuco.anomaly.prediction import predict_error, prediction_errors
+from gemuco.normal import Normal
 from gemuco.schema import BodySchema
 from hal.config import RobotConfig, load_robot
 from services.model.model_config import model_config
@@ -37,7 +39,7 @@ def learned(robot: RobotConfig, schema: BodySchema, arm: int) -> BodySchema:
         updater.add({name: values[index] for name, values in lived.items()})
         updater.step()
     schema = updater.schema
-    return schema.with_normal(Normal.fit(schema.predict_error(fresh), schema.scaler.std[schema.out_index]))
+    return schema.with_normal(Normal.fit(predict_error(schema, fresh), schema.scaler.std[schema.out_index]))
 
 
 def judged(schema: BodySchema, rows: dict[str, np.ndarray], right: str) -> tuple[float, float] | None:

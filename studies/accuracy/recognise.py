@@ -17,8 +17,9 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
+from gemuco.adaption.config import UpdateConfig
 from gemuco.adaption.recognise import Prior
-from gemuco.adaption.update import UpdateConfig, Updater
+from gemuco.adaption.update import Updater
 from gemuco.dataset import Dataset, Episode
 from gemuco.learning.config import TrainConfig
 from gemuco.learning.train import fit

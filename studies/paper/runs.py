@@ -19,6 +19,7 @@ from pathlib import Path
 from queue import Empty
 from typing import Any, TypeVar
 
+from gemuco import checkpoint
 from gemuco.dataset import Dataset
 from gemuco.errors import CheckpointError, DatasetError
 from gemuco.learning import cores, devices
@@ -72,7 +73,7 @@ class Run:
         path, stamp = self.folder / name, self._stamp(settings)
         if self._is_current(name, stamp):
             try:
-                return BodySchema.load(path)
+                return checkpoint.load(path)
             except CheckpointError:
                 shutil.rmtree(path, ignore_errors=True)
         made = make()
@@ -81,7 +82,7 @@ class Run:
 
     def keep(self, name: str, schema: BodySchema, **settings: Any) -> None:
         """Have `schema` find this under a name."""
-        schema.save(self.folder / name)
+        checkpoint.save(schema, self.folder / name)
         self._remember(name, self._stamp(settings))
 
     def has(self, name: str, **settings: Any) -> bool:

@@ -18,6 +18,7 @@ from rich.console import Console
 from rich.table import Table
 from torch import nn
 
+from gemuco.estimation import estimate
 from gemuco.layers import Layer, Weights, run
 from gemuco.scaler import Scaler
 from gemuco.schema import BodySchema
@@ -114,7 +115,7 @@ def module_of(schema: BodySchema) -> nn.Sequential:
 
 def rivals(schema: BodySchema, values: dict[str, np.ndarray], hidden: str) -> dict[str, Callable[[], object]]:
     """Three ways to the hidden signal."""
-    mask = schema.estimate(values)[hidden].mask
+    mask = estimate(schema, values)[hidden].mask
     x = schema.network_input(schema.normalise(values), mask)
     chain, module = schema.weights.whole, module_of(schema)
     tail = np.concatenate([[name in mask for name in schema.x_in], schema.bias]).astype(np.float32)
@@ -129,7 +130,7 @@ def rivals(schema: BodySchema, values: dict[str, np.ndarray], hidden: str) -> di
         return module(torch.from_numpy(given)).numpy()[out]
 
     return {
-        "BodySchema.estimate": lambda: schema.estimate(values)[hidden].value,
+        "gemuco.estimate": lambda: estimate(schema, values)[hidden].value,
         "bare chain": lambda: run(chain, x),
         "torch nn.Module": by_module,
     }

@@ -24,7 +24,8 @@ import numpy as np
 import torch
 from torch import nn
 
-from gemuco.adaption.update import UpdateConfig, Updater
+from gemuco.adaption.config import UpdateConfig
+from gemuco.adaption.update import Updater
 from gemuco.schema import BodySchema
 from gemuco.search.descent import NewtonConfig
 from gemuco.warm import warm

@@ -8,9 +8,11 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 
+from gemuco.adaption.config import UpdateConfig
 from gemuco.adaption.recognise import Kalman
-from gemuco.adaption.update import UpdateConfig, Updater
+from gemuco.adaption.update import Updater
 from gemuco.compiled.inference import infer
+from gemuco.estimation import estimate
 from gemuco.search.descent import NewtonConfig
 from studies.speed.bodies import body
 from studies.speed.solvers import BALANCE, PAPER, TERMS, Ours
@@ -35,7 +37,7 @@ def by_hidden() -> dict[str, list[float]]:
     for hidden in HIDDEN:
         schema = body((hidden, hidden))
         size, gate = schema.layout.size, schema.gate(schema.masks[0])
-        asked = (*schema.ready.parts, np.zeros(size), *gate, np.ones(size, bool), np.empty(size))
+        asked = (*schema.parts, np.zeros(size), *gate, np.ones(size, bool), np.empty(size))
         plain, balanced = Ours(schema, "e", TERMS), Ours(schema, "e", (*TERMS, BALANCE))
         for name, job, calls in (
             ("estimate by mask", lambda asked=asked: infer(*asked), 300),
@@ -59,7 +61,7 @@ def by_signals() -> dict[str, list[float]]:
         row, seen = random.standard_normal(schema.layout.size), Kalman(schema)
         for _ in range(20):
             seen.see(schema, random.standard_normal(schema.layout.size))
-        found[NAMED].append(median(lambda schema=schema, values=values: schema.estimate(values), 100))
+        found[NAMED].append(median(lambda schema=schema, values=values: estimate(schema, values), 100))
         found["p update"].append(median(lambda seen=seen, schema=schema, row=row: seen.see(schema, row), 50))
     return found
 

@@ -16,10 +16,9 @@ import torch
 from gemuco.compiled.problem import Problem
 from gemuco.schema import BodySchema
 from gemuco.search.asked import Asked
-from gemuco.search.descent import Descent, DescentConfig, NewtonConfig
+from gemuco.search.descent import Descent, DescentConfig, NewtonConfig, minimise
 from gemuco.search.fold import fold
 from gemuco.search.losses import Match, StayNear, StaySmall, Term
-from gemuco.search.minimise import minimise
 from gemuco.search.routes import InputRoute, LatentRoute
 from gemuco.search.torque import TorqueBalance
 from studies.speed.bodies import body, modules

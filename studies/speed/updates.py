@@ -9,10 +9,12 @@ import numpy as np
 import torch
 from torch import nn
 
+from gemuco.adaption.config import UpdateConfig
 from gemuco.adaption.recognise import Kalman
 from gemuco.adaption.relearn import Relearner
-from gemuco.adaption.update import UpdateConfig, Updater
+from gemuco.adaption.update import Updater
 from gemuco.compiled.inference import infer
+from gemuco.estimation import estimate
 from gemuco.schema import BodySchema
 from services.process.realtime import freeze
 from studies.speed.bodies import MASKS, body, modules
@@ -48,7 +50,7 @@ def inference() -> Iterator[Row]:
         given = np.concatenate([np.where(gate > 0, (joined - mean) / std, 0.0), tail]).astype(np.float32)
         return network(torch.from_numpy(given)).numpy() * std + mean
 
-    parts, every = schema.ready.parts, np.ones(len(joined), bool)
+    parts, every = schema.parts, np.ones(len(joined), bool)
 
     def ours() -> np.ndarray:
         found = np.empty(len(joined))
@@ -72,9 +74,9 @@ def inference() -> Iterator[Row]:
         return {name: found[span] for name, span in schema.layout.slices.items()}
 
     yield faster(
-        "BodySchema.estimate: named arrays, with std, method and residual",
+        "gemuco.estimate: named arrays, with std, method and residual",
         "torch nn.Module, taken apart by name",
-        lambda: schema.estimate(values),
+        lambda: estimate(schema, values),
         named_by_torch,
         0.0,
         "no bar was named",

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gemuco.checkpoint import save
 from gemuco.dataset import Dataset, Episode
 from gemuco.learning.train import TrainConfig, fit
 from hal.config import RobotConfig
@@ -27,4 +28,4 @@ def make(robot: RobotConfig, rows: Mapping[str, np.ndarray], masks: tuple[tuple[
     episodes = tuple(Episode("", {name: value[part] for name, value in rows.items()}) for part in parts)
     config = TrainConfig(hidden=(40, 20), epochs=25, batch=200, rate=5e-3)
     schema, _ = fit(Dataset(layout_of(robot), episodes), config, masks)
-    schema.with_manifest(fingerprint=artifacts.fingerprint(robot)).save(folder)
+    save(schema.with_manifest(fingerprint=artifacts.fingerprint(robot)), folder)

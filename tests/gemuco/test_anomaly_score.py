@@ -1,10 +1,11 @@
 import numpy as np
 import pytest
 
-from gemuco.anomaly.score import Normal
+from gemuco.anomaly.prediction import judges, prediction_errors
+from gemuco.anomaly.score import score
 from gemuco.compiled.score import errors
 from gemuco.errors import NotEnoughData
-from gemuco.normal import prediction_errors
+from gemuco.normal import Normal
 
 
 def rows(values):
@@ -22,8 +23,8 @@ def cut(values, muscle):
 @pytest.mark.parametrize("muscle", range(5))
 def test_finds_a_cut_muscle_and_blames_it(schema, arm, muscle):
     healthy, broken = arm.sample(300, 77), cut(arm.sample(300, 78), muscle)
-    normal = np.array([schema.anomaly(row).score for row in rows(healthy)])
-    found = [schema.anomaly(row) for row in rows(broken)]
+    normal = np.array([score(schema, row).score for row in rows(healthy)])
+    found = [score(schema, row) for row in rows(broken)]
     odd = np.array([score.score for score in found])
     auc = np.mean(odd[:, None] > normal[None, :])
     assert auc > 0.9
@@ -35,7 +36,7 @@ def test_finds_a_cut_muscle_and_blames_it(schema, arm, muscle):
 
 
 def test_keeps_the_wanted_false_alarm_rate(schema, arm):
-    alarms = [schema.anomaly(row).is_anomaly for row in rows(arm.sample(2000, 99))]
+    alarms = [score(schema, row).is_anomaly for row in rows(arm.sample(2000, 99))]
     assert np.mean(alarms) < 0.01  # asked for 0.001, learned from 480 samples
 
 
@@ -58,7 +59,7 @@ def test_compiled_errors_and_distance_are_those_of_numpy(schema, arm, missing):
         if missing is not None:
             row[missing[0]][missing[1]] = np.nan
         joined = schema.layout.join_one(row)
-        found = errors(schema.ready.predictor, schema.ready.judges, joined)
+        found = errors(schema.predictor, schema.derived(judges), joined)
         expected = prediction_errors(schema, schema.normalise_one(row))
         np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-5 * schema.scaler.std[schema.out_index].max())
         judged = np.isfinite(expected)
@@ -73,19 +74,19 @@ def test_compiled_errors_and_distance_are_those_of_numpy(schema, arm, missing):
 def test_judges_by_what_is_there(schema, arm):
     row = rows(arm.sample(1, 5))[0]
     row["joint_position"][0] = np.nan
-    found = schema.anomaly(row)
+    found = score(schema, row)
     assert np.isfinite(found.score)
     assert np.isnan(found.contribution["joint_position"][0])
     assert found.threshold < schema.normal.threshold
     row["muscle_tension"][:] = np.nan
-    silent = schema.anomaly(row)
+    silent = score(schema, row)
     assert np.isnan(silent.score)
     assert silent.blamed == ""
     assert not silent.is_anomaly
 
 
 def test_without_normal_data_there_is_no_score(schema, arm):
-    found = schema.with_normal(None).anomaly(rows(arm.sample(1, 5))[0])
+    found = score(schema.with_normal(None), rows(arm.sample(1, 5))[0])
     assert np.isnan(found.score)
     assert np.isnan(found.threshold)
     assert not found.is_anomaly

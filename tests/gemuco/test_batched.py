@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from muscle_arm import LAYOUT, MuscleArm
 
-from gemuco.activation import ACTIVATIONS
 from gemuco.dataset import Dataset, Episode
+from gemuco.layers import ACTIVATIONS
 from gemuco.learning import cores, devices
 from gemuco.learning.train import Job, TrainConfig, fine_tune, fit, fit_all
 from gemuco.masks import all_masks, bits

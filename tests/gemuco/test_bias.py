@@ -5,9 +5,10 @@ import pytest
 from tool_arm import MASKS, ToolArm, dataset, tools
 
 from gemuco.adaption import recognise as bias
+from gemuco.adaption.config import UpdateConfig
 from gemuco.adaption.innovation import Innovations
 from gemuco.adaption.recognise import GaussNewton, Kalman, Prior
-from gemuco.adaption.update import UpdateConfig, Updater
+from gemuco.adaption.update import Updater
 from gemuco.errors import SchemaError
 from gemuco.layers import run
 from gemuco.learning.config import TrainConfig

@@ -11,16 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from muscle_arm import gravity
 
-from gemuco.activation import ACTIVATIONS
 from gemuco.compiled import descent, newton
 from gemuco.compiled.chain import pack, unpack
 from gemuco.compiled.learning import SQUARED, gradients, loss
-from gemuco.layers import Layer
+from gemuco.layers import ACTIVATIONS, Layer
 from gemuco.learning.network import Network
-from gemuco.search.descent import DescentConfig, NewtonConfig, descend
+from gemuco.search.descent import DescentConfig, NewtonConfig, descend, minimise
 from gemuco.search.fold import Lines, around, fold
 from gemuco.search.losses import Match, StayNear, StaySmall
-from gemuco.search.minimise import minimise
 from gemuco.search.norms import total
 from gemuco.search.routes import InputRoute, LatentRoute
 from gemuco.search.torque import TorqueBalance
@@ -199,7 +197,10 @@ def test_what_is_no_number_is_not_hidden():
 ALL_WAYS = """
 import numpy as np
 from gemuco import warm
-from gemuco.adaption.update import UpdateConfig
+from gemuco.adaption.config import UpdateConfig
+from gemuco.adaption.update import adapt
+from gemuco.anomaly import score as anomaly
+from gemuco.estimation import estimate
 from gemuco.compiled import bank, batch, chain, descent, inference, innovation, learning, newton, score
 from gemuco.controller import Controller
 from gemuco.search.losses import Match, StaySmall
@@ -210,15 +211,15 @@ before = [len(one.signatures) for one in used]
 body = warm.body().under("other")
 whole = {name: np.full(size, 0.1) for name, (size, _) in warm.SIGNALS.items()}
 for absent in whole:
-    body.estimate({name: value for name, value in whole.items() if name != absent})
-    body.estimate({absent: whole[absent]})
+    estimate(body, {name: value for name, value in whole.items() if name != absent})
+    estimate(body, {absent: whole[absent]})
 for route in ("latent", "input"):
     Controller(body, (Match("position"), StaySmall("tension")), "tension", route).solve({"position": np.zeros(1)})
 for what in ("weights", "bias", "both", "bias_then_weights"):
     for method in ("ekf", "gauss_newton", "gradient"):
-        body = body.adapt([whole] * 12, UpdateConfig(what=what, bias_method=method, minimum=1))
-    body.estimate({"length": whole["length"]})
-body.anomaly(whole)
+        body = adapt(body, [whole] * 12, UpdateConfig(what=what, bias_method=method, minimum=1))
+    estimate(body, {"length": whole["length"]})
+anomaly.score(body, whole)
 after = [len(one.signatures) for one in used]
 import sys
 assert before == after == [1] * len(used), (before, after)

@@ -2,9 +2,8 @@ import numpy as np
 import pytest
 import torch
 
-from gemuco.activation import ACTIVATIONS
 from gemuco.errors import SchemaError
-from gemuco.layers import Curvature, pull, push, run, trace
+from gemuco.layers import ACTIVATIONS, Curvature, pull, push, run, trace
 from gemuco.learning.network import MODULES, Network
 
 INPUTS, OUTPUTS, SAMPLES = 9, 6, 4

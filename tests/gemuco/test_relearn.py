@@ -2,7 +2,9 @@ import numpy as np
 import pytest
 
 from gemuco.adaption.relearn import gates, mean_error
+from gemuco.anomaly.score import score
 from gemuco.compiled.batch import under_masks
+from gemuco.estimation import estimate
 
 
 @pytest.fixture
@@ -22,7 +24,7 @@ def by_numpy(schema, rows, biases):
 
 def test_every_sample_is_learned_once_under_every_mask_that_it_allows(schema, rows):
     biases = np.random.default_rng(1).standard_normal((len(rows), len(schema.bias))).astype(np.float32)
-    found = under_masks(rows, biases, *gates(schema), schema.ready.predictor)
+    found = under_masks(rows, biases, *gates(schema), schema.predictor)
     for ours, theirs in zip(found, zip(*by_numpy(schema, rows, biases), strict=True), strict=True):
         np.testing.assert_array_equal(ours, np.concatenate(theirs))
 
@@ -39,11 +41,11 @@ def test_the_mean_error_is_that_of_numpy(schema, rows):
 def test_what_the_last_schema_was_asked_is_ready_in_the_next(schema, arm, monkeypatch):
     row = {name: array[0] for name, array in arm.sample(1, 5).items()}
     row["joint_position"][0] = np.nan
-    schema.estimate(row)
-    schema.anomaly(row)
+    estimate(schema, row)
+    score(schema, row)
     after = schema.with_weights(schema.weights)
-    after.ready.prepare(schema.ready)
-    for name in ("Plan", "Judgement"):
-        monkeypatch.delattr(f"gemuco.derived.{name}")  # nothing is worked out any more
-    assert after.estimate(row)["joint_position"].method == "mask"
-    assert after.anomaly(row).score == pytest.approx(schema.anomaly(row).score)
+    after.prepare(schema)
+    for module, name in (("estimation", "Recipe"), ("anomaly.prediction", "Judgement")):
+        monkeypatch.delattr(f"gemuco.{module}.{name}.of")  # nothing is worked out any more
+    assert estimate(after, row)["joint_position"].method == "mask"
+    assert score(after, row).score == pytest.approx(score(schema, row).score)

@@ -7,7 +7,7 @@ from muscle_arm import HIGH, LOW, gravity
 from gemuco.errors import NotFinite, NotObservable, SchemaError, UnknownSignal, WrongSize
 from gemuco.search.losses import Hold, Match, StaySmall
 from gemuco.search.torque import TorqueBalance
-from gemuco.simulation import Simulator
+from gemuco.simulation import Simulator, simulate
 
 LENGTH, TENSION, POSITION = "muscle_length", "muscle_tension", "joint_position"
 MASK = frozenset({POSITION, TENSION})
@@ -98,7 +98,7 @@ def test_without_constraints_a_feasible_mask_is_enough(schema, arm):
     held = Simulator(schema, (Hold(TENSION, tuple(tension)),), LENGTH).step(length)
     assert (held.route, held.mask) == ("mask", {TENSION, LENGTH})
     assert np.linalg.norm(held.values[POSITION] - theta) < 0.1
-    states = schema.simulate([length, length], command=LENGTH, terms=(Hold(TENSION),), given={TENSION: tension})
+    states = simulate(schema, [length, length], command=LENGTH, terms=(Hold(TENSION),), given={TENSION: tension})
     assert [state.route for state in states] == ["mask", "mask"]
     np.testing.assert_array_equal(states[1].values[POSITION], held.values[POSITION])
 

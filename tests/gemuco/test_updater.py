@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 from muscle_arm import MuscleArm
 
-from gemuco.adaption.update import UpdateConfig, Updater
+from gemuco.adaption.config import UpdateConfig
+from gemuco.adaption.update import Updater
 from gemuco.errors import SchemaError, UnknownSignal, WrongSize
 
 FL = frozenset({"muscle_tension", "muscle_length"})

@@ -3,10 +3,11 @@ import pytest
 from tool_arm import ToolArm, dataset, tools
 
 from gemuco.anomaly.blame import parts, suspects
-from gemuco.anomaly.score import Normal
+from gemuco.anomaly.prediction import predict_error
 from gemuco.anomaly.verdict import judge, window_score
 from gemuco.learning.config import TrainConfig
 from gemuco.learning.train import fit
+from gemuco.normal import Normal
 from gemuco.schema import BodySchema
 
 TOOLS = tools((0.2, 0.35, 0.5), (0.0, 0.8), (0.3,))
@@ -20,7 +21,7 @@ def grips() -> BodySchema:
     config = TrainConfig(hidden=(50, 25), latent=8, bias_size=2, epochs=80, batch=100, rate=5e-3)
     outputs = ("center_of_gravity", "tool_tip_position")
     schema = fit(dataset(TOOLS, 300), config, masks, x_out=outputs)[0].under(HELD)
-    errors = schema.predict_error(TOOLS[HELD].sample(1000, 3))
+    errors = predict_error(schema, TOOLS[HELD].sample(1000, 3))
     return schema.with_normal(Normal.fit(errors, schema.scaler.std[schema.out_index]))
 
 

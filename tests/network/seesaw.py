@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from gemuco.checkpoint import save
+
 sys.path.append(str(Path(__file__).parents[1] / "services"))
 import small_arm
 
@@ -79,7 +81,7 @@ def train(robot: RobotConfig, folder: Path) -> None:
     ]
     config = TrainConfig(hidden=(40, 20), epochs=30, batch=200, rate=5e-3)
     schema = fit(Dataset(layout_of(robot), tuple(episodes)), config, MASKS)[0]
-    schema.with_manifest(fingerprint=fingerprint(robot)).save(folder)
+    save(schema.with_manifest(fingerprint=fingerprint(robot)), folder)
 
 
 class SeesawWorld(small_arm.WireWorld):

@@ -9,7 +9,7 @@ import yaml
 from small_hand import OUT_OF_SIGHT, config, gravity_of, tip_of
 from typer.testing import CliRunner
 
-from gemuco.schema import BodySchema
+from gemuco.checkpoint import load
 from hal.errors import ConfigError
 from services.cli import app
 from services.learning.collector import Wanted, collect_direct
@@ -222,6 +222,6 @@ def test_from_the_command_line_to_a_model_that_knows_every_condition(
     assert (code, "300 samples in runs/small_hand/data.npz" in told) == (0, True), told
     code, told = gemuco("train", str(robot))
     assert code == 0, told
-    assert tuple(BodySchema.load(tmp_path / "runs" / "small_hand" / "model").biases) == ("short", "long")
+    assert tuple(load(tmp_path / "runs" / "small_hand" / "model").biases) == ("short", "long")
     code, told = gemuco("collect", str(robot), "--condition", "middle")
     assert (code, "has no condition 'middle'. Known conditions: short, long" in told) == (2, True), told

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from arm_model import arm, fresh, small_model
 
+from gemuco.estimation import estimate
 from hal.clock import ManualClock
 from services.errors import NotEngaged, TargetRefused
 from services.model.control_loop import BUMP, Control
@@ -96,7 +97,7 @@ def test_the_settled_command_is_what_the_model_says_of_the_posture() -> None:
     posture = bench.newest.sample.values["joint_position"]
     schema = small_model()
     settled = bench.sent[-1].values
-    found = schema.estimate({"muscle_length": settled, "muscle_tension": np.full(10, 50.0)})["joint_position"].value
+    found = estimate(schema, {"muscle_length": settled, "muscle_tension": np.full(10, 50.0)})["joint_position"].value
     assert np.isfinite(found).all()
     assert np.ptp([command.values for command in bench.sent[-5:]], axis=0).max() < 1e-4  # m
     assert np.abs(settled - bench.newest.sample.values["muscle_length"]).max() < 0.05  # m

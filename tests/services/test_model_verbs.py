@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from arm_model import arm, small_model, states
 
+from gemuco.anomaly.score import score
 from gemuco.errors import NotFinite, NotObservable, UnknownSignal, WrongSize
+from gemuco.estimation import estimate
 from services.client import Client
 from services.errors import BadArguments
 from services.model.control_config import controller_of, simulator_of
@@ -38,19 +40,19 @@ def sample() -> dict[str, np.ndarray]:
 
 def test_estimates_given_values_like_the_schema_itself(client: Client, sample: dict[str, np.ndarray]) -> None:
     far = client.estimate(sample, hide=["joint_position"])
-    near = small_model().estimate({name: value for name, value in sample.items() if name != "joint_position"})
+    near = estimate(small_model(), {name: value for name, value in sample.items() if name != "joint_position"})
     assert far is not None
-    for name, estimate in near.items():
-        np.testing.assert_allclose(far.values[name], estimate.value)
-        np.testing.assert_allclose(far.std[name], estimate.std)
-        assert far.method[name] == estimate.method
+    for name, known in near.items():
+        np.testing.assert_allclose(far.values[name], known.value)
+        np.testing.assert_allclose(far.std[name], known.std)
+        assert far.method[name] == known.method
     assert far.mask["joint_position"] == "muscle_tension+muscle_length"
 
 
 def test_judges_given_values_like_the_schema_itself(client: Client, sample: dict[str, np.ndarray]) -> None:
     broken = {**sample, "muscle_tension": sample["muscle_tension"] + 100.0}
     for values in (sample, broken):
-        far, near = client.anomaly(values), small_model().anomaly(values)
+        far, near = client.anomaly(values), score(small_model(), values)
         assert far is not None
         assert far.score == pytest.approx(near.score)
         assert (far.is_anomaly, far.blamed) == (near.is_anomaly, near.blamed)

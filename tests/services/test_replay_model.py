@@ -11,6 +11,7 @@ from msgspec.structs import replace
 from recorded_arm import BEGIN, SECOND
 from small_arm import eventually
 
+from gemuco.estimation import estimate
 from services.client import Client
 from services.model.gemuco_service import GemucoService
 from services.process.service import Service
@@ -68,7 +69,7 @@ def test_the_estimates_are_those_of_the_recorded_samples(model: GemucoService, r
                 eventually(lambda cycle=cycle: _of(client, cycle) is not None)
                 seen, sample = _of(client, cycle), sample_of(cycle, cycle, silent(cycle))
                 assert seen is not None
-                near = small_model().estimate(sample.values)
+                near = estimate(small_model(), sample.values)
                 for name, one in near.items():
                     np.testing.assert_allclose(seen.values[name], one.value, atol=1e-9)
                     np.testing.assert_array_equal(seen.estimated[name], one.estimated)

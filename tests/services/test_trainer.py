@@ -7,6 +7,7 @@ import pytest
 from arm_model import arm, states
 from rich.console import Console
 
+from gemuco.anomaly.prediction import predict_error
 from gemuco.dataset import Dataset, Episode
 from gemuco.errors import DatasetError, NotWritten
 from gemuco.learning.history import History
@@ -105,7 +106,7 @@ def test_a_model_is_fine_tuned_on_few_samples_of_another_body(robot, dataset, st
     assert tuned.schema.masks == straight.schema.masks
 
     def wrong(schema):
-        return float(np.abs(schema.predict_error(longer)[:, schema.out_layout.slice("muscle_length")]).mean())
+        return float(np.abs(predict_error(schema, longer)[:, schema.out_layout.slice("muscle_length")]).mean())
 
     assert wrong(tuned.schema) < 0.7 * wrong(straight.schema)
     trainer.save(tuned, tmp_path / "model")

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from arm_model import MASKS, arm, fresh, small_model, states
 
-from gemuco.adaption.update import UpdateConfig as Learning
+from gemuco.adaption.config import UpdateConfig as Learning
 from gemuco.adaption.update import Updater
 from gemuco.dataset import Dataset, Episode
 from gemuco.errors import NotEnoughData

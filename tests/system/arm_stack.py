@@ -7,6 +7,7 @@ from pathlib import Path
 
 import yaml
 
+from gemuco.checkpoint import save
 from hal.config import load_robot
 from hal.errors import CommandRefused
 from services.client import Client
@@ -45,7 +46,7 @@ class Stack:
         self.file = folder / f"{robot}.yaml"
         self.file.write_text(yaml.safe_dump(description, sort_keys=False))
         self.model = folder / "runs" / robot / "model"
-        small_model().with_manifest(fingerprint=fingerprint(load_robot(self.file))).save(self.model)
+        save(small_model().with_manifest(fingerprint=fingerprint(load_robot(self.file))), self.model)
         self.supervisor = Supervisor(folder / "logs")
         self.client = Client(robot)
         self.commands = {

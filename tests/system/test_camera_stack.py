@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import yaml
 
+from gemuco.checkpoint import save
 from gemuco.dataset import Dataset, Episode
 from gemuco.learning.train import TrainConfig, fit
 from gemuco.schema import BodySchema
@@ -65,7 +66,7 @@ class Stack:
         self.file = folder / f"{robot}.yaml"
         self.file.write_text(yaml.safe_dump(description(robot)))
         model = folder / "model"
-        small_model(self.file).under("short").save(model)
+        save(small_model(self.file).under("short"), model)
         self.supervisor = Supervisor(folder / "logs")
         self.client = Client(robot)
         self.commands = {

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
+from gemuco.checkpoint import save
 from gemuco.dataset import Dataset, Episode
 from gemuco.learning.train import TrainConfig, fit
 from hal.config import load_robot
@@ -50,7 +51,7 @@ def robot_with_model(folder: Path) -> Path:
     dataset = Dataset(layout_of(robot), tuple(episodes))
     training = TrainConfig(hidden=(30, 20), latent=6, bias_size=2, epochs=10, batch=100, rate=1e-2)
     schema, _ = fit(dataset, training, (("joint_position",),), x_out=("center_of_gravity", "tool_tip_position"))
-    schema.with_manifest(fingerprint=fingerprint(robot)).save(folder / "runs" / name / "model")
+    save(schema.with_manifest(fingerprint=fingerprint(robot)), folder / "runs" / name / "model")
     return file
 
 

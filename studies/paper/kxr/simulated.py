@@ -6,7 +6,7 @@ from itertools import product
 
 import numpy as np
 
-from gemuco.adaption.update import UpdateConfig
+from gemuco.adaption.config import UpdateConfig
 from gemuco.dataset import Dataset
 from gemuco.masks import all_masks, label
 from gemuco.schema import BodySchema

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gemuco.adaption.update import UpdateConfig, Updater
+from gemuco.adaption.config import UpdateConfig
+from gemuco.adaption.update import Updater
 from gemuco.schema import BodySchema
 from gemuco.search.descent import DescentConfig
 from hal.config import RobotConfig

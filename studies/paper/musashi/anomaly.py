@@ -4,8 +4,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from gemuco.anomaly.score import Normal
+from gemuco.anomaly.prediction import predict_error
 from gemuco.dataset import Dataset, Episode
+from gemuco.normal import Normal
 from gemuco.schema import BodySchema
 from studies.paper.musashi.model import arrays
 from studies.paper.musashi.motion import RATE
@@ -18,7 +19,7 @@ SETTLED = 1.0
 
 def with_normal(schema: BodySchema, recording: Dataset) -> BodySchema:
     """The schema with what is normal learned from a healthy, unloaded arm."""
-    errors = schema.predict_error(arrays(recording, schema))
+    errors = predict_error(schema, arrays(recording, schema))
     return schema.with_normal(Normal.fit(errors, schema.scaler.std[schema.out_index]))
 
 
@@ -26,7 +27,7 @@ def scores(schema: BodySchema, recording: Dataset) -> np.ndarray:
     """Mahalanobis distance of every sample, shape (n,)."""
     if schema.normal is None:
         raise ValueError("This schema has not learned what is normal; give it to `with_normal` first.")
-    return schema.normal.distances(schema.predict_error(arrays(recording, schema)))
+    return schema.normal.distances(predict_error(schema, arrays(recording, schema)))
 
 
 def area(ill: np.ndarray, well: np.ndarray) -> float:

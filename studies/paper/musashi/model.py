@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gemuco.adaption.update import UpdateConfig, Updater
+from gemuco.adaption.config import UpdateConfig
+from gemuco.adaption.update import Updater
 from gemuco.dataset import Dataset, Episode
 from gemuco.masks import all_masks, label
 from gemuco.schema import BodySchema

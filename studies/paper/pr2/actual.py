@@ -5,7 +5,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gemuco.adaption.update import UpdateConfig, Updater
+from gemuco.adaption.config import UpdateConfig
+from gemuco.adaption.update import Updater
 from gemuco.dataset import Dataset, Episode
 from gemuco.learning.train import fine_tune
 from gemuco.schema import BodySchema

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from gemuco.adaption.update import UpdateConfig
+from gemuco.adaption.config import UpdateConfig
 from gemuco.dataset import Dataset
 from gemuco.schema import BodySchema
 from services.learning.collector import Wanted, collect_direct

@@ -5,8 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gemuco.adaption.update import UpdateConfig, Updater
+from gemuco.adaption.config import UpdateConfig
+from gemuco.adaption.update import Updater
 from gemuco.controller import Controller
+from gemuco.estimation import estimate
 from gemuco.schema import BodySchema
 from gemuco.search.descent import DescentConfig
 from gemuco.search.losses import Match, StayNear
@@ -45,7 +47,7 @@ def estimate_along(arm: Arm, schema: BodySchema, postures: np.ndarray, update: U
     for posture in postures:
         measured = arm.go(posture)
         now = updater.schema
-        errors.append(_distance(now.estimate({JOINTS: measured[JOINTS]})[TIP].value, arm.tip()))
+        errors.append(_distance(estimate(now, {JOINTS: measured[JOINTS]})[TIP].value, arm.tip()))
         biases.append(now.bias)
         updater.add(measured)
         updater.step()

@@ -1,0 +1,58 @@
+"""Settings of the online update (paper, II-F)."""
+
+from dataclasses import dataclass
+
+from gemuco.errors import SchemaError, whole_number
+from gemuco.optimiser import OPTIMISERS
+
+WHAT = ("weights", "bias", "both", "bias_then_weights")
+METHODS = ("ekf", "gauss_newton", "gradient")
+
+
+@dataclass(frozen=True, slots=True)
+class UpdateConfig:
+    """What to update, and how.
+
+    Attributes:
+        what: `weights`, `bias`, `both` at once by gradient, or `bias_then_weights`: W moves only while p is settled.
+            Without parametric bias this is the same as `weights`.
+        bias_method: `ekf`, `gauss_newton` (both from the first sample), or `gradient`, the paper's.
+        window: Samples kept; the oldest are dropped.
+        minimum: Samples needed before the first gradient step.
+        batch: Samples per gradient step, drawn from window, constraints and replay; each under every mask it allows.
+        steps: Gradient steps per `Updater.step`.
+        rate: Learning rate of W.
+        bias_rate: Learning rate of p, for `gradient` and `both`.
+        optimiser: `adam` or `sgd` (with momentum 0.9), for W and p.
+        replay: As how many samples of the window the training data counts, each under the p of its own condition. A
+            young window then cannot pull W far from what was known, and a full one outweighs what is known to be old.
+        held_out: Every so many-th sample is never learned from and judges W, which goes back when it does worse there;
+            0 learns from all and never goes back.
+        seed: For the draws.
+    """
+
+    what: str = "bias_then_weights"
+    bias_method: str = "ekf"
+    window: int = 6000
+    minimum: int = 10
+    batch: int = 100
+    steps: int = 3
+    rate: float = 1e-4
+    bias_rate: float = 0.02
+    optimiser: str = "adam"
+    replay: int = 300
+    held_out: int = 5
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, known in (("what", WHAT), ("bias_method", METHODS), ("optimiser", OPTIMISERS)):
+            if getattr(self, name) not in known:
+                raise SchemaError(f"{name} '{getattr(self, name)}' is not known. Known: {', '.join(known)}.")
+        for name, least in (("window", 1), ("minimum", 1), ("batch", 1), ("steps", 0), ("replay", 0), ("held_out", 0)):
+            whole_number(f"Update: {name}", getattr(self, name), least)
+        whole_number("Update: seed", self.seed, 0)
+        for name in ("rate", "bias_rate"):
+            if not 0.0 <= getattr(self, name) < float("inf"):
+                raise SchemaError(f"Update: {name} is {getattr(self, name)}; it must be 0 or a positive number.")
+        if self.held_out == 1:
+            raise SchemaError("held_out 1 holds every sample out and leaves none to learn from; use 0 or 2 and more.")
