@@ -1,7 +1,7 @@
-"""The table of roles as zenoh's access control: what the node at one end of a link lets the other end do.
+"""Access control of zenoh, made from the table of roles: the messages that a node accepts from the other end of a link.
 
-Every exchange needs both directions: a subscriber's declaration in, and the samples out. A rule lets through only keys
-that it includes, so that neither a subscription nor a put may be wider than what is allowed.
+Every exchange needs both directions: a subscriber's declaration in, and the samples out. A rule matches only keys that
+it includes, so neither a subscription nor a put may be wider than what is allowed.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -11,7 +11,7 @@ from services.wire import keys
 from services.wire.roles import ASKED, COMPUTING, RATES, ROLES, SIZES, Role
 
 Rule = tuple[str, tuple[str, ...], tuple[str, ...]]
-"""Flow, messages, keys."""
+"""A rule is a flow, the messages in that flow, and the keys that they may have."""
 _OPPOSITE = {"ingress": "egress", "egress": "ingress"}
 _ALL = (f"{keys.ROOT}/**",)
 _EVERY_MESSAGE = (
@@ -19,18 +19,18 @@ _EVERY_MESSAGE = (
     "declare_liveliness_subscriber", "liveliness_query",
 )  # fmt: skip
 THROUGH: tuple[Rule, ...] = (("ingress", _EVERY_MESSAGE, _ALL), ("egress", _EVERY_MESSAGE, _ALL))
-"""Between the routers of a fleet: each has judged its own already."""
+"""These rules hold between the routers of a fleet, since each router has checked its own members already."""
 
 
 def rules_of(role: Role, robots: Iterable[str]) -> list[Rule]:
-    """What a role may do with these robots (`*`: all), as seen by the node that it is linked to."""
+    """Return what a role may do with these robots (`*`: all), as seen by the node that it is linked to."""
     names = tuple(robots)
 
     def of(nouns: Iterable[str]) -> tuple[str, ...]:
         return tuple(keys.robot_key(robot, noun) for robot in names for noun in nouns)
 
     sees = of(["*/alive"])
-    found: list[Rule] = [
+    rules: list[Rule] = [
         ("ingress", ("declare_liveliness_subscriber", "liveliness_query"), sees),
         ("egress", ("liveliness_token",), sees),
         ("ingress", ("put",), of(role.says)),
@@ -43,46 +43,52 @@ def rules_of(role: Role, robots: Iterable[str]) -> list[Rule]:
         ("egress", ("query",), of(role.answers)),
         ("ingress", ("liveliness_token",), of(role.alive)),
     ]
-    return [rule for rule in found if rule[2]]
+    return [rule for rule in rules if rule[2]]
 
 
 def mirrored(rules: Iterable[Rule]) -> list[Rule]:
-    """The same as seen from the other end of the link."""
+    """Return the same rules as seen from the other end of the link."""
     return [(_OPPOSITE[flow], messages, names) for flow, messages, names in rules]
 
 
 def access_control(subjects: Mapping[str, tuple[Mapping[str, Sequence[str]], Iterable[Rule]]]) -> dict[str, Any]:
-    """Zenoh's `access_control`.
+    """Return zenoh's section `access_control`.
 
     Args:
-        subjects: Name -> how zenoh knows it (certificate, user), and what it may do.
+        subjects: Name -> certificate and user by which zenoh identifies it, and its rules.
     """
     rules, policies = [], []
     for name, (_, allowed) in subjects.items():
         numbered = {f"{name} {number}": rule for number, rule in enumerate(allowed)}
         rules += [
-            {"id": one, "permission": "allow", "flows": [flow], "messages": list(messages), "key_exprs": list(names)}
-            for one, (flow, messages, names) in numbered.items()
+            {
+                "id": rule_id,
+                "permission": "allow",
+                "flows": [flow],
+                "messages": list(messages),
+                "key_exprs": list(names),
+            }
+            for rule_id, (flow, messages, names) in numbered.items()
         ]
         policies.append({"subjects": [name], "rules": list(numbered)})
     return {
         "enabled": True,
         "default_permission": "deny",
         "rules": rules,
-        "subjects": [{"id": name, **how} for name, (how, _) in subjects.items()],
+        "subjects": [{"id": name, **identity} for name, (identity, _) in subjects.items()],
         "policies": policies,
     }
 
 
-def known_by(name: str, dials: bool) -> dict[str, list[str]]:
-    """How a node knows who is at the other end: by certificate, and by user if the other one dialled."""
+def identity_of(name: str, dials: bool) -> dict[str, list[str]]:
+    """Return how a node identifies the other end: by certificate, and also by user if the other end dialled."""
     return {"cert_common_names": [name]} | ({"usernames": [name]} if dials else {})
 
 
 def limits(robots: Iterable[str]) -> dict[str, Any]:
-    """Rate and size limits of a router; a rule about rates is one budget, so each key has its own."""
+    """Return rate and size limits of a router; a rule about rates is one budget, so each key has its own rule."""
     names = list(robots)
-    told = [(keys.robot_key(robot, noun), rate) for robot in names for noun, rate in RATES.items()]
+    published = [(keys.robot_key(robot, noun), rate) for robot in names for noun, rate in RATES.items()]
     asked = [
         (keys.verb(robot, service, verb), ASKED)
         for robot in names
@@ -97,7 +103,7 @@ def limits(robots: Iterable[str]) -> dict[str, Any]:
                 "messages": [message],
                 "rules": [{"key_expr": key, "freq": rate} for key, rate in of],
             }
-            for message, of in (("put", told), ("query", asked))
+            for message, of in (("put", published), ("query", asked))
         ],
         "low_pass_filter": [
             {

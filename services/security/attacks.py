@@ -1,4 +1,4 @@
-"""What somebody could try who must not, one function per subject; each tells what was refused and what was not."""
+"""Attacks on a secured installation, one function per subject; each yields what was refused and what was not."""
 
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -11,22 +11,22 @@ import zenoh
 from services.security.authority import Authority, Identity, encoded
 from services.security.init import CA, CA_KEY
 from services.security.plan import Plan
-from services.security.stage import PAUSE, PAYLOAD, Ears, Stage, answer, answered, until
+from services.security.stage import PAUSE, PAYLOAD, Listener, Stage, answer, answered, until
 from services.wire.roles import RATES, SIZES
 
 Verdict = Literal["refused", "NOT REFUSED", "works", "DOES NOT WORK", "not tried"]
 REPEATS = 5
-"""Attempts of each attack: one message may be lost by chance."""
+"""Every attack is repeated this often, because one message may be lost by chance."""
 FLOOD = 0.5
-"""How long [s] to flood."""
+"""A flood lasts this long [s]."""
 LISTENS = 0.3
-"""How long [s] to listen for what should not be heard, after those have heard it who should."""
+"""After the permitted receivers have heard a message, the check listens this long [s] for the others."""
 NEVER_HEARD = b"gemuco security check, forged"
 
 
 @dataclass(frozen=True, slots=True)
 class Attempt:
-    """What was tried, and what came of it."""
+    """An attempt and its result."""
 
     what: str
     verdict: Verdict
@@ -34,31 +34,31 @@ class Attempt:
 
 
 def refused(what: str, is_refused: bool, text: str = "") -> Attempt:
-    """An attack."""
+    """Return the result of an attack."""
     return Attempt(what, "refused" if is_refused else "NOT REFUSED", text)
 
 
 def allowed(what: str, works: bool, text: str = "") -> Attempt:
-    """Its counterpart: without it, a refusal would prove nothing."""
+    """Return the result of a permitted use; without it a refusal would prove nothing."""
     return Attempt(what, "works" if works else "DOES NOT WORK", text)
 
 
 def people(plan: Plan) -> tuple[str, str, str]:
-    """Names of an operator and a viewer of the attacked robot, and the robot's name."""
+    """Return the names of an operator and a viewer of the attacked robot, and the robot's name."""
     robot = next(iter(plan.robots))
     named = {person.role: name for name, person in reversed(plan.people.items()) if {"*", robot} & set(person.robots)}
     return named.get("operator", ""), named.get("viewer", ""), robot
 
 
 def entering(stage: Stage, name: str, where: str = "", at: str = "the router") -> Iterator[Attempt]:
-    """Getting in with less than all that it takes."""
+    """Try to connect without one of the things that a connection needs."""
     stage.member(name, where)
-    yield allowed(f"{name} gets in at {at}", True)
+    yield allowed(f"{name} connects to {at}", True)
 
     def tried(what: str, change: Callable[[dict[str, Any], dict[str, Any], dict[str, Any]], None]) -> Attempt:
-        found = stage.outside(name, where)
-        change(found, found["transport"]["link"]["tls"], found["transport"]["auth"]["usrpwd"])
-        return refused(f"{what} at {at}", not stage.enters(found))
+        configured = stage.outside(name, where)
+        change(configured, configured["transport"]["link"]["tls"], configured["transport"]["auth"]["usrpwd"])
+        return refused(f"{what} at {at}", not stage.enters(configured))
 
     yield tried("clear text", _clear_text)
     yield tried("no certificate", _no_certificate)
@@ -73,15 +73,15 @@ def entering(stage: Stage, name: str, where: str = "", at: str = "the router") -
         yield Attempt(f"expired certificate at {at}", "not tried", f"{CA_KEY} is not here to sign one")
     yield tried("wrong password", lambda _, __, login: login.update(password="wrong"))
     yield tried("unknown user", lambda _, __, login: login.update(user="stranger"))
-    yield tried("no password", lambda found, _, __: found["transport"].pop("auth"))
+    yield tried("no password", lambda configured, _, __: configured["transport"].pop("auth"))
 
 
 def at_the_hal(stage: Stage, operator: str, viewer: str) -> Iterator[Attempt]:
-    """The robot's own links are for its own services only."""
+    """Try to use the robot's direct links without being one of its services."""
     yield from entering(stage, f"model.{stage.robot}", stage.hal, "the HAL")
     for name in (operator, viewer):
         yield refused(f"{name} past the router, at the HAL", not stage.enters(stage.outside(name, stage.hal)))
-    heard = Ears(stage.hal_session, stage.key("hal", "command"))
+    heard = Listener(stage.hal_session, stage.key("hal", "command"))
     recorder = stage.member(f"recorder.{stage.robot}", stage.hal)
     model = stage.member(f"model.{stage.robot}", stage.hal)
     for _ in range(REPEATS):
@@ -93,7 +93,7 @@ def at_the_hal(stage: Stage, operator: str, viewer: str) -> Iterator[Attempt]:
 
 
 class Inside:
-    """Attacks of those who were let in."""
+    """Attacks by members that were accepted."""
 
     def __init__(self, stage: Stage, operator: str, viewer: str) -> None:
         self.stage = stage
@@ -102,22 +102,25 @@ class Inside:
         self.names = operator, viewer
         self.recorder = stage.member(f"recorder.{stage.robot}")
         self.hal = stage.member(f"hal.{stage.robot}")
-        self.heard, self.seen = Ears(self.recorder, stage.key("**")), Ears(self.viewer, stage.key("hal", "status"))
+        self.heard, self.seen = (
+            Listener(self.recorder, stage.key("**")),
+            Listener(self.viewer, stage.key("hal", "status")),
+        )
         self._number = 0
 
     def run(self) -> Iterator[Attempt]:
-        """All of them."""
+        """Make all attacks."""
         yield from self.allowed()
-        yield from self.saying()
-        yield from self.anothers_password()
+        yield from self.publishing()
+        yield from self.foreign_password()
         yield from self.spying()
-        yield from self.asking()
-        yield from self.serving()
+        yield from self.querying()
+        yield from self.answering()
         yield from self.robots()
         yield from self.limits()
 
     def allowed(self) -> Iterator[Attempt]:
-        """What must work, or else the rest would prove nothing."""
+        """Check what must work, since otherwise the rest would prove nothing."""
         stage = self.stage
         yield allowed("operator commands", self.settled())
         status = stage.key("hal", "status")
@@ -131,13 +134,13 @@ class Inside:
         yield allowed("viewer sees who is alive", until(lambda: "model" in self._alive(self.viewer)))
 
     def settled(self) -> bool:
-        """Whether what the operator says now is heard; whatever was said before has been then, if it ever is."""
+        """Whether a new message of the operator arrives; earlier messages have then arrived too, if they ever do."""
         self._number += 1
         mark = PAYLOAD + str(self._number).encode()
         return until(lambda: self.operator.put(self.command, mark) is None and self.heard.count(mark))
 
-    def saying(self) -> Iterator[Attempt]:
-        """A viewer says nothing, under no name."""
+    def publishing(self) -> Iterator[Attempt]:
+        """Publish as a viewer, who may publish nothing."""
         stage, forged = self.stage, (("hal", "sample"), ("model", "estimate"), ("vision", "sample"))
         attacks = {
             "viewer commands": self.command,
@@ -147,13 +150,13 @@ class Inside:
             **{f"viewer forges {service}/{noun}": stage.key(service, noun) for service, noun in forged},
         }
         before = self.heard.count(b"")
-        yield from self._said(self.viewer, attacks, lambda: self.viewer.delete(self.command))
+        yield from self._published(self.viewer, attacks, lambda: self.viewer.delete(self.command))
         yield refused("viewer deletes", self.heard.count(b"") == before)
 
-    def _said(
+    def _published(
         self, session: zenoh.Session, attacks: Mapping[str, str], also: Callable[[], object] = lambda: None
     ) -> Iterator[Attempt]:
-        """Put on keys; each attack has a payload of its own, by which it is known wherever it is heard."""
+        """Put on keys; each attack has its own payload, which identifies it wherever it arrives."""
         marks = {what: NEVER_HEARD + what.encode() for what in attacks}
         for _ in range(REPEATS):
             for what, key in attacks.items():
@@ -165,40 +168,40 @@ class Inside:
         for what, mark in marks.items():
             yield refused(what, not self.heard.count(mark))
 
-    def anothers_password(self) -> Iterator[Attempt]:
-        """Both belong together: who has one of them gets in, and can do nothing."""
+    def foreign_password(self) -> Iterator[Attempt]:
+        """Connect with one member's certificate and another's password, which must give no rights."""
         operator, viewer = self.names
-        found = self.stage.outside(viewer)
-        found["transport"]["auth"] = self.stage.outside(operator)["transport"]["auth"]
+        configured = self.stage.outside(viewer)
+        configured["transport"]["auth"] = self.stage.outside(operator)["transport"]["auth"]
         what = "viewer's certificate with the operator's password"
         try:
-            mixed = self.stage.open(found)
+            mixed = self.stage.open(configured)
         except zenoh.ZError:
-            yield refused(what, True, "not even let in")
+            yield refused(what, True, "the connection was refused")
             return
-        ears = Ears(mixed, self.stage.key("hal", "status"))
-        yield from self._said(mixed, {f"{what}: commands": self.command})
-        yield refused(f"{what}: looks on", not self._shown(ears))
+        listener = Listener(mixed, self.stage.key("hal", "status"))
+        yield from self._published(mixed, {f"{what}: commands": self.command})
+        yield refused(f"{what}: looks on", not self._shown(listener))
 
-    def _shown(self, *ears: Ears) -> bool:
-        """Whether anybody but the viewer hears a status that the viewer hears."""
+    def _shown(self, *listeners: Listener) -> bool:
+        """Whether a listener hears a status that the viewer hears."""
         self._number += 1
         mark, key = PAYLOAD + str(self._number).encode(), self.stage.key("hal", "status")
         until(lambda: self.hal.put(key, mark) is None and self.seen.count(mark))
-        return until(lambda: any(one.count(mark) for one in ears), LISTENS)
+        return until(lambda: any(listener.count(mark) for listener in listeners), LISTENS)
 
     def spying(self) -> Iterator[Attempt]:
-        """What is commanded is for the robot."""
+        """Subscribe to commands, which only the robot may hear."""
         name, patterns = self.names[1], ("**", "gemuco/**", self.stage.key("**"), self.command)
-        spies = {pattern: Ears(self.stage.member(name), pattern) for pattern in patterns}
+        spies = {pattern: Listener(self.stage.member(name), pattern) for pattern in patterns}
         if not (self.settled() and self.settled()):
             yield allowed("operator is heard meanwhile", False)
-        until(lambda: all(ears.anything for ears in spies.values()), LISTENS)
-        for pattern, ears in spies.items():
-            yield refused(f"viewer spies on {pattern}", not ears.anything)
+        until(lambda: all(spy.anything for spy in spies.values()), LISTENS)
+        for pattern, spy in spies.items():
+            yield refused(f"viewer spies on {pattern}", not spy.anything)
 
-    def asking(self) -> Iterator[Attempt]:
-        """A viewer asks only what changes nothing; nobody asks the router about itself."""
+    def querying(self) -> Iterator[Attempt]:
+        """Query as a viewer what would change something, and query the router's admin space."""
         stage, asked = self.stage, []
         if not stage.is_running:
             for service, verb in (("hal", "enable"), ("model", "engage")):
@@ -210,12 +213,14 @@ class Inside:
                 for selector in (key, "gemuco/**"):
                     yield refused(f"viewer asks {selector}", not answered(self.viewer, selector, b"done"))
         for name, session in zip(self.names, (self.operator, self.viewer), strict=True):
-            replies = [str(one.ok.key_expr) for one in session.get("@/**", timeout=1.0) if one.ok is not None]
-            told = [one for one in replies if str(session.zid()) not in one.split("/")[1]]  # its own is its own
-            yield refused(f"{name} reads the router's admin space", not told)
+            replies = [str(r.ok.key_expr) for r in session.get("@/**", timeout=1.0) if r.ok is not None]
+            foreign = [
+                key for key in replies if str(session.zid()) not in key.split("/")[1]
+            ]  # its own space is its own
+            yield refused(f"{name} reads the router's admin space", not foreign)
 
-    def serving(self) -> Iterator[Attempt]:
-        """Nobody answers or is alive in another's place."""
+    def answering(self) -> Iterator[Attempt]:
+        """Answer and declare liveliness in the place of a service."""
         fake = self.stage.key("model", "do", "estimate")
         queryable = answer(self.viewer, fake, NEVER_HEARD)
         token = self.viewer.liveliness().declare_token(self.stage.key("vision", "alive"))
@@ -227,13 +232,16 @@ class Inside:
         token.undeclare()
 
     def robots(self) -> Iterator[Attempt]:
-        """A robot's services are for that robot."""
+        """Publish as a service of another robot."""
         stage = self.stage
         other = next((name for name in stage.plan.robots if name != stage.robot), "")
         if not other:
-            yield Attempt("HAL of one robot forges another's", "not tried", "there is one robot only")
+            yield Attempt("HAL of one robot forges another's", "not tried", "the plan has one robot only")
             return
-        hearer, theirs = Ears(stage.member(f"recorder.{other}"), f"gemuco/{other}/**"), stage.member(f"hal.{other}")
+        listener, theirs = (
+            Listener(stage.member(f"recorder.{other}"), f"gemuco/{other}/**"),
+            stage.member(f"hal.{other}"),
+        )
         nouns = ("hal/sample", "model/estimate", "hal/command")
         for _ in range(REPEATS):
             for noun in nouns:
@@ -241,15 +249,17 @@ class Inside:
             time.sleep(PAUSE)
         key = f"gemuco/{other}/hal/status"
         yield allowed(
-            f"hal.{other} is heard", until(lambda: theirs.put(key, PAYLOAD) is None and hearer.count(PAYLOAD))
+            f"hal.{other} is heard", until(lambda: theirs.put(key, PAYLOAD) is None and listener.count(PAYLOAD))
         )
         for noun in nouns:
-            is_heard = hearer.count(NEVER_HEARD + noun.encode())
+            is_heard = listener.count(NEVER_HEARD + noun.encode())
             yield refused(f"hal.{stage.robot} forges {noun} of '{other}'", not is_heard)
-        yield from self._said(self.hal, {f"hal.{stage.robot} forges model/estimate": stage.key("model", "estimate")})
+        yield from self._published(
+            self.hal, {f"hal.{stage.robot} forges model/estimate": stage.key("model", "estimate")}
+        )
 
     def limits(self) -> Iterator[Attempt]:
-        """Even who may speak may not shout."""
+        """Exceed the limits of size and rate as an operator."""
         most = SIZES["hal/command"]
         yield allowed(f"operator sends {most} bytes", self._passes(b"s" * most))
         for _ in range(REPEATS):
@@ -274,11 +284,11 @@ class Inside:
 
     def _alive(self, session: zenoh.Session) -> set[str]:
         replies = session.liveliness().get(self.stage.key("*", "alive"), timeout=2.0)
-        return {str(one.ok.key_expr).split("/")[2] for one in replies if one.ok is not None}
+        return {str(reply.ok.key_expr).split("/")[2] for reply in replies if reply.ok is not None}
 
 
 def impostor(stage: Stage, name: str) -> Attempt:
-    """A router that somebody else made: a client must not go in there with its password."""
+    """Check that a client does not send its password to a router of a foreign authority."""
     stranger, fake = Authority.new(), stage.of("router")
     fake["listen"]["endpoints"] = [where := stage.another_endpoint()]
     tls = fake["transport"]["link"]["tls"]
@@ -288,14 +298,13 @@ def impostor(stage: Stage, name: str) -> Attempt:
     return refused("a router of a foreign authority", not stage.enters(stage.outside(name, where)))
 
 
-def _clear_text(found: dict[str, Any], tls: dict[str, Any], login: dict[str, Any]) -> None:
-    found["connect"] = found["connect"] | {
-        "endpoints": [f"tcp/{one.partition('/')[2]}" for one in found["connect"]["endpoints"]]
-    }
-    found["transport"]["link"]["protocols"] = ["tcp"]
+def _clear_text(configured: dict[str, Any], tls: dict[str, Any], login: dict[str, Any]) -> None:
+    endpoints = [f"tcp/{endpoint.partition('/')[2]}" for endpoint in configured["connect"]["endpoints"]]
+    configured["connect"] = configured["connect"] | {"endpoints": endpoints}
+    configured["transport"]["link"]["protocols"] = ["tcp"]
 
 
-def _no_certificate(found: dict[str, Any], tls: dict[str, Any], login: dict[str, Any]) -> None:
+def _no_certificate(configured: dict[str, Any], tls: dict[str, Any], login: dict[str, Any]) -> None:
     for part in ("connect_certificate_base64", "connect_private_key_base64", "enable_mtls"):
         tls.pop(part)
 

@@ -1,4 +1,4 @@
-"""A certificate authority of one's own, and certificates that say which role somebody has."""
+"""A private certificate authority, and certificates whose common name is a role."""
 
 import base64
 import ipaddress
@@ -17,7 +17,7 @@ from services.errors import ServiceError
 AUTHORITY = "gemuco authority"
 AUTHORITY_DAYS = 3650
 BACKDATED = timedelta(days=1)
-"""The clock of a robot that was just turned on may be behind."""
+"""Certificates begin this long before now, because the clock of a robot that was just switched on may be late."""
 _BOTH = x509.ExtendedKeyUsage([ExtendedKeyUsageOID.CLIENT_AUTH, ExtendedKeyUsageOID.SERVER_AUTH])
 
 
@@ -31,13 +31,13 @@ class Identity:
 
 @dataclass(frozen=True, slots=True)
 class Authority:
-    """Who signs certificates; whoever has its key can be anybody."""
+    """The signer of certificates; the holder of its key can impersonate every member."""
 
     identity: Identity
 
     @classmethod
     def new(cls, days: int = AUTHORITY_DAYS) -> Self:
-        """Make one."""
+        """Make a new authority with a key of its own."""
         key = ec.generate_private_key(ec.SECP256R1())
         name = _name(AUTHORITY)
         usage = x509.KeyUsage(
@@ -53,12 +53,12 @@ class Authority:
         return cls(Identity(_pem(certificate), _key_pem(key)))
 
     def sign(self, name: str, hosts: Iterable[str], until: datetime) -> Identity:
-        """A certificate for somebody.
+        """Sign a certificate for a member.
 
         Args:
-            name: The role, as in `hal.musashi_arm`: the common name, which access control goes by.
-            hosts: Names and addresses under which others reach it; none for who never listens.
-            until: When it ends.
+            name: The role, as in `hal.musashi_arm`; access control compares this common name.
+            hosts: Names and addresses under which others reach the member; empty if it never listens.
+            until: End of its validity.
         """
         signer = serialization.load_pem_private_key(self.identity.key, None)
         issuer = x509.load_pem_x509_certificate(self.identity.certificate).subject
@@ -68,18 +68,18 @@ class Authority:
         builder = _builder(_name(name), issuer, key.public_key(), until)
         builder = builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
         builder = builder.add_extension(_BOTH, critical=False)
-        if places := [_place(host) for host in hosts]:
+        if places := [_general_name(host) for host in hosts]:
             builder = builder.add_extension(x509.SubjectAlternativeName(places), critical=False)
         return Identity(_pem(builder.sign(signer, hashes.SHA256())), _key_pem(key))
 
 
 def encoded(pem: bytes) -> str:
-    """PEM as zenoh's configuration takes it inline."""
+    """Return PEM as zenoh's configuration takes it inline."""
     return base64.b64encode(pem).decode()
 
 
 def decoded(text: str) -> bytes:
-    """The opposite of `encoded`."""
+    """Return the PEM of an inline text; inverse of `encoded`."""
     return base64.b64decode(text)
 
 
@@ -102,7 +102,7 @@ def _name(text: str) -> x509.Name:
     return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, text)])
 
 
-def _place(host: str) -> x509.GeneralName:
+def _general_name(host: str) -> x509.GeneralName:
     try:
         return x509.IPAddress(ipaddress.ip_address(host.strip("[]")))
     except ValueError:

@@ -1,4 +1,4 @@
-"""`gemuco security check`: proves from outside that who must not get in does not, one line per attempt."""
+"""`gemuco security check`: attacks a folder of role files from outside and prints one line per attempt."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,31 +15,31 @@ _COLOURS = {"refused": typer.colors.GREEN, "works": typer.colors.GREEN, "not tri
 
 
 def run_check(folder: Path, running: str | None = None) -> int:
-    """Try everything, print a line for each, return the exit code: 1 if anything was not refused, or does not work.
+    """Make every attempt, print a line for each, return the exit code: 1 if an attack passed or a permitted use failed.
 
     Args:
-        folder: Of `gemuco security init`, with all role files.
+        folder: Made by `gemuco security init`, with all role files.
         running: The endpoint of a router that runs already; malformed messages then reach the robot, which counts them.
 
     Raises:
-        ServiceError: There is nothing to check, or it cannot be started.
+        ServiceError: The folder holds nothing to check, or the check cannot be started.
     """
     count = {"refused": 0, "works": 0, "not tried": 0, "NOT REFUSED": 0, "DOES NOT WORK": 0}
-    for one in attempts(folder, running):
-        count[one.verdict] += 1
-        is_bad = one.verdict in _BAD
+    for attempt in attempts(folder, running):
+        count[attempt.verdict] += 1
+        is_bad = attempt.verdict in _BAD
         verdict = typer.style(
-            f"{one.verdict:<14}", fg=typer.colors.RED if is_bad else _COLOURS[one.verdict], bold=is_bad
+            f"{attempt.verdict:<14}", fg=typer.colors.RED if is_bad else _COLOURS[attempt.verdict], bold=is_bad
         )
-        typer.echo(f"{verdict} {one.what}{f' ({one.text})' if one.text else ''}")
+        typer.echo(f"{verdict} {attempt.what}{f' ({attempt.text})' if attempt.text else ''}")
     bad = sum(count[name] for name in _BAD)
-    told = ", ".join(f"{number} {name}" for name, number in count.items() if number)
-    typer.secho(f"{told}.", fg=typer.colors.RED if bad else typer.colors.GREEN, bold=bool(bad))
+    summary = ", ".join(f"{number} {name}" for name, number in count.items() if number)
+    typer.secho(f"{summary}.", fg=typer.colors.RED if bad else typer.colors.GREEN, bold=bool(bad))
     return 1 if bad else 0
 
 
 def attempts(folder: Path, running: str | None = None, weaken: Weaken | None = None) -> Iterator[Attempt]:
-    """Every attempt, as it is made.
+    """Yield every attempt as it is made.
 
     Raises:
         ServiceError: As `run_check`.

@@ -1,4 +1,4 @@
-"""What `gemuco security init` was asked for: hosts, robots and people; `plan.json` in its folder, without a secret."""
+"""Hosts, robots and people of a secured installation: `plan.json` of `gemuco security init`, without secrets."""
 
 import ipaddress
 import re
@@ -14,16 +14,15 @@ from services.wire.session import ROUTER_PORT
 
 FILE = "plan.json"
 LISTENING = ("simulator", "hal", "vision", "model")
-"""Services that others are linked to directly."""
+"""These services accept direct links from other services."""
 LINKS = {"vision": ("simulator",), "model": ("hal", "vision"), "recorder": LISTENING}
-"""Who dials whom, beside the router, whom every service dials: what a robot's services tell each other goes no way
-round. The HAL dials no other service."""
+"""Service -> services that it dials directly, in addition to the router; the HAL dials no other service."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 _HOST = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]*[A-Za-z0-9])?")
 
 
 class Person(BaseModel):
-    """Somebody with a role file of their own."""
+    """A person with a role file."""
 
     model_config = ConfigDict(extra="forbid")
     role: Literal["operator", "viewer"]
@@ -31,12 +30,12 @@ class Person(BaseModel):
 
 
 class Plan(BaseModel):
-    """Who is where.
+    """Hosts of all members.
 
     Attributes:
-        protocol: Of every link.
-        days: How long a certificate is valid.
-        routers: Hosts with ports; services dial the first, people the first that answers.
+        protocol: Protocol of every link.
+        days: Validity of a certificate [days].
+        routers: HOST:PORT of each router; services dial the first, people the first that answers.
         robots: Robot -> service -> host.
         people: Name -> role and robots.
     """
@@ -52,34 +51,36 @@ class Plan(BaseModel):
 
     @field_validator("robots", "people")
     @classmethod
-    def _names(cls, found: dict[str, object]) -> dict[str, object]:
-        for name in found:
+    def _check_names(cls, entries: dict[str, object]) -> dict[str, object]:
+        for name in entries:
             if not _NAME.fullmatch(name) or name in ROLES.keys() - set(PEOPLE) or name == ROUTER:
-                raise ValueError(f"'{name}' cannot be a name here: letters, digits, _ and -, and none of a service")
-        return found
+                raise ValueError(
+                    f"'{name}' cannot be a name here: use letters, digits, _ and -, and no name of a service"
+                )
+        return entries
 
     @field_validator("robots")
     @classmethod
-    def _places(cls, found: dict[str, dict[str, str]]) -> dict[str, dict[str, str]]:
-        for robot, hosts in found.items():
+    def _check_hosts(cls, entries: dict[str, dict[str, str]]) -> dict[str, dict[str, str]]:
+        for robot, hosts in entries.items():
             if set(hosts) != set(LISTENING):
                 raise ValueError(f"robot '{robot}' needs a host for each of {', '.join(LISTENING)}")
             for host in hosts.values():
                 if not is_host(host):
-                    raise ValueError(f"'{host}' of robot '{robot}' is no host's name or address; ports are not told")
-        return found
+                    raise ValueError(f"'{host}' of robot '{robot}' is not a host's name or address; leave out ports")
+        return entries
 
     @field_validator("routers")
     @classmethod
-    def _routers(cls, found: list[str]) -> list[str]:
-        return [with_port(one) for one in found]
+    def _with_ports(cls, entries: list[str]) -> list[str]:
+        return [with_port(entry) for entry in entries]
 
     @classmethod
     def read(cls, folder: Path) -> Self | None:
-        """The plan of a folder; None if it has none.
+        """Return the plan of a folder; None if the folder has no plan.
 
         Raises:
-            ServiceError: It cannot be read.
+            ServiceError: The plan cannot be read.
         """
         path = folder / FILE
         if not path.exists():
@@ -90,19 +91,19 @@ class Plan(BaseModel):
             raise ServiceError(f"'{path}' is not a plan: {_first(error)}.") from None
 
     @classmethod
-    def of(cls, **told: object) -> Self:
-        """A plan of these fields.
+    def of(cls, **fields: object) -> Self:
+        """Make a plan of these fields.
 
         Raises:
-            ServiceError: One of them is wrong.
+            ServiceError: A field is wrong.
         """
         try:
-            return cls.model_validate(told)
+            return cls.model_validate(fields)
         except ValidationError as error:
-            raise ServiceError(f"No such plan: {_first(error)}.") from None
+            raise ServiceError(f"The plan is wrong: {_first(error)}.") from None
 
     def members(self) -> dict[str, Member]:
-        """Everybody with a role file, by its name: the router, services as `hal.<robot>`, people."""
+        """Return every member with a role file, by name: the router, services as `hal.<robot>`, people."""
         services = [name for name, role in ROLES.items() if role.is_service]
         return {
             ROUTER: Member(ROUTER, (ALL,)),
@@ -111,30 +112,30 @@ class Plan(BaseModel):
         }
 
     def hosts(self, name: str) -> list[str]:
-        """Under which names and addresses others reach this member; none if it never listens."""
+        """Return names and addresses under which others reach this member; empty if it never listens."""
         if name == ROUTER:
-            return [_host(one) for one in self.routers]
+            return [_host(router) for router in self.routers]
         service, _, robot = name.partition(".")
         return [self.robots[robot][service]] if service in LISTENING else []
 
 
 def with_port(place: str) -> str:
-    """`HOST` as `HOST:7447`; another port stays.
+    """Return `HOST` as `HOST:7447`; a port that is given stays.
 
     Raises:
-        ValueError: It is neither.
+        ValueError: The text is neither HOST nor HOST:PORT.
     """
     is_bare_v6 = place.count(":") > 1 and not place.startswith("[")
     host, colon, port = (place, "", "") if is_bare_v6 or place.endswith("]") else place.rpartition(":")
     if not colon:
         host, port = place, str(ROUTER_PORT)
     if not is_host(host) or not port.isdecimal() or not 0 < int(port) < 65536:
-        raise ValueError(f"'{place}' is no HOST or HOST:PORT")
+        raise ValueError(f"'{place}' is not HOST or HOST:PORT")
     return f"{_bracketed(host)}:{port}"
 
 
 def is_host(text: str) -> bool:
-    """Whether this can be a host's name or address."""
+    """Whether the text can be a host's name or address."""
     try:
         ipaddress.ip_address(text.strip("[]"))
     except ValueError:
@@ -143,7 +144,7 @@ def is_host(text: str) -> bool:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only this machine reaches that host."""
+    """Whether only this machine can reach the host."""
     try:
         return ipaddress.ip_address(host.strip("[]")).is_loopback
     except ValueError:
@@ -151,12 +152,15 @@ def is_loopback(host: str) -> bool:
 
 
 def dialled(host: str, port: str | int) -> str:
-    """`HOST:PORT` to connect to."""
+    """Return `HOST:PORT` to connect to."""
     return f"{_bracketed(host)}:{port}"
 
 
 def listened(host: str, port: str | int) -> str:
-    """`ADDRESS:PORT` to listen on for what is reached as `host`: every address, for a host may have several names."""
+    """Return `ADDRESS:PORT` to listen on for a member that is reached as `host`.
+
+    Every address but on loopback, because a host may have several names.
+    """
     if is_loopback(host):
         return dialled("127.0.0.1" if host == "localhost" else host, port)
     return f"[::]:{port}" if ":" in host else f"0.0.0.0:{port}"
@@ -173,7 +177,7 @@ def _host(place: str) -> str:
 def _first(error: OSError | ValidationError) -> str:
     if isinstance(error, OSError):
         return str(error.strerror)
-    told = error.errors(include_url=False)[0]
-    where = ".".join(str(part) for part in told["loc"])
-    said = str(told["msg"]).removeprefix("Value error, ")
-    return f"{where}: {said}" if where else said
+    first = error.errors(include_url=False)[0]
+    field = ".".join(str(part) for part in first["loc"])
+    message = str(first["msg"]).removeprefix("Value error, ")
+    return f"{field}: {message}" if field else message

@@ -1,4 +1,4 @@
-"""What `gemuco security init` says: what is new, where each file goes, and what to keep away from the network."""
+"""Output of `gemuco security init`: new files, where each file goes, and the key to keep offline."""
 
 from collections.abc import Iterable
 from datetime import UTC, datetime
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import typer
 
-from services.security.init import CA_KEY, Done
+from services.security.init import CA_KEY, Changes
 from services.security.plan import FILE, Plan
 from services.wire.connect import role_file
 from services.wire.entering import WARN_BEFORE, ending
@@ -15,38 +15,37 @@ from services.wire.roles import PEOPLE, ROUTER
 VERBS = {"simulator": "simulate", "hal": "hal", "vision": "vision", "model": "serve", "recorder": "record"}
 
 
-def tell(folder: Path, plan: Plan, done: Done) -> None:
-    """Print it."""
-    _list("made", done.made)
-    for name, parts in done.changed.items():
+def report(folder: Path, plan: Plan, changes: Changes) -> None:
+    """Print what was made and changed, and what to do with it."""
+    _list("made", changes.made)
+    for name, parts in changes.changed.items():
         typer.echo(f"changed  {name}: {parts}. Copy it again, and restart what uses it.")
-    _list("left", done.left)
+    _list("left", changes.left)
     known = {f"{name}.json" for name in plan.members()} | {FILE}
     for path in sorted(folder.glob("*.json")):
         if path.name not in known:
-            typer.echo(f"unknown  {path.name}: nobody in {FILE} has that name, and no router lets it in. Remove it?")
-    if done.made or done.changed:
-        for line in _where(folder, plan):
+            typer.echo(f"unknown  {path.name}: no member of {FILE} has this name, and no router accepts it. Remove it?")
+    if changes.made or changes.changed:
+        for line in _destinations(folder, plan):
             typer.echo(line)
-    for line in _ending(folder, plan):
+    for line in _expiring(folder, plan):
         typer.secho(line, fg=typer.colors.YELLOW)
     if (folder / CA_KEY).exists():
         typer.secho(
-            f"Keep {folder / CA_KEY} offline: whoever has it can be anybody. It is needed to add and to renew, and for "
-            "nothing else.",
+            f"Keep {folder / CA_KEY} offline: its holder can impersonate every member. It is only needed to add and to "
+            "renew members.",
             fg=typer.colors.YELLOW,
         )
     typer.echo(f"Prove it with: gemuco security check {folder}")
 
 
 def _list(word: str, names: Iterable[str]) -> None:
-    told = ", ".join(names)
-    if told:
-        typer.echo(f"{word:<8} {told}")
+    if listed := ", ".join(names):
+        typer.echo(f"{word:<8} {listed}")
 
 
-def _where(folder: Path, plan: Plan) -> Iterable[str]:
-    """Which file is for which command on which host, and which port must be open there."""
+def _destinations(folder: Path, plan: Plan) -> Iterable[str]:
+    """Yield for each file its command, its host, and the port that must be open there."""
     for name, member in plan.members().items():
         path = folder / f"{name}.json"
         listens = role_file(path).get("listen", {}).get("endpoints", [])
@@ -59,7 +58,7 @@ def _where(folder: Path, plan: Plan) -> Iterable[str]:
             yield f"  gemuco {VERBS[member.role]} {member.robots[0]} --connect {path}{opened}"
 
 
-def _ending(folder: Path, plan: Plan) -> Iterable[str]:
+def _expiring(folder: Path, plan: Plan) -> Iterable[str]:
     for name in plan.members():
         until = ending(role_file(folder / f"{name}.json"))
         if until is not None and until - datetime.now(UTC) < WARN_BEFORE:

@@ -1,4 +1,4 @@
-"""Role files: one self-contained zenoh configuration per role, with its certificate, key and password inside."""
+"""Role files: one self-contained zenoh configuration per role, with certificate, key and password inside."""
 
 import json
 import os
@@ -20,23 +20,23 @@ from services.wire.session import plain_settings, port
 ROUTER_SESSIONS = 256
 SERVICE_SESSIONS = 32
 PERSON_OPENS_MS = 2000
-"""Far away, certificates and passwords take some round trips; a robot's own links are repeated sooner."""
+"""A person's session has this long to open [ms], because certificates and passwords take some round trips."""
 ROUTER_ACCEPTS_MS = 3000
 
 
 @dataclass(frozen=True, slots=True)
 class Secrets:
-    """What is made once for a member and stays in its role file: identity and password."""
+    """Identity and password of a member, made once and kept in its role file."""
 
     identity: Identity
     password: str
 
 
 def secrets_of(path: Path) -> Secrets:
-    """The secrets of a role file.
+    """Return the secrets of a role file.
 
     Raises:
-        ServiceError: It is none that `gemuco security init` made.
+        ServiceError: The file was not made by `gemuco security init`.
     """
     transport = role_file(path).get("transport", {})
     try:
@@ -44,17 +44,17 @@ def secrets_of(path: Path) -> Secrets:
         identity = Identity(decoded(tls["connect_certificate_base64"]), decoded(tls["connect_private_key_base64"]))
         return Secrets(identity, transport["auth"]["usrpwd"]["password"])
     except (KeyError, TypeError, ValueError):
-        raise ServiceError(f"'{path}' is no role file that `gemuco security init` made.") from None
+        raise ServiceError(f"'{path}' is not a role file that `gemuco security init` made.") from None
 
 
 def configuration(plan: Plan, name: str, known: Mapping[str, Secrets], authority: bytes) -> dict[str, Any]:
-    """The role file of a member.
+    """Return the role file of a member.
 
     Args:
-        plan: Who is where.
-        name: As in `plan.members()`.
-        known: The secrets of all members.
-        authority: Certificate (PEM) of who signed.
+        plan: Hosts of all members.
+        name: Name of the member, as in `plan.members()`.
+        known: Secrets of all members.
+        authority: Certificate (PEM) of the authority.
     """
     member = plan.members()[name]
     if name == ROUTER:
@@ -74,7 +74,7 @@ def configuration(plan: Plan, name: str, known: Mapping[str, Secrets], authority
 
 
 def write(path: Path, content: str, mode: int = 0o600) -> None:
-    """Write a file whole or not at all, readable only as `mode` says from the first byte on."""
+    """Write a file whole or not at all, with `mode` from the first byte on."""
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
         with os.fdopen(handle, "w") as file:
@@ -87,14 +87,14 @@ def write(path: Path, content: str, mode: int = 0o600) -> None:
 
 
 def text_of(content: Mapping[str, Any]) -> str:
-    """A configuration as it stands in a role file."""
+    """Return a configuration as text of a role file."""
     return json.dumps(content, indent=1) + "\n"
 
 
 def _router(plan: Plan, known: Mapping[str, Secrets]) -> dict[str, Any]:
     members = plan.members()
     subjects = {
-        name: (access.known_by(name, dials=True), access.rules_of(ROLES[member.role], member.robots))
+        name: (access.identity_of(name, dials=True), access.rules_of(ROLES[member.role], member.robots))
         for name, member in members.items()
         if name != ROUTER
     }
@@ -107,7 +107,7 @@ def _router(plan: Plan, known: Mapping[str, Secrets]) -> dict[str, Any]:
             "auth": {"usrpwd": {"dictionary": _dictionary(members, known)}},
         },
         "access_control": access.access_control(
-            subjects | {ROUTER: (access.known_by(ROUTER, dials=False), access.THROUGH)}
+            subjects | {ROUTER: (access.identity_of(ROUTER, dials=False), access.THROUGH)}
         ),
         **access.limits(plan.robots),
     }
@@ -120,15 +120,15 @@ def _service(plan: Plan, name: str, known: Mapping[str, Secrets]) -> dict[str, A
     callers = [other for other, places in LINKS.items() if service in places]
     subjects = {
         **{
-            other: (access.known_by(f"{other}.{robot}", dials=True), access.rules_of(ROLES[other], [robot]))
+            other: (access.identity_of(f"{other}.{robot}", dials=True), access.rules_of(ROLES[other], [robot]))
             for other in callers
         },
         **{
-            other: (access.known_by(f"{other}.{robot}", dials=False), access.rules_of(ROLES[other], [robot]))
+            other: (access.identity_of(f"{other}.{robot}", dials=False), access.rules_of(ROLES[other], [robot]))
             for other in dials
         },
         ROUTER: (
-            access.known_by(ROUTER, dials=False),
+            access.identity_of(ROUTER, dials=False),
             access.mirrored(access.rules_of(ROLES[service], [robot])),
         ),
     }

@@ -1,4 +1,4 @@
-"""Where the security check plays: a router, a HAL and a model of the role files, and whoever wants to get at them."""
+"""Sessions of a security check: a router, a HAL and a model of the role files, and the sessions that attack them."""
 
 import copy
 import json
@@ -20,20 +20,20 @@ from services.wire.entering import usable
 from services.wire.roles import ROUTER
 
 Weaken = Callable[[str, dict[str, Any]], None]
-"""Takes a member's name and its configuration, and spoils it."""
+"""A function of this type takes a member's name and configuration, and weakens the configuration."""
 PAYLOAD = b"gemuco security check"
-"""No receiver takes this for a message."""
+"""This payload is not a valid message for any receiver."""
 WITHIN = 15.0
-"""How long [s] what is allowed may take to happen, on a machine that has much else to do."""
+"""A permitted exchange has this long [s] to happen, also on a busy machine."""
 PATIENT = {"unicast": {"open_timeout": 5000, "accept_timeout": 5000}, "link": {"tx": {"lease": 10000}}}
-"""What is proved is not how soon a frozen process is noticed."""
+"""Long limits for links, because the check does not prove how soon a frozen process is noticed."""
 PAUSE = 0.02
 ONCE = {"endpoints": [], "timeout_ms": 0, "exit_on_failure": True}
-"""One attempt to get in."""
+"""With these settings a session makes one attempt to connect."""
 
 
-class Ears:
-    """What arrives at a session on some keys."""
+class Listener:
+    """Messages that arrive at a session on some keys."""
 
     def __init__(self, session: zenoh.Session, *patterns: str) -> None:
         self._lock = threading.Lock()
@@ -51,7 +51,7 @@ class Ears:
             return bool(self._heard)
 
     def count(self, payload: bytes, key: str = "") -> int:
-        """How often a payload was heard, on one key or on all."""
+        """Return how often a payload was heard, on one key or on all."""
         with self._lock:
             return sum(said == payload and (not key or on == key) for on, said in self._heard)
 
@@ -60,22 +60,22 @@ class Stage:
     """The sessions of one check, as a context manager.
 
     Args:
-        folder: Of `gemuco security init`.
-        running: The endpoint of a router that runs already; one of its own otherwise.
-        weaken: For the tests of the check.
+        folder: Made by `gemuco security init`.
+        running: Endpoint of a router that runs already; None starts one.
+        weaken: Weakens configurations; for tests of the check.
 
     Attributes:
-        robot: The one that is attacked.
-        router: The router's endpoint.
-        hal: The HAL's; empty if the check starts none.
+        robot: Name of the attacked robot.
+        router: Endpoint of the router.
+        hal: Endpoint of the HAL; empty if the check starts no HAL.
     """
 
     def __init__(self, folder: Path, running: str | None = None, weaken: Weaken | None = None) -> None:
         plan = Plan.read(folder)
         if plan is None or not plan.robots:
-            raise ServiceError(f"'{folder}' is no folder of `gemuco security init`: it has no plan.json with a robot.")
+            raise ServiceError(f"'{folder}' was not made by `gemuco security init`: it has no plan.json with a robot.")
         self.plan, self.folder, self.robot = plan, folder, next(iter(plan.robots))
-        self._weaken = weaken or (lambda name, found: None)
+        self._weaken = weaken or (lambda name, configured: None)
         self._sessions: list[zenoh.Session] = []
         self._kept: list[Any] = []
         self.is_running = running is not None
@@ -94,7 +94,7 @@ class Stage:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        closing = [threading.Thread(target=one.close, daemon=True) for one in self._sessions]
+        closing = [threading.Thread(target=session.close, daemon=True) for session in self._sessions]
         for thread in closing:
             thread.start()
         for thread in closing:
@@ -117,28 +117,28 @@ class Stage:
             ]
 
     def another_endpoint(self) -> str:
-        """One of this machine where nobody is."""
+        """Return an endpoint of this machine that is free."""
         return f"{self.plan.protocol}/127.0.0.1:{_free_port(self.plan.protocol)}"
 
     def of(self, name: str) -> dict[str, Any]:
-        """A fresh copy of a member's role file."""
+        """Return a fresh copy of a member's role file."""
         path = self.folder / f"{name}.json"
         return copy.deepcopy(role_file(path))
 
     def outside(self, name: str, where: str = "") -> dict[str, Any]:
-        """A member's role file as whoever stole it would use it: going in at the router or elsewhere, without rules."""
-        found = self.of(name)
+        """Return a member's role file as a thief would use it: to connect to the router or elsewhere, without rules."""
+        stolen = self.of(name)
         for part in ("access_control", "downsampling", "low_pass_filter", "listen"):
-            found.pop(part, None)
-        found["transport"]["auth"]["usrpwd"].pop("dictionary", None)
-        found |= {"mode": "client", "connect": ONCE | {"endpoints": [where or self.router]}}
-        return found
+            stolen.pop(part, None)
+        stolen["transport"]["auth"]["usrpwd"].pop("dictionary", None)
+        stolen |= {"mode": "client", "connect": ONCE | {"endpoints": [where or self.router]}}
+        return stolen
 
     def open(self, configuration: dict[str, Any]) -> zenoh.Session:
         """Open a session that is closed with the stage.
 
         Raises:
-            zenoh.ZError: It is refused.
+            zenoh.ZError: The session is refused.
         """
         with usable(merged(configuration, {"transport": PATIENT})) as taken:
             session = zenoh.open(zenoh.Config.from_json5(json.dumps(taken)))
@@ -154,27 +154,27 @@ class Stage:
         return True
 
     def member(self, name: str, where: str = "") -> zenoh.Session:
-        """A session of a member at the router.
+        """Open a session of a member at the router.
 
         Raises:
-            ServiceError: It does not get in, and should.
+            ServiceError: The member is refused although its role file is valid.
         """
-        found = self.outside(name, where)
-        found["connect"] |= {"timeout_ms": round(1e3 * WITHIN)}
+        configured = self.outside(name, where)
+        configured["connect"] |= {"timeout_ms": round(1e3 * WITHIN)}
         try:
-            return self.open(found)
+            return self.open(configured)
         except zenoh.ZError:
             raise ServiceError(
-                f"'{name}' does not get in at {where or self.router} with its own role file: nothing can be proved."
+                f"'{name}' is refused at {where or self.router} with its own role file, so the check proves nothing."
             ) from None
 
     def key(self, *parts: str) -> str:
-        """A key of the attacked robot."""
+        """Return a key of the attacked robot."""
         return keys.robot_key(self.robot, *parts)
 
 
 def until(happened: Callable[[], object], within: float = WITHIN) -> bool:
-    """Wait for something that should happen."""
+    """Whether a condition becomes true within some time [s]."""
     deadline = time.monotonic() + within
     while time.monotonic() < deadline:
         if happened():
@@ -184,7 +184,7 @@ def until(happened: Callable[[], object], within: float = WITHIN) -> bool:
 
 
 def answer(session: zenoh.Session, key: str, payload: bytes) -> zenoh.Queryable:
-    """Answer a question with the same payload always."""
+    """Declare a queryable that always answers with the same payload."""
 
     def reply(query: zenoh.Query) -> None:
         with query:
@@ -194,7 +194,7 @@ def answer(session: zenoh.Session, key: str, payload: bytes) -> zenoh.Queryable:
 
 
 def answered(session: zenoh.Session, selector: str, payload: bytes = b"true", timeout: float = 2.0) -> bool:
-    """Whether a question is answered with this payload by anybody."""
+    """Whether any answer to a query has this payload."""
     replies = session.get(selector, target=zenoh.QueryTarget.ALL, timeout=timeout)
     return any(reply.ok is not None and reply.ok.payload.to_bytes() == payload for reply in replies)
 

@@ -80,13 +80,13 @@ def security_init(
     gets another certificate or password.
     """
     from services.security.init import init, placed, planned
-    from services.security.report import tell
+    from services.security.report import report
     from services.wire.session import address
 
     robots = {name: placed(hal or address(name), model, vision, simulator) for name in robot or ()}
     protocol = None if quic is None else "quic" if quic else "tls"
     plan = planned(folder, robots, router or (), protocol, days)
-    tell(folder, plan, init(folder, plan))
+    report(folder, plan, init(folder, plan))
 
 
 @speaks_plainly

@@ -91,13 +91,13 @@ def test_each_defence_by_itself_is_proved(tmp_path: Path) -> None:
 
 
 def test_a_folder_without_a_plan_is_told(tmp_path: Path) -> None:
-    with pytest.raises(ServiceError, match="is no folder of `gemuco security init`"):
+    with pytest.raises(ServiceError, match="was not made by `gemuco security init`"):
         run_check(tmp_path)
 
 
 def test_nobody_at_the_running_router_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("services.security.stage.WITHIN", 0.2)
-    with pytest.raises(ServiceError, match=r"does not get in at quic/127\.0\.0\.1:9 with its own role file"):
+    with pytest.raises(ServiceError, match=r"is refused at quic/127\.0\.0\.1:9 with its own role file"):
         run_check(made(tmp_path / "keys", "quic", "a"), "quic/127.0.0.1:9")
 
 
