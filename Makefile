@@ -6,8 +6,16 @@ STAMP := .venv/installed
 CLOCKLESS := tests/gemuco tests/house tests/hal/test_campaign.py tests/hal/test_fuzz.py
 SOCKETCAN := $(addprefix tests/system/test_socketcan,.py _bus.py _drivers.py _states.py)
 
+# Tests that need no clock run beside the others, at the lowest priority, and are printed at the end.
+define RUN_TESTS
+@mkdir -p build; nice -n 19 $(BIN)/python -m pytest -p no:cacheprovider $(TESTS) $(CLOCKLESS) >build/clockless.log 2>&1 & beside=$$!; \
+trap 'kill $$beside; exit 130' INT TERM; \
+$(BIN)/python -m pytest $(TESTS) $(addprefix --ignore=,$(CLOCKLESS)); failed=$$?; \
+wait $$beside || failed=1; cat build/clockless.log; exit $$failed
+endef
+
 .DEFAULT_GOAL := help
-.PHONY: help setup demo reproduce test check format faults fuzz bench test-socketcan test-controllers results clean test-compose wheels test-network
+.PHONY: help setup demo reproduce test test-all check format faults fuzz bench test-socketcan test-controllers results clean test-compose wheels test-network
 
 help:            ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 18
@@ -26,11 +34,12 @@ demo: $(STAMP)   ## one minute with a muscle-driven arm that loses a sensor and 
 reproduce: $(STAMP)  ## the paper's experiments on three simulated robots, its figures beside ours
 	for robot in pr2 musashi kxr; do $(BIN)/gemuco reproduce $$robot || exit 1; done
 
-test: $(STAMP)   ## all tests; those that need no clock run beside the others, and yield to them
-	@mkdir -p build; nice -n 19 $(BIN)/python -m pytest -p no:cacheprovider $(CLOCKLESS) >build/clockless.log 2>&1 & beside=$$!; \
-	trap 'kill $$beside; exit 130' INT TERM; \
-	$(BIN)/python -m pytest $(addprefix --ignore=,$(CLOCKLESS)); found=$$?; \
-	wait $$beside || found=1; cat build/clockless.log; exit $$found
+test: TESTS := -m "not long"
+test: $(STAMP)   ## every promise once, a few minutes: what a change needs
+	$(RUN_TESTS)
+
+test-all: $(STAMP)  ## all tests, a quarter of an hour; CI runs these
+	$(RUN_TESTS)
 
 check: $(STAMP)  ## formatting, lint, types, import contracts
 	$(BIN)/ruff format --check .

@@ -129,6 +129,7 @@ DELETE = object()
 CHANGES = st.lists(st.tuples(st.sampled_from(PLACES), st.one_of(st.just(DELETE), VALUES)), min_size=1, max_size=3)
 
 
+@pytest.mark.long
 @settings(max_examples=400, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
 @given(CHANGES)
 def test_any_change_of_a_robot_file_is_taken_or_refused_in_a_sentence(changes):

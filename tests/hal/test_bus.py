@@ -72,6 +72,7 @@ def test_it_comes_back_with_its_peer(bus, channel):
         wait_for(lambda: not bus.send(frame()), "a frame that cannot")
 
 
+@pytest.mark.long
 def test_an_interface_that_stays_silent_is_opened_again(channel):
     bus = Bus("can0", BusConfig(interface="virtual", channel=channel), SystemClock())
     bus.open()

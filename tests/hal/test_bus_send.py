@@ -153,6 +153,7 @@ def test_nothing_is_sent_while_the_controller_is_off_the_bus(bus, interface):
     assert bus.counters["opened"] == 1
 
 
+@pytest.mark.long
 def test_an_interface_that_hangs_while_sending_is_shut_and_opened_again(bus, interface):
     interface.is_stuck.set()
     bus.begin()

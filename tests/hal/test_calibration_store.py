@@ -213,6 +213,7 @@ def test_an_encoder_tells_the_truth_after_one_position(config, rig):
         assert robot.mode == "off"
 
 
+@pytest.mark.long
 def test_a_cell_tells_the_truth_after_three_weights_and_keeps_its_gain_at_a_tare(config, rig):
     what = subject(config, "muscle_tension.biceps", "gain")
     assert (what.device, what.unit) == ("biceps_cell", "N")
@@ -232,6 +233,7 @@ def test_a_cell_tells_the_truth_after_three_weights_and_keeps_its_gain_at_a_tare
     assert tared.value(points[2].read) == pytest.approx(18.0, abs=0.05)  # N
 
 
+@pytest.mark.long
 def test_a_drive_waits_for_the_next_position_without_a_fault_and_without_power(config, rig):
     with Measuring(subject(config, "biceps_drive", "direction")) as device:
         first = device.look(0.3, 0.1, 0.001)
@@ -243,6 +245,7 @@ def test_a_drive_waits_for_the_next_position_without_a_fault_and_without_power(c
     assert joint_line([first, second], -1, 0.01).factor == 1
 
 
+@pytest.mark.long
 def test_an_encoder_that_lost_its_power_in_between_is_opened_again(config, rig):
     with Measuring(subject(config, "elbow_encoder", "direction")) as device:
         first = device.look(0.3, 0.1, 0.005)
@@ -250,6 +253,7 @@ def test_an_encoder_that_lost_its_power_in_between_is_opened_again(config, rig):
         assert device.look(0.3, 0.1, 0.005).read == pytest.approx(first.read)
 
 
+@pytest.mark.long
 def test_a_device_that_moves_or_brings_nothing_is_refused(config, rig):
     with Measuring(subject(config, "biceps_cell", "gain")) as device:
         noise, over = np.random.default_rng(0), threading.Event()

@@ -138,6 +138,7 @@ def test_closing_and_opening_twice_is_safe(stage):
     assert not stage.is_powered
 
 
+@pytest.mark.long
 @every_kind
 def test_without_a_bus_it_says_so_and_lets_go(stage):
     device = stage.robot._devices[0]
@@ -170,6 +171,7 @@ def live(request):
         stage.close()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "live",
     [pytest.param((kind, bus), id=f"{kind}-{bus}") for kind in KINDS for bus in OTHER_BUSES],

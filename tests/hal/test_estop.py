@@ -210,6 +210,7 @@ class TestOnBuses:
         assert not any(enabled for _, enabled in bench.world.drives.values())
 
 
+@pytest.mark.long
 def test_drives_on_a_bus_that_is_gone_cannot_be_reached():
     robot = open_robot(RobotConfig.model_validate(description()))
     found = robot.estop("a test")

@@ -215,6 +215,7 @@ def test_bus_off_while_enabled_is_a_fault(bench):
     assert "bus-off" in bench.robot.fault_text
 
 
+@pytest.mark.long
 def test_a_bus_whose_peers_are_gone_reopens_and_its_nodes_work_again(bench):
     bench.enable()
     bench.powered = False

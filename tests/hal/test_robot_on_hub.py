@@ -70,6 +70,7 @@ def test_runs_and_survives_the_other_side(config):
         rig.stop()
 
 
+@pytest.mark.long
 def test_starts_before_the_other_side(config):
     robot = open_robot(config)
     try:

@@ -63,6 +63,7 @@ def send(wire, identifier, data=""):
     wire.send(can.Message(arbitration_id=identifier, data=bytes.fromhex(data), is_extended_id=False))
 
 
+@pytest.mark.long
 def test_every_node_is_found_and_tells_who_it_is():
     with running() as config, Tap("can1", config.buses["can1"]) as tap:
         found = scan(tap, listen=0.1, patience=PATIENCE)
@@ -96,6 +97,7 @@ def test_listening_only_sends_nothing():
     assert found.silence
 
 
+@pytest.mark.long
 def test_missing_unexpected_and_wrong_nodes_are_told():
     nodes = [
         NodeSpec("cell", "can1", 2, "muscle_tension.biceps", CellConstants()),
@@ -111,6 +113,7 @@ def test_missing_unexpected_and_wrong_nodes_are_told():
     assert "node 33 is not in the robot file" in text
 
 
+@pytest.mark.long
 def test_two_nodes_with_one_id_are_told():
     with running() as config, bus(config.buses["can1"]) as (tap, wire):
 
@@ -138,6 +141,7 @@ def test_an_odrive_is_recognised_and_never_sent_what_it_would_take_for_a_command
     assert sent and not [identifier for identifier in sent if identifier >> 5 == 48]
 
 
+@pytest.mark.long
 def test_mit_drives_are_looked_for_only_when_asked():
     with bus() as (tap, wire):
         asked = []
@@ -156,6 +160,7 @@ def test_mit_drives_are_looked_for_only_when_asked():
     assert [(one.protocol, one.node) for one in found.nodes] == [("MIT", 3)]
 
 
+@pytest.mark.long
 def test_a_search_for_mit_drives_takes_no_other_frame_for_an_answer_and_leaves_odrives_alone():
     with bus() as (tap, wire):
         sent = []

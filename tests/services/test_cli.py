@@ -26,6 +26,7 @@ def test_every_verb_explains_itself(verb: str) -> None:
     assert "ROBOT" in told.stdout
 
 
+@pytest.mark.long
 def test_a_wrong_robot_file_is_one_sentence_and_exit_code_2(tmp_path: Path) -> None:
     wrong = tmp_path / "wrong.yaml"
     wrong.write_text((ROOT / "robots" / "musashi_arm.yaml").read_text() + "\ncolour: blue\n")
@@ -41,6 +42,7 @@ def test_a_wrong_robot_file_is_one_sentence_and_exit_code_2(tmp_path: Path) -> N
         assert "Traceback" not in told.stderr
 
 
+@pytest.mark.long
 def test_what_is_missing_is_said(tmp_path: Path) -> None:
     robot = str(ROOT / "robots" / "musashi_arm.yaml")
     for words, sentence in (

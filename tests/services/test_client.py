@@ -81,6 +81,7 @@ MODEL = {
 }
 
 
+@pytest.mark.long
 def test_a_robot_is_described_as_far_as_it_is_there(robot: str, capsys: pytest.CaptureFixture[str]) -> None:
     with Client(robot) as client:
         with pytest.raises(ServiceUnavailable, match=f"Robot '{robot}' has no service now"):

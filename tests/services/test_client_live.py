@@ -117,6 +117,7 @@ def test_nobody_there_is_told_and_the_same_iterator_goes_on(client: Client, robo
     assert len(boots) == 2
 
 
+@pytest.mark.long
 def test_messages_of_another_version_are_an_error_and_not_silence(client: Client, robot: str) -> None:
     body = {**msgpack.unpackb(messages.encode(anomaly(1))), "v": 3}
     with Service(robot, "model") as service:
@@ -211,6 +212,7 @@ def router(tmp_path: Path) -> Iterator[Router]:
     found.close()
 
 
+@pytest.mark.long
 def test_iterators_go_on_when_the_router_was_away(robot: str, router: Router) -> None:
     with Service(robot, "model", [router.endpoint]) as service, Client(robot, router.endpoint) as far:
         publisher = service.publisher(keys.anomaly(robot), Anomaly)
@@ -239,6 +241,7 @@ def test_iterators_go_on_when_the_router_was_away(robot: str, router: Router) ->
         thread.join()
 
 
+@pytest.mark.long
 def test_a_robot_that_is_not_there_is_told_with_those_that_are(robot: str, router: Router) -> None:
     with Client(f"{robot}_x", router.endpoint) as far:
         with pytest.raises(ServiceUnavailable, match="The router is there, and no robot"):
@@ -254,6 +257,7 @@ def test_a_robot_that_is_not_there_is_told_with_those_that_are(robot: str, route
                 near.ask("model", "engage", timeout=0.2)
 
 
+@pytest.mark.long
 def test_no_router_is_told_at_once(robot: str, tmp_path: Path) -> None:
     with pytest.raises(ServiceUnavailable, match="gemuco router"):
         Client(robot, f"unixsock-stream/{tmp_path}/nobody").__enter__()

@@ -173,6 +173,7 @@ class StuckWires(Wires):
         self.never.wait(60.0)
 
 
+@pytest.mark.long
 def test_a_hal_whose_cycle_is_stuck_stops_its_drives_and_ends_when_told(robot: str) -> None:
     config = RobotConfig.model_validate(description(robot))
     wires = StuckWires(config, SystemClock())

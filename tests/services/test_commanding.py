@@ -78,6 +78,7 @@ def _command(client: Client, value: float = 0.0) -> None:
     client.command("muscle_length", np.full(2, value), sample)
 
 
+@pytest.mark.long
 def test_a_second_client_is_refused_by_name_and_may_stop(hal: Hal, anna: Client, bert: Client) -> None:
     with anna.lease(5.0):
         eventually(lambda: bert.holder().name == "anna")
@@ -108,6 +109,7 @@ def test_a_second_client_is_refused_by_name_and_may_stop(hal: Hal, anna: Client,
     bert.enable()
 
 
+@pytest.mark.long
 def test_a_lease_is_renewed_until_its_end_also_when_that_is_an_exception(anna: Client, bert: Client) -> None:
     with pytest.raises(ZeroDivisionError), anna.lease(0.6):
         time.sleep(1.2)
@@ -130,6 +132,7 @@ with Client(sys.argv[1], name="carl") as client, client.lease(float(sys.argv[2])
 """
 
 
+@pytest.mark.long
 def test_a_holder_that_is_killed_keeps_others_out_no_longer_than_its_lease(anna: Client, robot: str) -> None:
     holder = subprocess.Popen([sys.executable, "-c", _HOLDER, robot, str(SECONDS)], stdout=subprocess.PIPE, text=True)
     assert holder.stdout is not None
@@ -151,6 +154,7 @@ def test_a_holder_that_is_killed_keeps_others_out_no_longer_than_its_lease(anna:
     assert time.monotonic() - killed < SECONDS + 2.0
 
 
+@pytest.mark.long
 def test_a_hal_that_was_restarted_has_forgotten_the_holder_who_hears_of_it(hal: Hal, anna: Client) -> None:
     with anna.lease(5.0) as lease:
         hal.end()
@@ -167,6 +171,7 @@ def test_a_hal_that_was_restarted_has_forgotten_the_holder_who_hears_of_it(hal: 
     anna.enable()
 
 
+@pytest.mark.long
 def test_a_holder_that_was_frozen_longer_than_its_lease_knows_that_it_commands_no_more(anna: Client) -> None:
     lease = anna.lease(0.6)
     with lease:
@@ -189,6 +194,7 @@ def test_who_streams_without_a_lease_commands_until_a_second_after(hal: Hal, ann
         eventually(lambda: anna.holder().name == "bert")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("verb", ["enable", "reset", "home", "tare", "lease"])
 def test_what_may_move_the_robot_is_not_done_late(hal: Hal, anna: Client, verb: str) -> None:
     """As a link does that was cut: it delivers later what had been asked."""

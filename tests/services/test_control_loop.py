@@ -89,6 +89,7 @@ def test_the_reference_reaches_the_target_at_the_robot_files_speed() -> None:
     np.testing.assert_array_equal(bench.control.facts()["reference"], target)
 
 
+@pytest.mark.long
 def test_the_settled_command_is_what_the_model_says_of_the_posture() -> None:
     bench = Bench()
     bench.control.engage(bench.enable)

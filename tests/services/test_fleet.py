@@ -142,6 +142,7 @@ def run(service: Service, told: threading.Event) -> threading.Thread:
     return thread
 
 
+@pytest.mark.long
 def test_all_robots_of_a_router_are_seen_and_one_that_vanishes_stays_listed(robot: str, router: str) -> None:
     names = [f"{robot}_a", f"{robot}_b"]
     with (
@@ -174,6 +175,7 @@ def test_without_a_router_the_robots_of_this_machine_are_found(robot: str) -> No
         thread.join()
 
 
+@pytest.mark.long
 def test_printed_once_the_exit_code_tells(robot: str, router: str) -> None:
     told = threading.Event()
     console = Console(width=160)

@@ -54,6 +54,7 @@ def _follow(arm: Processes, values: np.ndarray, until: Any) -> None:
     eventually(command)
 
 
+@pytest.mark.long
 def test_every_cycle_is_published_with_age_and_validity(arm: Processes) -> None:
     samples = [arm.client.next_sample() for _ in range(20)]
     assert all(sample is not None for sample in samples)
@@ -162,6 +163,7 @@ def test_commands_while_off_are_refused(arm: Processes) -> None:
     assert "mode 'off'" in arm.refused()["text"]
 
 
+@pytest.mark.long
 def test_a_sensor_is_tared_while_the_robot_is_off_and_only_then(arm: Processes) -> None:
     cell = next(name for name in arm.client.describe("hal")["devices"] if name.endswith("_cell"))
 
@@ -261,6 +263,7 @@ def test_a_killed_simulator_makes_all_invalid_and_comes_back_without_a_restart_o
     arm.client.disable()
 
 
+@pytest.mark.long
 def test_a_hal_that_is_told_to_end_lets_the_drives_go_first(arm: Processes) -> None:
     """Were the drives only left alone, they would fault, and not take `enable` from the next HAL."""
     _enable(arm)
@@ -275,6 +278,7 @@ def test_a_hal_that_is_told_to_end_lets_the_drives_go_first(arm: Processes) -> N
     arm.client.disable()
 
 
+@pytest.mark.long
 def test_a_simulator_that_is_told_to_end_does(arm: Processes) -> None:
     code, said = arm.terminate("simulator")
     assert code == 0
@@ -291,6 +295,7 @@ def test_a_simulator_that_is_not_there_is_told(arm: Processes) -> None:
         run_simulator(config.model_copy(update={"simulator": None}), "plain", stop=threading.Event())
 
 
+@pytest.mark.long
 def test_run_until_told_from_a_thread(robot: str, tmp_path: Path) -> None:
     """Without signals, as the demo and the tests use it: a HAL whose nodes are not there runs, degraded."""
     lonely = Processes(robot, tmp_path)

@@ -89,6 +89,7 @@ def _gemuco(*words: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=60, cwd=ROOT, check=False)
 
 
+@pytest.mark.long
 def test_an_estop_answers_per_drive_and_is_latched(arm: Processes) -> None:
     with Mover(arm):
         answer = arm.client.estop("a test")
@@ -109,6 +110,7 @@ def test_gemuco_estop_says_what_every_drive_did(arm: Processes) -> None:
     assert "All 2 drives stopped." in said.stdout
 
 
+@pytest.mark.long
 def test_gemuco_estop_is_loud_when_a_drive_does_not_answer(arm: Processes) -> None:
     arm.client.fault("node_silent triceps_drive")
     said = _gemuco("estop", arm.robot)
@@ -127,6 +129,7 @@ def test_gemuco_estop_is_loud_when_nobody_is_there() -> None:
     assert "Traceback" not in said.stderr
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("frozen", [0.3, 3.0])
 def test_a_hal_that_was_frozen_moves_nothing_when_it_goes_on(arm: Processes, frozen: float) -> None:
     with Mover(arm):
@@ -155,6 +158,7 @@ def test_the_drives_of_a_killed_hal_stop_by_themselves(arm: Processes) -> None:
     eventually(lambda: arm.mode() == "off")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_hal_that_is_told_to_end_while_it_moves_stops_first(arm: Processes, number: signal.Signals) -> None:
     with Mover(arm):

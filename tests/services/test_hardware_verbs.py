@@ -107,6 +107,7 @@ def stage(tmp_path: Path, robot: str) -> Iterator[Stage]:
     stage.rig.stop()
 
 
+@pytest.mark.long
 def test_scan_tells_who_is_there_and_who_is_not(stage: Stage) -> None:
     told = stage.gemuco("scan", "--seconds", "0.2")
     assert told.exit_code == 0, told.output
@@ -161,6 +162,7 @@ def test_every_verb_explains_itself(words: tuple[str, ...]) -> None:
     assert "ROBOT" in told.output
 
 
+@pytest.mark.long
 def test_doctor_finds_what_is_wrong(stage: Stage) -> None:
     told = stage.doctor(", 0 bad.")
     assert told.exit_code == 0, told.output
@@ -180,6 +182,7 @@ def test_doctor_tells_what_is_wrong_with_the_file(tmp_path: Path) -> None:
     assert "unknown key 'colour'" in told.output
 
 
+@pytest.mark.long
 def test_doctor_asks_a_hal_that_runs(stage: Stage) -> None:
     stop = threading.Event()
     hal = threading.Thread(target=run_hal, args=(stage.config, (), stop))
@@ -200,6 +203,7 @@ def test_doctor_asks_a_hal_that_runs(stage: Stage) -> None:
     assert "already has a 'hal' service" in refused.output
 
 
+@pytest.mark.long
 def test_a_cell_is_calibrated_with_weights(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
     loads = iter([2.0, 14.0, 26.0])
     monkeypatch.setattr(typer, "prompt", lambda *_, **__: stage.set("muscle_tension.biceps", next(loads)))

@@ -132,6 +132,7 @@ def test_unknown_keys_and_bytes_that_are_no_message_are_kept_and_counted(
     assert list(read(path)) == []
 
 
+@pytest.mark.long
 def test_who_comes_goes_and_commands_is_in_the_log(robot: str, session: zenoh.Session, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     with _recording(session, robot, path) as found:
@@ -280,6 +281,7 @@ def test_a_recording_without_limits_begins_a_new_file_every_hour(robot: str, tmp
     assert _versions(*writer.paths) == [0, 1, 2]
 
 
+@pytest.mark.long
 def test_a_recording_never_replaces_a_file(robot: str, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     path.write_text("precious")
@@ -315,6 +317,7 @@ _RECORD = (
 )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
 def test_a_recording_is_readable_however_its_process_ends(
     robot: str, session: zenoh.Session, tmp_path: Path, end: signal.Signals
@@ -423,6 +426,7 @@ def test_a_damaged_part_is_left_out_and_the_rest_is_read(
         assert set(_try(lambda: _versions(tmp_path / "cut.mcap"))) <= set(range(30))
 
 
+@pytest.mark.long
 def test_nothing_secret_is_in_a_recording(robot: str, tmp_path: Path) -> None:
     role = tmp_path / "role.json"
     role.write_text('{"transport": {"auth": {"usrpwd": {"user": "recorder", "password": "open sesame"}}}}')

@@ -68,6 +68,7 @@ def _eventually(happened: Callable[[], Any], within: float = 30.0) -> None:
         time.sleep(0.01)
 
 
+@pytest.mark.long
 def test_step_by_step_everything_comes_once_in_order_as_a_replay(robot: str, tmp_path: Path) -> None:
     files = record(tmp_path / "run.mcap", "arm", 60, limits=Limits(max_seconds=0.25))
     assert len(files) > 1
@@ -95,6 +96,7 @@ def test_step_by_step_everything_comes_once_in_order_as_a_replay(robot: str, tmp
     assert keys.command(robot) not in heard
 
 
+@pytest.mark.long
 def test_twice_as_fast_takes_half_the_time_on_an_absolute_grid(robot: str, tmp_path: Path) -> None:
     files = record(tmp_path / "run.mcap", "arm", 600)
     with _listening(robot) as heard, _replaying(files, robot=robot, speed=2.0) as stop:
@@ -111,6 +113,7 @@ def test_twice_as_fast_takes_half_the_time_on_an_absolute_grid(robot: str, tmp_p
     assert np.allclose(np.diff(stamps), 5e6, atol=1e3)
 
 
+@pytest.mark.long
 def test_what_was_restarted_looks_restarted_again(robot: str, tmp_path: Path) -> None:
     files = record(tmp_path / "run.mcap", "arm", 20, make=lambda number: a_sample(number, boot=11 + (number >= 10)))
     with _listening(robot) as heard, _replaying(files, robot=robot, speed=0.0) as stop:
@@ -124,6 +127,7 @@ def test_what_was_restarted_looks_restarted_again(robot: str, tmp_path: Path) ->
     assert not {11, 12} & set(boots)
 
 
+@pytest.mark.long
 def test_long_pauses_are_cut(robot: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     files = record(tmp_path / "a.mcap", "arm", 5) + record(tmp_path / "b.mcap", "arm", 5, begin=100 * 3600)
     began = time.monotonic()
@@ -166,6 +170,7 @@ def test_a_replay_is_refused_where_a_hal_runs_and_what_cannot_be_played_is_told(
         run_replay(tmp_path / "empty.mcap", stop=threading.Event())
 
 
+@pytest.mark.long
 def test_a_cut_file_is_played_up_to_where_its_writer_was_killed(robot: str, tmp_path: Path) -> None:
     (file,) = record(tmp_path / "run.mcap", "arm", 200)
     data = file.read_bytes()

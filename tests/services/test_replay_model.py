@@ -57,6 +57,7 @@ def recorded(path: Path) -> list[Path]:
     return writer.paths
 
 
+@pytest.mark.long
 def test_the_estimates_are_those_of_the_recorded_samples(model: GemucoService, robot: str, tmp_path: Path) -> None:
     files, end = recorded(tmp_path / "arm.mcap"), threading.Event()
     replay = threading.Thread(target=run_replay, args=(files,), kwargs={"robot": robot, "speed": 0.0, "stop": end})

@@ -102,6 +102,7 @@ def test_an_operator_commands_and_a_viewer_looks_on(secured: Secured) -> None:
         operator.disable()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("part", ["certificate", "password"])
 def test_half_an_identity_opens_nothing(secured: Secured, tmp_path: Path, part: str) -> None:
     found, other = (json.loads(Path(secured.role(name)).read_text()) for name in ("viewer", "operator"))
@@ -118,6 +119,7 @@ def test_half_an_identity_opens_nothing(secured: Secured, tmp_path: Path, part: 
         Client(secured.robot, str(path)).__enter__()
 
 
+@pytest.mark.long
 def test_a_link_is_cut_when_its_certificate_ends(secured: Secured, tmp_path: Path) -> None:
     authority = Authority(Identity((secured.keys / CA).read_bytes(), (secured.keys / CA_KEY).read_bytes()))
     ends = datetime.now(UTC).replace(microsecond=0) + LEFT

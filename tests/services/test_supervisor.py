@@ -61,6 +61,7 @@ def test_a_child_that_never_is_ready(tmp_path: Path) -> None:
             supervisor.wait_ready("slow", lambda: False, 0.1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL])
 def test_no_child_survives_its_supervisor(tmp_path: Path, number: signal.Signals) -> None:
     program = textwrap.dedent(f"""

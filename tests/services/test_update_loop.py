@@ -104,6 +104,7 @@ def test_one_sample_of_a_body_at_rest_tells_p() -> None:
     bench.update.adapt(False)
 
 
+@pytest.mark.long
 def test_the_normal_is_learned_from_samples_since_the_model_changed() -> None:
     bench = Bench(window=200)
     bench.engaged = True
@@ -122,6 +123,7 @@ def test_the_normal_is_learned_from_samples_since_the_model_changed() -> None:
         bench.update.learn_normal()
 
 
+@pytest.mark.long
 def test_the_interval_is_between_samples_that_are_learned_from() -> None:
     bench = Bench(window=200, interval=0.4)
     bench.engaged = True

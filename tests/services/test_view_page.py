@@ -131,6 +131,7 @@ def test_a_read_only_page_asks_nothing_even_if_it_is_told_to():
     assert "no button 'dance'" in outcome.text
 
 
+@pytest.mark.long
 def test_without_a_robot_a_button_says_why(robot: str):
     with Viewing(robot) as page, Browser(page.port) as browser:
         browser.until(lambda b: "No robot" in b.text() and "Engage" in b.labels())
@@ -181,6 +182,7 @@ def test_a_missing_package_is_one_sentence(monkeypatch: pytest.MonkeyPatch):
         open_site("127.0.0.1", 0, "x")
 
 
+@pytest.mark.long
 def test_a_browser_that_never_reads_holds_nothing_up(talking: TalkingRobot):
     with Viewing(talking.robot) as page, Browser(page.port) as browser:
         browser.until(lambda b: "Healthy" in b.text())

@@ -60,6 +60,7 @@ def test_limits_are_those_of_the_robot_file():
         Reach.of({})
 
 
+@pytest.mark.long
 def test_it_moves_while_the_button_is_held_and_stops_when_it_is_not(arm: Processes, teacher: Teacher):
     start = taken(arm, teacher)
     teacher.wish(start + 5.0)
@@ -79,6 +80,7 @@ def test_it_moves_while_the_button_is_held_and_stops_when_it_is_not(arm: Process
     eventually(lambda: np.allclose(lengths(arm), where, atol=3e-3))
 
 
+@pytest.mark.long
 def test_a_step_goes_so_far_and_no_further(arm: Processes, teacher: Teacher):
     start = taken(arm, teacher)
     teacher.wish(np.array([0.2, start[1]]))
@@ -98,6 +100,7 @@ def test_the_robot_is_let_go_when_the_page_is_closed(arm: Processes, teacher: Te
     eventually(lambda: arm.mode() == "off")
 
 
+@pytest.mark.long
 def test_the_robot_is_let_go_when_the_page_hangs(arm: Processes, teacher: Teacher):
     taken(arm, teacher)
     begun = time.monotonic()
@@ -107,6 +110,7 @@ def test_the_robot_is_let_go_when_the_page_hangs(arm: Processes, teacher: Teache
     eventually(lambda: arm.mode() == "off")
 
 
+@pytest.mark.long
 def test_a_page_that_answers_keeps_the_robot(arm: Processes, teacher: Teacher):
     taken(arm, teacher)
     until = time.monotonic() + PAGE_PATIENCE + 0.5
@@ -116,6 +120,7 @@ def test_a_page_that_answers_keeps_the_robot(arm: Processes, teacher: Teacher):
     assert teacher.owner == PAGE
 
 
+@pytest.mark.long
 def test_the_robot_is_let_go_when_the_hal_dies(arm: Processes, teacher: Teacher):
     taken(arm, teacher)
     arm.kill("hal")
@@ -123,6 +128,7 @@ def test_the_robot_is_let_go_when_the_hal_dies(arm: Processes, teacher: Teacher)
     assert teacher.text
 
 
+@pytest.mark.long
 def test_only_one_teaches_and_nobody_while_another_client_commands(arm: Processes, teacher: Teacher):
     taken(arm, teacher)
     with pytest.raises(NotTeaching, match="Another browser window"):

@@ -88,6 +88,7 @@ def camera_of(robot: RobotConfig) -> Iterator[None]:
         thread.join()
 
 
+@pytest.mark.long
 def test_the_camera_sees_what_is_and_says_how_old_it_is(robot: str) -> None:
     with Truth(robot) as truth, camera_of(config(robot)), Client(robot) as client:
         frame = client.vision(timeout=10.0)
@@ -106,6 +107,7 @@ def test_the_camera_sees_what_is_and_says_how_old_it_is(robot: str) -> None:
         assert client.describe("vision")["signals"] == {"tool_tip_position": {"unit": "m", "elements": ["x", "y"]}}
 
 
+@pytest.mark.long
 def test_a_camera_with_nothing_to_look_at_is_silent_and_says_so(robot: str) -> None:
     with Truth(robot) as truth, camera_of(config(robot)), Client(robot) as client:
         assert client.vision(timeout=10.0) is not None
@@ -119,6 +121,7 @@ def test_a_camera_with_nothing_to_look_at_is_silent_and_says_so(robot: str) -> N
         assert client.vision(timeout=5.0) is not None
 
 
+@pytest.mark.long
 def test_faults_of_the_camera(robot: str) -> None:
     with Truth(robot), camera_of(config(robot)), Client(robot) as client:
         assert client.vision(timeout=10.0) is not None
@@ -148,6 +151,7 @@ def test_a_robot_without_a_camera_is_told(robot: str) -> None:
         run_vision(config(robot), "best")
 
 
+@pytest.mark.long
 def test_top_and_the_recorder_show_what_is_seen(robot: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with Truth(robot), camera_of(config(robot)), Service(robot, "recorder") as service:
         with (
@@ -162,6 +166,7 @@ def test_top_and_the_recorder_show_what_is_seen(robot: str, tmp_path: Path, caps
     assert len(list(read(tmp_path / "seen.mcap", [keys.vision(robot)]))) > 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("has_camera", [True, False])
 def test_top_misses_a_camera_only_where_there_is_one(
     robot: str, has_camera: bool, capsys: pytest.CaptureFixture[str]
@@ -197,6 +202,7 @@ def test_any_program_may_be_the_camera(robot: str) -> None:
         program.wait()
 
 
+@pytest.mark.long
 def test_the_frame_of_the_documentation_is_one(robot: str) -> None:
     program = (EXAMPLE.parents[1] / "docs" / "keys.md").read_text().split("```python\n")[-1].split("```")[0]
     program = program.replace("ENDPOINT", endpoint(robot, "model")).replace("gemuco/kxr_humanoid/", f"gemuco/{robot}/")

@@ -216,6 +216,7 @@ def test_shutdown_wakes_a_waiting_receiver(channel):
         bus.shutdown()
 
 
+@pytest.mark.long
 def test_python_can_tools_join_by_the_entry_point(channel, tmp_path):
     log = tmp_path / "bus.log"
     logger = [sys.executable, "-m", "can.logger", "-i", "hub", "-c", channel, "-f", str(log)]

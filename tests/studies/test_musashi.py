@@ -64,6 +64,7 @@ def test_geometric_data_are_random_states_in_episodes(monkeypatch):
     assert 175.0 < tension.max() <= 180.0
 
 
+@pytest.mark.long
 def test_what_training_found_is_read_from_the_model_it_made(monkeypatch):
     monkeypatch.setattr(model, "SAMPLES", 1000)
     trained = train(ROBOT, model.geometric_data(ROBOT, 0), 0, lambda done, text: None)

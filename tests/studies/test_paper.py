@@ -108,6 +108,7 @@ def _counts(run: Run, tell: Tell) -> tuple[int, int]:
     return run.seed, os.getpid()
 
 
+@pytest.mark.long
 def test_seeds_run_side_by_side_and_are_told_of(tmp_path):
     told: list[str] = []
 
@@ -122,12 +123,14 @@ def test_seeds_run_side_by_side_and_are_told_of(tmp_path):
     assert sorted(told) == ["seed 1: counting", "seed 2: counting", "seed 3: counting"]
 
 
+@pytest.mark.long
 def test_an_experiment_that_fails_ends_those_of_the_other_seeds(tmp_path):
     robot = load_robot(ROBOT).model_copy(update={"robot": "broken"})
     with pytest.raises(FileNotFoundError, match="of seed 0"):
         each_seed(robot, [0, 1], tmp_path, lambda share, text: None, False, _counts)
 
 
+@pytest.mark.long
 def test_a_process_that_is_killed_is_told_in_a_sentence(tmp_path):
     robot = load_robot(ROBOT).model_copy(update={"robot": "killed"})
     with pytest.raises(RunKilled, match="was killed"):

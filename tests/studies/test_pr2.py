@@ -65,6 +65,7 @@ def test_the_flexible_duster_has_six_grasps_that_the_file_does_not_list():
     assert not set(flexible(ROBOT)) & set(ROBOT.conditions)
 
 
+@pytest.mark.long
 def test_both_experiments_run_and_tell_their_figures(tmp_path, monkeypatch):
     monkeypatch.setattr(pr2_arm, "STROKES", 2)
     monkeypatch.setattr(pr2_trials, "SEARCH", DescentConfig(0.5, 10, 10))
@@ -96,6 +97,7 @@ def _model(run: Run, tell: Tell) -> np.ndarray:
     return schema.weights.encoder[0].matrix
 
 
+@pytest.mark.long
 def test_where_there_is_cuda_the_models_of_all_seeds_are_trained_together(tmp_path, monkeypatch):
     monkeypatch.setattr(devices, "best", lambda: "cpu")  # of torch
     robot, told = small(ROBOT), []

@@ -111,6 +111,7 @@ def stack(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stack]:
             yield stack
 
 
+@pytest.mark.long
 def test_what_the_camera_sees_and_the_hal_computes_is_measured(stack: Stack) -> None:
     found, truth = stack.estimate(), stack.client.truth(timeout=PATIENCE)
     assert truth is not None
@@ -139,6 +140,7 @@ def test_without_its_camera_the_tool_tip_is_estimated_and_marked_until_it_is_bac
     eventually(lambda: stack.said("model") == "")
 
 
+@pytest.mark.long
 def test_a_covered_camera_is_not_a_dead_one(stack: Stack) -> None:
     stack.client.fault("camera_covered", "vision")
     eventually(lambda: stack.method() == "mask")
@@ -147,6 +149,7 @@ def test_a_covered_camera_is_not_a_dead_one(stack: Stack) -> None:
     eventually(lambda: stack.method() == "measured")
 
 
+@pytest.mark.long
 def test_without_its_hal_the_camera_alone_is_told_for_what_it_is(stack: Stack) -> None:
     stack.supervisor.kill("hal")
     eventually(lambda: stack.estimate().cycle == -1)
@@ -158,6 +161,7 @@ def test_without_its_hal_the_camera_alone_is_told_for_what_it_is(stack: Stack) -
     eventually(lambda: stack.method("joint_position") == "measured")
 
 
+@pytest.mark.long
 def test_collecting_on_the_bus_records_what_the_camera_sees_under_the_told_condition(stack: Stack) -> None:
     robot = load_robot(stack.file)
     eventually(lambda: stack.method("joint_position") == "measured")

@@ -118,6 +118,7 @@ def test_the_image_holds_what_is_named_and_no_secrets() -> None:
     assert all((ROOT / name).exists() for name in named)
 
 
+@pytest.mark.long
 def test_a_robots_services_need_nothing_of_what_its_image_lacks() -> None:
     """What the small image's processes import, with the large packages out of reach."""
     modules = (

@@ -139,6 +139,7 @@ def test_a_marker_is_published() -> None:
     assert sample.values["tool_tip_position"].tolist() == [0.6, -0.2, 0.8]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("example", ["watch_estimates.py", "plot_estimates.py"])
 def test_watching_nobody_is_one_sentence(example: str) -> None:
     done = run(example, "nobody_at_all")

@@ -3,12 +3,14 @@
 import os
 from pathlib import Path
 
+import pytest
 from fuzz_messages import Stage, campaign
 
 COUNT = 2000
 PACE = 0.0005
 
 
+@pytest.mark.long
 def test_bad_messages_end_nothing_move_nothing_and_are_counted(tmp_path: Path) -> None:
     with Stage(tmp_path, f"fuzz_{os.getpid()}") as stage:
         found = campaign(stage, COUNT, PACE)

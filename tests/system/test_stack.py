@@ -49,6 +49,7 @@ def test_a_silent_encoder_is_estimated_by_another_process_too(stack: Stack) -> N
     eventually(lambda: stack.method() == "measured")
 
 
+@pytest.mark.long
 def test_what_cannot_be_is_refused_in_one_sentence(stack: Stack) -> None:
     with pytest.raises(TargetRefused, match=r"elbow_pitch of 9\.000 rad is outside of its limits"):
         stack.client.ask("model", "target", {"signal": "joint_position", "values": [0, 0, 0, 9, 0]})
@@ -64,6 +65,7 @@ def test_what_cannot_be_is_refused_in_one_sentence(stack: Stack) -> None:
     assert stack.mode() == "off"
 
 
+@pytest.mark.long
 def test_the_model_can_be_asked_what_it_is_and_does(stack: Stack) -> None:
     described = ask(stack, "describe", "model")
     assert "muscle_tension+muscle_length" in described.stdout
@@ -84,6 +86,7 @@ def test_the_model_can_be_asked_what_it_is_and_does(stack: Stack) -> None:
         assert word in top.stdout
 
 
+@pytest.mark.long
 def test_a_second_model_service_is_refused(stack: Stack) -> None:
     command = gemuco_command("serve", str(stack.file), "--model", str(stack.model))
     second = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
