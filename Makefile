@@ -15,7 +15,7 @@ wait $$beside || failed=1; cat build/clockless.log; exit $$failed
 endef
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo reproduce test test-all check format faults fuzz bench test-socketcan test-controllers results clean test-compose wheels test-network
+.PHONY: help setup demo reproduce test test-all check format faults fuzz bench test-socketcan test-controllers results clean test-compose wheels test-network docs
 
 help:            ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 18
@@ -76,6 +76,9 @@ fuzz: $(STAMP)    ## a hundred thousand bad messages on every key of a running r
 
 test-network: $(STAMP)  ## HAL and model on a link that is cut, slow or lossy, over TCP and QUIC (docs/network.md); needs root
 	$(BIN)/python tests/network/campaign.py --json runs/network.json
+
+docs: $(STAMP)   ## the documentation site in build/site; a broken link or a missing reference is an error
+	$(BIN)/zensical build --strict --clean
 
 bench: $(STAMP)   ## speed beside torch, zenoh and bare timers, a quarter of an hour; writes docs/benchmarks.md
 	env -u OPENBLAS_CORETYPE OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m studies.speed.all  # BLAS as free as torch

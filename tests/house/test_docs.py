@@ -1,0 +1,52 @@
+"""The documentation site holds together: every page is in the navigation, every link and reference has a target."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).parents[2]
+FRONT = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")
+
+
+def pages(nav: list | str | dict) -> set[str]:
+    """Return the files that a part of the navigation names."""
+    if isinstance(nav, str):
+        return {nav}
+    parts = nav.values() if isinstance(nav, dict) else nav
+    return set().union(*(pages(part) for part in parts))
+
+
+def test_every_page_is_in_the_navigation() -> None:
+    nav = yaml.safe_load((ROOT / "mkdocs.yml").read_text())["nav"]
+    assert pages(nav) == {path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").rglob("*.md")}
+
+
+def test_site_builds_without_a_warning() -> None:
+    """Broken links, anchors and references to Python names are errors of a strict build."""
+    build = [sys.executable, "-m", "zensical", "build", "--strict", "--clean"]
+    done = subprocess.run(build, cwd=ROOT, capture_output=True, text=True, timeout=100, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    page = (ROOT / "build" / "site" / "index.html").read_text()
+    assert not re.findall(r'(?:src|rel="stylesheet" href)="https?://[^"]*"', page), "the site loads from another host"
+
+
+@pytest.mark.parametrize("name", FRONT)
+def test_links_of_the_front_pages_have_targets(name: str) -> None:
+    text = (ROOT / name).read_text()
+    for target in re.findall(r"\]\(([^)]+)\)", text):
+        if target.startswith("http"):
+            continue
+        file, _, anchor = target.partition("#")
+        page = ROOT / (file or name)
+        assert page.exists(), f"{name}: {target}"
+        assert not anchor or anchor in anchors(page), f"{name}: {target}"
+
+
+def anchors(page: Path) -> set[str]:
+    """Return the anchors of a page's headings, as GitHub and the site form them."""
+    headings = re.findall(r"^#+ (.*)$", page.read_text(), re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", heading.lower()).strip().replace(" ", "-") for heading in headings}
