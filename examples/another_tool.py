@@ -5,14 +5,7 @@ Run `python examples/another_tool.py`; it takes a few seconds.
 
 import numpy as np
 
-from gemuco.adaption.config import UpdateConfig
-from gemuco.adaption.update import adapt
-from gemuco.dataset import Dataset, Episode
-from gemuco.estimation import estimate
-from gemuco.learning.train import TrainConfig
-from gemuco.schema import BodySchema
-from gemuco.signals import Layout, Signal
-from gemuco.structure.determination import learn
+from gemuco import BodySchema, Dataset, Episode, Layout, Signal, TrainConfig, UpdateConfig, adapt, estimate, learn
 
 
 def body(q: np.ndarray, stick: float) -> dict[str, np.ndarray]:

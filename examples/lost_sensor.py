@@ -5,11 +5,7 @@ python examples/lost_sensor.py
 
 import numpy as np
 
-from gemuco.dataset import Dataset, Episode
-from gemuco.estimation import estimate
-from gemuco.learning.train import TrainConfig, fit
-from gemuco.signals import Layout, Signal
-from gemuco.structure.determination import Thresholds, determine
+from gemuco import Dataset, Episode, Layout, Signal, Thresholds, TrainConfig, determine, estimate, fit
 
 ANCHORS = np.array([[-0.3, 0.0], [0.3, 0.0], [0.0, 0.4]])
 """Where the cables leave the frame [m]."""
