@@ -37,7 +37,7 @@ CMD ["--help"]
 
 FROM packages AS heavy
 # Only what the first image lacks, in a folder of its own: both images share all the layers below it.
-RUN deploy/install.sh --target /opt/workshop =torch =matplotlib =pybullet +sim
+RUN deploy/install.sh --target /opt/workshop =torch =matplotlib =pybullet =joblib +sim +studies
 
 FROM services AS workshop
 COPY --from=heavy /opt/workshop /opt/workshop

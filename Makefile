@@ -65,7 +65,7 @@ test-compose: $(STAMP)  ## the simulated stack in containers: up, a client, each
 	$(BIN)/python tests/system/compose_check.py
 
 wheels: $(STAMP)  ## fill wheels/, from which the images are then built without a network
-	$(BIN)/python deploy/requirements.py +sim | $(BIN)/python -m pip download --quiet --dest wheels --constraint constraints.txt --requirement /dev/stdin setuptools
+	$(BIN)/python deploy/requirements.py +sim +studies | $(BIN)/python -m pip download --quiet --dest wheels --constraint constraints.txt --requirement /dev/stdin setuptools
 
 faults: $(STAMP)  ## the robot broken in every way with many seeds (docs/safety.md), and a million random frames
 	$(BIN)/python tests/hal/campaign.py --seeds 7 --json runs/faults.json

@@ -14,7 +14,7 @@ from gemuco.compiled.chain import CODE, NARROW, matrix, offset
 from gemuco.compiled.jit import jit
 
 BLOCK = 256
-"""Rows at a time, at most: of smaller blocks a product has less, larger ones leave the cache (speed/learning.py)."""
+"""Rows at a time, at most: of smaller blocks a product has less, larger ones leave the cache."""
 
 
 class Rows(NamedTuple):

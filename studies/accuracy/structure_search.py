@@ -60,11 +60,6 @@ def run(signals: int, samples: int, seed: int) -> None:
     errors = judge.of(every).L_m
     known = every[errors < thresholds.into]
     took = time.process_time() - started
-    started = time.process_time()
-    raced = judge.race(every).L_m
-    race = time.process_time() - started
-    lost = int(((errors < thresholds.into) & (raced >= thresholds.into)).sum())
-    won = int(((errors >= thresholds.into) & (raced < thresholds.into)).sum())
     least, sizes = body.least_errors(every), np.array([signal.size for signal in body.layout.signals])
     judged = judge.outputs & ~every
     perfect = every[(least * judged * sizes).sum(axis=1) / (judged * sizes).sum(axis=1) < thresholds.into]
@@ -72,8 +67,7 @@ def run(signals: int, samples: int, seed: int) -> None:
     truth = {line.tobytes() for line in perfect}
     kept = np.array([bits(m, names) > 0 for m in structure.masks])
     print(
-        f"    exhaustive: {len(known)} feasible, {len(minimal(known))} minimal, {took:.1f} s, in a race "
-        f"{race:.1f} s with {lost} lost and {won} won; found "
+        f"    exhaustive: {len(known)} feasible, {len(minimal(known))} minimal, {took:.1f} s; found "
         f"{contains(known, feasible).mean():.1%} of them, "
         f"{np.mean([m.tobytes() in {f.tobytes() for f in feasible} for m in minimal(known)]):.1%} of the minimal, "
         f"{sum(f.tobytes() not in told for f in feasible)} false; served {contains(known, kept).mean():.1%}\n"

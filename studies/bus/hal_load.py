@@ -14,7 +14,6 @@ import tempfile
 import threading
 import time
 from dataclasses import dataclass, field
-from multiprocessing.connection import Connection
 from multiprocessing.synchronize import Event
 from pathlib import Path
 
@@ -25,11 +24,12 @@ from hal import registry
 from hal.clock import SystemClock
 from hal.config import RobotConfig, load_robot
 from hal.errors import CommandRefused
-from hal.robot import ANSWER_SHARE, Robot, open_robot
+from hal.robot import Robot, open_robot
 from hal.wire.budget import budgets
 from services.hardware.hal_service import CYCLE_PRIORITY, RECEIVE_PRIORITY
 from services.hardware.simulator_service import PRIORITY, THREADS
 from services.process import realtime
+from studies.stack.processes import BareLoops
 
 ARM = Path(__file__).parents[2] / "robots" / "musashi_arm.yaml"
 RATE = 200.0
@@ -85,17 +85,6 @@ def simulate(config: RobotConfig, ready: Event, stop: Event) -> None:
     ready.set()
     stop.wait()
     rig.stop()
-
-
-def tick(rate: float, stop: Event, late: Connection) -> None:
-    """A bare timer at the cycle's rate and priority: how late [s] the machine alone wakes a thread."""
-    realtime.prepare_thread(CYCLE_PRIORITY)
-    found = []
-    while not stop.is_set():
-        due = time.monotonic() + 1 / rate
-        time.sleep(1 / rate)
-        found.append(time.monotonic() - due)
-    late.send(found)
 
 
 def on_hub(config: RobotConfig, folder: str) -> RobotConfig:
@@ -186,27 +175,23 @@ def main() -> None:
             print(f"bus {budget.bus:11}{budget}")
         ready, stop = context.Event(), context.Event()
         nodes = context.Process(target=simulate, args=(config, ready, stop))
-        here, there = context.Pipe(False)
-        timer = context.Process(target=tick, args=(config.rates.hal, stop, there))
         nodes.start()
-        timer.start()
         ready.wait()
         clock = WaitMeter()
         try:
             before = time.monotonic()
-            with open_robot(config, clock) as robot:
+            with BareLoops({"bare": (config.rates.hal, CYCLE_PRIORITY)}) as bare, open_robot(config, clock) as robot:
                 print(f"commissioning  {time.monotonic() - before:.2f} s for {len(config.devices)} nodes")
                 run(robot, clock, given.seconds)
                 for name, bus in robot.health()["buses"].items():
                     print(f"bus {name:11}{bus['counters']}")
+                late = bare.counted()["bare"]
+                p99, most = 1e3 * late["total_p99"], 1e3 * late["total_max"]
+                print(f"bare timer     late by {p99:.2f} ms p99, {most:.1f} ms at most")
         finally:
             gc.unfreeze()
             stop.set()
-            late = np.array(here.recv())
-            timer.join()
             nodes.join()
-        share = np.mean(late > ANSWER_SHARE / config.rates.hal)
-        print(f"bare timer     later than the cycle waits in {share:.3%} of ticks, {late.max() * 1e3:.1f} ms at most")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Bodies of any size with random W, and what a user would write for them in torch."""
+"""Bodies of any size with random W, and the same networks in torch."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from gemuco.layers import Layer, Weights
+from gemuco.layers import Chain, Layer, Weights
 from gemuco.scaler import Scaler
 from gemuco.schema import BodySchema
 from gemuco.signals import Layout, Signal
@@ -28,7 +28,7 @@ def body(
     masks: Sequence[frozenset[str]] = MASKS,
     anchors: int = 0,
 ) -> BodySchema:
-    """A muscle-driven arm unless other signals are given; all signals are inputs and outputs."""
+    """Return a body of the size of a muscle-driven arm, or of other signals; all signals are inputs and outputs."""
     signals = signals or MUSCLES
     random = np.random.default_rng(0)
     layout = Layout(tuple(Signal(name, size, unit) for name, (size, unit) in signals.items()))
@@ -59,14 +59,15 @@ def body(
 
 
 def modules(schema: BodySchema) -> tuple[nn.Sequential, nn.Sequential]:
-    """Encoder and decoder of a schema in torch."""
-    made = []
-    for chain in (schema.weights.encoder, schema.weights.decoder):
-        parts: list[nn.Module] = []
-        for layer in chain:
-            linear = nn.Linear(*layer.matrix.shape)
-            linear.weight.data = torch.from_numpy(layer.matrix.T.copy())
-            linear.bias.data = torch.from_numpy(layer.offset.copy())
-            parts += [linear] if layer.activation == "linear" else [linear, nn.Tanh()]
-        made.append(nn.Sequential(*parts))
-    return made[0], made[1]
+    """Return encoder and decoder of a schema in torch."""
+    return module(schema.weights.encoder), module(schema.weights.decoder)
+
+
+def module(chain: Chain) -> nn.Sequential:
+    """Return a chain of layers in torch."""
+    parts: list[nn.Module] = []
+    for matrix, offset, activation in chain:
+        linear = nn.Linear(*matrix.shape)
+        linear.weight.data, linear.bias.data = torch.from_numpy(matrix.T.copy()), torch.from_numpy(offset.copy())
+        parts += [linear] if activation == "linear" else [linear, nn.Tanh()]
+    return nn.Sequential(*parts)

@@ -1,51 +1,55 @@
-"""What the running service costs beside its loops: messages, memory, and a question from elsewhere.
+"""Cost of the running service beside its loops: messages, a remote question, and a tick of the estimation.
 
 python -m studies.speed.service_cost
 """
 
-import subprocess
-import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import msgpack
 import numpy as np
+import torch
+from torch import nn
 
+from gemuco.schema import BodySchema
+from gemuco.warm import warm
+from hal.by_signal import Numbers, Truths
+from hal.clock import SystemClock
 from hal.config import load_robot
-from services.wire import messages
-from services.wire.messages import Sample
-from studies.speed import highest_rate
-from studies.speed.table import Row, faster
+from services.model.estimation import Estimation, Fresh, Freshness
+from services.process.realtime import freeze, prepare_process
+from services.wire import keys, messages
+from services.wire.messages import Estimates, Sample
+from services.wire.session import new_boot, open_session
+from services.wire.streams import Publisher
+from studies.speed.bodies import MASKS, body, modules
+from studies.speed.table import Row, faster, show
 from studies.stack import way_through
-from studies.stack.publish import examples
+from studies.stack.message_sizes import examples
 from studies.stack.remote_client import BARE, VERB, measure, robot_and_client
 
 ROBOT = Path("robots/musashi_arm.yaml")
 QUESTIONS = 400
-RUNNING = """
-import sys
-from gemuco.warm import warm
-import services.model.gemuco_service
-if sys.argv[1] == "torch":
-    import torch
-warm(is_service=True)
-print(int(open("/proc/self/statm").read().split()[1]) * 4096 / 1e6)
-"""
+SILENT = ("joint_position", 3)
 
 
 def codec() -> Row:
-    """A sample as it is published, and the same content as lists of numbers."""
-    sample, _ = examples(load_robot(ROBOT))
+    """Measure a published sample, and the same content as lists of numbers."""
+    sample, _ = examples(load_robot(ROBOT))[keys.sample("*")]
+    assert isinstance(sample, Sample)
     parts = ("values", "age", "valid")
 
     def ours() -> Sample:
         return messages.decode(messages.encode(sample), Sample)
 
     def lists() -> dict[str, dict[str, np.ndarray]]:
-        told = {part: {name: one.tolist() for name, one in getattr(sample, part).items()} for part in parts}
-        told |= {"type": "sample", "v": 1, "stamp_ns": sample.stamp_ns, "cycle": 1, "source": "can", "complete": True}
-        found = msgpack.unpackb(msgpack.packb(told))
-        return {part: {name: np.array(one) for name, one in found[part].items()} for part in parts}
+        content: dict[str, object] = {
+            part: {name: values.tolist() for name, values in getattr(sample, part).items()} for part in parts
+        }
+        content |= {"type": "sample", "v": 1, "stamp_ns": sample.stamp_ns, "cycle": 1, "source": "can"}
+        decoded = msgpack.unpackb(msgpack.packb(content | {"complete": True}))
+        return {part: {name: np.array(values) for name, values in decoded[part].items()} for part in parts}
 
     return faster(
         "encode and decode a sample of 25 elements: value, age, valid",
@@ -57,18 +61,8 @@ def codec() -> Row:
     )
 
 
-def memory() -> Row:
-    """Resident memory of a process with the model service loaded and warm, and with torch beside it."""
-    ours, theirs = (
-        float(subprocess.run([sys.executable, "-c", RUNNING, way],
-                             capture_output=True, text=True, check=True).stdout)
-        for way in ("plain", "torch")
-    )  # fmt: skip
-    return Row("memory of the service's process", "the same with torch", ours, theirs, "MB", theirs / ours, 2.0)
-
-
 def question() -> Row:
-    """Median of an estimate asked for by a client beyond that of a bare query with the same bytes."""
+    """Measure how much longer a remote client waits for an estimate than for a bare query with the same bytes."""
     with robot_and_client(False) as (client, connect):
         times = measure(client, connect, QUESTIONS)
     ours, bare = (1e3 * float(np.median(times[what])) for what in (VERB, BARE))
@@ -78,20 +72,96 @@ def question() -> Row:
     )  # fmt: skip
 
 
+def tick() -> Row:
+    """Measure one tick of the estimation loop with a silent encoder, and the same with a torch nn.Module."""
+    with ticks() as (ours, by_torch):
+        return faster(
+            "an estimation tick, one encoder silent, published",
+            "the same with torch eager",
+            ours,
+            by_torch,
+            0.0,
+            "no bar was named",
+        )
+
+
+@contextmanager
+def ticks() -> Iterator[tuple[Callable[[], None], Callable[[], None]]]:
+    """Yield the service's tick and torch's; both publish on the same session."""
+    prepare_process()
+    warm()
+    robot, schema, clock = load_robot(ROBOT), body((200, 200)), SystemClock()
+    with open_session(f"estimation_tick_{new_boot()}", "model", ()) as session:
+        publisher = Publisher(session, "gemuco/estimation_tick/model/estimate", Estimates, new_boot())
+        newest = samples(schema, clock)
+        ours = Estimation(Freshness(robot, newest, clock), lambda: schema, publisher.put, clock).tick
+        by_torch = torch_tick(schema, newest, publisher.put, clock)
+        for _ in range(50):
+            ours()
+            by_torch()
+        freeze()
+        yield ours, by_torch
+
+
+def samples(schema: BodySchema, clock: SystemClock) -> Callable[[], Fresh]:
+    """Return a source of sixteen different samples in turn, in which one encoder is silent."""
+    random, number = np.random.default_rng(0), 0
+    sizes = {signal.name: signal.size for signal in schema.layout.signals}
+    valid = {name: np.ones(size, bool) for name, size in sizes.items()}
+    valid[SILENT[0]][SILENT[1]] = False
+    age = {name: np.zeros(size) for name, size in sizes.items()}
+    known = [
+        Sample(
+            cycle=cycle, source="can", complete=False, age=age, valid=valid,
+            values={name: random.standard_normal(size) for name, size in sizes.items()},
+        )
+        for cycle in range(16)
+    ]  # fmt: skip
+
+    def newest() -> Fresh:
+        nonlocal number
+        number += 1
+        return Fresh(known[number % len(known)], clock.monotonic())
+
+    return newest
+
+
+def torch_tick(
+    schema: BodySchema, newest: Callable[[], Fresh], publish: Callable[[Estimates], None], clock: SystemClock
+) -> Callable[[], None]:
+    """Return a tick as a user would write it: take the sample, infer, keep the measured values, publish."""
+    torch.set_num_threads(1)
+    network = nn.Sequential(*modules(schema))
+    layout, mean, std = schema.layout, schema.scaler.mean, schema.scaler.std
+    gate, tail = schema.gate(MASKS[0])
+    zeros = np.zeros(layout.size)
+    names = layout.names
+
+    @torch.inference_mode()
+    def tick() -> None:
+        sample = newest().sample
+        x, valid, elements = sample.values.flat, sample.valid.flat, sample.elements
+        given = np.concatenate([np.where(gate > 0, (x - mean) / std, 0.0), tail]).astype(np.float32)
+        prediction = network(torch.from_numpy(given)).numpy() * std + mean
+        values = np.where(valid, x, prediction)
+        publish(
+            Estimates(
+                stamp_ns=clock.now_ns(), cycle=sample.cycle, elements=elements,
+                values=Numbers(values, elements), estimated=Truths(~valid, elements), std=Numbers(zeros, elements),
+                method=dict.fromkeys(names, "mask"), mask=dict.fromkeys(names, ""), residual=dict.fromkeys(names, 0.0),
+            )
+        )  # fmt: skip
+
+    return tick
+
+
 def rows() -> Iterator[Row]:
-    """All of them."""
+    """Measure all of them."""
     yield codec()
-    yield memory()
     yield question()
     yield way_through.row()
-    yield from highest_rate.rows()
-
-
-def main() -> None:
-    for row in rows():
-        figures = f"{row.ours:9.2f} {row.theirs:9.2f} {row.unit}  {row.value:6.2f} (bar {row.bar:g})"
-        print(f"{row.what:60s} {figures}  {row.note}")
+    yield tick()
 
 
 if __name__ == "__main__":
-    main()
+    show(rows())

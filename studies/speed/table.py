@@ -1,8 +1,8 @@
-"""What the benchmarks have in common: ours and a peer in turn, and rows with a bar."""
+"""Measure ours and a peer in turn; rows of a table with a bar."""
 
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,15 +14,15 @@ class Row:
     """One result.
 
     Attributes:
-        what: Was measured.
+        what: The measured quantity.
         against: The peer.
-        ours: Of ours, in `unit`.
-        theirs: Of the peer.
-        unit: Of both.
-        value: What is compared with the bar: how many times better, or what `bar` says.
-        bar: What was to be reached; a lower limit unless `is_most`.
+        ours: Result of ours, in `unit`.
+        theirs: Result of the peer, in `unit`.
+        unit: Unit of both.
+        value: Number that is compared with the bar: a ratio, or the quantity that `what` names.
+        bar: Limit to reach: a lower limit unless `is_most`; 0 without a limit.
         is_most: The bar is an upper limit.
-        note: What a reader must know.
+        note: Remark for below the table.
     """
 
     what: str
@@ -37,16 +37,27 @@ class Row:
 
     @property
     def is_reached(self) -> bool:
-        """Whether the bar was."""
+        """Whether the value is on the right side of the bar."""
         return self.value <= self.bar if self.is_most else self.value >= self.bar
 
-    def plain(self) -> dict[str, object]:
-        """For JSON."""
-        return asdict(self)
+    def cells(self) -> list[str]:
+        """Return the row's cells in the order of docs/benchmarks.md."""
+        mark = "" if not self.bar else "yes" if self.is_reached else "NO"
+        sign = "at most " if self.is_most else ""
+        value = f"{self.value:.3g}" + ("" if self.is_most else " x")
+        bar = f"{sign}{self.bar:g}" + ("" if self.is_most else " x") if self.bar else "-"
+        numbers = (f"{number:.3g} {self.unit}" for number in (self.ours, self.theirs))
+        return [self.what, self.against, *numbers, value, bar, mark]
+
+
+def show(rows: Iterable[Row]) -> None:
+    """Print rows as they are measured."""
+    for row in rows:
+        print(" | ".join([*row.cells(), row.note]), flush=True)
 
 
 def timed(job: Job, repeats: int) -> float:
-    """Time of one call [us], the mean over a batch."""
+    """Return the time of one call [us], the mean over a batch."""
     begun = time.perf_counter()
     for _ in range(repeats):
         job()
@@ -54,13 +65,13 @@ def timed(job: Job, repeats: int) -> float:
 
 
 def side_by_side(ours: Job, theirs: Job, rounds: int = 7, share: float = 0.03) -> tuple[float, float, float]:
-    """Median times [us] of ours and theirs, and the median over rounds of their ratio in the same round.
+    """Return median times [us] of ours and theirs, and the median over rounds of their ratio in the same round.
 
     Args:
         ours: One call.
         theirs: One call of the peer.
-        rounds: How often both are measured, in turn.
-        share: Time [s] that a batch of calls should take.
+        rounds: Number of rounds; each measures both, in turn.
+        share: Time [s] of one batch of calls.
     """
     counts = []
     for job in (ours, theirs):
@@ -74,6 +85,6 @@ def side_by_side(ours: Job, theirs: Job, rounds: int = 7, share: float = 0.03) -
 
 
 def faster(what: str, against: str, ours: Job, theirs: Job, bar: float, note: str = "", rounds: int = 7) -> Row:
-    """A row that says how many times as fast ours is."""
+    """Return a row whose value is the peer's time divided by ours."""
     mine, other, ratio = side_by_side(ours, theirs, rounds)
     return Row(what, against, mine, other, "us", ratio, bar, note=note)

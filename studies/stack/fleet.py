@@ -21,7 +21,6 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import msgpack
 import numpy as np
 import zenoh
@@ -37,8 +36,6 @@ from studies.stack import light_robot
 from studies.stack.fleet_robot import main
 from studies.stack.processes import BareLoops, look
 from studies.stack.soak import free_port
-
-mpl.use("Agg")
 
 NUMBERS = (1, 2, 5, 10, 20)
 RATE = 20.0
@@ -287,31 +284,6 @@ def show(found: dict[str, Any], console: Console) -> None:
         console.print(f"what arrived of the flood: {flow / 1e6:.1f} MB/s")
 
 
-def draw(found: dict[str, Any], path: Path) -> None:
-    """How it grows."""
-    from matplotlib import pyplot as plt
-
-    steps = found["steps"]
-    numbers = [step["robots"] for step in steps]
-    figure, (cost, age, rate) = plt.subplots(1, 3, figsize=(13, 4), layout="constrained")
-    for name in ("router", "client"):
-        cost.plot(numbers, [100 * step["cores"][name] for step in steps], "o-", label=name)
-    robots = [100 * sum(v for k, v in step["cores"].items() if k not in ("router", "client")) for step in steps]
-    cost.plot(numbers, robots, "o-", label="all robots together")
-    cost.set(title="Processor time", ylabel="% of a core", xlabel="robots")
-    for name in ("latency_p50", "latency_p99"):
-        age.semilogy(numbers, [1e3 * step["heard"]["everything"][name] for step in steps], "o-", label=name)
-    age.set(title="Measurement to estimate at the client", ylabel="ms", xlabel="robots")
-    rate.plot(numbers, [step["heard"]["everything"]["rate_mean"] for step in steps], "o-", label="mean")
-    rate.plot(numbers, [step["heard"]["everything"]["rate_least"] for step in steps], "o-", label="least of a robot")
-    rate.axhline(found["rate"], color="grey", ls=":")
-    rate.set(title="Estimates that arrive", ylabel="Hz per robot", xlabel="robots", ylim=(0, 1.1 * found["rate"]))
-    for axes in (cost, age, rate):
-        axes.grid(alpha=0.3)
-        axes.legend()
-    figure.savefig(path, dpi=110)
-
-
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--robots", type=int, nargs="+", default=list(NUMBERS))
@@ -320,5 +292,4 @@ if __name__ == "__main__":
     options.out.parent.mkdir(parents=True, exist_ok=True)
     result = run(tuple(options.robots), options.out.with_suffix(""))
     options.out.write_text(json.dumps(result, indent=1))
-    draw(result, options.out.with_suffix(".png"))
     show(result, Console(width=170))

@@ -98,7 +98,7 @@ class LiveDevice(DirectDevice):
     """The world in real time: it goes on by itself between two looks."""
 
     def __init__(self, config: RobotConfig, world: World) -> None:
-        super().__init__(config, world, _Wall())  # type: ignore[arg-type]
+        super().__init__(config, world, _Wall())
         self._live, self._before = world, time.monotonic()
 
     def read(self) -> Any:

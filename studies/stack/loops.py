@@ -1,26 +1,23 @@
-"""How the loops of HAL and service keep time, beside bare timer loops of the same rates at the same time.
+"""Punctuality of the loops of HAL and service, beside bare timer loops of the same rates at the same time.
 
     python -m studies.stack.loops --minutes 10 [--without-bus]
 
-The whole stack runs as in life: simulated nodes on the hub, HAL, service; a client engages the controller, sends a new
-target every second and keeps the online update on. A process of its own ticks four times nothing, at the same rates and
-with the same scheduling, and says how punctual this machine was meanwhile. Without a bus the arm's physics lies in the
-HAL's own process: 25 simulated nodes and the frames between them want more of a machine than the service that is
-measured, and no robot has them.
+The whole stack runs as on a robot: simulated nodes on the hub, HAL, service; a client engages the controller, sends a
+new target every second and keeps the online update on. Another process runs bare timer loops at the same rates with
+the same scheduling and counts how punctual the machine is meanwhile. Without a bus the arm's physics lies in the HAL's
+own process: 25 simulated nodes and the frames between them cost more than the measured service, and no robot has them.
 """
 
 import argparse
 import json
-import multiprocessing
 import resource
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
@@ -31,62 +28,30 @@ from hal.config import RobotConfig, load_robot
 from hal.errors import CommandRefused
 from services.client import Client
 from services.errors import NotEngaged
+from services.hardware.hal_service import CYCLE_PRIORITY
 from services.model.gemuco_service import PRIORITIES
-from services.process.lateness import Lateness
-from services.process.realtime import prepare_process, prepare_thread
 from services.process.supervisor import Supervisor, gemuco_command
+from services.wire.messages import Status
 from studies.accuracy.actual_arms import model
+from studies.stack.processes import BareLoops, cpu
 
 TARGET_EVERY = 1.0
 REACH = 0.6
 """Share of the joint range that targets are drawn from."""
 
 
-def bare_loop(rate: float, priority: int, stop: threading.Event, into: dict[str, float]) -> None:
-    """Tick nothing at a rate [Hz] until told to stop; count as the services count."""
-    prepare_thread(priority)
-    lateness = Lateness(1)
-    period, start, index, ticks, skipped = 1.0 / rate, time.monotonic(), 0, 0, 0
-    while not stop.is_set():
-        index += 1
-        behind = int((time.monotonic() - start) / period) - index
-        if behind > 0:
-            skipped += behind
-            index += behind
-        deadline = start + index * period
-        pause = deadline - time.monotonic()
-        if pause > 0:
-            time.sleep(pause)
-        lateness.add(time.monotonic() - deadline)
-        ticks += 1
-    into.update(lateness.total() | {"ticks": ticks, "skipped": skipped, "rate": ticks / (time.monotonic() - start)})
-
-
-def bare_process(rates: dict[str, float], pipe: Connection) -> None:
-    """All bare loops, in threads of one process as in the service, until the pipe closes."""
-    prepare_process()
-    stop, found = threading.Event(), {name: {} for name in rates}
-    threads = [
-        threading.Thread(target=bare_loop, args=(rate, PRIORITIES.get(name, 40), stop, found[name]))
-        for name, rate in rates.items()
-    ]
-    for thread in threads:
-        thread.start()
-    pipe.recv()
-    stop.set()
-    for thread in threads:
-        thread.join()
-    pipe.send(found)
-
-
 def measures(client: Client) -> bool:
-    """Whether every signal is measured and reaches this process."""
+    """Whether this process receives estimates in which every signal is measured."""
     estimate = client.estimate()
     return estimate is not None and set(estimate.method.values()) == {"measured"}
 
 
 def engage(client: Client) -> None:
-    """Engage the controller, out of a fault too; gives up after fifteen seconds."""
+    """Engage the controller, also from a fault.
+
+    Raises:
+        TimeoutError: It was not engaged within 15 s.
+    """
     deadline, refusal = time.monotonic() + 15.0, ""
     while time.monotonic() < deadline:
         applied = client.applied(timeout=1.0)
@@ -105,7 +70,7 @@ def engage(client: Client) -> None:
 
 
 def move(client: Client, robot: RobotConfig, duration: float) -> int:
-    """Send a random target every second for `duration` [s]; how often the HAL had stopped the arm."""
+    """Send a random target every second for `duration` [s]; return how often the HAL had stopped the arm."""
     stops = 0
     random = np.random.default_rng(0)
     low, high = robot.bounds("joint_position")
@@ -121,14 +86,8 @@ def move(client: Client, robot: RobotConfig, duration: float) -> int:
     return stops
 
 
-def cpu_share(pid: int, since: tuple[float, float] | None = None) -> tuple[float, float]:
-    """CPU time [s] of a process and the time [s] it was read."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
-    return (int(fields[11]) + int(fields[12])) / 100, time.monotonic()
-
-
 def stack(robot_file: Path, with_bus: bool) -> dict[str, list[str]]:
-    """Process -> how to start it."""
+    """Return process -> its command line."""
     file = str(robot_file)
     if not with_bus:
         return {
@@ -142,36 +101,31 @@ def stack(robot_file: Path, with_bus: bool) -> dict[str, list[str]]:
     }
 
 
-def run(robot_file: Path, minutes: float, with_bus: bool = True) -> dict[str, object]:
-    """The whole measurement; loop name -> statistics of ours and of the bare loop, process -> share of a core."""
+def run(robot_file: Path, minutes: float, with_bus: bool = True) -> dict[str, Any]:
+    """Return loop name -> statistics of ours and of the bare loop, process -> share of a core."""
     robot = load_robot(robot_file)
     model(robot, Console())
     rates = {name: rate for name, rate in robot.rates.model_dump().items() if name in ("hal", *PRIORITIES)}
-    context = multiprocessing.get_context("spawn")
-    pipe, other = context.Pipe()
-    bare = context.Process(target=bare_process, args=(rates, other), daemon=True)
+    bare = BareLoops({name: (rate, PRIORITIES.get(name, CYCLE_PRIORITY)) for name, rate in rates.items()})
     with Supervisor(Path("runs/loops")) as supervisor, Client(robot.robot) as client:
-        children = {name: supervisor.start(name, command) for name, command in stack(robot_file, with_bus).items()}
+        pids = {
+            name: supervisor.start(name, command).process.pid for name, command in stack(robot_file, with_bus).items()
+        }
         supervisor.wait_ready("serve", lambda: measures(client), 60)
         engage(client)
         client.adapt(True)
         time.sleep(3.0)
-        bare.start()
-        began = {name: cpu_share(child.process.pid) for name, child in children.items()}
-        before = {name: client.status(name, timeout=3.0) for name in ("hal", "model")}
-        stops = move(client, robot, 60 * minutes)
-        supervisor.check()
-        pipe.send("stop")
-        baseline = pipe.recv()
-        after = {name: client.status(name, timeout=3.0) for name in ("hal", "model")}
-        shares = {}
-        for name, child in children.items():
-            used, now = cpu_share(child.process.pid)
-            shares[name] = (used - began[name][0]) / (now - began[name][1])
-        bare.join()
+        with bare:
+            used, began = {name: cpu(pid) for name, pid in pids.items()}, time.monotonic()
+            before = statuses(client)
+            stops = move(client, robot, 60 * minutes)
+            supervisor.check()
+            baseline, after = bare.counted(), statuses(client)
+            elapsed = time.monotonic() - began
+            shares = {name: (cpu(pid) - used[name]) / elapsed for name, pid in pids.items()}
     loops = {}
-    for service in ("hal", "model"):
-        for name, end in after[service].loops.items():
+    for service, status in after.items():
+        for name, end in status.loops.items():
             start = before[service].loops[name]
             counted = {key: end[key] - start[key] for key in ("ticks", "skipped", "overruns", "failed")}
             kept = {key: end[key] for key in ("rate_wanted", "total_p50", "total_p99", "total_max")}
@@ -181,8 +135,23 @@ def run(robot_file: Path, minutes: float, with_bus: bool = True) -> dict[str, ob
     return {"minutes": minutes, "loops": loops, "cores": shares, "stops": stops, "facts": facts}
 
 
-def show(found: dict, console: Console) -> None:
-    """The table of docs/results.md."""
+def statuses(client: Client) -> dict[str, Status]:
+    """Return service -> its newest status.
+
+    Raises:
+        TimeoutError: A service published none within 3 s.
+    """
+    newest = {}
+    for name in ("hal", "model"):
+        status = client.status(name, timeout=3.0)
+        if status is None:
+            raise TimeoutError(f"No status of service '{name}' within 3 s. Is it running?")
+        newest[name] = status
+    return newest
+
+
+def show(found: dict[str, Any], console: Console) -> None:
+    """Print the table of docs/results.md."""
     table = Table(
         "loop",
         "rate [Hz]",
@@ -210,7 +179,7 @@ def show(found: dict, console: Console) -> None:
 
 @contextmanager
 def with_rates(robot_file: Path, rates: str) -> Iterator[Path]:
-    """The robot file with other rates (`estimation=500,update=20`), in a file beside it for as long as it is needed."""
+    """Yield a robot file with other rates (`estimation=500,update=20`), in the same folder."""
     if not rates:
         yield robot_file
         return

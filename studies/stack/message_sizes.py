@@ -1,12 +1,13 @@
-"""How large the messages of a robot are, and what they come to per second at its robot file's rates.
+"""Sizes of a robot's messages, and their sums per second at its robot file's rates.
 
     python -m studies.stack.message_sizes robots/musashi_arm.yaml
 
-Nothing runs: one message of each type is made with all the elements of the robot file, encoded, and decoded again.
+No process runs: one message of each type is made with all elements of the robot file, encoded, and decoded again.
 """
 
 import argparse
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -20,22 +21,18 @@ from services.wire import keys, messages
 BIG = 2**52
 TIMES = 300
 LOOPS = {"hal": 1, "model": 4}
-"""How many loops a status tells of."""
+"""Number of loops in a service's status."""
+COLUMNS = ("key", "bytes", "per second", "kB/s", "encoding us", "decoding us")
 
 
-def sizes(robot: RobotConfig) -> dict[str, tuple[int, float, float]]:
-    """Key -> bytes of a message, messages per second, processor time [s] to decode one."""
+def examples(robot: RobotConfig) -> dict[str, tuple[messages.Message, float]]:
+    """Return key -> a message with all elements, messages per second."""
     size = {name: signal.size for name, signal in robot.signals.items()}
     floats, truths = {n: np.ones(k) for n, k in size.items()}, {n: np.ones(k, bool) for n, k in size.items()}
     command, words = robot.command.signal, dict.fromkeys(size, "measured")
-    stamp = {"stamp_ns": BIG, "seq": 2**30, "boot": BIG}
     cycle, rates = 2**30, robot.rates
     n = size[command]
-    anomaly = messages.Anomaly(
-        cycle=cycle, score=1.0, threshold=1.0, is_anomaly=False, blamed="muscle_length.biceps", contribution=floats,
-        verdict="normal",
-    )  # fmt: skip
-    found: dict[str, tuple[messages.Message, float]] = {
+    made: dict[str, tuple[messages.Message, float]] = {
         keys.sample("*"): (
             messages.Sample(cycle=cycle, source="can", complete=True, values=floats, age=floats, valid=truths),
             rates.hal,
@@ -48,7 +45,10 @@ def sizes(robot: RobotConfig) -> dict[str, tuple[int, float, float]]:
             messages.Estimates(cycle=cycle, values=floats, estimated=truths, std=floats, method=words, mask=words,
                                residual=dict.fromkeys(size, 1.0)), rates.estimation,
         ),
-        keys.anomaly("*"): (anomaly, rates.anomaly),
+        keys.anomaly("*"): (
+            messages.Anomaly(cycle=cycle, score=1.0, threshold=1.0, is_anomaly=False, blamed="muscle_length.biceps",
+                             contribution=floats, verdict="normal"), rates.anomaly,
+        ),
         keys.update("*"): (
             messages.Update(active=True, model_version=9, window=500, dropped=0, loss=0.1, bias=np.ones(2)),
             rates.update,
@@ -63,39 +63,42 @@ def sizes(robot: RobotConfig) -> dict[str, tuple[int, float, float]]:
         status = messages.Status(
             service=service, state="running", loops={f"loop{index}": loop for index in range(count)}, facts=facts
         )
-        found[keys.status("*", service)] = (status, 1.0)
-    encoded = {key: (messages.encode(message, **stamp), rate) for key, (message, rate) in found.items()}
-    return {key: (len(data), rate, _decoding(data)) for key, (data, rate) in encoded.items()}
+        made[keys.status("*", service)] = (status, 1.0)
+    return made
 
 
-def _decoding(data: bytes) -> float:
-    """Processor time [s] that one message costs who reads it; the least of several tries."""
+def cost(act: Callable[[], object]) -> float:
+    """Return the processor time [us] of one call, the least of several tries."""
     tries = []
     for _ in range(5):
         begun = time.process_time()
         for _ in range(TIMES):
-            messages.decode_any(data)
-        tries.append((time.process_time() - begun) / TIMES)
+            act()
+        tries.append(1e6 * (time.process_time() - begun) / TIMES)
     return min(tries)
+
+
+def table(robot: RobotConfig) -> Table:
+    """Measure the messages of one robot."""
+    lines = Table(*COLUMNS, title=robot.robot)
+    stamp = {"stamp_ns": BIG, "seq": 2**30, "boot": BIG}
+    often = total = slow = cores = 0.0
+    for key, (message, rate) in examples(robot).items():
+        data = messages.encode(message, **stamp)
+        encoding = cost(lambda message=message: messages.encode(message, **stamp))
+        decoding = cost(lambda data=data: messages.decode_any(data))
+        lines.add_row(
+            key, f"{len(data)}", f"{rate:g}", f"{len(data) * rate / 1e3:.1f}", f"{encoding:.1f}", f"{decoding:.1f}"
+        )
+        often, total, cores = often + rate, total + len(data) * rate, cores + 1e-6 * rate * decoding
+        slow += len(data) * rate if rate <= 1.0 else 0.0
+    lines.add_row("all", "", f"{often:g}", f"{total / 1e3:.1f}", "", f"{100 * cores:.2f} % of a core")
+    lines.add_row("read by `gemuco top`", "", "", f"{slow / 1e3:.1f}")
+    return lines
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("robot", type=Path, nargs="*", default=sorted(Path("robots").glob("*_*.yaml")))
     for path in parser.parse_args().robot:
-        made = sizes(load_robot(path))
-        table = Table("key", "bytes", "per second", "kB/s", "decoding us", title=path.stem)
-        for name, (length, often, costs) in made.items():
-            table.add_row(name, f"{length}", f"{often:g}", f"{length * often / 1e3:.1f}", f"{1e6 * costs:.1f}")
-        total = sum(length * often for length, often, _ in made.values())
-        slow = sum(length * often for length, often, _ in made.values() if often <= 1.0)
-        cores = sum(often * costs for _, often, costs in made.values())
-        table.add_row(
-            "all",
-            "",
-            f"{sum(often for _, often, _ in made.values()):g}",
-            f"{total / 1e3:.1f}",
-            f"{100 * cores:.2f} % of a core",
-        )
-        table.add_row("what `gemuco top` hears", "", "", f"{slow / 1e3:.1f}")
-        Console(width=100).print(table)
+        Console(width=110).print(table(load_robot(path)))

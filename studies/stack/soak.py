@@ -7,7 +7,7 @@ processes; this one is the remote client, through the router. The robot is engag
 two seconds. Ten seconds into each minute one joint's encoder falls silent, thirty seconds later it comes back. Once a
 minute memory, threads, open files and processor time of every process are read, and every loop's ticks, skips and
 lateness; a process of bare timer loops with the same rates and priorities tells what the machine itself skipped
-meanwhile. Ends with verdicts, a JSON file and a picture.
+meanwhile. Ends with verdicts and a JSON file.
 """
 
 import argparse
@@ -21,7 +21,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import msgpack
 import numpy as np
 import zenoh
@@ -39,8 +38,6 @@ from services.process.supervisor import Supervisor, gemuco_command
 from services.wire import keys
 from studies.stack import light_robot
 from studies.stack.processes import BareLoops, look
-
-mpl.use("Agg")
 
 RATE = 50.0
 """Of HAL and estimation [Hz]; modest, since others work on this machine too."""
@@ -323,37 +320,6 @@ def _judge_loops(rows: list[dict[str, Any]], console: Console) -> bool:
     return good
 
 
-def draw(found: dict[str, Any], path: Path) -> None:
-    """Memory, skips, times of recovery and pauses over the hour."""
-    from matplotlib import pyplot as plt
-
-    rows = found["rows"]
-    minutes = [row["minute"] for row in rows]
-    figure, ((memory, skips), (sensor, pauses)) = plt.subplots(2, 2, figsize=(12, 7), layout="constrained")
-    for name in rows[0]["processes"]:
-        seen = [row["processes"][name]["rss"] for row in rows]
-        memory.plot(minutes, np.array(seen) - seen[min(SETTLED, len(seen) - 1)], label=f"{name} ({seen[-1]:.0f} MB)")
-    memory.set(title=f"Memory, against minute {SETTLED + 1}", ylabel="MB")
-    for name in found["rates"]:
-        ours = np.array([row["loops"].get(name, {}).get("skipped", np.nan) for row in rows])
-        bare = np.array([row["bare"][name]["skipped"] for row in rows])
-        (line,) = skips.plot(minutes, ours - ours[0], label=name)
-        skips.plot(minutes, bare - bare[0], ":", color=line.get_color())
-    skips.set(title="Skipped periods so far (dotted: bare loops beside them)", ylabel="periods")
-    for what, label in (("until_estimated", "lost until estimated"), ("until_measured", "back until measured")):
-        sensor.semilogy(minutes, [row[what] for row in rows], ".-", label=label)
-    sensor.set(title="The sensor of the minute, seen by the remote client", ylabel="s", xlabel="minute")
-    pauses.plot(minutes, [row["client"]["longest"] for row in rows], ".-", label="longest pause between estimates [s]")
-    pauses.plot(minutes, [row["load"] / 10 for row in rows], ":", color="grey", label="load of the machine / 10")
-    worst = [max(one["worst"] for one in row["bare"].values()) for row in rows]
-    pauses.plot(minutes, worst, "--", label="worst lateness of a bare loop so far [s]")
-    pauses.set(title="Pauses at the remote client", ylabel="s", xlabel="minute")
-    for axes in (memory, skips, sensor, pauses):
-        axes.grid(alpha=0.3)
-        axes.legend(fontsize=8)
-    figure.savefig(path, dpi=110)
-
-
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=int, default=60)
@@ -363,5 +329,4 @@ if __name__ == "__main__":
     result = run(options.minutes, options.out)
     terminal = Console(width=140)
     is_good = judge(result, terminal)
-    draw(result, options.out.with_suffix(".png"))
     terminal.print("ALL FLAT" if is_good else "NOT ALL FLAT", f"over {options.minutes} minutes; {options.out}")

@@ -6,12 +6,10 @@ Needs a running stack (`gemuco hal`, `gemuco serve`) on this machine. The same r
 """
 
 import argparse
-import os
 import subprocess
 import sys
 import threading
 import time
-from pathlib import Path
 
 import msgspec
 import viser
@@ -20,6 +18,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from services.client import Client
 from services.wire.messages import Status
+from studies.stack.processes import cpu
 
 PORT = 8093
 SERVICES = ("hal", "model")
@@ -27,12 +26,6 @@ CAMERA = {
     "type": "ViewerCameraMessage", "wxyz": (1.0, 0.0, 0.0, 0.0), "position": (1.0, 1.0, 1.0), "fov": 1.0, "near": 0.1,
     "far": 10.0, "image_height": 10, "image_width": 10, "look_at": (0.0, 0.0, 0.0), "up_direction": (0.0, 0.0, 1.0),
 }  # fmt: skip
-
-
-def cpu(pid: int) -> float:
-    """CPU time of a process so far [s]."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def browser() -> tuple[ClientConnection, list[int]]:

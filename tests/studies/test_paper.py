@@ -1,7 +1,6 @@
 import json
 import os
 import signal
-import time
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,7 @@ from gemuco.signals import Layout, Signal
 from hal.config import load_robot
 from services.errors import BadArguments
 from services.show import Tell
-from studies.paper import experiment, figures
+from studies.paper import experiment, figures, runs
 from studies.paper.report import Report, Row
 from studies.paper.runs import Run, RunKilled, each_seed, open_run
 
@@ -34,16 +33,16 @@ def test_a_report_is_saved_for_people_and_programs(tmp_path):
     report.add(Row("tip error", "mm", "52.2", (10.0, 13.0), bar=12.0))
     report.note("The tip hangs 100 mm below.")
     report.save(tmp_path)
-    told = (tmp_path / "report.md").read_text()
-    assert "| tip error | 52.2 mm | 11.5 ± 1.5 mm | < 12 mm | yes |" in told
-    assert told.strip().endswith("The tip hangs 100 mm below.")
+    page = (tmp_path / "report.md").read_text()
+    assert "| tip error | 52.2 mm | 11.5 ± 1.5 mm | < 12 mm | yes |" in page
+    assert page.strip().endswith("The tip hangs 100 mm below.")
     saved = json.loads((tmp_path / "report.json").read_text())
     assert saved["rows"][0]["reached"] is True
     assert saved["rows"][0]["values"] == [10.0, 13.0]
     assert report.table().row_count == 1
 
 
-def test_what_was_collected_is_used_again_until_something_changes(tmp_path):
+def test_results_are_cached_until_the_robot_file_or_a_setting_changes(tmp_path):
     robot = load_robot(ROBOT)
     calls = []
     layout = Layout((Signal("a", 1, "rad"),))
@@ -53,19 +52,16 @@ def test_what_was_collected_is_used_again_until_something_changes(tmp_path):
         return Dataset(layout, (Episode("", {"a": np.zeros((3, 1))}),))
 
     run = open_run(robot, tmp_path, 0)
-    assert len(run.dataset("nominal", make, samples=3)) == 3
-    run.dataset("nominal", make, samples=3)
+    assert len(run.cached("nominal", make, samples=3)) == 3
+    assert len(run.cached("nominal", make, samples=3)) == 3
     assert len(calls) == 1
-    run.dataset("nominal", make, samples=4)
+    run.cached("nominal", make, samples=4)
     assert len(calls) == 2
     other = robot.model_copy(update={"collect": {**robot.collect, "rate": 5}})
-    open_run(other, tmp_path, 0).dataset("nominal", make, samples=4)
+    open_run(other, tmp_path, 0).cached("nominal", make, samples=4)
     assert len(calls) == 3
-    (tmp_path / "seed_0" / "nominal.npz").write_bytes(b"damaged")
-    open_run(other, tmp_path, 0).dataset("nominal", make, samples=4)
+    open_run(other, tmp_path, 0, fresh=True).cached("nominal", make, samples=4)
     assert len(calls) == 4
-    open_run(other, tmp_path, 0, fresh=True).dataset("nominal", make, samples=4)
-    assert len(calls) == 5
 
 
 def test_unknown_experiments_are_one_sentence():
@@ -91,47 +87,39 @@ def test_two_components_are_enough_for_a_p_of_one_number(tmp_path):
     assert (tmp_path / "one.png").exists()
 
 
-def _counts(run: Run, tell: Tell) -> tuple[int, int]:
-    tell(0.0, "counting")
+def _seed_and_process(run: Run, tell: Tell) -> tuple[int, int]:
     if run.robot.robot == "killed":
         os.kill(os.getpid(), signal.SIGKILL)
-    if run.robot.robot == "broken":
-        if run.seed:
-            tell(0.5, "patient")
-            while True:
-                tell(0.5, "waiting")
+    tell(0.5, "counting")
+    if run.robot.robot == "broken" and run.seed == 0:
         raise FileNotFoundError("of seed 0")
-    deadline = time.monotonic() + 30.0
-    while not (run.folder / "heard").exists():
-        assert time.monotonic() < deadline, "nobody heard it"
-        time.sleep(0.01)
     return run.seed, os.getpid()
 
 
-@pytest.mark.long
-def test_seeds_run_side_by_side_and_are_told_of(tmp_path):
-    told: list[str] = []
-
-    def hear(share: float, text: str) -> None:
-        assert 0.0 <= share <= 1.0
-        told.append(text)
-        (tmp_path / f"seed_{text[5]}" / "heard").touch()
-
-    found = each_seed(load_robot(ROBOT), [3, 1, 2], tmp_path, hear, False, _counts)
-    assert [seed for seed, _ in found] == [3, 1, 2]
-    assert os.getpid() not in {process for _, process in found}
-    assert sorted(told) == ["seed 1: counting", "seed 2: counting", "seed 3: counting"]
+def _each_seed(robot: str, seeds: list[int], folder: Path, progress: Tell) -> list[tuple[int, int]]:
+    config = load_robot(ROBOT).model_copy(update={"robot": robot})
+    return each_seed(config, seeds, folder, progress, False, _seed_and_process)
 
 
 @pytest.mark.long
-def test_an_experiment_that_fails_ends_those_of_the_other_seeds(tmp_path):
-    robot = load_robot(ROBOT).model_copy(update={"robot": "broken"})
+def test_results_are_in_the_order_of_the_seeds_and_progress_is_reported(tmp_path, monkeypatch):
+    monkeypatch.setattr(runs, "cpu_count", lambda: 2)
+    reports: list[tuple[float, str]] = []
+    results = _each_seed("arm", [3, 1, 2], tmp_path, lambda share, text: reports.append((share, text)))
+    assert [seed for seed, _ in results] == [3, 1, 2]
+    assert os.getpid() not in {process for _, process in results}
+    assert sorted(text for _, text in reports) == ["seed 1: counting", "seed 2: counting", "seed 3: counting"]
+    assert max(share for share, _ in reports) == pytest.approx(0.5)
+
+
+@pytest.mark.long
+def test_an_error_in_one_seed_is_raised(tmp_path):
     with pytest.raises(FileNotFoundError, match="of seed 0"):
-        each_seed(robot, [0, 1], tmp_path, lambda share, text: None, False, _counts)
+        _each_seed("broken", [0, 1], tmp_path, lambda share, text: None)
 
 
 @pytest.mark.long
-def test_a_process_that_is_killed_is_told_in_a_sentence(tmp_path):
-    robot = load_robot(ROBOT).model_copy(update={"robot": "killed"})
+def test_a_killed_process_is_one_sentence(tmp_path, monkeypatch):
+    monkeypatch.setattr(runs, "cpu_count", lambda: 2)
     with pytest.raises(RunKilled, match="was killed"):
-        each_seed(robot, [0, 1], tmp_path, lambda share, text: None, False, _counts)
+        _each_seed("killed", [0, 1], tmp_path, lambda share, text: None)

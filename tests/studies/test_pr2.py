@@ -5,19 +5,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gemuco.learning import devices
 from gemuco.search.descent import DescentConfig
 from hal.config import RobotConfig, load_robot
-from services.learning.trainer import train
-from services.show import Tell
 from studies.paper.pr2 import arm as pr2_arm
 from studies.paper.pr2 import trials as pr2_trials
 from studies.paper.pr2.actual import actual, flexible, parted
 from studies.paper.pr2.arm import JOINTS, TIP, Arm, Geometry, duster_motion
 from studies.paper.pr2.experiment import Outcome, summary
 from studies.paper.pr2.figures import draw
-from studies.paper.pr2.simulated import BELIEVED, ELEVATION, OTHER_ELEVATION, collected, simulate
-from studies.paper.runs import MODEL, Run, each_seed, open_run
+from studies.paper.pr2.simulated import BELIEVED, ELEVATION, OTHER_ELEVATION, simulate
+from studies.paper.runs import open_run
 
 ROBOT = load_robot(Path(__file__).parents[2] / "robots" / "pr2_duster.yaml")
 
@@ -87,27 +84,5 @@ def test_both_experiments_run_and_tell_their_figures(tmp_path, monkeypatch):
     }
     again = simulate(open_run(small(ROBOT), tmp_path, seed=0), lambda share, text: None)
     assert again.held_out == simulated.held_out
-    first, last = parted(run.dataset("nominal", lambda: pytest.fail("collected again")), 0.5)
+    first, last = parted(run.cached("nominal", lambda: pytest.fail("collected again")), 0.5)
     assert len(first) + len(last) == 9 * 60
-
-
-def _model(run: Run, tell: Tell) -> np.ndarray:
-    schema = run.schema(MODEL, lambda: pytest.fail("trained again"))
-    assert schema.manifest["robot"] == "pr2_duster"
-    return schema.weights.encoder[0].matrix
-
-
-@pytest.mark.long
-def test_where_there_is_cuda_the_models_of_all_seeds_are_trained_together(tmp_path, monkeypatch):
-    monkeypatch.setattr(devices, "best", lambda: "cpu")  # of torch
-    robot, told = small(ROBOT), []
-    found = each_seed(robot, [0, 1], tmp_path, lambda done, _: told.append(done), True, _model, collected)
-    assert told == sorted(told)
-    monkeypatch.setattr(devices, "best", lambda: None)
-    for seed, matrix in enumerate(found):
-        run = open_run(robot, tmp_path, seed)
-        data = run.dataset("nominal", lambda: pytest.fail("collected again"))
-        alone = train(robot, data, seed, lambda done, text: None).schema
-        np.testing.assert_allclose(matrix, alone.weights.encoder[0].matrix, atol=2e-2)
-    again = each_seed(robot, [0, 1], tmp_path, lambda done, _: None, False, _model, collected)
-    np.testing.assert_array_equal(again, found)

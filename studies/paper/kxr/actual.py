@@ -59,8 +59,8 @@ def actual(run: Run, simulated: BodySchema, tell: Tell) -> Actual:
     """Collect on the actual robot, fine-tune what was learned in simulation, and run every trial of one seed."""
     tell(0.0, "collecting on the actual robot")
     settings = {"grid": TAUGHT_GRID, "margin": TAUGHT_MARGIN, "random": RANDOM}
-    data = run.dataset("actual", lambda: _collected(run), **settings)
-    schema = run.schema(
+    data = run.cached("actual", lambda: _collected(run), **settings)
+    schema = run.cached(
         "actual_model", lambda: _tuned(run, simulated, data, tell), epochs=EPOCHS, rate=RATE, **settings
     )
     tell(0.8, "trials on the actual robot")

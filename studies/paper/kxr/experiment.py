@@ -25,7 +25,6 @@ from studies.paper.kxr.simulated import (
     STEPS,
     TOOLS,
     Simulated,
-    collected,
     mask_errors,
     simulate,
 )
@@ -62,7 +61,7 @@ def reproduce(seeds: Sequence[int], folder: Path, progress: Tell, fresh: bool) -
     """See `studies.paper.Experiment`."""
     robot = load_robot(robot_file(ROBOT))
 
-    outcomes = each_seed(robot, seeds, folder, progress, fresh, _of_seed, collected)
+    outcomes = each_seed(robot, seeds, folder, progress, fresh, _of_seed)
     report = Report(ROBOT, tuple(seeds))
     _add_structure(report, outcomes)
     _add_recognition(report, outcomes)

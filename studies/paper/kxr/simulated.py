@@ -7,7 +7,6 @@ from itertools import product
 import numpy as np
 
 from gemuco.adaption.config import UpdateConfig
-from gemuco.dataset import Dataset
 from gemuco.masks import all_masks, label
 from gemuco.schema import BodySchema
 from services.learning.collector import collect_direct
@@ -27,7 +26,7 @@ from studies.paper.kxr.robot import (
     safe_postures,
 )
 from studies.paper.kxr.trials import Course, follow, follow_blindly, recognise, samples_until
-from studies.paper.runs import MODEL, Run
+from studies.paper.runs import Run, between
 
 NOMINAL = "nominal"
 TOOLS = {
@@ -85,17 +84,12 @@ class Simulated:
     limit: Course
 
 
-def collected(run: Run, tell: Tell) -> Dataset:
-    """What the model is trained on."""
-    tell(0.0, "collecting")
-    return run.dataset("nominal", lambda: collect_direct(run.robot, NOMINAL, run.seed).dataset)
-
-
 def simulate(run: Run, tell: Tell) -> Simulated:
     """Collect, train, and run every trial of one seed."""
     robot, seed = run.robot, run.seed
-    data = collected(run, tell)
-    schema = run.schema(MODEL, lambda: train(robot, data, seed, lambda done, text: tell(0.2 + 0.5 * done, text)).schema)
+    tell(0.0, "collecting")
+    data = run.cached("nominal", lambda: collect_direct(robot, NOMINAL, seed).dataset)
+    schema = run.cached("nominal_model", lambda: train(robot, data, seed, between(tell, 0.2, 0.7)).schema)
     tell(0.7, "recognising tools")
     needed, paths = recognitions(run, schema, NOMINAL, WAYS)
     tell(0.85, "reaching targets while tools change")

@@ -17,7 +17,7 @@ from studies.paper.musashi import figures as figures
 from studies.paper.musashi import simulation as simulation
 from studies.paper.musashi.model import decay
 from studies.paper.musashi.motion import LENGTH, POSITION, TENSION
-from studies.paper.musashi.seed import AFTER, BEFORE, HELD, Outcome, collected, run_seed
+from studies.paper.musashi.seed import AFTER, BEFORE, HELD, Outcome, run_seed
 from studies.paper.report import Report, Row
 from studies.paper.runs import each_seed
 
@@ -29,7 +29,7 @@ LOOSE = 0.30
 def reproduce(seeds: Sequence[int], folder: Path, progress: Tell, fresh: bool) -> Report:
     """Run all seeds, draw the figures and compare with the paper; see `Experiment`."""
     robot = load_robot(robot_file("musashi_arm"))
-    outcomes = each_seed(robot, seeds, folder, progress, fresh, run_seed, collected)
+    outcomes = each_seed(robot, seeds, folder, progress, fresh, run_seed)
     figures.draw(outcomes, robot, folder)
     return report(outcomes)
 

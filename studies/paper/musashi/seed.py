@@ -15,7 +15,7 @@ from studies.paper.musashi import control as control
 from studies.paper.musashi import model as model
 from studies.paper.musashi import simulation as simulation
 from studies.paper.musashi.motion import TENSION, record
-from studies.paper.runs import MODEL, Run, between
+from studies.paper.runs import Run, between
 
 LIVED, NORMAL, FRESH, CUT = 600.0, 240.0, 120.0, 30.0
 """Lengths of recordings [s]: learned from, what is normal, judged, and with a cut muscle."""
@@ -72,17 +72,12 @@ class Outcome:
     forced: Mapping[str, Mapping[str, np.ndarray]]
 
 
-def collected(run: Run, tell: Tell) -> Dataset:
-    """What the model is trained on: random states of the designer's model."""
-    tell(0.0, "drawing states of the geometric model")
-    return run.dataset("geometric", lambda: model.geometric_data(run.robot, run.seed))
-
-
 def run_seed(run: Run, tell: Tell) -> Outcome:
     """Train, move the actual arm, learn from it and use what was learned."""
     robot, seed = run.robot, run.seed
-    data = collected(run, tell)
-    before = run.schema(MODEL, lambda: train(robot, data, seed, between(tell, 0.0, 0.2)).schema)
+    tell(0.0, "drawing states of the geometric model")
+    data = run.cached("geometric", lambda: model.geometric_data(robot, seed))
+    before = run.cached("nominal_model", lambda: train(robot, data, seed, between(tell, 0.0, 0.2)).schema)
     tell(0.2, "moving the actual arm")
     lived = _recorded(run, "lived", 100, LIVED)
     tell(0.4, "learning from it")
@@ -130,7 +125,7 @@ def _recorded(run: Run, name: str, motion: int, duration: float, parts: tuple[tu
     """Random motion of the run's arm; every name has a motion of its own."""
     seed = 1000 * motion + run.seed
     broken = [list(part) for part in parts]
-    return run.dataset(
+    return run.cached(
         name,
         lambda: record(run.robot, run.seed, seed, duration, parts),
         motion=seed,

@@ -60,9 +60,9 @@ def actual(run: Run, simulated: BodySchema, tell: Tell) -> Actual:
     tell(0.0, "collecting on the actual arm")
     count = round(COLLECTED * collect_config(run.robot).samples)
     wanted = Wanted(flexible(run.robot), samples=count)
-    data = run.dataset("actual", lambda: collect_direct(run.robot, ACTUAL, run.seed, wanted).dataset, samples=count)
+    data = run.cached("actual", lambda: collect_direct(run.robot, ACTUAL, run.seed, wanted).dataset, samples=count)
     learned, judged = parted(data, LEARNED / COLLECTED)
-    schema = run.schema(
+    schema = run.cached(
         "actual_model", lambda: _tuned(run, simulated, learned, tell), samples=len(learned), epochs=EPOCHS, rate=RATE
     )
     tell(0.6, "trials on the actual arm")

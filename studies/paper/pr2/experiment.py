@@ -12,7 +12,7 @@ from services.show import Tell
 from studies.paper.pr2.actual import MODELS, Actual, actual
 from studies.paper.pr2.arm import JOINTS, TIP
 from studies.paper.pr2.figures import draw
-from studies.paper.pr2.simulated import CASES, POINTS, RECOGNISERS, WAYS, Simulated, collected, simulate
+from studies.paper.pr2.simulated import CASES, POINTS, RECOGNISERS, WAYS, Simulated, simulate
 from studies.paper.report import Report, Row, adder
 from studies.paper.runs import Run, between, each_seed
 
@@ -41,7 +41,7 @@ def reproduce(seeds: Sequence[int], folder: Path, progress: Tell, fresh: bool) -
     """See `studies.paper.Experiment`."""
     robot = load_robot(robot_file(ROBOT))
 
-    outcomes = each_seed(robot, seeds, folder, progress, fresh, _of_seed, collected)
+    outcomes = each_seed(robot, seeds, folder, progress, fresh, _of_seed)
     draw(folder, [outcome.simulated for outcome in outcomes], [outcome.actual for outcome in outcomes])
     return summary(seeds, outcomes)
 

@@ -15,7 +15,7 @@ from services.model.model_config import collect_config
 from services.show import Tell
 from studies.paper.pr2.arm import Arm, Geometry, duster_motion
 from studies.paper.pr2.trials import Course, control_along, estimate_along, model_error
-from studies.paper.runs import MODEL, Run
+from studies.paper.runs import Run, between
 
 NOMINAL = "nominal"
 BELIEVED = "l500_phi30"
@@ -105,25 +105,20 @@ class Simulated:
         return self.schema.manifest[name]
 
 
-def collected(run: Run, tell: Tell) -> Dataset:
-    """What the model is trained on."""
-    tell(0.0, "collecting")
-    return run.dataset("nominal", lambda: collect_direct(run.robot, NOMINAL, run.seed).dataset)
-
-
 def simulate(run: Run, tell: Tell) -> Simulated:
     """Collect, train, and run every trial of one seed."""
     robot, seed = run.robot, run.seed
-    data = collected(run, tell)
+    tell(0.0, "collecting")
+    data = run.cached("nominal", lambda: collect_direct(robot, NOMINAL, seed).dataset)
     count = round(FRESH_SHARE * collect_config(robot).samples)
-    fresh = run.dataset(
+    fresh = run.cached(
         "nominal_fresh",
         lambda: collect_direct(robot, NOMINAL, seed + FRESH, Wanted(samples=count)).dataset,
         samples=count,
     )
-    schema = run.schema(
-        MODEL,
-        lambda: train(robot, data, seed, lambda done, text: tell(0.3 + 0.4 * done, text)).schema,
+    schema = run.cached(
+        "nominal_model",
+        lambda: train(robot, data, seed, between(tell, 0.3, 0.7)).schema,
     )
     tell(0.7, "trials")
     errors = errors_by_grasp(schema, fresh)
