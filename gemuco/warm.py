@@ -104,7 +104,7 @@ def learning(schema: BodySchema) -> Iterator[str]:
     there, whole = np.ones((rows, size), bool), np.ones((rows, len(SIGNALS)), bool)
     x, p = np.zeros((rows, size), np.float32), np.zeros((rows, len(schema.bias)), np.float32)
     errors = MaskErrors(schema.layout, schema.weights.whole, x, there, whole, p, np.ones(size))
-    Judge(schema.layout.names, (errors,), Thresholds()).race(np.eye(len(SIGNALS), dtype=bool))
+    Judge(schema.layout.names, (errors,), Thresholds()).measure(np.eye(len(SIGNALS), dtype=bool))
 
 
 def warm(tell: Callable[[float, str], None] | None = None, is_service: bool = False) -> float:

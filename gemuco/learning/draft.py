@@ -33,8 +33,8 @@ class Draft:
         key: What the training depends on; a draft of another is ignored and overwritten.
     """
 
-    def __init__(self, path: Path | None, key: str) -> None:
-        self.path, self.key = path, key
+    def __init__(self, path: str | Path | None, key: str) -> None:
+        self.path, self.key = None if path is None else Path(path), key
 
     def load(self) -> tuple[dict[str, np.ndarray], dict[str, Any]] | None:
         """Arrays and facts; None if there is no draft of this very training, or it is damaged."""

@@ -118,14 +118,17 @@ class Learner:
 
     def run(self, progress: Progress | None, title: str, draft: Draft) -> Course:
         """Train to the end or until nothing gets better; leaves the best W and p in place."""
-        self.restore(draft)
+        self._restore(draft)
         while not self.is_done:
-            usual = self.begin()
-            self.end(self._pass(self.epoch, usual), self._held_out())
+            self._epoch()
             if progress is not None:
                 progress(self.epoch / self.config.epochs, f"{title}: held-out loss {self.course.least:.4f}")
-            self.keep(draft)
-        return self.close()
+            if self.epoch % max(1, self.config.epochs // DRAFTS) == 0 or self.epoch == self.config.epochs:
+                draft.save(*self._written())
+        for name, numbers in self._numbers().items():
+            numbers[...] = self.course.best[name]
+        self._look()
+        return self.course
 
     @property
     def epoch(self) -> int:
@@ -137,33 +140,16 @@ class Learner:
         """Whether all epochs are done, or nothing got better for long."""
         return self.epoch >= self.config.epochs or self.epoch - self.course.best_epoch > self.config.patience
 
-    def begin(self) -> float:
-        """What comes before an epoch; returns which misses count in proportion, see `HUBER`."""
-        epochs = self.config.epochs
+    def _epoch(self) -> None:
+        """Learn from every sample once, and measure on what is held out."""
+        course, epoch, epochs = self.course, self.epoch, self.config.epochs
         looks = range(epochs // 4, epochs, max(1, epochs // LOOKS))
-        if self.epoch in looks:
-            self._look(patient=self.epoch < epochs // 2)
-        return HUBER[self.epoch > looks.start]
-
-    def end(self, train: float, held_out: float) -> None:
-        """What comes after an epoch of these losses."""
-        course, epoch = self.course, self.epoch
-        course.train.append(train)
-        course.held_out.append(held_out)
-        if epoch == 0 or held_out < course.least:
+        if epoch in looks:
+            self._look(patient=epoch < epochs // 2)
+        course.train.append(self._pass(epoch, HUBER[epoch > looks.start]))
+        course.held_out.append(self._held_out())
+        if epoch == 0 or course.held_out[-1] < course.least:
             course.best_epoch, course.best = epoch, self._copy()
-
-    def keep(self, draft: Draft) -> None:
-        """Write the training down from time to time, and at its end."""
-        if self.epoch % max(1, self.config.epochs // DRAFTS) == 0 or self.epoch == self.config.epochs:
-            draft.save(*self._written())
-
-    def close(self) -> Course:
-        """Put the best W and p in place."""
-        for name, numbers in self._numbers().items():
-            numbers[...] = self.course.best[name]
-        self._look()
-        return self.course
 
     def _pass(self, epoch: int, straight: float) -> float:
         """One epoch; returns the mean loss of its steps."""
@@ -177,7 +163,7 @@ class Learner:
     def _step(self, batch: Batch, pace: float, straight: float) -> float:
         """One step of Adam; returns the loss before it."""
         missed, by_weights, by_input = gradients(
-            self.chain, self._inputs(batch), batch.wanted, self.straight(straight), True, self.biases.size > 0
+            self.chain, self._inputs(batch), batch.wanted, self._straight(straight), True, self.biases.size > 0
         )
         self.optimiser.rate = pace * self.config.rate
         self.optimiser.move(self.chain.flat, by_weights)
@@ -193,7 +179,7 @@ class Learner:
             np.concatenate([batch.inputs, self.biases[batch.condition]], axis=1) if self.biases.size else batch.inputs
         )
 
-    def straight(self, usual: float) -> np.float32:
+    def _straight(self, usual: float) -> np.float32:
         """Misses above this many standard deviations count in proportion; none, where nothing is rejected either."""
         return SQUARED if math.isinf(self.config.outliers) else np.float32(usual)
 
@@ -202,7 +188,7 @@ class Learner:
         if not len(rows):
             return math.inf
         batch = self.held.take(rows, chosen)
-        return float(loss(self.chain, self._inputs(batch), batch.wanted, self.straight(HUBER[1])))
+        return float(loss(self.chain, self._inputs(batch), batch.wanted, self._straight(HUBER[1])))
 
     def _look(self, patient: bool = False) -> None:
         """Suspect outliers anew, in what is learned and in what measures."""
@@ -237,7 +223,7 @@ class Learner:
         }
         return arrays, facts
 
-    def restore(self, draft: Draft) -> None:
+    def _restore(self, draft: Draft) -> None:
         """Go on where an interrupted training was written down, if it was."""
         found = draft.load()
         if found is None:

@@ -1,9 +1,7 @@
 """Training (paper, II-D): from episodes to a body schema, and from a schema to one that fits a few new episodes."""
 
-from collections.abc import Generator, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable
 from pathlib import Path
-from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -12,7 +10,6 @@ from gemuco.dataset import Dataset
 from gemuco.errors import NotEnoughData
 from gemuco.layers import Weights
 from gemuco.learning.accuracy import assess
-from gemuco.learning.batched import train
 from gemuco.learning.config import TrainConfig
 from gemuco.learning.draft import Draft, key_of
 from gemuco.learning.history import History
@@ -25,33 +22,7 @@ from gemuco.scaler import Scaler
 from gemuco.schema import BodySchema
 
 ANCHORS = 1000
-
-
-Found = TypeVar("Found")
-
-
-@dataclass(frozen=True, slots=True)
-class Job:
-    """One training of several; see `fit`.
-
-    Attributes:
-        dataset: Episodes of one body.
-        config: How.
-        masks: The feasible masks.
-        x_out: What to infer; every signal if None.
-        resume: A file to keep the training in.
-    """
-
-    dataset: Dataset
-    config: TrainConfig
-    masks: tuple[Mask, ...]
-    x_out: tuple[str, ...] | None = None
-    resume: str | Path | None = None
-
-
-Fitted = tuple[BodySchema, History]
-Work = Generator[Sequence[Job], list[Fitted], Found]
-"""What needs trainings on its way: it yields them, is sent what came of them, and returns what it is about."""
+"""A schema keeps at most this many samples of its training data."""
 
 
 def fit(
@@ -62,18 +33,18 @@ def fit(
     x_out: Iterable[str] | None = None,
     title: str = "training",
     resume: str | Path | None = None,
-) -> Fitted:
+) -> tuple[BodySchema, History]:
     """Train a body schema.
 
     Args:
         dataset: Episodes of one body.
-        config: How.
+        config: Settings of the training.
         masks: The feasible masks; their union is x_in.
         progress: Called after every epoch.
-        x_out: What to infer; every signal if not given.
+        x_out: Signals to infer; every signal if not given.
         title: Begins the progress text.
         resume: A file to keep the training in. If it holds this very training, interrupted, that goes on and ends
-            with the same result; if it is finished there, nothing is trained. Whoever names it removes it.
+            with the same result; if it is finished there, nothing is trained. The caller removes it.
 
     Returns:
         The schema with its held-out errors and the statistics of the normal, and how training went.
@@ -82,71 +53,11 @@ def fit(
         NotEnoughData: Too few samples to hold some out, or none that fits a mask.
         UnknownSignal: A mask or x_out names a signal that is not in the layout.
     """
-    job = Job(dataset, config, tuple(frozenset(m) for m in masks), None if x_out is None else tuple(x_out), resume)
-    return fit_all([job], progress, title)[0]
-
-
-def fit_all(jobs: Sequence[Job], progress: Progress | None = None, title: str = "training") -> list[Fitted]:
-    """Several trainings, such as of several seeds: together, see `gemuco.learning.batched`.
-
-    Args:
-        jobs: What `fit` is told of each.
-        progress: Told the share done of all of them.
-        title: Begins the progress text.
-    """
-    ready = [_ready(job) for job in jobs]
-    train([one.learner for one in ready], [one.draft for one in ready], progress, title)
-    found = []
-    for one in ready:
-        conditions = one.conditions
-        schema = _assessed(_schema(one.learner, one.scaler, conditions), one.learner, conditions)
-        found.append((schema, _history(one.learner, one.scaler, one.notes)))
-    return found
-
-
-def together(
-    works: Sequence[Work[Found]], rounds: Sequence[tuple[str, float]], progress: Progress | None = None
-) -> list[Found]:
-    """Several works, the trainings that they need next always together, see `fit_all`; what they return.
-
-    Args:
-        works: All of them need trainings equally often.
-        rounds: What to call the trainings of each time, and their share of it all.
-        progress: Told the share done of all of them.
-    """
-    wanted, found, begun = [next(work) for work in works], [], 0.0
-    for title, share in rounds:
-        trained = iter(fit_all([job for jobs in wanted for job in jobs], _part(progress, begun, share), title))
-        begun += share
-        for index, work in enumerate(works):
-            try:
-                wanted[index] = work.send([next(trained) for _ in wanted[index]])
-            except StopIteration as end:
-                found.append(end.value)
-    return found
-
-
-def _part(progress: Progress | None, begun: float, share: float) -> Progress | None:
-    """Progress of a part of the work, told as progress of the whole."""
-    return None if progress is None else lambda done, text: progress(begun + share * done, text)
-
-
-class _Ready(NamedTuple):
-    """A training that can begin."""
-
-    learner: Learner
-    draft: Draft
-    scaler: Scaler
-    conditions: tuple[str, ...]
-    notes: list[str]
-
-
-def _ready(job: Job) -> _Ready:
-    dataset, config, layout = job.dataset, job.config, job.dataset.layout
-    checked = tuple(mask(m, layout.names) for m in job.masks)
+    layout = dataset.layout
+    checked = tuple(mask(m, layout.names) for m in masks)
     if not checked or frozenset() in checked:
         raise NotEnoughData("Training needs at least one mask, and none of them empty.")
-    outputs = layout.subset(layout.names if job.x_out is None else job.x_out).names
+    outputs = layout.subset(layout.names if x_out is None else tuple(x_out)).names
     train_data, held_data = dataset.split(config.held_out, config.seed)
     scaler = Scaler.fit(layout, train_data.rows())
     task, notes = _heard(dataset, checked, outputs)
@@ -159,13 +70,15 @@ def _ready(job: Job) -> _Ready:
             f"All data are of one condition ('{conditions[0]}'), so the parametric bias has nothing to tell apart: p "
             "stays 0 and has no effect. Collect other conditions, or set `bias: 0`."
         )
-    draft = Draft(None if job.resume is None else Path(job.resume), _key(config, task, dataset))
     torch.manual_seed(config.seed)
     size = len(task.in_index) + len(task.x_in) + config.bias_size
     drawn = Network(size, len(task.out_index), config.hidden, config.latent, config.activation).weights()
     _mute(drawn, task, scaler.dead, config.bias_size if frozen.all() else 0)
     biases = np.zeros((len(conditions), config.bias_size), np.float32)
-    return _Ready(Learner(config, drawn, biases, frozen, material, held), draft, scaler, conditions, notes)
+    learner = Learner(config, drawn, biases, frozen, material, held)
+    learner.run(progress, title, Draft(resume, _key(config, task, dataset)))
+    schema = _assessed(_schema(learner, scaler, conditions), learner, conditions)
+    return schema, _history(learner, scaler, notes)
 
 
 def fine_tune(
@@ -175,7 +88,7 @@ def fine_tune(
     progress: Progress | None = None,
     title: str = "fine-tuning",
     resume: str | Path | None = None,
-) -> Fitted:
+) -> tuple[BodySchema, History]:
     """Train a schema further on few samples of a body that is like the one it knows: simulation to real robot.
 
     W starts from the schema's, and so does the p of every condition it knows; others start from the p in use. The
@@ -208,9 +121,8 @@ def fine_tune(
     material = _material(task, schema.scaler, train_data, fresh, schema)
     held = _material(task, schema.scaler, held_data, fresh)
     key = _key(config, task, dataset, *schema.weights.arrays(), start, schema.anchors, schema.scaler.std)
-    draft = Draft(None if resume is None else Path(resume), key)
     learner = Learner(config, schema.weights, start, frozen, material, held)
-    train([learner], [draft], progress, title)
+    learner.run(progress, title, Draft(resume, key))
     tuned = _assessed(_schema(learner, schema.scaler, fresh, schema), learner, fresh)
     return tuned, _history(learner, Scaler.fit(schema.layout, train_data.rows()), [])
 

@@ -1,33 +1,45 @@
-"""How badly one network infers every signal from any mask, measured on held-out rows."""
+"""How well one network infers every signal from any mask, measured on held-out rows."""
 
-from collections.abc import Iterator
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
+from pathlib import Path
 
 import numpy as np
 
+from gemuco.compiled.blas import one_thread
 from gemuco.compiled.chain import pack
-from gemuco.compiled.masks import Rows, squares
+from gemuco.compiled.masks import Rows, squared_errors
 from gemuco.dataset import Dataset
+from gemuco.errors import NotEnoughData
 from gemuco.layers import Chain
-from gemuco.learning import batched, cores, devices, outliers
+from gemuco.learning import outliers
+from gemuco.learning.config import TrainConfig
+from gemuco.learning.learner import Progress
 from gemuco.learning.material import Material
 from gemuco.learning.task import Task
-from gemuco.scaler import CLIP
+from gemuco.learning.train import fit
+from gemuco.masks import Mask, all_masks
+from gemuco.scaler import CLIP, Scaler
 from gemuco.schema import BodySchema
 from gemuco.signals import Layout
 
 RARE = 0.05
-"""An outlier is rare: where more than this share of a signal would be, the model is wrong, and all counts."""
+"""A signal with a larger share of suspected outliers has none: there the model is wrong, and all samples count."""
+LISTED = 10
+"""With at most this many signals every mask is measured."""
+TRAINED = 2000
+"""With more signals the network is trained under this many random masks, and generalises to the others."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MaskErrors:
-    """A network that infers every signal from any mask, and rows to try it on.
+    """A network that infers every signal from any mask, and rows to measure it on.
 
-    Errors are shares of variance: 1 is what always guessing the mean costs. For elements that vary, this is the mean
+    Errors are shares of variance: 1 is that of always guessing the mean. For elements that vary, this is the mean
     squared error in standard deviations. An element that hardly moves (below the floor of its signal's scale) counts as
-    little as it moves, and one that never does not at all, or dead channels would make a signal look well inferred.
+    little as it moves, and one that never moves does not count, or dead channels would make a signal look well
+    inferred.
 
     Attributes:
         layout: The signals.
@@ -49,7 +61,7 @@ class MaskErrors:
 
     @classmethod
     def of_schema(cls, schema: BodySchema, train: Dataset, held: Dataset, limit: float) -> "MaskErrors":
-        """For a schema whose inputs and outputs are all signals, on samples that it was not trained on.
+        """Return the errors of a schema whose inputs and outputs are all signals, on samples it was not trained on.
 
         Each sample is judged under the p of its condition. Outliers (`TrainConfig.outliers`) do not count.
         """
@@ -64,7 +76,7 @@ class MaskErrors:
         wild[:, wild.mean(axis=0) > RARE] = False
         there = np.isfinite(x) & ~wild[:, task.signal_of]
         granted = there.copy()
-        granted[:, scaler.dead] = True  # what is stuck hinders no mask
+        granted[:, scaler.dead] = True  # a dead element hinders no mask
         there[:, scaler.dead] = False
         whole = np.stack([granted[:, layout.slice(name)].all(axis=1) for name in layout.names], axis=1)
         known = scaler.normalise(train.rows())
@@ -74,71 +86,60 @@ class MaskErrors:
         x = np.clip(np.where(there, x, 0.0), -CLIP, CLIP).astype(np.float32)
         return cls(layout, schema.weights.whole, x, there, whole, p, liveliness)
 
-    def thinned(self, rows: int) -> "MaskErrors":
-        """On at most so many rows, evenly chosen: a quicker and rougher judgement."""
-        if len(self.x) <= rows:
+    def thinned(self, most: int) -> "MaskErrors":
+        """Return the same on at most `most` rows, evenly chosen."""
+        if len(self.x) <= most:
             return self
-        return self.rows(np.linspace(0, len(self.x) - 1, rows).astype(int))
+        return self.rows(np.linspace(0, len(self.x) - 1, most).astype(int))
 
     def rows(self, chosen: np.ndarray) -> "MaskErrors":
-        """On these rows (indices) and in this order."""
+        """Return the same on these rows (indices), in this order."""
         return replace(self, **{name: getattr(self, name)[chosen] for name in ("x", "there", "whole", "p")})
 
-    def of(self, bits: np.ndarray) -> np.ndarray:
-        """Errors under masks.
+    def of(self, masks: np.ndarray) -> np.ndarray:
+        """Measure masks on all cores.
 
         Args:
-            bits: One mask per line, shape (masks, signals), truth values.
+            masks: Truth values, shape (masks, signals).
 
         Returns:
-            Share of the variance of every signal that every mask leaves unexplained, shape (masks, signals), NaN where
-            no row tells.
+            Share of the variance of every signal that each mask leaves unexplained, shape (masks, signals), NaN where
+            no row has what it takes.
         """
-        parts = cores.parts(len(bits), len(bits)) if devices.best() is None else [slice(None)]
-        squared = np.concatenate(cores.run([partial(self.sums, bits[part]) for part in parts]))
-        return self.of_sums(bits, squared)
-
-    def of_sums(self, bits: np.ndarray, squared: np.ndarray) -> np.ndarray:
-        """The errors of `of` from `sums` over all rows, shape (masks, signals)."""
-        usable = (~self.whole).astype(np.float32) @ bits.T.astype(np.float32) < 0.5  # (rows, masks)
+        squared = self.squared(masks)
+        usable = (~self.whole).astype(np.float32) @ masks.T.astype(np.float32) < 0.5  # (rows, masks)
         count = usable.T.astype(np.float32) @ self.there.astype(np.float32)
         measured = self.by_signal(np.where(count > 0, self.liveliness, 0.0))
         missed = self.by_signal(squared / np.maximum(count, 1))
         return np.where(measured > 0, missed / np.maximum(measured, 1e-12), np.nan)
 
-    def sums(self, bits: np.ndarray) -> np.ndarray:
-        """Sum of `squares` over all rows under every mask, on CUDA or this core, shape (masks, size)."""
-        if (device := devices.best()) is not None:
-            return batched.sums(device, pack(self.chain), self.given, *self.gates(bits))
-        found = [one.sum(axis=0, dtype=float) for one in self.squares(bits)]
-        return np.array(found).reshape(len(bits), self.layout.size)
+    def squared(self, masks: np.ndarray) -> np.ndarray:
+        """Return the sum of squared errors of every element over the rows that count, shape (masks, size).
 
-    def squares(self, bits: np.ndarray) -> Iterator[np.ndarray]:
-        """Squared errors of every row under every mask, 0 where they do not count, each of shape (rows, size)."""
-        chain, rows = pack(self.chain), self.given
-        for gate, mask in zip(*self.gates(bits), strict=True):
-            yield squares(chain, rows, gate, mask)
-
-    def from_others(self) -> tuple[np.ndarray, np.ndarray]:
-        """Every signal from all others.
-
-        Returns:
-            Errors, shape (signals,), NaN if no row tells. And squared errors under the masks that lack one signal each,
-            of every row and signal, shape (signals, rows, signals).
+        Each core measures a part of the masks, compiled code holds no interpreter lock.
         """
-        bits, total, by_row = ~np.eye(len(self.layout.names), dtype=bool), [], []
-        for squared in self.squares(bits):
-            total.append(squared.sum(axis=0, dtype=float))
-            by_row.append(self.by_signal(squared))
-        errors = self.of_sums(bits, np.stack(total)).diagonal().copy()
+        chain, cores = pack(self.chain), len(os.sched_getaffinity(0))
+        inputs = np.concatenate([self.x, self.p], axis=1, dtype=np.float32)
+        rows = Rows(inputs, self.x, self.there.astype(np.float32), np.ascontiguousarray(self.whole))
+
+        def part(some: np.ndarray) -> np.ndarray:
+            gates = np.repeat(some, self.sizes, axis=1).astype(np.float32)
+            return np.asarray(squared_errors(chain, rows, gates, some.astype(np.float32)))
+
+        with one_thread(), ThreadPoolExecutor(cores) as pool:
+            return np.concatenate(list(pool.map(part, np.array_split(masks, cores))))
+
+    def from_others(self) -> np.ndarray:
+        """Measure every signal as inferred from all others, shape (signals,); NaN if no row has what it takes."""
+        errors = self.of(~np.eye(len(self.layout.names), dtype=bool)).diagonal().copy()
         for index in np.flatnonzero(np.isnan(errors)).tolist():
             errors[index] = self._from_some(index)
-        return errors, np.stack(by_row)
+        return errors
 
     def _from_some(self, signal: int) -> float:
-        """Error of a signal (by its index) that no row has together with all others; NaN if no row tells.
+        """Measure a signal (by its index) that no row has together with all others; NaN if no row has it.
 
-        Every row that has the signal is inferred from whatever others it has.
+        Every row that has the signal is inferred from those of the others that it has.
         """
         others = np.arange(len(self.layout.names)) != signal
         span = self.layout.slice(self.layout.names[signal])
@@ -146,31 +147,72 @@ class MaskErrors:
         patterns, which = np.unique(self.whole & others, axis=0, return_inverse=True)
         for index in np.flatnonzero(patterns.any(axis=1)):
             part = self.rows(np.flatnonzero(which.ravel() == index))
-            total += part.sums(patterns[index : index + 1])[0]
+            total += part.squared(patterns[index : index + 1])[0]
             count += part.there.sum(axis=0)
         known = self.liveliness[span] * (count[span] > 0)
         return float((total[span] / np.maximum(count[span], 1)).sum() / known.sum()) if known.any() else float("nan")
 
     @property
     def amounts(self) -> np.ndarray:
-        """How much of each signal there is to explain, shape (signals,): its elements, if all vary."""
+        """Variance of each signal to explain, shape (signals,): the number of its elements, if all vary."""
         return self.by_signal(self.liveliness)
 
     @property
     def sizes(self) -> list[int]:
-        """How many elements each signal has."""
+        """Number of elements of each signal."""
         return [signal.size for signal in self.layout.signals]
 
     def by_signal(self, elements: np.ndarray) -> np.ndarray:
-        """Sums over the elements of every signal, shape (..., size) -> (..., signals)."""
+        """Return sums over the elements of every signal, shape (..., size) -> (..., signals)."""
         return np.asarray(np.add.reduceat(elements, np.cumsum([0, *self.sizes[:-1]]), axis=-1))
 
-    @property
-    def given(self) -> Rows:
-        """What compiled code is given of the rows."""
-        rows = np.concatenate([self.x, self.p], axis=1, dtype=np.float32)
-        return Rows(rows, self.x, self.there.astype(np.float32), np.ascontiguousarray(self.whole))
 
-    def gates(self, bits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """And what of masks, shapes (masks, size) and (masks, signals)."""
-        return np.repeat(bits, self.sizes, axis=1).astype(np.float32), bits.astype(np.float32)
+def train_masks(
+    dataset: Dataset,
+    config: TrainConfig,
+    splits: int = 1,
+    progress: Progress | None = None,
+    drafts: Path | None = None,
+) -> tuple[MaskErrors, ...]:
+    """Train one network per split of the data under all masks, and return each with its held-out episodes.
+
+    Raises:
+        NotEnoughData: A signal never varies or was never measured, or there are too few samples.
+    """
+
+    def part(split: int) -> MaskErrors:
+        own = replace(config, seed=config.seed + split)
+        train, held = dataset.split(own.held_out, own.seed)
+        _check_alive(train)
+        resume = None if drafts is None else drafts / f"structure_{split}.safetensors"
+        masks = _drawn_masks(dataset.layout.names, own.seed)
+        share = None if progress is None else lambda done, text: progress((split + done) / splits, text)
+        schema, _ = fit(dataset, own, masks, share, title="structure", resume=resume)
+        return MaskErrors.of_schema(schema, train, held, config.outliers)
+
+    return tuple(part(split) for split in range(splits))
+
+
+def _check_alive(train: Dataset) -> None:
+    """Refuse signals that never vary or were never measured."""
+    rows = train.rows()
+    dead = np.isin(np.arange(train.layout.size), Scaler.fit(train.layout, rows).dead)
+    for name in train.layout.names:
+        span = train.layout.slice(name)
+        if dead[span].all():
+            fact = "never varies" if np.isfinite(rows[:, span]).any() else "was never measured"
+            raise NotEnoughData(
+                f"Signal '{name}' {fact} in the training data, so nothing can be learned of it; collect data in which "
+                "it moves, or leave it out of the model."
+            )
+
+
+def _drawn_masks(names: tuple[str, ...], seed: int) -> tuple[Mask, ...]:
+    """Return all masks, or those that lack one signal and `TRAINED` random ones of all sizes."""
+    if len(names) <= LISTED:
+        return all_masks(names)
+    random = np.random.default_rng(seed)
+    drawn = random.random((TRAINED, len(names))) < random.random((TRAINED, 1))
+    drawn[~drawn.any(axis=1), 0] = True
+    others = ~np.eye(len(names), dtype=bool)
+    return tuple(dict.fromkeys(frozenset(np.array(names)[line].tolist()) for line in np.concatenate([others, drawn])))

@@ -1,16 +1,17 @@
-"""Feasible masks of many signals without trying all 2^n - 1: walk the border between too little and enough.
+"""Feasible masks of many signals without measuring all 2^n - 1, and the choice of those that a schema keeps.
 
-Whether a mask is enough hardly ever depends on more than this: a superset of what is enough is enough, a subset of what
-is too little is too little. So the border says all: the smallest masks that are enough and the largest that are not.
-The search (after MARCO: Liffiton et al., Fast, flexible MUS enumeration, 2016) takes a mask about which the border
-found so far says nothing, tries it, and if it is enough takes signals away while it stays so, else adds signals while
-it stays too little. Each such walk ends on the border and is n tries long; walks are taken many at a time, so that
-their tries are evaluated together.
+Whether a mask is enough hardly ever depends on more than this: a superset of a mask that is enough is enough, a subset
+of one that is not enough is not enough. So the border is sufficient: the smallest masks that are enough and the largest
+that are not. The search (after MARCO: Liffiton et al., Fast, flexible MUS enumeration, 2016) takes a mask about which
+the known border says nothing and measures it. If it is enough, signals are taken away while it stays so, else added
+while it stays too small. Each such walk ends on the border and needs n measurements; walks are taken many at a time, so
+that their masks are measured together.
 
-The assumption only guides: every mask that is returned was tried itself, and when the border is complete its masks are
-tried with one signal less and with two, for exceptions from which new walks begin.
+The assumption only guides: every mask that is returned was measured itself. When the border is complete its masks are
+measured with one signal less and with two, for exceptions from which new walks begin.
 """
 
+import heapq
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -19,20 +20,22 @@ import numpy as np
 TOGETHER = 32
 """Walks at a time."""
 DEPTH = 2
-"""How far below the border exceptions are looked for."""
+"""Exceptions are looked for up to this many signals below the border."""
 SEEDS = 4000
-"""Random masks looked through for one that the border says nothing about, before the border counts as complete."""
+"""The border counts as complete when it decides all of this many random masks."""
+SCENES = 1500
+"""Random sets of available signals on which masks are compared."""
 
 
 @dataclass(frozen=True, slots=True)
 class Border:
-    """What the search found.
+    """Result of the search.
 
     Attributes:
         smallest: Masks that are enough and of which no signal can be spared, shape (n, signals).
-        largest: Masks that are too little, to which no signal can be added, shape (n, signals).
-        tried: How many masks were evaluated.
-        is_complete: Whether the search ended because nothing was left to look at, not for its budget.
+        largest: Masks that are not enough, to which no signal can be added, shape (n, signals).
+        tried: Number of masks that were measured.
+        is_complete: Whether the search ended because nothing was left to measure, not for its budget.
     """
 
     smallest: np.ndarray
@@ -42,7 +45,7 @@ class Border:
 
 
 class _Oracle:
-    """Remembers what was tried: line of truth values -> whether it is enough."""
+    """Memory of measured masks: line of truth values -> whether it is enough."""
 
     def __init__(self, is_enough: Callable[[np.ndarray], np.ndarray]) -> None:
         self._is_enough = is_enough
@@ -61,8 +64,8 @@ def find_border(is_enough: Callable[[np.ndarray], np.ndarray], signals: int, bud
 
     Args:
         is_enough: Masks (n, signals), truth values -> whether each is enough, shape (n,).
-        signals: How many there are.
-        budget: About how many masks to try at most.
+        signals: Number of signals.
+        budget: Number of masks to measure at most, roughly.
         seed: Of the order of the walks.
     """
     random = np.random.default_rng(seed)
@@ -82,13 +85,13 @@ def find_border(is_enough: Callable[[np.ndarray], np.ndarray], signals: int, bud
 
 
 def _walk(masks: np.ndarray, oracle: _Oracle, random: np.random.Generator, enough: bool) -> np.ndarray:
-    """Take signals away while the masks stay enough, or add signals while they stay too little."""
+    """Take signals away while the masks stay enough, or add signals while they stay too small."""
     masks = masks.copy()
     orders = random.permuted(np.tile(np.arange(masks.shape[1]), (len(masks), 1)), axis=1)
     for step in range(masks.shape[1]):
         rows = np.arange(len(masks))
         changed = masks[rows, orders[:, step]] == enough
-        changed &= masks.sum(axis=1) > enough  # the empty mask is none
+        changed &= masks.sum(axis=1) > enough  # the empty mask is not allowed
         rows = rows[changed]
         if len(rows):
             tried = masks[rows]
@@ -99,7 +102,7 @@ def _walk(masks: np.ndarray, oracle: _Oracle, random: np.random.Generator, enoug
 
 
 def _unexplored(smallest: np.ndarray, largest: np.ndarray, signals: int, random: np.random.Generator) -> np.ndarray:
-    """Masks that contain none of the smallest and lie in none of the largest, shape (at most TOGETHER, signals)."""
+    """Draw masks that the border does not decide, shape (at most TOGETHER, signals)."""
     shares = random.random((SEEDS, 1))
     masks = np.unique(random.random((SEEDS, signals)) < shares, axis=0)
     masks = masks[masks.any(axis=1)]
@@ -109,7 +112,7 @@ def _unexplored(smallest: np.ndarray, largest: np.ndarray, signals: int, random:
 
 
 def _exceptions(smallest: np.ndarray, largest: np.ndarray, oracle: _Oracle) -> np.ndarray:
-    """Masks up to `DEPTH` signals short of the border that are enough all the same, shape (n, signals)."""
+    """Find masks up to `DEPTH` signals short of the border that are enough all the same, shape (n, signals)."""
     short = np.concatenate([smallest, largest])
     for _ in range(DEPTH):
         lines, signals = np.nonzero(short)
@@ -118,20 +121,20 @@ def _exceptions(smallest: np.ndarray, largest: np.ndarray, oracle: _Oracle) -> n
         short = np.unique(short[short.any(axis=1)], axis=0)
         if not len(short):
             return short
-        found = short[oracle(short) & ~_contains(short, smallest)]
-        if len(found):
-            return found
-    return found
+        exceptions = short[oracle(short) & ~_contains(short, smallest)]
+        if len(exceptions):
+            return exceptions
+    return exceptions
 
 
 def _contains(masks: np.ndarray, parts: np.ndarray) -> np.ndarray:
-    """Whether each mask contains at least one of the parts, shape (masks,)."""
+    """Return whether each mask contains at least one of the parts, shape (masks,)."""
     lacking = parts.astype(np.float32) @ (~masks).T.astype(np.float32)  # (parts, masks): signals of a part not there
     return np.asarray((lacking < 0.5).any(axis=0)) if len(parts) else np.zeros(len(masks), bool)
 
 
 def _extremes(masks: np.ndarray) -> np.ndarray:
-    """The masks that contain no other of them."""
+    """Return the masks that contain no other of them."""
     masks = np.unique(masks, axis=0)
     if not len(masks):
         return masks
@@ -139,3 +142,61 @@ def _extremes(masks: np.ndarray) -> np.ndarray:
     inside = lacking < 0.5  # [i, j]: i lies in j
     np.fill_diagonal(inside, False)
     return masks[~inside.any(axis=0)]
+
+
+def choose(candidates: np.ndarray, errors: np.ndarray, outputs: np.ndarray, most: int, seed: int = 0) -> np.ndarray:
+    """Choose masks one after another, each the one that lowers the mean error over random scenes most.
+
+    If there is room, the masks of which no signal can be spared come first, so that every set of signals that is enough
+    is served.
+
+    A scene is a set of available signals: all but one, or a random one with any share of the signals lost. Its error is
+    that of the outputs it lacks under the best chosen mask that it covers, and 1 (guess the mean) if it covers none.
+
+    Args:
+        candidates: Feasible masks, shape (n, signals), truth values.
+        errors: Mean squared error of every signal under every mask [standard deviations squared], shape (n, signals).
+        outputs: Which signals are outputs, truth values, shape (signals,).
+        most: Number of masks to choose at most.
+        seed: Of the scenes.
+
+    Returns:
+        Indices of the chosen masks in the order of choice; fewer than `most` if more would serve no scene.
+    """
+    if len(candidates) <= most:
+        return np.arange(len(candidates))
+    scenes = _scenes(candidates.shape[1], seed)
+    needed = (outputs & ~scenes).astype(np.float32)  # (scenes, signals)
+    scenes, needed = scenes[needed.any(axis=1)], needed[needed.any(axis=1)]
+    # A mask without a measured error (NaN) does not serve; an error above 1 is worse than none.
+    known = np.clip(np.nan_to_num(errors, nan=1.0), 0.0, 1.0).astype(np.float32)
+    cost = known @ (needed / needed.sum(axis=1, keepdims=True)).T  # (candidates, scenes)
+    cost[candidates.astype(np.float32) @ (~scenes).T.astype(np.float32) > 0.5] = 1.0
+    least = np.ones(len(scenes), np.float32)
+    smallest = (~candidates).astype(np.float32) @ candidates.T.astype(np.float32) < 0.5  # [i, j]: i contains j
+    chosen = np.flatnonzero(smallest.sum(axis=1) == 1).tolist()
+    if len(chosen) > most:
+        chosen = []
+    elif chosen:
+        least = np.minimum(least, cost[chosen].min(axis=0))
+    # The gain of a mask only falls as others are chosen, so an old gain is an upper bound (lazy greedy).
+    bounds = [(-float(gain), index) for index, gain in enumerate(np.maximum(least - cost, 0.0).sum(axis=1))]
+    heapq.heapify(bounds)
+    while len(chosen) < most and bounds:
+        _, best = heapq.heappop(bounds)
+        bound = -float(np.maximum(least - cost[best], 0.0).sum()), best
+        if bounds and bound > bounds[0]:
+            heapq.heappush(bounds, bound)
+        elif bound[0] >= 0.0:
+            break
+        else:
+            chosen.append(best)
+            least = np.minimum(least, cost[best])
+    return np.array(chosen, int)
+
+
+def _scenes(signals: int, seed: int) -> np.ndarray:
+    """Draw sets of available signals, shape (scenes, signals), truth values."""
+    random = np.random.default_rng(seed)
+    shares = random.random((SCENES, 1))
+    return np.concatenate([~np.eye(signals, dtype=bool), random.random((SCENES, signals)) < shares])

@@ -1,6 +1,5 @@
 """The tables of structure determination as one picture."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib
@@ -42,28 +41,20 @@ def _masks(axis: Axes, structure: Structure, masks: list[frozenset[str]]) -> Non
     """One row per mask: a square per signal it contains, and its error."""
     names, feasible = structure.layout.names, set(structure.feasible)
     rows = ["".join("■" if n in m else "□" for n in names) for m in masks]
-    rough = [m in structure.rough for m in masks]
     errors = [structure.L_m[m] for m in masks]
-    _bars(axis, rows, errors, [m in feasible for m in masks], structure.thresholds.into, rough)
+    _bars(axis, rows, errors, [m in feasible for m in masks], structure.thresholds.into)
     known = len(structure.L_m)
     shown = f"the best {len(masks)} of {known} masks" if len(masks) < known else f"{known} masks"
     axis.set_title(f"L_m: outputs inferred from a mask; feasible if below the line; {shown}", loc="left", fontsize=10)
     axis.set_xlabel(f"{structure.thresholds.measure} in standard deviations; squares: {', '.join(names)}", fontsize=8)
 
 
-def _bars(
-    axis: Axes,
-    labels: list[str],
-    values: list[float],
-    good: list[bool],
-    threshold: float,
-    rough: Sequence[bool] = (),
-) -> None:
-    """Bars with their values, ~ before those that are estimates."""
+def _bars(axis: Axes, labels: list[str], values: list[float], good: list[bool], threshold: float) -> None:
+    """Draw bars with their values."""
     places = np.arange(len(labels))
     axis.barh(places, values, color=[GOOD if g else BAD for g in good])
-    for place, value, is_rough in zip(places, values, rough or [False] * len(values), strict=True):
-        axis.annotate(f" {'~' if is_rough else ''}{value:.3f}", (value, place), va="center", fontsize=8)
+    for place, value in zip(places, values, strict=True):
+        axis.annotate(f" {value:.3f}", (value, place), va="center", fontsize=8)
     axis.axvline(threshold, color="tab:red", linestyle="--", linewidth=1)
     axis.set_yticks(places, labels, fontsize=9)
     axis.invert_yaxis()

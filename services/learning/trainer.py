@@ -2,7 +2,7 @@
 
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,7 +23,7 @@ from services.model.living_model import layout_of
 from services.model.model_config import ModelConfig, model_config
 
 if TYPE_CHECKING:
-    from gemuco.learning.train import TrainConfig, Work
+    from gemuco.learning.train import TrainConfig
     from gemuco.structure.determination import Structure
 
 Progress = Callable[[float, str], None]
@@ -93,49 +93,34 @@ def learn(
     Raises:
         NotEnoughData: Too few samples, or nothing can be inferred.
     """
-    from gemuco.learning.train import together
+    from gemuco.learning.train import fit
+    from gemuco.structure.determination import Thresholds, determine
 
-    return together([learning(config, dataset, seed, drafts, **facts)], rounds(config), progress)[0]
-
-
-def train_all(
-    robot: RobotConfig, datasets: Sequence[Dataset], seeds: Sequence[int], progress: Progress
-) -> list[Trained]:
-    """The models of a robot from a dataset and a seed each, trained together; see `train`."""
-    from gemuco.learning.train import together
-
-    config, facts = model_config(robot), {"robot": robot.robot, "fingerprint": fingerprint(robot)}
-    works = [learning(config, data, seed, None, **facts) for data, seed in zip(datasets, seeds, strict=True)]
-    return together(works, rounds(config), progress)
-
-
-def learning(config: ModelConfig, dataset: Dataset, seed: int, drafts: Path | None, **facts: str) -> "Work[Trained]":
-    """`learn`, for whoever has the trainings done."""
-    from gemuco.learning.train import Job
-    from gemuco.structure.determination import Thresholds, determining
-
-    started, wanted = time.monotonic(), config.structure
-    first = train_config(config, config.structure.epochs, seed)
+    started, part = time.monotonic(), config.structure
+    first = train_config(config, part.epochs, seed)
     last = train_config(config, config.training.epochs, seed)
-    thresholds = Thresholds(wanted.threshold_out, wanted.threshold_in, wanted.measure, wanted.over)
-    found = yield from determining(dataset, first, thresholds, wanted.splits, drafts)
-    draft = None if drafts is None else drafts / "training.safetensors"
-    ((schema, history),) = yield [Job(dataset, last, found.masks, found.x_out, draft)]
+    share = part.epochs * part.splits / (part.epochs * part.splits + last.epochs)
+    thresholds = Thresholds(part.threshold_out, part.threshold_in, part.measure, part.over)
+    structure = determine(
+        dataset, first, thresholds, lambda done, text: progress(share * done, text), part.splits, drafts
+    )
+    schema, history = fit(
+        dataset,
+        last,
+        structure.masks,
+        lambda done, text: progress(share + (1.0 - share) * done, text),
+        structure.x_out,
+        resume=None if drafts is None else drafts / "training.safetensors",
+    )
     names = dataset.layout.names
     schema = schema.with_manifest(
         **facts,
         samples=len(dataset),
         held_out_loss=history.best,
-        L_i=found.L_i,
-        L_m={label(mask, names): found.L_m[mask] for mask in found.listed},
+        L_i=structure.L_i,
+        L_m={label(mask, names): structure.L_m[mask] for mask in structure.listed},
     )
-    return Trained(schema, found, history, len(dataset), time.monotonic() - started)
-
-
-def rounds(config: ModelConfig) -> tuple[tuple[str, float], ...]:
-    """The trainings of `learning`, and their shares of it all."""
-    first, last = config.structure.epochs * config.structure.splits, config.training.epochs
-    return ("structure", first / (first + last)), ("training", last / (first + last))
+    return Trained(schema, structure, history, len(dataset), time.monotonic() - started)
 
 
 def tune(

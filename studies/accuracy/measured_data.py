@@ -18,7 +18,7 @@ from gemuco.dataset import Dataset, Episode
 from gemuco.learning.train import fit
 from gemuco.schema import BodySchema
 from gemuco.structure.determination import Judge, Thresholds, determine
-from gemuco.structure.mask_training import train_masks
+from gemuco.structure.mask_errors import train_masks
 from services.learning.measured import MeasuredConfig, load_measured, read
 from services.learning.trainer import train_config
 

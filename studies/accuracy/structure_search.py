@@ -17,7 +17,7 @@ import numpy as np
 from gemuco.learning.train import TrainConfig
 from gemuco.masks import bits
 from gemuco.structure.determination import Judge, Thresholds, search, select
-from gemuco.structure.mask_training import train_masks
+from gemuco.structure.mask_errors import train_masks
 from studies.accuracy.synthetic_body import SyntheticBody
 
 CONFIG = TrainConfig(hidden=(200, 100), latent=40, activation="relu", epochs=100, batch=500, rate=3e-3)
@@ -43,13 +43,14 @@ def run(signals: int, samples: int, seed: int) -> None:
     started = time.process_time()
     judge = Judge(names, train_masks(body.sample(samples, seed), CONFIG), thresholds)
     trained = time.process_time()
-    tried, is_whole = search(judge, seed)
-    structure = select(body.layout, judge, tried, is_whole, seed)
+    masks, is_whole = search(judge, seed)
+    measured = judge.measured
+    structure = select(body.layout, judge, masks, is_whole, seed)
     searched = time.process_time()
     feasible = np.array([bits(m, names) > 0 for m in structure.feasible])
     print(
         f"{signals} signals, body {seed}: training {trained - started:.0f} s, search {searched - trained:.1f} s, "
-        f"{judge.tried} masks tried of {2**signals - 1}, {len(feasible)} feasible, {len(minimal(feasible))} of them "
+        f"{measured} masks measured of {2**signals - 1}, {len(feasible)} feasible, {len(minimal(feasible))} of them "
         f"minimal, {len(structure.masks)} kept"
     )
     if signals > EXHAUSTIVE:
@@ -57,7 +58,7 @@ def run(signals: int, samples: int, seed: int) -> None:
     every = (np.arange(1, 2**signals)[:, None] >> np.arange(signals) & 1) > 0
     every = every[judge.is_judged(every)]
     started = time.process_time()
-    errors = judge.of(every).L_m
+    errors, _ = judge.measure(every)
     known = every[errors < thresholds.into]
     took = time.process_time() - started
     least, sizes = body.least_errors(every), np.array([signal.size for signal in body.layout.signals])

@@ -9,12 +9,12 @@ from collections.abc import Iterator
 
 import numpy as np
 import torch
+from joblib import cpu_count
 
-from gemuco.learning import cores
 from gemuco.learning.train import TrainConfig
 from gemuco.masks import all_masks, bits
 from gemuco.structure.determination import Judge, Thresholds
-from gemuco.structure.mask_training import train_masks
+from gemuco.structure.mask_errors import train_masks
 from studies.accuracy.synthetic_body import SyntheticBody
 from studies.speed.bodies import module
 from studies.speed.table import Row, faster, show
@@ -47,13 +47,13 @@ def rows() -> Iterator[Row]:
             measured.append(float(torch.cat(squared)[:, outputs].mean()))
         return np.array(measured)
 
-    torch.set_num_threads(cores.count())
-    np.testing.assert_allclose(judge.of(masks).L_m, by_torch(), rtol=2e-3)
-    note = f"on {cores.count()} cores; both measure the same L_m of {len(masks)} masks"
+    torch.set_num_threads(cpu_count())
+    np.testing.assert_allclose(judge.measure(masks)[0], by_torch(), rtol=2e-3)
+    note = f"on {cpu_count()} cores; both measure the same L_m of {len(masks)} masks"
     yield faster(
         "structure, 10 signals, all masks x 1000 rows",
         "loop over masks in torch",
-        lambda: judge.of(masks),
+        lambda: judge.measure(masks),
         by_torch,
         BAR,
         note,

@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from gemuco.structure.mask_choice import _scenes, choose
-from gemuco.structure.mask_search import find_border
+from gemuco.structure.mask_search import _scenes, choose, find_border
 
 
 def lines(*masks: str) -> np.ndarray:

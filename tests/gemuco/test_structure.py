@@ -1,3 +1,5 @@
+import os
+
 import numpy as np
 import pytest
 from muscle_arm import LAYOUT
@@ -8,13 +10,8 @@ from gemuco.layers import run
 from gemuco.learning.train import TrainConfig
 from gemuco.masks import all_masks, bits
 from gemuco.signals import Layout, Signal
-from gemuco.structure import determination as structures
-from gemuco.structure import mask_judge
 from gemuco.structure.determination import Judge, Thresholds, determine, select
-from gemuco.structure.mask_errors import MaskErrors
-from gemuco.structure.mask_judge import BAD, HEATS, SURE, TOLD, Judged
-from gemuco.structure.mask_training import train_masks
-from gemuco.structure.row_draw import Heat, RowDraw
+from gemuco.structure.mask_errors import MaskErrors, train_masks
 
 TINY = TrainConfig(hidden=(20,), latent=5, epochs=3, batch=100)
 SHORT = TrainConfig(hidden=(40, 20), latent=6, epochs=25, batch=100)
@@ -175,167 +172,42 @@ def test_errors_of_masks_are_those_of_the_network(measured):
     assert errors.amounts == pytest.approx([errors.liveliness[layout.slice(name)].sum() for name in layout.names])
 
 
-def few_rows_tell(errors: MaskErrors, mask: np.ndarray, heat: Heat) -> tuple[np.ndarray, np.ndarray]:
-    """Squares of the first rows, shape (rows, size), and what makes weighted sums of them errors, shape (size,)."""
-    rows = len(heat)
-    (squared,) = errors.squares(mask[None])
-    counts = errors.whole[:rows, mask].all(axis=1)[:, None] & errors.there[:rows]
-    count, share = counts.sum(axis=0), heat.weights @ counts
-    factor = np.full(len(share), np.nan)
-    for name in errors.layout.names:
-        span = errors.layout.slice(name)
-        alive = errors.liveliness[span] > 0.0
-        scarce = (count[span] < TOLD) | (share[span] < 0.5 * count[span] / rows)
-        if not (scarce & alive).any() and alive.any():
-            factor[span] = 1.0 / (np.where(scarce, 1.0, share[span]) * errors.liveliness[span].sum())
-    return squared[:rows].astype(float), factor
-
-
-def test_first_rows_tell_known_means_exactly_and_all_others_nearly(measured):
-    layout, (errors, *_) = measured
-    _, others = errors.from_others()
-    draw = RowDraw(others.sum(axis=2), 0)
-    drawn = errors.rows(draw.order)
-    heat = draw.heat(len(errors.x) // 4)
-    assert heat.weights.sum() == pytest.approx(1.0)
-    np.testing.assert_allclose(heat.weights @ heat.known, [1.0] + [0.0] * (heat.known.shape[1] - 1), atol=1e-9)
-    masks = every_mask(layout)
-    told = []
-    for mask in masks:
-        squared, factor = few_rows_tell(drawn, mask, heat)
-        told.append(drawn.by_signal(heat.weights @ squared * factor))
-    told = np.array(told)
-    truth = errors.of(masks)
-    clear = np.isfinite(told) & (truth > 0.05)
-    assert clear.mean() > 0.3
-    assert np.median(np.abs(told / truth - 1.0)[clear]) < 0.15
-
-
-def test_rows_that_are_known_to_be_bad_are_drawn_first():
-    random = np.random.default_rng(0)
-    known = random.random((5, 300)) ** 2
-    known[:, 40:50] = 100.0
-    found = np.stack([np.argsort(RowDraw(known, seed).order)[40:50] for seed in range(20)])
-    assert np.median(found) < 20  # of 300
-
-
-def test_estimates_of_first_rows_spread_as_they_say():
-    """Errors that are skewed and partly like known ones: seldom off by two standard errors, and less than at random."""
-    random, off, missed = np.random.default_rng(0), [], []
-    for seed in range(200):
-        known = random.gamma(0.5, size=(4, 400))
-        value = (known.T @ random.random(4)) * random.gamma(2.0, size=400)
-        draw = RowDraw(known, seed)
-        heat, drawn = draw.heat(100), value[draw.order][:100]
-        left = drawn - heat.known @ (drawn @ heat.project)
-        missed.append((heat.weights @ drawn - value.mean(), random.choice(value, 100, False).mean() - value.mean()))
-        off.append(missed[-1][0] / np.sqrt(heat.doubt @ left**2))
-    assert np.mean(np.abs(off) > 2.0) < 0.1
-    assert 0.7 < np.std(off) < 1.3  # skewed: above what a normal one has
-    ours, at_random = np.sqrt(np.mean(np.square(missed), axis=0))
-    assert ours < 0.7 * at_random
-
-
-def test_rows_without_known_errors_are_drawn_alike():
-    heat = RowDraw(np.zeros((3, 200)), 0).heat(100)
-    np.testing.assert_allclose(heat.weights, 0.01)
-
-
 @pytest.mark.parametrize("measure", ["mse", "rmse"])
 @pytest.mark.parametrize("over", ["masked", "all"])
-@pytest.mark.parametrize("share", [0.2, 0.4, 0.7])
-def test_a_race_finds_what_the_full_measurement_finds(measured, measure, over, share, monkeypatch):
+def test_error_of_a_mask_is_that_of_its_outputs(measured, measure, over):
     layout, errors = measured
     judge = Judge(layout.names, errors, Thresholds(1.0, 1.0, measure, over))
     masks = every_mask(layout)
     masks = masks[judge.is_judged(masks)]
-    order, count = np.sort(judge.of(masks).L_m), int(share * len(masks))
-    into = float(order[count - 1 : count + 1].mean())  # so many are feasible
-    judge = Judge(layout.names, errors, Thresholds(1.0, into, measure, over))
-    full, raced = judge.of(masks), judge.race(masks)
-    is_rough = raced.is_rough.copy()
-    np.testing.assert_array_equal(raced.L_m < into, full.L_m < into)
-    np.testing.assert_allclose(raced.L_m[~is_rough], full.L_m[~is_rough], rtol=1e-5)
-    np.testing.assert_allclose(raced.squared[~is_rough], full.squared[~is_rough], rtol=1e-4, atol=1e-7)
-    np.testing.assert_allclose(raced.L_m[is_rough], full.L_m[is_rough], rtol=0.5)
-    judge.finish(raced, np.arange(0, len(masks), 2))
-    np.testing.assert_array_equal(raced.is_rough[1::2], is_rough[1::2])
-    assert not raced.is_rough[::2].any()
-    np.testing.assert_allclose(raced.L_m[::2], full.L_m[::2], rtol=1e-5)
-    np.testing.assert_allclose(raced.squared[::2], full.squared[::2], rtol=1e-4, atol=1e-7)
-    kept = []
-    for outright in (0, 99):
-        monkeypatch.setattr(structures, "OUTRIGHT", outright)
-        kept.append(select(layout, judge, every_mask(layout), True, 0))
-    race, whole = kept
-    assert set(race.feasible) == set(whole.feasible)
-    assert not whole.rough
-    assert not race.rough & set(race.masks)
-    assert [race.L_m[m] for m in race.masks] == pytest.approx([whole.L_m[m] for m in race.masks], rel=1e-5)
-    assert race.rough <= {frozenset(np.array(layout.names)[line].tolist()) for line in masks[is_rough]}
+    L_m, squared = judge.measure(masks)
+    amounts = np.max([split.amounts for split in judge.errors], axis=0)
+    for mask, error, line in zip(masks, L_m, squared, strict=True):
+        counted = judge.outputs & (~mask if over == "masked" else True) & np.isfinite(line)
+        mean = (line * amounts)[counted].sum() / amounts[counted].sum()
+        assert error == pytest.approx(mean if measure == "mse" else np.sqrt(mean), rel=1e-6)
 
 
-def verdict(judge: Judge, mask: np.ndarray, count: int) -> tuple[np.ndarray, bool]:
-    """What so many rows tell of a mask, written out: errors of all signals, shape (signals,), and if it is out."""
-    mean, variance, hidden, heats = np.zeros(len(mask)), 0.0, 0.0, [draw.heat(count) for draw in judge._draws]
-    weight = np.where(judge.outputs & ~mask, np.max([split.amounts for split in judge.errors], axis=0), 0.0)
-    weight /= weight.sum()
-    for split, heat in zip(judge.errors, heats, strict=True):
-        squared, factor = few_rows_tell(split, mask, heat)
-        mean += split.by_signal(heat.weights @ squared * factor) / len(heats)
-        value = squared @ np.nan_to_num(np.repeat(weight, split.sizes) * factor)
-        left = value - heat.known @ (value @ heat.project)
-        variance += heat.doubt @ left**2 / len(heats) ** 2
-        hidden += (value * heat.hidden).max() / len(heats)
-    mean = np.maximum(mean, 0.0)
-    over, spread = np.nan_to_num(mean) @ weight - judge.thresholds.into, SURE * np.sqrt(variance)
-    is_known = np.isfinite(mean[weight > 0.0]).all()
-    return mean, is_known and (over > spread or over + BAD * hidden < -spread)
-
-
-@pytest.mark.parametrize("heats", [HEATS, (20, 290)])  # the last is longer than a block of rows
-def test_a_race_goes_by_the_formulas(measured, heats, monkeypatch):
+@pytest.mark.parametrize("share", [0.2, 0.4, 0.7])
+def test_feasible_are_the_masks_below_the_threshold(measured, share):
     layout, errors = measured
-    monkeypatch.setattr(mask_judge, "HEATS", heats)
-    judge = Judge(layout.names, errors, Thresholds(1.0, 0.3))
+    judge = Judge(layout.names, errors, Thresholds(1.0, 1.0))
     masks = every_mask(layout)
-    judged = judge.race(masks[judge.is_judged(masks)])
-    heats = [rows for rows in heats if 4 * rows <= 3 * min(len(split.x) for split in judge.errors)]
-    assert set(np.unique(judged.done)) <= {-1, *heats}
-    assert judged.is_rough.any()
-    for mask, squared, done in zip(judged.masks, judged.squared, judged.done, strict=True):
-        told = [verdict(judge, mask, rows) for rows in heats if done < 0 or rows <= done]
-        assert [is_out for _, is_out in told] == [False] * (len(told) - 1) + [done >= 0]
-        if done >= 0:
-            np.testing.assert_allclose(squared, told[-1][0], rtol=1e-4, atol=1e-6)
+    masks = masks[judge.is_judged(masks)]
+    order, count = np.sort(judge.measure(masks)[0]), int(share * len(masks))
+    into = float(order[count - 1 : count + 1].mean())
+    structure = select(layout, Judge(layout.names, errors, Thresholds(1.0, into)), masks, True, 0)
+    assert len(structure.L_m) == len(masks)
+    assert len(structure.feasible) == count
+    assert set(structure.masks) <= set(structure.feasible)
+    errors_of_kept = [structure.L_m[m] for m in structure.masks]
+    assert errors_of_kept == sorted(errors_of_kept)
 
 
-def test_a_mask_that_a_race_misjudged_is_not_kept(measured, monkeypatch):
-    layout, errors = measured
-    judge = Judge(layout.names, errors, Thresholds(1.0, 0.4))
-    monkeypatch.setattr(structures, "OUTRIGHT", 99)
-    whole = select(layout, judge, every_mask(layout), True, 0)
-    honest = judge.race
-
-    def flattering(masks):
-        raced = honest(masks)
-        nothing, zeros = np.zeros_like(raced.done), np.zeros_like(raced.total)
-        return Judged(masks, raced.L_m * 0.01, raced.squared * 0.01, np.ones_like(raced.is_rough), zeros, nothing)
-
-    monkeypatch.setattr(structures, "OUTRIGHT", 0)
-    monkeypatch.setattr(judge, "race", flattering)
-    found = select(layout, judge, every_mask(layout), True, 0)
-    assert found.masks
-    assert set(found.masks) <= set(whole.feasible)
-    assert not found.rough & set(found.masks)
-    assert [found.L_m[m] for m in found.masks] == [whole.L_m[m] for m in found.masks]
-
-
-def test_most_masks_are_told_from_few_rows_and_the_report_says_so():
-    body = many_signals(0)
-    found = determine(body, QUICK, Thresholds(0.5, 0.15))
-    assert 0.5 * len(found.L_m) < len(found.rough) < len(found.L_m)
-    assert not found.rough & set(found.masks)
-    report = found.report()
-    assert f"L_m of {len(found.rough)} masks, marked ~, is an estimate from few rows" in report
-    assert any(" ~0." in line for line in report.splitlines())
+def test_number_of_cores_changes_nothing(measured, monkeypatch):
+    layout, (errors, *_) = measured
+    results = []
+    for count in (1, 2, 5):
+        monkeypatch.setattr(os, "sched_getaffinity", lambda _, count=count: set(range(count)))
+        results.append(errors.of(every_mask(layout)))
+    np.testing.assert_array_equal(results[1], results[0])
+    np.testing.assert_array_equal(results[2], results[0])
