@@ -4,9 +4,12 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 import yaml
+
+import gemuco
 
 ROOT = Path(__file__).parents[2]
 FRONT = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")
@@ -50,3 +53,9 @@ def anchors(page: Path) -> set[str]:
     """Return the anchors of a page's headings, as GitHub and the site form them."""
     headings = re.findall(r"^#+ (.*)$", page.read_text(), re.MULTILINE)
     return {re.sub(r"[^\w -]", "", heading.lower()).strip().replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("package", [gemuco], ids=lambda package: package.__name__)
+def test_reference_lists_every_exported_name(package: ModuleType) -> None:
+    page = (ROOT / "docs" / f"api_{package.__name__}.md").read_text()
+    assert set(re.findall(rf"^::: {package.__name__}\.(\w+)$", page, re.MULTILINE)) == set(package.__all__)
