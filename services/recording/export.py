@@ -1,4 +1,4 @@
-"""Recordings as tables for other programs: one per key, a row per message, a column per element with its unit.
+"""Export of recordings as tables: one table per key, one row per message, one column per element with its unit.
 
 Messages are written as they are read, so a recording may be larger than the memory.
 """
@@ -14,21 +14,21 @@ from typing import Any, Protocol
 import numpy as np
 
 from services.errors import RecordingError
-from services.recording.reading import Paths, Recorded, about, one_robot, read
+from services.recording.reading import Paths, Recorded, facts_of, one_robot, read
 from services.recording.schema import UNITS, Form
 from services.wire import keys
 from services.wire.records import Array, Message, Numbers, Truths
 
 ROWS = 4096
-"""Rows that are written together."""
+"""Rows are written in groups of this size."""
 FIRST = ("received [ns]", "stamp [ns]", "seq", "boot")
 HEADER = ("v", "stamp_ns", "seq", "boot")
 PLAIN = "values"
-"""The field whose columns need no prefix: what it is about."""
+"""Columns of this field have no prefix."""
 
 
 class Table(Protocol):
-    """A file that takes rows of the same columns."""
+    """File that takes rows of the same columns."""
 
     path: Path
 
@@ -40,7 +40,7 @@ class Table(Protocol):
 
 
 class CsvTable:
-    """Comma-separated text with the names of the columns in the first line; what was not measured is empty."""
+    """Comma-separated text with the names of the columns in the first line; unmeasured values are empty."""
 
     def __init__(self, path: Path, columns: list[str], first: list[Any]) -> None:
         self.path = path.with_name(path.name + ".csv")
@@ -58,7 +58,7 @@ class CsvTable:
 
 
 class ParquetTable:
-    """Apache Parquet; what was not measured is null."""
+    """Apache Parquet file; unmeasured values are null."""
 
     def __init__(self, arrow: ModuleType, path: Path, columns: list[str], first: list[Any]) -> None:
         import pyarrow.parquet
@@ -86,7 +86,7 @@ class ParquetTable:
 
 
 def run_export(paths: Paths, out: Path, form: str) -> None:
-    """Write recordings as tables, and print which.
+    """Write recordings as tables and print their names.
 
     Args:
         paths: Recordings of one robot, in any order.
@@ -104,20 +104,21 @@ def export(paths: Paths, out: Path, form: str) -> dict[Path, int]:
     """Write recordings as tables; see `run_export`.
 
     Returns:
-        Every table and how many rows it has.
+        Table -> number of its rows.
     """
-    files = about(paths)
+    files = facts_of(paths)
     one_robot(files)
     make = _maker(form)
-    tables: dict[tuple[str, str], _Filling] = {}
+    tables: dict[tuple[str, str], _TableFilling] = {}
     try:
         out.mkdir(parents=True, exist_ok=True)
-        for one in read([file.path for file in files]):
-            which = (one.key, json.dumps([one.form.schema["x-signals"], getattr(one.message, "signal", "")]))
-            if which not in tables:
-                number = 1 + sum(key == one.key for key, _ in tables)
-                tables[which] = _Filling(one, out / _name(one.key, number), make)
-            tables[which].add(one)
+        for recorded in read([file.path for file in files]):
+            signals = [recorded.form.schema["x-signals"], getattr(recorded.message, "signal", "")]
+            identity = (recorded.key, json.dumps(signals))
+            if identity not in tables:
+                number = 1 + sum(key == recorded.key for key, _ in tables)
+                tables[identity] = _TableFilling(recorded, out / _name(recorded.key, number), make)
+            tables[identity].add(recorded)
         for table in tables.values():
             table.close()
     except FileExistsError:
@@ -133,7 +134,7 @@ def _maker(form: str) -> Callable[[Path, list[str], list[Any]], Table]:
     if form == "csv":
         return CsvTable
     if form != "parquet":
-        raise RecordingError(f"'{form}' is no format of tables. Known formats: csv, parquet.")
+        raise RecordingError(f"'{form}' is not a format of tables. Known formats: csv, parquet.")
     try:
         import pyarrow
     except ImportError:
@@ -144,13 +145,13 @@ def _maker(form: str) -> Callable[[Path, list[str], list[Any]], Table]:
 
 
 def _name(key: str, number: int) -> str:
-    """`hal.sample`; `hal.sample-2` after the robot described itself anew, `model.target-2` of another signal."""
+    """Return `hal.sample`; `hal.sample-2` after a new description of the robot, `model.target-2` of another signal."""
     _, service, rest = keys.parse(key)
     return f"{service}.{rest.replace('/', '.')}" + (f"-{number}" if number > 1 else "")
 
 
-class _Filling:
-    """A table being filled."""
+class _TableFilling:
+    """Table that is being filled."""
 
     def __init__(self, first: Recorded, path: Path, make: Callable[[Path, list[str], list[Any]], Table]) -> None:
         self.rows = 0
@@ -159,8 +160,8 @@ class _Filling:
         self._table = make(path, self._columns, [value for _, value in _cells(first, typed=True)])
         self.path = self._table.path
 
-    def add(self, one: Recorded) -> None:
-        self._waiting.append([value for _, value in _cells(one)])
+    def add(self, recorded: Recorded) -> None:
+        self._waiting.append([value for _, value in _cells(recorded)])
         if len(self._waiting) >= ROWS:
             self._write()
 
@@ -175,15 +176,15 @@ class _Filling:
         self._waiting = []
 
 
-def _cells(one: Recorded, typed: bool = False) -> Iterator[tuple[str, Any]]:
-    """Name and value of every column, in an order that depends on the form alone.
+def _cells(recorded: Recorded, typed: bool = False) -> Iterator[tuple[str, Any]]:
+    """Yield name and value of every column, in an order that depends on the form alone.
 
     Args:
-        one: A recorded message.
-        typed: With a value of the column's type in place of one that is missing.
+        recorded: A recorded message.
+        typed: Whether a missing value is replaced by a value of the column's type.
     """
-    message, form = one.message, one.form
-    yield from zip(FIRST, (one.received_ns, message.stamp_ns, message.seq, message.boot), strict=True)
+    message, form = recorded.message, recorded.form
+    yield from zip(FIRST, (recorded.received_ns, message.stamp_ns, message.seq, message.boot), strict=True)
     for name, hint in form.hints.items():
         if name not in HEADER:
             yield from _columns(name, hint, message, form, typed)
@@ -196,7 +197,7 @@ def _columns(name: str, hint: Any, message: Message, form: Form, typed: bool) ->
         yield name, json.dumps(value.tolist())
     elif hint in (Array, Numbers, Truths):
         only = getattr(message, "signal", "")
-        found = {only: value} if hint == Array else value
+        by_signal = {only: value} if hint == Array else value
         for signal, listed in signals.items():
             if only and signal != only:
                 continue
@@ -204,7 +205,7 @@ def _columns(name: str, hint: Any, message: Message, form: Form, typed: bool) ->
             unit = "" if is_truth else UNITS.get(name, listed.unit)
             prefix = "" if name == PLAIN else f"{name}."
             suffix = f" [{unit}]" if unit else ""
-            numbers = found.get(signal)
+            numbers = by_signal.get(signal)
             for index, element in enumerate(listed.elements):
                 yield f"{prefix}{signal}.{element}{suffix}", _cell(is_truth, numbers, index, typed)
     elif hint in (dict[str, float], dict[str, str]):
@@ -224,5 +225,5 @@ def _cell(is_truth: bool, numbers: np.ndarray | None, index: int, typed: bool) -
 
 
 def _number(value: Any) -> Any:
-    """A number that is none is no value in a table."""
+    """Return the value, or None for a number that is not finite."""
     return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,7 +1,7 @@
-"""One file of a recording: MCAP whose every written part is whole, whatever happens next.
+"""File of a recording: MCAP of which every written part is whole, whatever happens next.
 
-What is added waits in memory and is written by `commit`, all of it or nothing: where the disk is full, or a limit on
-the size of files is met, the file is cut back to what it was, so that readers never find half a record.
+Added messages wait in memory and are written by `commit`, all or none: on a full disk, or at a limit on the size of
+files, the file is cut back to its former size, so readers never see half a record.
 """
 
 import json
@@ -20,7 +20,7 @@ from services.errors import RecordingError
 LIBRARY = f"gemuco; mcap {mcap.__version__}"
 PROFILE = "gemuco"
 CHUNK = 1 << 20
-"""Bytes of messages that are compressed together, if `commit` does not come first."""
+"""At most this many bytes of messages are compressed together; `commit` may come earlier."""
 DIGITS = 6
 
 
@@ -28,37 +28,37 @@ class RecordingFile:
     """An MCAP file being written.
 
     Args:
-        path: Must not exist.
+        path: The file; it must not exist.
 
     Raises:
-        RecordingError: It exists, or cannot be written.
+        RecordingError: The file exists, or cannot be written.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.messages = 0
-        """Messages that are safe in the file."""
+        """Number of messages that are safe in the file."""
         self._pending = 0
         self._schemas: dict[tuple[str, str, bytes], int] = {}
         self._channels: dict[tuple[str, str, int], int] = {}
-        self._stream = _Whole(path)
+        self._stream = _CommittedStream(path)
         self._writer = Writer(self._stream, chunk_size=CHUNK, compression=CompressionType.ZSTD)  # type: ignore[arg-type]
         self._writer.start(profile=PROFILE, library=LIBRARY)
 
     @property
     def size(self) -> int:
-        """Bytes on disk."""
+        """Size on disk [bytes]."""
         return self._stream.written
 
     def channel(self, topic: str, encoding: str, name: str = "", schema: Mapping[str, Any] | None = None) -> int:
-        """The channel for messages of this encoding and schema on a topic, made when first asked for."""
+        """Return the channel for messages of an encoding and schema on a topic; it is made at the first call."""
         number = 0
         if schema is not None:
             data = json.dumps(schema, ensure_ascii=False).encode()
-            which = (name, "jsonschema", data)
-            if which not in self._schemas:
-                self._schemas[which] = self._writer.register_schema(*which)
-            number = self._schemas[which]
+            definition = (name, "jsonschema", data)
+            if definition not in self._schemas:
+                self._schemas[definition] = self._writer.register_schema(*definition)
+            number = self._schemas[definition]
         key = (topic, encoding, number)
         if key not in self._channels:
             self._channels[key] = self._writer.register_channel(topic, encoding, number)
@@ -69,15 +69,15 @@ class RecordingFile:
         self._writer.add_message(channel, received_ns, data, stamp_ns, seq & 0xFFFFFFFF)
         self._pending += 1
 
-    def tell(self, name: str, facts: Mapping[str, str]) -> None:
-        """Add facts of the whole recording, as MCAP metadata."""
+    def add_facts(self, name: str, facts: Mapping[str, str]) -> None:
+        """Add facts about the whole recording, as MCAP metadata."""
         self._writer.add_metadata(name, dict(facts))
 
     def commit(self) -> None:
-        """Write what waits and have the disk keep it.
+        """Write the waiting messages and ask the disk to keep them.
 
         Raises:
-            OSError: It could not be written; the file is as it was after the last commit, and stays so.
+            OSError: They could not be written; the file stays as it was after the last commit.
         """
         self._writer.flush()
         self._stream.commit()
@@ -85,7 +85,7 @@ class RecordingFile:
         self._pending = 0
 
     def finish(self) -> None:
-        """Write what waits and the index, and close.
+        """Write the waiting messages and the index, and close.
 
         Raises:
             OSError: As `commit`; the file is closed, and has no index.
@@ -102,7 +102,7 @@ class RecordingFile:
         """Close after a `commit` that failed; a file without a message is removed.
 
         Returns:
-            How many messages were not written.
+            Number of messages that were not written.
         """
         self._stream.close()
         if self.messages == 0:
@@ -110,14 +110,14 @@ class RecordingFile:
         return self._pending
 
 
-class _Whole:
-    """What mcap's writer writes to: bytes that wait until `commit`, which writes all of them or none."""
+class _CommittedStream:
+    """Stream for mcap's writer: bytes wait until `commit`, which writes all of them or none."""
 
     def __init__(self, path: Path) -> None:
         self.written = 0
         self._waiting = bytearray()
         self._failure: OSError | None = None
-        self._wanted, self._ending = threading.Event(), False
+        self._requested, self._ending = threading.Event(), False
         if path.exists():
             raise RecordingError(f"There is a file '{path}' already; a recording never replaces one.")
         try:
@@ -136,36 +136,36 @@ class _Whole:
         return self.written + len(self._waiting)
 
     def flush(self) -> None:
-        """Mcap's writer calls this; `commit` comes after it."""
+        """Do nothing; mcap's writer calls this, and `commit` comes after it."""
 
     def commit(self) -> None:
         if self._failure is not None:
             raise self._failure
         try:
-            done = 0
+            written = 0
             with memoryview(self._waiting) as view:
-                while done < len(view):
-                    done += os.write(self._file, view[done:])
+                while written < len(view):
+                    written += os.write(self._file, view[written:])
         except OSError:
             os.ftruncate(self._file, self.written)
             raise
         self.written += len(self._waiting)
         self._waiting.clear()
-        self._wanted.set()
+        self._requested.set()
 
     def close(self) -> None:
         if self._file >= 0:
             self._ending = True
-            self._wanted.set()
+            self._requested.set()
             self._syncing.join()
             os.close(self._file)
             self._file = -1
 
     def _sync(self) -> None:
-        """Have the disk keep what was written; it may take long, while what comes is written all the same."""
+        """Ask the disk to keep what was written; this may take long, and writing goes on meanwhile."""
         while True:
-            self._wanted.wait()
-            self._wanted.clear()
+            self._requested.wait()
+            self._requested.clear()
             is_last = self._ending
             try:
                 os.fdatasync(self._file)
@@ -176,22 +176,22 @@ class _Whole:
 
 
 def numbered(path: Path, number: int) -> Path:
-    """`walk.mcap` and 7 make `walk-000007.mcap`, so that names sort as the files were written."""
+    """Return `walk-000007.mcap` for `walk.mcap` and 7, so that names sort in the order of writing."""
     return path.with_name(f"{path.stem}-{number:0{DIGITS}d}{path.suffix}")
 
 
 def next_path(path: Path, is_one_of_many: bool) -> Path:
-    """The next file of a recording: the path itself, or, where there may be many or it exists, a numbered one.
+    """Return the next file of a recording: the path itself, or a numbered one if there may be many or it exists.
 
-    Numbers go on from the highest that is there, so that a recorder that was killed can be started again as it was.
+    Numbers continue from the highest existing one, so a killed recorder can be started again with the same arguments.
     """
     if not is_one_of_many and not path.exists():
         return path
     shape = re.compile(re.escape(path.stem) + rf"-(\d{{{DIGITS},}})" + re.escape(path.suffix))
-    found = [int(match[1]) for one in _beside(path) if (match := shape.fullmatch(one.name))]
+    numbers = [int(match[1]) for other in _siblings(path) if (match := shape.fullmatch(other.name))]
     least = 0 if is_one_of_many else 1  # the path itself is the first
-    return numbered(path, max(found, default=least) + 1)
+    return numbered(path, max(numbers, default=least) + 1)
 
 
-def _beside(path: Path) -> list[Path]:
+def _siblings(path: Path) -> list[Path]:
     return list(path.parent.iterdir()) if path.parent.is_dir() else []

@@ -1,4 +1,4 @@
-"""What a recording lacks: counted per key, told in the file as facts and, with the time, as lines of its log."""
+"""Losses of a recording: counted per key, written into the file as facts and, with the time, as lines of its log."""
 
 import json
 from collections import Counter
@@ -6,26 +6,26 @@ from collections.abc import Iterator
 from typing import Any
 
 INFO, WARNING, ERROR = 2, 3, 4
-"""Levels of foxglove.Log."""
+"""These are the levels of foxglove.Log."""
 LOG = "foxglove.Log"
 OTHERS = "other keys"
 FURTHEST = 1_000_000_000
-"""No sender is so many messages ahead, not after two months at 200 Hz: who says so did not count."""
+"""A sender that is further ahead [messages] is ignored; this is two months at 200 Hz."""
 SENDERS = 8
-"""Senders of one key that are counted apart; of more, the first is forgotten."""
+"""At most this many senders of one key are counted separately; of more, the first is forgotten."""
 MOST_KEYS = 1000
-"""Keys of which what was dropped is counted apart: anybody may make up more."""
+"""Dropped messages are counted separately for at most this many keys, because any client may invent more."""
 _TIME = {"type": "object", "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}}}
 LOG_SCHEMA: dict[str, Any] = {
     "$schema": "https://json-schema.org/draft/2020-12/schema",
     "title": LOG,
-    "description": "What happened while recording; Foxglove shows it in its Log panel.",
+    "description": "Events during the recording; Foxglove shows them in its Log panel.",
     "type": "object",
     "properties": {
         "timestamp": _TIME,
         "level": {"type": "integer", "description": "2 info, 3 warning, 4 error"},
         "message": {"type": "string"},
-        "name": {"type": "string", "description": "The service that it is about."},
+        "name": {"type": "string", "description": "The service that the line is about."},
         "file": {"type": "string"},
         "line": {"type": "integer"},
         "kind": {
@@ -33,7 +33,7 @@ LOG_SCHEMA: dict[str, Any] = {
             "description": "alive, gone, holder, robot, file, clock, dropped, missed, malformed",
         },
         "key": {"type": "string"},
-        "count": {"type": "integer", "description": "How many messages."},
+        "count": {"type": "integer", "description": "Number of messages."},
     },
     "required": ["timestamp", "level", "message", "name", "kind"],
 }
@@ -45,20 +45,20 @@ _SENTENCES = {
 
 
 class Losses:
-    """Counts of what a recording lacks, per key, over all its files."""
+    """Counts of missing messages, per key, over all files of a recording."""
 
     def __init__(self) -> None:
         self.dropped: Counter[str] = Counter()
-        """Came, and could not be written: too many at once, or no space."""
+        """Messages that came and could not be written: too many at once, or no space."""
         self.missed: Counter[str] = Counter()
-        """Never came; told by gaps in the senders' counting."""
+        """Messages that never came, known from gaps in the sequence numbers."""
         self.malformed: Counter[str] = Counter()
-        """Were not what their key carries; their bytes are in the recording."""
-        self._told = {kind: Counter[str]() for kind in _SENTENCES}
+        """Messages of another kind than their key carries; their bytes are in the recording."""
+        self._reported = {kind: Counter[str]() for kind in _SENTENCES}
         self._last: dict[str, dict[int, int]] = {}
 
     def arrived(self, key: str, boot: int, seq: int) -> None:
-        """Note a sender's number, and what is missing before it."""
+        """Take a sender's sequence number, and count the messages that are missing before it."""
         senders = self._last.setdefault(key, {})
         before = senders.get(boot)
         if before is None:
@@ -71,37 +71,37 @@ class Losses:
         senders[boot] = seq
 
     def drop(self, key: str, count: int = 1) -> None:
-        """Count what came on a key and could not be written; the gap that it leaves is not counted as missed too."""
+        """Count messages of a key that could not be written; the gap that they leave is not counted as missed."""
         self.dropped[key if key in self.dropped or len(self.dropped) < MOST_KEYS else OTHERS] += count
         self._last.pop(key, None)
 
     def totals(self) -> dict[str, int]:
-        """`dropped`, `missed` and `malformed`, of all keys."""
+        """Return the totals `dropped`, `missed` and `malformed` over all keys."""
         return {kind: getattr(self, kind).total() for kind in _SENTENCES}
 
     def facts(self) -> dict[str, str]:
-        """The same as text, and each by key as JSON."""
+        """Return the totals as text, and each kind by key as JSON."""
         totals = {kind: str(count) for kind, count in self.totals().items()}
         return totals | {f"{kind}_by_key": json.dumps(dict(getattr(self, kind))) for kind in _SENTENCES}
 
     def news(self) -> Iterator[tuple[str, str, int]]:
-        """Kind, key and number of what was lost since the last call."""
-        for kind, told in self._told.items():
+        """Yield kind, key and number of the losses since the last call."""
+        for kind, reported in self._reported.items():
             counted: Counter[str] = getattr(self, kind)
             for key, count in list(counted.items()):
-                if count > told[key]:
-                    yield kind, key, count - told[key]
-            told.update(counted - told)
+                if count > reported[key]:
+                    yield kind, key, count - reported[key]
+            reported.update(counted - reported)
 
 
 def line(received_ns: int, level: int, kind: str, text: str, **more: str | int) -> dict[str, Any]:
-    """One line of a recording's log."""
+    """Return one line of a recording's log."""
     sec, nsec = divmod(received_ns, 10**9)
     timestamp = {"sec": sec, "nsec": nsec}
-    told: dict[str, Any] = {"timestamp": timestamp, "level": level, "message": text, "name": "recorder"}
-    return told | {"file": "", "line": 0, "kind": kind} | more
+    entry: dict[str, Any] = {"timestamp": timestamp, "level": level, "message": text, "name": "recorder"}
+    return entry | {"file": "", "line": 0, "kind": kind} | more
 
 
 def line_of_loss(received_ns: int, kind: str, key: str, count: int) -> dict[str, Any]:
-    """The line that tells a loss."""
+    """Return the line of the log that reports a loss."""
     return line(received_ns, WARNING, kind, _SENTENCES[kind].format(count=count), key=key, count=count)

@@ -1,4 +1,4 @@
-"""Read recordings back: several files as one, in any order, also those whose writer was killed."""
+"""Reader of recordings: several files as one recording, in any order, also files whose writer was killed."""
 
 import heapq
 import json
@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 
 Paths = str | Path | Iterable[str | Path]
 KINDS = ("dropped", "missed", "malformed")
-"""In which ways a message may be missing."""
+"""A message may be missing in one of these ways."""
 _BY_TITLE = {f"gemuco.{record.__name__}": record for record in RECORDS.values()}
 
 
@@ -32,10 +32,10 @@ class Recorded:
     """One message of a recording.
 
     Attributes:
-        key: On which key it was published.
-        received_ns: When the recorder received it [ns since 1970, the recorder's clock].
-        message: What was published.
-        form: How it looks in the file; tells the signals' units and elements.
+        key: Key on which it was published.
+        received_ns: Arrival at the recorder [ns since 1970, the recorder's clock].
+        message: The published message.
+        form: Its form in the file, with units and elements of the signals.
     """
 
     key: str
@@ -45,21 +45,21 @@ class Recorded:
 
 
 @dataclass(frozen=True, slots=True)
-class About:
-    """What a file tells of itself.
+class FileFacts:
+    """Facts that a file holds about itself.
 
     Attributes:
         path: The file.
-        robot: Whose recording it is.
-        recording: Random name that the files of one recording share.
+        robot: Name of the recorded robot.
+        recording: Random name that all files of one recording share.
         part: Its number among them.
-        condition: How the body was; empty if not told.
-        described: What the HAL told of itself, at least `signals`.
+        condition: Condition of the body; empty if not given.
+        described: Description that the HAL gave of itself, at least `signals`.
         losses: Messages that are missing from the recording up to here: `dropped`, `missed`, `malformed`.
-        keys: Keys with messages of ours.
-        begin_ns: First arrival; 0 in an empty file.
-        end_ns: Last arrival.
-        is_whole: Whether it was finished; one that was not is readable up to where its writer was killed.
+        keys: Keys that carry messages of gemuco.
+        begin_ns: First arrival [ns since 1970]; 0 in an empty file.
+        end_ns: Last arrival [ns since 1970].
+        is_whole: Whether it was finished; an unfinished file is readable up to where its writer was killed.
     """
 
     path: Path
@@ -76,81 +76,81 @@ class About:
 
     @property
     def catalogue(self) -> Catalogue:
-        """The robot's signals as it described them last."""
+        """Signals of the robot, as it described them last."""
         return Catalogue.of_description(self.described)
 
 
-def about(paths: Paths) -> list[About]:
-    """What files tell of themselves, in the order of their first arrival.
+def facts_of(paths: Paths) -> list[FileFacts]:
+    """Return the facts of files, in the order of their first arrival.
 
     Raises:
-        RecordingError: No file, or one is missing, damaged at its beginning, or no recording of ours.
+        RecordingError: No file is given, or a file is missing, damaged at its beginning, or not written by gemuco.
     """
-    found = sorted((_about(path) for path in _listed(paths)), key=lambda one: (one.begin_ns, one.part))
-    if not found:
+    files = sorted((_facts_of(path) for path in _listed(paths)), key=lambda file: (file.begin_ns, file.part))
+    if not files:
         raise RecordingError("No recording was named.")
-    return found
+    return files
 
 
-def one_robot(files: Iterable[About]) -> str:
-    """The robot that all these files are about.
+def one_robot(files: Iterable[FileFacts]) -> str:
+    """Return the name of the robot that all files belong to.
 
     Raises:
-        RecordingError: There are several.
+        RecordingError: The files belong to several robots.
     """
-    robots = sorted({one.robot for one in files})
+    robots = sorted({file.robot for file in files})
     if len(robots) != 1:
         raise RecordingError(f"These files are recordings of several robots: {', '.join(robots)}. Take those of one.")
     return robots[0]
 
 
 def losses(paths: Paths) -> dict[str, int]:
-    """How many messages are missing from recordings: `dropped`, `missed`, `malformed`, as the last files tell.
+    """Return the number of missing messages by kind: `dropped`, `missed`, `malformed`, from the last file of each.
 
     Raises:
-        RecordingError: As `about`.
+        RecordingError: As `facts_of`.
     """
-    last = {one.recording: one.losses for one in sorted(about(paths), key=lambda one: one.part)}
-    return {kind: sum(each[kind] for each in last.values()) for kind in KINDS}
+    last = {file.recording: file.losses for file in sorted(facts_of(paths), key=lambda file: file.part)}
+    return {kind: sum(counts[kind] for counts in last.values()) for kind in KINDS}
 
 
-def read(paths: Paths, wanted: Iterable[str] = ()) -> Iterator[Recorded]:
-    """The messages of recordings in the order of their arrival; what is no message of ours is left out.
+def read(paths: Paths, only: Iterable[str] = ()) -> Iterator[Recorded]:
+    """Yield the messages of recordings in the order of their arrival; foreign messages are left out.
 
     Args:
         paths: Files that the recorder wrote, finished or not, in any order.
-        wanted: Keys to read; all if none is given.
+        only: Keys to read; all if empty.
 
     Raises:
-        RecordingError: As `about`.
+        RecordingError: As `facts_of`.
     """
-    keys = frozenset(wanted)
-    later = about(paths)[::-1]
+    keys = frozenset(only)
+    later = facts_of(paths)[::-1]
     heap: list[tuple[int, int, Recorded, Iterator[Recorded]]] = []
     number = 0
     while later or heap:
-        # Files are opened when their time has come: a long recording has more of them than a process may open.
+        # Files are opened when their time has come: a long recording has more files than a process may open.
         while later and (not heap or later[-1].begin_ns <= heap[0][0]):
-            one = _messages(later.pop().path, keys)
+            messages = _messages(later.pop().path, keys)
             number += 1
-            if (first := next(one, None)) is not None:
-                heapq.heappush(heap, (first.received_ns, number, first, one))
+            if (first := next(messages, None)) is not None:
+                heapq.heappush(heap, (first.received_ns, number, first, messages))
         if not heap:
             continue
-        _, which, recorded, rest = heap[0]
+        _, index, recorded, rest = heap[0]
         following = next(rest, None)
         if following is None:
             heapq.heappop(heap)
         else:
-            heapq.heapreplace(heap, (following.received_ns, which, following, rest))
+            heapq.heapreplace(heap, (following.received_ns, index, following, rest))
         yield recorded
 
 
 def log_lines(path: str | Path) -> Iterator[dict[str, Any]]:
-    """What a file's log tells: who came and went, what was lost and when.
+    """Yield the lines of a file's log: services that came and went, losses and their times.
 
     Raises:
-        RecordingError: As `about`.
+        RecordingError: As `facts_of`.
     """
     channels: set[int] = set()
     logs: set[int] = set()
@@ -164,18 +164,18 @@ def log_lines(path: str | Path) -> Iterator[dict[str, Any]]:
 
 
 def _listed(paths: Paths) -> list[Path]:
-    """Each file once."""
-    many = [paths] if isinstance(paths, str | Path) else paths
-    return list(dict.fromkeys(Path(one) for one in many))
+    """Return each file once."""
+    several = [paths] if isinstance(paths, str | Path) else paths
+    return list(dict.fromkeys(Path(path) for path in several))
 
 
-def _messages(path: Path, wanted: frozenset[str]) -> Iterator[Recorded]:
+def _messages(path: Path, only: frozenset[str]) -> Iterator[Recorded]:
     forms: dict[int, Form] = {}
     channels: dict[int, tuple[str, Form]] = {}
     for record in _records(path):
         if isinstance(record, McapMessage):
             known = channels.get(record.channel_id)
-            if known is None or (wanted and known[0] not in wanted):
+            if known is None or (only and known[0] not in only):
                 continue
             try:
                 yield Recorded(known[0], record.log_time, known[1].read(record.data), known[1])
@@ -187,7 +187,7 @@ def _messages(path: Path, wanted: frozenset[str]) -> Iterator[Recorded]:
             channels[record.id] = (record.topic, forms[record.schema_id])
 
 
-def _about(path: Path) -> About:
+def _facts_of(path: Path) -> FileFacts:
     facts: dict[str, dict[str, str]] = {}
     begin_ns, end_ns, is_whole = 0, 0, False
     listed: list[object] = []
@@ -205,7 +205,7 @@ def _about(path: Path) -> About:
         own, lost = facts[FACTS], facts.get(LOSSES, {})
         if own["format"] != FORMAT:
             raise RecordingError(f"'{path}' is a recording in format {own['format']}; this reads {FORMAT}.")
-        return About(
+        return FileFacts(
             path=path,
             robot=own["robot"],
             recording=own["recording"],
@@ -219,23 +219,23 @@ def _about(path: Path) -> About:
             is_whole=is_whole,
         )
     except (KeyError, ValueError):
-        raise RecordingError(f"'{path}' is no recording that `gemuco record` wrote, or only its first bytes.") from None
+        raise RecordingError(f"'{path}' is not a recording of `gemuco record`, or only its first bytes.") from None
 
 
 def _keys(records: Iterable[object]) -> frozenset[str]:
-    """The topics whose schema is one of ours."""
-    ours: set[int] = set()
-    found: set[str] = set()
+    """Return the topics whose schema belongs to gemuco."""
+    own_schemas: set[int] = set()
+    topics: set[str] = set()
     for record in records:
         if isinstance(record, Schema) and record.name in _BY_TITLE:
-            ours.add(record.id)
-        elif isinstance(record, Channel) and record.schema_id in ours:
-            found.add(record.topic)
-    return frozenset(found)
+            own_schemas.add(record.id)
+        elif isinstance(record, Channel) and record.schema_id in own_schemas:
+            topics.add(record.topic)
+    return frozenset(topics)
 
 
 def _records(path: Path, whole_chunks: bool = False) -> Iterator[object]:
-    """All records up to the end of the file, or up to where its writer was killed; a damaged chunk is left out."""
+    """Yield all records up to the end of the file, or up to where its writer was killed, without damaged chunks."""
     try:
         stream = path.open("rb")
     except OSError as error:
@@ -246,10 +246,10 @@ def _records(path: Path, whole_chunks: bool = False) -> Iterator[object]:
         while True:
             try:
                 record = next(records, None)
-            except Exception as error:  # what a cut or damaged file makes mcap's reader raise
+            except Exception as error:  # mcap's reader raises various errors for a cut or damaged file
                 if not begun:
-                    said = str(error) or type(error).__name__
-                    raise RecordingError(f"'{path}' is not a recording, or only its first bytes: {said}.") from None
+                    reason = str(error) or type(error).__name__
+                    raise RecordingError(f"'{path}' is not a recording, or only its first bytes: {reason}.") from None
                 return
             if record is None:
                 return

@@ -1,7 +1,7 @@
-"""The process that writes down all that a robot's services publish, in files that Foxglove opens.
+"""Process that records everything that a robot's services publish, in files that Foxglove opens.
 
-Whatever was received more than a second ago survives kill -9, and, as far as the disk keeps its word, a power cut. What
-was lost is counted and written into the file. Nothing here can hold up zenoh, nor grow without bound.
+A message received more than a second ago survives kill -9 and, if the disk keeps its word, a power cut. Losses are
+counted and written into the file. The recorder never blocks zenoh and its memory is bounded.
 """
 
 import contextlib
@@ -27,74 +27,74 @@ from services.wire.messages import Status
 log = logging.getLogger(__name__)
 
 MOST = 8192
-"""Messages that may wait to be written; at five streams of 200 Hz, eight seconds of a disk that stalls."""
+"""At most this many messages wait to be written: eight seconds of a stalled disk at five streams of 200 Hz."""
 MOST_BYTES = 32 << 20
-"""Bytes that may wait."""
+"""At most this many bytes wait to be written."""
 TAKE_EVERY = 0.05
 COMMIT_EVERY = 0.4
-"""How often [s] what came is made safe; with the time to write it, under a second."""
+"""Messages are made safe at this interval [s]; with the time to write them this stays under a second."""
 DESCRIBED_WITHIN = 0.5
-"""How long [s] writing waits for the HAL to tell the names of its signals, where no robot file does."""
+"""Without a robot file, writing waits at most this long [s] for the HAL to name its signals."""
 ASK_WITHIN = 1.0
 STEPPED = 500_000_000
-"""A wall clock that jumps by so many ns is told."""
+"""A jump of the wall clock by at least this [ns] is reported."""
 
 
-class Arrived(NamedTuple):
-    """Something to write down: a `message`, that a service came (`alive`) or went (`gone`), or what a `robot` is."""
+class Entry(NamedTuple):
+    """Event to record: a `message`, a service that came (`alive`) or went (`gone`), or a description of the `robot`."""
 
     kind: str
     key: str
     received_ns: int
     payload: bytes = b""
     encoding: str = ""
-    told: Mapping[str, Any] | None = None
+    description: Mapping[str, Any] | None = None
 
 
-class Waiting:
-    """What came and is not written yet, bounded in number and bytes."""
+class EntryQueue:
+    """Entries that are not written yet, bounded in number and bytes."""
 
-    def __init__(self, most: int, most_bytes: int) -> None:
-        self._most, self._most_bytes = most, most_bytes
+    def __init__(self, limit: int, limit_bytes: int) -> None:
+        self._limit, self._limit_bytes = limit, limit_bytes
         self._lock = threading.Lock()
-        self._items: list[Arrived] = []
+        self._items: list[Entry] = []
         self._bytes = 0
         self._dropped: Counter[str] = Counter()
 
     def __len__(self) -> int:
         return len(self._items)
 
-    def put(self, item: Arrived) -> None:
-        """Add one, or count it as dropped; never waits for anything that takes long."""
+    def put(self, item: Entry) -> None:
+        """Add an entry, or count it as dropped; never blocks for long."""
         with self._lock:
-            if len(self._items) >= self._most or self._bytes + len(item.payload) > self._most_bytes:
-                # Of keys without number, each dropped one must not be remembered.
-                self._dropped[item.key if len(self._dropped) < self._most else ""] += 1
+            if len(self._items) >= self._limit or self._bytes + len(item.payload) > self._limit_bytes:
+                # There is no limit on the number of keys, so not every dropped key can be kept.
+                self._dropped[item.key if len(self._dropped) < self._limit else ""] += 1
                 return
             self._items.append(item)
             self._bytes += len(item.payload)
 
-    def take(self) -> tuple[list[Arrived], Counter[str]]:
-        """All that wait, in order, and what was dropped since the last call, by key."""
+    def take(self) -> tuple[list[Entry], Counter[str]]:
+        """Return and remove all entries in order, and the number dropped since the last call, by key."""
         with self._lock:
-            found = self._items, self._dropped
+            content = self._items, self._dropped
             self._items, self._bytes, self._dropped = [], 0, Counter()
-        return found
+        return content
 
 
 class ArrivalClock:
-    """The wall clock at the start, going on like a clock that nobody sets: arrivals never go back in time."""
+    """Clock that starts at wall-clock time and then is never set: arrivals never go back in time."""
 
     def __init__(self) -> None:
         self._ahead = time.time_ns() - time.monotonic_ns()
         self._stepped = 0
 
     def now_ns(self) -> int:
-        """Nanoseconds since 1970, by the wall clock as it was at the start."""
+        """Return the time [ns since 1970], by the wall clock as it was at the start."""
         return self._ahead + time.monotonic_ns()
 
     def step(self) -> float:
-        """By how much [s] somebody set the wall clock since the last call."""
+        """Return by how much [s] the wall clock was set since the last call."""
         apart = time.time_ns() - self.now_ns()
         step = apart - self._stepped
         if abs(step) < STEPPED:
@@ -104,24 +104,24 @@ class ArrivalClock:
 
 
 class Recorder:
-    """Records a robot's keys, from entering to leaving.
+    """Recording of a robot's keys; a context manager.
 
     Args:
         session: An open session; it must outlive the recorder.
         robot: The robot's name.
-        writer: Writes the files.
+        writer: Writer of the files.
         is_described: Whether the writer knows the robot's signals; if not, the HAL is asked first.
-        most: How many messages may wait to be written; more are dropped and counted.
+        limit: At most this many messages wait to be written; more are dropped and counted.
     """
 
     def __init__(
-        self, session: zenoh.Session, robot: str, writer: RecordingWriter, is_described: bool = True, most: int = MOST
+        self, session: zenoh.Session, robot: str, writer: RecordingWriter, is_described: bool = True, limit: int = MOST
     ) -> None:
         self.writer = writer
         self.failure = ""
-        """Why writing ended early; empty while all is well."""
+        """Reason why writing ended early; empty otherwise."""
         self._session, self._robot = session, robot
-        self._waiting = Waiting(most, MOST_BYTES)
+        self._waiting = EntryQueue(limit, MOST_BYTES)
         self._clock = ArrivalClock()
         self._stop = threading.Event()
         self._hal_came = threading.Event()
@@ -151,7 +151,7 @@ class Recorder:
         self._asking.join()
 
     def counters(self) -> dict[str, Any]:
-        """What was written and where, what was lost, and why nothing is recorded now, if so."""
+        """Return counts of written and lost messages, the file, and the failure if nothing is recorded now."""
         writer = self.writer
         return {
             "path": str(writer.paths[-1]) if writer.paths else "",
@@ -165,40 +165,38 @@ class Recorder:
         }
 
     def _receive(self, sample: zenoh.Sample) -> None:
-        """In zenoh's thread: note the time, never wait."""
+        """Queue a message with its arrival; runs in zenoh's thread and never blocks."""
         now = self._clock.now_ns()
-        self._waiting.put(
-            Arrived("message", str(sample.key_expr), now, sample.payload.to_bytes(), str(sample.encoding))
-        )
+        self._waiting.put(Entry("message", str(sample.key_expr), now, sample.payload.to_bytes(), str(sample.encoding)))
 
     def _came_or_went(self, sample: zenoh.Sample) -> None:
         came = sample.kind == zenoh.SampleKind.PUT
         key = str(sample.key_expr)
-        self._waiting.put(Arrived("alive" if came else "gone", key, self._clock.now_ns()))
+        self._waiting.put(Entry("alive" if came else "gone", key, self._clock.now_ns()))
         if came and key == keys.alive(self._robot, "hal"):
             self._hal_came.set()
 
     def _describe(self) -> None:
-        """Ask every HAL that comes what its signals are."""
+        """Query every HAL that comes for its signals."""
         while self._hal_came.wait() and not self._stop.is_set():
             self._hal_came.clear()
             with contextlib.suppress(ServiceError):  # not allowed, or gone again: then signals have numbers for names
-                told = query.ask(self._session, keys.verb(self._robot, "hal", "describe"), timeout=ASK_WITHIN)
-                self._waiting.put(Arrived("robot", "", self._clock.now_ns(), told=told))
+                description = query.ask(self._session, keys.verb(self._robot, "hal", "describe"), timeout=ASK_WITHIN)
+                self._waiting.put(Entry("robot", "", self._clock.now_ns(), description=description))
             self._known.set()
 
     def _write(self) -> None:
         self._known.wait(DESCRIBED_WITHIN)
         try:
-            self._write_until_told()
-        except Exception as error:  # whatever it was, what comes from now on counts as dropped, and is told
+            self._write_until_stopped()
+        except Exception as error:  # of any kind: later messages count as dropped, and the failure is reported
             self.failure = f"The recording ended early: {type(error).__name__}: {error}."
             log.exception("%s", self.failure)
             while not self._stop.wait(TAKE_EVERY):
                 self._drop_all()
             self._drop_all()
 
-    def _write_until_told(self) -> None:
+    def _write_until_stopped(self) -> None:
         due = time.monotonic() + COMMIT_EVERY
         while not (is_last := self._stop.wait(TAKE_EVERY)):
             self._take()
@@ -216,17 +214,17 @@ class Recorder:
 
     def _take(self) -> None:
         items, dropped = self._waiting.take()
-        # What the HAL tells of itself comes before messages that waited for it.
-        for item in sorted(items, key=lambda one: one.kind != "robot"):
+        # Descriptions come before the messages that waited for them.
+        for item in sorted(items, key=lambda item: item.kind != "robot"):
             self._add(item)
-        for key, count in dropped.items():  # they came after those that found room
+        for key, count in dropped.items():  # they came after the queued ones
             self.writer.losses.drop(key, count)
 
-    def _add(self, item: Arrived) -> None:
+    def _add(self, item: Entry) -> None:
         if item.kind == "message":
             self.writer.add(item.key, item.received_ns, item.payload, item.encoding)
-        elif item.told is not None:
-            self.writer.describe(item.received_ns, item.told)
+        elif item.description is not None:
+            self.writer.describe(item.received_ns, item.description)
         else:
             service = keys.parse(item.key)[1]
             text = f"The '{service}' service {'came' if item.kind == 'alive' else 'went'}."
@@ -254,9 +252,9 @@ def recording(
     Args:
         session: An open session.
         robot: The robot's name.
-        path: The file, or what its numbered names are made from.
+        path: The file; numbered names are derived from it.
         catalogue: The robot's signals; its HAL is asked if not given.
-        condition: How the body is meanwhile.
+        condition: Condition of the body meanwhile.
         limits: When to begin a new file.
 
     Raises:
@@ -281,68 +279,68 @@ def run_recorder(
 
     Args:
         robot: The robot's name.
-        path: The file to write; if it exists, or where there may be many, numbered ones beside it are written, so that
-            a recorder that was killed can be started again as it was.
+        path: The file to write; if it exists, or if there may be many, numbered files beside it are written, so a
+            killed recorder can be started again with the same arguments.
         connect: Endpoints, such as a router's, and role files.
         stop: Ends the recording in place of the signals.
         catalogue: The robot's signals; its HAL is asked if not given.
-        condition: How the body is meanwhile.
+        condition: Condition of the body meanwhile.
         limits: When to begin a new file.
 
     Returns:
-        The process's exit code; 1 if something that came could not be written.
+        Exit code of the process; 1 if a message could not be written.
 
     Raises:
         RecordingError: The file cannot be written.
         AlreadyRunning: The robot is being recorded already.
-        ServiceError: No session.
+        ServiceError: No session could be opened.
     """
     path = Path(path)
     if path.suffix != ".mcap":
         raise RecordingError(f"A recording's name ends in .mcap, unlike '{path}'.")
     began = time.monotonic()
     with (
-        until_told(stop) as told,
+        until_told(stop) as stopped,
         Service(robot, "recorder", connect) as service,
         recording(service.session, robot, path, catalogue, condition, limits) as recorder,
     ):
         service.watch(recorder.writer)
-        service.run(lambda: _status(recorder), told)
-    counted = recorder.counters()
+        service.run(lambda: _status(recorder), stopped)
+    counters = recorder.counters()
     print(summary(recorder, time.monotonic() - began))
-    return 1 if counted["failure"] or counted["dropped"] else 0
+    return 1 if counters["failure"] or counters["dropped"] else 0
 
 
 def summary(recorder: Recorder, seconds: float) -> str:
-    """What was recorded, and what is missing, for a person."""
-    told = recorder.counters()
+    """Return sentences on what was recorded and what is missing."""
+    counters = recorder.counters()
     files = recorder.writer.paths
     where = (
         f"{files[0]}" + (f" to {files[-1].name} ({len(files)} files)" if len(files) > 1 else "") if files else "no file"
     )
-    text = f"{told['written']} messages, {seconds:.1f} s, {told['bytes'] / 1e6:.2f} MB in {where}. {missing(told)}"
-    return f"{text} {told['failure']}".rstrip()
+    text = f"{counters['written']} messages, {seconds:.1f} s, {counters['bytes'] / 1e6:.2f} MB in {where}."
+    return f"{text} {missing(counters)} {counters['failure']}".rstrip()
 
 
-def missing(told: Mapping[str, Any]) -> str:
-    """What a recording lacks, in one sentence."""
-    said = {
+def missing(counters: Mapping[str, Any]) -> str:
+    """Return one sentence on the messages that a recording lacks."""
+    reasons = {
         "dropped": "could not be written",
         "missed": "never arrived here",
         "malformed": "were not what their key carries (kept as bytes)",
     }
-    found = [f"{told[kind]} {text}" for kind, text in said.items() if told[kind]]
-    return f"Of its messages {', '.join(found)}." if found else "Nothing is missing."
+    parts = [f"{counters[kind]} {text}" for kind, text in reasons.items() if counters[kind]]
+    return f"Of its messages {', '.join(parts)}." if parts else "Nothing is missing."
 
 
 def _status(recorder: Recorder) -> Status:
-    told = recorder.counters()
-    lost = told["dropped"] + told["missed"]
-    text = told["failure"] or (f"{lost} messages are missing from the recording." if lost else "")
+    counters = recorder.counters()
+    lost = counters["dropped"] + counters["missed"]
+    text = counters["failure"] or (f"{lost} messages are missing from the recording." if lost else "")
     return Status(
         stamp_ns=time.time_ns(),
         service="recorder",
-        state="fault" if told["failure"] else "running",
+        state="fault" if counters["failure"] else "running",
         text=text,
-        facts=told,
+        facts=counters,
     )

@@ -1,8 +1,8 @@
-"""What a message looks like in a recording: JSON, and a JSON Schema that names every element and its unit.
+"""Form of messages in a recording: JSON, and a JSON Schema that names every element and its unit.
 
 A number that was not measured is absent. JSON has no NaN, and Foxglove's reader of schemas knows neither null nor a
-choice of types, so absence is what a schema can say truthfully and every viewer draws as a gap. Read back, an absent
-number is NaN again, and an absent age is infinite: never measured. All other numbers are read back bit by bit.
+union of types, so absence is the only truthful form, and every viewer draws it as a gap. Read back, an absent number is
+NaN again, and an absent age is infinite: never measured. All other numbers are read back bit by bit.
 """
 
 import inspect
@@ -23,20 +23,20 @@ from services.wire.records import Array, Elements, Message, Numbers, OfSignals, 
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 ABSENT = {"age": math.inf}
-"""What an absent number of a field stands for, where that is not NaN."""
+"""An absent number of these fields has this value; of all other fields it is NaN."""
 UNITS = {"age": "s", "contribution": "1", "left": "s"}
-"""Units of fields that do not have the signal's."""
+"""These fields have a unit of their own instead of the signal's."""
 TYPES: dict[Any, str] = {int: "integer", float: "number", bool: "boolean", str: "string"}
 _encoder = msgspec.json.Encoder()
 _decoder = msgspec.json.Decoder()
 
 
 class OtherLayout(MessageError):
-    """A message has a signal that is not in the catalogue, or one of another size.
+    """A signal of a message is not in the catalogue, or has another size there.
 
     Attributes:
-        signal: Which.
-        size: How many elements it has in the message.
+        signal: Its name.
+        size: Number of its elements in the message.
     """
 
     def __init__(self, signal: str, size: int) -> None:
@@ -45,8 +45,8 @@ class OtherLayout(MessageError):
 
 
 @dataclass(frozen=True)
-class Listed:
-    """A signal in a catalogue: its unit, empty if not known, and its elements in order."""
+class CatalogueSignal:
+    """Signal in a catalogue: its unit, empty if not known, and its elements in order."""
 
     unit: str
     elements: tuple[str, ...]
@@ -54,57 +54,59 @@ class Listed:
 
 @dataclass(frozen=True)
 class Catalogue:
-    """The signals of a robot, by name."""
+    """Signals of a robot, by name."""
 
-    signals: Mapping[str, Listed]
+    signals: Mapping[str, CatalogueSignal]
 
     @classmethod
     def of_robot(cls, robot: RobotConfig) -> Self:
-        """Of a robot file."""
-        return cls({name: Listed(one.unit, tuple(one.elements)) for name, one in robot.signals.items()})
+        """Make the catalogue of a robot file."""
+        return cls({name: CatalogueSignal(s.unit, tuple(s.elements)) for name, s in robot.signals.items()})
 
     @classmethod
-    def of_description(cls, told: Mapping[str, Any]) -> Self:
-        """Of what a HAL answers to `describe`.
+    def of_description(cls, description: Mapping[str, Any]) -> Self:
+        """Make the catalogue of a HAL's answer to `describe`.
 
         Raises:
-            MessageError: It tells no signals.
+            MessageError: The answer lacks signals.
         """
         try:
             signals = {
-                str(name): Listed(str(one["unit"]), tuple(str(element) for element in one["elements"]))
-                for name, one in told["signals"].items()
+                str(name): CatalogueSignal(str(signal["unit"]), tuple(str(element) for element in signal["elements"]))
+                for name, signal in description["signals"].items()
             }
         except (KeyError, TypeError, AttributeError):
-            raise MessageError("The description tells no signals with their units and elements.") from None
+            raise MessageError("The description lacks signals with units and elements.") from None
         return cls(signals)
 
     @classmethod
     def of_schema(cls, schema: Mapping[str, Any]) -> Self:
-        """Of the schema that `Form` made."""
+        """Make the catalogue of a schema that `Form` made."""
         listed = schema.get("x-signals", {})
-        return cls({name: Listed(one["unit"], tuple(one["elements"])) for name, one in listed.items()})
+        return cls(
+            {name: CatalogueSignal(signal["unit"], tuple(signal["elements"])) for name, signal in listed.items()}
+        )
 
     def plain(self) -> dict[str, Any]:
-        """As JSON can carry it."""
-        return {name: {"unit": one.unit, "elements": list(one.elements)} for name, one in self.signals.items()}
+        """Return the catalogue as plain data for JSON."""
+        return {name: {"unit": s.unit, "elements": list(s.elements)} for name, s in self.signals.items()}
 
     def with_unknown(self, signal: str, size: int) -> "Catalogue":
-        """The same and one signal more, of which only the number of elements is known."""
+        """Return the catalogue with one more signal, of which only the number of elements is known."""
         elements = tuple(f"element_{number}" for number in range(1, size + 1))
-        return Catalogue({**self.signals, signal: Listed("", elements)})
+        return Catalogue({**self.signals, signal: CatalogueSignal("", elements)})
 
 
 Convert = Callable[[Any, dict[str, Any]], Any]
 
 
 class Form:
-    """How messages of one type look in a recording of one robot, to and fro.
+    """Conversion of messages of one type to and from a recording of one robot.
 
     Attributes:
         schema: The JSON Schema.
         hints: Field of the record -> its type.
-        by_signal: Whether the record has one signal, which its arrays are of.
+        by_signal: Whether the record has one signal, to which its arrays belong.
     """
 
     def __init__(self, record: type[Message], catalogue: Catalogue) -> None:
@@ -117,28 +119,28 @@ class Form:
         }
         self._is_of_signals = issubclass(record, OfSignals)
         self.by_signal = any(item.name == "signal" for item in self._fields)
-        self._plan = [(item.name, self._writer(item.name, self.hints[item.name])) for item in self._fields]
+        self._converters = [(item.name, self._writer(item.name, self.hints[item.name])) for item in self._fields]
         self._required = frozenset(item.name for item in self._fields if item.required)
         self.schema = self._schema()
 
     def write(self, payload: bytes) -> tuple[bytes, dict[str, Any]]:
-        """The JSON of a message as it was on the wire, and its content.
+        """Return a message of the wire as JSON, and its content.
 
         Raises:
             OtherLayout: The catalogue lacks one of its signals.
-            MessageError: It is not such a message, or JSON cannot hold it.
+            MessageError: The bytes are not such a message, or JSON cannot hold it.
         """
         try:
             body = msgspec.msgpack.decode(payload)
             if body["type"] != self.record.TYPE or body["v"] != VERSION:
-                raise MessageError(f"It is no {self.record.TYPE} message of version {VERSION}.")
+                raise MessageError(f"It is not a {self.record.TYPE} message of version {VERSION}.")
             if not self._required <= body.keys():
                 raise MessageError(f"A {self.record.TYPE} message lacks '{min(self._required - body.keys())}'.")
             if self._is_of_signals:
                 self._check(body)
-            for name, write in self._plan:
-                if name in body and (found := write(body[name], body)) is not None:
-                    body[name] = found
+            for name, convert in self._converters:
+                if name in body and (converted := convert(body[name], body)) is not None:
+                    body[name] = converted
                 else:
                     body.pop(name, None)
             body.pop("elements", None)  # every element stands beside its name
@@ -147,26 +149,26 @@ class Form:
             raise
         except (ValueError, TypeError, LookupError, AttributeError, struct.error, OverflowError, RecursionError,
                 msgspec.MsgspecError) as error:  # fmt: skip
-            raise MessageError(f"It is no {self.record.TYPE} message: {error or type(error).__name__}.") from None
+            raise MessageError(f"It is not a {self.record.TYPE} message: {error or type(error).__name__}.") from None
 
     def read(self, data: bytes) -> Message:
-        """The message again.
+        """Return the message of its JSON.
 
         Raises:
-            MessageError: The JSON is not what `write` makes.
+            MessageError: The JSON was not made by `write`.
         """
         try:
             body = _decoder.decode(data)
-            found = {item.name: self._read(item.name, body) for item in self._fields if self._is_there(item.name, body)}
-            return self.record(**found)
+            present = (item.name for item in self._fields if self._is_there(item.name, body))
+            return self.record(**{name: self._read(name, body) for name in present})
         except (ValueError, TypeError, LookupError, AttributeError) as error:
-            raise MessageError(f"It is no recorded {self.record.TYPE} message: {error}.") from None
+            raise MessageError(f"It is not a recorded {self.record.TYPE} message: {error}.") from None
 
     def _is_there(self, name: str, body: dict[str, Any]) -> bool:
         return name in body or (self.hints[name] is float and name in self._required)
 
     def _writer(self, name: str, hint: Any) -> Convert:
-        """What turns a field of the wire into JSON; None from it means that the field is absent."""
+        """Return the function that converts a field of the wire to JSON; its result None means an absent field."""
         if hint in (Numbers, Truths):
             return self._of_numbers if hint is Numbers else self._of_truths
         if hint == Array:
@@ -180,12 +182,12 @@ class Form:
             if inner is float:
                 return _map_of_numbers
             if typing.get_origin(inner) is dict:
-                return lambda value, body: {key: _map_of_numbers(one, body) for key, one in value.items()}
+                return lambda value, body: {key: _map_of_numbers(inner, body) for key, inner in value.items()}
             if inner is str:
-                return lambda value, _: {key: _checked(str, one) for key, one in value.items()}
+                return lambda value, _: {key: _checked(str, text) for key, text in value.items()}
             return lambda value, _: _checked(dict, value)
         if typing.get_origin(hint) is list:
-            return lambda value, _: [_checked(str, one) for one in _checked(list, value)]
+            return lambda value, _: [_checked(str, text) for text in _checked(list, value)]
         return lambda value, _: _checked(hint, value)
 
     def _numbers(self, signal: str, data: bytes) -> dict[str, float]:
@@ -195,16 +197,16 @@ class Form:
         return _named(elements, packed.unpack(data))
 
     def _check(self, body: dict[str, Any]) -> None:
-        """Raise unless a message tells everything of the same signals, all of them in the catalogue.
+        """Check that all parts of a message have the same signals, and that the catalogue holds them.
 
-        Sizes first: what `OtherLayout` tells is as much as really came.
+        Sizes are checked first, so that the size in `OtherLayout` is the size that really came.
         """
         elements = Elements.of(_checked(dict, body["elements"]))
         record: Any = self.record
         for name, kind in record.BY_ELEMENT:
-            there = len(_checked(bytes, body[name])) / kind.DTYPE.itemsize
-            if there != elements.size:
-                raise MessageError(f"{elements.size:g} elements are named, and {there:g} are there in '{name}'.")
+            count = len(_checked(bytes, body[name])) / kind.DTYPE.itemsize
+            if count != elements.size:
+                raise MessageError(f"{elements.size:g} elements are named, but '{name}' has {count:g}.")
         for signal, count in elements.counts.items():
             if signal not in self._packed or len(self._packed[signal][0]) != count:
                 raise OtherLayout(signal, count)
@@ -219,13 +221,13 @@ class Form:
         return self._split(data, body, _named_truths)
 
     def _split(self, values: Sequence[Any], body: dict[str, Any], named: Callable[..., dict[str, Any]]) -> Any:
-        """Parts of what is told of all signals, by signal."""
-        found, start = {}, 0
+        """Split the values of all elements by signal."""
+        parts, start = {}, 0
         for signal in body["elements"]:
             elements = self._packed[signal][0]
-            found[signal] = named(elements, values[start : start + len(elements)])
+            parts[signal] = named(elements, values[start : start + len(elements)])
             start += len(elements)
-        return found
+        return parts
 
     def _read(self, name: str, body: dict[str, Any]) -> Any:
         hint: Any = self.hints[name]
@@ -255,12 +257,12 @@ class Form:
         return np.array([part.get(element, absent) for element in elements], float)
 
     def _schema(self) -> dict[str, Any]:
-        told = _told(self.record)
+        descriptions = _descriptions(self.record)
         properties: dict[str, Any] = {"type": {"const": self.record.TYPE, "type": "string"}}
         for item in self._fields:
             properties[item.name] = self._schema_of(item.name, self.hints[item.name])
-            if item.name in told:
-                properties[item.name]["description"] = told[item.name]
+            if item.name in descriptions:
+                properties[item.name]["description"] = descriptions[item.name]
         required = [
             item.name for item in self._fields if item.name in self._required and self.hints[item.name] is not float
         ]
@@ -287,21 +289,21 @@ class Form:
             return _object(known)
         return {"type": TYPES[hint]} | ({"unit": UNITS[name]} if name in UNITS else {})
 
-    def _elements(self, name: str, listed: Listed) -> dict[str, Any]:
+    def _elements(self, name: str, listed: CatalogueSignal) -> dict[str, Any]:
         if self._is_truth(name):
             return _object({element: {"type": "boolean"} for element in listed.elements})
         unit = UNITS.get(name, listed.unit)
-        one = {"type": "number"} | ({"description": f"[{unit}]", "unit": unit} if unit else {})
-        return _object(dict.fromkeys(listed.elements, one))
+        number = {"type": "number"} | ({"description": f"[{unit}]", "unit": unit} if unit else {})
+        return _object(dict.fromkeys(listed.elements, number))
 
 
 def _object(properties: dict[str, Any]) -> dict[str, Any]:
-    """Foxglove refuses an object without `properties`."""
+    """Return the schema of an object; Foxglove refuses one without `properties`."""
     return {"type": "object", "properties": properties}
 
 
 def _named(elements: Sequence[str], values: Sequence[float]) -> dict[str, float]:
-    """The finite ones."""
+    """Return the finite values by element."""
     total = sum(values)
     if total - total == 0.0:  # all finite
         return dict(zip(elements, values, strict=True))
@@ -314,29 +316,29 @@ def _named_truths(elements: Sequence[str], values: Sequence[int]) -> dict[str, b
 
 def _finite(value: Any, _: dict[str, Any]) -> float | None:
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise MessageError(f"{value!r:.80} is no number.")
+        raise MessageError(f"{value!r:.80} is not a number.")
     return value if math.isfinite(value) else None
 
 
 def _map_of_numbers(value: Any, body: dict[str, Any]) -> dict[str, float]:
-    return {key: found for key, one in value.items() if (found := _finite(one, body)) is not None}
+    return {key: number for key, entry in value.items() if (number := _finite(entry, body)) is not None}
 
 
 def _list_of_numbers(value: Any, _: dict[str, Any]) -> list[float]:
-    found: list[float] = np.frombuffer(value, "<f8").tolist()
-    if not all(map(math.isfinite, found)):
+    numbers: list[float] = np.frombuffer(value, "<f8").tolist()
+    if not all(map(math.isfinite, numbers)):
         raise MessageError("A list without names cannot have a gap.")
-    return found
+    return numbers
 
 
 def _checked(kind: type, value: Any) -> Any:
     if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
-        raise MessageError(f"{value!r:.80} is no {kind.__name__}.")
+        raise MessageError(f"{value!r:.80} is not of type {kind.__name__}.")
     return value
 
 
-def _told(record: type[Message]) -> dict[str, str]:
-    """What the docstrings of a record and of `Message` say of each attribute."""
+def _descriptions(record: type[Message]) -> dict[str, str]:
+    """Return attribute -> its sentence in the docstrings of a record and of `Message`."""
     text = "\n".join(inspect.getdoc(kind) or "" for kind in (Message, record))
-    found = re.findall(r"^    (\w+): (.+(?:\n {8}.+)*)", text, re.MULTILINE)
-    return {name: " ".join(said.split()) for name, said in found}
+    entries = re.findall(r"^    (\w+): (.+(?:\n {8}.+)*)", text, re.MULTILINE)
+    return {name: " ".join(sentence.split()) for name, sentence in entries}

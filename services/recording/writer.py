@@ -1,4 +1,4 @@
-"""From messages as they arrive to the files of a recording, one after the other; no disk is filled to the last byte."""
+"""Writer of arriving messages into the files of a recording, one after the other; it leaves space on the disk."""
 
 import json
 import logging
@@ -25,35 +25,35 @@ log = logging.getLogger(__name__)
 
 FORMAT = "2"
 FACTS, ROBOT, LOSSES = "gemuco", "gemuco.robot", "gemuco.losses"
-"""Names of the metadata: what the recording is, the robot's description, what is missing."""
+"""These names of metadata hold facts of the recording, the robot's description, and the losses."""
 UNREADABLE = "#unreadable"
-"""Added to the topic of messages that are not what their key carries; no zenoh key has a `#`."""
+"""This is added to the topic of messages of another kind than their key carries; no zenoh key has a `#`."""
 CARRIED: dict[str, type[Message]] = {
     "hal/sample": Sample, "vision/sample": Sample, "simulator/truth": Sample, "hal/applied": Applied,
     "hal/command": Command, "hal/holder": Holder, "model/estimate": Estimates, "model/anomaly": Anomaly,
     "model/update": Update, "model/target": Target, **{f"{service}/status": Status for service in keys.SERVICES},
 }  # fmt: skip
-"""What each key carries, by what follows the robot's name."""
+"""Key after the robot's name -> type of the messages on it."""
 LEAST_FREE = 64 << 20
-"""A file is finished when the disk has less left [bytes], so that the robot's other processes can go on."""
+"""A file is finished when the disk has less space left [bytes], so that the robot's other processes can go on."""
 TRY_AGAIN = 1.0
-"""How long [s] after a file could not be written the next one is tried."""
+"""The next file is tried this long [s] after one could not be written."""
 MOST_TOPICS = 1000
-"""Keys that get a channel of their own; messages of more count as dropped."""
+"""At most this many keys get a channel of their own; messages of more keys count as dropped."""
 MOST_UNKNOWN = 64
-"""Signals that are not in the robot's description and are recorded all the same."""
+"""At most this many signals are recorded that are not in the robot's description."""
 LONGEST = 3600.0
-"""What one file covers at most [s]: the index of its parts stays in memory, 11 MB of it an hour (stack/soak.py)."""
+"""A file covers at most this time [s], because its index stays in memory, 11 MB an hour (stack/soak.py)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """When a file is finished and the next one begun.
+    """Limits at which a file is finished and the next one begun.
 
     Attributes:
-        max_bytes: When it has this size; never if None.
-        max_seconds: When it covers this long [s]; after `LONGEST` if None.
-        least_free: When the disk has less left [bytes]; then nothing is recorded until it has twice as much.
+        max_bytes: Size of a file [bytes]; no limit if None.
+        max_seconds: Time that a file covers [s]; `LONGEST` if None.
+        least_free: Space that the disk keeps [bytes]; below it nothing is recorded until there is twice as much.
     """
 
     max_bytes: int | None = None
@@ -67,14 +67,14 @@ class Limits:
 
 
 class RecordingWriter:
-    """Writes messages into one file after the other; used by one thread.
+    """Writer of messages into one file after the other; used by one thread.
 
     Args:
-        path: The file, or what its numbered names are made from.
+        path: The file; numbered names are derived from it.
         robot: The robot's name.
         catalogue: Its signals, as far as known.
-        condition: How the body is while it is recorded; empty if not told.
-        limits: When to begin a new file.
+        condition: Condition of the body while it is recorded; empty if not known.
+        limits: Limits of one file.
     """
 
     def __init__(
@@ -82,17 +82,17 @@ class RecordingWriter:
     ) -> None:
         self.losses = Losses()
         self.written = 0
-        """Messages that are safe in files."""
+        """Number of messages that are safe in files."""
         self.foreign = 0
-        """Of those, such on keys that are not ours."""
+        """Number of those on keys that are not gemuco's."""
         self.name, self.rate, self.done = "writer", 1.0, 0
-        """For health checks: how often it was asked to make everything safe, and nothing was in the way."""
+        """For health checks: number of commits without a failure."""
         self.failure = ""
-        """Why nothing is recorded now; empty while all is well."""
+        """Reason why nothing is recorded now; empty otherwise."""
         self.paths: list[Path] = []
         """The files so far."""
         self.bytes = 0
-        """Their size, without the one being written."""
+        """Size of the finished files [bytes]."""
         self._path, self._robot, self._condition = path, robot, condition
         self._limits = limits or Limits()
         self._identity = secrets.token_hex(8)
@@ -103,41 +103,43 @@ class RecordingWriter:
         self._topics: set[str] = set()
         self._waiting: Counter[str] = Counter()
         self._until_ns = 0
-        self._told: dict[str, str] = {}
+        self._reported: dict[str, str] = {}
         self._holder: str | None = None
         self._again = 0.0
         self._file: RecordingFile | None = None
 
     @property
     def size(self) -> int:
-        """Bytes on disk in all files."""
+        """Size on disk of all files [bytes]."""
         return self.bytes + (self._file.size if self._file else 0)
 
     def open(self, received_ns: int) -> None:
         """Begin the first file.
 
         Raises:
-            RecordingError: It cannot be written; a full disk is no error, but waited for.
+            RecordingError: The file cannot be written; a full disk is not an error, the writer waits for space.
         """
         if self._has_room(self._limits.least_free):
             self._begin(received_ns)
 
-    def describe(self, received_ns: int, told: Mapping[str, Any]) -> None:
-        """Take the names and units from what the HAL told of itself, from now on."""
+    def describe(self, received_ns: int, description: Mapping[str, Any]) -> None:
+        """Take names and units from the HAL's description, from now on."""
         try:
-            catalogue = Catalogue.of_description(told)
+            catalogue = Catalogue.of_description(description)
         except MessageError as error:
             log.warning("The HAL of robot '%s' describes itself badly: %s", self._robot, error)
             return
-        self._described = msgspec.json.encode({k: v for k, v in told.items() if k not in ("pid", "host")}).decode()
+        self._described = msgspec.json.encode(
+            {k: v for k, v in description.items() if k not in ("pid", "host")}
+        ).decode()
         if catalogue != self._catalogue:
             self._catalogue, self._unknown = catalogue, 0
             self._forms.clear()
         if self._file is not None:
-            self._file.tell(ROBOT, {"describe": self._described})
+            self._file.add_facts(ROBOT, {"describe": self._described})
 
     def add(self, key: str, received_ns: int, payload: bytes, encoding: str = "") -> None:
-        """Add what arrived on a key."""
+        """Add a message that arrived on a key."""
         if not self._is_open(received_ns):
             self.losses.drop(key)
             return
@@ -163,15 +165,15 @@ class RecordingWriter:
 
     @property
     def error(self) -> str:
-        """Why nothing is written now, for health checks; empty while all is well."""
+        """Reason why nothing is written now, for health checks; empty otherwise."""
         return self.failure
 
     def commit(self, received_ns: int) -> None:
-        """Make what was added safe; tell what was lost since; end the file if the disk is nearly full."""
+        """Make added messages safe, report losses, and end the file at a limit."""
         self.done += not self.failure
         if self._file is None:
             return
-        self._tell_losses(received_ns)
+        self._report_losses(received_ns)
         try:
             self._file.commit()
         except OSError as error:
@@ -183,12 +185,12 @@ class RecordingWriter:
             self._end()
 
     def finish(self, received_ns: int) -> None:
-        """Make everything safe, and end the last file."""
+        """Make everything safe and end the last file."""
         self.commit(received_ns)
         self._end()
 
     def _written(self, carried: type[Message], payload: bytes) -> tuple[Form, bytes, dict[str, Any]]:
-        """The JSON of a message and its content, with signals that nobody described numbered instead of named."""
+        """Return form, JSON and content of a message; elements of undescribed signals are numbered instead of named."""
         while True:
             form = self._forms.get(carried)
             if form is None:
@@ -203,7 +205,7 @@ class RecordingWriter:
                 self._forms.clear()
 
     def _channel(self, key: str, form: Form) -> int:
-        """The channel of a key in the file that is being written; looking it up by its schema would take long."""
+        """Return the channel of a key in the current file; a look-up by its schema would take long."""
         if (key, form) not in self._channels:
             assert self._file is not None
             self._channels[key, form] = self._file.channel(key, "json", form.schema["title"], form.schema)
@@ -223,20 +225,20 @@ class RecordingWriter:
         self._file.add(channel, received_ns, stamp_ns, seq, data)
         self._waiting[key] += 1
 
-    def _note(self, received_ns: int, told: dict[str, Any]) -> None:
+    def _note(self, received_ns: int, entry: dict[str, Any]) -> None:
         if self._file is not None:
             topic = keys.robot_key(self._robot, "recorder", "log")
-            data = msgspec.json.encode(told)
+            data = msgspec.json.encode(entry)
             self._file.add(self._file.channel(topic, "json", LOG, LOG_SCHEMA), received_ns, received_ns, 0, data)
 
     def _note_holder(self, received_ns: int, name: str) -> None:
         if name != self._holder:
             self._holder = name
-            text = f"{name} commands the robot." if name else "Nobody commands the robot."
+            text = f"{name} commands the robot." if name else "No client commands the robot."
             self.note(received_ns, INFO, "holder", text)
 
     def _is_open(self, received_ns: int) -> bool:
-        """Whether there is a file for a message of this time; a new one is begun where the limits say so."""
+        """Whether there is a file for a message of this time; a new file is begun at a limit."""
         if self._file is not None and 0 < self._until_ns <= received_ns:
             self.commit(received_ns)
             self._end()
@@ -247,7 +249,7 @@ class RecordingWriter:
                 try:
                     self._begin(received_ns)
                 except RecordingError as error:
-                    self._say(f"Nothing is recorded: {error}")
+                    self._report(f"Nothing is recorded: {error}")
         return self._file is not None
 
     def _begin(self, received_ns: int) -> None:
@@ -258,9 +260,9 @@ class RecordingWriter:
         self._until_ns = received_ns + round(1e9 * min(self._limits.max_seconds or LONGEST, LONGEST))
         part = str(len(self.paths))
         facts = {"format": FORMAT, "robot": self._robot, "recording": self._identity, "part": part}
-        self._file.tell(FACTS, facts | {"condition": self._condition, "begun_ns": str(received_ns)})
-        self._file.tell(ROBOT, {"describe": self._described})
-        self._told = {}
+        self._file.add_facts(FACTS, facts | {"condition": self._condition, "begun_ns": str(received_ns)})
+        self._file.add_facts(ROBOT, {"describe": self._described})
+        self._reported = {}
         self.note(received_ns, INFO, "file", f"File {part} of recording {self._identity} begins.")
         if self.failure:
             self.note(received_ns, ERROR, "file", f"Before this file: {self.failure}")
@@ -268,7 +270,7 @@ class RecordingWriter:
             self.failure = ""
 
     def _end(self) -> None:
-        """Write the index; without one, where there is no space for it, the file is readable all the same."""
+        """Write the index and close; a file without an index, for lack of space, stays readable."""
         if self._file is None:
             return
         try:
@@ -290,41 +292,41 @@ class RecordingWriter:
         self._waiting.clear()
         self.bytes += self._file.size
         self._again = time.monotonic() + TRY_AGAIN
-        self._say(f"Nothing is recorded: '{self._file.path}' could not be written on: {error.strerror}.")
+        self._report(f"Nothing is recorded: '{self._file.path}' could not be written on: {error.strerror}.")
         self._file = None
 
     def _count_written(self) -> None:
         self.written += self._waiting.total()
         self._waiting.clear()
 
-    def _has_room(self, wanted: int) -> bool:
-        """Whether the disk has so many bytes left; if not, that is told."""
-        folder = next(one for one in self._path.absolute().parents if one.is_dir())
-        found = os.statvfs(folder)
-        free = found.f_bavail * found.f_frsize
-        if free < wanted:
-            self._say(
+    def _has_room(self, needed: int) -> bool:
+        """Whether the disk has this many bytes left; a lack is reported."""
+        folder = next(parent for parent in self._path.absolute().parents if parent.is_dir())
+        disk = os.statvfs(folder)
+        free = disk.f_bavail * disk.f_frsize
+        if free < needed:
+            self._report(
                 f"Nothing is recorded: the disk of '{folder}' has {free / 1e6:.0f} MB left. It goes on when there are "
                 f"{2 * self._limits.least_free / 1e6:.0f} MB."
             )
-        return free >= wanted
+        return free >= needed
 
-    def _say(self, text: str) -> None:
+    def _report(self, text: str) -> None:
         if not self.failure:
             log.error("%s", text)
         self.failure = text
 
-    def _tell_losses(self, received_ns: int) -> None:
+    def _report_losses(self, received_ns: int) -> None:
         for loss in self.losses.news():
             self._note(received_ns, line_of_loss(received_ns, *loss))
         facts = self.losses.facts()
-        if facts != self._told and self._file is not None:
-            self._file.tell(LOSSES, facts)
-            self._told = facts
+        if facts != self._reported and self._file is not None:
+            self._file.add_facts(LOSSES, facts)
+            self._reported = facts
 
 
 def _name_of(encoding: str) -> str:
-    """MCAP's name for the encoding of a zenoh message."""
+    """Return MCAP's name for the encoding of a zenoh message."""
     plain = encoding.partition(";")[0].lower()
     known = {"application/json": "json", "text/json": "json", "application/msgpack": "msgpack",
              "application/protobuf": "protobuf", "application/cbor": "cbor", "application/cdr": "cdr"}  # fmt: skip

@@ -13,7 +13,7 @@ from services import show
 from services.learning import measured, trainer
 from services.learning.trainer import Progress, Trained
 from services.model import artifacts
-from services.recording.dataset import is_recording, pick
+from services.recording.dataset import is_recording, select
 
 
 def run_training(
@@ -74,7 +74,7 @@ def _data(robot: RobotConfig, data: Sequence[Path], condition: str | None) -> Da
         return Dataset.load(_only(data) or artifacts.data_path(robot.robot))
     if not all(is_recording(path) for path in data):
         raise DatasetError("Train from recordings (.mcap) or from collected samples (.npz), not from both at once.")
-    found = pick(robot, data, condition)
+    found = select(robot, data, condition)
     typer.echo(found.sentence())
     return found.dataset
 

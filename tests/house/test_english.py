@@ -24,7 +24,6 @@ NOT_YET = {
     "services/learning",
     "services/model",
     "services/process",
-    "services/recording",
     "services/runtime.py",
     "services/show.py",
     "services/verbs",

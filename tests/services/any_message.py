@@ -6,11 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from services.recording.schema import Catalogue, Listed
+from services.recording.schema import Catalogue, CatalogueSignal
 from services.wire.messages import VERSION
 from services.wire.records import Array, Message, Numbers, Truths
 
-ARM = Catalogue({"joint_position": Listed("rad", ("elbow", "wrist")), "muscle_tension": Listed("N", ("biceps",))})
+ARM = Catalogue(
+    {"joint_position": CatalogueSignal("rad", ("elbow", "wrist")), "muscle_tension": CatalogueSignal("N", ("biceps",))}
+)
 BY_SIGNAL = {"joint_position": 2, "muscle_tension": 1}
 
 

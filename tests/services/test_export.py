@@ -90,7 +90,7 @@ def test_every_kind_of_message_and_gaps_can_be_written(tmp_path: Path, form: str
 
 def test_what_cannot_be_exported_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     files = record(tmp_path / "run.mcap", "arm", 10)
-    with pytest.raises(RecordingError, match="'xls' is no format of tables"):
+    with pytest.raises(RecordingError, match="'xls' is not a format of tables"):
         export(files, tmp_path / "out", "xls")
     run_export(files, tmp_path / "out", "csv")
     assert f"10 rows in {tmp_path / 'out' / 'hal.sample.csv'}" in capsys.readouterr().out

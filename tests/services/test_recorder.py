@@ -22,8 +22,8 @@ from services.errors import RecordingError
 from services.process.service import Service
 from services.recording import recorder
 from services.recording.losses import LOG, MOST_KEYS, OTHERS, Losses
-from services.recording.reading import about, log_lines, losses, read
-from services.recording.recorder import Recorder, Waiting, run_recorder
+from services.recording.reading import facts_of, log_lines, losses, read
+from services.recording.recorder import EntryQueue, Recorder, run_recorder
 from services.recording.writer import UNREADABLE, Limits, RecordingWriter
 from services.wire import keys, messages
 from services.wire.records import Holder, Sample, Update
@@ -72,7 +72,7 @@ def test_what_was_published_is_read_back_in_order(robot: str, session: zenoh.Ses
     (again,) = read(path, [keys.sample(robot)])
     assert messages.encode(again.message) == messages.encode(sample)
     assert losses(path) == {"dropped": 0, "missed": 0, "malformed": 0}
-    (facts,) = about(path)
+    (facts,) = facts_of(path)
     assert (facts.robot, facts.condition, facts.part, facts.is_whole) == (robot, "a tool", 1, True)
     assert facts.catalogue == ARM
 
@@ -145,7 +145,7 @@ def test_who_comes_goes_and_commands_is_in_the_log(robot: str, session: zenoh.Se
         _eventually(lambda: [line for line in log_lines(path) if line["kind"] == "gone"])
     said = [line["message"] for line in log_lines(path) if line["kind"] in ("alive", "gone", "holder")]
     assert said == [
-        "The 'model' service came.", "anna commands the robot.", "Nobody commands the robot.",
+        "The 'model' service came.", "anna commands the robot.", "No client commands the robot.",
         "ben commands the robot.", "The 'model' service went.",
     ]  # fmt: skip
 
@@ -163,7 +163,7 @@ def test_the_hal_tells_what_elements_are_called(robot: str, tmp_path: Path) -> N
             samples.put(sample)
             _eventually(lambda: found.writer.written >= 1)
         close_session(client)
-    (facts,) = about(path)
+    (facts,) = facts_of(path)
     assert facts.described["rates"] == {"hal": 200.0}
     assert not {"pid", "host"} & facts.described.keys()
     (one,) = read(path, [keys.sample(robot)])
@@ -198,7 +198,7 @@ class StalledDisk(RecordingWriter):
 def test_losses_are_counted_and_written_into_the_file(robot: str, session: zenoh.Session, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     writer = StalledDisk(path, robot, ARM)
-    with Recorder(session, robot, writer, most=4) as found:
+    with Recorder(session, robot, writer, limit=4) as found:
         session.put(keys.update(robot), messages.encode(_update(0), seq=0, boot=3))
         assert writer.stands.wait(20.0)
         for seq in (1, 5, 6, 7, 8, 9):
@@ -223,14 +223,14 @@ def test_senders_of_one_key_are_counted_apart() -> None:
 
 
 def test_what_waits_is_bounded_in_number_and_bytes() -> None:
-    waiting = Waiting(most=3, most_bytes=100)
+    waiting = EntryQueue(limit=3, limit_bytes=100)
     for size in (60, 60, 30, 5, 5):
-        waiting.put(recorder.Arrived("message", "key", 0, bytes(size)))
+        waiting.put(recorder.Entry("message", "key", 0, bytes(size)))
     items, dropped = waiting.take()
     assert [len(item.payload) for item in items] == [60, 30, 5]
     assert dropped == {"key": 2}
     for number in range(10):
-        waiting.put(recorder.Arrived("message", f"key {number}", 0, bytes(101)))
+        waiting.put(recorder.Entry("message", f"key {number}", 0, bytes(101)))
     assert len(waiting.take()[1]) == 4  # no more names than messages are remembered
 
 
@@ -250,7 +250,7 @@ def test_a_new_file_begins_when_one_is_big_or_long_and_nothing_is_lost_or_double
     assert [len(_versions(file)) for file in files] == [20] * 5
     assert _versions(*reversed(files)) == list(range(100))
     assert losses(files)["missed"] == 0
-    assert [facts.part for facts in about(files)] == [1, 2, 3, 4, 5]
+    assert [facts.part for facts in facts_of(files)] == [1, 2, 3, 4, 5]
     again = RecordingWriter(path, robot, ARM, "", Limits(max_bytes=4000))
     again.open(0)
     for number in range(200):
@@ -337,7 +337,7 @@ def test_a_recording_is_readable_however_its_process_ends(
         process.kill()
         process.wait()
     assert _versions(path) == list(range(150))
-    assert about(path)[0].is_whole == (end is not signal.SIGKILL)
+    assert facts_of(path)[0].is_whole == (end is not signal.SIGKILL)
 
 
 def _try(reading: Callable[[], list[int]]) -> list[int]:
@@ -359,7 +359,7 @@ def test_a_full_disk_ends_the_file_and_a_new_one_begins_when_there_is_space(
     writer._limits = Limits(least_free=2 * free)
     writer.commit(1)
     assert "Nothing is recorded: the disk of" in writer.failure and writer.failure in caplog.text
-    assert about(path)[0].is_whole and _versions(path) == [0]
+    assert facts_of(path)[0].is_whole and _versions(path) == [0]
     for number in range(1, 5):
         writer.add(keys.update(robot), number, messages.encode(_update(number), seq=number))
         writer.commit(number)

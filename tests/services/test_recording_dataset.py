@@ -9,7 +9,7 @@ from recorded_arm import BEGIN, SECOND, a_sample, position, record
 
 from gemuco.errors import DatasetError
 from hal.config import RobotConfig
-from services.recording.dataset import pick
+from services.recording.dataset import select
 from services.recording.writer import Limits, RecordingWriter
 from services.verbs.train import run_training
 from services.wire import keys, messages
@@ -32,14 +32,14 @@ def _robot(name: str = "arm", **more: Any) -> RobotConfig:
 
 def test_samples_are_taken_at_the_rate_of_collecting_in_episodes(tmp_path: Path) -> None:
     files = record(tmp_path / "run.mcap", "arm", 1200, "loaded", Limits(max_seconds=7.0))
-    found = pick(_robot(), files[::-1])
+    found = select(_robot(), files[::-1])
     rows = found.dataset.rows()
     assert found.seen == len(rows) == 240  # 12 s at 20 Hz
     assert [len(episode.values["joint_position"]) for episode in found.dataset.episodes] == [200, 40]
     assert found.dataset.conditions == ("loaded",)
     np.testing.assert_array_equal(rows[:, :2], [position(5 * number) for number in range(240)])
     assert found.sentence() == "240 of 240 samples are used."
-    assert pick(_robot(), files, "empty").dataset.conditions == ("empty",)
+    assert select(_robot(), files, "empty").dataset.conditions == ("empty",)
     kept, away = found.dataset.split(0.2)
     assert len(kept) + len(away) == 240
 
@@ -56,7 +56,7 @@ def test_what_is_incomplete_invalid_or_beyond_limits_is_left_out_and_told(tmp_pa
             sample.age["joint_position"][:] = 0.5
         return sample
 
-    found = pick(_robot(), record(tmp_path / "run.mcap", "arm", 500, make=make))
+    found = select(_robot(), record(tmp_path / "run.mcap", "arm", 500, make=make))
     assert found.sentence() == (
         "80 of 100 samples are used; 5 were incomplete, in 15 a value was not measured or beyond its limits (most "
         "often joint_position.wrist, 10)."
@@ -67,7 +67,7 @@ def test_what_is_incomplete_invalid_or_beyond_limits_is_left_out_and_told(tmp_pa
 def test_pauses_and_restarts_begin_a_new_episode(tmp_path: Path) -> None:
     files = record(tmp_path / "a.mcap", "arm", 100) + record(tmp_path / "b.mcap", "arm", 100, begin=1000)
     files += record(tmp_path / "c.mcap", "arm", 200, begin=2000, make=lambda n: a_sample(n, boot=11 + (n >= 2100)))
-    found = pick(_robot(), files)
+    found = select(_robot(), files)
     assert [len(episode.values["muscle_tension"]) for episode in found.dataset.episodes] == [20, 20, 20, 20]
 
 
@@ -98,7 +98,7 @@ def test_what_a_camera_saw_is_merged_by_age_and_may_be_missing(tmp_path: Path) -
         if number < 100 and number % 3 == 0:
             writer.add(keys.vision("arm"), sample.stamp_ns, messages.encode(parts[1]))
     writer.finish(BEGIN + 3 * SECOND)
-    rows = pick(robot, writer.paths).dataset.rows()
+    rows = select(robot, writer.paths).dataset.rows()
     assert len(rows) == 40
     assert np.isfinite(rows[1:20, 2]).all() and np.isnan(rows[23:, 2]).all()
 
@@ -106,27 +106,27 @@ def test_what_a_camera_saw_is_merged_by_age_and_may_be_missing(tmp_path: Path) -
 def test_data_that_do_not_fit_are_one_sentence(tmp_path: Path) -> None:
     files = record(tmp_path / "run.mcap", "arm", 100)
     with pytest.raises(DatasetError, match="recordings of 'arm', and the robot file is that of 'leg'"):
-        pick(_robot("leg"), files)
-    with pytest.raises(DatasetError, match="Say it with --condition; those of the robot file are duster, none"):
-        pick(_robot(conditions=["duster", "none"]), files)
+        select(_robot("leg"), files)
+    with pytest.raises(DatasetError, match="Give it with --condition; the robot file has duster, none"):
+        select(_robot(conditions=["duster", "none"]), files)
     signals = {
         "joint_position": {"unit": "deg", "elements": ["elbow", "wrist"]},
         "muscle_tension": {"unit": "N", "elements": ["biceps"]},
     }
-    with pytest.raises(DatasetError, match=r"elbow, wrist \[rad\]; elbow, wrist \[deg\] are wanted"):
-        pick(_robot(signals=signals), files)
+    with pytest.raises(DatasetError, match=r"elbow, wrist \[rad\]; elbow, wrist \[deg\] are expected"):
+        select(_robot(signals=signals), files)
     with pytest.raises(DatasetError, match="'elbow_temperature' is not in"):
         more = {
             "elbow_temperature": {"unit": "degC", "elements": ["elbow"]},
             "muscle_tension": signals["muscle_tension"],
         }
-        pick(
+        select(
             _robot(signals=more, command={"signal": "muscle_tension", "time_to_live": 0.1, "hold": 0.5}, limits={}),
             files,
         )
     still = record(tmp_path / "bad.mcap", "arm", 100, make=lambda number: a_sample(number, complete=False))
-    with pytest.raises(DatasetError, match="Nothing in these recordings can be trained from: 0 of 20 samples"):
-        pick(_robot(), still)
+    with pytest.raises(DatasetError, match="These recordings hold nothing to train from: 0 of 20 samples"):
+        select(_robot(), still)
 
 
 def test_train_takes_recordings_and_tells_what_it_cannot_take(

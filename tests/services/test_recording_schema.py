@@ -181,7 +181,7 @@ def test_fields_of_a_newer_sender_are_kept() -> None:
 def test_a_sample_that_does_not_agree_with_itself_is_not_recorded_as_one(field: str) -> None:
     body = msgpack.unpackb(messages.encode(a_message(Sample)))
     body[field] = body[field][:-8] if field == "age" else body[field][:-1]
-    with pytest.raises(MessageError, match=f"3 elements are named, and 2 are there in '{field}'"):
+    with pytest.raises(MessageError, match=f"3 elements are named, but '{field}' has 2"):
         Form(Sample, ARM).write(msgpack.packb(body))
 
 

@@ -15,7 +15,7 @@ from hal.errors import CommandRefused
 from services.cli import app
 from services.errors import AlreadyRunning, RecordingError
 from services.process.lock import instead_of
-from services.recording.reading import about, read
+from services.recording.reading import facts_of, read
 from services.recording.recorder import recording
 from services.recording.replay import run_replay
 from services.recording.writer import Limits
@@ -175,7 +175,7 @@ def test_a_cut_file_is_played_up_to_where_its_writer_was_killed(robot: str, tmp_
     (file,) = record(tmp_path / "run.mcap", "arm", 200)
     data = file.read_bytes()
     file.write_bytes(data[: len(data) // 2])
-    assert not about(file)[0].is_whole
+    assert not facts_of(file)[0].is_whole
     count = len(list(read(file, [keys.sample("arm")])))
     assert 0 < count < 200
     with _listening(robot) as heard, _replaying(file, robot=robot, speed=0.0) as stop:
