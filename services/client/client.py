@@ -8,10 +8,10 @@ import numpy as np
 
 from hal.by_signal import Elements, Numbers, Truths
 from services.client import description
-from services.client.commanding import SECONDS, Commanding
 from services.client.link import TIMEOUT
 from services.client.listening import Listening
 from services.client.live import FRESH
+from services.command.client_lease import SECONDS, ClientLease
 from services.errors import ServiceUnavailable
 from services.wire import history, keys, query
 from services.wire.history import History
@@ -144,7 +144,7 @@ class Client(Listening):
             )
         )
 
-    def lease(self, seconds: float = SECONDS) -> Commanding:
+    def lease(self, seconds: float = SECONDS) -> ClientLease:
         """Command the robot, and nobody else, as a context manager.
 
             with arm.lease():
@@ -157,7 +157,7 @@ class Client(Listening):
         Args:
             seconds: How long the lease outlives this process; it is renewed in the background.
         """
-        return Commanding(self, seconds)
+        return ClientLease(self, seconds)
 
     def enable(self) -> dict[str, Any]:
         """Ask the drives to follow commands; the answer tells the mode, which soon is `hold` or `fault`."""

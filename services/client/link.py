@@ -12,8 +12,8 @@ from typing import Any, Self, TypeVar
 
 import zenoh
 
-from services.client.commanding import NEEDS_LEASE, Commanding
 from services.client.live import Presence
+from services.command.client_lease import NEEDS_LEASE, ClientLease
 from services.errors import NoAnswer, NotAllowed, ServiceError, ServiceUnavailable, TooSlow, WrongVersion
 from services.wire import keys, query
 from services.wire.absence import instead, starter
@@ -21,7 +21,7 @@ from services.wire.caller import Caller, own_name
 from services.wire.member import Member, told_by
 from services.wire.messages import Message, Sample
 from services.wire.session import CLIENT, close_session, new_boot, opened, settings
-from services.wire.streams import Newest, Publisher
+from services.wire.streams import Publisher, Reader
 
 M = TypeVar("M", bound=Message)
 
@@ -50,13 +50,13 @@ class Link:
         self.caller = Caller(name or own_name(), self.boot)
         self.member = Member()
         """The role, and the robots that it is for, as the role file says."""
-        self.commanding: Commanding | None = None
+        self.held_lease: ClientLease | None = None
         """The lease, while this client has or had one."""
         self.changed = threading.Condition()
         """Notified of every status, and of every service that comes or goes."""
         self._connect = (connect,) if isinstance(connect, str) else tuple(connect)
         self._session: zenoh.Session | None = None
-        self._readers: dict[str, Newest[Any]] = {}
+        self._readers: dict[str, Reader[Any]] = {}
         self._publishers: dict[str, Publisher[Any]] = {}
         self._presence: Presence | None = None
         self._making = threading.Lock()
@@ -130,24 +130,24 @@ class Link:
 
     def check_lease(self) -> None:
         """Raise `LeaseLost` if this client had a lease, and lost it."""
-        if self.commanding is not None:
-            self.commanding.check()
+        if self.held_lease is not None:
+            self.held_lease.check()
 
     def seen(self, timeout: float = SEEN_WITHIN) -> tuple[int, int]:
         """Run and cycle of the HAL's newest sample here: what may move the robot tells them, so that it is done at once
         or never. Zeros if none arrives in `timeout` [s].
         """
         reader = self.reader(keys.sample(self.robot), Sample)
-        slot = reader.last()
-        if slot is None or time.monotonic() - slot[0] > SEEN_WITHIN:
-            slot = reader.newer(slot, timeout) or slot
-        return (0, 0) if slot is None else (slot[1].boot, slot[1].cycle)
+        last = reader.last()
+        if last is None or time.monotonic() - last.received > SEEN_WITHIN:
+            last = reader.newer(last, timeout) or last
+        return (0, 0) if last is None else (last.message.boot, last.message.cycle)
 
     def _who_saw(self) -> Caller:
         hal_boot, cycle = self.seen()
         return replace(self.caller, hal_boot=hal_boot, cycle=cycle)
 
-    def reader(self, key: str, record: type[M]) -> Newest[M]:
+    def reader(self, key: str, record: type[M]) -> Reader[M]:
         """The reader of a key, made when first asked for.
 
         Raises:
@@ -159,7 +159,7 @@ class Link:
                 if not self.member.may_hear(self.robot, f"{service}/{noun}"):
                     raise NotAllowed(f"The role '{self.member.role}' may not read {key}.")
                 arrived = self.changed if noun == "status" else None
-                self._readers[key] = Newest(self.session, key, record, arrived=arrived)
+                self._readers[key] = Reader(self.session, key, record, arrived=arrived)
             return self._readers[key]
 
     def publisher(self, key: str, record: type[M]) -> Publisher[M]:
@@ -186,14 +186,14 @@ class Link:
         reader = self.reader(key, record)
         deadline = time.monotonic() + timeout
         while True:
-            slot, message, left = reader.last(), reader.get(max_age), deadline - time.monotonic()
-            if message is not None or left <= 0 or reader.newer(slot, left) is None:
+            last, message, left = reader.last(), reader.get(max_age), deadline - time.monotonic()
+            if message is not None or left <= 0 or reader.newer(last, left) is None:
                 break
         if message is None and (text := reader.other_version(max_age + timeout + LATELY)):
             raise WrongVersion(f"{text} Update the older of both programs.")
         return message
 
-    def silence(self, reader: Newest[Any], waited: float) -> NoAnswer:
+    def silence(self, reader: Reader[Any], waited: float) -> NoAnswer:
         """Why nothing came on a key for so long [s]: the error to raise."""
         _, service, noun = keys.parse(reader.key)
         if reader.has_ended or self._session is None:
@@ -211,7 +211,7 @@ class Link:
             f"Is {starter(service)} running?{instead(self.session, self.robot)}{unread}"
         )
 
-    def no_health(self, readers: Iterable[Newest[Any]], waited: float) -> NoAnswer:
+    def no_health(self, readers: Iterable[Reader[Any]], waited: float) -> NoAnswer:
         """Why nothing was heard of any service for so long [s]: the error to raise."""
         if self._session is None:
             return ServiceUnavailable(f"The client of robot '{self.robot}' was closed.")

@@ -10,7 +10,7 @@ import zenoh
 
 from services.wire import keys
 from services.wire.messages import Message, Status
-from services.wire.streams import Newest
+from services.wire.streams import Arrival, Reader
 
 M = TypeVar("M", bound=Message)
 DEADLINE = 2.0
@@ -36,24 +36,24 @@ class Live(Generic[M]):
         why: The error when none came in time.
     """
 
-    def __init__(self, reader: Newest[M], deadline: float | None, max_age: float, why: Why) -> None:
+    def __init__(self, reader: Reader[M], deadline: float | None, max_age: float, why: Why) -> None:
         self._reader, self._deadline, self._max_age, self._why = reader, deadline, max_age, why
-        self._given: tuple[float, M] | None = None
+        self._given: Arrival[M] | None = None
 
     def __iter__(self) -> Self:
         return self
 
     def __next__(self) -> M:
         begun = time.monotonic()
-        slot = self._reader.last()
-        while slot is None or slot is self._given or time.monotonic() - slot[0] > self._max_age:
+        newest = self._reader.last()
+        while newest is None or newest is self._given or time.monotonic() - newest.received > self._max_age:
             left = None if self._deadline is None else begun + self._deadline - time.monotonic()
-            found = self._reader.newer(slot, left) if left is None or left > 0 else None
-            if found is None:
+            arrival = self._reader.newer(newest, left) if left is None or left > 0 else None
+            if arrival is None:
                 raise self._why(time.monotonic() - begun)
-            slot = found
-        self._given = slot
-        return slot[1]
+            newest = arrival
+        self._given = newest
+        return newest.message
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +106,7 @@ class LiveHealth:
     def __init__(
         self,
         presence: Presence,
-        readers: Iterable[Newest[Status]],
+        readers: Iterable[Reader[Status]],
         changed: threading.Condition,
         deadline: float | None,
         why: Why,
@@ -130,7 +130,7 @@ class LiveHealth:
 
     def _heard(self) -> tuple[object, ...]:
         """What tells one moment from the next: who is alive, and when each status came."""
-        return (self._presence.now(), *(None if (slot := r.last()) is None else slot[0] for r in self._readers))
+        return (self._presence.now(), *(None if (last := r.last()) is None else last.received for r in self._readers))
 
     def _has_ended(self) -> bool:
         return any(reader.has_ended for reader in self._readers)

@@ -14,9 +14,10 @@ from hal.calibration import store
 from hal.config import RobotConfig
 from hal.errors import CommandRefused
 from hal.robot import Robot, open_robot
+from services.command.intake import Commands, Intake
+from services.command.lateness import Cycles
+from services.command.lease import Lease
 from services.errors import BadArguments
-from services.hardware.command_intake import CommandIntake
-from services.hardware.lease import Lease
 from services.process import realtime
 from services.process.loop import Loop
 from services.process.service import Service, until_told
@@ -24,7 +25,6 @@ from services.wire import keys, messages
 from services.wire.caller import ASKING, Caller
 from services.wire.messages import Status
 from services.wire.plain_text import plain
-from services.wire.recent import Cycles
 
 log = logging.getLogger(__name__)
 
@@ -59,7 +59,8 @@ class HalService:
         self._holder = service.publisher(keys.holder(config.robot), messages.Holder)
         self._lease = Lease(robot.clock)
         self._cycles = Cycles(config.rates.hal, service.boot, robot.clock)
-        self._intake = CommandIntake(service.session, config, robot, service.boot, self._lease)
+        self._commands = Commands(robot, config.command.signal, service.boot, self._lease)
+        self._intake = Intake(service.session, keys.command(config.robot), messages.Command, self._commands.follow)
         self._told_holder: tuple[int, int, int] | None = None
         self._holder_due = -math.inf
         self._loop = Loop("hal", config.rates.hal, self.tick, robot.clock, CYCLE_PRIORITY)
@@ -138,7 +139,7 @@ class HalService:
                 desired=applied.desired,
                 values=applied.values,
                 limited_by=applied.limited_by,
-                sender=self._intake.sender if applied.mode == "follow" else 0,
+                sender=self._commands.sender if applied.mode == "follow" else 0,
             )
         )
 
@@ -162,8 +163,8 @@ class HalService:
                 **health,
                 "camera": self._has_camera,
                 "uncalibrated": self._uncalibrated,
-                "commands": self._intake.facts(),
-                "holder": "" if (held := self._lease.held) is None else str(held.caller),
+                "commands": {**self._intake.facts(), "sender": self._commands.sender},
+                "holder": "" if (held := self._lease.tenure) is None else str(held.caller),
                 "scheduling": self._loop.scheduling,
             },
         )
@@ -193,7 +194,7 @@ class HalService:
 
     def _tell_holder(self, now: float) -> None:
         """Publish who commands when that has changed, and once a second."""
-        held = self._lease.held
+        held = self._lease.tenure
         told = (0, 0, 0) if held is None else (held.caller.boot, held.through, held.number)
         if told == self._told_holder and now < self._holder_due:
             return

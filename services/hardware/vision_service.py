@@ -65,9 +65,9 @@ class VisionService:
     def tick(self) -> None:
         """Publish a frame if there is a new truth to look at."""
         last = self._truth.last()
-        if last is None or last[1] is self._looked_at:
+        if last is None or last.message is self._looked_at:
             return
-        received, truth = last
+        truth, received = last
         with self._lock:
             seen = self._camera.see(truth.values)
         values = Numbers.of({name: seen[name] for name in self._robot.seen})

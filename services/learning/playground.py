@@ -11,7 +11,7 @@ from hal.config import RobotConfig
 from hal.robot import Robot
 from services.client import Client
 from services.errors import ServiceError
-from services.model.estimation import Fresh, Freshness
+from services.model.estimation import Freshness
 from services.wire import keys
 from services.wire.messages import Sample
 
@@ -100,9 +100,7 @@ class BusPlayground:
         self._interval = 1.0 / rate
         self._samples = client.reader(keys.sample(robot.robot), Sample)
         seen = client.reader(keys.vision(robot.robot), Sample)
-        self._freshness = Freshness(
-            robot, lambda: Fresh.of(self._samples), SystemClock(), lambda: Fresh.of(seen) if robot.seen else None
-        )
+        self._freshness = Freshness(robot, self._samples.last, SystemClock(), seen.last if robot.seen else None)
         self._began = self._recorded = time.monotonic()
         deadline = time.monotonic() + ENABLE_WITHIN
         client.enable()

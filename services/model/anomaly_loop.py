@@ -63,7 +63,7 @@ class AnomalyWatch:
             known = self._scored = schema, values, score, score.blamed(schema)
         found = known[2]
         now = self._clock.monotonic()
-        cycle = -1 if fresh is None else fresh.sample.cycle
+        cycle = -1 if fresh is None else fresh.message.cycle
         if found.distance > found.threshold:
             self._above_since = min(self._above_since, now)
             if cycle != self._last_cycle or not self._odd:

@@ -11,9 +11,10 @@ from hal.clock import Clock
 from hal.config import RobotConfig
 from services.errors import CommandHeld, NotEngaged, TargetRefused, TooLate
 from services.model.control_config import ControlConfig
-from services.model.estimation import Estimation, Fresh, Newest
-from services.wire.messages import Applied, Command, Target
+from services.model.estimation import Estimation, Newest
+from services.wire.messages import Applied, Command, Sample, Target
 from services.wire.plain_text import shown
+from services.wire.streams import Arrival
 
 BUMP = 0.3
 """Time constant [s] in which the first command's distance from where the servos are fades out."""
@@ -96,11 +97,14 @@ class Control:
             self._target, self.text = values, ""
 
     def try_target(self, target: Target, check: Callable[[Target], None] = lambda _: None) -> None:
-        """Take a target that came without anybody waiting for an answer; a refusal is counted and told in `facts`.
+        """Take a published target, whose sender waits for no answer; a refusal is counted, and reported by `facts`.
 
         Args:
-            target: As it was published.
+            target: The target as it was published.
             check: Raises `CommandHeld` or `TooLate` if it must not be followed.
+
+        Raises:
+            TargetRefused, CommandHeld, TooLate: The refusal.
         """
         try:
             check(target)
@@ -108,6 +112,7 @@ class Control:
         except (TargetRefused, CommandHeld, TooLate) as refusal:
             self.counters["refused_targets"] += 1
             self.text = str(refusal)
+            raise
 
     def engage(self, enable: Callable[[], Any]) -> None:
         """Take over from where the body is, and ask the HAL to enable.
@@ -154,7 +159,7 @@ class Control:
                 self.text = "The model's command is not a number; nothing was sent."
                 return
             signal = self._robot.command.signal
-            self._send(Command(signal=signal, values=values, cycle=fresh.sample.cycle, hal_boot=fresh.sample.boot))
+            self._send(Command(signal=signal, values=values, cycle=fresh.message.cycle, hal_boot=fresh.message.boot))
             self.counters["sent"] += 1
 
     def facts(self) -> dict[str, Any]:
@@ -164,7 +169,7 @@ class Control:
             reference = [] if self._reference is None else self._reference.tolist()
         return {"engaged": self.engaged, "target": target, "reference": reference, "text": self.text, **self.counters}
 
-    def _fresh(self) -> Fresh | None:
+    def _fresh(self) -> Arrival[Sample] | None:
         fresh = self._newest()
         if fresh is None or self._clock.monotonic() - fresh.received > self._robot.command.time_to_live:
             return None

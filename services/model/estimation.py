@@ -3,7 +3,6 @@
 import math
 from bisect import bisect_left
 from collections.abc import Callable, Iterable
-from typing import NamedTuple
 
 import numpy as np
 from msgspec.structs import replace
@@ -16,28 +15,10 @@ from hal.clock import Clock
 from hal.config import RobotConfig
 from services.model.living_model import layout_of
 from services.wire.messages import Estimates, Sample
-from services.wire.streams import Newest as Reader
+from services.wire.streams import Arrival
 
-
-class Fresh(NamedTuple):
-    """A sample and when it arrived.
-
-    Attributes:
-        sample: As it was sent.
-        received: This process's monotonic time [s]; ages go on from here, for two clocks are never compared.
-    """
-
-    sample: Sample
-    received: float
-
-    @classmethod
-    def of(cls, reader: Reader[Sample]) -> "Fresh | None":
-        """The last sample that arrived at a reader, however old."""
-        last = reader.last()
-        return None if last is None else cls(last[1], last[0])
-
-
-Newest = Callable[[], Fresh | None]
+Newest = Callable[[], Arrival[Sample] | None]
+"""Returns the last sample that arrived, however old."""
 
 
 class Freshness:
@@ -73,7 +54,7 @@ class Freshness:
         self._nothing = nothing, False
         self._told: tuple[np.ndarray, np.ndarray, Numbers] = nothing, nothing, Numbers(nothing, self.elements)
 
-    def take(self) -> tuple[Fresh | None, Numbers]:
+    def take(self) -> tuple[Arrival[Sample] | None, Numbers]:
         """The HAL's newest sample, and all usable values [unit], shapes (n,); NaN where invalid or stale by now.
 
         The sample is None if nothing of it is usable; what the camera sees may be usable then. Nobody may write into
@@ -106,11 +87,11 @@ class _Source:
         """The sample that was read last, what of it could be used when it was published, and whether anything could."""
         self._kept: tuple[np.ndarray, int, np.ndarray, bool] | None = None
 
-    def usable(self, fresh: Fresh, now: float) -> tuple[np.ndarray, bool]:
+    def usable(self, fresh: Arrival[Sample], now: float) -> tuple[np.ndarray, bool]:
         """Every element of the model [unit], shape (size,), NaN where it must not be used now; and whether any may."""
         read, kept = self._read, self._kept
-        if read is None or read[0] is not fresh.sample:
-            read = self._read = fresh.sample, *self._published(fresh.sample)
+        if read is None or read[0] is not fresh.message:
+            read = self._read = fresh.message, *self._published(fresh.message)
         _, published, is_any = read
         passed = bisect_left(self._limits, now - fresh.received)
         if not passed:
@@ -175,10 +156,10 @@ class Estimation:
         """Publish what is measured, and estimates in place of what is not; nothing is computed twice."""
         now = self._clock.monotonic()
         fresh, values = self._freshness.take()
-        self._waited = None if fresh is None or fresh.sample is self._newest else now - fresh.received
-        self._newest = None if fresh is None else fresh.sample
+        self._waited = None if fresh is None or fresh.message is self._newest else now - fresh.received
+        self._newest = None if fresh is None else fresh.message
         schema, stamp_ns = self._schema(), self._clock.now_ns()
-        cycle = -1 if fresh is None else fresh.sample.cycle
+        cycle = -1 if fresh is None else fresh.message.cycle
         told = self._told
         if self.latest is not None and told is not None and told[0] is schema and told[1] is values:
             self.latest = replace(self.latest, stamp_ns=stamp_ns, cycle=cycle)

@@ -17,15 +17,15 @@ from gemuco.search.descent import NewtonConfig
 from gemuco.warm import warm
 from hal.clock import SystemClock
 from hal.config import RobotConfig
+from services.command.intake import Intake
+from services.command.permission import Permission
 from services.model.anomaly_loop import VERDICTS, AnomalyWatch
 from services.model.control_config import ControlConfig, controller_of
 from services.model.control_loop import Control
-from services.model.directing import Directing
-from services.model.estimation import Estimation, Fresh, Freshness
+from services.model.estimation import Estimation, Freshness
 from services.model.living_model import LivingModel, load_model
 from services.model.model_config import ModelConfig, model_config
 from services.model.model_verbs import ModelVerbs
-from services.model.target_intake import TargetIntake
 from services.model.update_loop import OnlineUpdate
 from services.process.loop import Loop
 from services.process.one_core import OneCore
@@ -34,8 +34,8 @@ from services.process.service import Service, until_told
 from services.wire import keys, query
 from services.wire.caller import ASKING
 from services.wire.history import HistoryRing
-from services.wire.messages import Anomaly, Applied, Command, Estimates, Holder, Sample, Status, Update
-from services.wire.streams import Newest
+from services.wire.messages import Anomaly, Applied, Command, Estimates, Holder, Sample, Status, Target, Update
+from services.wire.streams import Reader
 
 log = logging.getLogger(__name__)
 
@@ -114,16 +114,16 @@ class GemucoService:
         self._samples = service.newest(keys.sample(robot.robot), Sample)
         self._seen = service.newest(keys.vision(robot.robot), Sample) if robot.seen else None
         self._applied = service.newest(keys.applied(robot.robot), Applied)
-        self._targets = TargetIntake(service.session, robot.robot)
-        self.directing = Directing(
+        self._targets = Intake(service.session, keys.target(robot.robot), Target, self._follow)
+        self.permission = Permission(
             service.boot,
-            self.newest_sample,
+            self._samples.last,
             service.newest(keys.holder(robot.robot), Holder),
             robot.rates.hal,
             self.clock,
         )
         self.freshness = Freshness(
-            robot, self.newest_sample, self.clock, self._newest_seen if robot.seen else None, schema.layout.names
+            robot, self._samples.last, self.clock, None if self._seen is None else self._seen.last, schema.layout.names
         )
         self.history = HistoryRing({one.name: one.size for one in schema.layout.signals}, robot.rates.estimation)
         self._estimates = service.publisher(keys.estimate(robot.robot), Estimates)
@@ -168,19 +168,12 @@ class GemucoService:
             loop("verdict", VERDICTS, anomaly.judge),
         ]
 
-    def newest_sample(self) -> Fresh | None:
-        """The last sample that arrived, however old."""
-        return Fresh.of(self._samples)
-
-    def _newest_seen(self) -> Fresh | None:
-        return None if self._seen is None else Fresh.of(self._seen)
-
     def enable_hal(self) -> dict[str, Any]:
         """Ask the HAL to enable the drives, on behalf of whoever asks."""
         caller = ASKING.get()
         key = keys.verb(self.robot.robot, "hal", "enable")
-        answer = query.ask(self.service.session, key, caller=lambda: self.directing.on_behalf(caller))
-        self.directing.begin(caller)
+        answer = query.ask(self.service.session, key, caller=lambda: self.permission.on_behalf(caller))
+        self.permission.begin(caller)
         return answer
 
     def status(self) -> Status:
@@ -211,7 +204,7 @@ class GemucoService:
                 "late_solves": 0 if self._solver is None else self._solver.late,
                 "scheduling": {loop.name: loop.scheduling for loop in self.loops},
                 "core": "any" if self._core.core is None else self._core.core,
-                "rejected": self._targets.rejected + sum(reader.rejected for reader in self._readers()),
+                "rejected": self._targets.counters["malformed"] + sum(reader.rejected for reader in self._readers()),
                 "signals": self.estimation.counts(),
                 "anomaly": self.anomaly.summary(),
                 "failing": failing,
@@ -241,7 +234,7 @@ class GemucoService:
 
     def _blind(self) -> str:
         """What to check when nothing comes from the camera's process; empty when something does."""
-        seen = self._newest_seen()
+        seen = None if self._seen is None else self._seen.last()
         longest = max((self.robot.signals[name].stale_after for name in self.robot.seen), default=0.0)
         if not self.robot.seen or (seen is not None and self.clock.monotonic() - seen.received <= longest):
             return ""
@@ -273,14 +266,14 @@ class GemucoService:
         commands = self.service.publisher(keys.command(self.robot.robot), Command)
         return (
             Control(
-                self.robot, config.control, self.newest_sample, self._newest_applied, self.estimation, solver,
-                lambda command: commands.put(replace(command, name=self.directing.name)), self.clock,
+                self.robot, config.control, self._samples.last, self._newest_applied, self.estimation, solver,
+                lambda command: commands.put(replace(command, name=self.permission.name)), self.clock,
             ),
             "",
         )  # fmt: skip
 
-    def _readers(self) -> list[Newest[Any]]:
-        readers: list[Newest[Any] | None] = [self._samples, self._seen, self._applied]
+    def _readers(self) -> list[Reader[Any]]:
+        readers: list[Reader[Any] | None] = [self._samples, self._seen, self._applied]
         return [reader for reader in readers if reader is not None]
 
     def _newest_applied(self) -> Applied | None:
@@ -289,11 +282,15 @@ class GemucoService:
     def _control_tick(self) -> None:
         if self.control is None:
             return
-        control = self.control
-        self._targets.take(lambda target: control.try_target(target, self.directing.may_set))
-        if control.engaged and (why := self.directing.ended()):
-            control.disengage(why)
-        control.tick()
+        self._targets.take()
+        if self.control.engaged and (why := self.permission.ended()):
+            self.control.disengage(why)
+        self.control.tick()
+
+    def _follow(self, target: Target) -> None:
+        """Follow a published target."""
+        if self.control is not None:
+            self.control.try_target(target, self.permission.may_set)
 
 
 def make_ready() -> None:

@@ -49,16 +49,16 @@ class ModelVerbs:
 
     def serve(self, service: Service) -> None:
         """Answer all of them; what changes what the robot does only for who commands, letting go for everybody."""
-        directing = self._service.directing
+        permission = self._service.permission
         guards: dict[str, Guard] = dict.fromkeys(("adapt", "rollback", "normal"), self._may_change)
-        guards |= {"engage": directing.may_move, "target": directing.may_move}
+        guards |= {"engage": permission.may_move, "target": permission.may_move}
         for name, handler in self.handlers().items():
             service.verb(name, handler, guards.get(name), always=name == "disengage")
 
     def _may_change(self, caller: Caller) -> None:
         """Raise unless the caller may change the model; another model moves the robot while one is engaged."""
-        control, directing = self._service.control, self._service.directing
-        (directing.may_move if control is not None and control.engaged else directing.check)(caller)
+        control, permission = self._service.control, self._service.permission
+        (permission.may_move if control is not None and control.engaged else permission.check)(caller)
 
     def describe(self) -> dict[str, Any]:
         """What the model is about."""
@@ -206,7 +206,7 @@ class ModelVerbs:
         given, cycle = arguments.get("values"), -1
         if given is None:
             fresh, newest = self._service.freshness.take()
-            values, cycle = dict(newest), -1 if fresh is None else fresh.sample.cycle
+            values, cycle = dict(newest), -1 if fresh is None else fresh.message.cycle
         else:
             values = _signals(given, "values")
         hidden = arguments.get("hide") or []

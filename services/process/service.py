@@ -19,7 +19,7 @@ from services.process.lock import ServiceLock
 from services.wire import keys, query
 from services.wire.messages import Message, Status
 from services.wire.session import close_session, new_boot, open_session
-from services.wire.streams import Newest, Publisher
+from services.wire.streams import Publisher, Reader
 
 M = TypeVar("M", bound=Message)
 log = logging.getLogger(__name__)
@@ -114,9 +114,9 @@ class Service:
         """A publisher on this session, marked with this run's boot."""
         return Publisher(self.session, key, record, self.boot)
 
-    def newest(self, key: str, record: type[M]) -> Newest[M]:
+    def newest(self, key: str, record: type[M]) -> Reader[M]:
         """A reader of the newest message of a key."""
-        return Newest(self.session, key, record)
+        return Reader(self.session, key, record)
 
     def verb(
         self, name: str, handler: query.Handler, guard: query.Guard | None = None, *, always: bool = False

@@ -13,7 +13,7 @@ from services.view.seen import Heard, Seen
 from services.wire import keys
 from services.wire.caller import own_name
 from services.wire.messages import Anomaly, Applied, Estimates, Holder, Message, Sample, Status, Update
-from services.wire.streams import Newest
+from services.wire.streams import Reader
 
 M = TypeVar("M", bound=Message)
 log = logging.getLogger(__name__)
@@ -88,9 +88,9 @@ class Watch:
             model=self._told["model"].about,
         )
 
-    def _heard(self, reader: Newest[M]) -> Heard[M] | None:
+    def _heard(self, reader: Reader[M]) -> Heard[M] | None:
         last = reader.last()
-        return None if last is None else Heard(last[1], max(0.0, self._clock.monotonic() - last[0]))
+        return None if last is None else Heard(last.message, max(0.0, self._clock.monotonic() - last.received))
 
     def _run(self) -> None:
         while not self._stop.is_set():
@@ -121,10 +121,10 @@ class Watch:
         self._alive = frozenset(client.alive())
         for service, told in self._told.items():
             last = _status(client, service).last()
-            if service in self._alive and last is not None and last[1].boot != told.boot:
+            if service in self._alive and last is not None and last.message.boot != told.boot:
                 about = client.describe(service)
-                told.boot, told.about = last[1].boot, about
+                told.boot, told.about = last.message.boot, about
 
 
-def _status(client: Client, service: str) -> Newest[Status]:
+def _status(client: Client, service: str) -> Reader[Status]:
     return client.reader(keys.status(client.robot, service), Status)

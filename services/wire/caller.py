@@ -42,6 +42,6 @@ def own_name() -> str:
     return plain(f"{user}@{socket.gethostname()} (pid {os.getpid()})", LONGEST_NAME)
 
 
-NOBODY = Caller()
-ASKING: ContextVar[Caller] = ContextVar("asking", default=NOBODY)
+UNKNOWN = Caller()
+ASKING: ContextVar[Caller] = ContextVar("asking", default=UNKNOWN)
 """Who asks the verb that is being answered in this thread."""

@@ -52,7 +52,7 @@ RECORDS: dict[str, type[Message]] = {
     record.TYPE: record for record in (Sample, Command, Holder, Applied, Estimates, Anomaly, Update, Target, Status)
 }
 M = TypeVar("M", bound=Message)
-Reader = Callable[[bytes], Any]
+Decode = Callable[[bytes], Any]
 
 
 def _packed(value: Any) -> Any:
@@ -73,10 +73,10 @@ def _read(_: Any, value: Any) -> np.ndarray:
 
 _NUMBER = Numbers.DTYPE
 _to_bytes = msgspec.msgpack.Encoder(enc_hook=_packed).encode
-_readers: dict[type[Message], Reader] = {
+_readers: dict[type[Message], Decode] = {
     record: msgspec.msgpack.Decoder(record, dec_hook=_read).decode for record in RECORDS.values()
 }
-_read_any: Reader = msgspec.msgpack.Decoder(
+_read_any: Decode = msgspec.msgpack.Decoder(
     Union[tuple(RECORDS.values())],  # noqa: UP007 - made of a list
     dec_hook=_read,
 ).decode
@@ -128,7 +128,7 @@ def decode_any(data: bytes) -> Message:
     return message
 
 
-def _decoded(data: bytes, read: Reader, wanted: str | None) -> Any:
+def _decoded(data: bytes, read: Decode, wanted: str | None) -> Any:
     if len(data) > MAX_BYTES:
         raise MessageError(f"A {wanted or 'gemuco'} message of {len(data)} bytes is over the limit of {MAX_BYTES}.")
     try:

@@ -22,7 +22,7 @@ from hal.errors import HalError
 from services.errors import NoAnswer, RemoteError, ServiceError, ServiceUnavailable, TooSlow, WrongVersion
 from services.wire import keys
 from services.wire.absence import instead, starter
-from services.wire.caller import ASKING, LONGEST_NAME, NOBODY, Caller
+from services.wire.caller import ASKING, LONGEST_NAME, UNKNOWN, Caller
 from services.wire.messages import MAX_BYTES, UNREADABLE, VERSION, MessageError
 from services.wire.plain_text import plain, shown
 
@@ -128,7 +128,7 @@ class _Verb:
                 ASKING.reset(token)
 
     def _read(self, query: zenoh.Query) -> tuple[Caller, dict[str, Any]]:
-        caller, arguments = NOBODY, {}
+        caller, arguments = UNKNOWN, {}
         try:
             caller = _caller(self._key, query.attachment)
             arguments = _arguments(self._key, query.payload)
@@ -161,7 +161,7 @@ def _caller(key: str, attachment: zenoh.ZBytes | None) -> Caller:
         MessageError: The attachment is none.
     """
     if attachment is None:
-        return NOBODY
+        return UNKNOWN
     told = attachment.to_bytes()
     return _known_caller(key, told) if len(told) <= LONGEST_KEPT else _read_caller(key, told)
 
@@ -207,7 +207,7 @@ def ask(
     key: str,
     arguments: Mapping[str, Any] | None = None,
     timeout: float = 2.0,
-    caller: Caller | Callable[[], Caller] = NOBODY,
+    caller: Caller | Callable[[], Caller] = UNKNOWN,
 ) -> dict[str, Any]:
     """Ask a service to do its verb, and wait for the answer.
 

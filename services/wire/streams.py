@@ -3,7 +3,7 @@
 import logging
 import math
 import threading
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import zenoh
 
@@ -80,8 +80,21 @@ class Transit:
         return difference - self._least
 
 
-class Newest(Generic[M]):
-    """The newest message of a key, and when it arrived here.
+class Arrival(NamedTuple, Generic[M]):
+    """A message and its time of arrival.
+
+    Attributes:
+        message: The message as it was sent.
+        received: Time of arrival, without its delay on the way [monotonic s of this process]; ages count from here, for
+            the clocks of two machines are never compared.
+    """
+
+    message: M
+    received: float
+
+
+class Reader(Generic[M]):
+    """A subscriber that keeps the newest message of a key, and its time of arrival.
 
     A thread takes messages from a ring of one, so a slow user never delays the session, and never reads old messages
     one by one. Bytes that are not the message they should be are counted and dropped. Ends with the session.
@@ -112,7 +125,7 @@ class Newest(Generic[M]):
         self.arrived = arrived or threading.Condition()
         self._record = record
         self._clock = clock or SystemClock()
-        self._slot: tuple[float, M] | None = None
+        self._newest: Arrival[M] | None = None
         self._other_version: tuple[float, str] | None = None
         self._subscriber = session.declare_subscriber(key, zenoh.handlers.RingChannel(1))
         self._thread = threading.Thread(target=self._receive, name=f"newest {key}", daemon=True)
@@ -120,14 +133,14 @@ class Newest(Generic[M]):
 
     def get(self, max_age: float) -> M | None:
         """The newest message if it arrived, or would have without delay, at most `max_age` [s] ago, else None."""
-        slot = self._slot
-        if slot is None or self._clock.monotonic() - slot[0] > max_age:
+        newest = self._newest
+        if newest is None or self._clock.monotonic() - newest.received > max_age:
             return None
-        return slot[1]
+        return newest.message
 
-    def last(self) -> tuple[float, M] | None:
-        """When the newest message arrived, or would have without delay [monotonic s], and the message; else None."""
-        return self._slot
+    def last(self) -> Arrival[M] | None:
+        """Return the newest message, however old; None before the first."""
+        return self._newest
 
     def other_version(self, max_age: float) -> str:
         """What is wrong with the newest message if it is of another version and came at most `max_age` [s] ago."""
@@ -136,14 +149,14 @@ class Newest(Generic[M]):
 
     def wait(self, timeout: float) -> M | None:
         """Wait for the next message to arrive; None if none does within `timeout` [s]."""
-        found = self.newer(self._slot, timeout)
-        return None if found is None else found[1]
+        arrival = self.newer(self._newest, timeout)
+        return None if arrival is None else arrival.message
 
-    def newer(self, than: tuple[float, M] | None, timeout: float | None) -> tuple[float, M] | None:
+    def newer(self, than: Arrival[M] | None, timeout: float | None) -> Arrival[M] | None:
         """Wait until `last()` is another one than this; None if `timeout` [s] passes or the session ends first."""
         with self.arrived:
-            self.arrived.wait_for(lambda: self._slot is not than or self.has_ended, timeout)
-            return None if self._slot is than else self._slot
+            self.arrived.wait_for(lambda: self._newest is not than or self.has_ended, timeout)
+            return None if self._newest is than else self._newest
 
     def join(self, timeout: float) -> None:
         """Wait until the thread has ended, after the session was closed, at most `timeout` [s]."""
@@ -170,5 +183,5 @@ class Newest(Generic[M]):
                     self._other_version = (received, str(error))
                 continue
             with self.arrived:
-                self._slot, self._other_version = (received, message), None
+                self._newest, self._other_version = Arrival(message, received), None
                 self.arrived.notify_all()

@@ -17,12 +17,12 @@ from gemuco.warm import warm
 from hal.by_signal import Numbers, Truths
 from hal.clock import SystemClock
 from hal.config import load_robot
-from services.model.estimation import Estimation, Fresh, Freshness
+from services.model.estimation import Estimation, Freshness
 from services.process.realtime import freeze, prepare_process
 from services.wire import keys, messages
 from services.wire.messages import Estimates, Sample
 from services.wire.session import new_boot, open_session
-from services.wire.streams import Publisher
+from services.wire.streams import Arrival, Publisher
 from studies.speed.bodies import MASKS, body, modules
 from studies.speed.table import Row, faster, show
 from studies.stack import way_through
@@ -103,7 +103,7 @@ def ticks() -> Iterator[tuple[Callable[[], None], Callable[[], None]]]:
         yield ours, by_torch
 
 
-def samples(schema: BodySchema, clock: SystemClock) -> Callable[[], Fresh]:
+def samples(schema: BodySchema, clock: SystemClock) -> Callable[[], Arrival[Sample]]:
     """Return a source of sixteen different samples in turn, in which one encoder is silent."""
     random, number = np.random.default_rng(0), 0
     sizes = {signal.name: signal.size for signal in schema.layout.signals}
@@ -118,16 +118,16 @@ def samples(schema: BodySchema, clock: SystemClock) -> Callable[[], Fresh]:
         for cycle in range(16)
     ]  # fmt: skip
 
-    def newest() -> Fresh:
+    def newest() -> Arrival[Sample]:
         nonlocal number
         number += 1
-        return Fresh(known[number % len(known)], clock.monotonic())
+        return Arrival(known[number % len(known)], clock.monotonic())
 
     return newest
 
 
 def torch_tick(
-    schema: BodySchema, newest: Callable[[], Fresh], publish: Callable[[Estimates], None], clock: SystemClock
+    schema: BodySchema, newest: Callable[[], Arrival[Sample]], publish: Callable[[Estimates], None], clock: SystemClock
 ) -> Callable[[], None]:
     """Return a tick as a user would write it: take the sample, infer, keep the measured values, publish."""
     torch.set_num_threads(1)
@@ -139,7 +139,7 @@ def torch_tick(
 
     @torch.inference_mode()
     def tick() -> None:
-        sample = newest().sample
+        sample = newest().message
         x, valid, elements = sample.values.flat, sample.valid.flat, sample.elements
         given = np.concatenate([np.where(gate > 0, (x - mean) / std, 0.0), tail]).astype(np.float32)
         prediction = network(torch.from_numpy(given)).numpy() * std + mean

@@ -9,9 +9,9 @@ from gemuco.dataset import Dataset, Episode
 from gemuco.learning.train import TrainConfig, fit
 from gemuco.schema import BodySchema
 from hal.config import RobotConfig, load_robot
-from services.model.estimation import Fresh
 from services.model.living_model import layout_of
 from services.wire.messages import Sample
+from services.wire.streams import Arrival
 from simulators.robots.musashi_arm.motion import random_states
 
 ROBOT = Path(__file__).parents[2] / "robots" / "musashi_arm.yaml"
@@ -51,5 +51,5 @@ def sample_of(index: int, cycle: int = 1, silent: tuple[str, ...] = (), seed: in
     return Sample(cycle=cycle, boot=7, source="simulated", complete=not silent, values=values, age=age, valid=valid)
 
 
-def fresh(index: int, received: float, cycle: int = 1, silent: tuple[str, ...] = (), seed: int = 0) -> Fresh:
-    return Fresh(sample_of(index, cycle, silent, seed), received)
+def fresh(index: int, received: float, cycle: int = 1, silent: tuple[str, ...] = (), seed: int = 0) -> Arrival[Sample]:
+    return Arrival(sample_of(index, cycle, silent, seed), received)

@@ -32,7 +32,7 @@ def bad_commands(sample: Sample) -> dict[str, tuple[bytes, str, str]]:
         "too many": (command(np.zeros(3)), "refused", "has 2 values, not shape"),
         "another signal": (command(signal="joint_position"), "refused", "takes 'muscle_length'"),
         "another run": (command(hal_boot=1), "refused", "another run of the HAL"),
-        "from nobody": (command(boot=0), "refused", "does not tell its sender's `boot`"),
+        "without a sender": (command(boot=0), "refused", "without its sender's `boot`"),
         "an old cycle": (command(cycle=1), "refused", "ycle 1"),
         "a future cycle": (command(cycle=10**9), "refused", "ycle 1000000000"),
     }

@@ -10,11 +10,11 @@ from hal.clock import Clock, ManualClock, SystemClock
 from hal.config import RobotConfig
 from hal.device import Device, DeviceHealth, DeviceState, Reading
 from hal.robot import Robot
-from services.hardware.command_intake import CommandIntake
+from services.command.intake import Commands, Intake
+from services.command.lease import Lease
 from services.hardware.hal_service import HalService
-from services.hardware.lease import Lease
 from services.process.service import Service
-from services.wire import messages
+from services.wire import keys, messages
 from services.wire.messages import Command, Sample
 from services.wire.session import close_session, open_session
 
@@ -73,7 +73,8 @@ class Taken:
         self.clock = ManualClock()
         self.robot = Robot(config, [Wires(config, self.clock)], clock=self.clock)
         self.session = open_session(robot, "client")
-        self.intake = CommandIntake(self.session, config, self.robot, BOOT, Lease(self.clock))
+        self.commands = Commands(self.robot, config.command.signal, BOOT, Lease(self.clock))
+        self.intake = Intake(self.session, keys.command(robot), Command, self.commands.follow)
         self.robot.open()
         self.cycle()
         self.robot.enable()
@@ -124,7 +125,7 @@ def test_a_good_command_is_followed_and_its_sender_known(taken: Taken) -> None:
     taken.intake.offer(messages.encode(good))
     taken.cycle()
     assert taken.robot.mode == "follow"
-    assert taken.intake.sender == 9
+    assert taken.commands.sender == 9
     assert taken.intake.facts()["accepted"] == 1
     assert taken.intake.news() == ""
 

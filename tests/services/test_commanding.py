@@ -203,8 +203,8 @@ def test_what_may_move_the_robot_is_not_done_late(hal: Hal, anna: Client, verb: 
     asked = replace(anna.caller, hal_boot=run, cycle=cycle)
     eventually(lambda: anna.seen()[1] - cycle > 1.1 * hal.config.rates.hal)
     for caller, says in (
-        (asked, "s old when it came|there is no cycle"),
-        (anna.caller, "does not tell which sample of the HAL it had seen"),
+        (asked, "s old when the question came|there was no cycle"),
+        (anna.caller, "does not say which sample of the HAL its sender saw"),
         (replace(asked, hal_boot=run + 1), "another run of the HAL"),
     ):
         with pytest.raises(TooLate, match=says):

@@ -6,11 +6,12 @@ from gemuco.estimation import estimate
 from hal.clock import ManualClock
 from services.errors import NotEngaged, TargetRefused
 from services.model.control_loop import BUMP, Control
-from services.model.estimation import Estimation, Fresh, Freshness
+from services.model.estimation import Estimation, Freshness
 from services.model.gemuco_service import ModelSolver
 from services.model.living_model import LivingModel
 from services.model.model_config import model_config
-from services.wire.messages import Applied, Command, Target
+from services.wire.messages import Applied, Command, Sample, Target
+from services.wire.streams import Arrival
 
 PERIOD = 0.02
 
@@ -23,7 +24,7 @@ class Bench:
         config = model_config(robot).control
         assert config is not None
         self.clock = ManualClock()
-        self.newest: Fresh | None = fresh(3, self.clock.monotonic(), cycle=10)
+        self.newest: Arrival[Sample] | None = fresh(3, self.clock.monotonic(), cycle=10)
         self.mode = "off"
         self.enabled = 0
         self.sent: list[Command] = []
@@ -48,7 +49,7 @@ class Bench:
     def turn(self, count: int = 1) -> None:
         for _ in range(count):
             self.clock.advance(PERIOD)
-            cycle = self.newest.sample.cycle + 4 if self.newest else 1
+            cycle = self.newest.message.cycle + 4 if self.newest else 1
             self.newest = fresh(3, self.clock.monotonic(), cycle=cycle)
             self.estimation.tick()
             self.control.tick()
@@ -70,9 +71,9 @@ def test_engaging_enables_and_starts_where_the_servos_are() -> None:
     assert bench.enabled == 1
     first = bench.sent[0]
     assert bench.newest is not None
-    np.testing.assert_allclose(first.values, bench.newest.sample.values["muscle_length"], atol=1e-9)
-    assert first.cycle == bench.newest.sample.cycle
-    assert first.hal_boot == bench.newest.sample.boot
+    np.testing.assert_allclose(first.values, bench.newest.message.values["muscle_length"], atol=1e-9)
+    assert first.cycle == bench.newest.message.cycle
+    assert first.hal_boot == bench.newest.message.boot
 
 
 def test_the_reference_reaches_the_target_at_the_robot_files_speed() -> None:
@@ -95,13 +96,13 @@ def test_the_settled_command_is_what_the_model_says_of_the_posture() -> None:
     bench.control.engage(bench.enable)
     bench.turn(round(10 * BUMP / PERIOD))
     assert bench.newest is not None
-    posture = bench.newest.sample.values["joint_position"]
+    posture = bench.newest.message.values["joint_position"]
     schema = small_model()
     settled = bench.sent[-1].values
     found = estimate(schema, {"muscle_length": settled, "muscle_tension": np.full(10, 50.0)})["joint_position"].value
     assert np.isfinite(found).all()
     assert np.ptp([command.values for command in bench.sent[-5:]], axis=0).max() < 1e-4  # m
-    assert np.abs(settled - bench.newest.sample.values["muscle_length"]).max() < 0.05  # m
+    assert np.abs(settled - bench.newest.message.values["muscle_length"]).max() < 0.05  # m
     assert posture.shape == found.shape
 
 
@@ -162,7 +163,8 @@ def test_a_target_that_cannot_be_is_refused_in_a_sentence(signal: str, values: l
     target = Target(signal=signal, values=np.array(values, float))
     with pytest.raises(TargetRefused, match=sentence):
         bench.control.set_target(target)
-    bench.control.try_target(target)
+    with pytest.raises(TargetRefused, match=sentence):
+        bench.control.try_target(target)
     assert bench.control.facts()["target"] == before
     assert bench.control.counters["refused_targets"] == 1
 

@@ -6,8 +6,9 @@ from msgspec.structs import replace
 
 from hal.clock import ManualClock
 from services.model.anomaly_loop import AnomalyWatch
-from services.model.estimation import Estimation, Fresh, Freshness
+from services.model.estimation import Estimation, Freshness
 from services.wire.messages import Anomaly, Estimates, Sample
+from services.wire.streams import Arrival
 
 
 class Bench:
@@ -15,7 +16,7 @@ class Bench:
 
     def __init__(self) -> None:
         self.clock = ManualClock()
-        self.newest: Fresh | None = None
+        self.newest: Arrival[Sample] | None = None
         self.published: list[Estimates] = []
         self.freshness = Freshness(arm(), lambda: self.newest, self.clock)
         self.estimation = Estimation(self.freshness, small_model, self.published.append, self.clock)
@@ -32,7 +33,7 @@ def test_measured_values_pass_through_unmarked() -> None:
     assert told.cycle == 42
     assert set(told.method.values()) == {"measured"}
     assert not any(part.any() for part in told.estimated.values())
-    for name, value in bench.newest.sample.values.items():
+    for name, value in bench.newest.message.values.items():
         np.testing.assert_array_equal(told.values[name], value)
 
 
@@ -74,7 +75,7 @@ def test_a_sample_of_wrong_shape_is_as_good_as_silent() -> None:
         cycle=1, source="simulated", complete=True, values=sample.values | {"joint_position": np.zeros(4)},
         age=sample.age | {"joint_position": np.zeros(4)}, valid=sample.valid | {"joint_position": np.ones(4, bool)},
     )  # fmt: skip
-    bench.newest = Fresh(broken, bench.clock.monotonic())
+    bench.newest = Arrival(broken, bench.clock.monotonic())
     assert bench.tick().method["joint_position"] == "mask"
 
 
@@ -97,7 +98,7 @@ def test_nothing_is_computed_twice_while_nothing_changes() -> None:
     bench = Bench()
     bench.newest = fresh(3, bench.clock.monotonic())
     _, first = bench.freshness.take()
-    bench.newest = Fresh(bench.newest.sample, bench.newest.received)
+    bench.newest = Arrival(bench.newest.message, bench.newest.received)
     assert bench.freshness.take()[1] is first
     assert not first.flat.flags.writeable
     bench.clock.advance(0.021)
@@ -114,7 +115,7 @@ def test_an_anomaly_must_last() -> None:
     tension[1] += 150.0  # N
     cut = replace(sample, values=sample.values | {"muscle_tension": tension})
     for _ in range(5):
-        bench.newest = Fresh(cut, bench.clock.monotonic())
+        bench.newest = Arrival(cut, bench.clock.monotonic())
         watch.tick()
         watch.judge()
         bench.clock.advance(0.02)
@@ -138,7 +139,7 @@ def test_a_verdict_is_of_what_is_odd_now_and_never_of_what_was() -> None:
 
     def tick(sample: Sample) -> Anomaly:
         bench.clock.advance(0.06)
-        bench.newest = Fresh(sample, bench.clock.monotonic())
+        bench.newest = Arrival(sample, bench.clock.monotonic())
         watch.tick()
         return told[-1]
 

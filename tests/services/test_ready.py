@@ -15,8 +15,9 @@ warm(is_service=True)
 from arm_model import arm, fresh, small_model
 from hal.clock import ManualClock
 from services.model.anomaly_loop import AnomalyWatch
-from services.model.estimation import Estimation, Fresh, Freshness
+from services.model.estimation import Estimation, Freshness
 from services.wire import messages
+from services.wire.streams import Arrival
 
 names = [one.name for one in pkgutil.iter_modules(gemuco.compiled.__path__, "gemuco.compiled.")]
 modules = [importlib.import_module(name) for name in names]
@@ -31,8 +32,8 @@ estimation = Estimation(freshness, lambda: schema, told.append, clock)
 anomaly = AnomalyWatch(freshness, lambda: schema, 0.5, told.append, clock)
 silences = ((), ("joint_position.elbow_pitch",), ("muscle_tension.biceps", "muscle_length.biceps"))
 for number, silent in enumerate(silences):
-    sample = messages.decode(messages.encode(fresh(number, 0.0, silent=silent).sample), messages.Sample)
-    newest = Fresh(sample, clock.monotonic())
+    sample = messages.decode(messages.encode(fresh(number, 0.0, silent=silent).message), messages.Sample)
+    newest = Arrival(sample, clock.monotonic())
     estimation.tick()
     anomaly.tick()
 clock.advance(0.015)

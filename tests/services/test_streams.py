@@ -13,14 +13,14 @@ from services.process.service import Service
 from services.wire import keys, messages
 from services.wire.messages import Status, Target, Update
 from services.wire.session import close_session, open_session
-from services.wire.streams import Newest, Publisher, Transit
+from services.wire.streams import Publisher, Reader, Transit
 
 
 def _update(version: int) -> Update:
     return Update(active=True, model_version=version, window=0, dropped=0, loss=0.0)
 
 
-def _read(newest: Newest[Update], version: int) -> Update:
+def _read(newest: Reader[Update], version: int) -> Update:
     deadline = time.monotonic() + 10.0
     while time.monotonic() < deadline:
         message = newest.get(float("inf"))
@@ -32,7 +32,7 @@ def _read(newest: Newest[Update], version: int) -> Update:
 
 def test_newest_is_handed_out_only_while_it_is_fresh(robot: str) -> None:
     session, clock = open_session(robot, "client"), ManualClock()
-    newest = Newest(session, keys.update(robot), Update, clock)
+    newest = Reader(session, keys.update(robot), Update, clock)
     publisher = Publisher(session, keys.update(robot), Update, boot=5)
     assert newest.get(1e9) is None
     assert newest.last() is None
@@ -46,7 +46,7 @@ def test_newest_is_handed_out_only_while_it_is_fresh(robot: str) -> None:
     assert newest.get(0.25) is None
     last = newest.last()
     assert last is not None
-    assert clock.monotonic() - last[0] == pytest.approx(0.3)
+    assert clock.monotonic() - last.received == pytest.approx(0.3)
     close_session(session)
 
 
@@ -94,7 +94,7 @@ def test_a_message_without_a_stamp_counts_from_its_arrival() -> None:
 
 def test_what_cannot_be_read_is_counted_and_does_not_replace_the_good(robot: str) -> None:
     session = open_session(robot, "client")
-    newest = Newest(session, keys.update(robot), Update)
+    newest = Reader(session, keys.update(robot), Update)
     session.put(keys.update(robot), messages.encode(_update(1)))
     good = _read(newest, 1)
     session.put(keys.update(robot), b"\xc1")
@@ -107,7 +107,7 @@ def test_what_cannot_be_read_is_counted_and_does_not_replace_the_good(robot: str
 
 def test_wait_returns_the_next_message_or_none(robot: str) -> None:
     session = open_session(robot, "client")
-    newest = Newest(session, keys.update(robot), Update)
+    newest = Reader(session, keys.update(robot), Update)
     assert newest.wait(0.05) is None
     timer = threading.Timer(0.05, lambda: session.put(keys.update(robot), messages.encode(_update(7))))
     timer.start()
@@ -121,7 +121,7 @@ def test_wait_returns_the_next_message_or_none(robot: str) -> None:
 
 def test_reader_threads_end_with_the_session(robot: str) -> None:
     session = open_session(robot, "client")
-    Newest(session, keys.update(robot), Update)
+    Reader(session, keys.update(robot), Update)
     close_session(session)
     deadline = time.monotonic() + 10.0
     while any(thread.name == f"newest {keys.update(robot)}" for thread in threading.enumerate()):
@@ -164,7 +164,7 @@ def test_a_target_waits_for_the_one_who_takes_it(robot: str) -> None:
             while (last := targets.last()) is None:
                 assert time.monotonic() < deadline
                 time.sleep(0.005)
-            assert last[1].values.tolist() == [0.5, -0.5]
+            assert last.message.values.tolist() == [0.5, -0.5]
 
 
 def test_a_second_service_is_refused_with_the_holders_pid(robot: str) -> None:

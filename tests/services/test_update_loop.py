@@ -9,11 +9,12 @@ from gemuco.errors import NotEnoughData
 from gemuco.learning.train import TrainConfig, fit
 from gemuco.schema import BodySchema
 from hal.clock import ManualClock
-from services.model.estimation import Fresh, Freshness
+from services.model.estimation import Freshness
 from services.model.living_model import LivingModel, layout_of
 from services.model.model_config import UpdateConfig
 from services.model.update_loop import OnlineUpdate
-from services.wire.messages import Update
+from services.wire.messages import Sample, Update
+from services.wire.streams import Arrival
 
 
 class Bench:
@@ -21,7 +22,7 @@ class Bench:
 
     def __init__(self, window: int = 50, interval: float = 0.1, schema: BodySchema | None = None) -> None:
         self.clock = ManualClock()
-        self.newest: Fresh | None = None
+        self.newest: Arrival[Sample] | None = None
         self.engaged = False
         self.told: list[Update] = []
         self.living = LivingModel(schema or small_model())

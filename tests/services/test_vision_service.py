@@ -22,7 +22,7 @@ from services.client import Client
 from services.errors import AlreadyRunning, RemoteError
 from services.hardware.vision_service import run_vision
 from services.learning.collector import Wanted, collect_direct
-from services.model.estimation import Fresh, Freshness
+from services.model.estimation import Freshness
 from services.process.service import Service
 from services.recording.reading import read
 from services.recording.recorder import Recorder
@@ -33,6 +33,7 @@ from services.verbs.top import watch
 from services.wire import keys
 from services.wire.messages import MessageError, Sample, Status
 from services.wire.session import endpoint
+from services.wire.streams import Arrival
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "publish_marker.py"
 
@@ -215,9 +216,9 @@ def test_the_frame_of_the_documentation_is_one(robot: str) -> None:
         last = frames.last()
     assert frames.rejected == 0, frames.rejected_text
     assert last is not None
-    assert last[1].source == "camera"
-    np.testing.assert_array_equal(last[1].values["tool_tip_position"], [0.12, -0.05, 0.31])
-    assert last[1].valid["tool_tip_position"].all()
+    assert last.message.source == "camera"
+    np.testing.assert_array_equal(last.message.values["tool_tip_position"], [0.12, -0.05, 0.31])
+    assert last.message.valid["tool_tip_position"].all()
 
 
 class Bench:
@@ -225,15 +226,15 @@ class Bench:
 
     def __init__(self) -> None:
         self.clock = ManualClock()
-        self.hal: Fresh | None = None
-        self.seen: Fresh | None = None
+        self.hal: Arrival[Sample] | None = None
+        self.seen: Arrival[Sample] | None = None
         self.freshness = Freshness(config(), lambda: self.hal, self.clock, lambda: self.seen)
         truth = HandWorld("short").truth()
         self.tip = truth.pop("tool_tip_position")
         self.body = truth
 
-    def now(self, values: dict[str, np.ndarray], age: float = 0.0) -> Fresh:
-        return Fresh(sample(values, age=age), self.clock.monotonic())
+    def now(self, values: dict[str, np.ndarray], age: float = 0.0) -> Arrival[Sample]:
+        return Arrival(sample(values, age=age), self.clock.monotonic())
 
 
 def test_each_signal_is_fresh_for_as_long_as_its_own_stale_after() -> None:

@@ -1,6 +1,6 @@
-"""Who may direct the model service, by what the HAL told of who commands, and what comes as a target."""
+"""The model service's rules for who may direct it, and the intake of targets."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -8,15 +8,14 @@ import zenoh
 from small_arm import eventually
 
 from hal.clock import ManualClock
+from services.command.intake import DEPTH, Intake
+from services.command.permission import HEARD_WITHIN, Permission
 from services.errors import CommandHeld, TooLate
-from services.model.directing import HEARD_WITHIN, Directing
-from services.model.estimation import Fresh
-from services.model.target_intake import DEPTH, TargetIntake
 from services.wire import keys, messages
 from services.wire.caller import Caller
 from services.wire.messages import Holder, Sample, Target
 from services.wire.session import close_session, open_session
-from services.wire.streams import Newest, Publisher
+from services.wire.streams import Arrival, Publisher, Reader
 
 MODEL, HAL, ANNA, BERT = 1000, 7, 11, 22
 RATE = 100.0
@@ -34,14 +33,14 @@ class Told:
 
     def __init__(self, session: zenoh.Session, robot: str) -> None:
         self.clock = ManualClock()
-        self._heard = Newest(session, keys.holder(robot), Holder, self.clock)
+        self._heard = Reader(session, keys.holder(robot), Holder, self.clock)
         self._says = Publisher(session, keys.holder(robot), Holder, HAL)
-        self.fresh: Fresh | None = None
-        self.directing = Directing(MODEL, lambda: self.fresh, self._heard, RATE, self.clock)
+        self.fresh: Arrival[Sample] | None = None
+        self.permission = Permission(MODEL, lambda: self.fresh, self._heard, RATE, self.clock)
 
     def sample(self, cycle: int) -> None:
         sample = Sample(boot=HAL, cycle=cycle, source="can", complete=True, values={}, age={}, valid={})
-        self.fresh = Fresh(sample, self.clock.monotonic())
+        self.fresh = Arrival(sample, self.clock.monotonic())
 
     def holder(self, name: str, boot: int, through: int = 0, left: float = 5.0) -> None:
         before = self._heard.last()
@@ -59,22 +58,22 @@ def anna(cycle: int = 500) -> Caller:
 
 
 def test_while_nobody_commands_anybody_may(told: Told) -> None:
-    told.directing.check(Caller())
+    told.permission.check(Caller())
     told.holder("", 0, left=0.0)
-    told.directing.check(Caller())
+    told.permission.check(Caller())
 
 
 def test_while_somebody_commands_only_that_one_may(told: Told) -> None:
     told.holder("anna", ANNA)
-    told.directing.check(anna())
+    told.permission.check(anna())
     for other in (Caller("bert", BERT), Caller()):
         with pytest.raises(CommandHeld, match="anna commands this robot"):
-            told.directing.check(other)
+            told.permission.check(other)
 
 
 def test_while_the_model_itself_commands_anybody_may(told: Told) -> None:
     told.holder("model service", MODEL)
-    told.directing.check(Caller("bert", BERT))
+    told.permission.check(Caller("bert", BERT))
 
 
 @pytest.mark.parametrize(("left", "waited"), [(5.0, HEARD_WITHIN + 0.01), (1.0, 1.01)])
@@ -82,86 +81,76 @@ def test_what_the_hal_told_is_believed_for_as_long_as_it_holds(told: Told, left:
     told.holder("anna", ANNA, left=left)
     told.clock.advance(waited - 0.02)
     with pytest.raises(CommandHeld):
-        told.directing.check(Caller("bert", BERT))
+        told.permission.check(Caller("bert", BERT))
     told.clock.advance(0.02)
-    told.directing.check(Caller("bert", BERT))
+    told.permission.check(Caller("bert", BERT))
 
 
 def test_what_moves_the_robot_is_done_at_once_or_never(told: Told) -> None:
     with pytest.raises(TooLate):
-        told.directing.may_move(anna())
+        told.permission.may_move(anna())
     told.sample(500)
-    told.directing.may_move(anna(500))
-    told.directing.may_move(anna(401))
+    told.permission.may_move(anna(500))
+    told.permission.may_move(anna(401))
     for caller in (anna(399), Caller("anna", ANNA), Caller("anna", ANNA, 0, HAL + 1, 500), anna(700)):
         with pytest.raises(TooLate):
-            told.directing.may_move(caller)
+            told.permission.may_move(caller)
     told.clock.advance(1.01)
     with pytest.raises(TooLate, match=r"1\.0 s old"):
-        told.directing.may_move(anna(500))
+        told.permission.may_move(anna(500))
 
 
 def test_a_published_target_is_judged_by_who_sent_it(told: Told) -> None:
     told.sample(500)
     told.holder("anna", ANNA)
-    told.directing.may_set(Target(boot=ANNA, cycle=499, hal_boot=HAL, signal="s", values=np.zeros(1)))
+    told.permission.may_set(Target(boot=ANNA, cycle=499, hal_boot=HAL, signal="s", values=np.zeros(1)))
     with pytest.raises(CommandHeld):
-        told.directing.may_set(Target(boot=BERT, cycle=499, hal_boot=HAL, signal="s", values=np.zeros(1)))
+        told.permission.may_set(Target(boot=BERT, cycle=499, hal_boot=HAL, signal="s", values=np.zeros(1)))
     with pytest.raises(TooLate):
-        told.directing.may_set(Target(boot=ANNA, cycle=300, hal_boot=HAL, signal="s", values=np.zeros(1)))
+        told.permission.may_set(Target(boot=ANNA, cycle=300, hal_boot=HAL, signal="s", values=np.zeros(1)))
 
 
 def test_the_controller_lets_go_with_the_lease_that_it_was_engaged_under(told: Told) -> None:
-    told.directing.begin(anna())
-    assert told.directing.ended() == "", "the HAL has not told yet"
+    told.permission.begin(anna())
+    assert told.permission.ended() == "", "the HAL has not told yet"
     told.holder("anna", ANNA, through=MODEL)
-    assert told.directing.ended() == ""
-    assert "engaged by anna" in told.directing.name
+    assert told.permission.ended() == ""
+    assert "engaged by anna" in told.permission.name
     told.clock.advance(HEARD_WITHIN + 0.01)
-    assert told.directing.ended() == "The lease of anna has ended, so the controller let go."
-    told.directing.begin(anna())
-    assert told.directing.ended() == "", "engaged anew"
+    assert told.permission.ended() == "The lease of anna has ended, so the controller let go."
+    told.permission.begin(anna())
+    assert told.permission.ended() == "", "engaged anew"
 
 
 def test_the_controller_lets_go_when_somebody_else_commands(told: Told) -> None:
-    told.directing.begin(anna())
+    told.permission.begin(anna())
     told.holder("model service", MODEL)
-    assert told.directing.ended() == ""
+    assert told.permission.ended() == ""
     told.holder("bert", BERT)
-    assert told.directing.ended() == "bert commands the robot now, so the controller let go."
+    assert told.permission.ended() == "bert commands the robot now, so the controller let go."
 
 
 def test_it_asks_the_hal_for_whoever_asked_it_with_what_it_has_seen_itself(told: Told) -> None:
     told.sample(640)
-    assert told.directing.on_behalf(anna(500)) == Caller("anna", ANNA, MODEL, HAL, 640)
-
-
-def taken(intake: TargetIntake, happened: Callable[[list[Target]], bool]) -> list[Target]:
-    found: list[Target] = []
-
-    def more() -> bool:
-        intake.take(found.append)
-        return happened(found)
-
-    eventually(more)
-    return found
+    assert told.permission.on_behalf(anna(500)) == Caller("anna", ANNA, MODEL, HAL, 640)
 
 
 def test_targets_come_in_their_order_and_what_is_none_is_counted(session: zenoh.Session, robot: str) -> None:
-    intake = TargetIntake(session, robot)
+    targets: list[Target] = []
+    intake = Intake(session, keys.target(robot), Target, targets.append)
     good = [messages.encode(Target(boot=ANNA, signal="s", values=np.array([float(n)])), seq=n) for n in range(3)]
     for payload in (good[0], b"", b"\xc1 no msgpack", good[1], good[1][:-3], good[2]):
         session.put(keys.target(robot), payload)
     session.put("gemuco/**", good[0])
-    found = taken(intake, lambda got: len(got) == 3 and intake.rejected == 4)
-    assert [float(target.values[0]) for target in found] == [0.0, 1.0, 2.0]
+    eventually(lambda: intake.take() or intake.counters == {"accepted": 3, "refused": 0, "malformed": 4})
+    assert [float(target.values[0]) for target in targets] == [0.0, 1.0, 2.0]
 
 
 def test_of_too_many_targets_the_newest_are_kept(session: zenoh.Session, robot: str) -> None:
-    intake = TargetIntake(session, robot)
+    targets: list[Target] = []
+    intake = Intake(session, keys.target(robot), Target, targets.append)
     last = 3 * DEPTH
     for number in range(last + 1):
         session.put(keys.target(robot), messages.encode(Target(signal="s", values=np.array([float(number)]))))
-    found: list[Target] = []
-    intake.take(found.append)  # the session's own puts have arrived when they return
-    assert [float(target.values[0]) for target in found] == list(range(last + 1 - DEPTH, last + 1))
+    intake.take()  # the session's own puts have arrived when they return
+    assert [float(target.values[0]) for target in targets] == list(range(last + 1 - DEPTH, last + 1))

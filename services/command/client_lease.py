@@ -1,4 +1,4 @@
-"""To command a robot: a lease that is renewed in the background, and lost loudly."""
+"""A client's lease of a robot, renewed in the background."""
 
 import logging
 import threading
@@ -12,41 +12,41 @@ from services.errors import CommandHeld, LeaseLost, NoAnswer, ServiceError, TooL
 log = logging.getLogger(__name__)
 
 SECONDS = 3.0
-"""A lease [s] that outlives a slow moment, and does not keep others out for long after its holder was killed."""
+"""Default length of a lease [s]: it outlives a slow moment, and ends soon after its holder was killed."""
 RENEWALS = 3
-"""How often a lease is renewed in its time: two may be lost."""
+"""A lease is renewed this many times in its length: two renewals may be lost."""
 BACK_WITHIN = 1.0
-"""How long [s] to wait for the HAL to take the lease back; it runs out by itself."""
+"""Longest wait [s] for the HAL to take the lease back; it also runs out by itself."""
 NEEDS_LEASE = {
     "hal": ("enable", "reset", "home", "tare"),
     "model": ("engage", "target", "adapt", "rollback", "normal"),
 }
-"""Service -> verbs that are refused while somebody else commands, and while the one who asks has lost its lease."""
+"""Service -> verbs that are refused while another client commands, and after the caller has lost its lease."""
 
 
-class Robot(Protocol):
-    """What a lease needs of a client."""
+class Asker(Protocol):
+    """The part of a client that a lease needs."""
 
-    commanding: "Commanding | None"
+    held_lease: "ClientLease | None"
 
     def ask(self, service: str, verb: str, arguments: Mapping[str, Any] | None = None, timeout: float = ...) -> Any:
-        """Ask any verb of any service."""
+        """Ask a verb of a service."""
         ...
 
 
-class Commanding:
-    """The lease of a robot, as a context manager: nobody else commands meanwhile, and everybody may stop it.
+class ClientLease:
+    """The lease of a robot, as a context manager: no other client commands meanwhile; every client may stop the robot.
 
-    After it was lost, commands and verbs that need it raise `LeaseLost`, until the end of the context. It was lost when
-    it could not be renewed in time, or the HAL was restarted; by the clock of this process before that of the HAL.
+    A lease that could not be renewed in time, or whose HAL was restarted, is lost: until the end of the context
+    commands and verbs that need it raise `LeaseLost`. By the clock of this process it ends before it does in the HAL.
 
     Args:
-        robot: The client that is to command.
-        seconds: How long it runs without being renewed; shorter is sooner free for others after this process died.
+        client: The client that is to command.
+        seconds: Time [s] that it runs without renewal; a short one is free for others soon after this process died.
     """
 
-    def __init__(self, robot: Robot, seconds: float = SECONDS) -> None:
-        self._robot, self._seconds = robot, seconds
+    def __init__(self, client: Asker, seconds: float = SECONDS) -> None:
+        self._client, self._seconds = client, seconds
         self._number = 0
         self._until = 0.0
         self._lost = ""
@@ -58,33 +58,33 @@ class Commanding:
         """Take the lease.
 
         Raises:
-            CommandHeld: Somebody else commands; the text names the holder.
-            NoAnswer: No HAL answers.
-            BadArguments: Not a time that a lease may have.
+            CommandHeld: Another client commands; the text names it.
+            NoAnswer: The HAL does not answer.
+            BadArguments: The time is not allowed.
         """
-        if self._robot.commanding is not None:
+        if self._client.held_lease is not None:
             raise CommandHeld("This client commands the robot already; one lease is enough.")
         asked = time.monotonic()
-        answer = self._robot.ask("hal", "lease", {"seconds": self._seconds})
+        answer = self._client.ask("hal", "lease", {"seconds": self._seconds})
         self._number, self._until = answer["number"], asked + self._seconds
-        self._robot.commanding = self
+        self._client.held_lease = self
         self._thread.start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._robot.commanding = None
+        self._client.held_lease = None
         self._done.set()
         self._thread.join(BACK_WITHIN)
         try:
-            self._robot.ask("hal", "release", timeout=BACK_WITHIN)
+            self._client.ask("hal", "release", timeout=BACK_WITHIN)
         except ServiceError as failure:
             log.warning("The lease was not given back, and runs out by itself: %s", failure)
 
     @property
     def text(self) -> str:
-        """Why the lease was lost; empty while it runs."""
+        """The reason why the lease was lost; empty while it runs."""
         if not self._lost and time.monotonic() >= self._until:
             self._lose(f"it was not renewed for {self._seconds:g} s. {self._trouble}")
         return self._lost
@@ -103,10 +103,10 @@ class Commanding:
             asked = time.monotonic()
             arguments = {"seconds": self._seconds, "number": self._number}
             try:
-                self._robot.ask("hal", "lease", arguments, min(pause, self._until - asked))
+                self._client.ask("hal", "lease", arguments, min(pause, self._until - asked))
             except (NoAnswer, TooLate) as error:
                 self._trouble = str(error)
-            except Exception as error:  # whatever it is, this client must not believe that it commands
+            except Exception as error:  # whatever it is, this client must not go on to command
                 self._lose(str(error))
             else:
                 self._trouble, self._until = "", asked + self._seconds

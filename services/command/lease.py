@@ -1,0 +1,185 @@
+"""The lease of a robot: one client at a time commands it, for as long as it renews its lease.
+
+The lease keeps clients out of each other's way. It does not stop a client that lies about its identity; roles do.
+"""
+
+import math
+import secrets
+import threading
+from dataclasses import dataclass, replace
+from typing import Any
+
+from hal.clock import Clock, SystemClock
+from services.errors import BadArguments, CommandHeld, LeaseLost
+from services.wire.caller import UNKNOWN, Caller
+from services.wire.plain_text import shown
+
+LONGEST = 60.0
+"""Longest lease [s]; a client that vanishes must not keep others out for long."""
+SHORTEST = 0.2
+"""Shortest lease [s]; it must be possible to renew it in time on a busy machine."""
+STREAM = 1.0
+"""A client without a lease still commands for this long [s] after its last command."""
+
+
+@dataclass(frozen=True, slots=True)
+class Tenure:
+    """The time for which one client commands.
+
+    Attributes:
+        caller: The holder; a caller without a boot before the first.
+        until: End [monotonic s].
+        through: `boot` of the service that commands for the holder; 0 if the holder does so itself.
+        number: Number of this lease; 0 if a stream of commands took it.
+    """
+
+    caller: Caller = UNKNOWN
+    until: float = -math.inf
+    through: int = 0
+    number: int = 0
+
+
+class Lease:
+    """The one lease of a robot, for any thread. Looking at it and streaming commands never wait."""
+
+    def __init__(self, clock: Clock | None = None) -> None:
+        self._clock = clock or SystemClock()
+        self._lock = threading.Lock()
+        self._tenure = Tenure()
+
+    @property
+    def tenure(self) -> Tenure | None:
+        """The tenure that runs now; None if the robot has no holder."""
+        tenure = self._tenure
+        return tenure if tenure.caller.boot and self._clock.monotonic() < tenure.until else None
+
+    def left(self) -> float:
+        """Return how long [s] the lease still runs; 0 without a holder."""
+        return max(0.0, self._tenure.until - self._clock.monotonic())
+
+    def take(self, caller: Caller, seconds: Any) -> Tenure:
+        """Give the caller the lease for this time [s] from now; its holder may take it again.
+
+        Raises:
+            CommandHeld: Another client has it.
+            BadArguments: The time is not allowed, or the caller has no boot.
+        """
+        duration = _checked(seconds)
+        if not caller.boot:
+            raise BadArguments(
+                "A client that wants the lease must send a `boot`, a random number, beside its question."
+            )
+        with self._lock:
+            tenure, until = self.tenure, self._clock.monotonic() + duration
+            if tenure is not None and tenure.caller.boot != caller.boot:
+                raise self._refusal(tenure)
+            through, number = (0, 0) if tenure is None else (tenure.through, tenure.number)
+            self._tenure = Tenure(caller, until, through, number or secrets.randbits(53) or 1)
+            return self._tenure
+
+    def renew(self, caller: Caller, seconds: Any, number: Any) -> Tenure:
+        """Extend a lease.
+
+        Args:
+            caller: Its holder.
+            seconds: Time [s] for which it shall run from now.
+            number: Number of the lease, from `take`.
+
+        Raises:
+            LeaseLost: It ran out or was given back, or the HAL was restarted.
+            CommandHeld: Another client has taken it since.
+            BadArguments: The time is not allowed.
+        """
+        duration = _checked(seconds)
+        with self._lock:
+            tenure = self.tenure
+            if tenure is not None and tenure.caller.boot != caller.boot:
+                raise self._refusal(tenure)
+            if tenure is None or tenure.number != number:
+                raise LeaseLost("This lease has ended: it was not renewed in time, or the HAL was restarted.")
+            self._tenure = replace(tenure, until=self._clock.monotonic() + duration)
+            return self._tenure
+
+    def give_back(self, caller: Caller) -> None:
+        """End the caller's lease, if it has it; the service that commanded for the caller must stop then."""
+        with self._lock:
+            if caller.boot and self._tenure.caller.boot == caller.boot:
+                self._tenure = replace(self._tenure, until=-math.inf)
+
+    def check(self, caller: Caller) -> None:
+        """Raise `CommandHeld` if another client commands; a caller without a boot is never the holder."""
+        tenure = self.tenure
+        if tenure is None or (caller.boot and caller.boot in (tenure.caller.boot, tenure.through)):
+            return
+        if caller.through and caller.through == tenure.caller.boot:
+            return  # the service streams without a lease: it commands for each client that asks it
+        raise self._refusal(tenure)
+
+    def delegate(self, caller: Caller) -> None:
+        """Let the service that asks on the caller's behalf command for it, as long as the caller's lease runs.
+
+        Raises:
+            CommandHeld: Another client commands.
+        """
+        with self._lock:
+            self.check(caller)
+            tenure = self.tenure
+            if tenure is None:
+                self._tenure = Tenure()
+            elif tenure.caller.boot == caller.boot:
+                self._tenure = replace(tenure, through=caller.through)
+
+    def stream(self, caller: Caller) -> None:
+        """Note that a command of this caller was followed; without a lease it then commands for `STREAM` seconds.
+
+        Never waits: if another thread is busy with the lease, the next command counts instead.
+        """
+        if not self._lock.acquire(blocking=False):
+            return
+        try:
+            tenure = self.tenure
+            if tenure is None or (tenure.caller.boot == caller.boot and not tenure.number):
+                self._tenure = Tenure(caller, self._clock.monotonic() + STREAM)
+        finally:
+            self._lock.release()
+
+    def check_stream(self, caller: Caller) -> None:
+        """Check that a command of this caller may be followed.
+
+        Raises:
+            CommandHeld: Another client commands, or the caller does not say who it is.
+            LeaseLost: The caller commanded for a client whose lease has ended.
+        """
+        if not caller.boot:
+            raise CommandHeld("A command without its sender's `boot` was refused.")
+        tenure = self._tenure
+        if tenure.through == caller.boot and self.tenure is None:
+            raise LeaseLost(f"The lease of {tenure.caller} has ended, so commands on its behalf are not followed.")
+        self.check(caller)
+
+    def end_stream(self) -> None:
+        """End the tenure of a client that only streams: the robot takes no commands now."""
+        tenure = self._tenure
+        if tenure.number or tenure.until == -math.inf or not self._lock.acquire(blocking=False):
+            return
+        try:
+            if not self._tenure.number:
+                self._tenure = replace(self._tenure, until=-math.inf)
+        finally:
+            self._lock.release()
+
+    def _refusal(self, tenure: Tenure) -> CommandHeld:
+        left = max(0.0, tenure.until - self._clock.monotonic())
+        return CommandHeld(
+            f"{tenure.caller} commands this robot, for another {left:.1f} s unless it goes on. "
+            "Stopping is always allowed."
+        )
+
+
+def _checked(seconds: Any) -> float:
+    is_number = isinstance(seconds, int | float) and not isinstance(seconds, bool)
+    if not is_number or not SHORTEST <= seconds <= LONGEST:  # also refuses NaN
+        raise BadArguments(
+            f"A lease runs for {SHORTEST:g} to {LONGEST:g} s, not for {shown(seconds)}; renew it to keep it longer."
+        )
+    return float(seconds)
