@@ -137,12 +137,12 @@ def collect(
     from services.model import artifacts
     from services.show import progress
 
-    config, wanted = load(robot), collector.Wanted(tuple(condition or ()), samples, postures)
+    config, request = load(robot), collector.Request(tuple(condition or ()), samples, postures)
     with progress("collecting") as tell:
         if bus:
-            found = collector.collect_bus(config, seed, wanted, tell)
+            found = collector.collect_bus(config, seed, request, tell)
         else:
-            found = collector.collect_direct(config, variant, seed, wanted, tell)
+            found = collector.collect_direct(config, variant, seed, request, tell)
     path = out or artifacts.data_path(config.robot)
     found.dataset.save(path)
     typer.echo(

@@ -1,4 +1,4 @@
-"""Safe motion, recorded: random or taught, condition by condition, without a bus or on a running robot."""
+"""Recording of safe motion: random or taught, condition by condition, without a bus or on a running robot."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -20,25 +20,25 @@ from services.model.living_model import layout_of
 from services.model.model_config import CollectConfig, collect_config
 
 EPISODE = 10.0
-"""Length of an episode [s of the robot's time]: held-out data are whole episodes."""
+"""An episode has this length [s of the robot's time]; held-out data are whole episodes."""
 MARGIN = 0.05
-"""Share of the range between two limits by which a sample may lie outside."""
+"""A sample may lie outside of its limits by this share of the range between them."""
 STARVED = 30.0
-"""Robot time [s] without a sample that counts, after which collecting is given up."""
+"""Collecting is given up after this robot time [s] without a usable sample."""
 BUS = "bus"
-"""Condition of what was recorded on a bus, of a robot whose file has no conditions, if none was told."""
+"""Data recorded on a bus get this condition if the robot file has no conditions and none was given."""
 
 Progress = Callable[[float, str], None]
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
-    """What to record, where the robot file leaves a choice.
+class Request:
+    """Choices for a recording that the robot file leaves open.
 
     Attributes:
         conditions: Names of conditions; all of the robot file's if empty.
-        samples: Per condition; the robot file's number, or all of the taught postures, if None.
-        postures: A CSV file of taught postures to play, in place of random motion.
+        samples: Samples per condition; the robot file's number, or all of the taught postures, if None.
+        postures: A CSV file of taught postures to play in place of random motion.
     """
 
     conditions: Sequence[str] = ()
@@ -46,17 +46,17 @@ class Wanted:
     postures: Path | None = None
 
 
-EVERYTHING = Wanted()
+EVERYTHING = Request()
 
 
 @dataclass(frozen=True, slots=True)
-class Collected:
-    """What was recorded, and how long it took.
+class Collection:
+    """Recorded episodes and the time that they took.
 
     Attributes:
         dataset: The episodes.
-        robot_time: How long the robot moved [s].
-        wall_time: How long that took [s].
+        robot_time: Time that the robot moved [s].
+        wall_time: Time that this took [s].
     """
 
     dataset: Dataset
@@ -65,92 +65,92 @@ class Collected:
 
     @property
     def speed(self) -> float:
-        """How many times faster than real time."""
+        """Ratio to real time."""
         return self.robot_time / max(self.wall_time, 1e-9)
 
 
 def _quiet(share: float, text: str) -> None:
-    """Tell nobody."""
+    """Report no progress."""
 
 
 def collect_direct(
     robot: RobotConfig,
     variant: str | None = None,
     seed: int = 0,
-    wanted: Wanted = EVERYTHING,
+    request: Request = EVERYTHING,
     progress: Progress = _quiet,
-) -> Collected:
+) -> Collection:
     """Record from the robot file's simulator without a bus, under one condition after the other.
 
     Args:
         robot: The robot file.
-        variant: Of the simulator; the designer's if None.
+        variant: Variant of the simulator; the designer's if None.
         seed: Chooses the robot among those of the variant, its noise, and the motion.
-        wanted: What to record.
-        progress: Told the share done, 0 to 1, and a line of text.
+        request: Conditions, number of samples and postures to record.
+        progress: Called with the share done, 0 to 1, and a line of text.
 
     Raises:
-        ConfigError: The robot file names no simulator, or cannot be moved; an unknown variant or condition.
-        BadPostures, NowhereToGo, CollectionStopped: Nothing, or not enough, was recorded.
+        ConfigError: The robot file names no simulator or no motion; an unknown variant or condition.
+        BadPostures, NowhereToGo, CollectionStopped: Too few samples were recorded.
     """
     config, simulator = collect_config(robot), simulator_of(robot)
     variant = variant_of(robot, variant)
-    # Each once: the same motion again would be in the data twice, and held out from itself.
-    chosen = dict.fromkeys(wanted.conditions or robot.conditions or (None,))
-    conditions = [condition_of(robot, one) for one in chosen]
-    motions = [_motion(robot, config, condition, seed, wanted) for condition in conditions]
-    found: list[Collected] = []
+    # Each once: a repeated motion would be held out to measure what was learned from its twin.
+    names = dict.fromkeys(request.conditions or robot.conditions or (None,))
+    conditions = [condition_of(robot, name) for name in names]
+    motions = [_motion(robot, config, condition, seed, request) for condition in conditions]
+    parts: list[Collection] = []
     for index, condition in enumerate(conditions):
 
-        def tell(share: float, text: str, index: int = index, condition: str | None = condition) -> None:
+        def report(share: float, text: str, index: int = index, condition: str | None = condition) -> None:
             progress((index + share) / len(conditions), text if condition is None else f"{condition}: {text}")
 
         with simulator.direct(robot, variant, seed, condition) as body:
             place = DirectPlayground(body, config.rate)
-            found.append(_gather(robot, place, motions[index], config, wanted, condition or variant, tell))
-    whole = _joined(found)
-    if config.states is None or variant != simulator.variants[0] or wanted.postures is not None:
+            parts.append(_gather(robot, place, motions[index], config, request, condition or variant, report))
+    whole = _joined(parts)
+    if config.states is None or variant != simulator.variants[0] or request.postures is not None:
         return whole
     return _with_states(robot, config, whole, seed)
 
 
 def collect_bus(
-    robot: RobotConfig, seed: int = 0, wanted: Wanted = EVERYTHING, progress: Progress = _quiet
-) -> Collected:
-    """Record from the robot that a HAL runs, as a client of it, and let it go at the end.
+    robot: RobotConfig, seed: int = 0, request: Request = EVERYTHING, progress: Progress = _quiet
+) -> Collection:
+    """Record as a client of a running HAL, and disable the robot at the end.
 
     Args:
         robot: The robot file.
-        seed: Of the motion.
-        wanted: What to record; of conditions at most one, any name, for what the body holds while it is recorded.
-        progress: Told the share done, 0 to 1, and a line of text.
+        seed: Seed of the motion.
+        request: As for `collect_direct`, with at most one condition, of any name: the body's during the recording.
+        progress: Called with the share done, 0 to 1, and a line of text.
 
     Raises:
-        ConfigError: The robot file does not say how to move.
+        ConfigError: The robot file has no motion.
         ServiceUnavailable: No HAL answers.
-        CommandHeld, LeaseLost: Somebody else commands the robot.
-        BadPostures, NowhereToGo, CollectionStopped: Nothing, or not enough, was recorded.
+        CommandHeld, LeaseLost: Another client commands the robot.
+        BadPostures, NowhereToGo, CollectionStopped: Too few samples were recorded.
     """
-    if len(wanted.conditions) > 1:
+    if len(request.conditions) > 1:
         raise CollectionStopped(
-            f"A running robot is under one condition at a time, not {', '.join(wanted.conditions)}: collect each by "
+            f"A running robot is under one condition at a time, not {', '.join(request.conditions)}: collect each by "
             "itself, and change the tool in between."
         )
     config = collect_config(robot)
-    told = wanted.conditions[0] if wanted.conditions else None
-    condition = condition_of(robot, told if told in robot.conditions else None)
-    motion = _motion(robot, config, condition, seed, wanted)
+    given = request.conditions[0] if request.conditions else None
+    condition = condition_of(robot, given if given in robot.conditions else None)
+    motion = _motion(robot, config, condition, seed, request)
     with Client(robot.robot) as client, client.lease():
         try:
             place = BusPlayground(robot, client, config.rate)
-            return _gather(robot, place, motion, config, wanted, told or condition or BUS, progress)
+            return _gather(robot, place, motion, config, request, given or condition or BUS, progress)
         finally:
             client.disable()
 
 
-def _motion(robot: RobotConfig, config: CollectConfig, condition: str | None, seed: int, wanted: Wanted) -> Motion:
-    if wanted.postures is not None:
-        return taught(robot, config, load_postures(wanted.postures, robot, config.hold))
+def _motion(robot: RobotConfig, config: CollectConfig, condition: str | None, seed: int, request: Request) -> Motion:
+    if request.postures is not None:
+        return taught(robot, config, load_postures(request.postures, robot, config.hold))
     if config.motion is not None:
         own = registry.load(config.motion)
         return lambda start: own(robot, seed)
@@ -162,38 +162,38 @@ def _gather(
     body: Playground,
     motion: Motion,
     config: CollectConfig,
-    wanted: Wanted,
+    request: Request,
     condition: str,
     progress: Progress,
-) -> Collected:
+) -> Collection:
     """Play the motion until enough samples are recorded, or to its end."""
     table = _Table(robot, config, condition)
     started = time.monotonic()
-    most = wanted.samples
-    if most is None and wanted.postures is None:
-        most = config.samples
-    told = 0.0
+    limit = request.samples
+    if limit is None and request.postures is None:
+        limit = config.samples
+    reported = 0.0
     for command, duration in motion(body.start):
         for values in body.play(command, duration):
             table.add(values, body.elapsed())
-        if time.monotonic() - told > 0.1:
-            told = time.monotonic()
-            speed = body.elapsed() / max(told - started, 1e-9)
-            progress(len(table.rows) / most if most else 0.5, f"{len(table.rows)} samples, {speed:.0f} x real time")
-        if most is not None and len(table.rows) >= most:
+        if time.monotonic() - reported > 0.1:
+            reported = time.monotonic()
+            speed = body.elapsed() / max(reported - started, 1e-9)
+            progress(len(table.rows) / limit if limit else 0.5, f"{len(table.rows)} samples, {speed:.0f} x real time")
+        if limit is not None and len(table.rows) >= limit:
             break
-    return Collected(table.dataset(most), body.elapsed(), time.monotonic() - started)
+    return Collection(table.dataset(limit), body.elapsed(), time.monotonic() - started)
 
 
-class Within:
-    """Which values count.
+class SampleLimits:
+    """Limits of usable values.
 
-    A value that a device measures must be there and within the robot file's limits: beyond them, on a mechanical stop
-    or with slack muscles, the signals do not say where the body is. What a camera sees may be missing.
+    A value of a device must be measured and within the robot file's limits: beyond them, on a mechanical stop or with
+    slack muscles, the signals do not determine the posture. Values of a camera may be missing.
 
     Attributes:
-        low: Least value that counts of every element [its unit], shape (layout.size,).
-        high: Greatest value that counts, likewise.
+        low: Least usable value of every element [its unit], shape (layout.size,).
+        high: Greatest usable value of every element [its unit], shape (layout.size,).
     """
 
     def __init__(self, robot: RobotConfig, layout: Layout) -> None:
@@ -204,67 +204,68 @@ class Within:
         sizes = [signal.size for signal in layout.signals]
         self._may_miss = np.repeat([name in robot.seen for name in layout.names], sizes)
 
-    def counts(self, row: np.ndarray) -> np.ndarray:
-        """Whether each value of a sample [unit], shape (layout.size,), counts."""
+    def usable(self, row: np.ndarray) -> np.ndarray:
+        """Return which values of a sample [unit] are usable, booleans, shape (layout.size,)."""
         return ((row >= self.low) & (row <= self.high)) | (self._may_miss & np.isnan(row))
 
 
 class _Table:
-    """The rows that count."""
+    """Table of usable samples."""
 
     def __init__(self, robot: RobotConfig, config: CollectConfig, condition: str) -> None:
         self._config, self._condition = config, condition
         self._layout: Layout = layout_of(robot)
-        self._within = Within(robot, self._layout)
+        self._limits = SampleLimits(robot, self._layout)
         self._fed = config.settle
         self.rows: list[np.ndarray] = []
 
     def add(self, values: Values, elapsed: float) -> None:
-        """Take a sample at the robot's time [s] if it counts.
+        """Add a sample of the robot's time [s] if it is usable.
 
         Raises:
-            CollectionStopped: None has counted for long.
+            CollectionStopped: No sample was usable for `STARVED`.
         """
         if elapsed < self._config.settle:
             return
         row = self._layout.join({name: values[name] for name in self._layout.names if name in values})
-        counts = self._within.counts(row)
-        if counts.all():
+        usable = self._limits.usable(row)
+        if usable.all():
             self.rows.append(row)
             self._fed = elapsed
         elif elapsed - self._fed > STARVED:
-            index, within = int(np.argmin(counts)), self._within
+            index, limits = int(np.argmin(usable)), self._limits
             raise CollectionStopped(
-                f"No sample counted for {STARVED:g} s: {self._layout.element(index)} is {row[index]:.4g}, and must be "
-                f"measured, from {within.low[index]:.4g} to {within.high[index]:.4g}. {len(self.rows)} were recorded."
+                f"No sample was usable for {STARVED:g} s: {self._layout.element(index)} is {row[index]:.4g}, and must "
+                f"be measured, from {limits.low[index]:.4g} to {limits.high[index]:.4g}. "
+                f"{len(self.rows)} were recorded."
             )
 
-    def dataset(self, most: int | None) -> Dataset:
-        """At most so many rows, in episodes.
+    def dataset(self, limit: int | None) -> Dataset:
+        """Return at most `limit` rows, in episodes.
 
         Raises:
-            CollectionStopped: There is none.
+            CollectionStopped: The table is empty.
         """
         if not self.rows:
             raise CollectionStopped("The motion ended before a sample was recorded. Is it too short for collect.rate?")
-        table = np.array(self.rows[:most])
+        table = np.array(self.rows[:limit])
         per_episode = max(2, round(EPISODE * self._config.rate))
         parts = np.split(table, range(per_episode, len(table), per_episode))
         return Dataset(self._layout, tuple(Episode(self._condition, self._layout.split(part)) for part in parts))
 
 
-def _joined(parts: Sequence[Collected]) -> Collected:
+def _joined(parts: Sequence[Collection]) -> Collection:
     episodes = tuple(episode for part in parts for episode in part.dataset.episodes)
     dataset = Dataset(parts[0].dataset.layout, episodes)
-    return Collected(dataset, sum(part.robot_time for part in parts), sum(part.wall_time for part in parts))
+    return Collection(dataset, sum(part.robot_time for part in parts), sum(part.wall_time for part in parts))
 
 
-def _with_states(robot: RobotConfig, config: CollectConfig, found: Collected, seed: int) -> Collected:
-    """What was recorded, and random states of the designer's geometry in episodes of the same length and condition."""
-    count = max(1, round(config.states_share * len(found.dataset)))
+def _with_states(robot: RobotConfig, config: CollectConfig, recorded: Collection, seed: int) -> Collection:
+    """Return a recording with random states of the designer's geometry added, in episodes of the same length."""
+    count = max(1, round(config.states_share * len(recorded.dataset)))
     states = registry.load(config.states or "")(robot, count, seed)
-    condition = found.dataset.conditions[0]
+    condition = recorded.dataset.conditions[0]
     parts = np.split(np.arange(count), range(round(EPISODE * config.rate), count, round(EPISODE * config.rate)))
     added = tuple(Episode(condition, {name: rows[part] for name, rows in states.items()}) for part in parts)
-    dataset = Dataset(found.dataset.layout, found.dataset.episodes + added)
-    return replace(found, dataset=dataset)
+    dataset = Dataset(recorded.dataset.layout, recorded.dataset.episodes + added)
+    return replace(recorded, dataset=dataset)

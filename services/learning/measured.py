@@ -1,7 +1,7 @@
-"""Measured data from text files, described by a small YAML file: what every column is, in which unit, and how to train.
+"""Measured data from text files, described by a YAML file: signal and unit of every column, and settings of training.
 
 A description names files, the columns of every signal, and the same `network`, `structure` and `training` sections as a
-robot file (docs/tutorial.md). What is wrong with a description or with the data is one sentence.
+robot file (docs/tutorial.md). A fault of the description or of the data is reported in one sentence.
 """
 
 import csv
@@ -37,21 +37,21 @@ CONVERSIONS = {
     "kgf": ("N", 9.80665),
     "N mm": ("N m", 1e-3),
 }
-"""Unit in a file -> SI unit, and what to multiply by."""
+"""Unit in a file -> SI unit, and the factor to multiply by."""
 
 MISSING = {"", "nan", "na", "none", "null"}
-"""Cells in which nothing was measured, in small letters."""
+"""A cell with one of these texts, in small letters, was not measured."""
 
 RANGE = re.compile(r"\{(\d+)\.\.(\d+)\}")
 
 
 class ColumnsConfig(Section):
-    """Where a signal, or the time, stands in the files."""
+    """Place of a signal, or of the time, in the files."""
 
     columns: tuple[str | int, ...] = Field(min_length=1)
-    """Names in the header, or numbers from 0 where there is none; `board{0..15}` stands for sixteen of them."""
+    """Names in the header, or numbers from 0 without a header; `board{0..15}` stands for sixteen names."""
     file: str | None = None
-    """Which file of an episode's folder; the episode itself if it is a file."""
+    """File in an episode's folder; None if the episode is a file."""
 
     @model_validator(mode="before")
     @classmethod
@@ -61,7 +61,7 @@ class ColumnsConfig(Section):
         return value
 
     def expanded(self) -> tuple[str, ...]:
-        """The columns with every range written out."""
+        """Return the columns with every range written out."""
         return tuple(name for column in self.columns for name in _expanded(str(column)))
 
 
@@ -70,7 +70,7 @@ class MeasuredSignalConfig(ColumnsConfig):
 
     unit: str
     written_in: str | None = None
-    """Unit of the numbers in the file, if it is not `unit`."""
+    """Unit of the numbers in the file, if different from `unit`."""
 
     @model_validator(mode="after")
     def _units_fit(self) -> "MeasuredSignalConfig":
@@ -80,50 +80,50 @@ class MeasuredSignalConfig(ColumnsConfig):
                 f"written_in: {self.unit}"
             )
         if self.written_in not in (None, self.unit) and CONVERSIONS.get(self.written_in or "", ("", 0))[0] != self.unit:
-            known = ", ".join(f"{there} to {here}" for there, (here, _) in CONVERSIONS.items())
+            known = ", ".join(f"{unit} to {si}" for unit, (si, _) in CONVERSIONS.items())
             raise ValueError(f"'{self.written_in}' cannot be converted to '{self.unit}'. Known: {known}")
         return self
 
     @property
     def scale(self) -> float:
-        """What turns a number of the file into `unit`."""
+        """Factor from a number of the file to `unit`."""
         return 1.0 if self.written_in in (None, self.unit) else CONVERSIONS[str(self.written_in)][1]
 
 
 class TimeConfig(ColumnsConfig):
-    """The stamp of every row [s], and where it tells that an episode ended."""
+    """Stamp of every row [s], and the pause that ends an episode."""
 
     gap: Positive
     """A pause longer than this [s], or a step back, begins another episode."""
 
 
 class MeasuredConfig(Section):
-    """The whole description."""
+    """Description of measured data."""
 
     recording: str
     description: str = ""
     episodes: tuple[str, ...] = Field(min_length=1)
-    """Patterns of files or folders; each that matches is at least one episode."""
+    """Patterns of files or folders; each match is at least one episode."""
     separator: str = Field(",", min_length=1, max_length=1)
     header: bool = True
     """Whether the first line names the columns."""
     cut_to_shortest: bool = False
-    """Whether the files of a folder may end at different rows; those that all of them have count."""
+    """Whether the files of a folder may end at different rows; only rows that all files have are used."""
     signals: dict[str, MeasuredSignalConfig] = Field(min_length=1)
     time: TimeConfig | None = None
-    """Absent: a file is one episode."""
+    """Time column; without it a file is one episode."""
     conditions: dict[str, str] = Field(default_factory=dict)
-    """Pattern of an episode's name -> condition of the body; absent: all are under one."""
+    """Pattern of an episode's name -> condition of the body; if empty, all episodes have one condition."""
     together: tuple[tuple[str, ...], ...] = ()
-    """Groups of patterns of episodes' names. Repetitions of one motion belong together: they become one episode, so
-    that none is held out to measure what was learned from its twin."""
+    """Groups of patterns of episodes' names. Repetitions of one motion become one episode, so that no repetition is
+    held out to measure what was learned from another."""
     network: NetworkConfig = NetworkConfig()
     structure: StructureConfig = StructureConfig()
     training: TrainingConfig = TrainingConfig()
 
     @property
     def layout(self) -> Layout:
-        """The signals and their elements."""
+        """Signals and their elements."""
         signals = [
             Signal(name, len(part.expanded()), part.unit, part.expanded()) for name, part in self.signals.items()
         ]
@@ -131,7 +131,7 @@ class MeasuredConfig(Section):
 
     @property
     def model(self) -> ModelConfig:
-        """The sections on the model, as those of a robot file."""
+        """Sections on the model, as in a robot file."""
         return ModelConfig(network=self.network, structure=self.structure, training=self.training)
 
 
@@ -139,7 +139,7 @@ def load_measured(path: Path) -> MeasuredConfig:
     """Read and check a description.
 
     Raises:
-        ConfigError: There is no such file, it is not YAML, or it is not such a description.
+        ConfigError: The file is missing, is not YAML, or is not a description of data.
     """
     try:
         content = yaml.safe_load(path.read_text())
@@ -148,7 +148,7 @@ def load_measured(path: Path) -> MeasuredConfig:
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ConfigError(f"'{path}' is not YAML: {str(error).splitlines()[0]}.") from None
     if not isinstance(content, dict):
-        raise ConfigError(f"'{path}' holds no description: it needs recording, episodes and signals.")
+        raise ConfigError(f"'{path}' is not a description of data: it needs recording, episodes and signals.")
     if isinstance(content.get("episodes"), str):
         content["episodes"] = (content["episodes"],)
     try:
@@ -158,7 +158,7 @@ def load_measured(path: Path) -> MeasuredConfig:
 
 
 def is_description(path: Path) -> bool:
-    """Whether a YAML file describes measured data, and not a robot."""
+    """Whether a YAML file describes measured data rather than a robot."""
     try:
         content = yaml.safe_load(path.read_text())
     except (OSError, UnicodeDecodeError, yaml.YAMLError):
@@ -167,42 +167,42 @@ def is_description(path: Path) -> bool:
 
 
 def read(config: MeasuredConfig, folder: Path) -> Dataset:
-    """All episodes that a description names.
+    """Read all episodes that a description names.
 
     Args:
         config: The description.
-        folder: Where its patterns begin.
+        folder: Folder in which its patterns are searched.
 
     Raises:
-        DatasetError: Nothing matches, or a file does not hold what the description says.
+        DatasetError: No file matches, or a file differs from the description.
     """
     places: dict[Path, None] = {}
     for pattern in config.episodes:
-        found = sorted(folder.glob(pattern), key=_natural)
-        if not found:
+        matches = sorted(folder.glob(pattern), key=_natural)
+        if not matches:
             raise DatasetError(f"Nothing in '{folder}' matches '{pattern}'. Is that the folder of the recording?")
-        places.update(dict.fromkeys(found))
+        places.update(dict.fromkeys(matches))
     episodes = [(place.name, episode) for place in places for episode in _episodes(config, place)]
     return Dataset(config.layout, _together(config, episodes))
 
 
 def _together(config: MeasuredConfig, episodes: list[tuple[str, Episode]]) -> tuple[Episode, ...]:
-    """The episodes with every group made one."""
+    """Return the episodes with every group joined into one."""
     merged: list[Episode] = []
     left = dict(enumerate(episodes))
     for group in config.together:
         chosen = [i for i, (name, _) in left.items() if any(fnmatch(name, pattern) for pattern in group)]
         parts = [left.pop(index)[1] for index in chosen]
         if len({part.condition for part in parts}) != 1:
-            fact = "of several conditions" if parts else "none"
-            raise DatasetError(f"together: the episodes that match {', '.join(group)} are {fact}; they must be of one.")
+            fault = "are of several conditions; they must be of one" if parts else "do not exist"
+            raise DatasetError(f"together: the episodes that match {', '.join(group)} {fault}.")
         values = {name: np.concatenate([part.values[name] for part in parts]) for name in config.signals}
         merged.append(Episode(parts[0].condition, values))
     return (*merged, *(episode for _, episode in left.values()))
 
 
 def _episodes(config: MeasuredConfig, place: Path) -> Iterator[Episode]:
-    """What one file or folder holds."""
+    """Yield the episodes of one file or folder."""
     tables: dict[str | None, _Table] = {}
 
     def columns(part: ColumnsConfig) -> np.ndarray:
@@ -216,10 +216,10 @@ def _episodes(config: MeasuredConfig, place: Path) -> Iterator[Episode]:
     if stamps is not None:
         lengths.add(len(stamps))
     if len(lengths) > 1 and not config.cut_to_shortest:
-        told = ", ".join(f"{file or place.name} {len(table.cells)}" for file, table in tables.items())
+        rows_of = ", ".join(f"{file or place.name} {len(table.cells)}" for file, table in tables.items())
         raise DatasetError(
-            f"The files of '{place}' have different numbers of rows: {told}. If the shortest counts, write "
-            "cut_to_shortest: true."
+            f"The files of '{place}' have different numbers of rows: {rows_of}. To use only rows that "
+            "all files have, write cut_to_shortest: true."
         )
     cuts: np.ndarray = np.zeros(0, int)
     if stamps is not None and config.time is not None:
@@ -241,7 +241,7 @@ def _condition(config: MeasuredConfig, name: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class _Table:
-    """One file: where its columns are, and its cells as text."""
+    """File with the places of its columns and its cells as text."""
 
     path: Path
     places: Mapping[str, int]
@@ -270,18 +270,18 @@ class _Table:
         return cls(path, {name: index for index, name in enumerate(names)}, lines[first:], first + 1)
 
     def columns(self, names: tuple[str, ...]) -> np.ndarray:
-        """Numbers, shape (rows, len(names)); NaN where a cell is empty."""
+        """Return numbers, shape (rows, len(names)); NaN where a cell is empty."""
         for name in names:
             if name not in self.places:
                 known = list(self.places)
                 shown = ", ".join(known[:12]) + (f" and {len(known) - 12} more" if len(known) > 12 else "")
                 raise DatasetError(f"'{self.path}' has no column '{name}'. Columns: {shown}.")
-        found = np.empty((len(self.cells), len(names)))
+        numbers = np.empty((len(self.cells), len(names)))
         for column, name in enumerate(names):
             place = self.places[name]
             for row, line in enumerate(self.cells):
-                found[row, column] = self._number(line[place], name, row)
-        return found
+                numbers[row, column] = self._number(line[place], name, row)
+        return numbers
 
     def _number(self, cell: str, name: str, row: int) -> float:
         try:
@@ -290,20 +290,20 @@ class _Table:
             if cell.strip().lower() in MISSING:
                 return math.nan
         raise DatasetError(
-            f"'{self.path}' line {row + self.first_line}, column '{name}': '{cell[:30]}' is no number. An empty cell "
-            "means that nothing was measured."
+            f"'{self.path}' line {row + self.first_line}, column '{name}': '{cell[:30]}' is not a number. An empty "
+            "cell means that no value was measured."
         )
 
 
 def _expanded(column: str) -> Iterator[str]:
-    found = RANGE.search(column)
-    if found is None:
+    match = RANGE.search(column)
+    if match is None:
         yield column
         return
-    for number in range(int(found[1]), int(found[2]) + 1):
-        yield from _expanded(column[: found.start()] + str(number) + column[found.end() :])
+    for number in range(int(match[1]), int(match[2]) + 1):
+        yield from _expanded(column[: match.start()] + str(number) + column[match.end() :])
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:
-    """`measurement_2` before `measurement_10`."""
+    """Return a sort key that puts `measurement_2` before `measurement_10`."""
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name)]

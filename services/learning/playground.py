@@ -1,4 +1,4 @@
-"""A robot that can be moved and looked at: without a bus as fast as it computes, or a running one in its own time."""
+"""Robots to record from: simulated without a bus, as fast as it computes, or running, in real time."""
 
 import time
 from collections.abc import Iterator, Mapping
@@ -16,38 +16,38 @@ from services.wire import keys
 from services.wire.messages import Sample
 
 ENABLE_WITHIN = 5.0
-"""Time [s] within which the drives must be enabled."""
+"""The drives must be enabled within this time [s]."""
 
 Values = Mapping[str, np.ndarray]
 
 
 class CollectionStopped(ServiceError):
-    """The robot stopped before enough was recorded; the text says why."""
+    """The robot stopped before enough was recorded; the text gives the reason."""
 
 
 class Playground(Protocol):
-    """A robot that can be moved and looked at."""
+    """Robot that can be moved and recorded."""
 
     start: np.ndarray
-    """Where the robot was when it was enabled [unit of the commanded signal], shape (k,)."""
+    """Position of the robot when it was enabled [unit of the commanded signal], shape (k,)."""
 
     def play(self, command: np.ndarray, duration: float) -> Iterator[Values]:
-        """Hold a command [unit of the commanded signal], shape (k,), for so long [s]; yield what is to be recorded."""
+        """Hold a command [unit of the commanded signal], shape (k,), for `duration` [s]; yield samples to record."""
         ...
 
     def elapsed(self) -> float:
-        """The robot's own time [s]."""
+        """Return the robot's own time [s]."""
         ...
 
 
 class DirectPlayground:
-    """A simulated robot without a bus; its time is the simulation's."""
+    """Simulated robot without a bus; its time is the simulation's."""
 
     def __init__(self, robot: Robot, rate: float) -> None:
-        """Enable the robot; `rate` [Hz] is how often a sample is recorded.
+        """Enable the robot; samples are recorded at `rate` [Hz].
 
         Raises:
-            CollectionStopped: The drives do not come.
+            CollectionStopped: The drives were not enabled in time.
         """
         self._robot = robot
         self._every = max(1, round(1.0 / (rate * robot.period)))
@@ -63,7 +63,7 @@ class DirectPlayground:
         raise CollectionStopped(f"The drives did not become enabled within {ENABLE_WITHIN:g} s: mode '{robot.mode}'.")
 
     def play(self, command: np.ndarray, duration: float) -> Iterator[Values]:
-        """See `Playground.play`."""
+        """Hold a command for `duration` [s] and yield samples, as `Playground.play`."""
         robot = self._robot
         for _ in range(max(1, round(duration / robot.period))):
             robot.command(command, self._cycle)
@@ -74,7 +74,7 @@ class DirectPlayground:
                 yield sample
 
     def elapsed(self) -> float:
-        """See `Playground.elapsed`."""
+        """Return the robot's own time [s]."""
         return self._robot.clock.monotonic() - self._began
 
     def _turn(self) -> Values:
@@ -86,15 +86,15 @@ class DirectPlayground:
 
 
 class BusPlayground:
-    """A running robot, and its camera if it has one; its time is the wall's."""
+    """Running robot, with its camera if it has one, in real time."""
 
     def __init__(self, robot: RobotConfig, client: Client, rate: float) -> None:
-        """Enable the robot; `rate` [Hz] is how often a sample is recorded.
+        """Enable the robot; samples are recorded at `rate` [Hz].
 
         Raises:
             ServiceUnavailable: No HAL answers.
-            CommandRefused: It does not enable.
-            CollectionStopped: The drives do not come.
+            CommandRefused: The HAL refuses to enable.
+            CollectionStopped: The drives were not enabled in time.
         """
         self._robot, self._client = robot, client
         self._interval = 1.0 / rate
@@ -111,19 +111,21 @@ class BusPlayground:
         self.start = self._next_sample().values[robot.command.signal]
 
     def play(self, command: np.ndarray, duration: float) -> Iterator[Values]:
-        """See `Playground.play`."""
+        """Hold a command for `duration` [s] and yield samples, as `Playground.play`."""
         end = time.monotonic() + duration
         while (now := time.monotonic()) < end:
             sample = self._next_sample()
             if (mode := self._mode()) not in ("hold", "follow"):
-                raise CollectionStopped(f"The robot went to '{mode}'. `gemuco top {self._robot.robot}` may tell why.")
+                raise CollectionStopped(
+                    f"The robot went to '{mode}'. `gemuco top {self._robot.robot}` may show the reason."
+                )
             self._client.command(self._robot.command.signal, command, sample)
             if now - self._recorded >= self._interval:
                 self._recorded = now
                 yield self._freshness.take()[1]
 
     def elapsed(self) -> float:
-        """See `Playground.elapsed`."""
+        """Return the robot's own time [s]."""
         return time.monotonic() - self._began
 
     def _next_sample(self) -> Sample:

@@ -1,4 +1,4 @@
-"""Taught postures: a CSV file of commands, one per line, each moved to smoothly and held."""
+"""Taught postures: a CSV file of commands, one per line; the robot moves to each smoothly and holds it."""
 
 import csv
 from collections.abc import Iterator
@@ -9,34 +9,34 @@ import numpy as np
 
 from hal.config import RobotConfig
 from services.errors import ServiceError
-from services.learning.motion import Motion, Move, speed_of, step_of, way
+from services.learning.motion import Motion, Move, minimum_jerk, speed_of, step_of
 from services.model.model_config import CollectConfig
 
 HOLD = "hold"
 
 
 class BadPostures(ServiceError):
-    """A file of taught postures that cannot be played; nothing moved because of it."""
+    """A file of taught postures cannot be played; nothing moved."""
 
 
 @dataclass(frozen=True, slots=True)
 class Posture:
-    """A command [unit of the commanded signal], shape (k,), and how long to stay there [s]."""
+    """Command [unit of the commanded signal], shape (k,), and the time to hold it [s]."""
 
     command: np.ndarray
     hold: float
 
 
 def load_postures(path: Path, robot: RobotConfig, hold: float) -> list[Posture]:
-    """Read a CSV file: a header of elements of the commanded signal, and `hold` [s] if wanted; then a line per posture.
+    """Read a CSV file: a header of elements of the commanded signal and optionally `hold` [s], then a line per posture.
 
     Args:
         path: The file.
-        robot: Whose limits every posture must keep.
-        hold: How long to stay [s] where the file does not say.
+        robot: Robot whose limits every posture must keep.
+        hold: Time to hold a posture [s] if the file has none.
 
     Raises:
-        BadPostures: Not such a file, or a posture outside of the limits; the text names the line.
+        BadPostures: The file has another form, or a posture is outside of the limits; the text names the line.
     """
     try:
         with path.open(newline="") as file:
@@ -51,7 +51,7 @@ def load_postures(path: Path, robot: RobotConfig, hold: float) -> list[Posture]:
             f"it names {', '.join(header) or 'nothing'}."
         )
     if len(lines) < 2:
-        raise BadPostures(f"There is no posture in '{path}': only its header.")
+        raise BadPostures(f"'{path}' holds no posture, only a header.")
     return [_posture(f"'{path}', line {number}", header, cells, robot, hold) for number, cells in lines[1:]]
 
 
@@ -80,12 +80,12 @@ def _posture(where: str, header: list[str], cells: list[str], robot: RobotConfig
 
 
 def taught(robot: RobotConfig, config: CollectConfig, postures: list[Posture]) -> Motion:
-    """Every posture once, in the order of the file."""
+    """Return a motion through every posture once, in the order of the file."""
     speed, step = speed_of(robot, config), step_of(robot)
 
     def moves(start: np.ndarray) -> Iterator[Move]:
         for posture in postures:
-            yield from ((point, step) for point in way(start, posture.command, speed, step))
+            yield from ((point, step) for point in minimum_jerk(start, posture.command, speed, step))
             if posture.hold:
                 yield posture.command, posture.hold
             start = posture.command

@@ -1,4 +1,4 @@
-"""The tables of structure determination as one picture."""
+"""Picture of the tables of structure determination."""
 
 from pathlib import Path
 
@@ -38,7 +38,7 @@ def _outputs(axis: Axes, structure: Structure, title: str) -> None:
 
 
 def _masks(axis: Axes, structure: Structure, masks: list[frozenset[str]]) -> None:
-    """One row per mask: a square per signal it contains, and its error."""
+    """Draw one row per mask: a square per signal it contains, and its error."""
     names, feasible = structure.layout.names, set(structure.feasible)
     rows = ["".join("■" if n in m else "□" for n in names) for m in masks]
     errors = [structure.L_m[m] for m in masks]

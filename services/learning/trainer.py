@@ -1,4 +1,4 @@
-"""From recorded data to a model that can serve: structure, training, and what the errors mean in physical units."""
+"""Training of a model for the service from recorded data: structure, training, and errors in physical units."""
 
 import shutil
 import time
@@ -29,19 +29,19 @@ if TYPE_CHECKING:
 Progress = Callable[[float, str], None]
 
 GENTLER = 1.0 / 3.0
-"""Peak learning rate of fine-tuning, as a share of the robot file's."""
+"""The peak learning rate of fine-tuning is this share of the robot file's."""
 
 
 @dataclass(frozen=True, slots=True)
-class Trained:
-    """A model and how it came about.
+class TrainingResult:
+    """A model and facts of its training.
 
     Attributes:
         schema: The body schema, with the robot file's fingerprint in its manifest.
-        structure: What was found out about the signals; None where an older model's was kept.
-        history: How the training went.
-        samples: How many samples it was made from.
-        seconds: How long structure and training took.
+        structure: The determined structure; None if an older model's was kept.
+        history: History of the training.
+        samples: Number of samples.
+        seconds: Time of structure determination and training [s].
     """
 
     schema: BodySchema
@@ -58,12 +58,12 @@ def train(
     progress: Progress,
     drafts: Path | None = None,
     base: BodySchema | None = None,
-) -> Trained:
-    """The model of a robot; see `learn`, or `tune` where there is a model to begin from.
+) -> TrainingResult:
+    """Train the model of a robot by `learn`, or by `tune` from a model `base`.
 
     Raises:
         DatasetError: The data are of another robot, or in other units.
-        NotEnoughData: Too few samples, or nothing can be inferred.
+        NotEnoughData: The samples are too few, or no signal can be inferred.
     """
     try:
         own = dataset.of(layout_of(robot))
@@ -79,19 +79,19 @@ def train(
 
 def learn(
     config: ModelConfig, dataset: Dataset, seed: int, progress: Progress, drafts: Path | None = None, **facts: str
-) -> Trained:
+) -> TrainingResult:
     """Determine the structure and train.
 
     Args:
-        config: How.
+        config: Settings of structure and training.
         dataset: Episodes of one body.
-        seed: Of all that is random.
-        progress: Told the share done, 0 to 1, and a line of text.
-        drafts: A folder to keep trainings in, so that what was interrupted goes on; nothing is kept without one.
-        facts: For the model's manifest.
+        seed: Seed of everything random.
+        progress: Called with the share done, 0 to 1, and a line of text.
+        drafts: A folder that keeps unfinished trainings, so that an interrupted one can go on; optional.
+        facts: Facts for the model's manifest.
 
     Raises:
-        NotEnoughData: Too few samples, or nothing can be inferred.
+        NotEnoughData: The samples are too few, or no signal can be inferred.
     """
     from gemuco.learning.train import fit
     from gemuco.structure.determination import Thresholds, determine
@@ -120,7 +120,7 @@ def learn(
         L_i=structure.L_i,
         L_m={label(mask, names): structure.L_m[mask] for mask in structure.listed},
     )
-    return Trained(schema, structure, history, len(dataset), time.monotonic() - started)
+    return TrainingResult(schema, structure, history, len(dataset), time.monotonic() - started)
 
 
 def tune(
@@ -131,21 +131,21 @@ def tune(
     progress: Progress,
     drafts: Path | None = None,
     **facts: str,
-) -> Trained:
+) -> TrainingResult:
     """Train a model further on few samples of the real body; network and masks stay those of the model.
 
     Args:
         base: The model to begin from, such as one trained in simulation.
-        config: How; the learning rate is a third of it.
+        config: Settings of training; the learning rate is a third of theirs.
         dataset: Episodes of the body as it is.
-        seed: Of all that is random.
-        progress: Told the share done, 0 to 1, and a line of text.
+        seed: Seed of everything random.
+        progress: Called with the share done, 0 to 1, and a line of text.
         drafts: As for `learn`.
-        facts: For the model's manifest.
+        facts: Facts for the model's manifest.
 
     Raises:
         DatasetError: The data lack a signal of the model, or are in other units.
-        NotEnoughData: Too few samples.
+        NotEnoughData: The samples are too few.
     """
     from gemuco.learning.train import fine_tune
 
@@ -155,19 +155,19 @@ def tune(
     resume = None if drafts is None else drafts / "training.safetensors"
     schema, history = fine_tune(base, dataset, gentle, progress, resume=resume)
     schema = schema.with_manifest(**facts, samples=len(dataset), held_out_loss=history.best)
-    return Trained(schema, None, history, len(dataset), time.monotonic() - started)
+    return TrainingResult(schema, None, history, len(dataset), time.monotonic() - started)
 
 
 def fits(robot: RobotConfig, folder: Path) -> bool:
-    """Whether a sound model lies there that was made for this robot file."""
+    """Whether the folder holds a sound model that was made for this robot file."""
     try:
         return checkpoint.load(folder).manifest.get("fingerprint") == fingerprint(robot)
     except CheckpointError:
         return False
 
 
-def save(trained: Trained, folder: Path) -> None:
-    """Write the model, the pictures of its structure and training beside it; its drafts are of no more use."""
+def save(trained: TrainingResult, folder: Path) -> None:
+    """Write the model with pictures of its structure and training, and remove its drafts."""
     from services.learning import structure_plot, training_plot
 
     checkpoint.save(trained.schema, folder)
@@ -179,17 +179,17 @@ def save(trained: Trained, folder: Path) -> None:
 
 
 def drafts_of(folder: Path) -> Path:
-    """Where unfinished trainings of the model in a folder are kept.
+    """Return the folder of unfinished trainings of the model in a folder.
 
     Raises:
-        NotWritten: The folder is a file: better told before training than after.
+        NotWritten: The folder is a file; this is reported before the training rather than after.
     """
     if folder.exists() and not folder.is_dir():
         raise NotWritten(f"'{folder}' is a file; a model is kept in a folder. Name another place.")
     return folder.with_name(folder.name + ".draft")
 
 
-def show(trained: Trained, console: Console) -> None:
+def show(trained: TrainingResult, console: Console) -> None:
     """Print the structure, and the error of each signal under each mask in its own unit."""
     if trained.structure is not None:
         console.print(trained.structure.report(), highlight=False)
@@ -207,27 +207,27 @@ def show(trained: Trained, console: Console) -> None:
 
 
 def remarks(history: History) -> list[str]:
-    """What a person should know of the data and the training."""
-    found = list(history.notes)
+    """Return sentences on faults of the data and on the training."""
+    sentences = list(history.notes)
     if history.resumed:
-        found.append(f"An interrupted training went on at epoch {history.resumed + 1}.")
+        sentences.append(f"An interrupted training went on at epoch {history.resumed + 1}.")
     if history.dead:
-        found.append(
-            f"Never varied or never measured: {', '.join(history.dead)}. What they say has no effect on the model. "
+        sentences.append(
+            f"Never varied or never measured: {', '.join(history.dead)}. Their values have no effect on the model. "
             "Check these sensors, or leave them out."
         )
     if history.skipped:
-        found.append(f"{history.skipped} training samples were skipped: they lack something of every mask.")
+        sentences.append(f"{history.skipped} training samples were skipped: they lack a signal of every mask.")
     if history.rejected:
-        found.append(
-            f"{history.rejected} measured signals in the training data were taken for outliers: the other signals of "
-            "their samples contradict them. If there are many, look for a loose sensor."
+        sentences.append(
+            f"{history.rejected} measured signals in the training data were rejected as outliers: the other signals "
+            "of their samples contradict them. If there are many, look for a loose sensor."
         )
-    return found
+    return sentences
 
 
 def train_config(config: ModelConfig, epochs: int, seed: int) -> "TrainConfig":
-    """The robot file's way to train, for so many epochs."""
+    """Return the robot file's settings of training, for a number of epochs."""
     from gemuco.learning.train import TrainConfig
 
     return TrainConfig(

@@ -1,4 +1,4 @@
-"""How a training went, as a picture."""
+"""Picture of a training."""
 
 from pathlib import Path
 

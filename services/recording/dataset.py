@@ -11,7 +11,7 @@ from gemuco.dataset import Dataset, Episode
 from gemuco.errors import DatasetError
 from gemuco.signals import Layout
 from hal.config import RobotConfig
-from services.learning.collector import BUS, EPISODE, Within
+from services.learning.collector import BUS, EPISODE, SampleLimits
 from services.model.living_model import layout_of
 from services.model.model_config import CollectConfig, collect_config
 from services.recording.reading import FileFacts, facts_of, one_robot, read
@@ -111,7 +111,7 @@ class _Selector:
 
     def __init__(self, robot: RobotConfig, layout: Layout) -> None:
         self._robot, self._layout = robot, layout
-        self._within = Within(robot, layout)
+        self._limits = SampleLimits(robot, layout)
         self._rate = (collect_config(robot) if robot.collect else CollectConfig()).rate
         self._stale = {name: robot.signals[name].stale_after for name in robot.seen}
         self._episodes: list[Episode] = []
@@ -161,11 +161,11 @@ class _Selector:
                 self._incomplete += 1
                 continue
             row = self._layout.join(self._values(sample, recorded.received_ns, seen))
-            counts = self._within.counts(row)
-            if counts.all():
+            usable = self._limits.usable(row)
+            if usable.all():
                 yield recorded.received_ns, sample.boot, row
             else:
-                self._outside[self._layout.element(int(np.argmin(counts)))] += 1
+                self._outside[self._layout.element(int(np.argmin(usable)))] += 1
 
     def _values(self, sample: Sample, now_ns: int, seen: tuple[int, Sample] | None) -> dict[str, np.ndarray]:
         values: dict[str, np.ndarray] = {}

@@ -18,7 +18,7 @@ from gemuco.dataset import Dataset, Episode
 from gemuco.learning.train import fine_tune, fit
 from gemuco.schema import BodySchema
 from hal.config import load_robot
-from services.learning.collector import Wanted, collect_direct
+from services.learning.collector import Request, collect_direct
 from services.learning.trainer import train_config
 from services.model.artifacts import robot_file
 from services.model.model_config import model_config
@@ -54,7 +54,7 @@ def main() -> None:
     model = model_config(robot)
     config = train_config(model, model.training.epochs, 0)
     clean = collect_direct(robot, "nominal", 0).dataset
-    fresh = collect_direct(robot, "nominal", 1000, Wanted(samples=100)).dataset
+    fresh = collect_direct(robot, "nominal", 1000, Request(samples=100)).dataset
     dirty, masks = spoilt(clean), [{JOINTS}]
     table = Table("training", "tool tip [mm]")
     known = None
@@ -68,7 +68,7 @@ def main() -> None:
         known = known or schema
         table.add_row(name, f"{error(schema, fresh):.1f}")
     assert known is not None
-    recorded = collect_direct(robot, "actual", 0, Wanted(conditions=flexible(robot), samples=310)).dataset
+    recorded = collect_direct(robot, "actual", 0, Request(conditions=flexible(robot), samples=310)).dataset
     few, judged = parted(recorded, 250 / 310)
     for name, replay in (("with replay", config.replay), ("without replay", 0.0)):
         tuned, _ = fine_tune(known, few, replace(config, rate=TUNING, replay=replay))

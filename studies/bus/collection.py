@@ -11,7 +11,7 @@ from pathlib import Path
 from hal.config import RobotConfig, load_robot
 from hal.robot import Robot
 from services.hardware.stand_in import condition_of, simulator_of, variant_of
-from services.learning.collector import Wanted, collect_direct
+from services.learning.collector import Request, collect_direct
 
 CYCLES = 2000
 
@@ -22,7 +22,7 @@ def collected(config: RobotConfig, samples: int, repeat: int) -> tuple[float, fl
     runs = []
     for _ in range(repeat):
         cpu = time.process_time()
-        found = collect_direct(config, wanted=Wanted((condition,) if condition else (), samples))
+        found = collect_direct(config, request=Request((condition,) if condition else (), samples))
         runs.append((found.robot_time, found.wall_time, time.process_time() - cpu))
     return min(runs, key=lambda run: run[2] / run[0])
 

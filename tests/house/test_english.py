@@ -21,7 +21,6 @@ NOT_YET = {
     "services/errors.py",
     "services/hardware",
     "services/health.py",
-    "services/learning",
     "services/model",
     "services/process",
     "services/runtime.py",

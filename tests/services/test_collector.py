@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 from gemuco.checkpoint import load
 from hal.errors import ConfigError
 from services.cli import app
-from services.learning.collector import Wanted, collect_direct
-from services.learning.motion import NowhereToGo, random_postures, way
+from services.learning.collector import Request, collect_direct
+from services.learning.motion import NowhereToGo, minimum_jerk, random_postures
 from services.learning.playground import CollectionStopped
 from services.learning.postures import BadPostures
 
@@ -21,7 +21,7 @@ LOW, HIGH = np.array([-1.0, -1.5]), np.array([1.0, 1.5])
 
 
 def collected(robot=None, *conditions, samples=None, seed=0, **wanted):
-    return collect_direct(robot or config(), None, seed, Wanted(conditions, samples, **wanted)).dataset
+    return collect_direct(robot or config(), None, seed, Request(conditions, samples, **wanted)).dataset
 
 
 def test_every_condition_is_recorded_and_told_in_its_episodes() -> None:
@@ -39,7 +39,7 @@ def test_every_condition_is_recorded_and_told_in_its_episodes() -> None:
 
 
 def test_a_condition_named_twice_is_recorded_once() -> None:
-    dataset = collect_direct(config(), None, 0, Wanted(("long", "short", "long"), 20)).dataset
+    dataset = collect_direct(config(), None, 0, Request(("long", "short", "long"), 20)).dataset
     assert dataset.conditions == ("long", "short")
     assert len(dataset) == 40
 
@@ -80,7 +80,7 @@ def test_the_same_seed_is_the_same_motion_and_a_condition_has_its_own() -> None:
 
 def test_a_way_begins_and_ends_at_rest_and_is_no_faster_than_asked() -> None:
     start, goal = np.array([0.0, 0.5]), np.array([1.0, 0.3])
-    points = np.vstack([start, way(start, goal, 0.8, 0.02)])
+    points = np.vstack([start, minimum_jerk(start, goal, 0.8, 0.02)])
     speed = np.abs(np.diff(points, axis=0)).max(axis=1) / 0.02
     np.testing.assert_allclose(points[-1], goal)
     assert 0.75 < speed.max() <= 0.8
@@ -143,7 +143,7 @@ def test_what_is_not_known_is_told_with_what_is() -> None:
 
 def test_samples_that_never_count_end_the_collection() -> None:
     limits = config().model_dump()["limits"] | {"center_of_gravity": {"low": [0.5, 0.5], "high": [0.6, 0.6]}}
-    with pytest.raises(CollectionStopped, match=r"No sample counted for 30 s: center_of_gravity.x is"):
+    with pytest.raises(CollectionStopped, match=r"No sample was usable for 30 s: center_of_gravity.x is"):
         collected(config(limits=limits))
 
 
@@ -176,7 +176,7 @@ def test_without_a_hold_column_the_robot_files_hold_counts(tmp_path: Path) -> No
         ("", "must name shoulder, elbow, each once, and may name hold; it names nothing"),
         ("shoulder,elbo\n0,0\n", "it names shoulder, elbo."),
         ("shoulder,elbow,elbow\n0,0,0\n", "each once"),
-        ("shoulder,elbow\n", "There is no posture in"),
+        ("shoulder,elbow\n", "holds no posture, only a header"),
         ("shoulder,elbow\n0.1\n", "line 2: 1 values under 2 names"),
         ("shoulder,elbow\n0.1,0.2\n0.1,left\n", "line 3: elbow is 'left', which is not a number"),
         ("shoulder,elbow\n0.1,nan\n", "elbow of nan rad is outside of its limits"),

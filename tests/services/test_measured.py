@@ -66,7 +66,7 @@ def test_repetitions_become_one_episode(tmp_path):
     text = HEAD + SIGNALS + "together: [['1.csv', '3.csv']]\n"
     data = read(load_measured(describe(tmp_path, text)), tmp_path)
     assert [len(e.values["load"]) for e in data.episodes] == [6, 1, 3]
-    with pytest.raises(DatasetError, match="match seven are none"):
+    with pytest.raises(DatasetError, match="match seven do not exist"):
         read(load_measured(describe(tmp_path, text.replace("'1.csv', '3.csv'", "seven"))), tmp_path)
 
 
@@ -75,7 +75,7 @@ def test_repetitions_become_one_episode(tmp_path):
     [
         ((), r"one\.csv' is empty"),
         (("1,2,3,0", "1,2"), r"line 3 has 2 columns; the first has 4\. Is the separator"),
-        (("1,2,many,0",), r"line 2, column 'load': 'many' is no number\. An empty cell means"),
+        (("1,2,many,0",), r"line 2, column 'load': 'many' is not a number\. An empty cell means"),
     ],
 )
 def test_bad_rows_are_one_sentence(tmp_path, lines, sentence):
@@ -103,7 +103,7 @@ def test_missing_columns_and_files_are_one_sentence(tmp_path):
         (HEAD + "signals: {a: {unit: N, written_in: deg, columns: x}}", "'deg' cannot be converted to 'N'. Known: deg"),
         (HEAD + "signals: {a: {unit: N, colums: x}}", "unknown key 'signals.a.colums'. Known keys there: columns"),
         (HEAD, "signals: Field required"),
-        ("nothing", "holds no description"),
+        ("nothing", "is not a description of data"),
         ("a: [", "is not YAML"),
     ],
 )

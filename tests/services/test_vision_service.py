@@ -21,7 +21,7 @@ from hal.errors import ConfigError
 from services.client import Client
 from services.errors import AlreadyRunning, RemoteError
 from services.hardware.vision_service import run_vision
-from services.learning.collector import Wanted, collect_direct
+from services.learning.collector import Request, collect_direct
 from services.model.estimation import Freshness
 from services.process.service import Service
 from services.recording.reading import read
@@ -268,7 +268,7 @@ def test_a_signal_is_taken_from_its_own_source_and_no_other() -> None:
 
 
 def test_collected_data_have_what_the_camera_sees() -> None:
-    dataset = collect_direct(config(), wanted=Wanted(("short",), 20)).dataset
+    dataset = collect_direct(config(), request=Request(("short",), 20)).dataset
     assert np.isfinite(dataset.rows()[:, -2:]).any()
 
 

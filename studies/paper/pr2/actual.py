@@ -12,7 +12,7 @@ from gemuco.learning.train import fine_tune
 from gemuco.schema import BodySchema
 from hal.config import RobotConfig
 from services.hardware.stand_in import simulator_of
-from services.learning.collector import Wanted, collect_direct
+from services.learning.collector import Request, collect_direct
 from services.learning.trainer import train_config
 from services.model.model_config import collect_config, model_config
 from services.show import Tell
@@ -59,8 +59,8 @@ def actual(run: Run, simulated: BodySchema, tell: Tell) -> Actual:
     """Collect on the actual arm, fine-tune what was learned in simulation, and run every trial of one seed."""
     tell(0.0, "collecting on the actual arm")
     count = round(COLLECTED * collect_config(run.robot).samples)
-    wanted = Wanted(flexible(run.robot), samples=count)
-    data = run.cached("actual", lambda: collect_direct(run.robot, ACTUAL, run.seed, wanted).dataset, samples=count)
+    request = Request(flexible(run.robot), samples=count)
+    data = run.cached("actual", lambda: collect_direct(run.robot, ACTUAL, run.seed, request).dataset, samples=count)
     learned, judged = parted(data, LEARNED / COLLECTED)
     schema = run.cached(
         "actual_model", lambda: _tuned(run, simulated, learned, tell), samples=len(learned), epochs=EPOCHS, rate=RATE

@@ -9,7 +9,7 @@ import numpy as np
 from gemuco.adaption.config import UpdateConfig
 from gemuco.dataset import Dataset
 from gemuco.schema import BodySchema
-from services.learning.collector import Wanted, collect_direct
+from services.learning.collector import Request, collect_direct
 from services.learning.trainer import train
 from services.model.model_config import collect_config
 from services.show import Tell
@@ -113,7 +113,7 @@ def simulate(run: Run, tell: Tell) -> Simulated:
     count = round(FRESH_SHARE * collect_config(robot).samples)
     fresh = run.cached(
         "nominal_fresh",
-        lambda: collect_direct(robot, NOMINAL, seed + FRESH, Wanted(samples=count)).dataset,
+        lambda: collect_direct(robot, NOMINAL, seed + FRESH, Request(samples=count)).dataset,
         samples=count,
     )
     schema = run.cached(
