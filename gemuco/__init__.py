@@ -15,7 +15,7 @@ _ROOMS = {
     "gemuco.anomaly.verdict": ("Verdict", "judge"),
     "gemuco.checkpoint": ("load", "save"),
     "gemuco.controller": ("Controller", "Solution", "control"),
-    "gemuco.dataset": ("Dataset", "Episode"),
+    "gemuco.dataset": ("Dataset", "Episode", "as_dataset"),
     "gemuco.errors": (
         "CheckpointError",
         "DatasetError",
@@ -26,6 +26,7 @@ _ROOMS = {
         "SchemaError",
         "UnknownCondition",
         "UnknownSignal",
+        "WrongKind",
         "WrongSize",
     ),
     "gemuco.estimation": ("Estimate", "estimate"),
@@ -58,6 +59,7 @@ if TYPE_CHECKING:
     from gemuco.controller import control as control
     from gemuco.dataset import Dataset as Dataset
     from gemuco.dataset import Episode as Episode
+    from gemuco.dataset import as_dataset as as_dataset
     from gemuco.errors import CheckpointError as CheckpointError
     from gemuco.errors import DatasetError as DatasetError
     from gemuco.errors import NotEnoughData as NotEnoughData
@@ -67,6 +69,7 @@ if TYPE_CHECKING:
     from gemuco.errors import SchemaError as SchemaError
     from gemuco.errors import UnknownCondition as UnknownCondition
     from gemuco.errors import UnknownSignal as UnknownSignal
+    from gemuco.errors import WrongKind as WrongKind
     from gemuco.errors import WrongSize as WrongSize
     from gemuco.estimation import Estimate as Estimate
     from gemuco.estimation import estimate as estimate

@@ -17,7 +17,7 @@ from gemuco.layers import LINEAR, Chain, Layer, Weights, check_activation
 from gemuco.masks import label
 from gemuco.normal import Normal
 from gemuco.scaler import Scaler
-from gemuco.schema import BodySchema
+from gemuco.schema import BodySchema, check_schema
 from gemuco.signals import Layout, Signal
 from gemuco.writing import writing
 
@@ -36,6 +36,7 @@ def save(schema: BodySchema, folder: str | Path) -> None:
     Raises:
         NotWritten: The disk is full, or the folder may not be written to.
     """
+    check_schema(schema)
     folder = Path(folder)
     data = save_tensors({name: np.ascontiguousarray(array) for name, array in _tensors(schema).items()})
     head = {

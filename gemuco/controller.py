@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from gemuco.errors import NotFinite, NotObservable, SchemaError
+from gemuco.errors import NotFinite, NotObservable, SchemaError, check_kind
 from gemuco.masks import Mask, label
-from gemuco.schema import BodySchema
+from gemuco.schema import BodySchema, check_schema
 from gemuco.search.asked import Asked, check_present, merged, signals_of
 from gemuco.search.descent import DescentConfig, NewtonConfig
 from gemuco.search.losses import Hold, Match, StayNear, Term
@@ -145,6 +145,8 @@ class Controller:
 
     def swap(self, schema: BodySchema) -> None:
         """Go on with another schema of the same body; the warm start is kept."""
+        check_schema(schema)
+        check_kind("The command", self.command, str, "the name of a signal")
         span = schema.layout.slice(self.command)
         if self.command not in (*schema.x_in, *schema.x_out):
             raise NotObservable(
@@ -187,7 +189,8 @@ class Controller:
             NotFinite: A target is NaN or infinite.
             NotObservable: A term or the route cannot work with this schema.
         """
-        schema, now = self.schema, now or {}
+        schema, now = self.schema, {} if now is None else now
+        check_kind("The target", target, Mapping, "a mapping of signal -> reference")
         if tuple(target) != self._names:
             self._ask(target)
         check_present(schema, now)

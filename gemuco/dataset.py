@@ -2,13 +2,13 @@
 
 import json
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from gemuco.errors import DatasetError, NotEnoughData, SchemaError
+from gemuco.errors import DatasetError, NotEnoughData, SchemaError, WrongSize, check_kind, described
 from gemuco.signals import Layout, Signal
 from gemuco.writing import writing
 
@@ -32,6 +32,10 @@ class Episode:
     condition: str
     values: Mapping[str, np.ndarray]
 
+    def __post_init__(self) -> None:
+        check_kind("The condition of an episode", self.condition, str, "text")
+        check_kind("The values of an episode", self.values, Mapping, "a mapping of signal -> array")
+
 
 @dataclass(frozen=True, slots=True)
 class Dataset:
@@ -41,8 +45,11 @@ class Dataset:
     episodes: tuple[Episode, ...]
 
     def __post_init__(self) -> None:
+        check_kind("The layout of a dataset", self.layout, Layout, "a Layout")
+        check_kind("The episodes of a dataset", self.episodes, (tuple, list), "a tuple of Episode")
         object.__setattr__(self, "episodes", tuple(self.episodes))
         for episode in self.episodes:
+            check_kind("Every entry of a dataset", episode, Episode, "an Episode")
             if self.layout.join(episode.values).ndim != 2:
                 raise DatasetError("An episode's arrays need a row per sample: shape (samples, n).")
 
@@ -185,3 +192,83 @@ class Dataset:
             raise DatasetError(
                 f"'{path}' is not a readable dataset ({type(error).__name__}); record it again."
             ) from None
+
+
+Arrays = Mapping[str, np.ndarray]
+"""One episode as plain data: signal -> array [its unit], shape (samples, n), or (samples,) for one element."""
+Data = Dataset | Arrays | Sequence[Arrays] | Mapping[str, Arrays | Sequence[Arrays]]
+"""A dataset, or plain data: an episode, a sequence of them, or a mapping of condition -> episodes."""
+CONDITION = "default"
+"""The condition of plain data that name none."""
+
+
+def as_dataset(data: Data, units: Mapping[str, str] | None = None) -> Dataset:
+    """Return data as a dataset.
+
+    Args:
+        data: A dataset, which is returned as it is; or one episode, a sequence of episodes, or a mapping of condition
+            -> episodes, each episode a mapping of signal -> array, shape (samples, n) or (samples,).
+        units: Signal -> unit, of plain data.
+
+    Raises:
+        WrongKind: The data are neither.
+        DatasetError: A unit is missing or superfluous.
+        UnknownSignal: An episode has a signal that the first one lacks.
+        WrongSize: Arrays do not fit each other.
+    """
+    if isinstance(data, Dataset):
+        return data
+    episodes = [
+        (condition, {name: _column(name, array) for name, array in values.items()})
+        for condition, values in _plain_episodes(data)
+    ]
+    if not episodes:
+        raise NotEnoughData("The data hold no episode.")
+    return Dataset(_layout(episodes[0][1], units or {}), tuple(Episode(*episode) for episode in episodes))
+
+
+def _plain_episodes(data: object) -> list[tuple[str, Arrays]]:
+    """Return (condition, values) of every episode."""
+    parts = data
+    if isinstance(data, Mapping):
+        is_named = any(_is_episodes(part) for part in data.values())
+        parts = data if is_named else {CONDITION: data}
+    elif isinstance(data, Sequence) and not isinstance(data, str):
+        parts = {CONDITION: data}
+    check_kind("The data", parts, Mapping, "a Dataset, a mapping of signal -> array, or a list of such mappings")
+    episodes: list[tuple[str, Arrays]] = []
+    for condition, part in parts.items():  # type: ignore[attr-defined]
+        for values in [part] if isinstance(part, Mapping) else part:
+            check_kind(f"An episode of condition '{condition}'", values, Mapping, "a mapping of signal -> array")
+            episodes.append((condition, values))
+    return episodes
+
+
+def _is_episodes(part: object) -> bool:
+    """Whether a value of a mapping is an episode or a list of them, not an array."""
+    first = part[0] if isinstance(part, list | tuple) and len(part) else part
+    return isinstance(first, Mapping)
+
+
+def _column(name: str, array: object) -> np.ndarray:
+    """Return the samples of a signal as an array, shape (samples, n)."""
+    try:
+        rows = np.asarray(array, float)
+    except (TypeError, ValueError):
+        raise WrongSize(f"Signal '{name}' needs an array of numbers, not {described(array)}.") from None
+    if rows.ndim not in (1, 2):
+        raise WrongSize(f"Signal '{name}' needs an array of shape (samples, n), not {rows.shape}.")
+    return rows.reshape(len(rows), -1)
+
+
+def _layout(values: Arrays, units: Mapping[str, str]) -> Layout:
+    check_kind("The units", units, Mapping, "a mapping of signal -> unit")
+    for name in values:
+        if name not in units:
+            raise DatasetError(
+                f"Signal '{name}' has no unit; give the units of plain data, such as units={{'{name}': 'rad'}}."
+            )
+    for name in units:
+        if name not in values:
+            raise DatasetError(f"A unit of '{name}' is given, but the data hold {', '.join(values)}.")
+    return Layout(tuple(Signal(name, array.shape[1], units[name]) for name, array in values.items()))

@@ -19,6 +19,10 @@ class WrongSize(SchemaError):
     """An array does not have as many elements as its signal."""
 
 
+class WrongKind(SchemaError):
+    """An argument is of another kind than the one that is needed."""
+
+
 class NotFinite(SchemaError):
     """A value that must be a number is NaN or infinite."""
 
@@ -41,6 +45,32 @@ class NotWritten(SchemaError):
 
 class CheckpointError(SchemaError):
     """A stored model is missing, damaged, or of another version."""
+
+
+def check_kind(what: str, value: object, kind: type | tuple[type, ...], needed: str) -> None:
+    """Refuse a value of another kind.
+
+    Args:
+        what: Begins the sentence, such as `The schema`.
+        value: The argument.
+        kind: Allowed classes.
+        needed: Ends the sentence, such as `a BodySchema`.
+
+    Raises:
+        WrongKind: The value is not an instance of the kind.
+    """
+    if not isinstance(value, kind):
+        raise WrongKind(f"{what} must be {needed}, not {described(value)}.")
+
+
+def described(value: object) -> str:
+    """Return a few words on what a value is: `an array of shape (3,)`, `the class Signal`, `an int`."""
+    if isinstance(value, type):
+        return f"the class {value.__name__}"
+    if hasattr(value, "shape"):
+        return f"an array of shape {value.shape}"
+    name = type(value).__name__
+    return f"{'an' if name[0].lower() in 'aeiou' else 'a'} {name}"
 
 
 def whole_number(what: str, value: object, least: int) -> None:

@@ -11,7 +11,7 @@ from gemuco.compiled.inference import infer
 from gemuco.derived import ByPattern
 from gemuco.layers import run
 from gemuco.masks import Mask, covered_by, label
-from gemuco.schema import BodySchema
+from gemuco.schema import BodySchema, check_schema
 from gemuco.search.descent import NewtonConfig, minimise
 from gemuco.search.fold import fitting, input_lines, latent_lines
 from gemuco.search.routes import STARTS, latent_starts
@@ -21,7 +21,7 @@ SEARCH = NewtonConfig()
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """A signal as well as it can be known.
+    """A signal as well as it can be known, of one sample; of several, every attribute has a row per sample.
 
     Attributes:
         value: Measured values, with estimates in place of missing elements [unit], shape (n,); NaN if impossible.
@@ -37,9 +37,9 @@ class Estimate:
     value: np.ndarray
     std: np.ndarray
     estimated: np.ndarray
-    method: str
-    mask: Mask
-    residual: float
+    method: str | np.ndarray
+    mask: Mask | np.ndarray
+    residual: float | np.ndarray
 
 
 class Completion(NamedTuple):
@@ -120,22 +120,43 @@ def estimate(schema: BodySchema, values: Mapping[str, np.ndarray]) -> dict[str, 
 
     Args:
         schema: The body schema.
-        values: Signal -> array [its unit], shape (n,). NaN elements and absent signals are estimated.
+        values: Signal -> array [its unit], shape (n,), or (samples, n) for several samples. NaN elements and absent
+            signals are estimated.
 
     Raises:
         UnknownSignal: A name is not in the layout.
         WrongSize: An array does not have its signal's size.
     """
-    joined = schema.layout.join_one(values)
+    check_schema(schema)
+    joined = schema.layout.join(values)
     joined.setflags(write=False)
-    found = fill(schema, joined)
+    if joined.ndim == 2:
+        return _batch(schema, [fill(schema, row) for row in joined])
+    completion = fill(schema, joined)
     return {
         name: Estimate(
-            found.value[span], found.std[span], found.estimated[span],
-            found.method[name], found.mask[name], found.residual[name],
+            completion.value[span], completion.std[span], completion.estimated[span],
+            completion.method[name], completion.mask[name], completion.residual[name],
         )
         for name, span in schema.layout.slices.items()
     }  # fmt: skip
+
+
+def _batch(schema: BodySchema, samples: list[Completion]) -> dict[str, Estimate]:
+    """Return the estimates of several samples, each attribute with a row per sample."""
+    size = schema.layout.size
+    value, std, estimated = (
+        np.array([getattr(sample, name) for sample in samples]).reshape(-1, size)
+        for name in ("value", "std", "estimated")
+    )
+    estimates = {}
+    for name, span in schema.layout.slices.items():
+        mask = np.empty(len(samples), object)
+        mask[:] = [sample.mask[name] for sample in samples]
+        method = np.array([sample.method[name] for sample in samples], object)
+        residual = np.array([sample.residual[name] for sample in samples], float)
+        estimates[name] = Estimate(value[:, span], std[:, span], estimated[:, span], method, mask, residual)
+    return estimates
 
 
 def fill(schema: BodySchema, joined: np.ndarray) -> Completion:

@@ -13,7 +13,7 @@ import numpy as np
 from gemuco.compiled.chain import pack
 from gemuco.compiled.inference import Parts, Predictor
 from gemuco.derived import prepare
-from gemuco.errors import NotFinite, UnknownCondition, UnknownSignal, WrongSize
+from gemuco.errors import NotFinite, UnknownCondition, UnknownSignal, WrongSize, check_kind
 from gemuco.layers import Chain, Weights, run
 from gemuco.masks import Mask, bits, label
 from gemuco.normal import Normal
@@ -27,7 +27,7 @@ ErrorTable = Mapping[tuple[str, Mask], np.ndarray]
 element of the layout, shape (size,), for the method `input`, which finds what is not in x_out."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class BodySchema:
     """Layout, masks, scaler and network weights together: everything that the verbs of other rooms need.
 
@@ -63,13 +63,13 @@ class BodySchema:
     bias: np.ndarray = field(default_factory=lambda: np.zeros(0, np.float32))
     biases: Mapping[str, np.ndarray] = field(default_factory=dict)
     manifest: Mapping[str, Any] = field(default_factory=dict)
-    out_layout: Layout = field(init=False, repr=False)
-    in_index: np.ndarray = field(init=False, repr=False)
-    out_index: np.ndarray = field(init=False, repr=False)
-    _gates: dict[Mask, tuple[np.ndarray, np.ndarray]] = field(init=False, repr=False)
-    _ranked: dict[str, tuple[Mask, ...]] = field(init=False, repr=False)
-    _chain: Chain = field(init=False, repr=False)
-    _derived: dict[Callable[..., Any], Any] = field(init=False, repr=False)
+    out_layout: Layout = field(init=False)
+    in_index: np.ndarray = field(init=False)
+    out_index: np.ndarray = field(init=False)
+    _gates: dict[Mask, tuple[np.ndarray, np.ndarray]] = field(init=False)
+    _ranked: dict[str, tuple[Mask, ...]] = field(init=False)
+    _chain: Chain = field(init=False)
+    _derived: dict[Callable[..., Any], Any] = field(init=False)
 
     def __post_init__(self) -> None:
         set_field = object.__setattr__
@@ -90,6 +90,33 @@ class BodySchema:
             self.gate(mask)
         for array in (*self.weights.arrays(), self.anchors, self.bias):
             array.setflags(write=False)
+
+    def __repr__(self) -> str:
+        size = f"{len(self.layout.names)} signals ({self.layout.size} elements), {len(self.masks)} masks"
+        lines = [
+            f"BodySchema of {size}, p of {len(self.bias)}",
+            f"  x_in        {', '.join(self.x_in)}",
+            f"  x_out       {', '.join(self.x_out)}",
+            f"  conditions  {', '.join(self.biases) or 'none'}",
+        ]
+        return "\n".join(lines)
+
+    def summary(self) -> str:
+        """Return a table of the signals, and one of the root mean square errors of every mask on held-out data."""
+        width = max(map(len, self.layout.names))
+        lines = [f"{'signal':<{width}}  elements  unit   role"]
+        for signal in self.layout.signals:
+            roles = [role for role, names in (("x_in", self.x_in), ("x_out", self.x_out)) if signal.name in names]
+            role = ", ".join(roles) or "not used"
+            lines.append(f"{signal.name:<{width}}  {signal.size:>8}  {signal.unit:<5}  {role}")
+        labels = [label(mask, self.layout.names) for mask in self.masks]
+        width, heads = max(map(len, labels)), [f"{s.name} [{s.unit}]" for s in self.out_layout.signals]
+        lines += ["", "  ".join([f"{'error from mask':<{width}}", *heads])]
+        errors = {(mask, name): error for mask, name, _, error in self.error_rows()}
+        for text in labels:
+            row = zip(heads, (errors.get((text, name), np.nan) for name in self.x_out), strict=True)
+            lines.append("  ".join([f"{text:<{width}}", *(f"{error:>{len(head)}.3g}" for head, error in row)]))
+        return "\n".join(lines)
 
     def __reduce__(self) -> tuple[type["BodySchema"], tuple[Any, ...]]:
         """Pickle the given values only; another process derives the rest anew."""
@@ -224,6 +251,15 @@ class BodySchema:
     def with_manifest(self, **facts: Any) -> "BodySchema":
         """The same body with more facts kept beside it."""
         return replace(self, manifest={**self.manifest, **facts})
+
+
+def check_schema(value: object) -> None:
+    """Refuse anything but a body schema as the first argument of a verb.
+
+    Raises:
+        WrongKind: The value is something else.
+    """
+    check_kind("The first argument", value, BodySchema, "a BodySchema")
 
 
 def _predictor(schema: BodySchema) -> Predictor:

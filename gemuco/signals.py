@@ -2,10 +2,11 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from numbers import Integral
 
 import numpy as np
 
-from gemuco.errors import UnknownSignal, WrongSize
+from gemuco.errors import UnknownSignal, WrongKind, WrongSize, check_kind, described
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,12 +26,25 @@ class Signal:
     elements: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        check_kind("The name of a signal", self.name, str, "text")
+        check_kind(f"The size of signal '{self.name}'", self.size, Integral, "a whole number")
+        check_kind(f"The unit of signal '{self.name}'", self.unit, str, "text, such as 'rad'")
+        check_kind(f"The elements of signal '{self.name}'", self.elements, (tuple, list), "a tuple of names")
         if self.size < 1:
             raise WrongSize(f"Signal '{self.name}' has {self.size} elements; it needs at least one.")
-        if not self.elements:
-            object.__setattr__(self, "elements", tuple(str(i) for i in range(self.size)))
+        object.__setattr__(self, "elements", tuple(self.elements) or tuple(str(i) for i in range(self.size)))
         if len(self.elements) != self.size:
             raise WrongSize(f"Signal '{self.name}' has {self.size} elements but {len(self.elements)} element names.")
+
+
+def check_samples(samples: object) -> None:
+    """Refuse one sample, or anything that is no sequence of them.
+
+    Raises:
+        WrongKind: The samples are something else.
+    """
+    if isinstance(samples, Mapping | str) or not isinstance(samples, Iterable):
+        raise WrongKind(f"Samples must be a list of mappings of signal -> array, not {described(samples)}.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,10 +65,12 @@ class Layout:
     _starts: np.ndarray = field(init=False, compare=False, repr=False)
 
     def __post_init__(self) -> None:
+        check_kind("The signals of a layout", self.signals, (tuple, list), "a tuple of Signal")
         object.__setattr__(self, "signals", tuple(self.signals))
         slices: dict[str, slice] = {}
         start = 0
         for signal in self.signals:
+            check_kind("Every entry of a layout", signal, Signal, "a Signal")
             if signal.name in slices:
                 raise UnknownSignal(f"Signal '{signal.name}' is in the layout twice; names must differ.")
             slices[signal.name] = slice(start, start + signal.size)
@@ -115,6 +131,26 @@ class Layout:
             UnknownSignal: A name is not of this layout.
             WrongSize: An array does not have its signal's size, or another number of samples than the rest.
         """
+        try:
+            return self._join_sample(values)
+        except (AttributeError, KeyError, TypeError, ValueError):
+            return self._join_any(values)
+
+    def _join_sample(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Join one sample of arrays that fit, which is what loops give; anything else raises something."""
+        joined = np.empty(self.size)
+        joined.fill(np.nan)
+        for name, value in values.items():
+            span = self.slices[name]
+            if value.shape != (span.stop - span.start,):
+                raise ValueError
+            joined[span] = value
+        return joined
+
+    def _join_any(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Join values of any allowed form, or say what is wrong with them."""
+        if not isinstance(values, Mapping):
+            raise WrongKind(f"Values must be a mapping of signal -> array, not {described(values)}.")
         arrays: dict[str, np.ndarray] = {}
         leading: tuple[int, ...] | None = None
         for name, value in values.items():
@@ -138,24 +174,12 @@ class Layout:
         return joined
 
     def join_one(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
-        """`join` of one sample, shape (size,).
+        """Join one sample, shape (size,).
 
         Raises:
-            WrongSize: Several samples were given, or what `join` raises it for.
+            WrongSize: Several samples were given, or an array does not have its signal's size.
         """
-        joined = np.full(self.size, np.nan)
-        for name, value in values.items():
-            span = self.slices.get(name)
-            try:
-                array = np.asarray(value, float)
-            except (TypeError, ValueError):
-                break
-            if span is None or array.shape != (span.stop - span.start,):
-                break
-            joined[span] = array
-        else:
-            return joined
-        joined = self.join(values)  # tells what is wrong
+        joined = self.join(values)
         if joined.ndim != 1:
             raise WrongSize(
                 f"One sample at a time is taken, an array of shape (n,) per signal; here are {len(joined)}. Give them "

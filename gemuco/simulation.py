@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from gemuco.errors import NotFinite, NotObservable, SchemaError
+from gemuco.errors import NotFinite, NotObservable, SchemaError, check_kind
 from gemuco.masks import Mask, best, label
-from gemuco.schema import BodySchema
+from gemuco.schema import BodySchema, check_schema
 from gemuco.search.asked import Asked, check_present, signals_of
 from gemuco.search.descent import DescentConfig, NewtonConfig
 from gemuco.search.losses import Hold, Match, Term
@@ -74,6 +74,8 @@ class Simulator:
             UnknownSignal: A name is not in the layout.
             NotObservable: The schema does not know the command, or the mask is not feasible.
         """
+        check_schema(schema)
+        check_kind("The command", command, str, "the name of a signal")
         schema.layout.slice(command)
         self.schema, self.command, self.route, self.mask = schema, command, checked_route(route), mask
         self.limits = dict(limits or {})

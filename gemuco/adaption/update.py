@@ -14,8 +14,9 @@ import numpy as np
 from gemuco.adaption.config import UpdateConfig
 from gemuco.adaption.recognise import RECOGNISERS, Prior, Recogniser
 from gemuco.adaption.relearn import Relearner
-from gemuco.errors import SchemaError
-from gemuco.schema import BodySchema
+from gemuco.errors import SchemaError, check_kind
+from gemuco.schema import BodySchema, check_schema
+from gemuco.signals import check_samples
 
 FORGET = 0.01
 """Share by which each new sample moves the running estimate of the model's errors."""
@@ -78,7 +79,9 @@ class Updater:
         config: UpdateConfig | None = None,
         constraints: Mapping[str, np.ndarray] | None = None,
     ) -> None:
-        self.config = config or UpdateConfig()
+        check_schema(schema)
+        self.config = UpdateConfig() if config is None else config
+        check_kind("The settings of an update", self.config, UpdateConfig, "an UpdateConfig")
         if not len(schema.bias) and self.config.what in ("bias", "both"):
             raise SchemaError(
                 f"what '{self.config.what}' needs a parametric bias; this schema was trained without (bias_size 0)."
@@ -203,6 +206,8 @@ def adapt(
         samples: Signal -> value [its unit], shape (n,), oldest first.
         config: What to update, and how.
     """
+    check_schema(schema)
+    check_samples(samples)
     updater = Updater(schema, config)
     for values in samples:
         updater.add(values)

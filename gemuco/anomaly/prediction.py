@@ -9,7 +9,7 @@ import numpy as np
 from gemuco.compiled.score import Judges
 from gemuco.derived import ByPattern
 from gemuco.masks import Mask
-from gemuco.schema import BodySchema
+from gemuco.schema import BodySchema, check_schema
 
 
 def judging_masks(schema: BodySchema) -> dict[str, Mask]:
@@ -38,6 +38,7 @@ def predict_error(schema: BodySchema, values: Mapping[str, np.ndarray]) -> np.nd
 
     Each signal is predicted from the others where a feasible mask allows; NaN where something is missing.
     """
+    check_schema(schema)
     return prediction_errors(schema, schema.normalise(values))
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from gemuco.anomaly.blame import suspects
 from gemuco.anomaly.prediction import judgements, judges
 from gemuco.compiled.score import deviation
-from gemuco.schema import BodySchema
+from gemuco.schema import BodySchema, check_schema
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +43,7 @@ def score(schema: BodySchema, values: Mapping[str, np.ndarray], blame: bool = Tr
         blame: Whether to find what is most likely wrong, which costs many times the score; else the element that
             contributes most is named.
     """
+    check_schema(schema)
     joined = schema.layout.join_one(values)
     joined.setflags(write=False)
     found = judged(schema, joined)

@@ -9,7 +9,8 @@ from gemuco.adaption.innovation import Innovations
 from gemuco.adaption.recognise import Prior, solve
 from gemuco.anomaly.blame import suspects
 from gemuco.anomaly.prediction import prediction_errors
-from gemuco.schema import BodySchema
+from gemuco.schema import BodySchema, check_schema
+from gemuco.signals import check_samples
 
 PLAUSIBLE = 3.0
 """How far p may be from the mean of the trained ones [their standard deviations] to be a condition of a body."""
@@ -51,6 +52,8 @@ def judge(schema: BodySchema, samples: Iterable[Mapping[str, np.ndarray]]) -> Ve
         UnknownSignal: A name is not in the layout.
         WrongSize: An array does not have its signal's size.
     """
+    check_schema(schema)
+    check_samples(samples)
     rows = np.array([schema.normalise_one(sample) for sample in samples]).reshape(-1, schema.layout.size)
     score = window_score(schema, rows)
     if not np.isfinite(score):

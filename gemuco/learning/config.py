@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from gemuco.errors import SchemaError, whole_number
+from gemuco.errors import SchemaError, check_kind, whole_number
 from gemuco.layers import check_activation
 
 
@@ -43,6 +43,7 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         check_activation(self.activation)
+        check_kind("Training: hidden", self.hidden, (tuple, list), "a tuple of widths, such as (200, 30)")
         object.__setattr__(self, "hidden", tuple(self.hidden))
         for name, least in (("latent", 1), ("bias_size", 0), ("epochs", 1), ("batch", 1), ("patience", 1), ("seed", 0)):
             whole_number(f"Training: {name}", getattr(self, name), least)

@@ -1,13 +1,13 @@
 """Training (paper, II-D): from episodes to a body schema, and from a schema to one that fits a few new episodes."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from gemuco.dataset import Dataset
-from gemuco.errors import NotEnoughData
+from gemuco.dataset import Data, Dataset, as_dataset
+from gemuco.errors import NotEnoughData, check_kind
 from gemuco.layers import Weights
 from gemuco.learning.accuracy import assess
 from gemuco.learning.config import TrainConfig
@@ -26,18 +26,19 @@ ANCHORS = 1000
 
 
 def fit(
-    dataset: Dataset,
+    data: Data,
     config: TrainConfig,
     masks: Iterable[Iterable[str]],
     progress: Progress | None = None,
     x_out: Iterable[str] | None = None,
     title: str = "training",
     resume: str | Path | None = None,
+    units: Mapping[str, str] | None = None,
 ) -> tuple[BodySchema, History]:
     """Train a body schema.
 
     Args:
-        dataset: Episodes of one body.
+        data: Episodes of one body, as a dataset or as plain arrays; see `as_dataset`.
         config: Settings of the training.
         masks: The feasible masks; their union is x_in.
         progress: Called after every epoch.
@@ -45,6 +46,7 @@ def fit(
         title: Begins the progress text.
         resume: A file to keep the training in. If it holds this very training, interrupted, that goes on and ends
             with the same result; if it is finished there, nothing is trained. The caller removes it.
+        units: Signal -> unit, of plain arrays.
 
     Returns:
         The schema with its held-out errors and the statistics of the normal, and how training went.
@@ -53,6 +55,8 @@ def fit(
         NotEnoughData: Too few samples to hold some out, or none that fits a mask.
         UnknownSignal: A mask or x_out names a signal that is not in the layout.
     """
+    check_kind("The settings of a training", config, TrainConfig, "a TrainConfig")
+    dataset = as_dataset(data, units)
     layout = dataset.layout
     checked = tuple(mask(m, layout.names) for m in masks)
     if not checked or frozenset() in checked:

@@ -85,6 +85,8 @@ def check_present(schema: BodySchema, now: Mapping[str, np.ndarray]) -> None:
         WrongSize: An array does not have its signal's size.
     """
     slices = schema.layout.slices
+    if not isinstance(now, Mapping):
+        schema.layout.join_one(now)
     for name, value in now.items():
         span = slices.get(name)
         if span is None or not isinstance(value, np.ndarray) or value.shape != (span.stop - span.start,):

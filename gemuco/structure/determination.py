@@ -4,15 +4,15 @@ Up to 10 signals all 2^n - 1 masks are measured; with more the border between to
 (`mask_search`). Either way a mask is feasible only if its own error was measured, on all rows, and is small enough.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import compress
 from pathlib import Path
 
 import numpy as np
 
-from gemuco.dataset import Dataset
-from gemuco.errors import NotEnoughData
+from gemuco.dataset import Data, as_dataset
+from gemuco.errors import NotEnoughData, check_kind
 from gemuco.learning.config import TrainConfig
 from gemuco.learning.learner import Progress
 from gemuco.learning.train import fit
@@ -109,28 +109,34 @@ class Structure:
 
 
 def determine(
-    dataset: Dataset,
-    config: TrainConfig,
+    data: Data,
+    config: TrainConfig | None = None,
     thresholds: Thresholds | None = None,
     progress: Progress | None = None,
     splits: int = 1,
     drafts: Path | None = None,
+    units: Mapping[str, str] | None = None,
 ) -> Structure:
     """Train once under all masks, measure masks on held-out episodes, and keep those that are feasible.
 
     Args:
-        dataset: Episodes of one body.
-        config: Settings of the training.
+        data: Episodes of one body, as a dataset or as plain arrays; see `as_dataset`.
+        config: Settings of the training; the defaults if not given.
         thresholds: Errors below which something counts as inferable; the paper's if not given.
         progress: Called with the share done, 0 to 1, and a line of text.
         splits: Number of trainings, each with other episodes held out; errors are means over all. One is the paper's
             way. Short recordings need more: their errors change many times over with the part that is held out.
         drafts: A folder to keep trainings in, so that an interrupted one goes on; see `fit`.
+        units: Signal -> unit, of plain arrays.
 
     Raises:
         NotEnoughData: Too few samples or signals, a signal that never varies, or no signal or mask below its threshold.
     """
-    thresholds = thresholds or Thresholds()
+    dataset = as_dataset(data, units)
+    config = TrainConfig() if config is None else config
+    thresholds = Thresholds() if thresholds is None else thresholds
+    check_kind("The settings of a training", config, TrainConfig, "a TrainConfig")
+    check_kind("The thresholds", thresholds, Thresholds, "a Thresholds")
     names = dataset.layout.names
     if len(names) < 2:
         raise NotEnoughData(
@@ -153,20 +159,23 @@ def determine(
 
 
 def learn(
-    dataset: Dataset,
+    data: Data,
     config: TrainConfig | None = None,
     masks: Iterable[Iterable[str]] | None = None,
     x_out: Iterable[str] | None = None,
+    units: Mapping[str, str] | None = None,
 ) -> BodySchema:
-    """Learn a body from data (paper, II-D and II-E); `gemuco.learning.train.fit` also returns the history.
+    """Learn a body from data (paper, II-D and II-E); `fit` also returns how training went.
 
     Args:
-        dataset: Episodes of one body.
+        data: Episodes of one body, as a dataset or as plain arrays; see `as_dataset`.
         config: Settings of the training; the defaults if not given.
         masks: The feasible masks; determined from the data if not given, and x_out with them.
         x_out: Signals to infer; every signal if masks are given and this is not.
+        units: Signal -> unit, of plain arrays.
     """
-    config = config or TrainConfig()
+    dataset = as_dataset(data, units)
+    config = TrainConfig() if config is None else config
     if masks is None:
         structure = determine(dataset, config)
         masks, x_out = structure.masks, x_out or structure.x_out

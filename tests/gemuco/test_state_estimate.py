@@ -155,7 +155,6 @@ def test_several_samples_at_once_are_refused(schema, arm):
     many = arm.sample(3, 0)
     posture = {"joint_position": many["joint_position"][0]}
     questions = (
-        lambda values: estimate(schema, values),
         lambda values: score(schema, values),
         lambda values: adapt(schema, [values]),
         lambda values: control(schema, posture, values, command="muscle_length"),
