@@ -4,20 +4,23 @@ from typing import Annotated, Literal, TypeVar
 
 from pydantic import Field, ValidationError
 
+from gemuco.learning.config import TrainConfig
 from hal.config import Positive, RangeConfig, RobotConfig, Section, explain
 from hal.errors import ConfigError
 from services.model.control_config import ControlConfig, SimulationConfig, named_signals
 
 Count = Annotated[int, Field(ge=1)]
+DEFAULT = TrainConfig()
+"""The defaults of training are those of the library."""
 
 
 class NetworkConfig(Section):
     """Shape of the encoder; the decoder mirrors it."""
 
-    hidden: tuple[Count, ...] = (200, 30)
-    latent: Count = 15
+    hidden: tuple[Count, ...] = DEFAULT.hidden
+    latent: Count = DEFAULT.latent
     activation: Literal["tanh", "relu", "sigmoid", "elu", "softplus"] = "tanh"
-    bias: Annotated[int, Field(ge=0)] = 0
+    bias: Annotated[int, Field(ge=0)] = DEFAULT.bias_size
     """Length of the parametric bias p, one p per condition; 0 without."""
 
 
@@ -43,17 +46,17 @@ class StructureConfig(Section):
 class TrainingConfig(Section):
     """How the network is fitted once its structure is known."""
 
-    epochs: Count = 150
-    batch: Count = 250
-    rate: Positive = 3e-3
+    epochs: Count = DEFAULT.epochs
+    batch: Count = DEFAULT.batch
+    rate: Positive = DEFAULT.rate
     """Peak learning rate of the one-cycle schedule."""
-    bias_rate: Positive = 1e-2
+    bias_rate: Positive = DEFAULT.bias_rate
     """Peak learning rate of p."""
-    held_out: Annotated[float, Field(gt=0, lt=1)] = 0.2
+    held_out: Annotated[float, Field(gt=0, lt=1)] = DEFAULT.held_out
     """Share of every condition's data that only measures."""
-    patience: Count | None = None
-    """Stop after so many epochs without a better held-out loss; to the end if absent."""
-    outliers: Positive = 6.0
+    patience: Count | None = DEFAULT.patience
+    """Training stops after this many epochs without a better held-out loss; `null`: it goes on to the end."""
+    outliers: Positive = DEFAULT.outliers
     """Reject a measured signal that the others contradict by so many robust standard deviations; `.inf`: none."""
 
 

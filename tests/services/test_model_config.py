@@ -2,8 +2,10 @@ from pathlib import Path
 
 import pytest
 
+from gemuco import Thresholds, TrainConfig, UpdateConfig
 from hal.config import RobotConfig, load_robot
 from hal.errors import ConfigError
+from services.learning.trainer import train_config
 from services.model.model_config import collect_config, model_config
 
 ROBOT = Path(__file__).parents[2] / "robots" / "musashi_arm.yaml"
@@ -50,3 +52,18 @@ def test_a_mistake_is_one_sentence(section: str, content: dict, sentence: str) -
 
 def test_a_robot_without_control_is_only_observed() -> None:
     assert model_config(robot(model={})).control is None
+
+
+def test_training_has_the_defaults_of_the_library() -> None:
+    ours = train_config(model_config(robot(model={})), TrainConfig().epochs, TrainConfig().seed)
+    assert ours == TrainConfig()
+
+
+def test_the_update_has_the_defaults_of_the_library() -> None:
+    ours = model_config(robot(model={})).update.model_dump(exclude={"interval"})
+    assert UpdateConfig(**ours) == UpdateConfig()
+
+
+def test_structure_has_the_thresholds_of_the_library() -> None:
+    ours = model_config(robot(model={})).structure
+    assert Thresholds(ours.threshold_out, ours.threshold_in, ours.measure, ours.over) == Thresholds()
