@@ -1,4 +1,4 @@
-"""What every story does with a robot: take over, send it somewhere, wait, and go on after the HAL stopped it."""
+"""Actions of every story on a robot: engage, send a target, wait, and go on after the HAL stopped it."""
 
 import time
 from collections.abc import Callable
@@ -11,12 +11,12 @@ from services.client import Client
 from services.errors import NotEngaged, ServiceError
 
 NOTICED_WITHIN = 3.0
-"""Time [s] within which what happens must be told."""
+"""An event must be reported within this time [s]."""
 ENGAGED_WITHIN = 1.0
 FOLLOWS_WITHIN = 15.0
-"""Time [s] that it may take to be followed: drives let go, nodes come back, and what refused once is asked again."""
+"""The robot must follow within this time [s]: drives are released, nodes come back, and refusals are repeated."""
 TRIES = 3
-"""How often one target is given, if the HAL stops the robot on the way each time."""
+"""A target is given at most this often, if the HAL stops the robot on the way each time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,11 +24,11 @@ class Stage:
     """One stage of a story.
 
     Attributes:
-        name: What happened.
-        start: When it began [s of the timeline].
-        end: When it ended.
-        figures: What was measured, in physical units.
-        observed: Whether what the stage is about was really seen.
+        name: Name of the stage.
+        start: Its beginning [s of the timeline].
+        end: Its end [s of the timeline].
+        figures: Sentences on measured values, in physical units.
+        observed: Whether the event of the stage was really observed.
     """
 
     name: str
@@ -39,16 +39,16 @@ class Stage:
 
 
 class Actor:
-    """Moves a robot through a client, as any remote program could."""
+    """Mover of a robot, through a client as any remote program."""
 
-    def __init__(self, client: Client, idle: Callable[[], None], tell: Callable[[str], None]) -> None:
-        """`idle` is called all the time while waiting, `tell` with what happens."""
-        self._client, self._idle, self._tell = client, idle, tell
+    def __init__(self, client: Client, idle: Callable[[], None], report: Callable[[str], None]) -> None:
+        """`idle` is called again and again while waiting, `report` with a line of text per event."""
+        self._client, self._idle, self._report = client, idle, report
         self.stops = 0
-        """How often the HAL stopped the robot by itself."""
+        """Number of times that the HAL stopped the robot by itself."""
 
     def engage(self) -> None:
-        """Engage, out of a fault too, and again if the moment was a bad one: a sample may be late just then.
+        """Engage, also out of a fault, and repeatedly, since a sample may be late at that moment.
 
         Raises:
             ServiceError: The robot does not follow.
@@ -68,7 +68,7 @@ class Actor:
             self.wait(self._follows, ENGAGED_WITHIN)
 
     def go(self, signal: str, values: np.ndarray, duration: float) -> None:
-        """Give a target [its unit], shape (n,), wait for so long [s]; again if the HAL stopped the robot on the way."""
+        """Give a target [its unit], shape (n,), and wait `duration` [s]; repeat if the HAL stopped the robot."""
         for _ in range(TRIES):
             if not self._follows():
                 self._recover()
@@ -78,7 +78,7 @@ class Actor:
                 return
 
     def wait(self, condition: Callable[[], bool], duration: float) -> bool:
-        """Wait for so long [s] or until the condition holds; whether it did."""
+        """Wait for `duration` [s] or until the condition holds; return whether it did."""
         deadline = time.monotonic() + duration
         while not condition():
             if time.monotonic() >= deadline:
@@ -88,31 +88,31 @@ class Actor:
         return True
 
     def truth(self, signal: str) -> np.ndarray:
-        """What a signal really is now [its unit], shape (n,).
+        """Return the true value of a signal now [its unit], shape (n,).
 
         Raises:
-            ServiceError: The simulator does not tell.
+            ServiceError: The simulator does not answer.
         """
         truth = self._client.truth(timeout=NOTICED_WITHIN)
         if truth is None:
-            raise ServiceError("The simulator does not tell the truth any more; see the logs beside the plot.")
+            raise ServiceError("The simulator does not publish the truth any more; see the logs beside the plot.")
         return truth.values[signal]
 
     def play(self, stage: Callable[[], Stage]) -> Stage:
-        """Play one stage and tell what was measured."""
-        done = stage()
-        for figure in done.figures:
-            self._tell(f"    {figure}")
-        if not done.observed:
-            self._tell("    [red]That is not what should have been seen.[/]")
-        return done
+        """Play one stage and report its measured values."""
+        played = stage()
+        for figure in played.figures:
+            self._report(f"    {figure}")
+        if not played.observed:
+            self._report("    [red]This differs from what should have been observed.[/]")
+        return played
 
     def _recover(self) -> None:
-        """Go on after the HAL stopped the arm, as a person would: read why, reset, engage again."""
+        """Go on after the HAL stopped the arm: read the reason, reset, engage again."""
         mode, status = self._mode(), self._client.status("hal", timeout=1.0)
         fault = status.facts.get("fault") if status else ""
-        why = f"({mode}). {fault or 'Commands came too late.'}"
-        self._tell(f"    [yellow]The HAL stopped the arm {why} It is reset and engaged again.[/]")
+        reason = f"({mode}). {fault or 'Commands came too late.'}"
+        self._report(f"    [yellow]The HAL stopped the arm {reason} It is reset and engaged again.[/]")
         self.stops += 1
         self.engage()
 

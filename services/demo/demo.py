@@ -1,4 +1,4 @@
-"""`gemuco demo`: everything from nothing, one minute of story, and nothing left behind."""
+"""`gemuco demo`: make a model, start all processes, play a story of one minute, and end every process."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -15,7 +15,7 @@ from hal.errors import ConfigError
 from services.client import Client
 from services.demo import pace
 from services.demo.actor import Actor, Stage
-from services.demo.pace import Pace
+from services.demo.pace import CycleCounts
 from services.demo.story import MUSCLE, Story
 from services.demo.timeline import Timeline
 from services.demo.tool_story import ToolStory
@@ -28,48 +28,50 @@ from services.process.supervisor import Supervisor, gemuco_command
 from services.show import progress
 
 READY_WITHIN = 180.0
-"""Time [s] that a process has to come up on a busy machine."""
+"""A process has this time [s] to come up on a busy machine."""
 CLIENT = "remote client"
 LEAST_LINES = 20
-"""What the remote client must have printed to count as observed."""
+"""The remote client must have printed this many estimates to count as observed."""
 
 
 def play(robot: RobotConfig, path: Path, seed: int, out: Path) -> int:
-    """Make a model if there is none, run the processes, play the story; the exit code is 0 if all was observed.
+    """Make a model if there is none, run the processes and play the story; return 0 if everything was observed.
 
     Args:
-        robot: The robot file's content.
+        robot: Content of the robot file.
         path: The robot file.
-        seed: Which of the actual robots.
+        seed: Seed of the simulated actual robot.
         out: Folder for plot, recording and logs.
     """
     console = Console()
     started = time.monotonic()
     target = control_of(robot).target
     make_model(robot, console)
-    with progress("compiling") as tell:  # what the processes would each wait for
-        warm(tell)
+    with progress("compiling") as report:  # otherwise each process would wait for it
+        warm(report)
     with Supervisor(out, at_checks=True) as supervisor:
         with running(robot, path, seed, target, out, supervisor, console) as cast:
             stages = perform(cast.robot, cast.client, target, seed, cast.actor, out / "story.png", console)
         supervisor.stop("client", "recorder")
-        cast.remote.tell()
+        cast.remote.print_new()
     ok = summary(stages, cast.actor.stops, cast.remote, out, console)
     if cast.robot.rates != robot.rates:
-        console.print(f"Played at {cast.robot.rates.hal:g} Hz, for this machine did not keep {robot.rates.hal:g} Hz.")
+        console.print(
+            f"Played at {cast.robot.rates.hal:g} Hz, because this machine did not keep {robot.rates.hal:g} Hz."
+        )
     console.print(f"{time.monotonic() - started:.0f} s in all.")
     return 0 if ok else 1
 
 
 @dataclass(frozen=True, slots=True)
 class Cast:
-    """A robot whose processes run, and what the story needs to play with it.
+    """Running robot and its clients, for the story.
 
     Attributes:
-        robot: As it runs, with the rates that this machine keeps.
-        client: Of the robot.
-        actor: Moves it.
-        remote: What a client in a process of its own prints.
+        robot: The robot, with the rates that this machine keeps.
+        client: Client of the robot.
+        actor: Mover of the robot.
+        remote: Output of a client in a process of its own.
     """
 
     robot: RobotConfig
@@ -82,7 +84,7 @@ class Cast:
 def running(
     robot: RobotConfig, path: Path, seed: int, target: str, out: Path, supervisor: Supervisor, console: Console
 ) -> Iterator[Cast]:
-    """Start the processes; where this machine does not keep their rate, again at half of it, twice at most."""
+    """Start the processes; if this machine does not keep their rate, again at half of it, at most twice."""
     rates = robot.rates
     for halvings_left in reversed(range(pace.HALVINGS + 1)):
         recording = out / "story.mcap"
@@ -93,34 +95,34 @@ def running(
 
             def idle(remote: RemoteClient = remote) -> None:
                 supervisor.check()
-                remote.tell()
+                remote.print_new()
 
             actor = Actor(client, idle, console.print)
-            found = pace.look(client, actor.wait)
-            if not found.is_kept:
-                console.print(too_slow(found, halvings_left))
-            if found.is_kept or not halvings_left:
+            counts = pace.count_cycles(client, actor.wait)
+            if not counts.is_kept:
+                console.print(too_slow(counts, halvings_left))
+            if counts.is_kept or not halvings_left:
                 yield Cast(load_robot(file), client, actor, remote)
                 return
             supervisor.stop_all()
         rates = pace.halved(rates)
 
 
-def too_slow(found: Pace, halvings_left: int) -> str:
-    """What was seen of a rate that is not kept, and what is done about it."""
-    then = (
-        f"All of it is started again at {found.rate / 2:g} Hz."
+def too_slow(counts: CycleCounts, halvings_left: int) -> str:
+    """Return sentences on a rate that is not kept and what is done about it."""
+    consequence = (
+        f"All of it is started again at {counts.rate / 2:g} Hz."
         if halvings_left
         else "The story is played all the same, and the HAL may stop the robot on the way."
     )
-    return f"[yellow]This machine does not keep {found.rate:g} Hz: {found}. {then}[/]"
+    return f"[yellow]This machine does not keep {counts.rate:g} Hz: {counts}. {consequence}[/]"
 
 
 def control_of(robot: RobotConfig) -> ControlConfig:
-    """How the robot is controlled in its story.
+    """Return the settings of control for the robot's story.
 
     Raises:
-        ConfigError: Not at all, or there is no story of such a robot.
+        ConfigError: The robot file has no control, or there is no story for such a robot.
     """
     control = model_config(robot).control
     if not has_tools(robot) and MUSCLE not in robot.signals[robot.command.signal].elements:
@@ -136,23 +138,23 @@ def control_of(robot: RobotConfig) -> ControlConfig:
 
 
 def has_tools(robot: RobotConfig) -> bool:
-    """Whether the robot holds one of several tools, and a camera looks on."""
+    """Whether the robot holds one of several tools and has a camera."""
     return bool(robot.conditions and robot.seen)
 
 
 def perform(
     robot: RobotConfig, client: Client, target: str, seed: int, actor: Actor, picture: Path, console: Console
 ) -> list[Stage]:
-    """Play the story that suits the robot, about its tools if it has some, and draw it."""
+    """Play the story that fits the robot, about its tools if it has some, and draw it."""
     sizes = robot.signals[target].size, robot.signals[robot.command.signal].size
     if has_tools(robot):
         from services.demo import tool_plot
 
         schema = load_model(robot, artifacts.model_folder(robot.robot))
         with Timeline(client, target, *sizes, robot.seen) as timeline:
-            told = ToolStory(robot, client, timeline, seed, actor, console.print, schema).play()
-        tool_plot.plot(robot, target, schema, timeline, told, picture)
-        return told.stages
+            marks_of_tools = ToolStory(robot, client, timeline, seed, actor, console.print, schema).play()
+        tool_plot.plot(robot, target, schema, timeline, marks_of_tools, picture)
+        return marks_of_tools.stages
     from services.demo import story_plot
 
     with Timeline(client, target, *sizes, [target]) as timeline:
@@ -168,13 +170,13 @@ def make_model(robot: RobotConfig, console: Console) -> None:
         console.print(f"Using the model in {folder}.")
         return
     console.print("No model yet: the designer's model moves at random, and the body schema is learned from it.")
-    with progress("collecting") as tell:
-        found = collector.collect_direct(robot, None, 0, progress=tell)
-    console.print(f"{len(found.dataset)} samples, {found.speed:.0f} times faster than real time.")
-    with progress("training") as tell:
-        trained = trainer.train(robot, found.dataset, 0, tell)
-    trainer.show(trained, console)
-    trainer.save(trained, folder)
+    with progress("collecting") as report:
+        collection = collector.collect_direct(robot, None, 0, progress=report)
+    console.print(f"{len(collection.dataset)} samples, {collection.speed:.0f} times faster than real time.")
+    with progress("training") as report:
+        result = trainer.train(robot, collection.dataset, 0, report)
+    trainer.show(result, console)
+    trainer.save(result, folder)
 
 
 def start(
@@ -190,8 +192,8 @@ def start(
     """Start the processes one after another, each when the one before is ready; the last one watches `target`.
 
     Raises:
-        ChildDied: One of them ended.
-        NotReady: One of them did not come up in time.
+        ChildDied: A process ended.
+        NotReady: A process did not come up in time.
     """
     commands = {
         "simulator": ("simulate", str(path), "--variant", "actual", "--seed", str(seed)),
@@ -217,19 +219,19 @@ def _is_running(client: Client, name: str) -> Callable[[], bool]:
 
 
 class RemoteClient:
-    """Shows what the remote client's process prints."""
+    """Output of the remote client's process."""
 
     def __init__(self, sign: str, log: Path, console: Console) -> None:
-        """`sign` is what a line begins with that is an estimate."""
+        """`sign` marks a line that is an estimate."""
         self._sign, self._log, self._console = sign, log, console
         self._read = 0
         self.lines = 0
-        """Estimates that it printed."""
+        """Number of estimates that it printed."""
         self.estimated = 0
-        """Of those, such that were not measured."""
+        """Number of those that were not measured."""
 
-    def tell(self) -> None:
-        """Print the whole lines that are new."""
+    def print_new(self) -> None:
+        """Print the new complete lines."""
         if not self._log.exists():
             return
         with self._log.open() as log:
@@ -244,7 +246,7 @@ class RemoteClient:
 
 
 def summary(stages: list[Stage], stops: int, remote: RemoteClient, out: Path, console: Console) -> bool:
-    """Print what happened as a table; whether every stage was really observed."""
+    """Print a table of the stages; return whether every stage was really observed."""
     table = Table(title="What happened", title_justify="left", show_lines=True)
     table.add_column("stage")
     table.add_column("measured")

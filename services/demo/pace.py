@@ -1,4 +1,4 @@
-"""Whether this machine keeps the rate of a robot file, and the same robot at half of it where it does not."""
+"""Check that this machine keeps the rate of a robot file, and a robot file at half the rate if it does not."""
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -15,24 +15,24 @@ from services.errors import ServiceError
 from services.wire.messages import Status
 
 LOOK = 4.0
-"""How long [s] is looked: a HAL tells how it does once a second."""
+"""The HAL is watched for this long [s]; it reports its counts once a second."""
 MOST_SKIPPED, MOST_INCOMPLETE = 0.02, 0.05
-"""Shares of the cycles that may be left out, or be without some answer, at a rate that is kept: drives and sensors
-survive a cycle now and then, and a machine that does its work misses none."""
+"""At most these shares of the cycles may be skipped, or lack an answer, at a rate that is kept: drives and sensors
+survive a missed cycle now and then, and a machine that is fast enough misses none."""
 HALVINGS = 2
-"""How often the rate is halved at most: a quarter of 200 Hz is as slow as a command may come."""
+"""The rate is halved at most this often: a quarter of 200 Hz is the slowest rate of commands."""
 
 
 @dataclass(frozen=True, slots=True)
-class Pace:
-    """How the HAL kept its rate for a while.
+class CycleCounts:
+    """Cycles of the HAL during a while.
 
     Attributes:
-        rate: What was wanted [Hz].
-        cycles: Cycles that were done.
-        skipped: Cycles that there was no time for.
-        incomplete: Cycles, of those done, in which not every device answered in time.
-        late: 99 of 100 cycles began no later than this [s].
+        rate: Rate of the robot file [Hz].
+        cycles: Number of cycles done.
+        skipped: Number of cycles skipped for lack of time.
+        incomplete: Number of cycles in which a device did not answer in time.
+        late: 99 of 100 cycles began at most this late [s].
     """
 
     rate: float
@@ -42,24 +42,24 @@ class Pace:
     late: float
 
     @classmethod
-    def between(cls, before: Status, after: Status) -> "Pace":
-        """From two statuses of the HAL."""
-        then, now = before.loops["hal"], after.loops["hal"]
+    def between(cls, before: Status, after: Status) -> "CycleCounts":
+        """Return the counts between two statuses of the HAL."""
+        first, last = before.loops["hal"], after.loops["hal"]
         return cls(
-            rate=now["rate_wanted"],
-            cycles=int(now["ticks"] - then["ticks"]),
-            skipped=int(now["skipped"] - then["skipped"]),
+            rate=last["rate_wanted"],
+            cycles=int(last["ticks"] - first["ticks"]),
+            skipped=int(last["skipped"] - first["skipped"]),
             incomplete=int(after.facts["incomplete"]) - int(before.facts["incomplete"]),
-            late=now["late_p99"],
+            late=last["late_p99"],
         )
 
     @property
     def is_kept(self) -> bool:
-        """Whether the rate is one that this machine keeps."""
+        """Whether this machine keeps the rate."""
         if self.cycles <= 0:
             return False
-        is_often = self.skipped <= MOST_SKIPPED * (self.cycles + self.skipped)
-        return is_often and self.incomplete <= MOST_INCOMPLETE * self.cycles
+        is_regular = self.skipped <= MOST_SKIPPED * (self.cycles + self.skipped)
+        return is_regular and self.incomplete <= MOST_INCOMPLETE * self.cycles
 
     def __str__(self) -> str:
         return (
@@ -68,31 +68,31 @@ class Pace:
         )
 
 
-def look(client: Client, wait: Callable[[Callable[[], bool], float], bool]) -> Pace:
-    """Watch the HAL for `LOOK` seconds.
+def count_cycles(client: Client, wait: Callable[[Callable[[], bool], float], bool]) -> CycleCounts:
+    """Count the cycles of the HAL for `LOOK` seconds.
 
     Args:
-        client: Of the robot.
-        wait: As `Actor.wait`: for so long [s] or until the condition holds.
+        client: Client of the robot.
+        wait: `Actor.wait`.
 
     Raises:
-        ServiceError: The HAL does not say how it does.
+        ServiceError: The HAL publishes no status.
     """
     before = _newest(client)
     wait(lambda: False, LOOK)
     wait(lambda: _newest(client).stamp_ns > before.stamp_ns, LOOK)
-    return Pace.between(before, _newest(client))
+    return CycleCounts.between(before, _newest(client))
 
 
 def _newest(client: Client) -> Status:
     status = client.status("hal", timeout=1.0)
     if status is None:
-        raise ServiceError("The HAL does not tell any more how it does; see the logs.")
+        raise ServiceError("The HAL publishes no status any more; see the logs.")
     return status
 
 
 def halved(rates: RatesConfig) -> RatesConfig:
-    """Half the rate for all that follows the HAL's cycle; the slower loops stay, but none is faster than the cycle."""
+    """Return half the rates for loops that follow the HAL's cycle; slower loops keep theirs, up to the HAL's."""
     hal = rates.hal / 2
     return RatesConfig(
         hal=hal,
@@ -105,10 +105,10 @@ def halved(rates: RatesConfig) -> RatesConfig:
 
 @contextmanager
 def at_rates(path: Path, robot: RobotConfig, rates: RatesConfig) -> Iterator[Path]:
-    """The robot file at other rates, in a file beside it for as long as it is needed.
+    """Yield the path of the robot file at other rates, a file beside it while the context lasts.
 
-    What the HAL measures stays valid for as many cycles as before: the same time would be no cycle at all in the end.
-    The model stays the one it has, for nothing of this says what the robot is.
+    Signals of the HAL stay valid for as many cycles as before. The model stays the same, since rates are no part of the
+    robot's fingerprint.
 
     Raises:
         ServiceError: The file cannot be written.
@@ -124,7 +124,7 @@ def at_rates(path: Path, robot: RobotConfig, rates: RatesConfig) -> Iterator[Pat
                 "stale_after": signal.stale_after * robot.rates.hal / rates.hal
             }
     with ExitStack() as kept:
-        try:  # a dot in the stem: listed nowhere as a robot file
+        try:  # names with a dot in the stem are not listed as robot files
             name = f"{path.stem}.{rates.hal:g}_hz."
             file = kept.enter_context(NamedTemporaryFile("w", prefix=name, suffix=path.suffix, dir=path.parent))
             yaml.safe_dump(described, file)

@@ -1,4 +1,4 @@
-"""The story of the demo: an arm moves, loses a sensor, learns its body, loses a muscle."""
+"""Story of the demo: an arm moves, loses a sensor, learns its body, loses a muscle."""
 
 from collections import Counter
 from collections.abc import Callable
@@ -13,32 +13,32 @@ from services.demo.timeline import Timeline, hidden_error
 from services.wire.messages import Anomaly
 
 POSE_TIME = 2.5
-"""Time for one pose [s]."""
+"""The arm has this time for one pose [s]."""
 POSES = 6
-"""Fresh poses at which the model is measured, before and after the update; none of them is learned from."""
+"""The model is measured at this many fresh poses, before and after the update; it does not learn from them."""
 LEARNING_POSES = 8
 LEARNING_TIME = 2.0
 LEARNED = 80
-"""Samples that the online update takes in before it is stopped; eight poses bring about a hundred."""
+"""The online update takes this many samples before it is stopped; eight poses bring about a hundred."""
 NORMAL = 100
-"""Samples of motion from which it is learned what is normal; six fresh poses bring about 150."""
+"""The statistics of normal errors are learned from this many samples; six fresh poses bring about 150."""
 MOST_POSES = 24
-"""After so many more the samples must do: a machine may be slow, but not without end."""
+"""After this many more poses the samples must suffice, because a machine may be slow."""
 CALM_TIME = 2.0
-"""How long [s] no anomaly may be told before the muscle is cut."""
+"""No anomaly may be reported for this long [s] before the muscle is cut."""
 CALM_TRIES = 3
-"""How often what is normal is learned at most, each time from more poses."""
+"""The statistics of normal errors are learned at most this often, each time from more poses."""
 SILENT_POSES = 3
 CUT_POSES = 3
 INSIDE = 0.15
-"""Targets keep this share of the range away from the limits."""
+"""Targets keep this share of the range as a distance from the limits."""
 ENCODER, SILENT_ELEMENT = "shoulder_roll_encoder", "shoulder_roll"
 MUSCLE = "deltoid_side"
 
 
 @dataclass(slots=True)
 class Marks:
-    """Moments and figures that the plot shows, on the timeline's clock."""
+    """Moments [s of the timeline] and figures that the plot shows."""
 
     silent: tuple[float, float] = (0.0, 0.0)
     learning: tuple[float, float] = (0.0, 0.0)
@@ -51,14 +51,14 @@ class Marks:
 
 
 class Story:
-    """Plays the stages through a client, as any remote program could."""
+    """Stages of the demo, played through a client as by any remote program."""
 
     def __init__(
         self, robot: RobotConfig, client: Client, timeline: Timeline, seed: int, actor: Actor,
-        tell: Callable[[str], None],
+        report: Callable[[str], None],
     ) -> None:  # fmt: skip
-        """`tell` is called with what happens."""
-        self._client, self._timeline, self._actor, self._tell = client, timeline, actor, tell
+        """`report` is called with a line of text per event."""
+        self._client, self._timeline, self._actor, self._report = client, timeline, actor, report
         self._signal = "joint_position"
         self._elements = robot.signals[self._signal].elements
         self._muscles = robot.signals[robot.command.signal].elements
@@ -69,14 +69,14 @@ class Story:
         self.marks = Marks()
 
     def play(self) -> Marks:
-        """All stages, about a minute."""
+        """Play all stages, about a minute."""
         for stage in (self.move, self.lose_sensor, self.learn, self.lose_muscle):
             self.marks.stages.append(self._actor.play(stage))
         return self.marks
 
     def move(self) -> Stage:
-        """(a) Targets are reached."""
-        self._tell("[bold](a)[/] The controller moves the arm to targets.")
+        """Play (a): the arm moves to targets."""
+        self._report("[bold](a)[/] The controller moves the arm to targets.")
         start = self._timeline.now()
         self._actor.engage()
         misses, errors = self._measure_poses()
@@ -91,8 +91,8 @@ class Story:
         return Stage("moves to targets", start, self._timeline.now(), figures, reached < 0.5 and span > 0.3)
 
     def lose_sensor(self) -> Stage:
-        """(b) An encoder falls silent; the arm goes on with an estimate."""
-        self._tell(f"[bold](b)[/] The node of {ENCODER} falls silent. The arm goes on with an estimate.")
+        """Play (b): an encoder falls silent; the arm goes on with an estimate."""
+        self._report(f"[bold](b)[/] The node of {ENCODER} falls silent. The arm goes on with an estimate.")
         index = self._elements.index(SILENT_ELEMENT)
         start = self._timeline.now()
         self._client.fault(f"sensor_silent {ENCODER}")
@@ -117,8 +117,8 @@ class Story:
         return Stage("loses an encoder", start, self._timeline.now(), figures, noticed and returned and mean < 0.5)
 
     def learn(self) -> Stage:
-        """(c) The model learns online while the arm moves, and is measured on fresh poses."""
-        self._tell("[bold](c)[/] The online update learns from the arm's own motion.")
+        """Play (c): the model learns online while the arm moves, and is measured at fresh poses."""
+        self._report("[bold](c)[/] The online update learns from the arm's own motion.")
         start = self._timeline.now()
         self._client.adapt(True)
         for _ in range(LEARNING_POSES):
@@ -134,14 +134,14 @@ class Story:
             f"learned for {self.marks.learning[1] - start:.0f} s from {window} samples",
             f"estimate on {POSES} fresh poses with all encoders hidden: {before:.3f} rad before, {after:.3f} rad after",
             f"distance from the targets now {_mean_norm(misses):.3f} rad",
-            f"what is normal learned anew from {normal} samples",
+            f"statistics of normal errors learned anew from {normal} samples",
         )
         return Stage("learns its own body", start, self._timeline.now(), figures, after < before)
 
     def lose_muscle(self) -> Stage:
-        """(d) A muscle is cut, and the anomaly detector says which."""
+        """Play (d): a muscle is cut, and the anomaly detection names it."""
         self._become_calm()
-        self._tell(f"[bold](d)[/] The wire of {MUSCLE} is cut.")
+        self._report(f"[bold](d)[/] The wire of {MUSCLE} is cut.")
         start = self._timeline.now()
         calm = self._timeline.between("is_anomaly", start - CALM_TIME, start)
         score = float(np.nanmedian(self._timeline.between("score", start - CALM_TIME, start)))
@@ -159,7 +159,7 @@ class Story:
         limit = float(np.nanmedian(self._timeline.between("threshold", start, end)))
         figures = (
             f"anomaly score {score:.1f} before the cut, {after:.1f} after it, threshold {limit:.1f}",
-            f"told after {1e3 * (self.marks.alarm - start):.0f} ms; blamed element {element or 'none'}",
+            f"reported after {1e3 * (self.marks.alarm - start):.0f} ms; blamed element {element or 'none'}",
             f"muscle with the largest part in the score: {self.marks.blamed or 'none'}",
         )
         right = self.marks.blamed == MUSCLE
@@ -167,7 +167,7 @@ class Story:
         return Stage("loses a muscle", start, end, figures, alarmed and right and not calm.any())
 
     def _gather(self, samples: int) -> int:
-        """Go on to more poses until the model's window holds so many samples; how many it does."""
+        """Go to more poses until the model's window holds this many samples; return its number of samples."""
         for _ in range(MOST_POSES):
             if self._window() >= samples:
                 break
@@ -179,24 +179,26 @@ class Story:
         return 0 if update is None else update.window
 
     def _learn_normal(self) -> int:
-        """Learn what is normal from motion since the model changed; from how many samples."""
+        """Learn the statistics of normal errors since the model changed; return the number of samples."""
         self._gather(NORMAL)
         return int(self._client.ask("model", "normal")["samples"])
 
     def _become_calm(self) -> None:
-        """See that nothing is told of the whole arm; if something is, learn what is normal from more of its motion."""
+        """Wait until no anomaly is reported for the whole arm; if one is, learn normal errors from more motion."""
         for tries_left in reversed(range(CALM_TRIES)):
             start = self._timeline.now()
             self._actor.wait(lambda: False, CALM_TIME)
             if not self._timeline.between("is_anomaly", start, self._timeline.now()).any() or not tries_left:
                 return
-            self._tell("    An anomaly is told of the whole arm: what is normal is learned from more of its motion.")
+            self._report(
+                "    An anomaly is reported for the whole arm: normal errors are learned from more of its motion."
+            )
             for _ in range(LEARNING_POSES):
                 self._go(self._pose(), LEARNING_TIME)
-            self._tell(f"    What is normal learned anew from {self._learn_normal()} samples.")
+            self._report(f"    Statistics of normal errors learned anew from {self._learn_normal()} samples.")
 
     def _blamed_muscle(self, anomalies: list[Anomaly]) -> str:
-        """The muscle whose tension and length together contribute most; empty without anomalies."""
+        """Return the muscle whose tension and length together contribute most; empty without anomalies."""
         total = np.zeros(len(self._muscles))
         for anomaly in anomalies:
             for signal in self._muscle_signals & anomaly.contribution.keys():
@@ -204,7 +206,7 @@ class Story:
         return self._muscles[int(np.argmax(total))] if anomalies else ""
 
     def _measure_poses(self) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """At every fresh pose: target minus truth, and estimate with the encoders hidden minus truth [rad]."""
+        """Return, for every fresh pose, target minus truth and estimate with hidden encoders minus truth [rad]."""
         misses, errors = [], []
         for pose in self._poses:
             self._go(pose, POSE_TIME)
@@ -213,15 +215,15 @@ class Story:
         return misses, errors
 
     def _hidden_error(self) -> np.ndarray:
-        """Estimate with the encoders hidden minus truth [rad]; asked again while a muscle's sensor is late."""
-        found: list[np.ndarray] = []
+        """Return estimate with hidden encoders minus truth [rad]; queried again while a muscle's sensor is late."""
+        errors: list[np.ndarray] = []
 
-        def is_told() -> bool:
-            found.append(hidden_error(self._client, self._signal, [self._signal]))
-            return bool(np.isfinite(found[-1]).all())
+        def is_complete() -> bool:
+            errors.append(hidden_error(self._client, self._signal, [self._signal]))
+            return bool(np.isfinite(errors[-1]).all())
 
-        self._actor.wait(is_told, NOTICED_WITHIN)
-        return found[-1]
+        self._actor.wait(is_complete, NOTICED_WITHIN)
+        return errors[-1]
 
     def _go(self, pose: np.ndarray, duration: float) -> None:
         self._actor.go(self._signal, pose, duration)

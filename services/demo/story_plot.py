@@ -1,4 +1,4 @@
-"""The story in one picture."""
+"""Picture of the story."""
 
 from pathlib import Path
 
@@ -49,8 +49,8 @@ def _silent_joint(axis: Axes, robot: RobotConfig, timeline: Timeline, marks: Mar
     axis.axvspan(*marks.silent, color="gold", alpha=0.3, label="encoder silent")
     axis.plot(time[:rows], truth[:rows, index], color="black", linewidth=2.5, alpha=0.35, label="truth")
     axis.plot(time[:rows], value[:rows, index], color=BLUE, linewidth=1, label="published value")
-    guessed = np.where(estimated, value[:rows, index], np.nan)
-    axis.plot(time[:rows], guessed, color=RED, linewidth=2, label="of which estimated")
+    estimates = np.where(estimated, value[:rows, index], np.nan)
+    axis.plot(time[:rows], estimates, color=RED, linewidth=2, label="of which estimated")
     axis.set_ylabel(f"{SILENT_ELEMENT} [rad]")
     axis.legend(loc="lower left", ncols=4, fontsize=8)
 

@@ -1,4 +1,4 @@
-"""What happened during a story, sampled beside it: truth, estimate, hidden estimate, anomaly, applied command."""
+"""Record of a story: truth, estimate, estimate with hidden signals, anomaly and applied command over time."""
 
 import math
 import threading
@@ -15,22 +15,22 @@ from services.errors import ServiceError
 from services.wire.messages import Anomaly, Update
 
 EVERY = 0.05
-"""Time between two rows [s]."""
+"""Rows have this distance in time [s]."""
 HIDDEN_EVERY = 4
-"""Each so many rows, the model is asked for the signal as if it were not measured at all."""
+"""Every this many rows, the model is queried for the signal as if it were not measured."""
 
 
 class Timeline:
-    """Rows of a story in a thread of its own, as columns of arrays.
+    """Columns of a story, sampled in a thread.
 
     Columns are `time` [s since the start], `truth`, `value`, `estimated` and `source` (method and signals) of one
     signal, `applied` command, `score`, `threshold`, `is_anomaly` and `verdict`; and on a time axis of their own
-    `hidden_time` and `hidden_error`, the norm of what the model says of the hidden signal minus the truth [its unit].
-    What was not there is NaN.
+    `hidden_time` and `hidden_error`, the norm of the model's estimate of the hidden signal minus the truth [its unit].
+    Missing values are NaN.
     """
 
     def __init__(self, client: Client, signal: str, size: int, commands: int, hide: Sequence[str]) -> None:
-        """Prepare for a signal of so many elements, and for asking the model with some signals hidden."""
+        """Prepare for a signal of `size` elements, and for queries of the model with the signals `hide` hidden."""
         self._client, self._signal, self._hide = client, signal, hide
         self._nothing, self._no_command = np.full(size, np.nan), np.full(commands, np.nan)
         self._columns: dict[str, list[object]] = defaultdict(list)
@@ -40,7 +40,7 @@ class Timeline:
         self.anomalies: list[tuple[float, Anomaly]] = []
         """Time [s] and message of every row that was an anomaly."""
         self.updates: list[tuple[float, Update]] = []
-        """Time [s] and message of what the online update said, once each."""
+        """Time [s] and message of every report of the online update."""
 
     def __enter__(self) -> "Timeline":
         self._start = time.monotonic()
@@ -52,15 +52,15 @@ class Timeline:
         self._thread.join()
 
     def now(self) -> float:
-        """Seconds since the start."""
+        """Return the time since the start [s]."""
         return time.monotonic() - self._start
 
     def column(self, name: str) -> np.ndarray:
-        """A column so far, shape (rows,) or (rows, n)."""
+        """Return a column so far, shape (rows,) or (rows, n)."""
         return np.array(list(self._columns[name]))
 
     def between(self, name: str, start: float, end: float, axis: str = "time") -> np.ndarray:
-        """The rows of a column in a span of time [s]."""
+        """Return the rows of a column in a span of time [s]."""
         column = self.column(name)
         at = self.column(axis)[: len(column)]
         return column[: len(at)][(at >= start) & (at < end)]
@@ -70,7 +70,7 @@ class Timeline:
         while not self._stop.wait(max(0.0, row * EVERY - self.now())):
             self._sample()
             if row % HIDDEN_EVERY == 0:
-                self._ask_hidden()
+                self._query_hidden()
             row = max(row + 1, math.floor(self.now() / EVERY))
 
     def _sample(self) -> None:
@@ -96,7 +96,7 @@ class Timeline:
             self._columns[name].append(value)
         self._columns["time"].append(self.now())
 
-    def _ask_hidden(self) -> None:
+    def _query_hidden(self) -> None:
         try:
             error = hidden_error(self._client, self._signal, self._hide)
         except (ServiceError, SchemaError, HalError):
@@ -106,7 +106,7 @@ class Timeline:
 
 
 def hidden_error(client: Client, signal: str, hide: Sequence[str]) -> np.ndarray:
-    """What the model says of a signal while some are hidden, minus the truth [unit], shape (n,); NaN if unknown."""
+    """Return the estimate of a signal with some signals hidden minus the truth [unit], shape (n,); NaN if unknown."""
     answer = client.infer(signal, hide=hide)
     truth = client.truth()
     value = np.asarray(answer["values"], float)

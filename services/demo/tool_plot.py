@@ -1,4 +1,4 @@
-"""The story of a robot with tools in one picture."""
+"""Picture of the story of a robot with tools."""
 
 from pathlib import Path
 
@@ -62,8 +62,8 @@ def _tip(axis: Axes, elements: tuple[str, ...], timeline: Timeline, marks: ToolM
     for index, element in enumerate(elements):
         line = axis.plot(time[:rows], truth[:rows, index], linewidth=4, alpha=0.3, label=f"{element}, truth")[0]
         axis.plot(time[:rows], value[:rows, index], color=line.get_color(), linewidth=1)
-        guessed = np.where(estimated[:rows, index] > 0, value[:rows, index], np.nan)
-        axis.plot(time[:rows], guessed, color=RED, linewidth=1.5, label=None if index else "published as estimated")
+        estimates = np.where(estimated[:rows, index] > 0, value[:rows, index], np.nan)
+        axis.plot(time[:rows], estimates, color=RED, linewidth=1.5, label=None if index else "published as estimated")
     at = [moment for moment, _ in marks.targets] + [timeline.now()]
     for (start, target), end in zip(marks.targets, at[1:], strict=True):
         axis.hlines(target, start, min(end, time[-1]), color="black", linewidth=0.7, linestyle=(0, (4, 3)))
@@ -104,10 +104,10 @@ def _bias(axis: Axes, schema: BodySchema, timeline: Timeline, marks: ToolMarks) 
     time = np.array([at for at, _ in timeline.updates])
     for name, known in zip(schema.biases, prior.known, strict=True):
         away = [prior.between(update.bias, known) for _, update in timeline.updates]
-        told = name in marks.conditions
+        is_played = name in marks.conditions
         axis.plot(
-            time, away, linewidth=2 if told else 1, color=None if told else "0.85", label=name if told else None,
-            zorder=2 if told else 1,
+            time, away, linewidth=2 if is_played else 1, color=None if is_played else "0.85",
+            label=name if is_played else None, zorder=2 if is_played else 1,
         )  # fmt: skip
     axis.set_ylabel("p to known tools [std]")
     axis.set_ylim(bottom=0.0)

@@ -1,4 +1,4 @@
-"""Targets that a robot can reach with either of two tools, by its designer's model."""
+"""Targets that a robot reaches with either of two tools, by its designer's model."""
 
 import numpy as np
 
@@ -9,15 +9,15 @@ from services.learning.motion import Forecast, NowhereToGo
 from services.model.model_config import collect_config
 
 DRAWN = 30_000
-"""Random postures per tool."""
+"""This many random postures are drawn per tool."""
 INSIDE = 0.1
-"""Postures keep this share of the range away from the limits."""
+"""Postures keep this share of the range as a distance from the limits."""
 TRIED = 3000
-"""Of those, how many are tried as a target."""
+"""At most this many postures are tried as a target."""
 CLOSE = 0.02
-"""So near [unit of the target] a posture with the other tool must come to a target."""
+"""A posture with the other tool must come this near to a target [unit of the target]."""
 APART = (0.08, 0.25)
-"""Least and largest distance from one target to the next [unit of the target]."""
+"""One target has at least and at most this distance from the next [unit of the target]."""
 
 
 def common_targets(
@@ -27,18 +27,18 @@ def common_targets(
 
     Args:
         robot: The robot file, whose `collect` section has a forecast of the signal.
-        signal: What is to be reached.
+        signal: Signal of the targets.
         conditions: Two of the robot's conditions.
-        count: How many targets.
-        seed: Of the draws.
+        count: Number of targets.
+        seed: Seed of the draws.
 
     Returns:
         Targets [unit of the signal], shape (count, n), each near the one before; and the postures that reach them
         under the first condition [unit of the commanded signal], shape (count, k).
 
     Raises:
-        ConfigError: Nothing forecasts the signal.
-        NowhereToGo: There are not so many.
+        ConfigError: The robot file has no forecast of the signal.
+        NowhereToGo: There are fewer targets than `count`.
     """
     random = np.random.default_rng(seed)
     (postures, first), (_, second) = (_reached(robot, signal, condition, random) for condition in conditions)
@@ -50,7 +50,7 @@ def common_targets(
 
 
 def _next(order: np.ndarray, first: np.ndarray, second: np.ndarray, chosen: list[int]) -> int:
-    """The first in an order that is new, near the last one chosen, and reached by the second tool as well."""
+    """Return the first index in an order that is new, near the last chosen one, and reached by the second tool too."""
     least, largest = APART
     for index in order:
         away = np.linalg.norm(first[chosen] - first[index], axis=1)
@@ -68,15 +68,15 @@ def _next(order: np.ndarray, first: np.ndarray, second: np.ndarray, chosen: list
 def _reached(
     robot: RobotConfig, signal: str, condition: str, random: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Random postures that are allowed under a condition, shape (m, k), and what they reach, shape (m, n)."""
+    """Return random postures allowed under a condition, shape (m, k), and the targets they reach, shape (m, n)."""
     config = collect_config(robot)
     if config.forecast is None:
-        raise ConfigError(f"Robot '{robot.robot}' has no collect.forecast, so which targets it reaches is not known.")
+        raise ConfigError(f"Robot '{robot.robot}' has no collect.forecast, so its reachable targets are not known.")
     low, high = robot.bounds(robot.command.signal)
     margin = INSIDE * (high - low)
     postures = random.uniform(low + margin, high - margin, (DRAWN, low.size))
     postures = postures[~Forecast(robot, config, condition).outside(postures).any(axis=1)]
-    found = registry.load(config.forecast)(robot, condition, postures)
-    if signal not in found:
-        raise ConfigError(f"{config.forecast} forecasts {', '.join(found)}; the targets are of {signal}.")
-    return postures, np.asarray(found[signal], float)
+    forecast = registry.load(config.forecast)(robot, condition, postures)
+    if signal not in forecast:
+        raise ConfigError(f"{config.forecast} forecasts {', '.join(forecast)}; the targets are of {signal}.")
+    return postures, np.asarray(forecast[signal], float)

@@ -17,7 +17,6 @@ NOT_YET = {
     "simulators",
     "services/client",
     "services/cli.py",
-    "services/demo",
     "services/errors.py",
     "services/hardware",
     "services/health.py",

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from hal.config import RobotConfig, load_robot
 from services.demo import demo, pace
-from services.demo.pace import Pace, at_rates, halved, look
+from services.demo.pace import CycleCounts, at_rates, count_cycles, halved
 from services.errors import ServiceError
 from services.model.artifacts import fingerprint
 from services.wire.messages import Status
@@ -49,8 +49,8 @@ def arm(tmp_path: Path) -> Path:
 
 def test_the_pace_is_what_happened_between_two_statuses() -> None:
     client = Told(status(1, 500, 90, 40), status(1, 500, 90, 40), status(5, 1290, 100, 43), status(5, 1290, 100, 43))
-    found = look(client, until)  # type: ignore[arg-type]
-    assert found == Pace(rate=200.0, cycles=790, skipped=10, incomplete=3, late=0.0031)
+    found = count_cycles(client, until)  # type: ignore[arg-type]
+    assert found == CycleCounts(rate=200.0, cycles=790, skipped=10, incomplete=3, late=0.0031)
     assert found.is_kept
     assert str(found) == "10 of 800 cycles were skipped and 3 incomplete, 99 of 100 began within 3.1 ms"
 
@@ -60,12 +60,12 @@ def test_the_pace_is_what_happened_between_two_statuses() -> None:
     [(800, 0, 0, True), (784, 16, 39, True), (780, 20, 0, False), (800, 0, 41, False), (0, 0, 0, False)],
 )
 def test_a_rate_is_kept_if_few_cycles_are_missed(cycles: int, skipped: int, incomplete: int, is_kept: bool) -> None:
-    assert Pace(200.0, cycles, skipped, incomplete, 0.0).is_kept is is_kept
+    assert CycleCounts(200.0, cycles, skipped, incomplete, 0.0).is_kept is is_kept
 
 
 def test_a_hal_that_says_nothing_is_told() -> None:
-    with pytest.raises(ServiceError, match="does not tell any more how it does"):
-        look(Told(None), until)  # type: ignore[arg-type]
+    with pytest.raises(ServiceError, match="publishes no status any more"):
+        count_cycles(Told(None), until)  # type: ignore[arg-type]
 
 
 def test_half_the_rate_is_half_of_all_that_follows_the_cycle(arm: Path) -> None:
@@ -115,7 +115,7 @@ class Processes:
         self.highest, self.rates, self.stopped = highest, [], 0
         monkeypatch.setattr(demo, "start", self._start)
         monkeypatch.setattr(demo, "Client", self._client)
-        monkeypatch.setattr(pace, "look", self._look)
+        monkeypatch.setattr(pace, "count_cycles", self._look)
 
     def _start(self, robot: RobotConfig, file: Path, *_: object) -> None:
         self.rates.append(load_robot(file).rates.hal)
@@ -124,9 +124,9 @@ class Processes:
     def _client(self, name: str) -> Iterator[None]:
         yield None
 
-    def _look(self, *_: object) -> Pace:
+    def _look(self, *_: object) -> CycleCounts:
         rate = self.rates[-1]
-        return Pace(rate, 700, 0 if rate <= self.highest else 100, 0, 0.002)
+        return CycleCounts(rate, 700, 0 if rate <= self.highest else 100, 0, 0.002)
 
     def check(self) -> None:
         pass

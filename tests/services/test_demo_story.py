@@ -73,7 +73,7 @@ def test_what_is_normal_is_learned_from_more_until_the_whole_arm_is_calm(alarms:
     assert len(machine.normals) == learned
     assert machine.normals == sorted(machine.normals)
     assert machine.poses == learned * LEARNING_POSES
-    assert sum("An anomaly is told of the whole arm" in sentence for sentence in machine.said) == learned
+    assert sum("An anomaly is reported for the whole arm" in sentence for sentence in machine.said) == learned
 
 
 class Stopping:
