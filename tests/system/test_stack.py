@@ -1,12 +1,13 @@
 """The whole stack as processes: simulated nodes, HAL and model of the shipped arm under a name of its own."""
 
 import os
+import re
 import subprocess
 from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from arm_stack import PATIENCE, Stack, eventually
+from arm_stack import PATIENCE, ROOT, Stack, eventually
 
 from services.errors import TargetRefused
 from services.process.supervisor import gemuco_command
@@ -93,6 +94,16 @@ def test_a_second_model_service_is_refused(stack: Stack) -> None:
     assert second.returncode == 1
     assert "already" in second.stderr
     assert "Traceback" not in second.stderr
+
+
+def test_the_remote_client_of_the_front_page_moves_the_arm(stack: Stack) -> None:
+    snippets = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    program = snippets[1].replace('"musashi_arm"', repr(stack.robot), 1) + "            break\n"
+    eventually(lambda: stack.method() == "measured")
+    names: dict[str, object] = {}
+    exec(program, names)
+    assert names["now"].values["joint_position"].shape == (5,)
+    eventually(lambda: stack.mode() == "off")
 
 
 def test_the_arm_follows_and_stops_when_the_model_is_killed(stack: Stack) -> None:

@@ -1,0 +1,37 @@
+"""The snippets of README.md, run as they stand."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import yaml
+
+from hal.config import RobotConfig
+from hal.robot import open_robot
+
+ROOT = Path(__file__).parents[2]
+TEXT = (ROOT / "README.md").read_text()
+
+
+def test_the_first_program_prints_what_the_page_shows() -> None:
+    program, shown = re.search(r"```python\n(.*?)```\n\n```\n(.*?)```", TEXT, re.DOTALL).groups()
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=100, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == shown
+    assert len([line for line in program.splitlines() if line]) == 12
+
+
+def test_the_robot_file_is_a_robot() -> None:
+    text = re.search(r"```yaml\n(.*?)```", TEXT, re.DOTALL)[1]
+    assert len(text.splitlines()) == 8
+    description = yaml.safe_load(text)
+    description["buses"]["can0"] = {"interface": "virtual", "channel": "readme"}
+    robot = open_robot(RobotConfig.model_validate({**description, "folder": ROOT / "robots"}))
+    assert [device.name for device in robot._devices] == ["elbow_drive"]
+
+
+def test_the_page_is_short() -> None:
+    assert len(TEXT.splitlines()) <= 130
