@@ -59,3 +59,13 @@ def anchors(page: Path) -> set[str]:
 def test_reference_lists_every_exported_name(package: ModuleType) -> None:
     page = (ROOT / "docs" / f"api_{package.__name__}.md").read_text()
     assert set(re.findall(rf"^::: {package.__name__}\.(\w+)$", page, re.MULTILINE)) == set(package.__all__)
+
+
+def test_every_test_that_safety_names_exists() -> None:
+    text = (ROOT / "docs" / "safety.md").read_text()
+    named = re.findall(r"`(tests/[\w/]+\.py)((?:::\w+)*)`", text)
+    assert named
+    for path, names in named:
+        assert (ROOT / path).exists(), path
+        definitions = set(re.findall(r"(?:def|class) (\w+)", (ROOT / path).read_text()))
+        assert set(filter(None, names.split("::"))) <= definitions, path + names
