@@ -1,6 +1,6 @@
-"""What several benchmarks need: the trained model of the arm, and random motion of arms that were built otherwise."""
+"""The trained model of the muscle-driven arm, and random motion of its actual variants."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 from rich.console import Console
@@ -18,8 +18,10 @@ from services.model.living_model import load_model
 from simulators.direct import DirectDevice, WorldClock
 
 
-def motion(robot: RobotConfig, body: Robot, seed: int, rate: float, duration: float) -> Iterator[dict[str, np.ndarray]]:
-    """Samples [unit] at a rate [Hz] of so much random motion [s of the arm's time]."""
+def motion(
+    robot: RobotConfig, body: Robot, seed: int, rate: float, duration: float
+) -> Iterator[Mapping[str, np.ndarray]]:
+    """Yield samples [unit] at a rate [Hz] of random motion that lasts `duration` [s of the arm's time]."""
     playground = DirectPlayground(body, rate)
     for command, hold in registry.load(robot.collect["motion"])(robot, seed):
         yield from playground.play(command, hold)
@@ -30,7 +32,7 @@ def motion(robot: RobotConfig, body: Robot, seed: int, rate: float, duration: fl
 def record(
     robot: RobotConfig, arm: int, seed: int, rate: float, duration: float, part: str = ""
 ) -> dict[str, np.ndarray]:
-    """Signal -> samples (count, n) [unit] of one actual arm."""
+    """Return signal -> samples (count, n) [unit] of one actual arm."""
     world = registry.load(robot.simulator or "").world("actual", arm)
     if part:
         world.break_part(part)
@@ -41,7 +43,7 @@ def record(
 
 
 def model(robot: RobotConfig, console: Console) -> BodySchema:
-    """The trained model of the robot; collected and trained here if it is missing."""
+    """Load the trained model of the robot; collect and train first if it is missing."""
     folder = artifacts.model_folder(robot.robot)
     if not folder.exists():
         console.print("collecting and training")

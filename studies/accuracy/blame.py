@@ -1,11 +1,11 @@
-"""How often the right muscle is blamed when it is cut, and the right encoder when it is off: one sample, and a window.
+"""Share of cut muscles and shifted encoders that are blamed rightly: from one sample, and from a window.
 
     python -m studies.accuracy.blame [--arms 3]
 
-On each of several actual arms the model first learns four simulated minutes of motion, then what is normal. Then every
-muscle is cut in turn, and every encoder reads 0.3 rad too much. The first twenty samples above the threshold are judged
-one by one (`gemuco.anomaly.score`) and together (`gemuco.anomaly.blame`). Faults with less than three such samples are
-left out.
+On each of several actual arms the model first learns four simulated minutes of motion, then its normal errors. Then
+every muscle is cut in turn, and every encoder reads 0.3 rad too much. The first twenty samples above the threshold are
+judged one by one (`gemuco.anomaly.score`) and together (`gemuco.anomaly.blame`). Faults with less than three such
+samples are left out.
 """
 
 import argparse
@@ -31,7 +31,7 @@ WINDOW = 20
 
 
 def learned(robot: RobotConfig, schema: BodySchema, arm: int) -> BodySchema:
-    """The model of one actual arm, with what is normal there."""
+    """Return the model of one actual arm, with its normal errors."""
     config = model_config(robot).update
     lived, fresh = record(robot, arm, 100 + arm, 10.0, 240.0), record(robot, arm, 500 + arm, 20.0, 60.0)
     updater = Updater(schema, UpdateConfig(**config.model_dump(exclude={"interval"})))
@@ -43,7 +43,7 @@ def learned(robot: RobotConfig, schema: BodySchema, arm: int) -> BodySchema:
 
 
 def judged(schema: BodySchema, rows: dict[str, np.ndarray], right: str) -> tuple[float, float] | None:
-    """Share of single samples that blame the right name, and whether the window does; None if too few are odd."""
+    """Return the share of single samples that blame the right name, and 1.0 if the window does; None if too few."""
     x = schema.normalise(rows)
     assert schema.normal is not None
     odd = x[schema.normal.distances(prediction_errors(schema, x)) > schema.normal.threshold][:WINDOW]
@@ -70,7 +70,7 @@ if __name__ == "__main__":
             for index, joint in enumerate(robot.signals[JOINTS].elements)
         }
         for label, faults in (("muscle cut", cut), ("encoder off", off)):
-            found = [hit for name, rows in faults.items() if (hit := judged(schema, rows, name)) is not None]
-            single, window = np.mean(found, axis=0) if found else (np.nan, np.nan)
-            table.add_row(str(arm), label, str(len(found)), f"{single:.2f}", f"{window:.2f}")
+            verdicts = [verdict for name, rows in faults.items() if (verdict := judged(schema, rows, name)) is not None]
+            single, window = np.mean(verdicts, axis=0) if verdicts else (np.nan, np.nan)
+            table.add_row(str(arm), label, str(len(verdicts)), f"{single:.2f}", f"{window:.2f}")
     console.print(table)

@@ -1,4 +1,4 @@
-"""What outliers in the training data cost, and what fine-tuning does to what was known, on the PR2's arm.
+"""Cost of outliers in the training data, and effect of fine-tuning on the older conditions, on the PR2's arm.
 
     python -m studies.accuracy.imperfect_data
 
@@ -32,7 +32,7 @@ TUNING = 1e-3
 
 
 def spoilt(data: Dataset) -> Dataset:
-    """The same episodes with outliers, each in a random direction."""
+    """Return the same episodes with outliers, each in a random direction."""
     random = np.random.default_rng(0)
     spread = np.nanstd(data.rows(), axis=0)
     episodes = []
@@ -45,7 +45,7 @@ def spoilt(data: Dataset) -> Dataset:
 
 
 def error(schema: BodySchema, fresh: Dataset) -> float:
-    """Mean error of the tool tip over all grasps [mm]."""
+    """Return the mean error of the tool tip over all grasps [mm]."""
     return 1e3 * float(np.mean(list(errors_by_grasp(schema, fresh).values())))
 
 

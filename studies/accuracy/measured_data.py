@@ -1,4 +1,4 @@
-"""What the model makes of two recordings of real robots.
+"""Structure and errors of the model on two recordings of real robots.
 
     python -m studies.accuracy.measured_data [--seeds 3]
 
@@ -28,14 +28,14 @@ ANGLES = "joint_position"
 
 
 def recording(name: str) -> tuple[MeasuredConfig, Dataset]:
-    """A description of examples/ and the data it describes."""
+    """Return a description of examples/ and the data it describes."""
     config = load_measured(ROOT / "examples" / f"{name}.yaml")
     folder = Path(os.environ.get("GEMUCO_DATA", ROOT.parent / "shared" / "data"))
     return config, read(config, folder / name)
 
 
 def lost_boards(config: MeasuredConfig, data: Dataset, masks: tuple[frozenset[str], ...], seed: int) -> np.ndarray:
-    """Error of the angles with no board lost and with each, last fifth held out [standard deviations], shape (5,)."""
+    """Return the errors of the angles with no board and with each board lost, last fifth held out [std], shape (5,)."""
     rows = data.rows()
     first = round(0.8 * len(rows))
     known = Dataset(data.layout, (Episode("known", data.layout.split(rows[:first])),))
@@ -50,19 +50,19 @@ def _error(schema: BodySchema, rows: np.ndarray, given: set[str]) -> float:
 
 
 def ridge(data: Dataset, weight: float = 10.0) -> np.ndarray:
-    """The same errors of ridge regression, fitted for each set of boards, shape (5,)."""
+    """Return the same errors of ridge regression, fitted for each set of boards, shape (5,)."""
     rows, layout = data.rows(), data.layout
     first = round(0.8 * len(rows))
     mean, std = rows[:first].mean(axis=0), rows[:first].std(axis=0)
     x = np.clip((rows - mean) / np.where(std > 0, std, np.inf), -4.0, 4.0)
     y = x[:, layout.slice(ANGLES)]
-    found = []
+    errors = []
     for lost in ("", *BOARDS):
         given = x[:, layout.indices(set(BOARDS) - {lost})]
         normal = given[:first].T @ given[:first] + weight * np.eye(given.shape[1])
-        told = given[first:] @ np.linalg.solve(normal, given[:first].T @ y[:first])
-        found.append(float(np.sqrt(np.mean((told - y[first:]) ** 2))))
-    return np.array(found)
+        prediction = given[first:] @ np.linalg.solve(normal, given[:first].T @ y[:first])
+        errors.append(float(np.sqrt(np.mean((prediction - y[first:]) ** 2))))
+    return np.array(errors)
 
 
 def joint_capsule(seeds: range) -> None:
@@ -70,13 +70,13 @@ def joint_capsule(seeds: range) -> None:
     config, data = recording("joint_capsule")
     errors = []
     for seed in seeds:
-        wanted = config.structure
-        thresholds = Thresholds(wanted.threshold_out, wanted.threshold_in, wanted.measure, wanted.over)
+        settings = config.structure
+        thresholds = Thresholds(settings.threshold_out, settings.threshold_in, settings.measure, settings.over)
         # Splits of other seeds overlap little.
-        training = train_config(config.model, wanted.epochs, seed * wanted.splits)
-        found = determine(data, training, thresholds, splits=wanted.splits)
-        print(f"joint capsule, seed {seed}:\n{found.report()}\n")
-        errors.append(lost_boards(config, data, found.masks, seed))
+        training = train_config(config.model, settings.epochs, seed * settings.splits)
+        structure = determine(data, training, thresholds, splits=settings.splits)
+        print(f"joint capsule, seed {seed}:\n{structure.report()}\n")
+        errors.append(lost_boards(config, data, structure.masks, seed))
     mean, spread = np.mean(errors, axis=0), np.std(errors, axis=0)
     growth = np.array(errors)[:, 1:] / np.array(errors)[:, :1]
     print("error of the angles [std], last fifth held out: all boards, board 0 to 3 lost")
@@ -86,23 +86,18 @@ def joint_capsule(seeds: range) -> None:
 
 
 def schunk_arm(seeds: range) -> None:
-    """Print what can be told from what."""
+    """Print how well each signal is inferred from all others."""
     config, data = recording("schunk_arm")
-    wanted = config.structure
+    settings = config.structure
     for seed in seeds:
-        training = train_config(config.model, wanted.epochs, seed * wanted.splits)
-        judge = Judge(data.layout.names, train_masks(data, training, wanted.splits), Thresholds())
+        training = train_config(config.model, settings.epochs, seed * settings.splits)
+        judge = Judge(data.layout.names, train_masks(data, training, settings.splits), Thresholds())
         print(f"Schunk arm, seed {seed}: L_i", {name: round(value, 3) for name, value in judge.L_i.items()})
 
 
-def main() -> None:
-    """Run both."""
+if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=3)
-    seeds = range(parser.parse_args().seeds)
-    joint_capsule(seeds)
-    schunk_arm(seeds)
-
-
-if __name__ == "__main__":
-    main()
+    options = parser.parse_args()
+    joint_capsule(range(options.seeds))
+    schunk_arm(range(options.seeds))

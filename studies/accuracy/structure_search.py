@@ -1,4 +1,4 @@
-"""How well and how fast structure determination finds the feasible masks of many signals.
+"""Accuracy and time of structure determination with many signals.
 
     python -m studies.accuracy.structure_search [--signals 12] [--seeds 3] [--samples 10000]
 
@@ -25,19 +25,19 @@ EXHAUSTIVE = 12
 
 
 def contains(masks: np.ndarray, parts: np.ndarray) -> np.ndarray:
-    """Whether each mask contains one of the parts, shape (masks,)."""
+    """Return for each mask whether it contains one of the parts, shape (masks,)."""
     lacking = (~masks).astype(np.float32) @ parts.T.astype(np.float32)
-    return (lacking < 0.5).any(axis=1)
+    return np.asarray((lacking < 0.5).any(axis=1))
 
 
 def minimal(masks: np.ndarray) -> np.ndarray:
-    """The masks that contain no other of them."""
+    """Return the masks that contain no other of them."""
     lacking = (~masks).astype(np.float32) @ masks.T.astype(np.float32)
     return masks[(lacking < 0.5).sum(axis=1) == 1]
 
 
 def run(signals: int, samples: int, seed: int) -> None:
-    """One body; prints what was found and how long it took."""
+    """Search one body; print the feasible masks that were found and the time it took."""
     body = SyntheticBody.random(signals, seed)
     names, thresholds = body.layout.names, Thresholds()
     started = time.process_time()
@@ -64,16 +64,16 @@ def run(signals: int, samples: int, seed: int) -> None:
     least, sizes = body.least_errors(every), np.array([signal.size for signal in body.layout.signals])
     judged = judge.outputs & ~every
     perfect = every[(least * judged * sizes).sum(axis=1) / (judged * sizes).sum(axis=1) < thresholds.into]
-    told = {line.tobytes() for line in known}
+    measured = {line.tobytes() for line in known}
     truth = {line.tobytes() for line in perfect}
     kept = np.array([bits(m, names) > 0 for m in structure.masks])
     print(
         f"    exhaustive: {len(known)} feasible, {len(minimal(known))} minimal, {took:.1f} s; found "
         f"{contains(known, feasible).mean():.1%} of them, "
         f"{np.mean([m.tobytes() in {f.tobytes() for f in feasible} for m in minimal(known)]):.1%} of the minimal, "
-        f"{sum(f.tobytes() not in told for f in feasible)} false; served {contains(known, kept).mean():.1%}\n"
-        f"    perfect model: {len(perfect)} feasible; the network finds {np.mean([k in told for k in truth]):.1%} of "
-        f"them and {sum(k not in truth for k in told)} false"
+        f"{sum(f.tobytes() not in measured for f in feasible)} false; served {contains(known, kept).mean():.1%}\n"
+        f"    perfect model: {len(perfect)} feasible; the network finds {np.mean([k in measured for k in truth]):.1%} "
+        f"of them and {sum(k not in truth for k in measured)} false"
     )
 
 

@@ -2,7 +2,7 @@
 
 Latent coordinates q ~ N(0, I). Every signal sees one to three of them: element = g(a . q + noise), a of random
 direction, together of variance 1, of which the noise is 1 to 5 %; g(y) = y + sin(y) / 2 bends every element and can be
-undone. The last signal is noise alone. Because g can be undone, whoever knows x knows y, and y is jointly normal: for
+undone. The last signal is noise alone. Because g can be undone, x determines y, and y is jointly normal: for
 every mask, the least mean squared error that any model can reach has a closed form (`least_errors`).
 """
 
@@ -18,7 +18,7 @@ BEND = 0.5
 
 @dataclass(frozen=True)
 class SyntheticBody:
-    """One such body.
+    """A made-up body.
 
     Attributes:
         layout: The signals, `s0` and so on.
@@ -32,7 +32,7 @@ class SyntheticBody:
 
     @classmethod
     def random(cls, signals: int, seed: int) -> "SyntheticBody":
-        """A body of so many signals, and 0.6 times as many latent coordinates."""
+        """Make a body with 0.6 times as many latent coordinates as signals."""
         random = np.random.default_rng(seed)
         latents = round(0.6 * signals)
         made, mixing, noise = [], [], []
@@ -49,7 +49,7 @@ class SyntheticBody:
         return cls(Layout(tuple(made)), np.array(mixing), np.array(noise))
 
     def sample(self, count: int, seed: int, episodes: int = 20) -> Dataset:
-        """Independent samples, in episodes."""
+        """Draw independent samples, in episodes."""
         random = np.random.default_rng(seed)
         y = random.normal(size=(count, self.mixing.shape[1])) @ self.mixing.T
         y += self.noise * random.normal(size=y.shape)
@@ -58,7 +58,7 @@ class SyntheticBody:
         return Dataset(self.layout, tuple(Episode("body", self.layout.split(part)) for part in parts))
 
     def least_errors(self, bits: np.ndarray) -> np.ndarray:
-        """Least mean squared error of every signal from every mask [standard deviations squared].
+        """Return the least mean squared error of every signal from every mask [standard deviations squared].
 
         Args:
             bits: One mask per line, shape (masks, signals), truth values.
@@ -69,17 +69,17 @@ class SyntheticBody:
         sizes = [signal.size for signal in self.layout.signals]
         starts = np.cumsum([0, *sizes[:-1]])
         covariance = self.mixing @ self.mixing.T + np.diag(self.noise**2)
-        found = np.zeros(bits.shape)
+        errors = np.zeros(bits.shape)
         for index, mask in enumerate(bits):
             given = np.repeat(mask, sizes)
             cross = covariance[:, given]
             explained = np.einsum("ij,ij->i", cross, np.linalg.solve(covariance[np.ix_(given, given)], cross.T).T)
             lost = _second_moment(np.ones(1), 0.0) - _second_moment(np.clip(explained, 0.0, 1.0), 1.0 - explained)
-            found[index] = np.where(mask, 0.0, np.add.reduceat(lost, starts) / sizes) / _second_moment(np.ones(1), 0.0)
-        return found
+            errors[index] = np.where(mask, 0.0, np.add.reduceat(lost, starts) / sizes) / _second_moment(np.ones(1), 0.0)
+        return errors
 
 
 def _second_moment(spread: np.ndarray, left: np.ndarray | float) -> np.ndarray:
-    """E[E[g(y) | mu]^2] for y ~ N(mu, left) and mu ~ N(0, spread)."""
+    """Return E[E[g(y) | mu]^2] for y ~ N(mu, left) and mu ~ N(0, spread)."""
     bend = BEND * np.exp(-np.asarray(left) / 2)
     return spread + 2 * bend * spread * np.exp(-spread / 2) + bend**2 * (1 - np.exp(-2 * spread)) / 2

@@ -1,24 +1,23 @@
-"""How long the three robots' models take: structure determination and training, as `gemuco train` does them.
+"""Time of structure determination and training of the three robots' models, as `gemuco train` does them.
 
     python -m studies.accuracy.training                # with the networks of the robot files
     python -m studies.accuracy.training --published    # PR2 with the published five hidden layers of 300
 
-Data are those of `gemuco collect` in runs/<robot>/data.npz; what is missing is collected first, and not counted. One
-thread does all the work, so the CPU time is what it takes on a core of its own; wall time is what it took beside
-whatever else was running.
+Data are those of `gemuco collect` in runs/<robot>/data.npz; missing data are collected first and not counted. The CPU
+time is what the work takes on a core of its own; other programs on the machine add to the wall time.
 """
 
 import argparse
 import time
 
 from rich.console import Console
-from rich.progress import Progress
 from rich.table import Table
 
 from gemuco.dataset import Dataset
 from hal.config import RobotConfig, load_robot
 from services.learning import collector, trainer
 from services.model import artifacts
+from services.show import progress
 
 ROBOTS = ("pr2_duster", "musashi_arm", "kxr_humanoid")
 BAR = 240.0
@@ -34,13 +33,13 @@ PUBLISHED = {
 
 
 def data_of(robot: RobotConfig) -> Dataset:
+    """Load the robot's data, or collect them."""
     path = artifacts.data_path(robot.robot)
-    if path.exists():
-        return Dataset.load(path)
-    return collector.collect_direct(robot).dataset
+    return Dataset.load(path) if path.exists() else collector.collect_direct(robot).dataset
 
 
 def main() -> None:
+    """Train all robots and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--published", action="store_true", help="PR2 with the published network")
     parser.add_argument("--robots", nargs="+", default=ROBOTS, choices=ROBOTS)
@@ -53,10 +52,9 @@ def main() -> None:
         if chosen.published and name in PUBLISHED:
             robot = robot.model_copy(update={"model": {**robot.model, **PUBLISHED[name]}})
         dataset = data_of(robot)
-        with Progress(console=console, transient=True) as bar:
-            task = bar.add_task(name, total=1.0)
+        with progress(name, console) as report:
             wall, cpu = time.monotonic(), time.process_time()
-            trained = trainer.train(robot, dataset, 0, lambda done, _, at=task: bar.update(at, completed=done))
+            trained = trainer.train(robot, dataset, 0, report)
             wall, cpu = time.monotonic() - wall, time.process_time() - cpu
         wall_sum, cpu_sum = wall_sum + wall, cpu_sum + cpu
         layers = trained.schema.weights.whole

@@ -1,7 +1,9 @@
-"""How much faster than real time data are collected: `python -m studies.bus.collection [ROBOT ...] [--samples 500]`.
+"""Speed of data collection without a bus, in times real time.
 
-One condition of each robot of robots/, without a bus, best of several runs; CPU is process time, so that other load on
-the machine does not count. The robot's own share of a cycle is measured beside it, with the world standing still.
+    python -m studies.bus.collection [ROBOT ...] [--samples 500]
+
+One condition of each robot of robots/, best of several runs; CPU is process time, so that other load on the machine
+does not count. The robot's own share of a cycle is measured beside it, with the world standing still.
 """
 
 import argparse
@@ -17,18 +19,18 @@ CYCLES = 2000
 
 
 def collected(config: RobotConfig, samples: int, repeat: int) -> tuple[float, float, float]:
-    """Seconds of the robot's time, of the wall's and of the CPU's, of the run that took least CPU."""
+    """Return robot time, wall time and CPU time [s] of the run that took least CPU."""
     condition = condition_of(config, None)
     runs = []
     for _ in range(repeat):
         cpu = time.process_time()
-        found = collect_direct(config, request=Request((condition,) if condition else (), samples))
-        runs.append((found.robot_time, found.wall_time, time.process_time() - cpu))
+        result = collect_direct(config, request=Request((condition,) if condition else (), samples))
+        runs.append((result.robot_time, result.wall_time, time.process_time() - cpu))
     return min(runs, key=lambda run: run[2] / run[0])
 
 
 def cost_of_a_cycle(robot: Robot, repeat: int) -> float:
-    """CPU time [s] of a cycle that holds a command, without the world's step and what that would take."""
+    """Return the CPU time [s] of a cycle that holds a command, without the world's step."""
     with robot:
         sample, _ = robot.cycle()
         robot.enable()

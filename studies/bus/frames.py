@@ -1,10 +1,12 @@
-"""What a received frame costs: `python -m studies.bus.frames [--runs 15]`.
+"""CPU time of a received frame, from the bus to SI units.
 
-The frames are those of ten simulated drives, ten cells and five encoders (robots/musashi_arm.yaml), recorded while they
-run on virtual buses. Then everything else is stopped, and the same frames go again and again through the bus, the
-protocol and the conversion to SI units, as they do in the receive thread; beside them, in the same run, through
-canopen, whose callback reads the three variables of a drive with `.raw`. What python-can takes to hand a frame over
-comes on top and is told for the hub. All times are CPU time; bars: 3 us per frame, 8 to 12 us for canopen.
+    python -m studies.bus.frames [--runs 15]
+
+The frames are those of ten simulated drives, ten cells and five encoders (robots/musashi_arm.yaml), recorded while
+they run on virtual buses. Then all devices are stopped, and the same frames go repeatedly through the bus, the protocol
+and the conversion to SI units, as in the receive thread; beside them, in the same run, through canopen, whose callback
+reads the three variables of a drive with `.raw`. The time that python-can takes to hand a frame over comes on top and
+is printed for the hub. Bars: 3 us per frame, 8 to 12 us for canopen.
 """
 
 import argparse
@@ -33,30 +35,31 @@ from simulators.hub import HubServer
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 ROUNDS = 30
-"""Cycles whose frames are handled in one go: few enough that their stamps stay fresh."""
+"""Number of cycles whose frames are handled at once; few, so that their stamps stay fresh."""
 RECORD = 1.0
-"""How long [s] the robot runs."""
+"""Time [s] for which the robot runs."""
 DRIVES, CELLS = (0x181, 0x18B), (0x18B, 0x195)
-"""Identifiers of their process data: from, to."""
+"""First identifier of the process data of drives and of cells, and the one after the last."""
 WAIT = 0.0003
-"""Age [s] that the stamps of the frames have."""
+"""Age [s] of the frames' stamps."""
 
 
 def microseconds(job: Callable[[], object], frames: int) -> float:
-    """CPU time per frame [us] of a job that handles so many."""
+    """Return the CPU time per frame [us] of a job that handles `frames` frames."""
     before = time.thread_time_ns()
     job()
     return (time.thread_time_ns() - before) / frames / 1e3
 
 
-def report(what: str, found: Sequence[float]) -> float:
-    median = statistics.median(found)
-    print(f"{what:58}{median:7.2f} us   ({min(found):.2f} to {max(found):.2f} in {len(found)} runs)")
+def report(what: str, times: Sequence[float]) -> float:
+    """Print and return the median of times [us]."""
+    median = statistics.median(times)
+    print(f"{what:58}{median:7.2f} us   ({min(times):.2f} to {max(times):.2f} in {len(times)} runs)")
     return median
 
 
 def robot_file() -> RobotConfig:
-    """The muscle-driven arm on virtual buses; its drives tell torque as well, as most robots want it."""
+    """Return the muscle-driven arm on virtual buses; its drives send torque too, as most robots need it."""
     path = ROBOTS / "musashi_arm.yaml"
     raw = yaml.safe_load(path.read_text())
     muscles = raw["signals"]["muscle_length"]["elements"]
@@ -71,7 +74,7 @@ def robot_file() -> RobotConfig:
 
 
 def record(config: RobotConfig) -> tuple[list[Bus], list[Device], dict[str, list[can.Message]]]:
-    """Buses whose devices are commissioned, and the newest process data of every node."""
+    """Return buses, their commissioned devices, and the newest process data of every node."""
     rig = registry.load(str(config.simulator)).rig(config, "geometric", 0)
     clock = SystemClock()
     buses, devices = build(config, clock, {})
@@ -83,20 +86,20 @@ def record(config: RobotConfig) -> tuple[list[Bus], list[Device], dict[str, list
     while time.monotonic() < until:
         robot.cycle()
         time.sleep(robot.period)
-    found: dict[str, list[can.Message]] = {}
+    recorded: dict[str, list[can.Message]] = {}
     for name, tap in taps.items():
         newest = {}
         while (message := tap.recv(0)) is not None:
             if 0x180 < message.arbitration_id < 0x200:
                 newest[message.arbitration_id] = message
-        found[name] = list(newest.values())
+        recorded[name] = list(newest.values())
         tap.shutdown()
     rig.stop()
-    return buses, devices, found
+    return buses, devices, recorded
 
 
 def ours(bus: Bus, devices: Sequence[CanDevice], cycle: Sequence[can.Message], has_stamps: bool) -> float:
-    """CPU time per frame [us] of some cycles' frames, as the receive thread handles them."""
+    """Return the CPU time per frame [us] of some cycles' frames, as the receive thread handles them."""
     receiver = bus._receiver
     receiver._frame_clock = FrameClock(SystemClock()) if has_stamps else ArrivalClock()
     handle, monotonic = receiver.handle, time.monotonic
@@ -115,13 +118,13 @@ def ours(bus: Bus, devices: Sequence[CanDevice], cycle: Sequence[can.Message], h
             for device in devices:
                 device.missed = 1
 
-    found = microseconds(job, ROUNDS * len(cycle))
-    assert all(device.is_commissioned for device in devices), "some frames were not taken"
-    return found
+    cost = microseconds(job, ROUNDS * len(cycle))
+    assert all(device.is_commissioned for device in devices), "some frames were not handled"
+    return cost
 
 
 def canopen_raw(frames: Sequence[can.Message]) -> Callable[[], float]:
-    """CPU time per frame [us] of canopen for a drive's frames, with a callback that reads its three variables."""
+    """Return a function that measures canopen's CPU time per frame [us] of a drive with three variables."""
     network = canopen.Network()
     node = network.add_node(1, str(ROBOTS / "eds" / "servo_drive.eds"))
     map_ = node.tpdo[1]
@@ -140,15 +143,15 @@ def canopen_raw(frames: Sequence[can.Message]) -> Callable[[], float]:
 
     def measure() -> float:
         seen.clear()
-        found = microseconds(job, len(batch))
+        cost = microseconds(job, len(batch))
         assert len(seen) == len(batch)
-        return found
+        return cost
 
     return measure
 
 
 def taking_from_hub(count: int = 2000) -> float:
-    """CPU time per frame [us] that python-can takes in `recv`, where frames come one by one as from drives."""
+    """Return the CPU time per frame [us] of python-can's `recv`, when frames come one by one as from drives."""
     with tempfile.TemporaryDirectory() as folder, HubServer(f"{folder}/can0"):
         here, there = (can.Bus(interface="hub", channel=f"{folder}/can0") for _ in range(2))
 
@@ -158,15 +161,16 @@ def taking_from_hub(count: int = 2000) -> float:
 
         sender = threading.Thread(target=send)
         sender.start()
-        found = microseconds(lambda: [here.recv(5.0) for _ in range(count)], count)
+        cost = microseconds(lambda: [here.recv(5.0) for _ in range(count)], count)
         sender.join()
         here.shutdown()
         there.shutdown()
-    return found
+    return cost
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    """Measure all paths in turn."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--runs", default=15, type=int)
     runs = range(parser.parse_args().runs)
     config = robot_file()

@@ -1,10 +1,12 @@
-"""What the HAL costs while it runs: `python -m studies.bus.hal_load [--seconds 300] [ROBOT.yaml]`.
+"""Cost of the HAL while it runs.
+
+    python -m studies.bus.hal_load [--seconds 300] [ROBOT.yaml]
 
 Without a robot file: ten drives and ten load cells of the muscle-driven arm, five and five on each of two buses, at
 200 Hz. The simulated nodes run in another process behind the hub, as in the demo; this process is the HAL alone,
 enabled and following a small motion. Both are scheduled as `gemuco hal` and `gemuco simulate` are. Bars: 25 % of a
-core, 99.9 % of cycles complete, and 1 ms for a turn of the cycle beside the wait for answers. CPU is the process's own,
-so other load on the machine counts only in what it delays; what it delays a bare timer is told beside.
+core, 99.9 % of cycles complete, and 1 ms for a turn of the cycle without the wait for answers. CPU is the process's
+own, so other load on the machine only delays; the delay of a bare timer is printed beside.
 """
 
 import argparse
@@ -34,17 +36,17 @@ from studies.stack.processes import BareLoops
 ARM = Path(__file__).parents[2] / "robots" / "musashi_arm.yaml"
 RATE = 200.0
 WARM_UP = 2.0
-"""Not measured [s]."""
+"""Time [s] before the measurement."""
 
 
 class WaitMeter(SystemClock):
-    """The machine's clock, which knows how long the cycle waited for answers."""
+    """The machine's clock, which also measures how long the cycle waits for answers."""
 
     def __init__(self) -> None:
         self.waited = 0.0
 
     def wait(self, event: threading.Event, deadline: float) -> bool:
-        """See `BusClock.wait`."""
+        """Wait for an event and add the time."""
         before = time.perf_counter()
         is_set = super().wait(event, deadline)
         self.waited += time.perf_counter() - before
@@ -53,7 +55,7 @@ class WaitMeter(SystemClock):
 
 @dataclass
 class Turns:
-    """What every turn of the cycle took [s], and how many were incomplete, skipped, or came too late for a command."""
+    """Times of every turn of the cycle [s], and numbers of incomplete, skipped and refused ones."""
 
     wall: list[float] = field(default_factory=list)
     waited: list[float] = field(default_factory=list)
@@ -65,7 +67,7 @@ class Turns:
 
 
 def drives_and_cells() -> RobotConfig:
-    """Ten drives and ten cells of the muscle-driven arm, in front of the bench."""
+    """Return ten drives and ten cells of the muscle-driven arm, in front of the bench."""
     raw = yaml.safe_load(ARM.read_text())
     del raw["signals"]["joint_position"], raw["limits"]["joint_position"], raw["collect"], raw["model"]
     raw["devices"] = {name: entry for name, entry in raw["devices"].items() if entry["kind"] != "joint_encoder"}
@@ -75,6 +77,7 @@ def drives_and_cells() -> RobotConfig:
 
 
 def simulate(config: RobotConfig, ready: Event, stop: Event) -> None:
+    """Run the simulated nodes until `stop`."""
     simulator = registry.load(str(config.simulator))
     rig = simulator.rig(config, simulator.variants[0], 0)
     realtime.prepare_process()
@@ -88,6 +91,7 @@ def simulate(config: RobotConfig, ready: Event, stop: Event) -> None:
 
 
 def on_hub(config: RobotConfig, folder: str) -> RobotConfig:
+    """Return the robot file with all buses on the hub."""
     buses = {
         name: bus.model_copy(update={"interface": "hub", "channel": f"{folder}/{name}"})
         for name, bus in config.buses.items()
@@ -96,7 +100,7 @@ def on_hub(config: RobotConfig, folder: str) -> RobotConfig:
 
 
 def turn(robot: Robot, clock: WaitMeter, cycles: int, turns: Turns) -> None:
-    """Follow a small motion for so many cycles, on an absolute grid as the service's loop."""
+    """Follow a small motion for a number of cycles, on an absolute grid as the service's loop."""
     middle = None
     due = time.monotonic()
     for number in range(cycles):
@@ -119,15 +123,17 @@ def turn(robot: Robot, clock: WaitMeter, cycles: int, turns: Turns) -> None:
         if middle is not None:
             try:
                 robot.command(middle + 0.001 * np.sin(0.02 * number), sample.cycle)
-            except CommandRefused:  # this machine stood still for longer than a command lives
+            except CommandRefused:  # the machine stood still for longer than a command lives
                 turns.refused += 1
 
 
 def received(robot: Robot) -> int:
+    """Return the number of frames received on all buses."""
     return sum(bus["counters"]["received"] for bus in robot.health()["buses"].values())
 
 
 def run(robot: Robot, clock: WaitMeter, seconds: float) -> None:
+    """Run the cycle and print its costs."""
     realtime.prepare_process()
     scheduling = realtime.prepare_thread(CYCLE_PRIORITY)
     realtime.promote("bus ", RECEIVE_PRIORITY)
@@ -153,24 +159,25 @@ def run(robot: Robot, clock: WaitMeter, seconds: float) -> None:
     print(
         f"receiving      {(process - thread) / frames * 1e6:.1f} us per frame, {frames / cycles:.1f} frames per cycle"
     )
-    for what, found in (
+    for what, times in (
         ("turn, no wait", busy),
         ("its CPU", np.array(turns.cpu)),
         ("with the wait", np.array(turns.wall)),
         ("begun late by", np.array(turns.late)),
     ):
-        p50, p99 = np.percentile(found, [50, 99]) * 1e3
-        print(f"{what:15}{p50:.2f} ms median, {p99:.2f} ms p99, {found.max() * 1e3:.1f} ms at most")
+        p50, p99 = np.percentile(times, [50, 99]) * 1e3
+        print(f"{what:15}{p50:.2f} ms median, {p99:.2f} ms p99, {times.max() * 1e3:.1f} ms at most")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    """Start simulated nodes and a bare timer, and run the HAL."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("robot", nargs="?", type=Path)
     parser.add_argument("--seconds", default=300.0, type=float)
-    given = parser.parse_args()
+    options = parser.parse_args()
     context = multiprocessing.get_context("spawn")
     with tempfile.TemporaryDirectory() as folder:
-        config = on_hub(load_robot(given.robot) if given.robot else drives_and_cells(), folder)
+        config = on_hub(load_robot(options.robot) if options.robot else drives_and_cells(), folder)
         for budget in budgets(config):
             print(f"bus {budget.bus:11}{budget}")
         ready, stop = context.Event(), context.Event()
@@ -182,7 +189,7 @@ def main() -> None:
             before = time.monotonic()
             with BareLoops({"bare": (config.rates.hal, CYCLE_PRIORITY)}) as bare, open_robot(config, clock) as robot:
                 print(f"commissioning  {time.monotonic() - before:.2f} s for {len(config.devices)} nodes")
-                run(robot, clock, given.seconds)
+                run(robot, clock, options.seconds)
                 for name, bus in robot.health()["buses"].items():
                     print(f"bus {name:11}{bus['counters']}")
                 late = bare.counted()["bare"]

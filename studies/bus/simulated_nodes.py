@@ -1,7 +1,8 @@
-"""What the simulated arm costs at 200 Hz on the hub, and how long its answers take.
+"""Cost of the simulated arm at 200 Hz on the hub, and the time until its answers.
 
-`python studies/bus/simulated_nodes.py`; with `--timed` the hub keeps the timing of two 1 Mbit/s buses,
-`--period 0.0025` changes the step of the physics [s].
+    python -m studies.bus.simulated_nodes [--timed] [--period 0.0025]
+
+With `--timed` the hub keeps the timing of two 1 Mbit/s buses; `--period` is the step of the physics [s].
 """
 
 import argparse
@@ -23,9 +24,9 @@ DRIVES = {"can0": range(1, 6), "can1": range(6, 11)}
 
 
 def cycle(buses: dict[str, can.BusABC]) -> tuple[float, bool]:
-    """Set-points and SYNC on both buses; seconds until the last answer, and whether all came within a cycle."""
+    """Send set-points and SYNC on both buses; return the time [s] to the last answer, and whether all came in time."""
     for name, bus in buses.items():
-        while bus.recv(0) is not None:  # a late answer is none to this cycle
+        while bus.recv(0) is not None:  # a late answer does not belong to this cycle
             pass
         for node in DRIVES[name]:
             data = struct.pack("<Hi", 0x06, 0)
@@ -42,16 +43,17 @@ def cycle(buses: dict[str, can.BusABC]) -> tuple[float, bool]:
 
 
 def main() -> None:
+    """Run the arm and print its cost."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--timed", action="store_true")
     parser.add_argument("--period", type=float, default=rig_module.PERIOD)
     parser.add_argument("--seconds", type=float, default=10.0)
-    told = parser.parse_args()
-    rig_module.PERIOD = told.period
-    options = {"bit_timing": True} if told.timed else {}
+    parsed = parser.parse_args()
+    rig_module.PERIOD = parsed.period
+    timing = {"bit_timing": True} if parsed.timed else {}
     config = load_robot(Path(__file__).parents[2] / "robots" / "musashi_arm.yaml")
     channels = {
-        name: BusConfig(interface="hub", channel=f"bench_{uuid.uuid4().hex[:8]}", options=options)
+        name: BusConfig(interface="hub", channel=f"bench_{uuid.uuid4().hex[:8]}", options=timing)
         for name in config.buses
     }
     rig = simulator.rig(config.model_copy(update={"buses": channels}), "actual", 1)
@@ -63,7 +65,7 @@ def main() -> None:
     waits, incomplete = [], 0
     began, spent, own = time.monotonic(), time.process_time(), time.thread_time()
     due = began
-    while time.monotonic() < began + told.seconds:
+    while time.monotonic() < began + parsed.seconds:
         wait, is_complete = cycle(buses)
         waits.append(wait)
         incomplete += not is_complete

@@ -19,81 +19,29 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import yaml
 from rich.console import Console
 from rich.table import Table
 
-from hal.config import RobotConfig, load_robot
-from hal.errors import CommandRefused
+from hal.config import load_robot
 from services.client import Client
-from services.errors import NotEngaged
 from services.hardware.hal_service import CYCLE_PRIORITY
 from services.model.gemuco_service import PRIORITIES
 from services.process.supervisor import Supervisor, gemuco_command
 from services.wire.messages import Status
 from studies.accuracy.actual_arms import model
+from studies.stack.driving import Mover, engage, measures
 from studies.stack.processes import BareLoops, cpu
 
-TARGET_EVERY = 1.0
-REACH = 0.6
-"""Share of the joint range that targets are drawn from."""
-
-
-def measures(client: Client) -> bool:
-    """Whether this process receives estimates in which every signal is measured."""
-    estimate = client.estimate()
-    return estimate is not None and set(estimate.method.values()) == {"measured"}
-
-
-def engage(client: Client) -> None:
-    """Engage the controller, also from a fault.
-
-    Raises:
-        TimeoutError: It was not engaged within 15 s.
-    """
-    deadline, refusal = time.monotonic() + 15.0, ""
-    while time.monotonic() < deadline:
-        applied = client.applied(timeout=1.0)
-        mode = "unheard" if applied is None else applied.mode
-        if mode in ("hold", "follow"):
-            return
-        try:
-            if mode == "fault":
-                client.reset()
-            if mode != "enabling":
-                client.engage()
-        except (CommandRefused, NotEngaged) as error:
-            refusal = str(error)
-        time.sleep(0.3)
-    raise TimeoutError(f"The controller was not engaged within fifteen seconds. {refusal}")
-
-
-def move(client: Client, robot: RobotConfig, duration: float) -> int:
-    """Send a random target every second for `duration` [s]; return how often the HAL had stopped the arm."""
-    stops = 0
-    random = np.random.default_rng(0)
-    low, high = robot.bounds("joint_position")
-    middle, half = (low + high) / 2, (high - low) / 2
-    end = time.monotonic() + duration
-    while time.monotonic() < end:
-        applied = client.applied()
-        if applied is None or applied.mode not in ("follow", "hold", "enabling"):
-            stops += 1
-            engage(client)
-        client.target("joint_position", middle + REACH * half * random.uniform(-1, 1, low.size))
-        time.sleep(TARGET_EVERY)
-    return stops
+TARGET_EVERY, REACH = 1.0, 0.6
 
 
 def stack(robot_file: Path, with_bus: bool) -> dict[str, list[str]]:
     """Return process -> its command line."""
     file = str(robot_file)
     if not with_bus:
-        return {
-            "hal": [sys.executable, "-m", "studies.stack.without_bus", file],
-            "serve": gemuco_command("serve", file),
-        }
+        hal = [sys.executable, "-m", "studies.stack.in_process", file]
+        return {"hal": hal, "serve": gemuco_command("serve", file)}
     return {
         "simulate": gemuco_command("simulate", file, "--variant", "actual", "--seed", "1"),
         "hal": gemuco_command("hal", file),
@@ -118,7 +66,9 @@ def run(robot_file: Path, minutes: float, with_bus: bool = True) -> dict[str, An
         with bare:
             used, began = {name: cpu(pid) for name, pid in pids.items()}, time.monotonic()
             before = statuses(client)
-            stops = move(client, robot, 60 * minutes)
+            with Mover(client, robot, TARGET_EVERY, REACH) as mover:
+                time.sleep(60 * minutes)
+                stops = mover.counted["engaged"] + mover.counted["refused"]
             supervisor.check()
             baseline, after = bare.counted(), statuses(client)
             elapsed = time.monotonic() - began
@@ -150,29 +100,22 @@ def statuses(client: Client) -> dict[str, Status]:
     return newest
 
 
-def show(found: dict[str, Any], console: Console) -> None:
-    """Print the table of docs/results.md."""
+def show(result: dict[str, Any], console: Console) -> None:
+    """Print the table of docs/results.md; times in ms."""
     table = Table(
-        "loop",
-        "rate [Hz]",
-        "p50 [ms]",
-        "p99 [ms]",
-        "max [ms]",
-        "skipped",
-        "bare p50",
-        "bare p99",
-        "bare max",
-        "bare skipped",
+        "loop", "rate [Hz]", "p50", "p99", "max", "skipped", "bare p50", "bare p99", "bare max", "bare skipped"
     )
-    for name, one in found["loops"].items():
-        bare = one["bare"]
-        row = [f"{one[key] * 1e3:.2f}" for key in ("total_p50", "total_p99", "total_max")]
-        skipped = f"{one['skipped']:.0f} of {one['ticks'] + one['skipped']:.0f}"
-        other = [f"{bare[key] * 1e3:.2f}" for key in ("total_p50", "total_p99", "total_max")] if bare else ["", "", ""]
-        table.add_row(name, f"{one['rate']:.2f}", *row, skipped, *other, f"{bare.get('skipped', 0):.0f}")
+    for name, loop in result["loops"].items():
+        bare = loop["bare"]
+        late, other = (
+            [f"{1e3 * counts[key]:.2f}" if counts else "" for key in ("total_p50", "total_p99", "total_max")]
+            for counts in (loop, bare)
+        )
+        skipped = f"{loop['skipped']:.0f} of {loop['ticks'] + loop['skipped']:.0f}"
+        table.add_row(name, f"{loop['rate']:.2f}", *late, skipped, *other, f"{bare.get('skipped', 0):.0f}")
     console.print(table)
-    console.print(f"the HAL stopped the arm {found['stops']} times")
-    console.print("share of a core: " + ", ".join(f"{name} {share:.0%}" for name, share in found["cores"].items()))
+    console.print(f"the HAL stopped the arm {result['stops']} times")
+    console.print("share of a core: " + ", ".join(f"{name} {share:.0%}" for name, share in result["cores"].items()))
     peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
     console.print(f"largest process: {peak:.0f} MiB")
 

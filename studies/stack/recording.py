@@ -1,7 +1,7 @@
-"""What recording costs: CPU per message and bytes per hour beside plain msgpack, and what kill -9 loses.
+"""Cost of recording: CPU per message and bytes per hour beside plain msgpack, and the loss at kill -9.
 
 `python -m studies.stack.recording` for the costs, `--kills 10` for kill -9 as well, `--hours 5` for the writer's memory
-over so many hours of commits. Times are CPU times of one process.
+over five hours of commits. Times are CPU times of one process.
 The messages are those of musashi_arm with random walks for values, which compress worse than sensors do.
 """
 
@@ -55,12 +55,12 @@ def main() -> None:
             (Path(folder) / "run.mcap").unlink()
         for number in range(options.kills):
             print(f"kill -9, run {number + 1}: {1e3 * kill(robot, ticks, Path(folder) / f'{number}.mcap'):.0f} ms lost")
-        for number, size in enumerate(memory(robot, ticks[0], Path(folder) / "long.mcap", options.hours), 1):
-            print(f"memory of the writer's process after {number} h: {size:.1f} MB")
+        for hour, resident in enumerate(memory(robot, ticks[0], Path(folder) / "long.mcap", options.hours), 1):
+            print(f"memory of the writer's process after {hour} h: {resident:.1f} MB")
 
 
 class Walk:
-    """Messages of a robot whose values walk at random: sample, set-points and estimates, and half as often anomaly."""
+    """Messages of a robot whose values walk at random: sample, set-points, estimates, and every second tick anomaly."""
 
     def __init__(self, robot: RobotConfig) -> None:
         self._robot = robot
@@ -68,14 +68,14 @@ class Walk:
         self._values = {name: self._random.normal(size=one.size) for name, one in robot.signals.items()}
 
     def tick(self, number: int) -> list[tuple[str, bytes]]:
-        """Keys and payloads of one tick."""
+        """Return keys and payloads of one tick."""
         for value in self._values.values():
             value += 1e-3 * self._random.normal(size=value.shape)
         name, values = self._robot.robot, {key: value.copy() for key, value in self._values.items()}
         head = {"stamp_ns": time.time_ns(), "seq": number, "boot": 1234567890123, "cycle": number}
         signal = self._robot.command.signal
         truths = {key: np.ones(value.shape, bool) for key, value in values.items()}
-        found: list[tuple[str, messages.Message]] = [
+        made: list[tuple[str, messages.Message]] = [
             (keys.sample(name), Sample(
                 **head, source="can", complete=True, values=values, valid=truths,
                 age={key: 0.002 + 1e-4 * self._random.random(value.shape) for key, value in values.items()},
@@ -94,22 +94,22 @@ class Walk:
         if number % 2 == 0:
             parts = {key: self._random.normal(size=value.shape) ** 2 for key, value in values.items()}
             anomaly = Anomaly(**head, score=3.0, threshold=9.0, is_anomaly=False, blamed="", contribution=parts)
-            found.append((keys.anomaly(name), anomaly))
-        return [(key, messages.encode(message)) for key, message in found]
+            made.append((keys.anomaly(name), anomaly))
+        return [(key, messages.encode(message)) for key, message in made]
 
 
 Ticks = list[list[tuple[str, bytes]]]
 
 
 def as_json(robot: RobotConfig, ticks: Ticks, path: Path) -> tuple[float, int]:
-    """CPU time [s] and size [bytes] of a recording as it is made."""
+    """Return CPU time [s] and size [bytes] of a recording as the recorder writes it."""
     writer = RecordingWriter(path, robot.robot, Catalogue.of_robot(robot))
     writer.open(0)
     return _timed(path, ticks, lambda key, now, payload: writer.add(key, now, payload), writer.commit, writer.finish)
 
 
 def as_msgpack(robot: RobotConfig, ticks: Ticks, path: Path) -> tuple[float, int]:
-    """The same with the messages as they come from the network, without schema: what nobody else can read."""
+    """Return the same for the messages as they come from the network, without a schema; other tools cannot read it."""
     file = RecordingFile(path)
     return _timed(
         path, ticks, lambda key, now, payload: file.add(file.channel(key, "msgpack"), now, now, 0, payload),
@@ -135,7 +135,7 @@ def _timed(
 
 
 def memory(robot: RobotConfig, tick: list[tuple[str, bytes]], path: Path, hours: int) -> Iterator[float]:
-    """Resident memory [MB] at the end of every hour of commits, each with a tick in it."""
+    """Yield the resident memory [MB] at the end of every hour of commits, each with a tick in it."""
     writer = RecordingWriter(path, robot.robot, Catalogue.of_robot(robot))
     writer.open(0)
     now, pause_ns = 0, round(1e9 * COMMIT_EVERY / 200)
@@ -150,7 +150,7 @@ def memory(robot: RobotConfig, tick: list[tuple[str, bytes]], path: Path, hours:
 
 
 def kill(robot: RobotConfig, ticks: Ticks, path: Path) -> float:
-    """How much [s] of what was published before kill -9 is not in the file."""
+    """Return the time [s] before kill -9 whose messages are not in the file."""
     name = f"killed_{os.getpid()}"
     code = "import sys; from services.recording.recorder import run_recorder; run_recorder(sys.argv[1], sys.argv[2])"
     process = subprocess.Popen([sys.executable, "-c", code, name, str(path)])
@@ -172,7 +172,7 @@ def kill(robot: RobotConfig, ticks: Ticks, path: Path) -> float:
     process.send_signal(signal.SIGKILL)
     process.wait()
     close_session(session)
-    newest = max(one.message.stamp_ns for one in read(path))
+    newest = max(message.message.stamp_ns for message in read(path))
     return (killed - newest) * 1e-9
 
 

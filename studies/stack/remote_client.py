@@ -1,9 +1,9 @@
-"""What a question through the client costs, beside a bare zenoh query with the same bytes; and importing the client.
+"""Time of a question through the client, beside a bare zenoh query with the same bytes; and of importing the client.
 
     python -m studies.stack.remote_client [--questions 1000] [--router]
 
 The model service of a light robot runs in one process, a bare queryable that answers the same bytes in another; both
-are asked in turn, so that whatever else the machine does falls on both. `--router`: all of it through a router.
+are asked in turn, so that other load on the machine slows both. `--router`: all of it through a router.
 """
 
 import argparse
@@ -25,7 +25,7 @@ import zenoh
 from services.client import Client
 from services.errors import NotAllowed, ServiceUnavailable
 from services.wire.session import CLIENT, endpoint, open_session
-from studies.stack import light_robot
+from studies.stack import light_model, light_robot
 
 RATE = 50.0
 KEY = "bare/echo"
@@ -35,7 +35,7 @@ READ = "Client.estimate(): the newest published"
 
 
 def echo(robot: str, connect: tuple[str, ...], answer: bytes) -> None:
-    """Answer the same bytes for ever, in a process of its own; the recorder's place is free."""
+    """Answer the same bytes for ever, in a process of its own, in place of a recorder."""
     session = open_session(robot, "recorder", connect)
 
     def reply(query: zenoh.Query) -> None:
@@ -48,36 +48,39 @@ def echo(robot: str, connect: tuple[str, ...], answer: bytes) -> None:
 
 
 def ask_bare(session: zenoh.Session, question: bytes) -> None:
+    """Query the echo and read its answer."""
     for reply in session.get(KEY, payload=question, timeout=10.0):
         if reply.ok is not None:
             reply.ok.payload.to_bytes()
 
 
 def timed(ask: Callable[[], object]) -> float:
+    """Return the time of one call [s]."""
     begun = time.perf_counter()
     ask()
     return time.perf_counter() - begun
 
 
 def line(what: str, times: list[float]) -> str:
+    """Return a line of the table; times in s."""
     p50, p99 = (1e3 * float(np.percentile(times, q)) for q in (50, 99))
     return f"{what:44s} p50 {p50:7.2f} ms   p99 {p99:7.2f} ms"
 
 
-def imports(times: int = 7) -> dict[str, float]:
-    """Median wall time [s] of importing, each in an interpreter of its own, in turn."""
+def imports(rounds: int = 7) -> dict[str, float]:
+    """Return the median wall time [s] of each import, in interpreters of their own, in turn."""
     statements = ("import numpy, zenoh", "import services.client")
-    found: dict[str, list[float]] = {statement: [] for statement in statements}
-    for _ in range(times):
+    times: dict[str, list[float]] = {statement: [] for statement in statements}
+    for _ in range(rounds):
         for statement in statements:
             program = f"import time; begun = time.perf_counter(); {statement}; print(time.perf_counter() - begun)"
             done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-            found[statement].append(float(done.stdout))
-    return {statement: statistics.median(values) for statement, values in found.items()}
+            times[statement].append(float(done.stdout))
+    return {statement: statistics.median(values) for statement, values in times.items()}
 
 
 def measure(client: Client, connect: tuple[str, ...], questions: int) -> dict[str, list[float]]:
-    """Ask both in turn: what was asked -> times [s]."""
+    """Ask both in turn; return question -> times [s]."""
     while client.estimate(timeout=60.0) is None:
         pass
     schema = client.describe("model", timeout=60.0)["signals"]
@@ -88,20 +91,20 @@ def measure(client: Client, connect: tuple[str, ...], questions: int) -> dict[st
     child = multiprocessing.get_context("spawn").Process(target=echo, args=(client.robot, connect, answer), daemon=True)
     child.start()
     places = connect or (endpoint(client.robot, "recorder"),)  # the client connects to the recorder by itself otherwise
-    found: dict[str, list[float]] = {BARE: [], VERB: [], READ: []}
+    times: dict[str, list[float]] = {BARE: [], VERB: [], READ: []}
     with when_there(client.robot, places) as bare:
         while not any(reply.ok for reply in bare.get(KEY, payload=question, timeout=1.0)):
             time.sleep(0.05)
         for _ in range(questions):
-            found[BARE].append(timed(lambda: ask_bare(bare, question)))
-            found[VERB].append(timed(lambda: client.estimate(values, ["joint_position"])))
-            found[READ].append(timed(client.estimate))
+            times[BARE].append(timed(lambda: ask_bare(bare, question)))
+            times[VERB].append(timed(lambda: client.estimate(values, ["joint_position"])))
+            times[READ].append(timed(client.estimate))
     child.kill()
-    return found
+    return times
 
 
 def when_there(robot: str, places: tuple[str, ...]) -> zenoh.Session:
-    """A session with a process that is still starting; gives up after twenty seconds."""
+    """Open a session with a process that may still be starting, within 20 s."""
     deadline = time.monotonic() + 20.0
     while True:
         try:
@@ -114,18 +117,25 @@ def when_there(robot: str, places: tuple[str, ...]) -> zenoh.Session:
 
 @contextmanager
 def robot_and_client(through_router: bool) -> Iterator[tuple[Client, tuple[str, ...]]]:
-    """A light robot in a process of its own, a client, and how to get there."""
+    """Yield a client of a light robot in a process of its own, and the endpoints of its router."""
     robot = f"remote_{os.getpid()}"
     with tempfile.TemporaryDirectory() as folder:
         file = light_robot.write(Path(folder), robot, RATE, with_bus=False)
-        light_robot.make_model(file, Path(folder) / "model")
+        light_model.make(file, Path(folder) / "model")
         where = f"unixsock-stream/{folder}/router" if through_router else ""
         settings = (
             f'{{mode: "router", listen: {{endpoints: ["{where}"]}}, scouting: {{multicast: {{enabled: false}}}}}}'
         )
         with zenoh.open(zenoh.Config.from_json5(settings)) if where else nullcontext():
             process = subprocess.Popen(
-                [sys.executable, "-m", "studies.stack.fleet_robot", str(file), f"{folder}/model", "1", where]
+                [
+                    sys.executable,
+                    "-m",
+                    "studies.stack.in_process",
+                    str(file),
+                    f"--model={folder}/model",
+                    f"--connect={where}",
+                ]
             )
             try:
                 connect = (where,) if where else ()
@@ -149,9 +159,9 @@ def main() -> None:
             print(line(what, times))
         time.sleep(max(0.0, 20.0 - asked.questions * 0.005))
         for seconds in (1.0, 60.0):
-            found = client.history(seconds)
+            rows = len(client.history(seconds).stamp_ns)
             took = [timed(lambda seconds=seconds: client.history(seconds)) for _ in range(20)]
-            print(line(f"Client.history({seconds:g}): {len(found.stamp_ns)} rows", took))
+            print(line(f"Client.history({seconds:g}): {rows} rows", took))
 
 
 if __name__ == "__main__":

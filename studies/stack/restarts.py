@@ -1,9 +1,9 @@
-"""How long until everything is valid again after `kill -9` of a process and its restart, its start included.
+"""Time until every signal is valid again after `kill -9` of a process and its restart, its start included.
 
     python -m studies.stack.restarts --times 5
 
-The arm is engaged and following when a process dies. After the service's death the time is also taken until the HAL
-follows its last command no more.
+The arm is engaged and following when a process dies. After the death of the service, the time is also taken until the
+HAL no longer follows its last command.
 """
 
 import argparse
@@ -17,37 +17,38 @@ from rich.table import Table
 
 from hal.config import load_robot
 from services.client import Client
-from services.process.supervisor import Supervisor, gemuco_command
+from services.process.supervisor import Supervisor
 from studies.accuracy.actual_arms import model
-from studies.stack.loops import engage, measures
+from studies.stack.driving import engage, measures
+from studies.stack.loops import stack
 
 
 def until(condition: Callable[[], bool], limit: float = 30.0) -> float:
-    """Seconds until a condition holds."""
+    """Return the seconds until a condition holds.
+
+    Raises:
+        TimeoutError: It did not hold within the limit [s].
+    """
     began = time.monotonic()
     while not condition():
         if time.monotonic() - began > limit:
-            raise TimeoutError(f"It did not happen within {limit:g} s.")
+            raise TimeoutError(f"The condition did not hold within {limit:g} s.")
         time.sleep(0.002)
     return time.monotonic() - began
 
 
 def gone(client: Client) -> bool:
-    """Whether no estimate that stands on measurements reaches this process."""
+    """Whether this process receives no estimate that is based on measurements."""
     estimate = client.estimate(max_age=0.1)
     return estimate is None or set(estimate.method.values()) == {"none"}
 
 
 def run(robot_file: Path, times: int) -> dict[str, list[float]]:
-    """Process or event -> seconds, one per try."""
+    """Return process or event -> seconds, one per try."""
     robot = load_robot(robot_file)
     model(robot, Console())
-    commands = {
-        "simulate": gemuco_command("simulate", str(robot_file), "--variant", "actual", "--seed", "1"),
-        "hal": gemuco_command("hal", str(robot_file)),
-        "serve": gemuco_command("serve", str(robot_file)),
-    }
-    found: dict[str, list[float]] = {name: [] for name in (*commands, "serve: not followed any more")}
+    commands = stack(robot_file, with_bus=True)
+    seconds: dict[str, list[float]] = {name: [] for name in (*commands, "serve: no longer followed")}
     with Supervisor(Path("runs/restarts")) as supervisor, Client(robot.robot) as client:
         for name, command in commands.items():
             supervisor.start(name, command)
@@ -60,12 +61,12 @@ def run(robot_file: Path, times: int) -> dict[str, list[float]]:
                 supervisor.kill(name)
                 if name == "serve":
                     held = until(lambda: (applied := client.applied()) is None or applied.mode != "follow")
-                    found["serve: not followed any more"].append(held)
+                    seconds["serve: no longer followed"].append(held)
                 until(lambda: gone(client))
                 supervisor.start(name, command)
-                found[name].append(until(lambda: not gone(client) and measures(client)))
+                seconds[name].append(until(lambda: not gone(client) and measures(client)))
                 until(lambda: (applied := client.applied()) is not None and applied.mode in ("off", "fault"))
-    return found
+    return seconds
 
 
 if __name__ == "__main__":

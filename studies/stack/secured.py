@@ -1,4 +1,7 @@
-"""What security costs: round trips and processor time through a plain and a secured router, in turns in one run."""
+"""Cost of security: round trips and processor time through a plain and a secured router, in turns in one run.
+
+python -m studies.stack.secured [--count 300] [--turns 3]
+"""
 
 import argparse
 import json
@@ -19,7 +22,7 @@ ROBOT = "benchmark_secured"
 def round_trips(
     hal: tuple[str, ...], client: tuple[str, ...], router: tuple[str, ...], count: int
 ) -> tuple[float, ...]:
-    """Median and p99 [ms] of a verb, and processor time [ms] of all three processes' work for one."""
+    """Return median and p99 [ms] of a verb, and the processor time [ms] that client, router and HAL take for one."""
     sessions = [opened(router_settings((), router) if router else router_settings(), "the router")]
     try:
         sessions += [open_session(ROBOT, "hal", hal), open_session(ROBOT, CLIENT, client)]
@@ -45,28 +48,28 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=300)
     parser.add_argument("--turns", type=int, default=3)
-    told = parser.parse_args()
+    options = parser.parse_args()
     plain = "tcp/127.0.0.1:7447"
     with tempfile.TemporaryDirectory() as name:
-        ways = {"plain": ((plain,), (plain,), ())}
+        links: dict[str, tuple[tuple[str, ...], ...]] = {"plain": ((plain,), (plain,), ())}
         for protocol in ("quic", "tls"):
             folder = Path(name) / protocol
             init(folder, planned(folder, {ROBOT: placed(address(ROBOT))}, ["127.0.0.1:17447"], protocol, None))
             unlimited(folder)
-            ways[protocol] = tuple((str(folder / f"{one}.json"),) for one in (f"hal.{ROBOT}", "viewer", "router"))
+            links[protocol] = tuple((str(folder / f"{role}.json"),) for role in (f"hal.{ROBOT}", "viewer", "router"))
         print("| link | p50 [ms] | p99 [ms] | processor [ms] |\n|---|---|---|---|")
-        for _ in range(told.turns):
-            for way, (hal, client, router) in ways.items():
-                found = round_trips(hal, client, router, told.count)
-                print("| " + " | ".join([way, *(f"{number:.2f}" for number in found)]) + " |", flush=True)
+        for _ in range(options.turns):
+            for link, (hal, client, router) in links.items():
+                costs = round_trips(hal, client, router, options.count)
+                print("| " + " | ".join([link, *(f"{cost:.2f}" for cost in costs)]) + " |", flush=True)
 
 
 def unlimited(folder: Path) -> None:
-    """Take the limit of 50 questions per second away, which would be measured otherwise."""
+    """Remove the limit of 50 questions per second, which would be measured otherwise."""
     path = folder / "router.json"
-    found = json.loads(path.read_text())
-    del found["downsampling"]
-    path.write_text(json.dumps(found))
+    settings = json.loads(path.read_text())
+    del settings["downsampling"]
+    path.write_text(json.dumps(settings))
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""What the live page costs a running robot: CPU and ticks of its services without a page, and with 0, 1 and 5 browsers.
+"""Cost of the live page for a running robot: CPU and ticks of its services without a page, and with 0, 1, 5 browsers.
 
     python -m studies.stack.view_cost musashi_arm
 
-Needs a running stack (`gemuco hal`, `gemuco serve`) on this machine. The same run has the baseline, twice.
+Needs a running stack (`gemuco hal`, `gemuco serve`) on this machine. The same run measures the baseline twice.
 """
 
 import argparse
@@ -29,7 +29,7 @@ CAMERA = {
 
 
 def browser() -> tuple[ClientConnection, list[int]]:
-    """A browser that reads everything, and the bytes it got."""
+    """Connect a browser that reads everything; return it and the count of its bytes."""
     page = connect(f"ws://127.0.0.1:{PORT}", subprotocols=[f"viser-v{viser.__version__}"], max_size=None)  # type: ignore[list-item]
     page.send(msgspec.msgpack.encode(CAMERA))
     got = [0]
@@ -46,7 +46,7 @@ def browser() -> tuple[ClientConnection, list[int]]:
 
 
 def counted(client: Client) -> tuple[dict[str, float], dict[str, float]]:
-    """Ticks and skips of all loops of each service so far."""
+    """Return the ticks and the skips of all loops of each service since their start."""
     ticks, skips = {}, {}
     for name in SERVICES:
         status: Status | None = client.status(name, timeout=5.0)
@@ -57,14 +57,15 @@ def counted(client: Client) -> tuple[dict[str, float], dict[str, float]]:
 
 
 def measure(client: Client, pids: dict[str, int], label: str, seconds: float, got: list[list[int]]) -> None:
+    """Print CPU, ticks and skips of every service over a time span [s], and the bytes that each browser got."""
     ticks, skips = counted(client)
-    before, began, bytes_before = {n: cpu(p) for n, p in pids.items()}, time.monotonic(), sum(one[0] for one in got)
+    before, began, bytes_before = {n: cpu(p) for n, p in pids.items()}, time.monotonic(), sum(count[0] for count in got)
     time.sleep(seconds)
     took = time.monotonic() - began
     used = {n: 100 * (cpu(p) - before[n]) / took for n, p in pids.items()}
     later, skipped = counted(client)
     cells = [f"{used[n]:5.1f} %  {later[n] - ticks[n]:6.0f} / {skipped[n] - skips[n]:3.0f}" for n in SERVICES]
-    sent = (sum(one[0] for one in got) - bytes_before) / took / 1e3 / max(1, len(got))
+    sent = (sum(count[0] for count in got) - bytes_before) / took / 1e3 / max(1, len(got))
     print(f"{label:16} {'   '.join(cells)}   {used.get('view', 0.0):5.1f} %   {sent:6.1f} kB/s", flush=True)
 
 

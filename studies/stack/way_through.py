@@ -1,15 +1,15 @@
-"""From a sample of the HAL to its estimate at a client in another process, and what of that estimation takes.
+"""Time from a sample of the HAL to its estimate, at a client in another process.
 
     python -m studies.stack.way_through [--seconds 20] [--rates estimation=500]
 
-At the robot file's rates, HAL and estimation both at 200 Hz, unless others are named.
-
-The client notes when the sample of a cycle arrives and when the first estimate from that cycle does; the difference is
-what the client waits for estimation: for the next tick of the loop, for the tick, and for one more way over the wire.
+HAL and estimation run at the robot file's rates, both 200 Hz, unless others are given. The client notes when the
+sample of a cycle arrives and when the first estimate from that cycle does. The difference is the time until the next
+tick of the estimation, the tick, and one more way over the wire.
 """
 
 import argparse
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -22,21 +22,22 @@ from services.process.supervisor import Supervisor
 from services.wire import keys
 from services.wire.messages import Estimates, Sample, decode
 from studies.accuracy.actual_arms import model
-from studies.speed.table import Row
-from studies.stack.loops import measures, stack, with_rates
+from studies.speed.table import Row, show
+from studies.stack.driving import measures
+from studies.stack.loops import stack, with_rates
 
 ROBOT = Path("robots/musashi_arm.yaml")
 SETTLING = 5.0
-"""Time [s] in which the estimation loop finds out when samples come."""
+"""Time [s] in which the estimation loop learns when samples come."""
 
 
 def differences(file: Path, seconds: float) -> np.ndarray:
-    """Time [s] by which the estimate of each cycle came after its sample."""
+    """Return the time [s] from the sample of each cycle to its estimate."""
     robot = load_robot(file)
     model(robot, Console(stderr=True))
     came: dict[str, dict[int, float]] = {"sample": {}, "estimates": {}}
 
-    def note(record: type[Sample] | type[Estimates]) -> object:
+    def note(record: type[Sample] | type[Estimates]) -> Callable[[zenoh.Sample], None]:
         def on_message(message: zenoh.Sample) -> None:
             now = time.perf_counter()
             came[record.TYPE].setdefault(decode(message.payload.to_bytes(), record).cycle, now)
@@ -61,7 +62,7 @@ def differences(file: Path, seconds: float) -> np.ndarray:
 
 
 def row(seconds: float = 20.0, rates: str = "") -> Row:
-    """The median."""
+    """Measure the median."""
     with with_rates(ROBOT, rates) as file:
         took = 1e3 * differences(file, seconds)
     middle, late = float(np.median(took)), float(np.percentile(took, 99))
@@ -71,13 +72,9 @@ def row(seconds: float = 20.0, rates: str = "") -> Row:
     )  # fmt: skip
 
 
-def main() -> None:
+if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--rates", default="", help="other rates than the robot file's: estimation=500")
     options = parser.parse_args()
-    print(row(options.seconds, options.rates))
-
-
-if __name__ == "__main__":
-    main()
+    show([row(options.seconds, options.rates)])

@@ -44,7 +44,8 @@ from services.verbs import fleet_top, top  # noqa: E402
 from services.verbs.fleet_watch import FleetWatch  # noqa: E402
 from services.wire import keys, messages  # noqa: E402
 from services.wire.session import CLIENT, close_session, new_boot, open_session  # noqa: E402
-from studies.stack import light_robot  # noqa: E402
+from studies.stack import light_model, light_robot  # noqa: E402
+from studies.stack.in_process import LiveDevice  # noqa: E402
 from studies.stack.soak import free_port  # noqa: E402
 
 RATE = 50.0
@@ -187,7 +188,7 @@ def _with_raw(body: dict[str, Any], field: bytes, raw: bytes) -> bytes:
     return b"".join(parts)
 
 
-class Watched(light_robot.LiveDevice):
+class Watched(LiveDevice):
     """The light robot, which notes what its drives are really told."""
 
     def __init__(self, config: Any, world: light_robot.LightWorld) -> None:
@@ -211,7 +212,7 @@ class Stage:
         file = light_robot.write(folder, robot, RATE, False)
         self.robot, self._config, self._folder = robot, load_robot(file), folder
         self._model = folder / "model"
-        light_robot.make_model(file, self._model)
+        light_model.make(file, self._model)
         self.device = Watched(self._config, light_robot.LightWorld(0))
         self.told = threading.Event()
         self.died: list[str] = []

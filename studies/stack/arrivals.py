@@ -1,0 +1,52 @@
+"""Estimates of one robot as they arrive at a remote client."""
+
+import threading
+import time
+from typing import Any
+
+import numpy as np
+
+
+class Arrivals:
+    """Counts the estimates of one robot, those that are lost, and pauses between them.
+
+    Args:
+        gap: A longer pause [s] between two estimates is a gap.
+    """
+
+    def __init__(self, gap: float) -> None:
+        self._gap = gap
+        self._news = threading.Condition()
+        self._estimated: dict[str, bytes] = {}
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin to count anew; a pause before is not counted."""
+        self._newest: tuple[int, int, float] | None = None
+        self.arrived = self.lost = self.gaps = 0
+        self.longest = 0.0
+
+    def add(self, message: dict[str, Any]) -> None:
+        """Count one estimate."""
+        now = time.monotonic()
+        self.arrived += 1
+        if self._newest is not None and self._newest[1] == message["boot"]:
+            self.lost += message["seq"] - self._newest[0] - 1
+            pause = now - self._newest[2]
+            self.gaps += pause > self._gap
+            self.longest = max(self.longest, pause)
+        self._newest = (message["seq"], message["boot"], now)
+        with self._news:
+            self._estimated = message["estimated"]
+            self._news.notify_all()
+
+    def wait(self, signal: str, element: int, is_estimated: bool, timeout: float) -> float:
+        """Return the time [s] until an element is estimated, or measured; NaN if it takes longer than `timeout` [s]."""
+
+        def is_there() -> bool:
+            elements = np.frombuffer(self._estimated.get(signal, b""), "?")
+            return bool(len(elements)) and bool(elements[element]) == is_estimated
+
+        begun = time.monotonic()
+        with self._news:
+            return time.monotonic() - begun if self._news.wait_for(is_there, timeout) else float("nan")
