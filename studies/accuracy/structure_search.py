@@ -64,16 +64,16 @@ def run(signals: int, samples: int, seed: int) -> None:
     least, sizes = body.least_errors(every), np.array([signal.size for signal in body.layout.signals])
     judged = judge.outputs & ~every
     perfect = every[(least * judged * sizes).sum(axis=1) / (judged * sizes).sum(axis=1) < thresholds.into]
-    measured = {line.tobytes() for line in known}
+    exhaustive = {line.tobytes() for line in known}
     truth = {line.tobytes() for line in perfect}
     kept = np.array([bits(m, names) > 0 for m in structure.masks])
     print(
         f"    exhaustive: {len(known)} feasible, {len(minimal(known))} minimal, {took:.1f} s; found "
         f"{contains(known, feasible).mean():.1%} of them, "
         f"{np.mean([m.tobytes() in {f.tobytes() for f in feasible} for m in minimal(known)]):.1%} of the minimal, "
-        f"{sum(f.tobytes() not in measured for f in feasible)} false; served {contains(known, kept).mean():.1%}\n"
-        f"    perfect model: {len(perfect)} feasible; the network finds {np.mean([k in measured for k in truth]):.1%} "
-        f"of them and {sum(k not in truth for k in measured)} false"
+        f"{sum(f.tobytes() not in exhaustive for f in feasible)} false; served {contains(known, kept).mean():.1%}\n"
+        f"    perfect model: {len(perfect)} feasible; the network finds {np.mean([k in exhaustive for k in truth]):.1%} "
+        f"of them and {sum(k not in truth for k in exhaustive)} false"
     )
 
 

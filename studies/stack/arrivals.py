@@ -17,7 +17,7 @@ class Arrivals:
     def __init__(self, gap: float) -> None:
         self._gap = gap
         self._news = threading.Condition()
-        self._estimated: dict[str, bytes] = {}
+        self._estimated: dict[str, np.ndarray] = {}
         self.restart()
 
     def restart(self) -> None:
@@ -36,16 +36,18 @@ class Arrivals:
             self.gaps += pause > self._gap
             self.longest = max(self.longest, pause)
         self._newest = (message["seq"], message["boot"], now)
+        elements, start = np.frombuffer(message["estimated"], "?"), 0
         with self._news:
-            self._estimated = message["estimated"]
+            for signal, count in message["elements"].items():
+                self._estimated[signal] = elements[start : start + count]
+                start += count
             self._news.notify_all()
 
     def wait(self, signal: str, element: int, is_estimated: bool, timeout: float) -> float:
         """Return the time [s] until an element is estimated, or measured; NaN if it takes longer than `timeout` [s]."""
 
         def is_there() -> bool:
-            elements = np.frombuffer(self._estimated.get(signal, b""), "?")
-            return bool(len(elements)) and bool(elements[element]) == is_estimated
+            return signal in self._estimated and bool(self._estimated[signal][element]) == is_estimated
 
         begun = time.monotonic()
         with self._news:
