@@ -1,4 +1,4 @@
-"""The simulated arm behind the robot contract, without a bus and faster than real time.
+"""Move the simulated arm behind the robot contract, without a bus and faster than real time.
 
 python examples/move_without_bus.py
 """

@@ -1,4 +1,4 @@
-"""A camera's program for a real robot, without the camera: publishes where a marker is. `gemuco serve` does the rest.
+"""Publish the position of a marker, as the program of a real robot's camera does; `gemuco serve` uses it.
 
 python examples/publish_marker.py [ROBOT] [SECONDS]
 """
@@ -19,9 +19,7 @@ with Service(robot, "vision") as camera:
     publish = camera.publisher(keys.vision(robot), Sample).put
     while time.monotonic() < end:
         taken_ns, taken = time.time_ns(), time.monotonic()
-        marker = {
-            "tool_tip_position": np.array([0.6, -0.2, 0.8])
-        }  # what your detector finds [m]; NaN where it does not
+        marker = {"tool_tip_position": np.array([0.6, -0.2, 0.8])}  # your detector's result [m]; NaN without a result
         frame += 1
         age = {name: np.full(value.shape, time.monotonic() - taken) for name, value in marker.items()}
         valid = {name: np.isfinite(value) for name, value in marker.items()}

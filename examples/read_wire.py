@@ -1,4 +1,4 @@
-"""A sensor sample read with zenoh and msgpack and nothing of ours; any language that has both can do this.
+"""Read a sensor sample with zenoh and msgpack alone; any language that has both can do this.
 
 python examples/read_wire.py tcp/127.0.0.1:PORT [ROBOT]
 """

@@ -1,4 +1,4 @@
-"""A remote client in ten lines: prints what is estimated, and from what, for as long as the robot lasts.
+"""Print all estimates and their masks until the robot ends: a remote client in ten lines.
 
 python examples/watch_estimates.py ROBOT [tcp/ROUTER:7447 or a role file]
 """
@@ -14,6 +14,6 @@ try:
         for now in robot.estimates():
             for signal, values in now.values.items():
                 print(f"{signal} {values.round(3)} {now.method[signal]} {now.mask[signal]}", flush=True)
-            time.sleep(0.5)  # whoever is slow gets the newest
+            time.sleep(0.5)  # a slow client receives the newest estimate
 except ServiceError as error:
     sys.exit(str(error))

@@ -67,13 +67,14 @@ def run(signals: int, samples: int, seed: int) -> None:
     exhaustive = {line.tobytes() for line in known}
     truth = {line.tobytes() for line in perfect}
     kept = np.array([bits(m, names) > 0 for m in structure.masks])
+    returned = {line.tobytes() for line in feasible}
+    whole = np.mean([line.tobytes() in returned for line in minimal(known)])
     print(
         f"    exhaustive: {len(known)} feasible, {len(minimal(known))} minimal, {took:.1f} s; found "
-        f"{contains(known, feasible).mean():.1%} of them, "
-        f"{np.mean([m.tobytes() in {f.tobytes() for f in feasible} for m in minimal(known)]):.1%} of the minimal, "
-        f"{sum(f.tobytes() not in exhaustive for f in feasible)} false; served {contains(known, kept).mean():.1%}\n"
-        f"    perfect model: {len(perfect)} feasible; the network finds {np.mean([k in exhaustive for k in truth]):.1%} "
-        f"of them and {sum(k not in truth for k in exhaustive)} false"
+        f"{contains(known, feasible).mean():.1%} of them, {whole:.1%} of the minimal, "
+        f"{len(returned - exhaustive)} false; served {contains(known, kept).mean():.1%}\n"
+        f"    perfect model: {len(truth)} feasible; the network finds {len(truth & exhaustive) / len(truth):.1%} of "
+        f"them and {len(exhaustive - truth)} false"
     )
 
 

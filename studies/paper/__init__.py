@@ -13,27 +13,27 @@ EXPERIMENTS = ("pr2", "musashi", "kxr")
 
 
 class Experiment(Protocol):
-    """What a module of this package offers under the name `reproduce`."""
+    """The function `reproduce` of each robot's module `experiment`."""
 
     def __call__(self, seeds: Sequence[int], folder: Path, progress: Tell, fresh: bool) -> Report:
         """Run every experiment of one robot.
 
         Args:
-            seeds: One run each, all with the same settings.
-            folder: Where data, models, figures and the report go.
-            progress: Told the share done, 0 to 1, and a line of text.
-            fresh: Collect and train again even if that was done before.
+            seeds: Seeds of the runs; all have the same settings.
+            folder: Folder of data, models, figures and the report.
+            progress: Receives the share done, 0 to 1, and a line of text.
+            fresh: Collect and train again, even if data and models are cached.
         """
         ...
 
 
 def experiment(name: str) -> Experiment:
-    """The experiments on a robot: `pr2`, `musashi` or `kxr`.
+    """Return the experiments on a robot: `pr2`, `musashi` or `kxr`.
 
     Raises:
-        BadArguments: There are none of this name.
+        BadArguments: There are no experiments of this name.
     """
     if name not in EXPERIMENTS:
         raise BadArguments(f"There are no experiments '{name}'. Known: {', '.join(EXPERIMENTS)}.")
-    found: Experiment = importlib.import_module(f"studies.paper.{name}.experiment").reproduce
-    return found
+    reproduce: Experiment = importlib.import_module(f"studies.paper.{name}.experiment").reproduce
+    return reproduce

@@ -1,4 +1,4 @@
-"""The kinds of figures that the experiments share, drawn into PNG files."""
+"""Kinds of figures that the experiments share, drawn into PNG files."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -16,7 +16,7 @@ DPI = 110
 
 @contextmanager
 def picture(path: Path, title: str, columns: int = 1, rows: int = 1) -> Iterator[list[Axes]]:
-    """Axes to draw on, row by row; the PNG is written when the block ends."""
+    """Yield axes to draw on, row by row; write the PNG when the block ends."""
     figure, grid = plt.subplots(rows, columns, figsize=(6.4 * columns, 4.6 * rows), layout="constrained", squeeze=False)
     try:
         figure.suptitle(title)
@@ -28,10 +28,10 @@ def picture(path: Path, title: str, columns: int = 1, rows: int = 1) -> Iterator
 
 
 def bias_map(axis: Axes, biases: Mapping[str, np.ndarray], paths: Mapping[str, np.ndarray] | None = None) -> None:
-    """The p of every condition in the plane of their two principal components, and ways that p took.
+    """Draw the p of every condition in the plane of their two principal components, and paths of p.
 
     Args:
-        axis: Where to draw.
+        axis: The axis to draw on.
         biases: Condition -> p, shape (bias_size,).
         paths: Label -> the p of every step, shape (steps, bias_size).
     """
@@ -53,7 +53,7 @@ def bias_map(axis: Axes, biases: Mapping[str, np.ndarray], paths: Mapping[str, n
 
 
 def _principal_plane(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean (k,) and the two directions of largest spread as columns (k, 2)."""
+    """Return the mean (k,) and the two directions of largest spread as columns (k, 2)."""
     center = points.mean(axis=0)
     _, _, directions = np.linalg.svd(points - center, full_matrices=True)
     plane = np.zeros((points.shape[1], 2))
@@ -64,14 +64,14 @@ def _principal_plane(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def over_steps(
     axis: Axes, curves: Mapping[str, np.ndarray], unit: str, steps: str = "step", bar: float | None = None
 ) -> None:
-    """Errors over steps or time: mean over the runs, and a band from the least to the largest.
+    """Draw errors over steps or time: mean over the runs, and a band from the least to the largest.
 
     Args:
-        axis: Where to draw.
-        curves: Label -> error [unit], shape (runs, steps); NaN where nothing was measured.
+        axis: The axis to draw on.
+        curves: Label -> error [unit], shape (runs, steps); NaN where no error was measured.
         unit: Unit of the errors.
-        steps: What a step is.
-        bar: What was to be reached [unit].
+        steps: Label of the steps.
+        bar: Limit to reach [unit].
     """
     for label, values in curves.items():
         runs = np.atleast_2d(values)
@@ -90,10 +90,10 @@ def over_steps(
 
 
 def bars(axis: Axes, groups: Mapping[str, Mapping[str, Sequence[float]]], unit: str) -> None:
-    """Means with standard deviations, side by side.
+    """Draw means with standard deviations, side by side.
 
     Args:
-        axis: Where to draw.
+        axis: The axis to draw on.
         groups: Group -> series -> one value per seed [unit].
         unit: Unit of the values.
     """
@@ -117,14 +117,14 @@ def score_over_time(
     threshold: float | None = None,
     spans: Mapping[str, tuple[float, float]] | None = None,
 ) -> None:
-    """Anomaly scores over time on a logarithmic axis.
+    """Draw anomaly scores over time on a logarithmic axis.
 
     Args:
-        axis: Where to draw.
+        axis: The axis to draw on.
         time: [s], shape (n,).
         scores: Label -> Mahalanobis distance, shape (n,).
-        threshold: Above which a score is no longer normal.
-        spans: What happened -> from when to when [s].
+        threshold: Highest score that counts as normal.
+        spans: Label of an event -> its begin and end [s].
     """
     for index, (label, span) in enumerate((spans or {}).items()):
         axis.axvspan(*span, color=f"C{index + 5}", alpha=0.15, label=label)

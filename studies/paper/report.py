@@ -1,4 +1,4 @@
-"""What an experiment measured, beside what the paper reports and what was to be reached."""
+"""Results of an experiment beside those of the paper and the bars to reach."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -17,12 +17,12 @@ class Row:
     """One figure, measured once per seed.
 
     Attributes:
-        name: What was measured.
-        unit: Of ours, of the bar and of the paper's figure; empty for a share or a count.
-        paper: What the paper reports, as it writes it; empty if it does not.
-        values: One per seed [unit].
-        bar: What was to be reached [unit]; None where nothing was asked.
-        better: Whether a lower or a higher figure is better.
+        name: The measured quantity.
+        unit: Unit of ours, of the bar and of the paper's figure; empty for a share or a count.
+        paper: The paper's figure, as it writes it; empty if it has none.
+        values: One value per seed [unit].
+        bar: Limit to reach [unit]; None without a limit.
+        better: Side of the bar on which a figure is good.
     """
 
     name: str
@@ -55,15 +55,15 @@ class Row:
         return bool(self.mean < self.bar if self.better == "lower" else self.mean > self.bar)
 
     def cells(self) -> tuple[str, ...]:
-        """What people read, in the order of `COLUMNS`."""
+        """Return the cells of a table in the order of `COLUMNS`."""
         ours = f"{self.mean:.3g} {self.unit}".strip()
         if len(self.values) > 1:
             ours = f"{self.mean:.3g} ± {self.spread:.2g} {self.unit}".strip()
-        wanted = ""
+        bar = "-"
         if self.bar is not None:
-            wanted = f"{'<' if self.better == 'lower' else '>'} {self.bar:g} {self.unit}".strip()
+            bar = f"{'<' if self.better == 'lower' else '>'} {self.bar:g} {self.unit}".strip()
         paper = f"{self.paper} {self.unit}".strip() if self.paper else "-"
-        return self.name, paper, ours, wanted or "-", {None: "-", True: "yes", False: "NO"}[self.reached]
+        return self.name, paper, ours, bar, {None: "-", True: "yes", False: "NO"}[self.reached]
 
 
 @dataclass(slots=True)
@@ -73,8 +73,8 @@ class Report:
     Attributes:
         robot: The robot's name.
         seeds: The seeds, in the order of every row's values.
-        rows: In the order in which they were added.
-        notes: Sentences for below the table.
+        rows: The rows in order.
+        notes: Sentences below the table.
     """
 
     robot: str
@@ -83,15 +83,15 @@ class Report:
     notes: list[str] = field(default_factory=list)
 
     def add(self, row: Row) -> None:
-        """One more figure."""
+        """Add a row."""
         self.rows.append(row)
 
     def note(self, sentence: str) -> None:
-        """Something that a reader of the table must know."""
+        """Add a sentence below the table."""
         self.notes.append(sentence)
 
     def table(self) -> Table:
-        """For the terminal."""
+        """Return the table for the terminal."""
         count = f", {len(self.seeds)} seeds: mean ± standard deviation" if self.seeds else ""
         table = Table(title=f"{self.robot}{count}", title_justify="left", caption="\n".join(self.notes) or None)
         for column in COLUMNS:
@@ -102,7 +102,7 @@ class Report:
         return table
 
     def markdown(self) -> str:
-        """The same table for a document."""
+        """Return the same table for a document."""
         lines = ["| " + " | ".join(COLUMNS) + " |", "|---" * len(COLUMNS) + "|"]
         lines += ["| " + " | ".join(row.cells()) + " |" for row in self.rows]
         return "\n".join([*lines, *(f"\n{note}" for note in self.notes)]) + "\n"
@@ -117,7 +117,7 @@ class Report:
 
 
 def adder(report: Report, outcomes: Sequence[Any]) -> Callable[..., None]:
-    """Adds rows whose values are a figure of every seed's outcome."""
+    """Return a function that adds a row, computed from every seed's outcome."""
 
     def add(
         name: str,

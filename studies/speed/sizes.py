@@ -1,8 +1,9 @@
-"""How costs grow: inference and searches with the network, recognition with signals, the step on W with its batch.
+"""Growth of costs: inference and searches with the network, recognition with signals, the step on W with its batch.
 
 python -m studies.speed.sizes        # writes docs/images/cost.png
 """
 
+from functools import partial
 from pathlib import Path
 
 import matplotlib as mpl
@@ -16,7 +17,7 @@ from gemuco.estimation import estimate
 from gemuco.search.descent import NewtonConfig
 from studies.speed.bodies import body
 from studies.speed.solvers import BALANCE, PAPER, TERMS, Ours
-from studies.speed.table import timed
+from studies.speed.table import Job, timed
 
 HIDDEN = (50, 100, 200, 300, 400)
 SIGNALS = (3, 6, 10, 20, 30)
@@ -25,33 +26,33 @@ NAMED = "estimate, named arrays"
 PICTURE = Path("docs/images/cost.png")
 
 
-def median(job, calls: int) -> float:  # type: ignore[no-untyped-def]
-    """Median time of one call [us]."""
+def median(job: Job, calls: int) -> float:
+    """Return the median time of one call [us]."""
     job()
     return float(np.median([timed(job, 1) for _ in range(calls)]))
 
 
 def by_hidden() -> dict[str, list[float]]:
-    """What searches and inference take with wider layers."""
-    found: dict[str, list[float]] = {}
+    """Return the times of searches and inference with wider layers [us]."""
+    times: dict[str, list[float]] = {}
     for hidden in HIDDEN:
         schema = body((hidden, hidden))
         size, gate = schema.layout.size, schema.gate(schema.masks[0])
-        asked = (*schema.parts, np.zeros(size), *gate, np.ones(size, bool), np.empty(size))
+        arguments = (*schema.parts, np.zeros(size), *gate, np.ones(size, bool), np.empty(size))
         plain, balanced = Ours(schema, "e", TERMS), Ours(schema, "e", (*TERMS, BALANCE))
         for name, job, calls in (
-            ("estimate by mask", lambda asked=asked: infer(*asked), 300),
-            ("default search", lambda plain=plain: plain.solve(NewtonConfig()), 30),
-            ("default search, torque balance", lambda balanced=balanced: balanced.solve(NewtonConfig()), 15),
-            ("descent 20 x 30", lambda plain=plain: plain.solve(PAPER), 15),
+            ("estimate by mask", partial(infer, *arguments), 300),
+            ("default search", partial(plain.solve, NewtonConfig()), 30),
+            ("default search, torque balance", partial(balanced.solve, NewtonConfig()), 15),
+            ("descent 20 x 30", partial(plain.solve, PAPER), 15),
         ):
-            found.setdefault(name, []).append(median(job, calls))
-    return found
+            times.setdefault(name, []).append(median(job, calls))
+    return times
 
 
 def by_signals() -> dict[str, list[float]]:
-    """What inference and recognition of p take with more signals of three elements each."""
-    found: dict[str, list[float]] = {NAMED: [], "p update": []}
+    """Return the times of inference and recognition of p with more signals of three elements [us]."""
+    times: dict[str, list[float]] = {NAMED: [], "p update": []}
     random = np.random.default_rng(0)
     for count in SIGNALS:
         signals = {f"s{index}": (3, "1") for index in range(count)}
@@ -61,14 +62,14 @@ def by_signals() -> dict[str, list[float]]:
         row, seen = random.standard_normal(schema.layout.size), Kalman(schema)
         for _ in range(20):
             seen.see(schema, random.standard_normal(schema.layout.size))
-        found[NAMED].append(median(lambda schema=schema, values=values: estimate(schema, values), 100))
-        found["p update"].append(median(lambda seen=seen, schema=schema, row=row: seen.see(schema, row), 50))
-    return found
+        times[NAMED].append(median(partial(estimate, schema, values), 100))
+        times["p update"].append(median(partial(seen.see, schema, row), 50))
+    return times
 
 
 def by_window() -> dict[str, list[float]]:
-    """What one step on W takes with more samples, each under three masks."""
-    found: dict[str, list[float]] = {"W update, 3 masks": []}
+    """Return the time of one step on W with more samples, each under three masks [us]."""
+    times: dict[str, list[float]] = {"W update, 3 masks": []}
     random = np.random.default_rng(0)
     for batch in WINDOW:
         schema = body((200, 200))
@@ -76,10 +77,8 @@ def by_window() -> dict[str, list[float]]:
         updater = Updater(schema, config)
         for _ in range(batch):
             updater.add(schema.layout.split(random.standard_normal(schema.layout.size)))
-        relearner = updater._relearner
-        job = lambda relearner=relearner, schema=schema: relearner.step(schema, True, False)  # noqa: E731
-        found["W update, 3 masks"].append(median(job, 15))
-    return found
+        times["W update, 3 masks"].append(median(partial(updater._relearner.step, schema, True, False), 15))
+    return times
 
 
 def draw(where: Path = PICTURE) -> None:
@@ -88,17 +87,17 @@ def draw(where: Path = PICTURE) -> None:
     from matplotlib import pyplot
 
     figure, axes = pyplot.subplots(1, 3, figsize=(13, 4), sharey=True)
-    for axis, label, at, found in zip(
+    for axis, label, at, times in zip(
         axes,
         ("width of the hidden layers", "signals of three elements, hidden 200", "samples in a batch, hidden 200"),
         (HIDDEN, SIGNALS, WINDOW),
         (by_hidden(), by_signals(), by_window()),
         strict=True,
     ):
-        for name, times in found.items():
-            axis.plot(at, np.array(times) / 1e3, marker="o", label=name)
+        for name, values in times.items():
+            axis.plot(at, np.array(values) / 1e3, marker="o", label=name)
         axis.set(xlabel=label, yscale="log", xscale="log")
-        axis.set_xticks(at, [str(one) for one in at])
+        axis.set_xticks(at, [str(size) for size in at])
         axis.minorticks_off()
         axis.grid(alpha=0.3)
         axis.legend(fontsize=8)

@@ -39,6 +39,8 @@ def engage(client: Client) -> None:
                 client.engage()
         except (CommandRefused, NotEngaged) as error:
             refusal = str(error)
+            with contextlib.suppress(CommandRefused):  # a drive may be in fault while the robot is off
+                client.reset()
         time.sleep(0.3)
     raise TimeoutError(f"The controller was not engaged within {PATIENCE:g} s. {refusal}")
 

@@ -14,21 +14,22 @@ from services.learning.trainer import train_config
 from services.model.living_model import layout_of
 from services.model.model_config import model_config
 from services.show import Tell
-from studies.paper.kxr.robot import JOINTS, Standing, inverse, random_targets, safe_postures, stiff
+from studies.paper.body import JOINTS
+from studies.paper.kxr.robot import Standing, inverse, random_targets, safe_postures, stiff
 from studies.paper.kxr.simulated import AFTER, FRESH, LEADS, TOOLS, WAYS, control_of, leads, recognitions
 from studies.paper.kxr.trials import Course, follow, follow_blindly, samples_until
 from studies.paper.runs import Run
 
 ACTUAL = "actual"
 TAUGHT_GRID = (5, 3, 2, 2)
-"""Postures that a person would choose: so many steps of shoulder pitch and yaw, elbow and ankle pitch; 60 in all."""
+"""Number of taught postures along shoulder pitch and yaw, elbow and ankle pitch; 60 in all."""
 TAUGHT_MARGIN = 0.15
-"""Share of a joint's range that a person keeps away from either end of it."""
+"""Distance of taught postures from the ends of a joint's range, as a share of it."""
 RANDOM = 20
-"""Random postures per tool, in which the designer's robot is in balance and sees its tool."""
+"""Number of random postures per tool in which the designer's robot is in balance and sees its tool."""
 PER_EPISODE = 10
 EPOCHS, RATE = 300, 1e-3
-"""Of fine-tuning."""
+"""Epochs and rate of fine-tuning."""
 TARGETS = 30
 MODELS = ("geometric", "simulated", "fine-tuned")
 FOLLOWING = "simulated, p updated"
@@ -40,11 +41,11 @@ class Actual:
 
     Attributes:
         schema: Fine-tuned.
-        samples: How many it was tuned with.
-        leads: Way of p, by label, to a tool with all sensors.
-        needed: Tool -> samples until it is recognised by the default way.
-        recognised: Case -> samples until long_middle is recognised by the default way, shape (runs,).
-        controlled: Model -> targets at long_middle.
+        samples: Number of samples of fine-tuning.
+        leads: Label -> path of p to a tool with all sensors.
+        needed: Tool -> samples until it is recognised by the default update.
+        recognised: Case -> samples until long_middle is recognised by the default update, shape (runs,).
+        controlled: Model -> course with long_middle.
     """
 
     schema: BodySchema
@@ -56,7 +57,7 @@ class Actual:
 
 
 def actual(run: Run, simulated: BodySchema, tell: Tell) -> Actual:
-    """Collect on the actual robot, fine-tune what was learned in simulation, and run every trial of one seed."""
+    """Collect on the actual robot, fine-tune the simulated model, and run every trial of one seed."""
     tell(0.0, "collecting on the actual robot")
     settings = {"grid": TAUGHT_GRID, "margin": TAUGHT_MARGIN, "random": RANDOM}
     data = run.cached("actual", lambda: _collected(run), **settings)
@@ -64,21 +65,21 @@ def actual(run: Run, simulated: BodySchema, tell: Tell) -> Actual:
         "actual_model", lambda: _tuned(run, simulated, data, tell), epochs=EPOCHS, rate=RATE, **settings
     )
     tell(0.8, "trials on the actual robot")
-    ways = leads(run, schema, ACTUAL)
-    needed = {tool: samples_until(ways[f"to {tool}, ekf"], schema, tool) for tool in LEADS}
-    recognised = {case: found for (case, _), found in recognitions(run, schema, ACTUAL, ["ekf"])[0].items()}
-    return Actual(schema, len(data), ways, needed, recognised, _controlled(run, simulated, schema))
+    paths = leads(run, schema, ACTUAL)
+    needed = {tool: samples_until(paths[f"to {tool}, ekf"], schema, tool) for tool in LEADS}
+    recognised = {case: samples for (case, _), samples in recognitions(run, schema, ACTUAL, ["ekf"])[0].items()}
+    return Actual(schema, len(data), paths, needed, recognised, _controlled(run, simulated, schema))
 
 
 def taught_postures(robot: RobotConfig) -> np.ndarray:
-    """A grid within the limits [rad], shape (60, 4), in the order in which a person would go through it."""
+    """Return the grid of postures [rad], shape (60, 4), that a person would teach."""
     low, high = robot.bounds(JOINTS)
     shares = [np.linspace(TAUGHT_MARGIN, 1.0 - TAUGHT_MARGIN, count) for count in TAUGHT_GRID]
     return low + (high - low) * np.array(list(product(*shares)))
 
 
 def _collected(run: Run) -> Dataset:
-    """One sample per posture, with whatever was out of sight missing."""
+    """Collect one sample per posture; signals out of sight are missing."""
     robot, episodes = run.robot, []
     layout, random = layout_of(robot), np.random.default_rng([FRESH + run.seed, 200])
     for tool in TOOLS:

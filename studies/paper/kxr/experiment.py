@@ -58,9 +58,8 @@ def _of_seed(run: Run, tell: Tell) -> Outcome:
 
 
 def reproduce(seeds: Sequence[int], folder: Path, progress: Tell, fresh: bool) -> Report:
-    """See `studies.paper.Experiment`."""
+    """Run both experiments; see `studies.paper.Experiment`."""
     robot = load_robot(robot_file(ROBOT))
-
     outcomes = each_seed(robot, seeds, folder, progress, fresh, _of_seed)
     report = Report(ROBOT, tuple(seeds))
     _add_structure(report, outcomes)
@@ -113,16 +112,16 @@ def _mean(outcome: Outcome, case: str, way: str) -> float:
 
 
 def _share(outcome: Outcome, case: str, way: str) -> float:
-    return _found(outcome.simulated.needed[case, way])
+    return _recognised(outcome.simulated.needed[case, way])
 
 
 def _needed(samples: np.ndarray) -> float:
-    """Mean over the runs, shape (runs,), of the samples until recognition."""
+    """Return the mean over the runs of the samples until recognition, shape (runs,)."""
     return float(np.minimum(samples, SAMPLES + 1).mean())
 
 
-def _found(samples: np.ndarray) -> float:
-    """Share [%] of the runs, shape (runs,), in which the tool was recognised."""
+def _recognised(samples: np.ndarray) -> float:
+    """Return the share [%] of the runs, shape (runs,), in which the tool was recognised."""
     return 100.0 * float(np.isfinite(samples).mean())
 
 
@@ -170,7 +169,7 @@ def _known(outcome: Outcome) -> Course:
 
 
 def _inside(course: Course, bounds: tuple[np.ndarray, np.ndarray]) -> float:
-    """Share of the steps with a known tool in which the center of gravity is within bounds [m]."""
+    """Return the share of steps with a known tool in which the center of gravity is within bounds [m]."""
     known = np.arange(len(course.tips)) % STEPS > 0
     inside = np.all((course.centers >= bounds[0]) & (course.centers <= bounds[1]), axis=1)
     return float(inside[known].mean())
@@ -183,7 +182,7 @@ def _add_actual(report: Report, outcomes: Sequence[Outcome]) -> None:
     for tool in LEADS:
         row(f"actual: {tool} recognised, samples", "", "", lambda o, tool=tool: min(o.actual.needed[tool], SAMPLES + 1))
     for case in CASES:
-        row(f"actual: recognised in {SAMPLES}, {case}", "%", "", lambda o, c=case: _found(o.actual.recognised[c]))
+        row(f"actual: recognised in {SAMPLES}, {case}", "%", "", lambda o, c=case: _recognised(o.actual.recognised[c]))
         row(f"actual: recognised, {case}, samples", "", "", lambda o, c=case: _needed(o.actual.recognised[c]))
     papers = dict(zip(MODELS, ("largest", "smaller", "smallest"), strict=True))
     for model in (*MODELS, FOLLOWING):

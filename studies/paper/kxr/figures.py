@@ -37,12 +37,12 @@ def draw(folder: Path, simulated: Sequence[Simulated], actual: Sequence[Actual])
 def _structure(path: Path, simulated: Sequence[Simulated]) -> None:
     with figures.picture(path, "Structure: errors on held-out data, all seeds", columns=2) as (left, right):
         outputs = {
-            name: [one.schema.manifest["L_i"][name] for one in simulated] for name in simulated[0].schema.layout.names
+            name: [seed.schema.manifest["L_i"][name] for seed in simulated] for name in simulated[0].schema.layout.names
         }
         _bars(left, outputs, "L_i: each signal from all others")
-        masks = [mask_errors(one.schema) for one in simulated]
-        ordered = sorted(masks[0], key=lambda mask: float(np.mean([one[mask] for one in masks])))
-        _bars(right, {mask: [one[mask] for one in masks] for mask in ordered}, "L_m: what is masked, by mask")
+        masks = [mask_errors(seed.schema) for seed in simulated]
+        ordered = sorted(masks[0], key=lambda mask: float(np.mean([errors[mask] for errors in masks])))
+        _bars(right, {mask: [errors[mask] for errors in masks] for mask in ordered}, "L_m: masked signals, by mask")
         right.set_ylabel("joints, center of gravity, tip, pixel")
 
 
@@ -64,16 +64,16 @@ def _bars(axis: Axes, values: dict[str, list[float]], title: str) -> None:
     axis.set_title(title, fontsize=10)
 
 
-def _maps(path: Path, one: Simulated) -> None:
-    biases = {name: one.schema.biases[name] for name in TOOLS}
-    with figures.picture(path, "p of every tool, and its ways while it was updated", columns=2, rows=2) as axes:
+def _maps(path: Path, first: Simulated) -> None:
+    biases = {name: first.schema.biases[name] for name in TOOLS}
+    with figures.picture(path, "p of every tool, and its paths during updates", columns=2, rows=2) as axes:
         for axis, way in zip(axes, SHOWN, strict=False):
-            steps = {f"short2long-{case[0]}": one.paths[case, way] for case in CASES}
+            steps = {f"short2long-{case[0]}": first.paths[case, way] for case in CASES}
             figures.bias_map(axis, biases, steps)
             axis.set_title(f"short_middle to {AFTER}, p by {way}", fontsize=10)
-        figures.bias_map(axes[2], biases, one.leads)
+        figures.bias_map(axes[2], biases, first.leads)
         axes[2].set_title("to two tools, all sensors", fontsize=10)
-        figures.bias_map(axes[3], biases, {way: one.controlled[way].biases for way in (KNOWING, GRADIENT)})
+        figures.bias_map(axes[3], biases, {way: first.controlled[way].biases for way in (KNOWING, GRADIENT)})
         axes[3].set_title(f"while controlled: {', '.join(SEQUENCE)}", fontsize=10)
 
 
@@ -81,11 +81,11 @@ def _control(path: Path, simulated: Sequence[Simulated]) -> None:
     ways = (BLIND, KNOWING, GRADIENT)
     with figures.picture(path, "Targets reached while tools change, all seeds", columns=2, rows=2) as axes:
         for row, (smooth, title) in enumerate(((False, "raw"), (True, "average of 5 steps"))):
-            tips = {way: _curves([one.controlled[way].tips for one in simulated], smooth) for way in ways}
+            tips = {way: _curves([seed.controlled[way].tips for seed in simulated], smooth) for way in ways}
             figures.over_steps(axes[2 * row], tips, "mm", bar=12.0)
             axes[2 * row].set_title(f"tool tip, {title}", fontsize=10)
-            centers = {way: _curves([one.controlled[way].off_center for one in simulated], smooth) for way in ways}
-            centers["perfect model"] = _curves([one.limit.off_center for one in simulated], smooth)
+            centers = {way: _curves([seed.controlled[way].off_center for seed in simulated], smooth) for way in ways}
+            centers["perfect model"] = _curves([seed.limit.off_center for seed in simulated], smooth)
             figures.over_steps(axes[2 * row + 1], centers, "mm", bar=15.0)
             axes[2 * row + 1].set_title(f"center of gravity, {title}", fontsize=10)
         for axis in axes:
@@ -99,16 +99,16 @@ def _control(path: Path, simulated: Sequence[Simulated]) -> None:
 
 
 def _curves(errors: Sequence[np.ndarray], smooth: bool) -> np.ndarray:
-    return np.stack([1e3 * (smoothed(one) if smooth else one) for one in errors])
+    return np.stack([1e3 * (smoothed(course) if smooth else course) for course in errors])
 
 
 def _actual(path: Path, actual: Sequence[Actual]) -> None:
     with figures.picture(path, "The actual robot", columns=2) as (left, right):
         figures.bias_map(left, {name: actual[0].schema.biases[name] for name in TOOLS}, actual[0].leads)
-        left.set_title("p after fine-tuning, and its ways to two tools", fontsize=10)
+        left.set_title("p after fine-tuning, and its paths to two tools", fontsize=10)
         groups = {
             name: {
-                model: [1e3 * getattr(one.controlled[model], part).mean() for one in actual]
+                model: [1e3 * getattr(seed.controlled[model], part).mean() for seed in actual]
                 for model in (*MODELS, FOLLOWING)
             }
             for name, part in (("tool tip", "tips"), ("center of gravity", "off_center"))

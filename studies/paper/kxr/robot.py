@@ -1,8 +1,7 @@
-"""The humanoid in its experiments: moved posture by posture, and what its designer's models say of it."""
+"""The humanoid in its experiments, and its designer's models."""
 
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -10,113 +9,91 @@ from hal import registry
 from hal.config import RobotConfig
 from services.learning.motion import Forecast
 from services.model.model_config import collect_config
+from studies.paper.body import JOINTS, Body
 
-JOINTS, CENTER, TIP, PIXEL = "joint_position", "center_of_gravity", "tool_tip_position", "tool_tip_pixel"
-TICK = 0.02
-"""Step of the simulated robot [s]."""
+CENTER, TIP, PIXEL = "center_of_gravity", "tool_tip_position", "tool_tip_pixel"
 ARRIVED = 1e-5
 """Joint travel per step [rad] below which the servos stand."""
 EASY = np.array([0.010, 0.015])
-"""Targets are tips that can be reached with the center of gravity so near the middle of the feet [m]."""
+"""Largest offset of the center of gravity from the middle of the feet [m] at which a tip is a target."""
 TIP_SCALE, CENTER_SCALE = 0.001, 0.020
-"""In inverse kinematics a millimetre of the tip counts as much as 20 mm of the center of gravity."""
+"""Errors of tip and center of gravity [m] that count the same in inverse kinematics."""
 ROUNDS, SLOPE = 60, 1e-5
 
 Model = Callable[[np.ndarray], Mapping[str, np.ndarray]]
-"""Commands [rad], shape (n, 4), to signals, shapes (n, size)."""
+"""A model maps commands [rad], shape (n, 4), to signals, shapes (n, size)."""
 
 
-class Standing:
-    """The simulated humanoid; not thread-safe."""
+class Standing(Body):
+    """The simulated humanoid."""
 
     def __init__(self, robot: RobotConfig, variant: str, seed: int, condition: str) -> None:
-        self._world: Any = registry.load(str(robot.simulator)).world(variant, seed, condition)
-        self._low, self._high = robot.bounds(JOINTS)
-        self._elements = [f"{JOINTS}.{name}" for name in robot.signals[JOINTS].elements]
-
-    def go(self, command: np.ndarray) -> Mapping[str, np.ndarray]:
-        """Move to a posture [rad], shape (4,), within the robot file's limits; what is measured at rest there."""
-        for element, angle in zip(self._elements, np.clip(command, self._low, self._high).tolist(), strict=True):
-            self._world.drive(element, angle, True)
-        before = np.full(len(command), np.inf)
-        while np.abs((now := self._world.truth()[JOINTS]) - before).max() > ARRIVED:
-            before = now
-            self._world.step(TICK)
-        measured: Mapping[str, np.ndarray] = self._world.measure()
-        return {name: measured[name] for name in (JOINTS, CENTER, TIP, PIXEL)}
-
-    def truth(self, signal: str) -> np.ndarray:
-        """A signal as it is, seen by the camera or not [its unit]."""
-        found: np.ndarray = self._world.truth()[signal]
-        return found
-
-    def hold(self, condition: str) -> None:
-        """Put another tool into the hand."""
-        self._world.break_part(f"tool_changed:{condition}")
+        super().__init__(robot, variant, seed, condition, ARRIVED)
 
 
 def designed(robot: RobotConfig, condition: str) -> Model:
-    """The designer's model with its deflection: the robot file's `collect.forecast`."""
+    """Return the designer's model with its deflection: the robot file's `collect.forecast`."""
     model: Model = partial(registry.load(str(collect_config(robot).forecast)), robot, condition)
     return model
 
 
 def stiff(robot: RobotConfig, condition: str) -> Model:
-    """The designer's geometry without any deflection."""
+    """Return the designer's geometry without deflection."""
     model: Model = partial(registry.load(str(robot.simulator)).geometric, condition)
     return model
 
 
 def safe_postures(robot: RobotConfig, condition: str, count: int, random: np.random.Generator) -> np.ndarray:
-    """Random commands [rad], shape (count, 4), that the designer's model says keep the robot file's constraints."""
+    """Draw commands [rad], shape (count, 4), that keep the constraints by the designer's model."""
     forecast = Forecast(robot, collect_config(robot), condition)
-    found = np.zeros((0, 4))
-    while len(found) < count:
+    safe = np.zeros((0, 4))
+    while len(safe) < count:
         drawn = random.uniform(*robot.bounds(JOINTS), (16 * count, 4))
-        found = np.concatenate([found, drawn[~forecast.outside(drawn).any(axis=1)]])
-    return found[:count]
+        safe = np.concatenate([safe, drawn[~forecast.outside(drawn).any(axis=1)]])
+    return safe[:count]
 
 
 def random_targets(robot: RobotConfig, condition: str, count: int, random: np.random.Generator) -> np.ndarray:
-    """Tips [m], shape (count, 3), that the designer's robot can reach in balance with a tool."""
+    """Draw tips [m], shape (count, 3), that the designer's robot reaches in balance with a tool."""
     model = designed(robot, condition)
-    found = np.zeros((0, 3))
-    while len(found) < count:
-        told = model(safe_postures(robot, condition, 4 * count, random))
-        easy = np.all(np.abs(told[CENTER]) < EASY, axis=1)
-        found = np.concatenate([found, told[TIP][easy]])
-    return found[:count]
+    targets = np.zeros((0, 3))
+    while len(targets) < count:
+        forecast = model(safe_postures(robot, condition, 4 * count, random))
+        is_easy = np.all(np.abs(forecast[CENTER]) < EASY, axis=1)
+        targets = np.concatenate([targets, forecast[TIP][is_easy]])
+    return targets[:count]
 
 
 def inverse(robot: RobotConfig, model: Model, targets: np.ndarray) -> np.ndarray:
-    """Commands [rad], shape (n, 4), that bring the tip to targets [m], shape (n, 3), and the center of gravity near 0.
+    """Return commands [rad], shape (n, 4), that bring the tip to targets [m], shape (n, 3), in balance.
 
-    Gauss-Newton with damping by a model, from several postures; the best is kept.
+    Gauss-Newton with damping on a model, from several postures; the best solution is kept.
     """
     low, high = robot.bounds(JOINTS)
     starts = low + (high - low) * np.random.default_rng(0).uniform(0.2, 0.8, (6, 4))
-    found, least = np.zeros((len(targets), 4)), np.full(len(targets), np.inf)
+    best, least = np.zeros((len(targets), 4)), np.full(len(targets), np.inf)
     for start in starts:
         command = np.repeat(start[None], len(targets), axis=0)
         damping = np.full(len(targets), 1.0)
-        left = _left(model, command, targets)
+        residual = _residual(model, command, targets)
         for _ in range(ROUNDS):
             slopes = np.stack(
-                [(_left(model, command + SLOPE * one, targets) - left) / SLOPE for one in np.eye(4)], axis=2
+                [(_residual(model, command + SLOPE * axis, targets) - residual) / SLOPE for axis in np.eye(4)], axis=2
             )
             curvature = np.einsum("nij,nik->njk", slopes, slopes) + damping[:, None, None] * np.eye(4)
-            step = np.linalg.solve(curvature, -np.einsum("nij,ni->nj", slopes, left)[..., None])[..., 0]
+            step = np.linalg.solve(curvature, -np.einsum("nij,ni->nj", slopes, residual)[..., None])[..., 0]
             tried = np.clip(command + step, low, high)
-            after = _left(model, tried, targets)
-            better = np.sum(after**2, axis=1) < np.sum(left**2, axis=1)
-            command, left = np.where(better[:, None], tried, command), np.where(better[:, None], after, left)
+            after = _residual(model, tried, targets)
+            better = np.sum(after**2, axis=1) < np.sum(residual**2, axis=1)
+            command = np.where(better[:, None], tried, command)
+            residual = np.where(better[:, None], after, residual)
             damping = np.where(better, 0.3 * damping, 4.0 * damping).clip(1e-3, 1e9)
-        cost = np.sum(left**2, axis=1)
-        found = np.where((cost < least)[:, None], command, found)
+        cost = np.sum(residual**2, axis=1)
+        best = np.where((cost < least)[:, None], command, best)
         least = np.minimum(cost, least)
-    return found
+    return best
 
 
-def _left(model: Model, command: np.ndarray, targets: np.ndarray) -> np.ndarray:
-    told = model(command)
-    return np.concatenate([(told[TIP] - targets) / TIP_SCALE, told[CENTER] / CENTER_SCALE], axis=1)
+def _residual(model: Model, command: np.ndarray, targets: np.ndarray) -> np.ndarray:
+    forecast = model(command)
+    return np.concatenate([(forecast[TIP] - targets) / TIP_SCALE, forecast[CENTER] / CENTER_SCALE], axis=1)

@@ -14,9 +14,9 @@ from services.learning.trainer import train
 from services.model.control_config import ControlConfig
 from services.model.model_config import model_config
 from services.show import Tell
+from studies.paper.body import JOINTS
 from studies.paper.kxr.robot import (
     CENTER,
-    JOINTS,
     PIXEL,
     TIP,
     Standing,
@@ -35,7 +35,7 @@ TOOLS = {
         (("short", 176.0), ("long", 236.0)), (("light", 40.0), ("middle", 80.0), ("heavy", 120.0))
     )
 }
-"""Length [mm] and weight [g] of every tool, which p is to be ordered by; the model is not told them."""
+"""Length [mm] and weight [g] of every tool; p is to be ordered by them, and the model does not see them."""
 CASES = {
     "A: joints, center of gravity": (JOINTS, CENTER),
     "B: and pixel": (JOINTS, CENTER, PIXEL),
@@ -47,20 +47,20 @@ WAYS = {
     "gauss_newton": UpdateConfig(what="bias", bias_method="gauss_newton"),
     "gradient": UpdateConfig(what="bias", bias_method="gradient", minimum=1, window=10),
 }
-"""Ways to find p; the first is the default, the last the paper's."""
+"""Updates of p; the first is the default, the last the paper's."""
 KNOWING, GRADIENT, BLIND, LIGHT = "p by ekf", "p by gradient", "p not updated", "p by ekf, weight 0.01"
-"""Ways to control; the last with the paper's weight of the center of gravity."""
+"""Updates during control; the last has the paper's weight of the center of gravity."""
 LEADS = ("long_light", "short_heavy")
 """Tools whose recognition the paper draws."""
 RUNS, SAMPLES = 10, 35
 SEQUENCE = ("long_light", "long_heavy", "short_heavy")
 STEPS = 30
-"""Of control with each tool."""
+"""Number of control steps with each tool."""
 SETTLED = 10
-"""Steps after a change within which the error is to be small."""
+"""Number of steps after a change, after which the error is to be small."""
 PAPER_WEIGHT = 0.01
 FRESH = 1000
-"""Added to the seed for trials."""
+"""Offset of the seed in trials."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,11 +69,11 @@ class Simulated:
 
     Attributes:
         schema: As trained.
-        needed: (case, way) -> samples until the tool is recognised, shape (runs,).
-        paths: (case, way) -> p along the first run, shape (samples + 1, bias_size).
-        leads: Tool -> p on the way to it with all sensors, by the paper's way.
-        controlled: Way to control -> what happened.
-        limit: What a perfect model of the robot reaches.
+        needed: (case, update) -> samples until the tool is recognised, shape (runs,).
+        paths: (case, update) -> p along the first run, shape (samples + 1, bias_size).
+        leads: Label -> path of p to a tool with all sensors.
+        controlled: Update -> course.
+        limit: Course of a perfect model of the robot.
     """
 
     schema: BodySchema
@@ -98,14 +98,14 @@ def simulate(run: Run, tell: Tell) -> Simulated:
 
 
 def samples_of(run: Run, variant: str, condition: str, chance: int) -> list[Mapping[str, np.ndarray]]:
-    """What is measured in random postures with a tool."""
+    """Measure random postures with a tool."""
     body = Standing(run.robot, variant, run.seed, condition)
     random = np.random.default_rng([FRESH + run.seed, chance])
     return [dict(body.go(posture)) for posture in safe_postures(run.robot, condition, SAMPLES, random)]
 
 
 def leads(run: Run, schema: BodySchema, variant: str) -> dict[str, np.ndarray]:
-    """Ways of p to two tools with all sensors."""
+    """Return label -> path of p to two tools with all sensors."""
     start = schema.under(BEFORE)
     return {
         f"to {tool}, {way}": recognise(start, samples_of(run, variant, tool, 50), (JOINTS, CENTER, TIP, PIXEL), update)
@@ -118,7 +118,7 @@ def leads(run: Run, schema: BodySchema, variant: str) -> dict[str, np.ndarray]:
 def recognitions(
     run: Run, schema: BodySchema, variant: str, ways: Iterable[str]
 ) -> tuple[dict[tuple[str, str], np.ndarray], dict[tuple[str, str], np.ndarray]]:
-    """Samples until long_middle is recognised by some ways in every case, and p along the first run of each."""
+    """Return the samples until long_middle is recognised in every case, and p along the first run of each."""
     needed: dict[tuple[str, str], list[float]] = {key: [] for key in product(CASES, ways)}
     paths: dict[tuple[str, str], np.ndarray] = {}
     for chance in range(RUNS):
@@ -158,21 +158,21 @@ def _controls(run: Run, schema: BodySchema) -> tuple[dict[str, Course], Course]:
 
 
 def mask_errors(schema: BodySchema) -> dict[str, float]:
-    """L_m by mask, written as in the paper: 0 or 1 for joints, center of gravity, tip and pixel."""
+    """Return L_m by mask, written as in the paper: 0 or 1 for joints, center of gravity, tip and pixel."""
     names = schema.layout.names
     by_label = {label(mask, names): "".join("01"[name in mask] for name in names) for mask in all_masks(names)}
     return {by_label[name]: value for name, value in schema.manifest["L_m"].items()}
 
 
 def control_of(run: Run) -> ControlConfig:
-    """The robot file's control section."""
+    """Return the robot file's control section."""
     control = model_config(run.robot).control
     assert control is not None
     return control
 
 
 def with_weight(control: ControlConfig, weight: float) -> ControlConfig:
-    """The same with another weight of the center of gravity."""
+    """Return the same with another weight of the center of gravity."""
     terms = tuple(
         term.model_copy(update={"weight": weight}) if term.match == CENTER else term for term in control.terms
     )

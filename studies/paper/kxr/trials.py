@@ -14,23 +14,23 @@ from services.model.control_config import ControlConfig, controller_of
 from studies.paper.kxr.robot import CENTER, TIP, Standing
 
 SEARCH = DescentConfig(gamma_max=0.5, candidates=10, iterations=100)
-"""The service makes fewer iterations per tick, and goes on in the next."""
+"""Search settings; the service makes fewer iterations per tick and continues in the next."""
 NEAR = 0.2
-"""A tool is recognised when p is nearest to its p of all, and within this share of the way that p had to go."""
+"""Distance of p from a tool's p, as a share of the first distance, below which the tool is recognised."""
 SMOOTH = 5
-"""Steps of the average that is shown beside the raw errors, as in the paper."""
+"""Number of steps of the average that is drawn beside the raw errors, as in the paper."""
 
 Sample = Mapping[str, np.ndarray]
 
 
 @dataclass(frozen=True, slots=True)
 class Course:
-    """What happened step by step while targets were given.
+    """Errors and p step by step while targets are given.
 
     Attributes:
         tips: Distance of the tool tip from its target [m], shape (n,).
         centers: Center of gravity [m], shape (n, 2).
-        biases: p that was used, shape (n, bias_size).
+        biases: p at every step, shape (n, bias_size).
     """
 
     tips: np.ndarray
@@ -45,7 +45,7 @@ class Course:
 
 
 def recognise(schema: BodySchema, samples: Sequence[Sample], given: Sequence[str], update: UpdateConfig) -> np.ndarray:
-    """Show samples of which only some signals are given; p before the first and after each, (n + 1, bias_size)."""
+    """Update p by samples with only some signals; return p before the first and after each, (n + 1, bias_size)."""
     updater = Updater(schema, update)
     path = [schema.bias]
     for sample in samples:
@@ -55,7 +55,7 @@ def recognise(schema: BodySchema, samples: Sequence[Sample], given: Sequence[str
 
 
 def samples_until(path: np.ndarray, schema: BodySchema, condition: str) -> float:
-    """Samples after which a tool is recognised and stays so to the end; infinite if it is not."""
+    """Return the samples after which a tool is recognised to the end; infinite if it is not."""
     names, known = list(schema.biases), np.stack(list(schema.biases.values()))
     right = schema.biases[condition]
     away = np.linalg.norm(path - right, axis=1)
@@ -76,12 +76,12 @@ def follow(
     """Bring the tool tip to targets [m], shape (n, 3), while p follows the body.
 
     Args:
-        robot: The robot file.
-        body: What is moved.
-        schema: The model to begin with.
-        control: What else is asked.
-        targets: Of the tip.
-        update: How to follow the body; None: not at all.
+        robot: The robot file's content.
+        body: The robot to move.
+        schema: The first model.
+        control: Other terms of the control.
+        targets: Targets of the tip.
+        update: Settings of the online update; None: no update.
         changes: Step -> tool that is put into the hand before it.
     """
     updater = None if update is None else Updater(schema, update)
@@ -90,8 +90,7 @@ def follow(
     for index, target in enumerate(targets):
         if changes and index in changes:
             body.hold(changes[index])
-        found = controller.solve({TIP: target})
-        measured = body.go(found.command)
+        measured = body.go(controller.solve({TIP: target}).command)
         tips.append(np.linalg.norm(body.truth(TIP) - target))
         centers.append(body.truth(CENTER))
         biases.append(controller.schema.bias)
@@ -103,7 +102,7 @@ def follow(
 
 
 def follow_blindly(body: Standing, targets: np.ndarray, commands: np.ndarray) -> Course:
-    """The same with commands [rad], shape (n, 4), that somebody else chose."""
+    """Return the course of given commands [rad], shape (n, 4)."""
     tips, centers = [], []
     for target, command in zip(targets, commands, strict=True):
         body.go(command)
@@ -113,7 +112,7 @@ def follow_blindly(body: Standing, targets: np.ndarray, commands: np.ndarray) ->
 
 
 def steps_until(errors: np.ndarray, bar: float) -> float:
-    """Steps after which the average of the last few errors stays below a bar; infinite if it does not."""
+    """Return the steps after which the average of the last errors stays below a bar; infinite if it does not."""
     above = np.flatnonzero(smoothed(errors) >= bar)
     if not len(above):
         return 0.0
@@ -121,13 +120,13 @@ def steps_until(errors: np.ndarray, bar: float) -> float:
 
 
 def smoothed(errors: np.ndarray) -> np.ndarray:
-    """Average over the last few steps, shape (n,)."""
+    """Return the average over the last steps, shape (n,)."""
     return np.array([errors[max(0, index - SMOOTH + 1) : index + 1].mean() for index in range(len(errors))])
 
 
 def order(biases: Mapping[str, np.ndarray], values: Mapping[str, Sequence[float]]) -> float:
-    """R^2 of a linear fit of p on what tells the conditions apart (condition -> values)."""
+    """Return R^2 of a linear fit of p on properties of the conditions (condition -> values)."""
     p = np.stack([biases[name] for name in values]).astype(float)
     columns = np.column_stack([np.array(list(values.values()), float), np.ones(len(p))])
-    left = p - columns @ np.linalg.lstsq(columns, p, rcond=None)[0]
-    return float(1.0 - np.sum(left**2) / np.sum((p - p.mean(axis=0)) ** 2))
+    residual = p - columns @ np.linalg.lstsq(columns, p, rcond=None)[0]
+    return float(1.0 - np.sum(residual**2) / np.sum((p - p.mean(axis=0)) ** 2))

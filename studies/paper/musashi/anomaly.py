@@ -1,4 +1,4 @@
-"""Is a cut muscle told from a healthy body, with and without a heavy object in the hand?"""
+"""Detection of a cut muscle, with and without a heavy object in the hand."""
 
 from collections.abc import Mapping, Sequence
 
@@ -12,26 +12,26 @@ from studies.paper.musashi.model import arrays
 from studies.paper.musashi.motion import RATE
 
 CUT_AFTER = 1.0
-"""A muscle is cut so long after a recording began [s]."""
+"""Time after the begin of a recording at which a muscle is cut [s]."""
 SETTLED = 1.0
-"""Samples count as of a cut muscle so long after the cut [s]."""
+"""Time after the cut from which samples count as those of a cut muscle [s]."""
 
 
 def with_normal(schema: BodySchema, recording: Dataset) -> BodySchema:
-    """The schema with what is normal learned from a healthy, unloaded arm."""
+    """Return the schema with the normal errors of a healthy, unloaded arm."""
     errors = predict_error(schema, arrays(recording, schema))
     return schema.with_normal(Normal.fit(errors, schema.scaler.std[schema.out_index]))
 
 
 def scores(schema: BodySchema, recording: Dataset) -> np.ndarray:
-    """Mahalanobis distance of every sample, shape (n,)."""
+    """Return the Mahalanobis distance of every sample, shape (n,)."""
     if schema.normal is None:
-        raise ValueError("This schema has not learned what is normal; give it to `with_normal` first.")
+        raise ValueError("This schema has no normal errors. Call `with_normal` first.")
     return schema.normal.distances(predict_error(schema, arrays(recording, schema)))
 
 
 def area(ill: np.ndarray, well: np.ndarray) -> float:
-    """Area under the ROC curve: how often a score of an ill body is higher than one of a healthy body."""
+    """Return the area under the ROC curve: how often a score of an ill body exceeds that of a healthy one."""
     ordered = np.sort(well)
     below = np.searchsorted(ordered, ill, side="left")
     not_above = np.searchsorted(ordered, ill, side="right")
@@ -39,7 +39,7 @@ def area(ill: np.ndarray, well: np.ndarray) -> float:
 
 
 def since_cut(recording: Dataset) -> Dataset:
-    """What a recording with a cut muscle holds from a second after the cut."""
+    """Return the part of a recording that begins a second after the cut."""
     first = round((CUT_AFTER + SETTLED) * RATE)
     episode = recording.episodes[0]
     kept = {name: values[first:] for name, values in episode.values.items()}
@@ -49,13 +49,13 @@ def since_cut(recording: Dataset) -> Dataset:
 def areas(
     schema: BodySchema, healthy: Sequence[Dataset], cut: Mapping[str, Dataset], over: float = 0.0
 ) -> dict[str, float]:
-    """Muscle -> area under the ROC curve of the scores after its cut against those of all healthy recordings.
+    """Return muscle -> area under the ROC curve of its scores against those of all healthy recordings.
 
     Args:
-        schema: With what is normal.
+        schema: A schema with normal errors.
         healthy: Recordings of whole arms.
         cut: Muscle -> recording after its cut.
-        over: Scores are averaged over so long before they are judged [s]; 0 judges every sample alone.
+        over: Time over which scores are averaged [s]; 0 judges every sample alone.
     """
     weights = np.ones(max(1, round(over * RATE)))
     weights /= weights.sum()

@@ -22,21 +22,21 @@ OURS, WEIGHTS = "robot file's weights", "paper's weights"
 
 
 def ways(robot: RobotConfig) -> dict[str, ControlConfig]:
-    """The robot file's way, and the same route with the paper's weights.
+    """Return the robot file's control, and the same route with the paper's weights.
 
     Raises:
         ValueError: The robot file has no control section.
     """
     config = model_config(robot).control
     if config is None:
-        raise ValueError(f"Robot '{robot.robot}' is not controlled: its file has no model.control.")
+        raise ValueError(f"Robot '{robot.robot}' has no `model.control` in its file.")
     return {OURS: config, WEIGHTS: config.model_copy(update={"terms": PAPER_TERMS})}
 
 
 def errors(robot: RobotConfig, schema: BodySchema, arm: int, way: ControlConfig, starts: int = STARTS) -> np.ndarray:
-    """||theta_ref - theta|| at rest [rad], shape (targets, starts); NaN where the limits stopped the arm.
+    """Return ||theta_ref - theta|| at rest [rad], shape (targets, starts); NaN where the limits stopped the arm.
 
-    Targets and starts are the arm's own, the same for every schema and way; `starts` of them per target are tried.
+    Each arm has its own targets and starts, the same for every schema; `starts` of them per target are tried.
     """
     random = np.random.default_rng([arm, 7])
     low, high = robot.bounds(POSITION)

@@ -1,7 +1,7 @@
-"""The Musashi experiments (paper, III-B): learned from the geometric model, then online from arms built otherwise.
+"""The Musashi experiments (paper, III-B): learning from the geometric model, then online from actual arms.
 
-Seed n stands for training n and actual arm n. What was chosen by looking at results (tensions of the geometric data,
-weights of the simulation) was chosen on arms 11 and 13, which are not judged here.
+Seed n stands for training n and actual arm n. Tensions of the geometric data and weights of the simulation were chosen
+by results on arms 11 and 13, which are not judged here.
 """
 
 from collections.abc import Sequence
@@ -27,7 +27,7 @@ LOOSE = 0.30
 
 
 def reproduce(seeds: Sequence[int], folder: Path, progress: Tell, fresh: bool) -> Report:
-    """Run all seeds, draw the figures and compare with the paper; see `Experiment`."""
+    """Run all experiments; see `studies.paper.Experiment`."""
     robot = load_robot(robot_file("musashi_arm"))
     outcomes = each_seed(robot, seeds, folder, progress, fresh, run_seed)
     figures.draw(outcomes, robot, folder)
@@ -35,7 +35,7 @@ def reproduce(seeds: Sequence[int], folder: Path, progress: Tell, fresh: bool) -
 
 
 def report(outcomes: Sequence[Outcome]) -> Report:
-    """The table of everything that was measured."""
+    """Return the table of all measurements."""
     result = Report("musashi", [outcome.seed for outcome in outcomes])
     for rows in (_structure, _learning, _control, _simulation, _anomaly):
         for row in rows(outcomes):
@@ -122,5 +122,5 @@ def _anomaly(outcomes: Sequence[Outcome]) -> list[Row]:
             Row(f"the same mean of ten, scores averaged over {over:g} s", "", "", values, None, "higher")
             for over, values in held.items()
         ),
-        Row("AUC of the muscle told worst, after", "", "", tuple(map(min, areas[AFTER])), None, "higher"),
+        Row("AUC of the muscle detected worst, after", "", "", tuple(map(min, areas[AFTER])), None, "higher"),
     ]

@@ -17,11 +17,11 @@ from studies.paper.musashi.seed import AFTER, BEFORE, STORY, STORY_MUSCLE, Outco
 
 COLORS = {BEFORE: "tab:orange", AFTER: "tab:blue"}
 SMOOTH = 50
-"""Samples over which errors are averaged for the eye."""
+"""Number of samples over which drawn errors are averaged."""
 
 
 def draw(outcomes: Sequence[Outcome], robot: RobotConfig, folder: Path) -> None:
-    """All pictures; what concerns a single arm is drawn of the first seed."""
+    """Draw all pictures; those of a single arm show the first seed."""
     first = outcomes[0]
     plot_structure(first.structure, folder / "structure.png")
     _update(outcomes, folder / "a_online_update.png")
@@ -96,7 +96,7 @@ def _control(outcomes: Sequence[Outcome], path: Path) -> None:
 
 
 def _course(outcome: Outcome, robot: RobotConfig, path: Path) -> None:
-    """Joint positions and tensions as simulated and as they were."""
+    """Draw simulated and measured joint positions and tensions."""
     courses = outcome.courses[simulation.OURS]
     joints, muscles = robot.signals[POSITION].elements, robot.signals[TENSION].elements
     chosen = [(POSITION, index) for index in (0, 1, 3)] + [(TENSION, index) for index in (0, 6, 8)]

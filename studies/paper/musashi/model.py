@@ -1,4 +1,4 @@
-"""The body schema of the arm: learned from its design, then from the motion of an arm that was built otherwise."""
+"""The body schema of the arm: learned from its design, then from the motion of an actual arm."""
 
 from dataclasses import dataclass
 
@@ -17,16 +17,16 @@ from services.model.model_config import model_config
 from studies.paper.musashi.motion import LENGTH, POSITION, RATE, TENSION, signals
 
 SAMPLES = 10_000
-"""Random joint positions and tensions of the geometric model, as many as in the paper."""
+"""Number of random states of the geometric model, as in the paper."""
 EPISODE = 100
 BLIND = frozenset({TENSION, LENGTH})
-"""What joint positions are estimated from when the encoders are hidden: the paper's mask 011."""
+"""The mask when the encoders are hidden: the paper's 011."""
 CONSTANTS = np.geomspace(1.0, 2000.0, 400)
-"""Time constants that an exponential fit tries [s]."""
+"""Candidate time constants of an exponential fit [s]."""
 
 
 def geometric_data(robot: RobotConfig, seed: int) -> Dataset:
-    """Random states of the designer's model, in episodes of independent samples."""
+    """Draw random states of the designer's model, in episodes of independent samples."""
     states = registry.load(robot.collect["states"])(robot, SAMPLES, seed)
     parts = np.split(np.arange(SAMPLES), range(EPISODE, SAMPLES, EPISODE))
     episodes = tuple(Episode("geometric", {name: rows[part] for name, rows in states.items()}) for part in parts)
@@ -34,7 +34,7 @@ def geometric_data(robot: RobotConfig, seed: int) -> Dataset:
 
 
 def structure_of(robot: RobotConfig, schema: BodySchema) -> Structure:
-    """What the training of a schema of few signals found, from its manifest and the settings of the robot file."""
+    """Return the structure that a training determined, from the schema's manifest and the robot file."""
     names, wanted, L_m = schema.layout.names, model_config(robot).structure, schema.manifest["L_m"]
     return Structure(
         layout=schema.layout,
@@ -48,14 +48,14 @@ def structure_of(robot: RobotConfig, schema: BodySchema) -> Structure:
 
 
 @dataclass(frozen=True, slots=True)
-class Learned:
-    """What an online update did.
+class Update:
+    """Result of an online update.
 
     Attributes:
         schema: The model at the end.
-        time: Of every sample [s], shape (n,).
-        errors: Of the joint positions estimated with all encoders hidden, just before the sample was learned from
-            [rad], norm over the joints, shape (n,).
+        time: Time of every sample [s], shape (n,).
+        errors: Error of the joint positions with all encoders hidden, just before each sample was learned from [rad],
+            norm over the joints, shape (n,).
     """
 
     schema: BodySchema
@@ -63,8 +63,8 @@ class Learned:
     errors: np.ndarray
 
 
-def learn(robot: RobotConfig, schema: BodySchema, lived: Dataset, seed: int) -> Learned:
-    """Live through a recording with the online update of the robot file."""
+def learn(robot: RobotConfig, schema: BodySchema, lived: Dataset, seed: int) -> Update:
+    """Run the robot file's online update over a recording."""
     config = model_config(robot).update
     updater = Updater(schema, UpdateConfig(**config.model_dump(exclude={"interval"}), seed=seed))
     errors = []
@@ -72,32 +72,32 @@ def learn(robot: RobotConfig, schema: BodySchema, lived: Dataset, seed: int) -> 
         errors.append(float(joint_errors(updater.schema, row[None])[0]))
         updater.add(schema.layout.split(row))
         updater.step()
-    return Learned(updater.schema, np.arange(1, len(errors) + 1) / RATE, np.array(errors))
+    return Update(updater.schema, np.arange(1, len(errors) + 1) / RATE, np.array(errors))
 
 
 def joint_errors(schema: BodySchema, rows: np.ndarray) -> np.ndarray:
-    """||theta_est - theta|| [rad] with the encoders hidden, shape (n,), of samples [unit], (n, at least the layout)."""
+    """Return ||theta_est - theta|| [rad], shape (n,), with the encoders hidden, of samples [unit], shape (n, size)."""
     rows = rows[:, : schema.layout.size]
     x = schema.scaler.normalise(rows)
-    found = np.full(x.shape, np.nan)
-    found[:, schema.out_index] = schema.infer(x, BLIND)
+    estimate = np.full(x.shape, np.nan)
+    estimate[:, schema.out_index] = schema.infer(x, BLIND)
     position = schema.layout.slice(POSITION)
-    return np.asarray(np.linalg.norm((schema.scaler.restore(found) - rows)[:, position], axis=1))
+    return np.asarray(np.linalg.norm((schema.scaler.restore(estimate) - rows)[:, position], axis=1))
 
 
 def recorded_errors(schema: BodySchema, recording: Dataset) -> np.ndarray:
-    """See `joint_errors`, for a whole recording."""
+    """Return the `joint_errors` of a whole recording."""
     return joint_errors(schema, recording.rows())
 
 
 def arrays(recording: Dataset, schema: BodySchema) -> dict[str, np.ndarray]:
-    """Signal of the schema -> samples [unit], shape (count, n)."""
+    """Return signal of the schema -> samples [unit], shape (count, n)."""
     return {name: values for name, values in signals(recording).items() if name in schema.layout.names}
 
 
 @dataclass(frozen=True, slots=True)
 class Decay:
-    """floor + drop * exp(-t / constant).
+    """The function floor + drop * exp(-t / constant).
 
     Attributes:
         floor: [rad]
@@ -110,17 +110,17 @@ class Decay:
     constant: float
 
     def at(self, time: np.ndarray | float) -> np.ndarray:
-        """Values [rad] at times [s]."""
+        """Return values [rad] at times [s]."""
         return np.asarray(self.floor + self.drop * np.exp(-np.asarray(time) / self.constant))
 
 
 def decay(time: np.ndarray, errors: np.ndarray, has_floor: bool = True) -> Decay:
-    """The exponential that fits errors [rad] over time [s] best, in least squares; without floor it goes to zero."""
-    found: list[tuple[float, Decay]] = []
+    """Fit an exponential to errors [rad] over time [s] by least squares; without floor it goes to zero."""
+    fits: list[tuple[float, Decay]] = []
     for constant in CONSTANTS:
         columns = [np.exp(-time / constant), *([np.ones_like(time)] if has_floor else [])]
         matrix = np.stack(columns, axis=1)
         weights = np.linalg.lstsq(matrix, errors, rcond=None)[0]
-        left = float(np.sum((matrix @ weights - errors) ** 2))
-        found.append((left, Decay(float(weights[1]) if has_floor else 0.0, float(weights[0]), float(constant))))
-    return min(found, key=lambda pair: pair[0])[1]
+        residual = float(np.sum((matrix @ weights - errors) ** 2))
+        fits.append((residual, Decay(float(weights[1]) if has_floor else 0.0, float(weights[0]), float(constant))))
+    return min(fits, key=lambda pair: pair[0])[1]

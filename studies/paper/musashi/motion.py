@@ -1,4 +1,4 @@
-"""One arm that was built otherwise than designed: moved at random or to targets, recorded, and broken on the way."""
+"""An actual arm: moved at random or to targets, recorded, and broken during the motion."""
 
 from collections.abc import Iterator, Sequence
 from types import TracebackType
@@ -17,9 +17,9 @@ from services.model.living_model import layout_of
 
 POSITION, TENSION, LENGTH = "joint_position", "muscle_tension", "muscle_length"
 SENT = "sent_length"
-"""Beside the robot's signals a recording holds the wire lengths that were commanded [m]."""
+"""Signal of a recording with the commanded wire lengths [m]."""
 RATE = 10.0
-"""Samples per second of what is recorded, and of what is learned from."""
+"""Rate of recorded samples [Hz]."""
 
 SET_POINT = 0.04
 """Time between two set-points on the way to a target [s]."""
@@ -51,7 +51,7 @@ class ActualArm:
         self._body.close()
 
     def play(self, command: np.ndarray, duration: float) -> Iterator[Values]:
-        """Hold wire lengths [m], shape (10,), for so long [s]; yields samples [unit].
+        """Hold wire lengths [m], shape (10,), for a duration [s]; return samples [unit].
 
         Raises:
             CollectionStopped: The limits of the robot file stopped the arm.
@@ -59,20 +59,20 @@ class ActualArm:
         return self._playground.play(command, duration)
 
     def break_part(self, part: str) -> None:
-        """`muscle_cut:biceps`, `heavy_object`."""
+        """Break a part: `muscle_cut:biceps`, `heavy_object`."""
         self._world.break_part(part)
 
     def position(self) -> np.ndarray:
-        """Joint positions that are [rad], shape (5,)."""
+        """Return the true joint positions [rad], shape (5,)."""
         return np.asarray(self._world.truth()[POSITION])
 
     def elapsed(self) -> float:
-        """Time since it was enabled [s]."""
+        """Return the time since the arm was enabled [s]."""
         return self._playground.elapsed()
 
 
 def recording_layout(robot: RobotConfig) -> Layout:
-    """The robot's signals and what was sent."""
+    """Return the layout of the robot's signals and the commands."""
     command = robot.signals[robot.command.signal]
     return Layout((*layout_of(robot).signals, Signal(SENT, command.size, command.unit, command.elements)))
 
@@ -80,7 +80,7 @@ def recording_layout(robot: RobotConfig) -> Layout:
 def record(
     robot: RobotConfig, arm: int, seed: int, duration: float, parts: Sequence[tuple[float, str]] = ()
 ) -> Dataset:
-    """Random motion of one arm.
+    """Record random motion of one arm.
 
     Args:
         robot: The robot file's content.
@@ -111,18 +111,18 @@ def record(
 
 
 def signals(recording: Dataset) -> dict[str, np.ndarray]:
-    """Signal -> samples [unit], shape (count, n), with what was sent among them."""
+    """Return signal -> samples [unit], shape (count, n), commands included."""
     return recording.layout.split(recording.rows())
 
 
 def go(body: ActualArm, controller: Controller, start: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Lead the arm from one reference posture to another along a smooth step, and let it rest there.
+    """Move the arm from one reference posture to another along a smooth step, and let it rest there.
 
     Args:
         body: The arm.
-        controller: Tells the wire lengths of every posture on the way.
-        start: Where the reference is [rad], shape (5,).
-        target: Where it shall go [rad], shape (5,).
+        controller: Finds the wire lengths of every posture on the way.
+        start: First reference [rad], shape (5,).
+        target: Last reference [rad], shape (5,).
 
     Returns:
         Joint positions at the end of the rest, mean over a fifth of it [rad], shape (5,).

@@ -18,12 +18,12 @@ from studies.paper.musashi.motion import TENSION, record
 from studies.paper.runs import Run, between
 
 LIVED, NORMAL, FRESH, CUT = 600.0, 240.0, 120.0, 30.0
-"""Lengths of recordings [s]: learned from, what is normal, judged, and with a cut muscle."""
+"""Lengths of recordings [s]: for the update, for normal errors, for judging, and with a cut muscle."""
 STORY = (60.0, 120.0, 180.0)
-"""Figure (b): until when the arm is healthy, carries the heavy object, and lacks a muscle [s]."""
+"""Figure (b): times [s] at which the healthy part, the heavy object and the cut muscle end."""
 STORY_MUSCLE = "biceps"
 STARTS = {control.OURS: control.STARTS, control.WEIGHTS: 1}
-"""How many starts per target are tried."""
+"""Number of starts per target."""
 HELD = (1.0, 5.0, 10.0)
 """Times over which anomaly scores are averaged [s]."""
 BEFORE, AFTER = "before", "after"
@@ -35,24 +35,24 @@ Pair = Mapping[str, np.ndarray]
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What was measured.
+    """Results of one seed.
 
     Attributes:
         seed: Of training and arm.
-        structure: What structure determination found on the geometric data.
-        time: Of every sample of the online update [s], shape (n,).
+        structure: Structure of the geometric data.
+        time: Time of every sample of the online update [s], shape (n,).
         learning: Error of the estimate before each was learned from [rad], shape (n,).
         unchanged: Errors of the model as trained on the same samples [rad], shape (n,).
         fresh: Errors of the estimate on fresh random motion [rad].
         heavy: The same with a heavy object in the hand [rad].
         areas: Muscle -> area under the ROC curve of its cut, before and after.
-        areas_held: The same after the update, of scores averaged over so many seconds.
+        areas_held: The same after the update, of scores averaged over a time [s].
         story: Errors of the estimate [rad] while the arm is healthy, loaded, and cut.
         scores: Anomaly scores then.
-        threshold: Of the scores after the update.
-        control: Way -> errors [rad], shape (targets, starts), before and after.
+        threshold: Threshold of the scores after the update.
+        control: Weights -> errors [rad], shape (targets, starts), before and after.
         courses: Loss -> simulated motion, before and after.
-        forced: Figure (f), after the update; see `musashi_simulation.forced`.
+        forced: Figure (f), after the update; see `simulation.forced`.
     """
 
     seed: int
@@ -73,7 +73,7 @@ class Outcome:
 
 
 def run_seed(run: Run, tell: Tell) -> Outcome:
-    """Train, move the actual arm, learn from it and use what was learned."""
+    """Train, move the actual arm, learn from it, and judge the models before and after."""
     robot, seed = run.robot, run.seed
     tell(0.0, "drawing states of the geometric model")
     data = run.cached("geometric", lambda: model.geometric_data(robot, seed))
@@ -122,7 +122,7 @@ def run_seed(run: Run, tell: Tell) -> Outcome:
 
 
 def _recorded(run: Run, name: str, motion: int, duration: float, parts: tuple[tuple[float, str], ...] = ()) -> Dataset:
-    """Random motion of the run's arm; every name has a motion of its own."""
+    """Return random motion of the run's arm; every name has its own motion."""
     seed = 1000 * motion + run.seed
     broken = [list(part) for part in parts]
     return run.cached(
@@ -141,10 +141,10 @@ def _story(run: Run) -> Dataset:
 
 
 def _cuts(run: Run) -> dict[str, Dataset]:
-    """Muscle -> motion after it was cut."""
-    found = {}
+    """Return muscle -> motion after its cut."""
+    cuts = {}
     for index, muscle in enumerate(run.robot.signals[TENSION].elements):
         parts = ((anomaly.CUT_AFTER, f"muscle_cut:{muscle}"),)
         whole = _recorded(run, f"cut_{muscle}", 600 + index, CUT, parts)
-        found[muscle] = anomaly.since_cut(whole)
-    return found
+        cuts[muscle] = anomaly.since_cut(whole)
+    return cuts

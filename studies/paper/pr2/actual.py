@@ -16,21 +16,21 @@ from services.learning.collector import Request, collect_direct
 from services.learning.trainer import train_config
 from services.model.model_config import collect_config, model_config
 from services.show import Tell
-from studies.paper.pr2.arm import JOINTS, TIP, Arm, Geometry, duster_motion
+from studies.paper.body import JOINTS
+from studies.paper.pr2.arm import TIP, Arm, Geometry, duster_motion
 from studies.paper.pr2.simulated import BELIEVED, ELEVATION, errors_by_grasp
 from studies.paper.pr2.trials import Course, control_along, follow_blindly, model_error
 from studies.paper.runs import Run
 
 ACTUAL = "actual"
 COLLECTED, LEARNED = 0.35, 0.25
-"""Per grasp, as shares of the robot file's samples: 350 are collected, and 250 of them are learned from, 1500 in all.
-The others judge."""
+"""Shares of the robot file's samples that are collected and learned from per grasp: 350 and 250, 1500 in all."""
 EPOCHS, RATE = 2 / 3, 3e-3
-"""Of fine-tuning, as a share of the robot file's; W is learned whole, without replay of the simulated dusters."""
+"""Epochs of fine-tuning, as a share of the robot file's, and its rate; no simulated duster is replayed."""
 STIFF = "l700"
-"""The stiff duster that the designer's geometry has in place of the flexible one: about as long from hand to tip."""
+"""The stiff duster by which the geometry models the flexible one: about as long from hand to tip."""
 BEGINS, HELD, CHANGED = "short_phi0", "long_phi60", "short_phi0"
-"""Control: the grasp that is believed at first, the one that is there, and the one after the change."""
+"""Grasps in control: the first belief, the true one, and the one after the change."""
 MODELS = ("geometry", "simulated", "fine-tuned")
 
 
@@ -41,10 +41,10 @@ class Actual:
     Attributes:
         schema: Fine-tuned; its p of the flexible duster's grasps only.
         errors: Model -> grasp -> mean error [m] on samples that were not learned from, under the best p of each.
-        controlled: Model -> error [m] at every point of the motion, twice, with a change of the grasp between.
+        controlled: Model -> error [m] at every point of two motions, between which the grasp changes.
         course: The fine-tuned model's course.
         change: Point before which the grasp changed.
-        samples: How many were learned from.
+        samples: Number of samples that were learned from.
     """
 
     schema: BodySchema
@@ -56,7 +56,7 @@ class Actual:
 
 
 def actual(run: Run, simulated: BodySchema, tell: Tell) -> Actual:
-    """Collect on the actual arm, fine-tune what was learned in simulation, and run every trial of one seed."""
+    """Collect on the actual arm, fine-tune the simulated model, and run every trial of one seed."""
     tell(0.0, "collecting on the actual arm")
     count = round(COLLECTED * collect_config(run.robot).samples)
     request = Request(flexible(run.robot), samples=count)
@@ -79,12 +79,12 @@ def actual(run: Run, simulated: BodySchema, tell: Tell) -> Actual:
 
 
 def flexible(robot: RobotConfig) -> tuple[str, ...]:
-    """The grasps of the flexible duster, which the simulator knows and the robot file does not list."""
+    """Return the grasps of the flexible duster, which the simulator knows and the robot file does not list."""
     return tuple(name for name in simulator_of(robot).conditions if name.startswith(("short", "long")))
 
 
 def parted(data: Dataset, share: float) -> tuple[Dataset, Dataset]:
-    """The first episodes of every condition, and the last."""
+    """Split the episodes of every condition into the first `share` and the rest."""
     first: list[Episode] = []
     for condition in data.conditions:
         episodes = [episode for episode in data.episodes if episode.condition == condition]
@@ -121,7 +121,7 @@ def _stiff(condition: str) -> str:
 
 
 def _recognised(schema: BodySchema, learned: Dataset, condition: str) -> BodySchema:
-    """The schema under the p that explains the samples of a grasp best, W as it is."""
+    """Return the schema under the p that explains the samples of a grasp best."""
     updater = Updater(schema, UpdateConfig(what="bias"))
     for episode in learned.episodes:
         if episode.condition == condition:
@@ -138,14 +138,14 @@ def _control(
     change = len(motion)
     targets = np.concatenate([motion, motion])
     origins = np.tile(geometry.follow(motion, BELIEVED, ELEVATION), (2, 1))
-    found: dict[str, np.ndarray] = {}
+    errors: dict[str, np.ndarray] = {}
     with Arm(run.robot, ACTUAL, run.seed, HELD) as arm:
         first, second = (geometry.follow(motion, _stiff(name), ELEVATION) for name in (HELD, CHANGED))
         before = follow_blindly(arm, motion, first)
         arm.hold(CHANGED)
-        found["geometry"] = np.concatenate([before, follow_blindly(arm, motion, second)])
+        errors["geometry"] = np.concatenate([before, follow_blindly(arm, motion, second)])
     for name, schema in (("simulated", simulated.under(BELIEVED)), ("fine-tuned", tuned.under(BEGINS))):
         with Arm(run.robot, ACTUAL, run.seed, HELD) as arm:
             course = control_along(arm, schema, targets, origins, geometry, UpdateConfig(), {change: CHANGED})
-        found[name] = course.errors
-    return found, course, change
+        errors[name] = course.errors
+    return errors, course, change

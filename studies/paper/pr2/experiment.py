@@ -9,8 +9,9 @@ import numpy as np
 from hal.config import load_robot
 from services.model.artifacts import robot_file
 from services.show import Tell
+from studies.paper.body import JOINTS
 from studies.paper.pr2.actual import MODELS, Actual, actual
-from studies.paper.pr2.arm import JOINTS, TIP
+from studies.paper.pr2.arm import TIP
 from studies.paper.pr2.figures import draw
 from studies.paper.pr2.simulated import CASES, POINTS, RECOGNISERS, WAYS, Simulated, simulate
 from studies.paper.report import Report, Row, adder
@@ -19,7 +20,7 @@ from studies.paper.runs import Run, between, each_seed
 ROBOT = "pr2_duster"
 PAPER_ESTIMATE = {"(1)": "52.2", "(2)": "25.9"}
 PAPER_CONTROL = {"p": ("31.5", "22.6"), "p by gradient": ("31.5", "22.6"), "W": ("19.2", "207")}
-"""Way to update -> error while it goes on, and afterwards at the other posture [mm]; the paper's p is by gradient."""
+"""Update -> the paper's error during it, and afterwards at the other posture [mm]; its p is by gradient."""
 CONTROL_BARS = {"p, then W (default)": 6.0, "p": 15.0}
 SAME_POSTURE_BAR, OTHERS_BAR, ESTIMATE_BAR, ORDER_BAR = 15.0, 25.0, 12.0, 0.95
 
@@ -38,16 +39,15 @@ def _of_seed(run: Run, tell: Tell) -> Outcome:
 
 
 def reproduce(seeds: Sequence[int], folder: Path, progress: Tell, fresh: bool) -> Report:
-    """See `studies.paper.Experiment`."""
+    """Run both experiments; see `studies.paper.Experiment`."""
     robot = load_robot(robot_file(ROBOT))
-
     outcomes = each_seed(robot, seeds, folder, progress, fresh, _of_seed)
     draw(folder, [outcome.simulated for outcome in outcomes], [outcome.actual for outcome in outcomes])
     return summary(seeds, outcomes)
 
 
 def summary(seeds: Sequence[int], outcomes: Sequence[Outcome]) -> Report:
-    """Every figure of some seeds, beside the paper's."""
+    """Return every figure beside the paper's."""
     report = Report(ROBOT, tuple(seeds))
     _add_structure(report, outcomes)
     _add_simulated(report, outcomes)
@@ -63,7 +63,7 @@ def _add_structure(report: Report, outcomes: Sequence[Outcome]) -> None:
     right = [
         o.simulated.schema.x_out == (TIP,) and o.simulated.schema.masks == (frozenset({JOINTS}),) for o in outcomes
     ]
-    report.add(Row(outputs, "%", "100", tuple(100.0 * one for one in right)))
+    report.add(Row(outputs, "%", "100", tuple(100.0 * is_right for is_right in right)))
     row("tool tip by the model, fresh samples, p of the grasp", "mm", "", lambda o: 1e3 * o.simulated.held_out)
     row("R^2 of l on p", "", "", lambda o: o.simulated.order.length, ORDER_BAR, "higher")
     row("R^2 of phi on p", "", "", lambda o: o.simulated.order.angle, ORDER_BAR, "higher")

@@ -19,15 +19,15 @@ from studies.paper.runs import Run, between
 
 NOMINAL = "nominal"
 BELIEVED = "l500_phi30"
-"""The grasp that theta_orig is made for, and that control begins with."""
+"""The grasp of theta_orig, and the first belief in control."""
 HELD = "l500_phi60"
-"""The grasp that is really there."""
+"""The true grasp in control."""
 ELEVATION, OTHER_ELEVATION = np.radians(45.0), np.radians(20.0)
-"""Of the stick: the constraint that makes theta_orig, and the one that makes the other posture [rad]."""
+"""Elevations of the stick [rad]: the constraints of theta_orig and of the other posture."""
 POINTS = 20
-"""Of points: the paper gives errors for when more were collected."""
+"""Number of points after which the paper gives errors."""
 FRESH, FRESH_SHARE = 1000, 0.1
-"""Added to the seed for samples on which models are judged; a tenth of what is learned from."""
+"""Offset of the seed of the samples that judge models, and their share of those learned from."""
 
 CASES = {
     "(1)": ("l500_phi60", "l500_phi0"),
@@ -35,8 +35,7 @@ CASES = {
     "(3)": ("l500_phi60", "l400_phi15"),
     "(4)": ("l300_phi30", "l600_phi45"),
 }
-"""Estimation: the grasp that is believed at first, the one that is there. (3) and (4) are ours: of grasps between those
-that were trained."""
+"""Cases of estimation: the first belief and the true grasp. (3) and (4) are ours: grasps between the trained ones."""
 RECOGNISERS = {
     name: UpdateConfig(what="bias", bias_method=name, minimum=1) for name in ("ekf", "gauss_newton", "gradient")
 }
@@ -48,18 +47,18 @@ WAYS: Mapping[str, UpdateConfig | None] = {
     "W": UpdateConfig(what="weights", optimiser="sgd", rate=0.01, replay=0, held_out=0, minimum=1),
     KNOWN: None,
 }
-"""What is updated while the body is another one. W alone as in the paper: without replay, by gradient descent with
-momentum (0.01). With the p of the grasp that is really held from the start, the error is the trained model's own."""
+"""Updates while another grasp is held. W alone is as in the paper: without replay, by gradient descent with momentum
+(0.01). With the p of the true grasp from the start, the error is the trained model's own."""
 
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """How p is ordered over the grasps.
+    """Order of p over the grasps.
 
     Attributes:
         length: R^2 of the linear regression of l on p, over the nine grasps.
         angle: R^2 of the linear regression of phi on p.
-        spread: Length [mm] -> distance of the p of the largest and the smallest angle.
+        spread: Length [mm] -> distance between the p of the largest and the smallest angle.
     """
 
     length: float
@@ -72,7 +71,7 @@ class Controlled:
     """Control under another grasp than the believed one.
 
     Attributes:
-        course: The motion, while the model follows.
+        course: The motion during the update.
         elsewhere: The same targets at the other posture, the update stopped.
         others: Mean error [m] of the model under the p of the other grasps after the update.
     """
@@ -89,9 +88,9 @@ class Simulated:
     Attributes:
         schema: As trained.
         held_out: Mean error [m] on fresh samples, under each grasp's own p.
-        order: How p is ordered.
-        estimated: (case, recogniser) -> what happened.
-        controlled: Way to update -> what happened.
+        order: Order of p.
+        estimated: (case, recogniser) -> errors.
+        controlled: Update -> errors.
     """
 
     schema: BodySchema
@@ -101,7 +100,7 @@ class Simulated:
     controlled: Mapping[str, Controlled]
 
     def fact(self, name: str) -> Any:
-        """What the training noted: `L_i` or `L_m`."""
+        """Return `L_i` or `L_m` of the training."""
         return self.schema.manifest[name]
 
 
@@ -132,7 +131,7 @@ def simulate(run: Run, tell: Tell) -> Simulated:
 
 
 def errors_by_grasp(schema: BodySchema, data: Dataset) -> dict[str, float]:
-    """Condition -> mean error [m] of the model under its p."""
+    """Return condition -> mean error [m] of the model under its p."""
     rows, owner = data.rows(), data.condition_of_rows()
     return {name: model_error(schema.under(name), rows[owner == index]) for index, name in enumerate(data.conditions)}
 
@@ -160,23 +159,23 @@ def _explained(values: np.ndarray, p: np.ndarray) -> float:
 
 def _estimations(run: Run, schema: BodySchema) -> dict[tuple[str, str], Course]:
     postures = Geometry(run.robot).follow(duster_motion(), BELIEVED, ELEVATION)
-    found = {}
+    courses = {}
     for case, (believed, held) in CASES.items():
         for name, update in RECOGNISERS.items():
             with Arm(run.robot, NOMINAL, run.seed, held) as arm:
-                found[case, name] = estimate_along(arm, schema.under(believed), postures, update)
-    return found
+                courses[case, name] = estimate_along(arm, schema.under(believed), postures, update)
+    return courses
 
 
 def _controls(run: Run, schema: BodySchema, fresh: Dataset) -> dict[str, Controlled]:
     geometry, targets = Geometry(run.robot), duster_motion()
     near, elsewhere = (geometry.follow(targets, BELIEVED, angle) for angle in (ELEVATION, OTHER_ELEVATION))
-    found = {}
+    results = {}
     for name, update in WAYS.items():
         with Arm(run.robot, NOMINAL, run.seed, HELD) as arm:
             believed = schema.under(BELIEVED if update else HELD)
             course = control_along(arm, believed, targets, near, geometry, update)
             again = control_along(arm, course.schema, targets, elsewhere, geometry, None)
         errors = errors_by_grasp(course.schema, fresh)
-        found[name] = Controlled(course, again, float(np.mean([e for c, e in errors.items() if c != HELD])))
-    return found
+        results[name] = Controlled(course, again, float(np.mean([e for c, e in errors.items() if c != HELD])))
+    return results

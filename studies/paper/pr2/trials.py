@@ -1,6 +1,6 @@
 """Trials with the PR2's arm: the duster motion driven point by point, while a model follows the body."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,22 +12,21 @@ from gemuco.estimation import estimate
 from gemuco.schema import BodySchema
 from gemuco.search.descent import DescentConfig
 from gemuco.search.losses import Match, StayNear
-from studies.paper.pr2.arm import JOINTS, TIP, Arm, Geometry
+from studies.paper.body import JOINTS
+from studies.paper.pr2.arm import TIP, Arm, Geometry
 
 SEARCH = DescentConfig(gamma_max=0.5, candidates=20, iterations=60)
 STAY = 0.3
 """Weight of ||theta - theta_orig|| (paper, III-A), both norms in standard deviations of the training data."""
 
-Event = Callable[[Arm], None]
-
 
 @dataclass(frozen=True, slots=True)
 class Course:
-    """What happened along a motion.
+    """Errors and p along a motion.
 
     Attributes:
-        errors: Of the estimate or of the control at every point, before it was learned from [m], shape (n,).
-        biases: p that was used there, shape (n, bias_size).
+        errors: Error of the estimate or of the control at every point, before it was learned from [m], shape (n,).
+        biases: p at every point, shape (n, bias_size).
         schema: The model at the end.
     """
 
@@ -36,7 +35,7 @@ class Course:
     schema: BodySchema
 
     def mean(self, first: int = 0, last: int | None = None) -> float:
-        """Mean error [mm] from one point to before another; to the end if none is given."""
+        """Return the mean error [mm] from point `first` to before `last`; None: to the end."""
         return float(self.errors[first:last].mean() * 1e3)
 
 
@@ -66,12 +65,12 @@ def control_along(
     """Bring the tool tip to targets [m], (n, 3), near postures theta_orig [rad], (n, 7).
 
     Args:
-        arm: What is moved.
-        schema: The model to begin with.
+        arm: The arm to move.
+        schema: The first model.
         targets: Shape (n, 3).
         origins: Shape (n, 7).
-        geometry: Whose limits hold.
-        update: How to follow the body; None: not at all.
+        geometry: Has the joint limits.
+        update: Settings of the online update; None: no update.
         events: Point -> duster that is put into the hand before it.
     """
     updater = None if update is None else Updater(schema, update)
@@ -87,8 +86,8 @@ def control_along(
         if events and index in events:
             arm.hold(events[index])
         controller.restart()
-        found = controller.solve({TIP: target, JOINTS: origin}, {JOINTS: origin})
-        measured = arm.go(found.command)
+        solution = controller.solve({TIP: target, JOINTS: origin}, {JOINTS: origin})
+        measured = arm.go(solution.command)
         errors.append(_distance(arm.tip(), target))
         biases.append(controller.schema.bias)
         if updater is not None:
@@ -99,7 +98,7 @@ def control_along(
 
 
 def follow_blindly(arm: Arm, targets: np.ndarray, postures: np.ndarray) -> np.ndarray:
-    """How far the tip is from targets [m], (n, 3), at postures [rad], (n, 7), that somebody else chose; (n,) [m]."""
+    """Return the distance [m], (n,), of the tip from targets [m], (n, 3), at given postures [rad], (n, 7)."""
     errors = []
     for target, posture in zip(targets, postures, strict=True):
         arm.go(posture)
@@ -108,11 +107,11 @@ def follow_blindly(arm: Arm, targets: np.ndarray, postures: np.ndarray) -> np.nd
 
 
 def model_error(schema: BodySchema, rows: np.ndarray) -> float:
-    """Mean error [m] of the tool tip inferred from the joints, on samples [unit], shape (k, size)."""
+    """Return the mean error [m] of the tool tip inferred from the joints, on samples [unit], shape (k, size)."""
     x = schema.scaler.normalise(rows[np.isfinite(rows).all(axis=1)])
-    amiss = (schema.infer(x, schema.masks[0]) - x[:, schema.out_index]) * schema.scaler.std[schema.out_index]
-    return float(np.linalg.norm(amiss, axis=1).mean())
+    residual = (schema.infer(x, schema.masks[0]) - x[:, schema.out_index]) * schema.scaler.std[schema.out_index]
+    return float(np.linalg.norm(residual, axis=1).mean())
 
 
-def _distance(one: np.ndarray, other: np.ndarray) -> float:
-    return float(np.linalg.norm(one - other))
+def _distance(tip: np.ndarray, target: np.ndarray) -> float:
+    return float(np.linalg.norm(tip - target))
