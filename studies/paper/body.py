@@ -7,6 +7,7 @@ import numpy as np
 
 from hal import registry
 from hal.config import RobotConfig
+from services.model.living_model import layout_of
 
 JOINTS = "joint_position"
 TICK = 0.02
@@ -28,7 +29,7 @@ class Body:
         self._world: Any = registry.load(str(robot.simulator)).world(variant, seed, condition)
         self._low, self._high = robot.bounds(JOINTS)
         self._elements = [f"{JOINTS}.{name}" for name in robot.signals[JOINTS].elements]
-        self._signals, self._arrived = tuple(robot.signals), arrived
+        self._signals, self._arrived = layout_of(robot).names, arrived
 
     def __enter__(self) -> Self:
         return self
