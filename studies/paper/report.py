@@ -4,11 +4,13 @@ import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 from rich.table import Table
 
+Outcome = TypeVar("Outcome")
+Adder = Callable[..., None]
 COLUMNS = ("what", "paper", "ours", "to reach", "reached")
 
 
@@ -116,14 +118,14 @@ class Report:
         (folder / "report.json").write_text(json.dumps(content, indent=2) + "\n")
 
 
-def adder(report: Report, outcomes: Sequence[Any]) -> Callable[..., None]:
+def adder(report: Report, outcomes: Sequence[Outcome]) -> Adder:
     """Return a function that adds a row, computed from every seed's outcome."""
 
     def add(
         name: str,
-        unit: str,
-        paper: str,
-        figure: Callable[[Any], float],
+        figure: Callable[[Outcome], float],
+        unit: str = "",
+        paper: str = "",
         bar: float | None = None,
         better: Literal["lower", "higher"] = "lower",
     ) -> None:

@@ -42,6 +42,7 @@ RECOGNITION = {
     "C: and tip": "15",
 }
 SAMPLES_BAR, SHARE_BAR = 3.0, 89.0
+LIMIT = "limit (perfect model)"
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,47 +73,40 @@ def reproduce(seeds: Sequence[int], folder: Path, progress: Tell, fresh: bool) -
 
 
 def _add_structure(report: Report, outcomes: Sequence[Outcome]) -> None:
-    row = adder(report, outcomes)
+    row = adder(report, [outcome.simulated for outcome in outcomes])
     for signal in outcomes[0].simulated.schema.layout.names:
-        row(f"L of {signal}", "", "below 0.15", lambda o, s=signal: o.simulated.schema.manifest["L_i"][s], SIGNAL_BAR)
-    row("the paper's 8 masks that are feasible", "", "8", lambda o: len(_feasible(o) & set(PAPER_MASKS)), 7.5, "higher")
-    row("other masks that are feasible", "", "0", lambda o: len(_feasible(o) - set(PAPER_MASKS)))
-    row("of these 0110 (center of gravity, tip)", "", "0", lambda o: len(_feasible(o) & {"0110"}))
+        error = lambda o, signal=signal: o.schema.manifest["L_i"][signal]
+        row(f"L of {signal}", error, paper="below 0.15", bar=SIGNAL_BAR)
+    paper = set(PAPER_MASKS)
+    row("the paper's 8 masks that are feasible", lambda o: len(_feasible(o) & paper), "", "8", 7.5, "higher")
+    row("other masks that are feasible", lambda o: len(_feasible(o) - paper), paper="0")
+    row("of these 0110 (center of gravity, tip)", lambda o: len(_feasible(o) & {"0110"}), paper="0")
     for mask in ("0111", "0110", "0011", "0101"):
-        paper = "below 0.15" if mask == "0111" else "above 0.15"
-        row(f"L of mask {mask}", "", paper, lambda o, mask=mask: mask_errors(o.simulated.schema).get(mask, np.nan))
-    row("R^2 of p on weight and length", "", "", lambda o: order(o.simulated.schema.biases, TOOLS), ORDER_BAR, "higher")
+        side = "below 0.15" if mask == "0111" else "above 0.15"
+        row(f"L of mask {mask}", lambda o, mask=mask: mask_errors(o.schema).get(mask, np.nan), paper=side)
+    row("R^2 of p on weight and length", lambda o: order(o.schema.biases, TOOLS), bar=ORDER_BAR, better="higher")
 
 
-def _feasible(outcome: Outcome) -> set[str]:
-    schema = outcome.simulated.schema
+def _feasible(outcome: Simulated) -> set[str]:
+    schema = outcome.schema
     return {"".join("01"[name in mask] for name in schema.layout.names) for mask in schema.masks}
 
 
 def _add_recognition(report: Report, outcomes: Sequence[Outcome]) -> None:
-    row = adder(report, outcomes)
+    row = adder(report, [outcome.simulated.needed for outcome in outcomes])
+    hard, *easy = RECOGNITION
+    for case in easy:
+        row(f"recognised, {case}, samples", lambda o, c=case: _needed(o[c, "ekf"]), "", RECOGNITION[case], SAMPLES_BAR)
+    row(f"recognised in {SAMPLES}, {hard}", lambda o: _recognised(o[hard, "ekf"]), "%", "0", SHARE_BAR, "higher")
+    row(f"recognised, {hard}, samples", lambda o: _needed(o[hard, "ekf"]))
     for case, paper in RECOGNITION.items():
-        if paper.isdigit():
-            row(f"recognised, {case}, samples", "", paper, lambda o, c=case: _mean(o, c, "ekf"), SAMPLES_BAR)
-    hard = next(iter(CASES))
-    row(f"recognised in {SAMPLES}, {hard}", "%", "0", lambda o: _share(o, hard, "ekf"), SHARE_BAR, "higher")
-    row(f"recognised, {hard}, samples", "", "", lambda o: _mean(o, hard, "ekf"))
-    for case, paper in RECOGNITION.items():
-        row(f"p by gauss_newton, {case}, samples", "", "", lambda o, c=case: _mean(o, c, "gauss_newton"))
-        row(f"p by gradient, {case}, samples", "", paper, lambda o, c=case: _mean(o, c, "gradient"))
-        row(f"p by gradient, {case}, recognised", "%", "", lambda o, c=case: _share(o, c, "gradient"))
+        row(f"p by gauss_newton, {case}, samples", lambda o, c=case: _needed(o[c, "gauss_newton"]))
+        row(f"p by gradient, {case}, samples", lambda o, c=case: _needed(o[c, "gradient"]), paper=paper)
+        row(f"p by gradient, {case}, recognised", lambda o, c=case: _recognised(o[c, "gradient"]), "%")
     report.note(
         f"Recognised: p is nearest to the p of {AFTER} of all tools and within 20 % of the way from the first p, and "
         f"stays so up to sample {SAMPLES}; a run in which it is not counts as {SAMPLES + 1}. {RUNS} runs per seed."
     )
-
-
-def _mean(outcome: Outcome, case: str, way: str) -> float:
-    return _needed(outcome.simulated.needed[case, way])
-
-
-def _share(outcome: Outcome, case: str, way: str) -> float:
-    return _recognised(outcome.simulated.needed[case, way])
 
 
 def _needed(samples: np.ndarray) -> float:
@@ -126,46 +120,23 @@ def _recognised(samples: np.ndarray) -> float:
 
 
 def _add_control(report: Report, outcomes: Sequence[Outcome], bounds: tuple[np.ndarray, np.ndarray]) -> None:
-    row = adder(report, outcomes)
+    row = adder(report, [{**outcome.simulated.controlled, LIMIT: outcome.simulated.limit} for outcome in outcomes])
     for index, tool in enumerate(SEQUENCE):
         begin, after = index * STEPS, slice(index * STEPS + SETTLED, (index + 1) * STEPS)
         whole = slice(begin, (index + 1) * STEPS)
-        row(f"{tool}: tip, first step, {KNOWING}", "mm", "", lambda o, at=begin: 1e3 * _known(o).tips[at])
-        row(
-            f"{tool}: steps until the tip's average of 5 stays below {TIP_BAR:g} mm",
-            "",
-            "",
-            lambda o, at=whole: min(steps_until(1e3 * _known(o).tips[at], TIP_BAR), STEPS),
-            SETTLED + 0.5,
-        )
+        row(f"{tool}: tip, first step, {KNOWING}", lambda o, at=begin: 1e3 * o[KNOWING].tips[at], "mm")
+        steps = lambda o, at=whole: min(steps_until(1e3 * o[KNOWING].tips[at], TIP_BAR), STEPS)
+        row(f"{tool}: steps until the tip's average of 5 stays below {TIP_BAR:g} mm", steps, bar=SETTLED + 0.5)
         for way in outcomes[0].simulated.controlled:
-            is_asked = way == KNOWING
-            row(
-                f"{tool}: tip after {SETTLED} steps, {way}",
-                "mm",
-                "",
-                lambda o, way=way, at=after: 1e3 * o.simulated.controlled[way].tips[at].mean(),
-                TIP_BAR if is_asked else None,
-            )
-            row(
-                f"{tool}: center of gravity after {SETTLED} steps, {way}",
-                "mm",
-                "",
-                lambda o, way=way, at=after: 1e3 * o.simulated.controlled[way].off_center[at].mean(),
-                CENTER_BAR if is_asked else None,
-            )
-        row(
-            f"{tool}: center of gravity, limit (perfect model)",
-            "mm",
-            "",
-            lambda o, at=after: 1e3 * o.simulated.limit.off_center[at].mean(),
-        )
+            tip, center = (TIP_BAR, CENTER_BAR) if way == KNOWING else (None, None)
+            off_tip = lambda o, way=way, at=after: 1e3 * o[way].tips[at].mean()
+            row(f"{tool}: tip after {SETTLED} steps, {way}", off_tip, "mm", bar=tip)
+            off_center = lambda o, way=way, at=after: 1e3 * o[way].off_center[at].mean()
+            row(f"{tool}: center of gravity after {SETTLED} steps, {way}", off_center, "mm", bar=center)
+        limit = lambda o, at=after: 1e3 * o[LIMIT].off_center[at].mean()
+        row(f"{tool}: center of gravity, {LIMIT}", limit, "mm")
     share = "center of gravity inside collect.constraints, steps with a known tool"
-    row(share, "%", "", lambda o: 100.0 * _inside(_known(o), bounds), 99.0, "higher")
-
-
-def _known(outcome: Outcome) -> Course:
-    return outcome.simulated.controlled[KNOWING]
+    row(share, lambda o: 100.0 * _inside(o[KNOWING], bounds), "%", bar=99.0, better="higher")
 
 
 def _inside(course: Course, bounds: tuple[np.ndarray, np.ndarray]) -> float:
@@ -176,19 +147,15 @@ def _inside(course: Course, bounds: tuple[np.ndarray, np.ndarray]) -> float:
 
 
 def _add_actual(report: Report, outcomes: Sequence[Outcome]) -> None:
-    row = adder(report, outcomes)
-    row("actual: samples for fine-tuning", "", "480", lambda o: o.actual.samples)
-    row("actual: R^2 of p on weight and length", "", "", lambda o: order(o.actual.schema.biases, TOOLS))
+    row = adder(report, [outcome.actual for outcome in outcomes])
+    row("actual: samples for fine-tuning", lambda o: o.samples, paper="480")
+    row("actual: R^2 of p on weight and length", lambda o: order(o.schema.biases, TOOLS))
     for tool in LEADS:
-        row(f"actual: {tool} recognised, samples", "", "", lambda o, tool=tool: min(o.actual.needed[tool], SAMPLES + 1))
+        row(f"actual: {tool} recognised, samples", lambda o, tool=tool: min(o.needed[tool], SAMPLES + 1))
     for case in CASES:
-        row(f"actual: recognised in {SAMPLES}, {case}", "%", "", lambda o, c=case: _recognised(o.actual.recognised[c]))
-        row(f"actual: recognised, {case}, samples", "", "", lambda o, c=case: _needed(o.actual.recognised[c]))
+        row(f"actual: recognised in {SAMPLES}, {case}", lambda o, c=case: _recognised(o.recognised[c]), "%")
+        row(f"actual: recognised, {case}, samples", lambda o, c=case: _needed(o.recognised[c]))
     papers = dict(zip(MODELS, ("largest", "smaller", "smallest"), strict=True))
     for model in (*MODELS, FOLLOWING):
-        row(
-            f"actual: tip at {AFTER}, {model}",
-            "mm",
-            papers.get(model, ""),
-            lambda o, model=model: 1e3 * o.actual.controlled[model].tips.mean(),
-        )
+        error = lambda o, model=model: 1e3 * o.controlled[model].tips.mean()
+        row(f"actual: tip at {AFTER}, {model}", error, "mm", papers.get(model, ""))

@@ -5,6 +5,7 @@ by results on arms 11 and 13, which are not judged here.
 """
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from studies.paper.musashi import simulation as simulation
 from studies.paper.musashi.model import decay
 from studies.paper.musashi.motion import LENGTH, POSITION, TENSION
 from studies.paper.musashi.seed import AFTER, BEFORE, HELD, Outcome, run_seed
-from studies.paper.report import Report, Row
+from studies.paper.report import Adder, Report, adder
 from studies.paper.runs import each_seed
 
 PAPER_MASKS = {frozenset({POSITION, TENSION}), frozenset({TENSION, LENGTH})}
@@ -37,90 +38,73 @@ def reproduce(seeds: Sequence[int], folder: Path, progress: Tell, fresh: bool) -
 def report(outcomes: Sequence[Outcome]) -> Report:
     """Return the table of all measurements."""
     result = Report("musashi", [outcome.seed for outcome in outcomes])
-    for rows in (_structure, _learning, _control, _simulation, _anomaly):
-        for row in rows(outcomes):
-            result.add(row)
-    stopped = int(
-        sum(np.isnan(o.control[way][which]).sum() for o in outcomes for way in o.control for which in o.areas)
-    )
+    row = adder(result, outcomes)
+    _add_structure(row)
+    _add_learning(row)
+    _add_control(row)
+    _add_simulation(row)
+    _add_anomaly(row)
+    stopped = sum(np.isnan(o.control[way][when]).sum() for o in outcomes for way in o.control for when in o.areas)
     result.note(f"Control: the limits stopped an arm on {stopped} of the ways to a target; those are left out.")
     return result
 
 
-def _structure(outcomes: Sequence[Outcome]) -> list[Row]:
-    structures = [outcome.structure for outcome in outcomes]
-    rows = [
-        Row(f"L of {name}", "", paper, tuple(s.L_i[name] for s in structures))
-        for name, paper in ((POSITION, "0.012"), (TENSION, "0.247"), (LENGTH, "0.012"))
-    ]
-    same = tuple(float(set(s.masks) == PAPER_MASKS) for s in structures)
-    loose = tuple(float(sum(error < LOOSE for error in s.L_m.values())) for s in structures)
-    return [
-        *rows,
-        Row("masks at 0.15 are 110 and 011 (share of seeds)", "", "1", same, 0.99, "higher"),
-        Row("masks at 0.30", "", "4", loose),
-    ]
+def _add_structure(row: Adder) -> None:
+    for name, paper in ((POSITION, "0.012"), (TENSION, "0.247"), (LENGTH, "0.012")):
+        row(f"L of {name}", lambda o, name=name: o.structure.L_i[name], paper=paper)
+    same = "masks at 0.15 are 110 and 011 (share of seeds)"
+    row(same, lambda o: set(o.structure.masks) == PAPER_MASKS, "", "1", 0.99, "higher")
+    row("masks at 0.30", lambda o: sum(error < LOOSE for error in o.structure.L_m.values()), paper="4")
 
 
-def _learning(outcomes: Sequence[Outcome]) -> list[Row]:
-    fits = [float(decay(o.time, o.learning).at(o.time[-1])) for o in outcomes]
-    plain = [float(decay(o.time, o.learning, has_floor=False).at(o.time[-1])) for o in outcomes]
-    minute = [o.learning[o.time > o.time[-1] - 60.0].mean() for o in outcomes]
-    return [
-        Row("joint error of the model as trained", "rad", "0.324", tuple(o.unchanged.mean() for o in outcomes)),
-        Row("joint error while learning, first 10 s", "rad", "", tuple(o.learning[:100].mean() for o in outcomes)),
-        Row("joint error after 10 minutes, exponential fit", "rad", "0.154", tuple(fits), 0.15),
-        Row("the same, fit without floor", "rad", "", tuple(plain)),
-        Row("joint error while learning, last minute", "rad", "", tuple(minute)),
-        Row("fresh motion, before", "rad", "0.414", _means(outcomes, "fresh", BEFORE)),
-        Row("fresh motion, after", "rad", "0.186", _means(outcomes, "fresh", AFTER), 0.16),
-        Row("heavy object, before", "rad", "", _means(outcomes, "heavy", BEFORE)),
-        Row("heavy object, after", "rad", "", _means(outcomes, "heavy", AFTER), 0.2),
-    ]
+def _add_learning(row: Adder) -> None:
+    row("joint error of the model as trained", lambda o: o.unchanged.mean(), "rad", "0.324")
+    row("joint error while learning, first 10 s", lambda o: o.learning[:100].mean(), "rad")
+    row("joint error after 10 minutes, exponential fit", _fit, "rad", "0.154", 0.15)
+    row("the same, fit without floor", lambda o: _fit(o, has_floor=False), "rad")
+    row("joint error while learning, last minute", lambda o: o.learning[o.time > o.time[-1] - 60.0].mean(), "rad")
+    row("fresh motion, before", lambda o: np.mean(o.fresh[BEFORE]), "rad", "0.414")
+    row("fresh motion, after", lambda o: np.mean(o.fresh[AFTER]), "rad", "0.186", 0.16)
+    row("heavy object, before", lambda o: np.mean(o.heavy[BEFORE]), "rad")
+    row("heavy object, after", lambda o: np.mean(o.heavy[AFTER]), "rad", "", 0.2)
 
 
-def _means(outcomes: Sequence[Outcome], what: str, when: str) -> tuple[float, ...]:
-    return tuple(float(np.mean(getattr(outcome, what)[when])) for outcome in outcomes)
+def _fit(outcome: Outcome, has_floor: bool = True) -> float:
+    """Return the error [rad] at the end of the exponential that fits the online update."""
+    return float(decay(outcome.time, outcome.learning, has_floor).at(outcome.time[-1]))
 
 
-def _control(outcomes: Sequence[Outcome]) -> list[Row]:
-    rows = []
+def _add_control(row: Adder) -> None:
     for way in (control.OURS, control.WEIGHTS):
-        missed = {when: [float(np.nanmean(o.control[way][when])) for o in outcomes] for when in (BEFORE, AFTER)}
-        rows += [Row(f"control, {way}, {when}", "rad", "", tuple(missed[when])) for when in (BEFORE, AFTER)]
+        for when in (BEFORE, AFTER):
+            row(f"control, {way}, {when}", lambda o, way=way, when=when: np.nanmean(o.control[way][when]), "rad")
         if way == control.OURS:
-            better = tuple(float(a < b) for a, b in zip(missed[AFTER], missed[BEFORE], strict=True))
-            rows.append(Row("control better after (share of arms)", "", "1", better, 0.99, "higher"))
-    return rows
+            better = lambda o, way=way: np.nanmean(o.control[way][AFTER]) < np.nanmean(o.control[way][BEFORE])
+            row("control better after (share of arms)", better, "", "1", 0.99, "higher")
 
 
-def _simulation(outcomes: Sequence[Outcome]) -> list[Row]:
-    rows = []
+def _add_simulation(row: Adder) -> None:
     for loss in (simulation.OURS, simulation.PAPER):
         for signal, unit, before, after, bar in (
             (POSITION, "rad", "0.335", "0.162", 0.2),
             (TENSION, "N", "104.8", "92.2", None),
         ):
-            errors = {
-                when: tuple(float(o.courses[loss][when].errors(signal).mean()) for o in outcomes)
-                for when in (BEFORE, AFTER)
-            }
-            rows.append(Row(f"simulated {signal}, {loss}, before", unit, before, errors[BEFORE]))
-            rows.append(Row(f"simulated {signal}, {loss}, after", unit, after, errors[AFTER], bar))
-        gained = tuple(100.0 * (1.0 - a / b) for a, b in zip(errors[AFTER], errors[BEFORE], strict=True))
-        rows.append(Row(f"simulated tension better by, {loss}", "%", "12", gained, 25.0, "higher"))
-    return rows
+            error = partial(_simulated, loss, signal)
+            row(f"simulated {signal}, {loss}, before", partial(error, BEFORE), unit, before)
+            row(f"simulated {signal}, {loss}, after", partial(error, AFTER), unit, after, bar)
+        gain = lambda o, error=error: 100.0 * (1.0 - error(AFTER, o) / error(BEFORE, o))
+        row(f"simulated tension better by, {loss}", gain, "%", "12", 25.0, "higher")
 
 
-def _anomaly(outcomes: Sequence[Outcome]) -> list[Row]:
-    areas = {when: [list(o.areas[when].values()) for o in outcomes] for when in (BEFORE, AFTER)}
-    held = {over: tuple(float(np.mean(list(o.areas_held[over].values()))) for o in outcomes) for over in HELD}
-    return [
-        Row("AUC of a cut muscle, mean of ten, before", "", "", tuple(map(np.mean, areas[BEFORE])), None, "higher"),
-        Row("AUC of a cut muscle, mean of ten, after", "", "", tuple(map(np.mean, areas[AFTER])), 0.95, "higher"),
-        *(
-            Row(f"the same mean of ten, scores averaged over {over:g} s", "", "", values, None, "higher")
-            for over, values in held.items()
-        ),
-        Row("AUC of the muscle detected worst, after", "", "", tuple(map(min, areas[AFTER])), None, "higher"),
-    ]
+def _simulated(loss: str, signal: str, when: str, outcome: Outcome) -> float:
+    return float(outcome.courses[loss][when].errors(signal).mean())
+
+
+def _add_anomaly(row: Adder) -> None:
+    row("AUC of a cut muscle, mean of ten, before", lambda o: np.mean(list(o.areas[BEFORE].values())), better="higher")
+    mean = "AUC of a cut muscle, mean of ten, after"
+    row(mean, lambda o: np.mean(list(o.areas[AFTER].values())), bar=0.95, better="higher")
+    for over in HELD:
+        held = lambda o, over=over: np.mean(list(o.areas_held[over].values()))
+        row(f"the same mean of ten, scores averaged over {over:g} s", held, better="higher")
+    row("AUC of the muscle detected worst, after", lambda o: min(o.areas[AFTER].values()), better="higher")

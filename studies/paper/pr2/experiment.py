@@ -14,7 +14,7 @@ from studies.paper.pr2.actual import MODELS, Actual, actual
 from studies.paper.pr2.arm import TIP
 from studies.paper.pr2.figures import draw
 from studies.paper.pr2.simulated import CASES, POINTS, RECOGNISERS, WAYS, Simulated, simulate
-from studies.paper.report import Report, Row, adder
+from studies.paper.report import Report, adder
 from studies.paper.runs import Run, between, each_seed
 
 ROBOT = "pr2_duster"
@@ -56,84 +56,57 @@ def summary(seeds: Sequence[int], outcomes: Sequence[Outcome]) -> Report:
 
 
 def _add_structure(report: Report, outcomes: Sequence[Outcome]) -> None:
-    row = adder(report, outcomes)
-    row("L of joint_position (an output if below 0.15)", "", "above 0.15", lambda o: o.simulated.fact("L_i")[JOINTS])
-    row("L of tool_tip_position", "", "below 0.15", lambda o: o.simulated.fact("L_i")[TIP])
-    outputs = "seeds whose only output is tool_tip_position, only mask joint_position"
-    right = [
-        o.simulated.schema.x_out == (TIP,) and o.simulated.schema.masks == (frozenset({JOINTS}),) for o in outcomes
-    ]
-    report.add(Row(outputs, "%", "100", tuple(100.0 * is_right for is_right in right)))
-    row("tool tip by the model, fresh samples, p of the grasp", "mm", "", lambda o: 1e3 * o.simulated.held_out)
-    row("R^2 of l on p", "", "", lambda o: o.simulated.order.length, ORDER_BAR, "higher")
-    row("R^2 of phi on p", "", "", lambda o: o.simulated.order.angle, ORDER_BAR, "higher")
+    row = adder(report, [outcome.simulated for outcome in outcomes])
+    row("L of joint_position (an output if below 0.15)", lambda o: o.fact("L_i")[JOINTS], paper="above 0.15")
+    row("L of tool_tip_position", lambda o: o.fact("L_i")[TIP], paper="below 0.15")
+    row("seeds whose only output is tool_tip_position, only mask joint_position", _has_one_mask, "%", "100")
+    row("tool tip by the model, fresh samples, p of the grasp", lambda o: 1e3 * o.held_out, "mm")
+    row("R^2 of l on p", lambda o: o.order.length, bar=ORDER_BAR, better="higher")
+    row("R^2 of phi on p", lambda o: o.order.angle, bar=ORDER_BAR, better="higher")
     for length in outcomes[0].simulated.order.spread:
-        row(
-            f"distance of p between 0 and 60 deg, l = {length} mm",
-            "",
-            "grows with l",
-            lambda o, length=length: o.simulated.order.spread[length],
-        )
+        name = f"distance of p between 0 and 60 deg, l = {length} mm"
+        row(name, lambda o, length=length: o.order.spread[length], paper="grows with l")
+
+
+def _has_one_mask(outcome: Simulated) -> float:
+    return 100.0 * (outcome.schema.x_out == (TIP,) and outcome.schema.masks == (frozenset({JOINTS}),))
 
 
 def _add_simulated(report: Report, outcomes: Sequence[Outcome]) -> None:
-    row = adder(report, outcomes)
+    row = adder(report, [outcome.simulated for outcome in outcomes])
     for case in CASES:
+        paper = PAPER_ESTIMATE.get(case, "")
         for name in RECOGNISERS:
-            row(
-                f"estimate {case} after {POINTS} points, p by {name}",
-                "mm",
-                PAPER_ESTIMATE.get(case, ""),
-                lambda o, key=(case, name): o.simulated.estimated[key].mean(POINTS),
-                ESTIMATE_BAR if name == "ekf" and case in PAPER_ESTIMATE else None,
-            )
-    row("control, first point", "mm", "240", lambda o: 1e3 * o.simulated.controlled["p"].course.errors[0])
+            bar = ESTIMATE_BAR if name == "ekf" and paper else None
+            figure = lambda o, key=(case, name): o.estimated[key].mean(POINTS)
+            row(f"estimate {case} after {POINTS} points, p by {name}", figure, "mm", paper, bar)
+    row("control, first point", lambda o: 1e3 * o.controlled["p"].course.errors[0], "mm", "240")
     for way in WAYS:
-        paper = PAPER_CONTROL.get(way, ("", ""))
-        is_asked = way in CONTROL_BARS
-        row(
-            f"control after {POINTS} points, update {way}",
-            "mm",
-            paper[0],
-            lambda o, way=way: o.simulated.controlled[way].course.mean(POINTS),
-            CONTROL_BARS.get(way),
-        )
-        row(
-            f"at the other posture, update {way}",
-            "mm",
-            paper[1],
-            lambda o, way=way: o.simulated.controlled[way].elsewhere.mean(),
-            SAME_POSTURE_BAR if is_asked else None,
-        )
+        during, afterwards = PAPER_CONTROL.get(way, ("", ""))
+        same, others = (SAME_POSTURE_BAR, OTHERS_BAR) if way in CONTROL_BARS else (None, None)
+        control = lambda o, way=way: o.controlled[way].course.mean(POINTS)
+        row(f"control after {POINTS} points, update {way}", control, "mm", during, CONTROL_BARS.get(way))
+        elsewhere = lambda o, way=way: o.controlled[way].elsewhere.mean()
+        row(f"at the other posture, update {way}", elsewhere, "mm", afterwards, same)
         row(
             f"model under the other grasps, update {way}",
+            lambda o, way=way: 1e3 * o.controlled[way].others,
             "mm",
             "",
-            lambda o, way=way: 1e3 * o.simulated.controlled[way].others,
-            OTHERS_BAR if is_asked else None,
+            others,
         )
 
 
 def _add_actual(report: Report, outcomes: Sequence[Outcome]) -> None:
-    row = adder(report, outcomes)
-    row("actual: samples for fine-tuning", "", "1500", lambda o: o.actual.samples)
+    row = adder(report, [outcome.actual for outcome in outcomes])
+    row("actual: samples for fine-tuning", lambda o: o.samples, paper="1500")
     for model in MODELS:
-        row(
-            f"actual: tool tip by {model}, best p of every grasp",
-            "mm",
-            "",
-            lambda o, model=model: 1e3 * float(np.mean(list(o.actual.errors[model].values()))),
-        )
+        error = lambda o, model=model: 1e3 * np.mean(list(o.errors[model].values()))
+        row(f"actual: tool tip by {model}, best p of every grasp", error, "mm")
     for model in MODELS:
-        row(
-            f"actual: control by {model}, after {POINTS} points",
-            "mm",
-            "",
-            lambda o, model=model: 1e3 * float(o.actual.controlled[model][POINTS : o.actual.change].mean()),
-        )
-    row("actual: control, first point", "mm", "1000", lambda o: 1e3 * o.actual.course.errors[0])
-    row(f"actual: after {POINTS} points", "mm", "150", lambda o: o.actual.course.mean(POINTS, o.actual.change))
-    row(
-        "actual: right after the tool was changed", "mm", "500", lambda o: 1e3 * o.actual.course.errors[o.actual.change]
-    )
-    row(f"actual: {POINTS} points later", "mm", "200", lambda o: o.actual.course.mean(o.actual.change + POINTS))
+        error = lambda o, model=model: 1e3 * o.controlled[model][POINTS : o.change].mean()
+        row(f"actual: control by {model}, after {POINTS} points", error, "mm")
+    row("actual: control, first point", lambda o: 1e3 * o.course.errors[0], "mm", "1000")
+    row(f"actual: after {POINTS} points", lambda o: o.course.mean(POINTS, o.change), "mm", "150")
+    row("actual: right after the tool was changed", lambda o: 1e3 * o.course.errors[o.change], "mm", "500")
+    row(f"actual: {POINTS} points later", lambda o: o.course.mean(o.change + POINTS), "mm", "200")
