@@ -4,6 +4,7 @@ import time
 from collections.abc import Mapping
 
 import numpy as np
+from typing_extensions import override
 
 from hal.config import RobotConfig
 from hal.device import Device, DeviceHealth, DeviceState, Reading
@@ -49,38 +50,43 @@ class DirectDevice(Device):
         self._clock = clock
         self._state = DeviceState.CLOSED
 
+    @override
     def open(self) -> None:
-        """See `Device.open`."""
         self._state = DeviceState.READY
 
+    @override
     def read(self) -> Reading:
-        """See `Device.read`; the world is measured now."""
+        """Measure the world now."""
         measured: Mapping[str, np.ndarray] = self._world.measure()
         values = np.concatenate([measured[signal] for signal in self._signals])
         return Reading(values, np.full(len(values), self._clock.monotonic()))
 
+    @override
     def health(self) -> DeviceHealth:
-        """See `Device.health`."""
         return DeviceHealth(self._state)
 
+    @override
     def enable(self) -> None:
-        """See `Device.enable`; holds the lengths that are."""
+        """Enable all servos at their present lengths."""
         self._drive(self._world.truth()[self._commanded], True)
         self._state = DeviceState.ENABLED
 
+    @override
     def disable(self) -> None:
-        """See `Device.disable`; the brakes hold."""
+        """Disable all servos; the brakes hold."""
         if self._state is DeviceState.ENABLED:
             self._drive(self._world.truth()[self._commanded], False)
             self._state = DeviceState.READY
 
+    @override
     def apply(self, values: np.ndarray) -> None:
-        """See `Device.apply`; not enabled, it does nothing."""
+        """Set the targets of all servos; do nothing unless enabled."""
         if self._state is DeviceState.ENABLED:
             self._drive(values, True)
 
+    @override
     def close(self) -> None:
-        """See `Device.close`; the world goes with it."""
+        """Disable all servos and close the world."""
         if self._state is not DeviceState.CLOSED:
             self.disable()
             self._state = DeviceState.CLOSED

@@ -12,15 +12,17 @@ import math
 from collections.abc import Mapping
 
 import numpy as np
+from typing_extensions import override
 
 from simulators.bullet import BulletBody
 from simulators.faults import MUSCLE_CUT, check_part
 from simulators.muscle_body import Body, Friction, Servo
 from simulators.muscle_kernels import held, pull
+from simulators.world import World
 
 
-class MuscleWorld:
-    """See `simulators.world.World`. Signals: joint_position, muscle_tension, muscle_length."""
+class MuscleWorld(World):
+    """World of a muscle-driven body. Signals: joint_position, muscle_tension, muscle_length."""
 
     _STEPS_PER_REFRESH = 2
     """Moment arms and inertia are solved anew every so many steps; in between paths are linear in joint positions."""
@@ -61,8 +63,8 @@ class MuscleWorld:
         self._whole[:] = 1.0
         self._pulled(longest_step, self._wires.copy(), self._slid_joint.copy())  # compiled now, and not on the way
 
+    @override
     def step(self, duration: float) -> None:
-        """See `World.step`."""
         count = max(1, math.ceil(duration / self._longest_step - 1e-6))
         size = duration / count
         for index in range(count):
@@ -71,24 +73,25 @@ class MuscleWorld:
             self._substep(size)
         self.time += duration
 
+    @override
     def measure(self) -> Mapping[str, np.ndarray]:
-        """See `World.measure`."""
         values = self.truth()
         for name, (deviation, size) in self._noise.items():
             if deviation:
                 values[name] += deviation * self._random.standard_normal(size)
         return values
 
+    @override
     def truth(self) -> dict[str, np.ndarray]:
-        """See `World.truth`."""
         return {
             "joint_position": self._bullet.position.copy(),
             "muscle_tension": self._tension.copy(),
             "muscle_length": self._spool - self._body.slack,
         }
 
+    @override
     def drive(self, element: str, target: float, enabled: bool) -> None:
-        """See `World.drive`; the element of a servo is its muscle's length."""
+        """Set the target of a servo; its element is its muscle's length."""
         index = self._muscles.get(element)
         if index is None:
             raise KeyError(f"No servo moves '{element}'. Known servos: {', '.join(self._muscles)}.")
@@ -99,8 +102,9 @@ class MuscleWorld:
             self._follows[index] = enabled
             self._hold_or_drive()
 
+    @override
     def break_part(self, part: str) -> None:
-        """See `World.break_part`: `muscle_cut:<muscle>` or `heavy_object`."""
+        """Break `muscle_cut:<muscle>`, or add `heavy_object`."""
         kind, muscle = check_part(part, self._body.paths.names)
         if kind == MUSCLE_CUT:
             self._whole[self._body.paths.names.index(muscle)] = 0.0
@@ -108,8 +112,8 @@ class MuscleWorld:
             hand = self._body.paths.chain.joints[-1]
             self._bullet.add_mass(hand, self._body.object_mass, self._body.object_radius)
 
+    @override
     def close(self) -> None:
-        """See `World.close`."""
         self._bullet.close()
 
     def _refresh(self, duration: float) -> None:

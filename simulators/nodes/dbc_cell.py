@@ -5,8 +5,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
+from typing_extensions import override
+
 from simulators.nodes.canopen.spec import NodeSpec
-from simulators.nodes.node import Frame, Handler
+from simulators.nodes.node import Frame, Handler, SimulatedNode
 from simulators.nodes.plant import Plant
 
 GOOD, OVERLOAD, UNDERLOAD, SENSOR_BROKEN = 0, 1, 2, 4
@@ -33,7 +35,7 @@ class DbcCellConstants:
     period: float = 0.005
 
 
-class DbcCell:
+class DbcCell(SimulatedNode):
     """One cell, which sends by its own clock."""
 
     def __init__(self, spec: NodeSpec, plant: Plant, outbox: list[Frame]) -> None:
@@ -51,32 +53,34 @@ class DbcCell:
         self._due = 0.0
 
     @property
+    @override
     def condition(self) -> str:
-        """See `SimulatedNode.condition`."""
         return "off" if not self.is_powered else "broken" if self._is_broken else "measuring"
 
+    @override
     def routes(self) -> dict[int, Handler]:
-        """See `SimulatedNode.routes`."""
         return {_REQUEST + self.spec.node: self._on_request}
 
+    @override
     def sync(self, now: float) -> None:
-        """See `SimulatedNode.sync`; such a cell knows none."""
+        """Ignore SYNC, which such a cell does not know."""
 
+    @override
     def power_up(self, now: float) -> None:
-        """See `SimulatedNode.power_up`."""
         self.is_powered, self.is_muted, self._is_broken = True, False, False
         self._tare, self._counter, self._due = 0.0, 0, now
 
+    @override
     def power_down(self) -> None:
-        """See `SimulatedNode.power_down`."""
         self.is_powered = False
 
+    @override
     def break_down(self) -> None:
-        """See `SimulatedNode.break_down`: the strain gauge is gone."""
+        """Break the strain gauge."""
         self._is_broken = True
 
+    @override
     def tick(self, now: float) -> None:
-        """See `SimulatedNode.tick`."""
         if not self.is_powered or now < self._due - 1e-9:
             return
         self._due = max(self._due + self._constants.period, now)

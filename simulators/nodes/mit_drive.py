@@ -11,8 +11,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
+from typing_extensions import override
+
 from simulators.nodes.canopen.spec import NodeSpec
-from simulators.nodes.node import Frame, Handler
+from simulators.nodes.node import Frame, Handler, SimulatedDrive, SimulatedNode
 from simulators.nodes.plant import Plant
 from simulators.nodes.rotor import Rotor
 
@@ -95,7 +97,7 @@ class Wanted:
     torque: float = 0.0
 
 
-class MitDriveNode:
+class MitDriveNode(SimulatedNode, SimulatedDrive):
     """One drive: answers each frame with one, and moves its rotor as the last one said."""
 
     def __init__(self, spec: NodeSpec, plant: Plant, outbox: list[Frame]) -> None:
@@ -122,29 +124,31 @@ class MitDriveNode:
         self._heard = self._now = self._before = 0.0
 
     @property
+    @override
     def servo(self) -> tuple[float, bool]:
-        """See `SimulatedDrive.servo`."""
         return self._constants.zero + self._constants.unit * self._rotor.position, self.is_on
 
     @property
+    @override
     def condition(self) -> str:
-        """See `SimulatedNode.condition`."""
         if not self.is_powered:
             return "off"
         return f"error {self.error:X}h" if self.error else "enabled" if self.is_on else "disabled"
 
+    @override
     def routes(self) -> dict[int, Handler]:
-        """See `SimulatedNode.routes`."""
         routes: dict[int, Handler] = {self.spec.node: self._on_frame}
         if self._constants.make == "damiao":
             routes[REGISTER_ID] = self._on_register
         return routes
 
+    @override
     def sync(self, now: float) -> None:
-        """See `SimulatedNode.sync`; such a drive knows none."""
+        """Ignore SYNC, which such a drive does not know."""
 
+    @override
     def power_up(self, now: float) -> None:
-        """See `SimulatedNode.power_up`; what was written to registers is forgotten."""
+        """Start as after power-on; values written to registers are lost."""
         constants = self._constants
         self.is_powered, self.is_muted = True, False
         self._switch_off()
@@ -167,17 +171,19 @@ class MitDriveNode:
         self.registers = {key: struct.pack("<I", value) for key, value in numbers.items()}
         self.registers |= {key: struct.pack("<f", value) for key, value in ranges}
 
+    @override
     def power_down(self) -> None:
-        """See `SimulatedNode.power_down`."""
         self.is_powered = False
         self._switch_off()
 
+    @override
     def break_down(self) -> None:
-        """See `SimulatedNode.break_down`: the rotor is too hot."""
+        """Report an overheated rotor."""
         self._fail(_TOO_HOT[self._constants.make])
 
+    @override
     def tick(self, now: float) -> None:
-        """See `SimulatedNode.tick`: the watchdog, and the rotor's next step."""
+        """Advance the watchdog and the rotor."""
         duration, self._now = now - self._now, now
         if not self.is_powered or duration <= 0:
             return

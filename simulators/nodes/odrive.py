@@ -11,8 +11,10 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import ClassVar
 
+from typing_extensions import override
+
 from simulators.nodes.canopen.spec import NodeSpec
-from simulators.nodes.node import EXTENDED, REMOTE, Frame, Handler
+from simulators.nodes.node import EXTENDED, REMOTE, Frame, Handler, SimulatedDrive, SimulatedNode
 from simulators.nodes.plant import Plant
 from simulators.nodes.rotor import Rotor
 
@@ -92,7 +94,7 @@ class OdriveConstants:
         return self.direction * 2.0 * math.pi / self.gear
 
 
-class OdriveAxis:
+class OdriveAxis(SimulatedNode, SimulatedDrive):
     """One axis: hears what is sent to its node id, and tells how it is by itself."""
 
     def __init__(self, spec: NodeSpec, plant: Plant, outbox: list[Frame]) -> None:
@@ -126,19 +128,19 @@ class OdriveAxis:
         self._due: dict[Callable[[], tuple[int, bytes]], float] = {}
 
     @property
+    @override
     def servo(self) -> tuple[float, bool]:
-        """See `SimulatedDrive.servo`."""
         return self._rotor.position, self.state is AxisState.CLOSED_LOOP_CONTROL
 
     @property
+    @override
     def condition(self) -> str:
-        """See `SimulatedNode.condition`."""
         if not self.is_powered:
             return "off"
         return f"error {self.error:X}h" if self.error else self.state.name.lower().replace("_", " ")
 
+    @override
     def routes(self) -> dict[int, Handler]:
-        """See `SimulatedNode.routes`."""
         commands: dict[int, Callable[[bytes], None]] = {
             0x02: lambda data: self.fail(ESTOP_REQUESTED),
             0x07: self._request,
@@ -158,11 +160,12 @@ class OdriveAxis:
         routes[self._flags | BROADCAST << 5 | 0x06 | REMOTE] = lambda data, now: self._send(self._address())
         return routes
 
+    @override
     def sync(self, now: float) -> None:
-        """See `SimulatedNode.sync`; an axis knows none."""
+        """Ignore SYNC, which an axis does not know."""
 
+    @override
     def power_up(self, now: float) -> None:
-        """See `SimulatedNode.power_up`."""
         self.is_powered, self.is_muted = True, False
         self.state, self.error, self.result = AxisState.UNDEFINED, INITIALIZING, SUCCESS
         self.control_mode = POSITION
@@ -172,13 +175,14 @@ class OdriveAxis:
         self._before = self._position()
         self._due = dict.fromkeys(self._periods, now)
 
+    @override
     def power_down(self) -> None:
-        """See `SimulatedNode.power_down`."""
         self.is_powered = False
         self._disarm()
 
+    @override
     def break_down(self) -> None:
-        """See `SimulatedNode.break_down`: the power stage reports a fault."""
+        """Report a fault of the power stage."""
         self.fail(DRV_FAULT)
 
     def fail(self, error: int) -> None:
@@ -188,8 +192,9 @@ class OdriveAxis:
             self.result = DISARMED
         self._disarm()
 
+    @override
     def tick(self, now: float) -> None:
-        """See `SimulatedNode.tick`: the watchdog, the rotor's next step, and what is sent by itself."""
+        """Advance the watchdog and the rotor, and send cyclic messages."""
         duration, self._now = now - self._now, now
         if not self.is_powered:
             return

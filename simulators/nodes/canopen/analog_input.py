@@ -4,6 +4,8 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar
 
+from typing_extensions import override
+
 from simulators.nodes.canopen.node import CanopenNode
 from simulators.nodes.canopen.pdo import Pdo
 from simulators.nodes.canopen.spec import NodeSpec
@@ -49,12 +51,13 @@ class AnalogInput(CanopenNode):
         self._is_broken = False
         super().__init__(spec, plant, outbox)
 
+    @override
     def restart(self) -> None:
-        """See `CanopenNode.restart`."""
         self._is_broken = False
 
+    @override
     def break_down(self) -> None:
-        """See `CanopenNode.break_down`; the converter reads its lower end from now on."""
+        """Let the converter read its lower end from now on."""
         super().break_down()
         self._is_broken = True
 
@@ -76,6 +79,7 @@ class AnalogInput(CanopenNode):
             values[0x6403, channel] = counts / half * RANGE
         values[0x2120, 0] = status
 
+    @override
     def may_send(self, pdo: Pdo) -> bool:
-        """See `CanopenNode.may_send`; a PDO with analogue inputs only once 6423h says so (CiA 401)."""
+        """Whether a PDO may be sent; one with analogue inputs only after 6423h allows it (CiA 401)."""
         return bool(self.objects.values[0x6423, 0]) or all(index >> 8 != 0x64 for index, _ in pdo.keys)

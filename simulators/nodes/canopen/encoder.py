@@ -2,6 +2,8 @@
 
 import math
 
+from typing_extensions import override
+
 from simulators.nodes.canopen.node import CanopenNode
 from simulators.nodes.canopen.objects import Value
 from simulators.nodes.canopen.spec import EncoderConstants, NodeSpec
@@ -35,12 +37,12 @@ class JointEncoder(CanopenNode):
         }
         self.objects.on_write[0x6003] = self._preset
 
+    @override
     def restart(self) -> None:
-        """See `CanopenNode.restart`."""
         self._before = None
 
+    @override
     def break_down(self) -> None:
-        """See `CanopenNode.break_down`."""
         super().break_down()
         self.objects.values[0x6503, 0] = POSITION_ERROR
 

@@ -2,6 +2,8 @@
 
 import math
 
+from typing_extensions import override
+
 from simulators.nodes.canopen.node import CanopenNode
 from simulators.nodes.canopen.objects import Abort, Refused, Value
 from simulators.nodes.canopen.spec import CellConstants, NodeSpec
@@ -39,17 +41,18 @@ class LoadCell(CanopenNode):
             }
         self.objects.on_write[0x6125] = self._tare
 
+    @override
     def restart(self) -> None:
-        """See `CanopenNode.restart`."""
         self._is_broken = False
 
+    @override
     def break_down(self) -> None:
-        """See `CanopenNode.break_down`."""
         super().break_down()
         self._is_broken = True
 
+    @override
     def sample(self) -> None:
-        """See `CanopenNode.sample`; a channel without a cell stays as at power-on."""
+        """Measure; a channel without a cell stays as at power-on."""
         for channel, element in self._cells:
             self.objects.values[0x6150, channel] = self._convert(channel, element)
 

@@ -4,11 +4,13 @@ import struct
 from collections.abc import Callable
 from enum import IntEnum
 
+from typing_extensions import override
+
 from simulators.nodes.canopen.objects import Abort, ObjectDictionary, Refused, Value, as_maker_says, read_eds
 from simulators.nodes.canopen.pdo import Pdo, PdoTable
 from simulators.nodes.canopen.sdo import SdoServer
 from simulators.nodes.canopen.spec import NodeSpec
-from simulators.nodes.node import Frame, Handler
+from simulators.nodes.node import Frame, Handler, SimulatedNode
 from simulators.nodes.plant import Plant
 
 HEARTBEAT_LOST = 0x8130
@@ -29,7 +31,7 @@ class Nmt(IntEnum):
     PRE_OPERATIONAL = 0x7F
 
 
-class CanopenNode:
+class CanopenNode(SimulatedNode):
     """One node: frames in by `routes` and `sync`, time by `tick`, frames out into `outbox`.
 
     Times are seconds of one monotonic clock. A node is used by one thread at a time.
@@ -58,8 +60,8 @@ class CanopenNode:
         self._now = 0.0
 
     @property
+    @override
     def condition(self) -> str:
-        """See `SimulatedNode.condition`."""
         return self.nmt.name.lower() if self.is_powered else "off"
 
     def sample(self) -> None:

@@ -1,5 +1,7 @@
 """A simulated CiA 402 servo drive: state machine, limits and faults; how it moves is `DriveMechanics`."""
 
+from typing_extensions import override
+
 from simulators.nodes.canopen.node import GENERIC, HARDWARE, HEARTBEAT_LOST, CanopenNode
 from simulators.nodes.canopen.objects import Abort, Refused, Value
 from simulators.nodes.canopen.spec import DriveConstants, NodeSpec
@@ -61,8 +63,8 @@ class ServoDrive(CanopenNode):
         enabled = self.state in (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE)
         return self._mechanics.target, enabled
 
+    @override
     def restart(self) -> None:
-        """See `CanopenNode.restart`."""
         self.state = State.SWITCH_ON_DISABLED
         self._controlword = 0
         self._deviates_since = None
@@ -109,8 +111,8 @@ class ServoDrive(CanopenNode):
         else:
             self._react(code or HEARTBEAT_LOST)
 
+    @override
     def break_down(self) -> None:
-        """See `CanopenNode.break_down`."""
         self.emergency(HARDWARE, GENERIC)
         self._react(HARDWARE)
 

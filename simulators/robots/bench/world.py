@@ -4,16 +4,18 @@ import math
 from collections.abc import Mapping
 
 import numpy as np
+from typing_extensions import override
 
 from hal.config import RobotConfig
 from simulators.faults import UnknownPart
+from simulators.world import World
 
 SET = "set"
 BANDWIDTH = 30.0
 """Of the servos [rad/s]: a twentieth of a second behind."""
 
 
-class BenchWorld:
+class BenchWorld(World):
     """One number per measured element; commanded ones begin in the middle of their range, all others at zero."""
 
     def __init__(self, config: RobotConfig) -> None:
@@ -29,8 +31,8 @@ class BenchWorld:
                 self._places[f"{name}.{element}"] = (name, index)
         self._servos: dict[str, tuple[float, bool]] = {}
 
+    @override
     def step(self, duration: float) -> None:
-        """See `World.step`."""
         self.time += duration
         share = 1.0 - math.exp(-BANDWIDTH * duration)
         for element, (target, enabled) in self._servos.items():
@@ -39,16 +41,16 @@ class BenchWorld:
                 values = self._values[signal]
                 values[index] += share * (target - values[index])
 
+    @override
     def measure(self) -> Mapping[str, np.ndarray]:
-        """See `World.measure`."""
         return {name: values.copy() for name, values in self._values.items()}
 
+    @override
     def truth(self) -> Mapping[str, np.ndarray]:
-        """See `World.truth`."""
         return self.measure()
 
+    @override
     def drive(self, element: str, target: float, enabled: bool) -> None:
-        """See `World.drive`."""
         self._servos[element] = (target, enabled)
 
     def break_part(self, part: str) -> None:
@@ -70,5 +72,6 @@ class BenchWorld:
         signal, index = self._places[element]
         self._values[signal][index] = value
 
+    @override
     def close(self) -> None:
-        """See `World.close`."""
+        """Do nothing."""

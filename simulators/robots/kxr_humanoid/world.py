@@ -4,12 +4,14 @@ import math
 from collections.abc import Mapping
 
 import numpy as np
+from typing_extensions import override
 
 from simulators.faults import UnknownPart, changed_tool, check_condition
 from simulators.robots.kxr_humanoid.body import REST, Body
 from simulators.robots.kxr_humanoid.eye import PIXEL, POSITION, Eye
 from simulators.robots.kxr_humanoid.feet import center_of, foot_forces
 from simulators.robots.kxr_humanoid.statics import rest
+from simulators.world import World
 
 COMMAND, FORCE, CENTER = "joint_position", "foot_force", "center_of_gravity"
 JOINTS = ("shoulder_pitch", "shoulder_yaw", "elbow_pitch", "ankle_pitch")
@@ -20,10 +22,10 @@ LAG = 0.03
 """Time constant of its position loop [s]."""
 
 
-class HumanoidWorld:
-    """See `simulators.world.World`. Quasi-static: links, feet and camera are where the motors' angles put them at rest.
+class HumanoidWorld(World):
+    """World of a low-rigidity humanoid, quasi-static: links, feet and camera are at rest for the motors' angles.
 
-    joint_position is the motors' side, what the servos' encoders measure; what the links do beyond is deflection.
+    joint_position is the motors' side, as the servos' encoders measure it; the links differ from it by deflection.
     """
 
     def __init__(self, body: Body, seed: int, condition: str | None = None) -> None:
@@ -44,8 +46,8 @@ class HumanoidWorld:
         self._follows = np.zeros(len(JOINTS))
         self._state: dict[str, np.ndarray] | None = None
 
+    @override
     def step(self, duration: float) -> None:
-        """See `World.step`."""
         self.time += duration
         reach = FASTEST * duration
         move = (self._target - self._motor) * (-math.expm1(-duration / LAG))
@@ -54,8 +56,8 @@ class HumanoidWorld:
             self._motor = self._motor + move
             self._state = None
 
+    @override
     def measure(self) -> Mapping[str, np.ndarray]:
-        """See `World.measure`."""
         values = dict(self.truth())
         for name in (COMMAND, FORCE):
             deviation = self._body.noise.get(name, 0.0)
@@ -64,8 +66,9 @@ class HumanoidWorld:
         values[CENTER] = center_of(values[FORCE])
         return values | self._eye.see(values)
 
+    @override
     def truth(self) -> Mapping[str, np.ndarray]:
-        """See `World.truth`; the image point also where the image does not reach."""
+        """Return the truth; the image point also outside of the image."""
         if self._state is None:
             state = rest(self._body, self._tool, self._motor[None])
             forces = foot_forces(state.center[0], state.weight)
@@ -78,8 +81,9 @@ class HumanoidWorld:
             }
         return {name: value.copy() for name, value in self._state.items()}
 
+    @override
     def drive(self, element: str, target: float, enabled: bool) -> None:
-        """See `World.drive`; a servo without power is held by the friction of its gear."""
+        """Set the target of a servo; without power it is held by the friction of its gear."""
         index = self._servos.get(element)
         if index is None:
             raise KeyError(f"No servo moves '{element}'. Known servos: {', '.join(self._servos)}.")
@@ -88,8 +92,9 @@ class HumanoidWorld:
         self._target[index] = target
         self._follows[index] = enabled
 
+    @override
     def break_part(self, part: str) -> None:
-        """See `World.break_part`: `tool_changed:<condition>`, or one of the camera's faults."""
+        """Change the tool by `tool_changed:<condition>`, or break the camera."""
         if part.startswith("tool_changed"):
             self._tool = self._body.tools[changed_tool(part, self._conditions)]
             self._state = None
@@ -100,8 +105,9 @@ class HumanoidWorld:
             tools = ", ".join(f"tool_changed:{name}" for name in self._conditions)
             raise UnknownPart(f"{error} Tools to change to: {tools}.") from None
 
+    @override
     def close(self) -> None:
-        """See `World.close`; there is nothing to let go of."""
+        """Do nothing: there is no physics engine."""
 
 
 _STILL = 1e-5

@@ -9,16 +9,18 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
+from typing_extensions import override
 
 from simulators.bullet import BulletBody
 from simulators.faults import changed_tool, check_condition
 from simulators.robots.pr2_duster.body import FASTEST, LAG, REST, URDF, Body, chain
 from simulators.robots.pr2_duster.camera import SIGNAL, DepthCamera
 from simulators.robots.pr2_duster.duster import GRASPS, Grasp
+from simulators.world import World
 
 
-class DusterWorld:
-    """See `simulators.world.World`. Signals: joint_position, tool_tip_position."""
+class DusterWorld(World):
+    """World of an arm that holds a duster. Signals: joint_position, tool_tip_position."""
 
     def __init__(self, body: Body, seed: int, condition: str | None = None) -> None:
         """Put the arm at rest, its brakes on, with a duster in its hand.
@@ -45,30 +47,33 @@ class DusterWorld:
         self._grasp = self._gripped(condition or body.condition)
         self._bullet = BulletBody(URDF, chain().joints, REST)
 
+    @override
     def step(self, duration: float) -> None:
-        """See `World.step`."""
         reach = FASTEST * duration
         move = (self._target - self._position) * -math.expm1(-duration / LAG)
         self._position += np.minimum(np.maximum(move, -reach), reach) * self._follows
         np.minimum(np.maximum(self._position, self._low, out=self._position), self._high, out=self._position)
         self.time += duration
 
+    @override
     def measure(self) -> Mapping[str, np.ndarray]:
-        """See `World.measure`; the tool tip as the camera sees it."""
+        """Return measurements; the tool tip is as the camera sees it."""
         values = self.truth()
         if self._body.encoder_noise:
             values["joint_position"] += self._body.encoder_noise * self._random.standard_normal(len(REST))
         return values | self._camera.see(values)
 
+    @override
     def truth(self) -> dict[str, np.ndarray]:
-        """See `World.truth`; joint positions are those that ideal encoders with these zeros report."""
+        """Return the truth; joint positions are those of ideal encoders with these zeros."""
         self._bullet.place(self._position)
         rotation, origin = self._bullet.frame(self._hand)
         tip = self._grasp.cloth(rotation[None], (origin + rotation @ self._body.grip)[None])[0]
         return {"joint_position": self._position - self._body.zero, SIGNAL: tip}
 
+    @override
     def drive(self, element: str, target: float, enabled: bool) -> None:
-        """See `World.drive`; the element of a servo is its joint's position."""
+        """Set the target of a servo; its element is its joint's position."""
         index = self._servos.get(element)
         if index is None:
             raise KeyError(f"No servo moves '{element}'. Known servos: {', '.join(self._servos)}.")
@@ -77,12 +82,13 @@ class DusterWorld:
         self._target[index] = target + self._body.zero[index]
         self._follows[index] = enabled
 
+    @override
     def break_part(self, part: str) -> None:
-        """See `World.break_part`: `tool_changed:<condition>`."""
+        """Change the tool: `tool_changed:<condition>`."""
         self._grasp = self._gripped(changed_tool(part, tuple(GRASPS)))
 
+    @override
     def close(self) -> None:
-        """See `World.close`."""
         self._bullet.close()
 
     def _gripped(self, condition: str) -> Grasp:
