@@ -25,7 +25,7 @@ from services.wire.session import new_boot, open_session
 from services.wire.streams import Arrival, Publisher
 from studies.speed.bodies import MASKS, body, modules
 from studies.speed.table import Row, faster, show
-from studies.stack import way_through
+from studies.stack import estimate_latency
 from studies.stack.message_sizes import examples
 from studies.stack.remote_client import BARE, VERB, measure, robot_and_client
 
@@ -159,7 +159,7 @@ def rows() -> Iterator[Row]:
     """Measure all of them."""
     yield codec()
     yield question()
-    yield way_through.row()
+    yield estimate_latency.row()
     yield tick()
 
 

@@ -118,7 +118,7 @@ THERE = (opened, heard(0.0))
         ((opened, worry(1)), "gone", 0),
     ],
 )
-def test_every_way_through_the_states(events, state, losses):
+def test_every_estimate_latency_the_states(events, state, losses):
     told = []
     watch = BusWatch(lambda state, text: told.append(state))
     for event in events:

@@ -24,7 +24,7 @@ from studies.paper.kxr.robot import (
     safe_postures,
     stiff,
 )
-from studies.paper.kxr.simulated import PAPER_WEIGHT, TOOLS, WAYS, with_weight
+from studies.paper.kxr.simulated import PAPER_WEIGHT, TOOLS, UPDATES, with_weight
 from studies.paper.kxr.trials import (
     follow,
     follow_blindly,
@@ -84,13 +84,13 @@ def test_tools_are_recognised_and_targets_reached_with_a_small_model(schema):
     body = Standing(ROBOT, "nominal", 0, "long_heavy")
     random = np.random.default_rng(3)
     samples = [body.go(one) for one in safe_postures(ROBOT, "long_heavy", 8, random)]
-    path = recognise(schema.under("short_light"), samples, (JOINTS, CENTER, TIP, PIXEL), WAYS["ekf"])
+    path = recognise(schema.under("short_light"), samples, (JOINTS, CENTER, TIP, PIXEL), UPDATES["ekf"])
     assert path.shape == (9, 2)
     assert samples_until(path, schema, "long_heavy") <= 3
     assert order(schema.biases, TOOLS) > 0.9
     control = model_config(ROBOT).control
     targets = random_targets(ROBOT, "long_heavy", 10, random)
-    course = follow(ROBOT, body, schema.under("short_light"), control, targets, WAYS["ekf"])
+    course = follow(ROBOT, body, schema.under("short_light"), control, targets, UPDATES["ekf"])
     blind = follow(ROBOT, body, schema.under("short_light"), control, targets)
     assert course.tips[3:].mean() < 0.02 < blind.tips[3:].mean()
     assert course.centers.shape == (10, 2)
@@ -98,8 +98,8 @@ def test_tools_are_recognised_and_targets_reached_with_a_small_model(schema):
 
 def test_recognised_means_near_and_for_good(schema):
     start, right = schema.biases["short_middle"], schema.biases["long_middle"]
-    way = np.array([0.0, 0.5, 0.9, 0.5, 0.9, 0.95, 1.0])[:, None]
-    path = start + way * (right - start)
+    share = np.array([0.0, 0.5, 0.9, 0.5, 0.9, 0.95, 1.0])[:, None]
+    path = start + share * (right - start)
     assert samples_until(path, schema, "long_middle") == 4
     assert samples_until(path[:4], schema, "long_middle") == float("inf")
 

@@ -10,7 +10,7 @@ from hal.config import load_robot
 from services.learning.trainer import train
 from studies.paper.musashi import anomaly as anomaly
 from studies.paper.musashi import model as model
-from studies.paper.musashi.control import OURS, WEIGHTS, ways
+from studies.paper.musashi.control import OURS, WEIGHTS, controls
 from studies.paper.musashi.motion import LENGTH, POSITION, SENT, TENSION, record, signals
 
 ROBOT = load_robot(Path(__file__).parents[2] / "robots" / "musashi_arm.yaml")
@@ -72,7 +72,7 @@ def test_what_training_found_is_read_from_the_model_it_made(monkeypatch):
 
 
 def test_paper_and_robot_file_differ_in_their_weights_alone():
-    ours, paper = ways(ROBOT)[OURS], ways(ROBOT)[WEIGHTS]
+    ours, paper = controls(ROBOT)[OURS], controls(ROBOT)[WEIGHTS]
     assert (ours.route, ours.mask) == (paper.route, paper.mask)
     assert [term.weight for term in paper.terms] == [None, 1.0, 0.01]
 

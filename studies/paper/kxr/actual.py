@@ -16,7 +16,7 @@ from services.model.model_config import model_config
 from services.show import Tell
 from studies.paper.body import JOINTS
 from studies.paper.kxr.robot import Standing, inverse, random_targets, safe_postures, stiff
-from studies.paper.kxr.simulated import AFTER, FRESH, LEADS, TOOLS, WAYS, control_of, leads, recognitions
+from studies.paper.kxr.simulated import AFTER, FRESH, LEADS, TOOLS, UPDATES, control_of, leads, recognitions
 from studies.paper.kxr.trials import Course, follow, follow_blindly, samples_until
 from studies.paper.runs import Run
 
@@ -106,6 +106,6 @@ def _controlled(run: Run, simulated: BodySchema, tuned: BodySchema) -> dict[str,
     return {
         "geometric": follow_blindly(body(), targets, inverse(robot, stiff(robot, AFTER), targets)),
         "simulated": follow(robot, body(), simulated.under(AFTER), control, targets),
-        FOLLOWING: follow(robot, body(), simulated.under(AFTER), control, targets, WAYS["ekf"]),
+        FOLLOWING: follow(robot, body(), simulated.under(AFTER), control, targets, UPDATES["ekf"]),
         "fine-tuned": follow(robot, body(), tuned.under(AFTER), control, targets),
     }

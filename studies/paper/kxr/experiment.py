@@ -127,12 +127,12 @@ def _add_control(report: Report, outcomes: Sequence[Outcome], bounds: tuple[np.n
         row(f"{tool}: tip, first step, {KNOWING}", lambda o, at=begin: 1e3 * o[KNOWING].tips[at], "mm")
         steps = lambda o, at=whole: min(steps_until(1e3 * o[KNOWING].tips[at], TIP_BAR), STEPS)
         row(f"{tool}: steps until the tip's average of 5 stays below {TIP_BAR:g} mm", steps, bar=SETTLED + 0.5)
-        for way in outcomes[0].simulated.controlled:
-            tip, center = (TIP_BAR, CENTER_BAR) if way == KNOWING else (None, None)
-            off_tip = lambda o, way=way, at=after: 1e3 * o[way].tips[at].mean()
-            row(f"{tool}: tip after {SETTLED} steps, {way}", off_tip, "mm", bar=tip)
-            off_center = lambda o, way=way, at=after: 1e3 * o[way].off_center[at].mean()
-            row(f"{tool}: center of gravity after {SETTLED} steps, {way}", off_center, "mm", bar=center)
+        for update in outcomes[0].simulated.controlled:
+            tip, center = (TIP_BAR, CENTER_BAR) if update == KNOWING else (None, None)
+            off_tip = lambda o, update=update, at=after: 1e3 * o[update].tips[at].mean()
+            row(f"{tool}: tip after {SETTLED} steps, {update}", off_tip, "mm", bar=tip)
+            off_center = lambda o, update=update, at=after: 1e3 * o[update].off_center[at].mean()
+            row(f"{tool}: center of gravity after {SETTLED} steps, {update}", off_center, "mm", bar=center)
         limit = lambda o, at=after: 1e3 * o[LIMIT].off_center[at].mean()
         row(f"{tool}: center of gravity, {LIMIT}", limit, "mm")
     share = "center of gravity inside collect.constraints, steps with a known tool"

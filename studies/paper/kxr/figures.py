@@ -67,24 +67,27 @@ def _bars(axis: Axes, values: dict[str, list[float]], title: str) -> None:
 def _maps(path: Path, first: Simulated) -> None:
     biases = {name: first.schema.biases[name] for name in TOOLS}
     with figures.picture(path, "p of every tool, and its paths during updates", columns=2, rows=2) as axes:
-        for axis, way in zip(axes, SHOWN, strict=False):
-            steps = {f"short2long-{case[0]}": first.paths[case, way] for case in CASES}
+        for axis, update in zip(axes, SHOWN, strict=False):
+            steps = {f"short2long-{case[0]}": first.paths[case, update] for case in CASES}
             figures.bias_map(axis, biases, steps)
-            axis.set_title(f"short_middle to {AFTER}, p by {way}", fontsize=10)
+            axis.set_title(f"short_middle to {AFTER}, p by {update}", fontsize=10)
         figures.bias_map(axes[2], biases, first.leads)
         axes[2].set_title("to two tools, all sensors", fontsize=10)
-        figures.bias_map(axes[3], biases, {way: first.controlled[way].biases for way in (KNOWING, GRADIENT)})
+        figures.bias_map(axes[3], biases, {update: first.controlled[update].biases for update in (KNOWING, GRADIENT)})
         axes[3].set_title(f"while controlled: {', '.join(SEQUENCE)}", fontsize=10)
 
 
 def _control(path: Path, simulated: Sequence[Simulated]) -> None:
-    ways = (BLIND, KNOWING, GRADIENT)
+    updates = (BLIND, KNOWING, GRADIENT)
     with figures.picture(path, "Targets reached while tools change, all seeds", columns=2, rows=2) as axes:
         for row, (smooth, title) in enumerate(((False, "raw"), (True, "average of 5 steps"))):
-            tips = {way: _curves([seed.controlled[way].tips for seed in simulated], smooth) for way in ways}
+            tips = {update: _curves([seed.controlled[update].tips for seed in simulated], smooth) for update in updates}
             figures.over_steps(axes[2 * row], tips, "mm", bar=12.0)
             axes[2 * row].set_title(f"tool tip, {title}", fontsize=10)
-            centers = {way: _curves([seed.controlled[way].off_center for seed in simulated], smooth) for way in ways}
+            centers = {
+                update: _curves([seed.controlled[update].off_center for seed in simulated], smooth)
+                for update in updates
+            }
             centers["perfect model"] = _curves([seed.limit.off_center for seed in simulated], smooth)
             figures.over_steps(axes[2 * row + 1], centers, "mm", bar=15.0)
             axes[2 * row + 1].set_title(f"center of gravity, {title}", fontsize=10)

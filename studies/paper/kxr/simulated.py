@@ -42,7 +42,7 @@ CASES = {
     "C: and tip": (JOINTS, CENTER, TIP, PIXEL),
 }
 BEFORE, AFTER = "short_middle", "long_middle"
-WAYS = {
+UPDATES = {
     "ekf": UpdateConfig(what="bias"),
     "gauss_newton": UpdateConfig(what="bias", bias_method="gauss_newton"),
     "gradient": UpdateConfig(what="bias", bias_method="gradient", minimum=1, window=10),
@@ -91,7 +91,7 @@ def simulate(run: Run, tell: Tell) -> Simulated:
     data = run.cached("nominal", lambda: collect_direct(robot, NOMINAL, seed).dataset)
     schema = run.cached("nominal_model", lambda: train(robot, data, seed, between(tell, 0.2, 0.7)).schema)
     tell(0.7, "recognising tools")
-    needed, paths = recognitions(run, schema, NOMINAL, WAYS)
+    needed, paths = recognitions(run, schema, NOMINAL, UPDATES)
     tell(0.85, "reaching targets while tools change")
     controlled, limit = _controls(run, schema)
     return Simulated(schema, needed, paths, leads(run, schema, NOMINAL), controlled, limit)
@@ -108,25 +108,25 @@ def leads(run: Run, schema: BodySchema, variant: str) -> dict[str, np.ndarray]:
     """Return label -> path of p to two tools with all sensors."""
     start = schema.under(BEFORE)
     return {
-        f"to {tool}, {way}": recognise(start, samples_of(run, variant, tool, 50), (JOINTS, CENTER, TIP, PIXEL), update)
+        f"to {tool}, {name}": recognise(start, samples_of(run, variant, tool, 50), (JOINTS, CENTER, TIP, PIXEL), update)
         for tool in LEADS
-        for way, update in WAYS.items()
-        if way != "gauss_newton"
+        for name, update in UPDATES.items()
+        if name != "gauss_newton"
     }
 
 
 def recognitions(
-    run: Run, schema: BodySchema, variant: str, ways: Iterable[str]
+    run: Run, schema: BodySchema, variant: str, updates: Iterable[str]
 ) -> tuple[dict[tuple[str, str], np.ndarray], dict[tuple[str, str], np.ndarray]]:
     """Return the samples until long_middle is recognised in every case, and p along the first run of each."""
-    needed: dict[tuple[str, str], list[float]] = {key: [] for key in product(CASES, ways)}
+    needed: dict[tuple[str, str], list[float]] = {key: [] for key in product(CASES, updates)}
     paths: dict[tuple[str, str], np.ndarray] = {}
     for chance in range(RUNS):
         samples = samples_of(run, variant, AFTER, chance)
-        for case, way in needed:
-            path = recognise(schema.under(BEFORE), samples, CASES[case], WAYS[way])
-            needed[case, way].append(samples_until(path, schema, AFTER))
-            paths.setdefault((case, way), path)
+        for case, update in needed:
+            path = recognise(schema.under(BEFORE), samples, CASES[case], UPDATES[update])
+            needed[case, update].append(samples_until(path, schema, AFTER))
+            paths.setdefault((case, update), path)
     return {key: np.array(values) for key, values in needed.items()}, paths
 
 
@@ -136,16 +136,16 @@ def _controls(run: Run, schema: BodySchema) -> tuple[dict[str, Course], Course]:
     targets = np.concatenate([random_targets(robot, tool, STEPS, random) for tool in SEQUENCE])
     changes = {index * STEPS: tool for index, tool in enumerate(SEQUENCE)}
     control = control_of(run)
-    ways = {
-        KNOWING: (control, WAYS["ekf"]),
-        GRADIENT: (control, WAYS["gradient"]),
+    trials = {
+        KNOWING: (control, UPDATES["ekf"]),
+        GRADIENT: (control, UPDATES["gradient"]),
         BLIND: (control, None),
-        LIGHT: (with_weight(control, PAPER_WEIGHT), WAYS["ekf"]),
+        LIGHT: (with_weight(control, PAPER_WEIGHT), UPDATES["ekf"]),
     }
     controlled = {}
-    for name, (asked, update) in ways.items():
+    for name, (config, update) in trials.items():
         body = Standing(robot, NOMINAL, run.seed, SEQUENCE[0])
-        controlled[name] = follow(robot, body, schema.under(SEQUENCE[0]), asked, targets, update, changes)
+        controlled[name] = follow(robot, body, schema.under(SEQUENCE[0]), config, targets, update, changes)
     parts = []
     for index, tool in changes.items():
         mine = targets[index : index + STEPS]

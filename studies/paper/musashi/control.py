@@ -21,7 +21,7 @@ PAPER_TERMS = (
 OURS, WEIGHTS = "robot file's weights", "paper's weights"
 
 
-def ways(robot: RobotConfig) -> dict[str, ControlConfig]:
+def controls(robot: RobotConfig) -> dict[str, ControlConfig]:
     """Return the robot file's control, and the same route with the paper's weights.
 
     Raises:
@@ -33,7 +33,7 @@ def ways(robot: RobotConfig) -> dict[str, ControlConfig]:
     return {OURS: config, WEIGHTS: config.model_copy(update={"terms": PAPER_TERMS})}
 
 
-def errors(robot: RobotConfig, schema: BodySchema, arm: int, way: ControlConfig, starts: int = STARTS) -> np.ndarray:
+def errors(robot: RobotConfig, schema: BodySchema, arm: int, config: ControlConfig, starts: int = STARTS) -> np.ndarray:
     """Return ||theta_ref - theta|| at rest [rad], shape (targets, starts); NaN where the limits stopped the arm.
 
     Each arm has its own targets and starts, the same for every schema; `starts` of them per target are tried.
@@ -46,7 +46,7 @@ def errors(robot: RobotConfig, schema: BodySchema, arm: int, way: ControlConfig,
     missed = np.full((TARGETS, starts), np.nan)
     pairs = [(t, s) for t in range(TARGETS) for s in range(starts)]
     while pairs:
-        controller = controller_of(schema, robot, way)
+        controller = controller_of(schema, robot, config)
         with ActualArm(robot, arm) as body:
             reference = body.position()
             try:

@@ -1,6 +1,6 @@
 """The Musashi experiments (paper, III-B): learning from the geometric model, then online from actual arms.
 
-Seed n stands for training n and actual arm n. Tensions of the geometric data and weights of the simulation were chosen
+Seed n stands for training n and actual arm n. Tensions of the geometric data and name of the simulation were chosen
 by results on arms 11 and 13, which are not judged here.
 """
 
@@ -44,7 +44,7 @@ def report(outcomes: Sequence[Outcome]) -> Report:
     _add_control(row)
     _add_simulation(row)
     _add_anomaly(row)
-    stopped = sum(np.isnan(o.control[way][when]).sum() for o in outcomes for way in o.control for when in o.areas)
+    stopped = sum(np.isnan(o.control[name][when]).sum() for o in outcomes for name in o.control for when in o.areas)
     result.note(f"Control: the limits stopped an arm on {stopped} of the ways to a target; those are left out.")
     return result
 
@@ -75,11 +75,15 @@ def _fit(outcome: Outcome, has_floor: bool = True) -> float:
 
 
 def _add_control(row: Adder) -> None:
-    for way in (control.OURS, control.WEIGHTS):
+    for name in (control.OURS, control.WEIGHTS):
         for when in (BEFORE, AFTER):
-            row(f"control, {way}, {when}", lambda o, way=way, when=when: np.nanmean(o.control[way][when]), "rad")
-        if way == control.OURS:
-            better = lambda o, way=way: np.nanmean(o.control[way][AFTER]) < np.nanmean(o.control[way][BEFORE])
+            row(
+                f"control, {name}, {when}",
+                lambda o, name=name, when=when: np.nanmean(o.control[name][when]),
+                "rad",
+            )
+        if name == control.OURS:
+            better = lambda o, name=name: np.nanmean(o.control[name][AFTER]) < np.nanmean(o.control[name][BEFORE])
             row("control better after (share of arms)", better, "", "1", 0.99, "higher")
 
 

@@ -110,8 +110,10 @@ def run_seed(run: Run, tell: Tell) -> Outcome:
         scores=both(anomaly.scores, story),
         threshold=getattr(schemas[AFTER].normal, "threshold", float("nan")),
         control={
-            name: {which: control.errors(robot, schema, seed, way, STARTS[name]) for which, schema in schemas.items()}
-            for name, way in control.ways(robot).items()
+            name: {
+                which: control.errors(robot, schema, seed, config, STARTS[name]) for which, schema in schemas.items()
+            }
+            for name, config in control.controls(robot).items()
         },
         courses={
             name: {which: simulation.simulate(robot, schema, motion, terms) for which, schema in schemas.items()}

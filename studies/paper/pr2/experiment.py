@@ -13,7 +13,7 @@ from studies.paper.body import JOINTS
 from studies.paper.pr2.actual import MODELS, Actual, actual
 from studies.paper.pr2.arm import TIP
 from studies.paper.pr2.figures import draw
-from studies.paper.pr2.simulated import CASES, POINTS, RECOGNISERS, WAYS, Simulated, simulate
+from studies.paper.pr2.simulated import CASES, POINTS, RECOGNISERS, UPDATES, Simulated, simulate
 from studies.paper.report import Report, adder
 from studies.paper.runs import Run, between, each_seed
 
@@ -81,16 +81,16 @@ def _add_simulated(report: Report, outcomes: Sequence[Outcome]) -> None:
             figure = lambda o, key=(case, name): o.estimated[key].mean(POINTS)
             row(f"estimate {case} after {POINTS} points, p by {name}", figure, "mm", paper, bar)
     row("control, first point", lambda o: 1e3 * o.controlled["p"].course.errors[0], "mm", "240")
-    for way in WAYS:
-        during, afterwards = PAPER_CONTROL.get(way, ("", ""))
-        same, others = (SAME_POSTURE_BAR, OTHERS_BAR) if way in CONTROL_BARS else (None, None)
-        control = lambda o, way=way: o.controlled[way].course.mean(POINTS)
-        row(f"control after {POINTS} points, update {way}", control, "mm", during, CONTROL_BARS.get(way))
-        elsewhere = lambda o, way=way: o.controlled[way].elsewhere.mean()
-        row(f"at the other posture, update {way}", elsewhere, "mm", afterwards, same)
+    for update in UPDATES:
+        during, afterwards = PAPER_CONTROL.get(update, ("", ""))
+        same, others = (SAME_POSTURE_BAR, OTHERS_BAR) if update in CONTROL_BARS else (None, None)
+        control = lambda o, update=update: o.controlled[update].course.mean(POINTS)
+        row(f"control after {POINTS} points, update {update}", control, "mm", during, CONTROL_BARS.get(update))
+        elsewhere = lambda o, update=update: o.controlled[update].elsewhere.mean()
+        row(f"at the other posture, update {update}", elsewhere, "mm", afterwards, same)
         row(
-            f"model under the other grasps, update {way}",
-            lambda o, way=way: 1e3 * o.controlled[way].others,
+            f"model under the other grasps, update {update}",
+            lambda o, update=update: 1e3 * o.controlled[update].others,
             "mm",
             "",
             others,

@@ -7,7 +7,7 @@ import numpy as np
 
 from studies.paper import figures
 from studies.paper.pr2.actual import MODELS, Actual
-from studies.paper.pr2.simulated import CASES, RECOGNISERS, WAYS, Simulated
+from studies.paper.pr2.simulated import CASES, RECOGNISERS, UPDATES, Simulated
 
 
 def draw(folder: Path, simulated: Sequence[Simulated], actual: Sequence[Actual]) -> None:
@@ -44,11 +44,14 @@ def _estimation(path: Path, simulated: Sequence[Simulated]) -> None:
 def _control(path: Path, simulated: Sequence[Simulated]) -> None:
     with figures.picture(path, "Control error of the tool tip", columns=2) as (left, right):
         while_updated = {
-            way: np.stack([1e3 * seed.controlled[way].course.errors for seed in simulated]) for way in WAYS
+            update: np.stack([1e3 * seed.controlled[update].course.errors for seed in simulated]) for update in UPDATES
         }
         figures.over_steps(left, while_updated, "mm", "data points")
         left.set_title("while the model is updated")
-        after = {way: np.stack([1e3 * seed.controlled[way].elsewhere.errors for seed in simulated]) for way in WAYS}
+        after = {
+            update: np.stack([1e3 * seed.controlled[update].elsewhere.errors for seed in simulated])
+            for update in UPDATES
+        }
         figures.over_steps(right, after, "mm", "points of the motion")
         right.set_title("afterwards, at the other posture")
 

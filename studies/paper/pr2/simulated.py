@@ -40,7 +40,7 @@ RECOGNISERS = {
     name: UpdateConfig(what="bias", bias_method=name, minimum=1) for name in ("ekf", "gauss_newton", "gradient")
 }
 KNOWN = "nothing, the grasp is known"
-WAYS: Mapping[str, UpdateConfig | None] = {
+UPDATES: Mapping[str, UpdateConfig | None] = {
     "p, then W (default)": UpdateConfig(),
     "p": UpdateConfig(what="bias"),
     "p by gradient": RECOGNISERS["gradient"],
@@ -171,7 +171,7 @@ def _controls(run: Run, schema: BodySchema, fresh: Dataset) -> dict[str, Control
     geometry, targets = Geometry(run.robot), duster_motion()
     near, elsewhere = (geometry.follow(targets, BELIEVED, angle) for angle in (ELEVATION, OTHER_ELEVATION))
     results = {}
-    for name, update in WAYS.items():
+    for name, update in UPDATES.items():
         with Arm(run.robot, NOMINAL, run.seed, HELD) as arm:
             believed = schema.under(BELIEVED if update else HELD)
             course = control_along(arm, believed, targets, near, geometry, update)

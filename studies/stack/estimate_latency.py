@@ -1,6 +1,6 @@
 """Time from a sample of the HAL to its estimate, at a client in another process.
 
-    python -m studies.stack.way_through [--seconds 20] [--rates estimation=500]
+    python -m studies.stack.estimate_latency [--seconds 20] [--rates estimation=500]
 
 HAL and estimation run at the robot file's rates, both 200 Hz, unless others are given. The client notes when the
 sample of a cycle arrives and when the first estimate from that cycle does. The difference is the time until the next
@@ -44,7 +44,7 @@ def differences(file: Path, seconds: float) -> np.ndarray:
 
         return on_message
 
-    with Supervisor(Path("runs/way_through")) as supervisor, Client(robot.robot) as client:
+    with Supervisor(Path("runs/estimate_latency")) as supervisor, Client(robot.robot) as client:
         for name, command in stack(file, False).items():
             supervisor.start(name, command)
         supervisor.wait_ready("serve", lambda: measures(client), 60)
