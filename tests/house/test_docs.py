@@ -69,3 +69,19 @@ def test_every_test_that_safety_names_exists() -> None:
         assert (ROOT / path).exists(), path
         definitions = set(re.findall(r"(?:def|class) (\w+)", (ROOT / path).read_text()))
         assert set(filter(None, names.split("::"))) <= definitions, path + names
+
+
+@pytest.mark.parametrize(
+    "page", [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))], ids=lambda path: path.name
+)
+def test_files_and_modules_that_a_page_names_exist(page: Path) -> None:
+    text = page.read_text()
+    files = re.findall(
+        r"\b(?:gemuco|hal|simulators|services|studies|examples|robots|deploy|tests)/[a-z0-9_/]+\.(?:py|yaml|dbc)\b",
+        text,
+    )
+    missing = [file for file in files if not (ROOT / file).exists()]
+    for module in re.findall(r"python -m ((?:gemuco|services|studies)[\w.]*\w)", text):
+        path = ROOT / module.replace(".", "/")
+        missing += [] if path.is_dir() or path.with_suffix(".py").exists() else [module]
+    assert not missing
