@@ -13,6 +13,7 @@ import statistics
 import struct
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -30,21 +31,25 @@ FRAMES = 20_000
 BAR = 2.0
 Handler = Callable[[bytearray, float], None]
 
-ESTIMATES = DbcSettings(
-    dbc=Path("dbc/odrive_cansimple.dbc"),
-    node_offset=32,
-    periods={"Get_Encoder_Estimates": 0.01},
-    quantities={
-        "position": {"signal": "Get_Encoder_Estimates.Pos_Estimate", "scale": 0.785},
-        "velocity": {"signal": "Get_Encoder_Estimates.Vel_Estimate", "scale": 0.785},
-    },
+ESTIMATES = DbcSettings.model_validate(
+    {
+        "dbc": "dbc/odrive_cansimple.dbc",
+        "node_offset": 32,
+        "periods": {"Get_Encoder_Estimates": 0.01},
+        "quantities": {
+            "position": {"signal": "Get_Encoder_Estimates.Pos_Estimate", "scale": 0.785},
+            "velocity": {"signal": "Get_Encoder_Estimates.Vel_Estimate", "scale": 0.785},
+        },
+    }
 )
-FORCE = DbcSettings(
-    dbc=Path("dbc/load_cell.dbc"),
-    node_offset=1,
-    periods={"Force": 0.005},
-    quantities={"force": {"signal": "Force.Force"}},
-    error={"signal": "Force.Status", "good": "GOOD"},
+FORCE = DbcSettings.model_validate(
+    {
+        "dbc": "dbc/load_cell.dbc",
+        "node_offset": 1,
+        "periods": {"Force": 0.005},
+        "quantities": {"force": {"signal": "Force.Force"}},
+        "error": {"signal": "Force.Status", "good": "GOOD"},
+    }
 )
 
 
@@ -93,7 +98,7 @@ def place(*quantities: str) -> Place:
 
 def by_cantools(name: str, message: str, signals: dict[str, float]) -> Handler:
     """Return a handler in which cantools decodes, and which stores the values and their times."""
-    decode = dbc.load(ROBOTS / "dbc" / name).message(message).decode
+    decode: Any = dbc.load(ROBOTS / "dbc" / name).message(message).decode
     values, times = np.zeros(len(signals)), np.zeros(len(signals))
 
     def handle(data: bytearray, received: float) -> None:

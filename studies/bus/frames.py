@@ -11,7 +11,6 @@ is printed for the hub. Bars: 3 us per frame, 8 to 12 us for canopen.
 
 import argparse
 import gc
-import statistics
 import tempfile
 import threading
 import time
@@ -20,6 +19,7 @@ from pathlib import Path
 
 import can
 import canopen
+import numpy as np
 import yaml
 
 from hal import registry
@@ -30,7 +30,7 @@ from hal.drivers.can_device import CanDevice
 from hal.fleet import build
 from hal.robot import Robot
 from hal.wire.bus import Bus
-from hal.wire.stamps import ArrivalClock, FrameClock
+from hal.wire.stamps import FrameClock
 from simulators.hub import HubServer
 
 ROBOTS = Path(__file__).parents[2] / "robots"
@@ -38,8 +38,8 @@ ROUNDS = 30
 """Number of cycles whose frames are handled at once; few, so that their stamps stay fresh."""
 RECORD = 1.0
 """Time [s] for which the robot runs."""
-DRIVES, CELLS = (0x181, 0x18B), (0x18B, 0x195)
-"""First identifier of the process data of drives and of cells, and the one after the last."""
+DRIVES = range(0x181, 0x18B)
+"""Identifiers of the drives' process data."""
 WAIT = 0.0003
 """Age [s] of the frames' stamps."""
 
@@ -51,11 +51,9 @@ def microseconds(job: Callable[[], object], frames: int) -> float:
     return (time.thread_time_ns() - before) / frames / 1e3
 
 
-def report(what: str, times: Sequence[float]) -> float:
-    """Print and return the median of times [us]."""
-    median = statistics.median(times)
-    print(f"{what:58}{median:7.2f} us   ({min(times):.2f} to {max(times):.2f} in {len(times)} runs)")
-    return median
+def report(what: str, times: np.ndarray) -> None:
+    """Print the median of times [us], shape (runs,)."""
+    print(f"{what:58}{np.median(times):7.2f} us   ({times.min():.2f} to {times.max():.2f} in {len(times)} runs)")
 
 
 def robot_file() -> RobotConfig:
@@ -98,10 +96,10 @@ def record(config: RobotConfig) -> tuple[list[Bus], list[Device], dict[str, list
     return buses, devices, recorded
 
 
-def ours(bus: Bus, devices: Sequence[CanDevice], cycle: Sequence[can.Message], has_stamps: bool) -> float:
+def ours(bus: Bus, devices: Sequence[CanDevice], cycle: Sequence[can.Message]) -> float:
     """Return the CPU time per frame [us] of some cycles' frames, as the receive thread handles them."""
     receiver = bus._receiver
-    receiver._frame_clock = FrameClock(SystemClock()) if has_stamps else ArrivalClock()
+    receiver._frame_clock = FrameClock(SystemClock())  # frames have the kernel's stamps
     handle, monotonic = receiver.handle, time.monotonic
     receiver.routes.open_window(monotonic())
     beats = [can.Message(arbitration_id=0x700 + device.node, data=b"\5", is_extended_id=False) for device in devices]
@@ -175,31 +173,21 @@ def main() -> None:
     runs = range(parser.parse_args().runs)
     config = robot_file()
     buses, devices, recorded = record(config)
-    here = [name for name, device in config.devices.items() if device.bus == buses[0].name]
     bus, cycle = buses[0], recorded[buses[0].name]
+    here = {name for name, device in config.devices.items() if device.bus == bus.name}
     answering = [device for device in devices if isinstance(device, CanDevice) and device.name in here]
-    drive, cell = ([frame for frame in cycle if frame.arbitration_id in range(*ids)] for ids in (DRIVES, CELLS))
+    drive = [frame for frame in cycle if frame.arbitration_id in DRIVES]
     assert {len(frame.data) for frame in drive} == {8}, "a drive sends statusword, position and torque"
     reference = canopen_raw(drive)
     gc.disable()
-    stamped, plain, drives, cells, raw = [], [], [], [], []
     before = dict(bus.counters)
-    for _ in runs:
-        stamped.append(ours(bus, answering, cycle, True))
-        plain.append(ours(bus, answering, cycle, False))
-        drives.append(ours(bus, answering, drive, True))
-        cells.append(ours(bus, answering, cell, True))
-        raw.append(reference())
+    costs = np.array([(ours(bus, answering, cycle), reference()) for _ in runs])
     gc.enable()
     for count in ("ignored", "unknown", "babbled", "broken_handlers"):
         assert bus.counters[count] == before[count], f"frames were {count}, not handled"
-    median = report("bus, protocol and SI conversion, with stamps of the kernel", stamped)
-    report("the same, drives only", drives)
-    report("the same, cells only", cells)
-    report("the same for all, with the time of arrival", plain)
-    theirs = report("canopen: notify and a callback that reads three `.raw`", raw)
-    print(f"{'canopen takes':58}{theirs / median:7.1f} times as long")
-    report("beside either: python-can's recv() from the hub", [taking_from_hub() for _ in runs])
+    report("bus, protocol and SI conversion", costs[:, 0])
+    report("canopen: notify and a callback that reads three `.raw`", costs[:, 1])
+    report("beside either: python-can's recv() from the hub", np.array([taking_from_hub() for _ in runs]))
 
 
 if __name__ == "__main__":

@@ -15,7 +15,6 @@ import multiprocessing
 import tempfile
 import threading
 import time
-from dataclasses import dataclass, field
 from multiprocessing.synchronize import Event
 from pathlib import Path
 
@@ -53,19 +52,6 @@ class WaitMeter(SystemClock):
         return is_set
 
 
-@dataclass
-class Turns:
-    """Times of every turn of the cycle [s], and numbers of incomplete, skipped and refused ones."""
-
-    wall: list[float] = field(default_factory=list)
-    waited: list[float] = field(default_factory=list)
-    cpu: list[float] = field(default_factory=list)
-    late: list[float] = field(default_factory=list)
-    incomplete: int = 0
-    skipped: int = 0
-    refused: int = 0
-
-
 def drives_and_cells() -> RobotConfig:
     """Return ten drives and ten cells of the muscle-driven arm, in front of the bench."""
     raw = yaml.safe_load(ARM.read_text())
@@ -74,6 +60,15 @@ def drives_and_cells() -> RobotConfig:
     raw["simulator"] = "simulators.robots.bench:simulator"
     raw["rates"]["hal"] = RATE
     return RobotConfig.model_validate({**raw, "folder": ARM.parent})
+
+
+def on_hub(config: RobotConfig, folder: str) -> RobotConfig:
+    """Return the robot file with all buses on the hub."""
+    buses = {
+        name: bus.model_copy(update={"interface": "hub", "channel": f"{folder}/{name}"})
+        for name, bus in config.buses.items()
+    }
+    return config.model_copy(update={"buses": buses})
 
 
 def simulate(config: RobotConfig, ready: Event, stop: Event) -> None:
@@ -90,41 +85,33 @@ def simulate(config: RobotConfig, ready: Event, stop: Event) -> None:
     rig.stop()
 
 
-def on_hub(config: RobotConfig, folder: str) -> RobotConfig:
-    """Return the robot file with all buses on the hub."""
-    buses = {
-        name: bus.model_copy(update={"interface": "hub", "channel": f"{folder}/{name}"})
-        for name, bus in config.buses.items()
-    }
-    return config.model_copy(update={"buses": buses})
+def follow(robot: Robot, clock: WaitMeter, cycles: int) -> tuple[np.ndarray, dict[str, int]]:
+    """Follow a small motion for a number of cycles, on an absolute grid as the service's loop.
 
-
-def turn(robot: Robot, clock: WaitMeter, cycles: int, turns: Turns) -> None:
-    """Follow a small motion for a number of cycles, on an absolute grid as the service's loop."""
-    middle = None
+    Returns:
+        Time of every turn without the wait [s], shape (cycles,); counts of incomplete, skipped and refused turns.
+    """
+    middle, times, counts = None, np.empty(cycles), {"incomplete": 0, "skipped": 0, "refused": 0}
     due = time.monotonic()
     for number in range(cycles):
-        behind = time.monotonic() - due
-        if behind > robot.period:
-            turns.skipped += int(behind / robot.period)
-            due += int(behind / robot.period) * robot.period
+        behind = int((time.monotonic() - due) / robot.period)
+        if behind > 0:
+            counts["skipped"] += behind
+            due += behind * robot.period
         due += robot.period
         time.sleep(max(due - time.monotonic(), 0.0))
-        turns.late.append(time.monotonic() - due)
-        clock.waited = 0.0
-        wall, cpu = time.perf_counter(), time.thread_time()
+        clock.waited, begun = 0.0, time.perf_counter()
         sample, applied = robot.cycle()
-        turns.wall.append(time.perf_counter() - wall)
-        turns.cpu.append(time.thread_time() - cpu)
-        turns.waited.append(clock.waited)
-        turns.incomplete += not sample.complete
+        times[number] = time.perf_counter() - begun - clock.waited
+        counts["incomplete"] += not sample.complete
         if applied.mode == "hold" and middle is None:
             middle = applied.values
         if middle is not None:
             try:
                 robot.command(middle + 0.001 * np.sin(0.02 * number), sample.cycle)
             except CommandRefused:  # the machine stood still for longer than a command lives
-                turns.refused += 1
+                counts["refused"] += 1
+    return times, counts
 
 
 def received(robot: Robot) -> int:
@@ -141,32 +128,21 @@ def run(robot: Robot, clock: WaitMeter, seconds: float) -> None:
     while not robot.cycle()[0].complete and time.monotonic() < until:
         time.sleep(robot.period)
     robot.enable()
-    turn(robot, clock, round(WARM_UP / robot.period), Turns())
+    follow(robot, clock, round(WARM_UP / robot.period))
     realtime.freeze()
-    turns, cycles, frames = Turns(), round(seconds / robot.period), received(robot)
+    cycles, frames = round(seconds / robot.period), received(robot)
     wall, process, thread = time.monotonic(), time.process_time(), time.thread_time()
-    turn(robot, clock, cycles, turns)
+    times, counts = follow(robot, clock, cycles)
     wall, process, thread = time.monotonic() - wall, time.process_time() - process, time.thread_time() - thread
     frames = received(robot) - frames
-    busy = np.array(turns.wall) - np.array(turns.waited)
+    p50, p99 = 1e3 * np.percentile(times, [50, 99])
+    print(f"rate           {cycles / wall:.1f} Hz of {1 / robot.period:.0f}; {scheduling}")
+    print(f"complete       {1 - counts['incomplete'] / cycles:.3%} of {cycles} cycles (bar 99.9 %); {counts}")
+    print(f"whole process  {process / wall:.1%} of a core (bar 25 %), {1e6 * process / cycles:.0f} us per cycle")
     print(
-        f"rate           {cycles / wall:.1f} Hz of {1 / robot.period:.0f}, {turns.skipped} cycles skipped; {scheduling}"
+        f"receiving      {1e6 * (process - thread) / frames:.1f} us per frame, {frames / cycles:.1f} frames per cycle"
     )
-    print(
-        f"complete       {1 - turns.incomplete / cycles:.3%} of {cycles} (bar 99.9 %); {turns.refused} commands refused"
-    )
-    print(f"whole process  {process / wall:.1%} of a core (bar 25 %), {process / cycles * 1e6:.0f} us per cycle")
-    print(
-        f"receiving      {(process - thread) / frames * 1e6:.1f} us per frame, {frames / cycles:.1f} frames per cycle"
-    )
-    for what, times in (
-        ("turn, no wait", busy),
-        ("its CPU", np.array(turns.cpu)),
-        ("with the wait", np.array(turns.wall)),
-        ("begun late by", np.array(turns.late)),
-    ):
-        p50, p99 = np.percentile(times, [50, 99]) * 1e3
-        print(f"{what:15}{p50:.2f} ms median, {p99:.2f} ms p99, {times.max() * 1e3:.1f} ms at most")
+    print(f"turn, no wait  {p50:.2f} ms median, {p99:.2f} ms p99, {1e3 * times.max():.1f} ms at most")
 
 
 def main() -> None:
@@ -180,15 +156,14 @@ def main() -> None:
         config = on_hub(load_robot(options.robot) if options.robot else drives_and_cells(), folder)
         for budget in budgets(config):
             print(f"bus {budget.bus:11}{budget}")
-        ready, stop = context.Event(), context.Event()
+        ready, stop, clock = context.Event(), context.Event(), WaitMeter()
         nodes = context.Process(target=simulate, args=(config, ready, stop))
         nodes.start()
         ready.wait()
-        clock = WaitMeter()
         try:
-            before = time.monotonic()
+            begun = time.monotonic()
             with BareLoops({"bare": (config.rates.hal, CYCLE_PRIORITY)}) as bare, open_robot(config, clock) as robot:
-                print(f"commissioning  {time.monotonic() - before:.2f} s for {len(config.devices)} nodes")
+                print(f"commissioning  {time.monotonic() - begun:.2f} s for {len(config.devices)} nodes")
                 run(robot, clock, options.seconds)
                 for name, bus in robot.health()["buses"].items():
                     print(f"bus {name:11}{bus['counters']}")

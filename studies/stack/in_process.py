@@ -36,7 +36,7 @@ class LiveDevice(DirectDevice):
     """A simulated world that advances in real time between two reads."""
 
     def __init__(self, config: RobotConfig, world: World) -> None:
-        super().__init__(config, world, SystemClock())
+        super().__init__(config, world, SystemClock())  # type: ignore[arg-type]
         self._live, self._before = world, time.monotonic()
 
     def read(self) -> Any:

@@ -8,6 +8,7 @@ No process runs: one message of each type is made with all elements of the robot
 import argparse
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -85,8 +86,8 @@ def table(robot: RobotConfig) -> Table:
     often = total = slow = cores = 0.0
     for key, (message, rate) in examples(robot).items():
         data = messages.encode(message, **stamp)
-        encoding = cost(lambda message=message: messages.encode(message, **stamp))
-        decoding = cost(lambda data=data: messages.decode_any(data))
+        encoding = cost(partial(messages.encode, message, **stamp))
+        decoding = cost(partial(messages.decode_any, data))
         lines.add_row(
             key, f"{len(data)}", f"{rate:g}", f"{len(data) * rate / 1e3:.1f}", f"{encoding:.1f}", f"{decoding:.1f}"
         )

@@ -1,14 +1,17 @@
 import json
 import os
 import signal
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from gemuco.dataset import Dataset, Episode
 from gemuco.signals import Layout, Signal
 from hal.config import load_robot
+from services.cli import app
 from services.errors import BadArguments
 from services.show import Tell
 from studies.paper import experiment, figures, runs
@@ -67,6 +70,14 @@ def test_results_are_cached_until_the_robot_file_or_a_setting_changes(tmp_path):
 def test_unknown_experiments_are_one_sentence():
     with pytest.raises(BadArguments, match=r"no experiments 'pr3'\. Known: pr2, musashi, kxr"):
         experiment("pr3")
+
+
+def test_experiments_that_are_not_installed_are_one_sentence(monkeypatch):
+    monkeypatch.setitem(sys.modules, "studies.paper", None)
+    result = CliRunner().invoke(app, ["reproduce", "kxr"])
+    assert result.exit_code == 2
+    assert "'studies.paper:experiment' cannot be loaded" in result.output
+    assert "Traceback" not in result.output
 
 
 def test_every_kind_of_figure_can_be_drawn(tmp_path):
