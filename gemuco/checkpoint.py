@@ -1,4 +1,4 @@
-"""A body schema on disk: model.safetensors for the arrays, manifest.json for everything a person may want to read."""
+"""A body schema on disk: model.safetensors for the arrays, manifest.json for everything that people read."""
 
 import hashlib
 import json
@@ -68,7 +68,7 @@ def save(schema: BodySchema, folder: str | Path) -> None:
 
 
 def signed(head: Mapping[str, Any]) -> dict[str, Any]:
-    """The manifest with the hash of all its other entries."""
+    """Return the manifest with the hash of all its other entries."""
     rest = {name: value for name, value in head.items() if name != "sha256"}
     text = json.dumps(rest, sort_keys=True)
     return {**rest, "sha256": hashlib.sha256(text.encode()).hexdigest()}
@@ -105,7 +105,7 @@ def load(folder: str | Path) -> BodySchema:
     """Read what `save` wrote.
 
     Raises:
-        CheckpointError: Nothing there, damaged, not a body schema, or of another version.
+        CheckpointError: The model is missing, damaged, not a body schema, or of another version.
     """
     folder = Path(folder)
     head = _manifest(folder)
@@ -115,7 +115,7 @@ def load(folder: str | Path) -> BodySchema:
         raise CheckpointError(f"The model in '{folder}' has no {TENSORS}; train it again.") from None
     try:
         if hashlib.sha256(data).hexdigest() != head["tensors"]["sha256"]:
-            raise CheckpointError(f"{TENSORS} in '{folder}' is not the one its manifest describes; train it again.")
+            raise CheckpointError(f"{TENSORS} in '{folder}' is not the file of its manifest; train it again.")
         return _sound(_schema(head, load_tensors(data)))
     except CheckpointError:
         raise
@@ -135,8 +135,8 @@ def _manifest(folder: Path) -> dict[str, Any]:
     except ValueError:
         raise CheckpointError(f"'{path}' is damaged: it is not JSON; train the model again.") from None
     if not isinstance(head, dict) or head.get("format") != FORMAT:
-        found = head.get("format") if isinstance(head, dict) else type(head).__name__
-        raise CheckpointError(f"'{path}' does not describe a body schema but {found!r}.")
+        kind = head.get("format") if isinstance(head, dict) else type(head).__name__
+        raise CheckpointError(f"'{path}' does not describe a body schema but {kind!r}.")
     version = head.get("version")
     if version != VERSION:
         newer = isinstance(version, int) and version > VERSION
@@ -145,7 +145,7 @@ def _manifest(folder: Path) -> dict[str, Any]:
             f"The model in '{folder}' has version {version!r}; this gemuco reads {VERSION}: {advice}."
         )
     if signed(head) != head:
-        raise CheckpointError(f"'{path}' is damaged: it is not as it was written; train the model again.")
+        raise CheckpointError(f"'{path}' is damaged: it was changed after it was written; train the model again.")
     return head
 
 
@@ -189,13 +189,13 @@ def _activation(name: Any) -> str:
 
 
 def _sound(schema: BodySchema) -> BodySchema:
-    """The schema, if its arrays fit each other.
+    """Return the schema after a check of its arrays.
 
     Raises:
-        ValueError: They do not.
+        ValueError: Arrays do not fit each other.
     """
     size, outputs, p = schema.layout.size, len(schema.out_index), len(schema.bias)
-    wanted: list[tuple[str, np.ndarray, tuple[int, ...]]] = [
+    shapes: list[tuple[str, np.ndarray, tuple[int, ...]]] = [
         *((f"scaler.{name}", getattr(schema.scaler, name), (size,)) for name in SCALES[:-1]),
         *((f"p of '{condition}'", array, (p,)) for condition, array in schema.biases.items()),
         *(
@@ -205,13 +205,13 @@ def _sound(schema: BodySchema) -> BodySchema:
         ("anchor_conditions", schema.anchor_conditions, (len(schema.anchors) if schema.biases else 0,)),
     ]
     if len(schema.anchors):
-        wanted.append(("anchors", schema.anchors, (len(schema.anchors), size)))
+        shapes.append(("anchors", schema.anchors, (len(schema.anchors), size)))
     if schema.normal is not None:
-        wanted.append(("normal.mean", schema.normal.mean, (outputs,)))
-        wanted.append(("normal.covariance", schema.normal.covariance, (outputs, outputs)))
+        shapes.append(("normal.mean", schema.normal.mean, (outputs,)))
+        shapes.append(("normal.covariance", schema.normal.covariance, (outputs, outputs)))
     for before, layer in pairwise(schema.weights.whole):
-        wanted.append(("layer", layer.matrix, (len(before.offset), len(layer.offset))))
-    for name, array, shape in wanted:
+        shapes.append(("layer", layer.matrix, (len(before.offset), len(layer.offset))))
+    for name, array, shape in shapes:
         if array.shape != shape:
             raise ValueError(f"array {name} has shape {array.shape} in place of {shape}")
     for name, index, count in (

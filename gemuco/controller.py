@@ -1,4 +1,4 @@
-"""Control (paper, II-I): the command whose predicted outcome loses least."""
+"""Control (paper, II-I): the command whose predicted outcome has the least loss."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -11,28 +11,28 @@ import numpy as np
 from gemuco.errors import NotFinite, NotObservable, SchemaError, check_kind
 from gemuco.masks import Mask, label
 from gemuco.schema import BodySchema, check_schema
-from gemuco.search.asked import Asked, check_present, merged, signals_of
 from gemuco.search.descent import DescentConfig, NewtonConfig
 from gemuco.search.losses import Hold, Match, StayNear, Term
+from gemuco.search.request import Request, merged, signals_of
 from gemuco.search.routes import Limits, bounds_of, checked_mask, checked_route
-from gemuco.search.search import Found, Search
+from gemuco.search.search import Outcome, Search
 
 SEARCH = NewtonConfig()
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """What to do, and what is expected of it; the latter is computed when it is looked at.
+    """A command and its predicted outcome; the prediction is computed when it is first read.
 
     Attributes:
         command: The commanded signal [its unit], shape (n,), inside its limits.
         loss: Sum of the terms.
         route: `mask` (usages a and b), `latent` (e) or `input` (f).
         mask: The signals that the network was given; empty for `latent`.
-        is_late: Whether time was up before the search ended; the command is the best that it had found.
+        is_late: Whether the deadline ended the search; the command is the best until then.
         predicted: Signal -> its value when the command has been followed [its unit], shape (n,).
-        residual: How far the body that the command leads to, asked of the network again, is from what was to be matched
-            (root mean square, standard deviations); NaN if no mask can tell.
+        residual: Root mean square of the targets minus the network's prediction from the command [standard deviations];
+            NaN without a mask that predicts them from the command.
     """
 
     command: np.ndarray
@@ -47,66 +47,66 @@ class Solution:
         """Signal -> its value when the command has been followed [its unit], shape (n,)."""
         values = self._outlook.schema.scaler.restore(self._outlook.x)
         parts = self._outlook.schema.layout.split(values)
-        found = {name: part for name, part in parts.items() if np.isfinite(part).all()}
-        return found | {self._outlook.command: self.command.copy()}
+        known = {name: part for name, part in parts.items() if np.isfinite(part).all()}
+        return known | {self._outlook.command: self.command.copy()}
 
     @cached_property
     def residual(self) -> float:
-        """See the class."""
+        """Error of the targets when they are predicted from the command [standard deviations]."""
         return self._outlook.residual()
 
 
 @dataclass(frozen=True, slots=True)
 class Outlook:
-    """Where a search for a command ended.
+    """Result of a search for a command.
 
     Attributes:
-        schema: Whose predictions.
+        schema: The schema that predicts.
         command: The signal that is commanded.
-        x: What is predicted, shape (size,) [standard deviations]; NaN for what the route says nothing about.
-        wishes: What was to be matched.
+        x: Prediction, shape (size,) [standard deviations]; NaN outside of the route.
+        matches: The terms that match a target.
         target: Signal -> reference [its unit], shape (n,).
     """
 
     schema: BodySchema
     command: str
     x: np.ndarray
-    wishes: Sequence[Match]
+    matches: Sequence[Match]
     target: Mapping[str, np.ndarray]
 
     def residual(self) -> float:
-        """What was to be matched, asked of the network again, from the command and as little else as possible."""
+        """Return the error of the targets when the network predicts them from the command and few other signals."""
         schema, x = self.schema, self.x
-        matches = [wish for wish in self.wishes if wish.signal in schema.x_out]
-        judged = {wish.signal for wish in matches} - {self.command}
-        there = schema.layout.whole(np.isfinite(x))
-        blind = [m for m in schema.masks if self.command in m and m <= there and not m & judged]
+        matches = [match for match in self.matches if match.signal in schema.x_out]
+        judged = {match.signal for match in matches} - {self.command}
+        known = schema.layout.whole(np.isfinite(x))
+        blind = [m for m in schema.masks if self.command in m and m <= known and not m & judged]
         if not blind or not judged:
             return float("nan")
-        again = np.zeros(schema.layout.size)
-        again[schema.out_index] = schema.infer(x, min(blind, key=len))
-        amiss = [
-            replace(wish, unit="std").difference(schema, self.target).at(again[None])[0]
-            for wish in matches
-            if wish.signal in judged
+        prediction = np.zeros(schema.layout.size)
+        prediction[schema.out_index] = schema.infer(x, min(blind, key=len))
+        errors = [
+            replace(match, unit="std").difference(schema, self.target).at(prediction[None])[0]
+            for match in matches
+            if match.signal in judged
         ]
-        return float(np.sqrt(np.mean(np.concatenate(amiss) ** 2)))
+        return float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
 
 
 class Controller:
-    """Finds commands for targets, each solve beginning where the last one ended.
+    """A solver of commands for targets; each solve begins at the end of the last one.
 
-    Route `auto` is the paper's rule. `mask`, usages (a) and (b): the command is in x_out, and a feasible mask is
-    exactly what is asked. `latent`, usage (e): the command is in x_out, and what is asked needs a loss; z descends.
-    `input`, usage (f): the command is not in x_out; the command itself descends as part of x_in.
+    Route `auto` is the paper's rule. `mask`, usages (a) and (b): the command is in x_out, and the targets are exactly
+    a feasible mask. `latent`, usage (e): the command is in x_out, and the terms need a loss; z is searched. `input`,
+    usage (f): the command is not in x_out; the command itself is searched as part of x_in.
 
-    A robot may know better and name route and mask:
+    Route and mask can also be named:
 
-    - Descent on z can end beside the data's manifold, where the predicted target fits but the predicted command does
-      not lead there (see `Solution.residual`). With route `input` the command itself descends, as if it were not in
-      x_out, under the smallest mask that holds it, and what is predicted is what it leads to.
-    - With route `input` and a mask that leaves out the command, as (theta, f) does for l, the target is given to the
-      network as if it were measured, and descent runs over the rest of the mask.
+    - A search of z can end beside the manifold of the data, where the predicted target fits but the predicted command
+      does not lead there (see `Solution.residual`). With route `input` the command itself is searched, as if it were
+      not in x_out, under the smallest mask that contains it, and the prediction is the outcome of the command.
+    - With route `input` and a mask without the command, as (theta, f) is for l, the target is given to the network as
+      if it were measured, and the rest of the mask is searched.
     """
 
     def __init__(
@@ -123,17 +123,17 @@ class Controller:
 
         Args:
             schema: The body schema.
-            terms: What is asked; to match every target if not given.
+            terms: The terms of the loss; a `Match` of every target if not given.
             command: The signal that is commanded.
             route: `auto`, `mask`, `latent` or `input`.
-            search: How to descend.
-            mask: Signals that the network is given; chosen from the route if not given.
-            limits: Signal -> bounds of what may be tried; a command that the network infers is clipped to them.
+            search: Settings of the search.
+            mask: Signals given to the network; chosen for the route if not given.
+            limits: Signal -> bounds of the search; a command that the network infers is clipped to them.
 
         Raises:
-            SchemaError: The route is not known, or terms or limits make no sense.
+            SchemaError: The route is not known, or terms or limits are contradictory.
             UnknownSignal: The command is not in the layout.
-            NotObservable: The schema can neither infer the command nor try it, or the mask is not feasible.
+            NotObservable: The command is neither input nor output of the network, or the mask is not feasible.
         """
         self.terms = None if terms is None else tuple(terms)
         self.command, self.route, self.mask = command, checked_route(route), mask
@@ -144,14 +144,14 @@ class Controller:
         self.swap(schema)
 
     def swap(self, schema: BodySchema) -> None:
-        """Go on with another schema of the same body; the warm start is kept."""
+        """Continue with another schema of the same body; the warm start is kept."""
         check_schema(schema)
         check_kind("The command", self.command, str, "the name of a signal")
         span = schema.layout.slice(self.command)
         if self.command not in (*schema.x_in, *schema.x_out):
             raise NotObservable(
-                f"'{self.command}' is commanded, but this schema neither infers nor takes it; it takes "
-                f"{', '.join(schema.x_in)} and infers {', '.join(schema.x_out)}."
+                f"'{self.command}' is commanded, but is neither input nor output of this schema. Inputs: "
+                f"{', '.join(schema.x_in)}. Outputs: {', '.join(schema.x_out)}."
             )
         if self.mask is not None:
             checked_mask(schema, self.mask)
@@ -174,14 +174,13 @@ class Controller:
         now: Mapping[str, np.ndarray] | None = None,
         within: float = math.inf,
     ) -> Solution:
-        """The command for a target.
+        """Find the command for a target.
 
         Args:
-            target: Signal -> reference [its unit], shape (n,): what `Match` reaches, `Hold` holds and `StayNear` stays
-                near; a search that shall stay near something begins there, others begin from the present and from
-                training data.
+            target: Signal -> reference [its unit], shape (n,), of `Match`, `Hold` and `StayNear`; a search with
+                `StayNear` begins there, others begin from the present and from training data.
             now: Signal -> present value [its unit], shape (n,); NaN or absent where it is not known.
-            within: Time that a second-order search may take [s]; the best found until then is the solution.
+            within: Time limit of a second-order search [s]; the best point until then is the solution.
 
         Raises:
             UnknownSignal: A name is not in the layout.
@@ -192,73 +191,73 @@ class Controller:
         schema, now = self.schema, {} if now is None else now
         check_kind("The target", target, Mapping, "a mapping of signal -> reference")
         if tuple(target) != self._names:
-            self._ask(target)
-        check_present(schema, now)
-        for wish in self._matches:
-            if not np.isfinite(wish.reference(target)).all():
-                raise NotFinite(f"The target of '{wish.signal}' is not finite; every element needs a number.")
-        self._asked.read(target, now)
+            self._take_terms(target)
+        schema.layout.join_one(now)
+        for match in self._matches:
+            if not np.isfinite(match.reference(target)).all():
+                raise NotFinite(f"The target of '{match.signal}' is not finite; every element needs a number.")
+        self._request.read(target, now)
         direct = self._direct(target)
-        near = [wish for wish in self._asked.wishes if isinstance(wish, StayNear)]
+        near = [term for term in self._request.terms if isinstance(term, StayNear)]
 
         def begin() -> np.ndarray:
-            to = [schema.normalise({wish.signal: wish.reference(schema, target, now)}) for wish in near]
+            to = [schema.normalise({term.signal: term.reference(schema, target, now)}) for term in near]
             return merged(schema, [schema.normalise_one(now), *to])
 
-        return self._solution(self._search.find(self._asked, direct, self._choose, begin, bool(near), within), target)
+        return self._solution(self._search.find(self._request, direct, self._choose, begin, bool(near), within), target)
 
-    def _ask(self, target: Mapping[str, np.ndarray]) -> None:
-        """Lay the terms out, after a look at whether they and the target are about the same signals."""
+    def _take_terms(self, target: Mapping[str, np.ndarray]) -> None:
+        """Make the request, after a check that terms and target are about the same signals."""
         schema = self.schema
         for name in target:
             schema.layout.slice(name)
         if not target and not self.terms:
-            raise NotObservable("Nothing was asked: give a target, or terms with values of their own.")
+            raise NotObservable("There is nothing to reach: give a target, or terms with values of their own.")
         terms = tuple(Match(name) for name in target) if self.terms is None else self.terms
-        minded = {name for term in terms for name in signals_of(term)}
-        minded |= {name for term in terms if (name := getattr(term, "position", "")) in target}
+        used = {name for term in terms for name in signals_of(term)}
+        used |= {name for term in terms if (name := getattr(term, "position", "")) in target}
         for name in target:
-            if name not in minded:
-                known = ", ".join(sorted(minded)) or "nothing"
-                raise NotObservable(f"A target of '{name}' was given, but no term is about it; they are about {known}.")
+            if name not in used:
+                known = ", ".join(sorted(used)) or "none"
+                raise NotObservable(f"The target '{name}' is in no term. Signals of the terms: {known}.")
         if self._names is None or self.terms is None:
-            self._asked = Asked(schema, terms)
-            self._matches = [wish for wish in self._asked.wishes if isinstance(wish, Match)]
+            self._request = Request(schema, terms)
+            self._matches = [term for term in self._request.terms if isinstance(term, Match)]
         self._names = tuple(target)
 
     def _direct(self, target: Mapping[str, np.ndarray]) -> np.ndarray:
-        """What the asker decided, shape (size,) [standard deviations]: what is held, and what is plainly matched."""
-        direct, layout, scaler = self._asked.held.copy(), self.schema.layout, self.schema.scaler
-        for wish in self._matches:
-            if wish.matrix is None and wish.signal != self.command:
-                span = layout.slices[wish.signal]
-                value = (wish.reference(target) - scaler.mean[span]) / scaler.std[span]
+        """Return held elements and plainly matched targets, shape (size,) [standard deviations]; NaN elsewhere."""
+        direct, layout, scaler = self._request.held.copy(), self.schema.layout, self.schema.scaler
+        for match in self._matches:
+            if match.matrix is None and match.signal != self.command:
+                span = layout.slices[match.signal]
+                value = (match.reference(target) - scaler.mean[span]) / scaler.std[span]
                 np.copyto(direct[span], value, where=np.isnan(direct[span]))
         return direct
 
-    def _solution(self, found: Found, target: Mapping[str, np.ndarray]) -> Solution:
-        x, span = found.x, self._span
+    def _solution(self, outcome: Outcome, target: Mapping[str, np.ndarray]) -> Solution:
+        x, span = outcome.x, self._span
         command = x[span] * self._std + self._mean
         if self.command in self.limits:
             command = np.clip(command, *self.limits[self.command])
             x[span] = (command - self._mean) / self._std
-        kept = {name: np.array(value, float) for name, value in target.items()}
-        outlook = Outlook(self.schema, self.command, x, self._matches, kept)
-        return Solution(command, found.loss, found.route, found.mask, found.is_late, outlook)
+        references = {name: np.array(value, float) for name, value in target.items()}
+        outlook = Outlook(self.schema, self.command, x, self._matches, references)
+        return Solution(command, outcome.loss, outcome.route, outcome.mask, outcome.is_late, outlook)
 
     def _choose(self, direct: Mask) -> tuple[str, Mask]:
-        """Route and mask for what is asked; `direct` are the signals whose whole value was decided by the asker."""
-        schema, wishes = self.schema, self._asked.wishes
-        asked = {wish.signals[0] for wish in wishes if isinstance(wish, Match)}
+        """Choose route and mask; `direct` are the signals that targets and holds give completely."""
+        schema, terms = self.schema, self._request.terms
+        matched = {term.signals[0] for term in terms if isinstance(term, Match)}
         infers = self.command in schema.x_out
         if self.mask is not None:
             if self.command not in self.mask and not infers:
-                raise NotObservable(f"'{self.command}' is neither in the mask nor inferred; the mask must hold it.")
+                raise NotObservable(f"'{self.command}' is neither in the mask nor inferred; the mask must contain it.")
             if self.route == "mask" and not self.mask <= direct:
                 missing = label(self.mask - direct, schema.layout.names)
                 raise NotObservable(f"Route mask needs a target of {missing}; give one, or use route input.")
             return self.route, self.mask
-        plain = all(isinstance(wish, Match) and wish.matrix is None for wish in wishes)
+        plain = all(isinstance(term, Match) and term.matrix is None for term in terms)
         if self.route == "mask" or (self.route == "auto" and infers and plain and direct in schema.masks):
             if not (infers and plain and direct in schema.masks):
                 raise NotObservable(
@@ -267,22 +266,22 @@ class Controller:
                 )
             return "mask", direct
         if self.route == "latent" or (self.route == "auto" and infers):
-            self._check_latent(wishes)
+            self._check_latent(terms)
             return "latent", frozenset()
-        trying = [m for m in schema.masks if self.command in m]
-        giving = [m for m in schema.masks if infers and asked and asked <= (m & direct) and self.command not in m]
-        if not trying and not giving:
+        holding = [m for m in schema.masks if self.command in m]
+        giving = [m for m in schema.masks if infers and matched and matched <= (m & direct) and self.command not in m]
+        if not holding and not giving:
             raise NotObservable(
-                f"No feasible mask holds '{self.command}', nor all of {', '.join(sorted(asked)) or 'what is asked'} "
+                f"No feasible mask contains '{self.command}', nor all of {', '.join(sorted(matched)) or 'the targets'} "
                 f"without it; use route latent."
             )
-        return "input", min(trying, key=lambda m: (len(m & asked), len(m))) if trying else max(giving, key=len)
+        return "input", min(holding, key=lambda m: (len(m & matched), len(m))) if holding else max(giving, key=len)
 
-    def _check_latent(self, wishes: Sequence[Term]) -> None:
+    def _check_latent(self, terms: Sequence[Term]) -> None:
         if self.command not in self.schema.x_out:
             raise NotObservable(f"Route latent decodes the command, but '{self.command}' is not in x_out; use input.")
-        for wish in wishes:
-            for name in wish.signals:
+        for term in terms:
+            for name in term.signals:
                 if name not in self.schema.x_out:
                     raise NotObservable(
                         f"Route latent predicts only x_out ({', '.join(self.schema.x_out)}), but a term is about "
@@ -306,7 +305,7 @@ def control(
         target: Signal -> reference [its unit].
         now: Signal -> present value [its unit].
         command: The signal that is commanded.
-        terms: What is asked; to match every target if not given.
+        terms: The terms of the loss; a `Match` of every target if not given.
         options: Of `Controller`: route, mask, search, limits.
     """
     return Controller(schema, terms, command, **options).solve(target, now)

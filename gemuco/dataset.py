@@ -1,4 +1,4 @@
-"""What a robot has lived through: episodes, each under one condition of the body."""
+"""Recorded data of one body: episodes, each under one condition."""
 
 import json
 import zipfile
@@ -15,9 +15,9 @@ from gemuco.writing import writing
 FORMAT = "gemuco.dataset"
 VERSION = 1
 MIN_EPISODES = 5
-"""With fewer episodes than this, a condition is split by time block instead of by episode."""
+"""A condition with fewer episodes than this is split by time block instead of by episode."""
 BLOCKS = 10
-"""Into so many blocks an episode is cut then."""
+"""An episode is then cut into this many blocks."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +25,7 @@ class Episode:
     """A stretch of time under one condition.
 
     Attributes:
-        condition: How the body is: tool, load, wear.
+        condition: State of the body: tool, load, wear.
         values: Signal -> array [its unit], shape (samples, n); NaN where nothing was measured.
     """
 
@@ -54,42 +54,42 @@ class Dataset:
                 raise DatasetError("An episode's arrays need a row per sample: shape (samples, n).")
 
     def __len__(self) -> int:
-        """Samples in all episodes."""
+        """Return the number of samples in all episodes."""
         return len(self.rows())
 
     @property
     def conditions(self) -> tuple[str, ...]:
-        """The conditions in order of first appearance."""
+        """Conditions in order of first appearance."""
         return tuple(dict.fromkeys(episode.condition for episode in self.episodes))
 
     def rows(self) -> np.ndarray:
-        """All samples [unit], shape (samples, layout.size); NaN where nothing was measured, or nothing finite."""
+        """Return all samples [unit], shape (samples, layout.size); NaN where no finite value was measured."""
         parts = [self.layout.join(episode.values) for episode in self.episodes]
         rows = np.concatenate(parts) if parts else np.zeros((0, self.layout.size))
         rows[~np.isfinite(rows)] = np.nan
         return rows
 
     def condition_of_rows(self) -> np.ndarray:
-        """Index into `conditions` of every row, shape (samples,)."""
+        """Return the index into `conditions` of every row, shape (samples,)."""
         order = {condition: index for index, condition in enumerate(self.conditions)}
         parts = [np.full(len(self.layout.join(e.values)), order[e.condition]) for e in self.episodes]
         return np.concatenate(parts) if parts else np.zeros(0, int)
 
     def split(self, held_out: float, seed: int = 0) -> tuple["Dataset", "Dataset"]:
-        """Training and held-out data: of every condition some episodes, or time blocks if it has few episodes.
+        """Split into training and held-out data, by episodes of every condition, or by time blocks if these are few.
 
-        Never by random rows: neighbours in time are nearly equal, so a random split measures memory.
+        A split by random rows would measure memory, for neighbours in time are nearly equal.
 
         Args:
             held_out: Share of the episodes or blocks to hold out, 0 to 1; at least one of every condition.
-            seed: Which ones.
+            seed: Seed of the draw.
 
         Raises:
-            NotEnoughData: A condition has less than two samples, or there is none at all.
+            NotEnoughData: A condition has less than two samples, or there is no sample.
         """
         random = np.random.default_rng(seed)
-        kept: list[Episode] = []
-        away: list[Episode] = []
+        training: list[Episode] = []
+        held: list[Episode] = []
         for condition in self.conditions:
             parts = self._parts(condition)
             if len(parts) < 2:
@@ -100,17 +100,17 @@ class Dataset:
             count = min(max(1, round(held_out * len(parts))), len(parts) - 1)
             chosen = set(random.permutation(len(parts))[:count].tolist())
             for index, part in enumerate(parts):
-                (away if index in chosen else kept).append(part)
-        if not kept:
+                (held if index in chosen else training).append(part)
+        if not training:
             raise NotEnoughData("There are no samples to train from; record some with `gemuco collect`.")
-        return Dataset(self.layout, tuple(kept)), Dataset(self.layout, tuple(away))
+        return Dataset(self.layout, tuple(training)), Dataset(self.layout, tuple(held))
 
     def _of(self, condition: str) -> np.ndarray:
-        """The rows of one condition [unit], shape (samples, layout.size)."""
+        """Return the rows of one condition [unit], shape (samples, layout.size)."""
         return self.rows()[self.condition_of_rows() == self.conditions.index(condition)]
 
     def _parts(self, condition: str) -> list[Episode]:
-        """What the split may not cut: a condition's episodes, or blocks of time where those are few."""
+        """Return the parts that a split leaves whole: a condition's episodes, or blocks of time if these are few."""
         episodes = [e for e in self.episodes if e.condition == condition and len(self.layout.join(e.values))]
         if len(episodes) >= MIN_EPISODES:
             return episodes
@@ -121,8 +121,8 @@ class Dataset:
             blocks += [Episode(condition, self.layout.split(block)) for block in np.array_split(rows, count)]
         return blocks
 
-    def of(self, layout: Layout) -> "Dataset":
-        """The same episodes with the signals of another layout, in its order.
+    def with_layout(self, layout: Layout) -> "Dataset":
+        """Return the same episodes with the signals of another layout, in its order.
 
         Raises:
             DatasetError: A signal is not in the data, or has another unit or other elements there.
@@ -132,25 +132,25 @@ class Dataset:
         for signal in layout.signals:
             if signal.name not in self.layout.names:
                 raise DatasetError(
-                    f"Signal '{signal.name}' is not in the data. They hold: {', '.join(self.layout.names)}."
+                    f"Signal '{signal.name}' is not in the data. Its signals: {', '.join(self.layout.names)}."
                 )
-            theirs = self.layout.signal(signal.name)
-            if theirs.unit != signal.unit:
+            recorded = self.layout.signal(signal.name)
+            if recorded.unit != signal.unit:
                 raise DatasetError(
-                    f"Signal '{signal.name}' is in {theirs.unit} in the data, but {signal.unit} is wanted. Convert "
-                    "the data, or write the unit they have."
+                    f"Signal '{signal.name}' is in {recorded.unit} in the data, but must be in {signal.unit}. "
+                    "Convert the data, or state the unit they have."
                 )
-            if theirs.elements != signal.elements:
+            if recorded.elements != signal.elements:
                 raise DatasetError(
-                    f"Signal '{signal.name}' has the elements {', '.join(theirs.elements)} in the data, but "
-                    f"{', '.join(signal.elements)} are wanted."
+                    f"Signal '{signal.name}' has the elements {', '.join(recorded.elements)} in the data, but must "
+                    f"have {', '.join(signal.elements)}."
                 )
         index = np.concatenate([np.arange(self.layout.size)[self.layout.slice(name)] for name in layout.names])
         parts = [Episode(e.condition, layout.split(self.layout.join(e.values)[:, index])) for e in self.episodes]
         return Dataset(layout, tuple(parts))
 
     def save(self, path: str | Path) -> None:
-        """Write one .npz file; nothing in it is pickled."""
+        """Write one .npz file without pickled objects."""
         head = {
             "format": FORMAT,
             "version": VERSION,
@@ -171,13 +171,13 @@ class Dataset:
         """Read what `save` wrote.
 
         Raises:
-            DatasetError: No such file, damaged, or not a dataset of this version.
+            DatasetError: The file is missing, damaged, or not a dataset of this version.
         """
         try:
             with np.load(path, allow_pickle=False) as archive:
                 head = json.loads(str(archive["head"]))
                 if head["format"] != FORMAT or head["version"] != VERSION:
-                    raise DatasetError(f"'{path}' is {head['format']} version {head['version']}; this reads version 1.")
+                    raise DatasetError(f"'{path}' is {head['format']} version {head['version']}; this reads {VERSION}.")
                 layout = Layout(tuple(Signal(n, size, unit, tuple(e)) for n, size, unit, e in head["signals"]))
                 episodes = tuple(
                     Episode(condition, layout.split(archive[f"episode_{i}"]))

@@ -1,4 +1,4 @@
-"""What can be wrong with values, data or a stored model."""
+"""Exceptions about values, data and stored models."""
 
 from numbers import Integral
 
@@ -28,11 +28,11 @@ class NotFinite(SchemaError):
 
 
 class NotObservable(SchemaError):
-    """What was asked for cannot be inferred from what is available."""
+    """A value or command cannot be inferred from the available signals."""
 
 
 class NotEnoughData(SchemaError):
-    """Too few samples for what was asked."""
+    """There are too few samples."""
 
 
 class DatasetError(SchemaError):
@@ -40,7 +40,7 @@ class DatasetError(SchemaError):
 
 
 class NotWritten(SchemaError):
-    """A model or data cannot be stored: the disk is full, or the place may not be written to."""
+    """A model or data cannot be stored: the disk is full, or the folder is not writable."""
 
 
 class CheckpointError(SchemaError):
@@ -74,10 +74,10 @@ def described(value: object) -> str:
 
 
 def whole_number(what: str, value: object, least: int) -> None:
-    """Refuse what is no whole number, or too small.
+    """Refuse a value that is not a whole number, or is too small.
 
     Raises:
-        SchemaError: It is; the sentence begins with `what`.
+        SchemaError: The value is refused; the sentence begins with `what`.
     """
     if not isinstance(value, Integral):
         raise SchemaError(f"{what} is {value!r}; it must be a whole number.")

@@ -1,4 +1,4 @@
-"""State estimation (paper, II-G): what is missing, by a feasible mask, by descent on z, or by descent on x_in."""
+"""State estimation (paper, II-G) of missing values: by a feasible mask, by descent on z, or by descent on x_in."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -21,17 +21,17 @@ SEARCH = NewtonConfig()
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """A signal as well as it can be known, of one sample; of several, every attribute has a row per sample.
+    """Measured and estimated values of a signal in one sample; of several samples, every attribute has a row each.
 
     Attributes:
-        value: Measured values, with estimates in place of missing elements [unit], shape (n,); NaN if impossible.
+        value: Measured values, and estimates of missing elements [unit], shape (n,); NaN if there is no estimate.
         std: Expected error (1 sigma, from held-out data) [unit], shape (n,); 0 where measured, NaN where unknown.
-        estimated: Which elements were estimated, shape (n,).
+        estimated: Whether each element was estimated, shape (n,).
         method: `measured`, `mask` (usages a and b), `latent` (e), `input` (f) or `none`.
         mask: The signals it was estimated from; empty where measured.
-        residual: How badly the model explains what it was given (root mean square, standard deviations of the
-            training data), for `latent` also when what was found is given to the network again: a z beside the data's
-            manifold fits what was measured, and yet its body does not exist. 0 where measured, NaN if impossible.
+        residual: Root mean square of the given values minus the model's [standard deviations of the training data];
+            0 where measured, NaN without estimate. For `latent` at least the same of the estimate given to the network
+            again: a z beside the manifold of the data fits the measured values, but its body does not exist.
     """
 
     value: np.ndarray
@@ -43,16 +43,16 @@ class Estimate:
 
 
 class Completion(NamedTuple):
-    """Every element of a layout as well as it can be known; see `Estimate` for what is told of each signal.
+    """A completed sample in one array; the attributes are those of `Estimate`.
 
     Attributes:
-        value: Shape (size,).
-        std: Shape (size,).
-        estimated: Shape (size,).
-        method: By signal.
-        mask: By signal.
-        label: By signal, the mask as text.
-        residual: By signal.
+        value: Of every element, shape (size,).
+        std: Of every element, shape (size,).
+        estimated: Of every element, shape (size,).
+        method: Of every signal.
+        mask: Of every signal.
+        label: Of every signal, the mask as text.
+        residual: Of every signal.
     """
 
     value: np.ndarray
@@ -66,18 +66,18 @@ class Completion(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """How a schema fills in samples that lack the same elements; all but the numbers is known beforehand.
+    """The steps that complete samples which lack the same elements; all but the values is known beforehand.
 
     Attributes:
-        ways: Method, mask, for which elements of the layout, shape (size,), and for which signals.
-        std: As of `Completion`, and so are the others.
-        estimated: Which elements are.
-        method: By signal.
-        mask: By signal.
-        label: By signal.
+        steps: Method, mask, estimated elements as truth values, shape (size,), and their signals.
+        std: See `Completion`, and so for the others.
+        estimated: See there.
+        method: See there.
+        mask: See there.
+        label: See there.
     """
 
-    ways: tuple[tuple[str, Mask, np.ndarray, tuple[str, ...]], ...]
+    steps: tuple[tuple[str, Mask, np.ndarray, tuple[str, ...]], ...]
     std: np.ndarray
     estimated: np.ndarray
     method: Mapping[str, str]
@@ -86,14 +86,14 @@ class Recipe:
 
     @classmethod
     def of(cls, schema: BodySchema, finite: np.ndarray) -> "Recipe":
-        """For samples of which these elements are there, truth values, shape (size,)."""
+        """Prepare for samples with these finite elements, truth values, shape (size,)."""
         slices, whole = schema.layout.slices, schema.layout.whole(finite)
         named: dict[tuple[str, Mask], list[str]] = {}
         for name in slices:
-            way = ("measured", frozenset()) if name in whole else _route(schema, name, whole, finite)
-            named.setdefault(way, []).append(name)
+            source = ("measured", frozenset()) if name in whole else _route(schema, name, whole, finite)
+            named.setdefault(source, []).append(name)
         std, estimated = np.zeros(len(finite)), np.zeros(len(finite), bool)
-        ways = []
+        steps = []
         for (method, mask), names in named.items():
             missing = np.zeros(len(finite), bool)
             for name in names:
@@ -101,17 +101,17 @@ class Recipe:
             std[missing] = _std(schema, method, mask)[missing]
             estimated |= missing & (method != "none")
             if method != "measured":
-                ways.append((method, mask, missing, tuple(names)))
-        of_signal = {name: way for way, names in named.items() for name in names}
+                steps.append((method, mask, missing, tuple(names)))
+        of_signal = {name: source for source, names in named.items() for name in names}
         std.setflags(write=False)
         estimated.setflags(write=False)
         masks = {name: of_signal[name][1] for name in slices}
         labels = {name: label(mask, schema.layout.names) for name, mask in masks.items()}
-        return cls(tuple(ways), std, estimated, {name: of_signal[name][0] for name in slices}, masks, labels)
+        return cls(tuple(steps), std, estimated, {name: of_signal[name][0] for name in slices}, masks, labels)
 
 
 def recipes(schema: BodySchema) -> ByPattern[Recipe]:
-    """Return how a schema completes samples, by which of their elements were measured."""
+    """Return the recipes of a schema, by the finite elements of a sample."""
     return ByPattern(partial(Recipe.of, schema))
 
 
@@ -160,25 +160,25 @@ def _batch(schema: BodySchema, samples: list[Completion]) -> dict[str, Estimate]
 
 
 def fill(schema: BodySchema, joined: np.ndarray) -> Completion:
-    """What `estimate` tells, of a sample in one array [unit of each element], shape (size,); NaN where missing.
+    """Complete a sample in one array [unit of each element], shape (size,), NaN where missing; see `estimate`.
 
-    Nobody may write into that array: as in a service, and code is compiled for one of both kinds.
+    The array must be read-only, as it is in a service: the code is compiled for that kind alone.
     """
     recipe = schema.derived(recipes)(np.isfinite(joined))
     value, residual = joined.copy(), dict.fromkeys(recipe.method, 0.0)
-    for method, mask, missing, names in recipe.ways:
+    for method, mask, missing, names in recipe.steps:
         if method == "mask":
-            amiss = infer(*schema.parts, joined, *schema.gate(mask), missing, value)
+            error = infer(*schema.parts, joined, *schema.gate(mask), missing, value)
         else:
-            told, amiss = _guess(schema, method, mask, joined)
-            np.copyto(value, told, where=missing)
+            prediction, error = _search(schema, method, mask, joined)
+            np.copyto(value, prediction, where=missing)
         for name in names:
-            residual[name] = amiss
+            residual[name] = error
     return Completion(value, recipe.std, recipe.estimated, recipe.method, recipe.mask, recipe.label, residual)
 
 
 def _route(schema: BodySchema, name: str, whole: Mask, finite: np.ndarray) -> tuple[str, Mask]:
-    """How to estimate a signal, and from which signals."""
+    """Choose the method for a signal, and the signals to estimate it from."""
     if name in schema.x_out:
         mask = next((m for m in schema.ranked(name) if m <= whole), None)
         if mask is not None:
@@ -189,8 +189,8 @@ def _route(schema: BodySchema, name: str, whole: Mask, finite: np.ndarray) -> tu
     return "none", frozenset()
 
 
-def _guess(schema: BodySchema, method: str, mask: Mask, joined: np.ndarray) -> tuple[np.ndarray, float]:
-    """Every element as the model says [unit], shape (size,), NaN where it says nothing; and the residual."""
+def _search(schema: BodySchema, method: str, mask: Mask, joined: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return every element as the search predicts it [unit], shape (size,), NaN where it does not; and the residual."""
     x = np.where(np.isfinite(joined), schema.scaler.normalise(joined), np.nan)
     full = np.full(schema.layout.size, np.nan)
     if method == "latent":
@@ -204,7 +204,7 @@ def _guess(schema: BodySchema, method: str, mask: Mask, joined: np.ndarray) -> t
 
 
 def _std(schema: BodySchema, method: str, mask: Mask) -> np.ndarray:
-    """Expected error of every element of the layout [unit], shape (size,); NaN where it is not known."""
+    """Return the expected error of every element of the layout [unit], shape (size,); NaN where it is not known."""
     std = np.full(schema.layout.size, np.nan)
     known = schema.errors.get((method, mask))
     if known is not None:
@@ -213,13 +213,13 @@ def _std(schema: BodySchema, method: str, mask: Mask) -> np.ndarray:
 
 
 def _residual(x: np.ndarray, full: np.ndarray) -> float:
-    """Root mean square of what was given minus what the model says of it; NaN if it says nothing."""
+    """Return the root mean square of the given elements minus their predictions; NaN if there are none."""
     given = np.isfinite(x) & np.isfinite(full)
     return float(np.sqrt(np.mean((full[given] - x[given]) ** 2))) if given.any() else float("nan")
 
 
 def _again(schema: BodySchema, full: np.ndarray) -> np.ndarray:
-    """What the network makes of a body it was given as found, by the first mask that can, shape (size,)."""
+    """Give an estimate to the network again, under the first mask that it covers, shape (size,)."""
     again = full.copy()
     covered = covered_by(schema.masks, schema.layout.whole(np.isfinite(full)))
     if covered:
@@ -228,7 +228,7 @@ def _again(schema: BodySchema, full: np.ndarray) -> np.ndarray:
 
 
 def latent_search(schema: BodySchema, x: np.ndarray) -> np.ndarray:
-    """Usage (e): the x_out that fits the given ones best, shape (out_size,) [standard deviations].
+    """Return the x_out of the z that fits the given ones best, usage (e), shape (out_size,) [standard deviations].
 
     Args:
         schema: The body schema.
@@ -236,12 +236,12 @@ def latent_search(schema: BodySchema, x: np.ndarray) -> np.ndarray:
     """
     data = np.full(len(x), np.nan)
     data[schema.out_index] = x[schema.out_index]
-    found = minimise(fitting(latent_lines(schema), data), schema.derived(latent_starts), SEARCH)
-    return run(schema.weights.decoder, found.point)
+    solution = minimise(fitting(latent_lines(schema), data), schema.derived(latent_starts), SEARCH)
+    return run(schema.weights.decoder, solution.point)
 
 
 def input_search(schema: BodySchema, x: np.ndarray, available: Mask) -> np.ndarray:
-    """Usage (f): missing x_in that make the network's output fit what is given, shape (size,) [standard deviations].
+    """Search the missing x_in that make the network's output fit the given signals, usage (f).
 
     Args:
         schema: The body schema.
@@ -249,27 +249,27 @@ def input_search(schema: BodySchema, x: np.ndarray, available: Mask) -> np.ndarr
         available: Signals of which every element was measured.
 
     Returns:
-        x_out as predicted and the missing x_in as found; NaN elsewhere.
+        The predicted x_out and the missing x_in, shape (size,) [standard deviations]; NaN elsewhere.
     """
     missing = set(schema.x_in) - set(schema.x_out) - available
     mask = max(covered_by(schema.masks, available | missing), key=lambda m: (len(m & missing), len(m)))
     full = np.where(np.isfinite(x), x, 0.0)
     base = schema.network_input(full, mask)
     through, _ = schema.gate(mask)
-    sought = schema.layout.indices(mask - available)
-    sought = sought[~np.isfinite(x[sought])]
-    columns = np.flatnonzero(np.isin(schema.in_index, sought) & (through > 0))
+    free = schema.layout.indices(mask - available)
+    free = free[~np.isfinite(x[free])]
+    columns = np.flatnonzero(np.isin(schema.in_index, free) & (through > 0))
     data = np.full(len(x), np.nan)
     data[schema.out_index] = x[schema.out_index]
     far = np.full(len(columns), np.inf)
     inferred = np.ones(len(schema.out_index), bool)
     anchors = schema.anchors[:STARTS]
-    starts = anchors[:, sought] if len(anchors) else np.zeros((1, len(sought)))
+    starts = anchors[:, free] if len(anchors) else np.zeros((1, len(free)))
     lines = input_lines(schema, base, columns, np.zeros(0, int), inferred, np.zeros(len(x)), -far, far)
-    found = minimise(fitting(lines, data), starts, SEARCH).point
+    solution = minimise(fitting(lines, data), starts, SEARCH).point
     result = np.full(schema.layout.size, np.nan)
-    base[columns] = found
+    base[columns] = solution
     result[schema.out_index] = run(schema.weights.whole, base)
-    hidden = sought[~np.isin(sought, schema.out_index)]
-    result[hidden] = found[np.isin(sought, hidden)]
+    hidden = free[~np.isin(free, schema.out_index)]
+    result[hidden] = solution[np.isin(free, hidden)]
     return result

@@ -2,8 +2,8 @@
 
 A chain of layers is y = W_n(... a(x W_1 + b_1) ...) + b_n, with a the activation of each layer. The latent state and
 the output are linear, so encoder, decoder and both together are all chains, and one set of functions serves them all.
-Rows are samples. Derivatives carry the names of their direction: `pull` brings a gradient from the output to the input
-(reverse mode), `push` brings a change of the input to the output (forward mode).
+Rows are samples. Derivatives are named by their direction: `pull` takes a gradient from the output to the input
+(reverse mode), `push` takes a change of the input to the output (forward mode).
 """
 
 from collections.abc import Callable
@@ -103,21 +103,21 @@ class Weights:
         return self.encoder + self.decoder
 
     def arrays(self) -> list[np.ndarray]:
-        """Every matrix and offset, in the order of the layers."""
+        """Return every matrix and offset, in the order of the layers."""
         return [array for layer in self.whole for array in (layer.matrix, layer.offset)]
 
     def replaced(self, arrays: list[np.ndarray]) -> "Weights":
-        """The same network with other numbers, given in the order of `arrays`."""
+        """Return the same network with other numbers, given in the order of `arrays`."""
         layers = tuple(Layer(arrays[2 * i], arrays[2 * i + 1], layer.activation) for i, layer in enumerate(self.whole))
         return Weights(layers[: len(self.encoder)], layers[len(self.encoder) :])
 
     def astype(self, dtype: type) -> "Weights":
-        """A copy in another precision (float64 for finite differences)."""
+        """Return a copy in another precision (float64 for finite differences)."""
         return self.replaced([array.astype(dtype) for array in self.arrays()])
 
 
 def run(chain: Chain, x: np.ndarray) -> np.ndarray:
-    """Forward pass, shape (n_in,) or (samples, n_in) -> (n_out,) or (samples, n_out)."""
+    """Run forward, shape (n_in,) or (samples, n_in) -> (n_out,) or (samples, n_out)."""
     for matrix, offset, activation in chain:
         x = x @ matrix
         x += offset
@@ -127,7 +127,7 @@ def run(chain: Chain, x: np.ndarray) -> np.ndarray:
 
 
 def trace(chain: Chain, x: np.ndarray) -> Trace:
-    """Forward pass that keeps what the other passes need."""
+    """Run forward and keep the values that the other passes need."""
     values = [x]
     for matrix, offset, activation in chain:
         x = x @ matrix
@@ -139,7 +139,7 @@ def trace(chain: Chain, x: np.ndarray) -> Trace:
 
 
 def pull(chain: Chain, values: Trace, gradient: np.ndarray) -> np.ndarray:
-    """Gradient of a scalar with respect to the output -> with respect to the input, shapes (samples, n)."""
+    """Take the gradient of a scalar from the output to the input, shapes (samples, n)."""
     for (matrix, _, activation), value in zip(reversed(chain), reversed(values), strict=False):
         if activation != LINEAR:
             gradient = gradient * ACTIVATIONS[activation].slope(value)
@@ -148,7 +148,7 @@ def pull(chain: Chain, values: Trace, gradient: np.ndarray) -> np.ndarray:
 
 
 def push(chain: Chain, values: Trace, tangent: np.ndarray) -> np.ndarray:
-    """Change of the input -> change of the output to first order, shapes (samples, n)."""
+    """Take a change of the input to the output, to first order, shapes (samples, n)."""
     for (matrix, _, activation), value in zip(chain, values[1:], strict=True):
         tangent = tangent @ matrix
         if activation != LINEAR:
@@ -182,7 +182,7 @@ class Curvature:
         self.gradient = gradient
 
     def mixed(self, tangent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What happens to u . g: (dy/dx u, shape (samples, n_out)) and (d(u . g)/dx, shape (samples, n_in))."""
+        """Return dy/dx u, shape (samples, n_out), and d(u . g)/dx, shape (samples, n_in), of a tangent u."""
         tangents: list[np.ndarray] = []
         for (matrix, _, _), slope in zip(self._chain, self._slopes, strict=True):
             tangent = tangent @ matrix

@@ -1,4 +1,4 @@
-"""Feasible masks as sets of signal names (paper, II-A.1): which signals are enough to infer the others."""
+"""Feasible masks as sets of signal names (paper, II-A.1): the signals that are enough to infer the others."""
 
 from collections.abc import Callable, Iterable, Sequence
 from itertools import combinations
@@ -11,13 +11,13 @@ Mask = frozenset[str]
 
 
 def all_masks(names: Sequence[str]) -> tuple[Mask, ...]:
-    """Every mask but the empty one, large ones first (the paper's M_all)."""
+    """Return every mask but the empty one, large ones first (the paper's M_all)."""
     sizes = range(len(names), 0, -1)
     return tuple(frozenset(combination) for size in sizes for combination in combinations(names, size))
 
 
 def mask(names: Iterable[str], known: Sequence[str]) -> Mask:
-    """A mask whose names were checked.
+    """Return a mask after a check of its names.
 
     Raises:
         UnknownSignal: A name is not among the known ones.
@@ -29,22 +29,22 @@ def mask(names: Iterable[str], known: Sequence[str]) -> Mask:
 
 
 def bits(chosen: Mask, names: Sequence[str]) -> np.ndarray:
-    """The mask as the network sees it: 1 where a signal is given, shape (len(names),), float32."""
+    """Return the network's m of a mask: 1 where a signal is given, shape (len(names),), float32."""
     return np.array([name in chosen for name in names], np.float32)
 
 
 def label(chosen: Mask, names: Sequence[str]) -> str:
-    """The mask for people: names joined by `+`, in the order of the layout."""
+    """Return the text of a mask: names joined by `+`, in the order of the layout."""
     return "+".join(name for name in names if name in chosen)
 
 
 def covered_by(masks: Iterable[Mask], available: Iterable[str]) -> tuple[Mask, ...]:
-    """The masks that need nothing but what is available."""
-    there = frozenset(available)
-    return tuple(m for m in masks if m <= there)
+    """Return the masks whose signals are all available."""
+    names = frozenset(available)
+    return tuple(m for m in masks if m <= names)
 
 
 def best(masks: Iterable[Mask], available: Iterable[str], error: Callable[[Mask], float]) -> Mask | None:
-    """The covered mask of the smallest error; None if no mask is covered."""
+    """Return the covered mask of the smallest error; None if no mask is covered."""
     covered = covered_by(masks, available)
     return min(covered, key=error) if covered else None

@@ -1,4 +1,4 @@
-"""What prediction errors are like on a healthy body: their mean, covariance and usual distance (paper, II-K)."""
+"""Statistics of the prediction errors of a healthy body: mean, covariance and threshold (paper, II-K)."""
 
 from dataclasses import dataclass, field
 from statistics import NormalDist
@@ -9,28 +9,28 @@ from gemuco.compiled import score
 from gemuco.errors import NotEnoughData
 
 SHRINK = 0.05
-"""Share of the covariance that is replaced by its diagonal, so that a few samples cannot make it singular."""
+"""This share of the covariance is replaced by its diagonal, so that a few samples cannot make it singular."""
 
 FLOOR = 0.01
-"""Smallest standard deviation of an error, as a share of the signal's own standard deviation."""
+"""The standard deviation of an error is at least this share of the signal's own standard deviation."""
 
 PATTERNS = 64
-"""Inverse covariances kept, one for every set of elements that were judged of late."""
+"""At most this many inverse covariances are kept, one for every set of elements that was judged lately."""
 
 HELD_OUT = 0.3
-"""Share of the normal data, its end, that sets the threshold and is not used for mean and covariance."""
+"""This share of the normal data, its end, sets the threshold and is not used for mean and covariance."""
 
 
 @dataclass(frozen=True, slots=True)
 class Normal:
-    """What prediction errors are like on a healthy body.
+    """Statistics of the prediction errors of a healthy body.
 
     Attributes:
         mean: Mean error [unit], shape (out_size,); NaN where errors were never seen.
         covariance: Regularised covariance [unit^2], shape (out_size, out_size).
-        threshold: Score that a healthy body exceeds with the wanted false alarm rate.
+        threshold: Score that a healthy body exceeds at the given false alarm rate.
         false_alarm: That rate, per sample.
-        usual: How many elements are judged when nothing is missing.
+        usual: Number of elements that are judged when none is missing.
     """
 
     mean: np.ndarray
@@ -48,7 +48,7 @@ class Normal:
         """Learn from errors of a healthy body, oldest first.
 
         Args:
-            errors: Prediction errors [unit], shape (samples, out_size), NaN where one was not to be had.
+            errors: Prediction errors [unit], shape (samples, out_size), NaN where one is not known.
             spread: Standard deviation of every x_out element itself [unit], shape (out_size,).
             false_alarm: Share of healthy samples that may lie above the threshold.
 
@@ -76,51 +76,54 @@ class Normal:
         return cls(mean, covariance, _tail(scores, false_alarm), false_alarm)
 
     def distance(self, error: np.ndarray) -> tuple[float, np.ndarray, int]:
-        """Distance of one error [unit], shape (out_size,), judged by the elements that are there.
+        """Return the distance of one error [unit], shape (out_size,), judged by its finite elements.
 
         Returns:
             The Mahalanobis distance, each element's contribution to its square (the drop of the square when that
-            element alone is left out: (P e)_i^2 / P_ii), and how many elements were judged.
+            element alone is left out: (P e)_i^2 / P_ii), and the number of judged elements.
         """
         index, precision = self.precision(np.isfinite(error - self.mean))
         if not len(index):
             return float("nan"), np.full(len(error), np.nan), 0
-        found, contribution = score.distance(error, self.mean, index, precision)
-        return found, contribution, len(index)
+        distance, contribution = score.distance(error, self.mean, index, precision)
+        return distance, contribution, len(index)
 
     def distances(self, errors: np.ndarray) -> np.ndarray:
-        """Distances of errors that lack the same elements, shape (samples, out_size) -> (samples,)."""
+        """Return the distances of errors that lack the same elements, shape (samples, out_size) -> (samples,)."""
         index, precision = self.precision(np.isfinite(errors[0] - self.mean))
         e = errors[:, index] - self.mean[index]
         return np.sqrt(np.einsum("ij,jk,ik->i", e, precision, e).clip(min=0.0))
 
     def threshold_of(self, judged: int | np.ndarray) -> np.ndarray:
-        """The threshold where fewer elements are judged: the square of a distance grows with their number.
+        """Return the threshold for fewer judged elements: the square of a distance grows with their number.
 
         Args:
-            judged: How many elements, one number or shape (samples,); NaN where none.
+            judged: Number of judged elements, one or of shape (samples,).
+
+        Returns:
+            The threshold; NaN where no element is judged.
         """
         share = np.asarray(judged, float) / self.usual
         return np.where(share > 0.0, self.threshold * np.sqrt(share), np.nan)
 
-    def precision(self, there: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The elements that are judged, positions, shape (n,), and the inverse of their covariance, shape (n, n).
+    def precision(self, judged: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the positions of the judged elements, shape (n,), and the inverse of their covariance, shape (n, n).
 
         Args:
-            there: Of which there is an error, and a mean one, truth values, shape (out_size,).
+            judged: Truth values, shape (out_size,); an element needs a known error and a known mean.
         """
-        found = self._precisions.get(there.tobytes())
-        if found is None:
-            index = np.flatnonzero(there)
-            found = index, np.linalg.inv(self.covariance[np.ix_(index, index)])
+        kept = self._precisions.get(judged.tobytes())
+        if kept is None:
+            index = np.flatnonzero(judged)
+            kept = index, np.linalg.inv(self.covariance[np.ix_(index, index)])
             if len(self._precisions) >= PATTERNS:
                 self._precisions.clear()
-            self._precisions[there.tobytes()] = found
-        return found
+            self._precisions[judged.tobytes()] = kept
+        return kept
 
 
 def _tail(scores: np.ndarray, false_alarm: float) -> float:
-    """The score that is exceeded with a small probability: observed where there is data, else by a log-normal tail."""
+    """Return the score exceeded with a small probability: as observed, at least as in a log-normal tail."""
     logs = np.log(np.maximum(scores, 1e-9))
     z = NormalDist().inv_cdf(1.0 - false_alarm)
     return max(float(np.quantile(scores, 1.0 - false_alarm)), float(np.exp(logs.mean() + z * logs.std())))

@@ -1,4 +1,4 @@
-"""How a gradient moves numbers: Adam, or descent with momentum."""
+"""Optimisers that move numbers by their gradient: Adam, or descent with momentum."""
 
 import numpy as np
 
@@ -8,15 +8,15 @@ OPTIMISERS = ("adam", "sgd")
 
 
 class Optimiser:
-    """Moves numbers against their gradient, in place.
+    """Descent of numbers along their gradient, in place.
 
     Args:
         kind: `adam` or `sgd` (with momentum 0.9).
         rate: Learning rate.
-        size: How many numbers it will move.
+        size: How many numbers are moved.
 
     Attributes:
-        time: Steps so far.
+        time: Number of steps.
     """
 
     def __init__(self, kind: str, rate: float, size: int) -> None:
@@ -25,7 +25,7 @@ class Optimiser:
         self.time = 0
 
     def move(self, numbers: np.ndarray, gradient: np.ndarray) -> None:
-        """One step; both of shape (size,), float32."""
+        """Take one step; both arrays have shape (size,), float32."""
         self.time += 1
         if self.kind == "sgd":
             momentum(numbers, gradient, self._slow, float(self.rate))
@@ -33,5 +33,5 @@ class Optimiser:
             adam(numbers, gradient, self._slow, self._square, float(self.rate), self.time)
 
     def state(self) -> dict[str, np.ndarray]:
-        """What the next step depends on beside `time`; to be kept, or written into."""
+        """Return the arrays that the next step depends on beside `time`; a resumed training writes into them."""
         return {"slow": self._slow, "square": self._square}

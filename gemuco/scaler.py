@@ -8,16 +8,15 @@ from gemuco.errors import NotEnoughData
 from gemuco.signals import Layout
 
 FLOOR = 0.02
-"""An element varies at least this share of the liveliest element of its signal, so that the noise of an element that
-hardly moved in the training data is not blown up to the size of a motion."""
+"""The standard deviation of an element is at least this share of the largest in its signal, so that the noise of an
+element that hardly moved in the training data is not scaled up to the size of a motion."""
 
 CLIP = 4.0
-"""Network inputs are held within this many standard deviations: outside the data a network has nothing to say."""
-
+"""Network inputs are clipped to this many standard deviations, for outside of its data a network is of no use."""
 
 CORE = (0.02, 0.98)
-"""Quantiles between which an element's usual values lie. What is further outside than these are apart (6 standard
-deviations of a normal distribution) may be learned, but has no part in the scale: one wild value must not set it."""
+"""The usual values of an element lie between these quantiles. A value further outside than these are apart (6 standard
+deviations of a normal distribution) may be learned but does not set the scale: one outlier must not set it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +28,7 @@ class Scaler:
         std: Standard deviation with a floor [unit], shape (size,).
         low: Smallest usual value in the training data [unit], shape (size,).
         high: Largest usual value in the training data [unit], shape (size,).
-        dead: Positions of the elements that never varied or were never measured, shape (n,).
+        dead: Positions of elements that never varied or were never measured, shape (n,).
     """
 
     mean: np.ndarray
@@ -42,8 +41,8 @@ class Scaler:
     def fit(cls, layout: Layout, rows: np.ndarray) -> "Scaler":
         """Learn the scale from rows [unit], shape (samples, size); NaN or infinite where nothing was measured.
 
-        A dead element gets the mean it was stuck at (0 if it was never measured) and, so that its noise is not blown
-        up, the floor of its signal; 1 unit if the whole signal is dead.
+        A dead element gets its constant value as mean (0 if it was never measured) and the floor of its signal as
+        standard deviation, so that its noise is not scaled up; 1 unit if the whole signal is dead.
 
         Raises:
             NotEnoughData: There is no row with a number in it.
@@ -60,21 +59,21 @@ class Scaler:
         std[dead] = 0.0
         for name in layout.names:
             part = std[layout.slice(name)]
-            liveliest = float(part.max())
-            np.maximum(part, FLOOR * liveliest if liveliest > 0.0 else 1.0, out=part)
+            largest = float(part.max())
+            np.maximum(part, FLOOR * largest if largest > 0.0 else 1.0, out=part)
         return cls(mean, std, low, high, dead)
 
     def normalise(self, values: np.ndarray) -> np.ndarray:
-        """Physical units -> standard deviations, shape (..., size)."""
+        """Convert physical units to standard deviations, shape (..., size)."""
         return (values - self.mean) / self.std
 
     def restore(self, values: np.ndarray) -> np.ndarray:
-        """Standard deviations -> physical units, shape (..., size)."""
+        """Convert standard deviations to physical units, shape (..., size)."""
         return values * self.std + self.mean
 
 
 def _usual(values: np.ndarray) -> np.ndarray:
-    """The values without those far outside of nearly all others; all of them if nearly all are the same."""
+    """Drop values far outside of nearly all others; keep all if nearly all are the same."""
     if len(values) < 2:
         return values
     low, high = np.quantile(values, CORE)

@@ -1,7 +1,7 @@
-"""The body schema: what a body has learned about itself, as one immutable value.
+"""The body schema: a learned model of a body, as one immutable value.
 
-Nothing here changes in place. What is learned later is another schema (`with_weights`, `with_normal`), so a loop that
-holds one can go on with it while another thread makes the next.
+Nothing changes in place. Learning later makes another schema (`with_weights`, `with_normal`), so that a loop goes on
+with the one it holds while another thread makes the next.
 """
 
 from collections.abc import Callable, Mapping
@@ -14,7 +14,7 @@ from gemuco.compiled.chain import pack
 from gemuco.compiled.inference import Parts, Predictor
 from gemuco.derived import prepare
 from gemuco.errors import NotFinite, UnknownCondition, UnknownSignal, WrongSize, check_kind
-from gemuco.layers import Chain, Weights, run
+from gemuco.layers import Weights, run
 from gemuco.masks import Mask, bits, label
 from gemuco.normal import Normal
 from gemuco.scaler import CLIP, Scaler
@@ -23,31 +23,31 @@ from gemuco.signals import Layout
 T = TypeVar("T")
 
 ErrorTable = Mapping[tuple[str, Mask], np.ndarray]
-"""(method, signals it was inferred from) -> expected error of every x_out element [unit], shape (out_size,); of every
-element of the layout, shape (size,), for the method `input`, which finds what is not in x_out."""
+"""The table has (method, given signals) -> expected error of every x_out element [unit], shape (out_size,); for the
+method `input`, which also estimates signals outside of x_out, of every element of the layout, shape (size,)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class BodySchema:
-    """Layout, masks, scaler and network weights together: everything that the verbs of other rooms need.
+    """Layout, masks, scaler and network weights of one body.
 
     Attributes:
         layout: Every signal of the body.
         x_in: Signals the network is given, in the order of the layout.
         x_out: Signals the network infers, in the order of the layout.
-        masks: The feasible masks: what is enough to infer x_out.
-        scaler: Units outside, standard deviations inside.
+        masks: The feasible masks: sets of signals that are enough to infer x_out.
+        scaler: Conversion between units and standard deviations.
         weights: The network's W.
-        errors: How well every mask did on held-out data (1 sigma).
-        anchors: Some rows of the training data [standard deviations], shape (n, layout.size): where a descent starts.
+        errors: Errors of every mask on held-out data (1 sigma).
+        anchors: Some rows of the training data [standard deviations], shape (n, layout.size); a descent starts there.
         anchor_conditions: Index into `biases` of every anchor, shape (n,); empty without parametric bias.
-        normal: What prediction errors are like on a healthy body; None if never learned.
+        normal: Statistics of the prediction errors of a healthy body; None if not known.
         bias: The parametric bias p of the present condition, shape (bias_size,).
         biases: Condition -> its p.
-        manifest: Facts that whoever made the schema wants kept with it (JSON values).
+        manifest: Further facts that are stored with the schema (JSON values).
         out_layout: The layout of x_out alone.
-        in_index: Where the elements of x_in lie in the layout, shape (in_size,).
-        out_index: Where the elements of x_out lie in the layout, shape (out_size,).
+        in_index: Positions of the elements of x_in in the layout, shape (in_size,).
+        out_index: Positions of the elements of x_out in the layout, shape (out_size,).
     """
 
     layout: Layout
@@ -68,7 +68,6 @@ class BodySchema:
     out_index: np.ndarray = field(init=False)
     _gates: dict[Mask, tuple[np.ndarray, np.ndarray]] = field(init=False)
     _ranked: dict[str, tuple[Mask, ...]] = field(init=False)
-    _chain: Chain = field(init=False)
     _derived: dict[Callable[..., Any], Any] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -80,11 +79,10 @@ class BodySchema:
         shape = (self.weights.encoder[0].matrix.shape[0], self.weights.decoder[-1].matrix.shape[1])
         if shape != (inputs, len(self.out_index)):
             raise WrongSize(
-                f"The network is {shape[0]} -> {shape[1]}; the layout asks for {inputs} -> {len(self.out_index)}."
+                f"The network is {shape[0]} -> {shape[1]}; the layout needs {inputs} -> {len(self.out_index)}."
             )
         set_field(self, "_gates", {})
         set_field(self, "_ranked", {})
-        set_field(self, "_chain", self.weights.whole)
         set_field(self, "_derived", {})
         for mask in self.masks:
             self.gate(mask)
@@ -144,23 +142,23 @@ class BodySchema:
         return self.derived(_parts)
 
     def gate(self, mask: Mask) -> tuple[np.ndarray, np.ndarray]:
-        """What lets a mask's signals through: (0 or 1 per x_in element, the input's tail of m and p), float32."""
-        found = self._gates.get(mask)
-        if found is None:
+        """Return the gate of a mask: 0 or 1 per x_in element, and the input's tail of m and p, float32."""
+        gate = self._gates.get(mask)
+        if gate is None:
             for name in sorted(mask - set(self.x_in)):
                 raise UnknownSignal(f"Signal '{name}' is not an input of the network. Inputs: {', '.join(self.x_in)}.")
             m = bits(mask, self.x_in)
             sizes = [self.layout.signal(name).size for name in self.x_in]
-            found = np.repeat(m, sizes).astype(np.float32), np.concatenate([m, self.bias]).astype(np.float32)
-            self._gates[mask] = found
-        return found
+            gate = np.repeat(m, sizes).astype(np.float32), np.concatenate([m, self.bias]).astype(np.float32)
+            self._gates[mask] = gate
+        return gate
 
     def ranked(self, name: str) -> tuple[Mask, ...]:
-        """The feasible masks, the one that infers a signal of x_out best first."""
-        found = self._ranked.get(name)
-        if found is None:
-            found = self._ranked[name] = tuple(sorted(self.masks, key=lambda m: self.mask_error(m, name)))
-        return found
+        """Return the feasible masks, the one that infers a signal of x_out best first."""
+        ranked = self._ranked.get(name)
+        if ranked is None:
+            ranked = self._ranked[name] = tuple(sorted(self.masks, key=lambda m: self.mask_error(m, name)))
+        return ranked
 
     def mask_error(self, mask: Mask, name: str) -> float:
         """Return the mean squared held-out error of a signal under a mask [standard deviations]; 1 if unknown."""
@@ -171,11 +169,11 @@ class BodySchema:
         return float(np.mean(scaled[self.out_layout.slice(name)] ** 2))
 
     def network_input(self, normalised: np.ndarray, mask: Mask, bias: np.ndarray | None = None) -> np.ndarray:
-        """x_in masked and clipped, with m and p behind it.
+        """Return x_in masked and clipped, followed by m and p.
 
         Args:
-            normalised: Every signal [standard deviations], shape (size,) or (samples, size); NaN where masked is fine.
-            mask: Which signals to let through.
+            normalised: Every signal [standard deviations], shape (size,) or (samples, size); may be NaN where masked.
+            mask: The given signals.
             bias: p of every sample, shape (samples, bias_size), or one for all; the present one if not given.
         """
         through, tail = self.gate(mask)
@@ -188,15 +186,15 @@ class BodySchema:
         return x
 
     def infer(self, normalised: np.ndarray, mask: Mask) -> np.ndarray:
-        """Usage (a) and (b): every x_out from the signals of a mask [standard deviations], shape (..., out_size)."""
-        return run(self._chain, self.network_input(normalised, mask))
+        """Infer x_out from the signals of a mask, usages (a) and (b) [standard deviations], shape (..., out_size)."""
+        return run(self.weights.whole, self.network_input(normalised, mask))
 
     def normalise(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Named arrays [unit] -> one vector [standard deviations]; NaN where a value is absent or infinite."""
+        """Join named arrays [unit] into a vector [standard deviations]; NaN where a value is absent or infinite."""
         return self._normalised(self.layout.join(values))
 
     def normalise_one(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
-        """`normalise` of one sample, shape (size,); several are refused."""
+        """Join one sample, shape (size,), and refuse several; see `normalise`."""
         return self._normalised(self.layout.join_one(values))
 
     def _normalised(self, joined: np.ndarray) -> np.ndarray:
@@ -204,7 +202,7 @@ class BodySchema:
         return self.scaler.normalise(joined)
 
     def error_rows(self) -> list[tuple[str, str, str, float]]:
-        """For a table: (mask, signal, unit, root mean square error over its elements) on held-out data."""
+        """Return rows of a table: mask, signal, unit, root mean square error over its elements on held-out data."""
         rows: list[tuple[str, str, str, float]] = []
         for mask in self.masks:
             known = self.errors.get(("mask", mask))
@@ -216,15 +214,15 @@ class BodySchema:
         return rows
 
     def with_weights(self, weights: Weights, errors: ErrorTable | None = None) -> "BodySchema":
-        """The same body with another W, and with the errors it was found to make if they are known."""
+        """Return the same body with another W, and with its errors if they are known."""
         return replace(self, weights=weights, errors=self.errors if errors is None else errors)
 
     def with_bias(self, bias: np.ndarray) -> "BodySchema":
-        """The same network under another p, shape (bias_size,).
+        """Return the same network under another p, shape (bias_size,).
 
         Raises:
             WrongSize: p does not have this schema's size.
-            NotFinite: p holds something that is not a number.
+            NotFinite: An element of p is not a finite number.
         """
         p = np.array(bias, np.float32)
         if p.shape != self.bias.shape:
@@ -234,7 +232,7 @@ class BodySchema:
         return replace(self, bias=p)
 
     def under(self, condition: str) -> "BodySchema":
-        """The same network under the p that a condition had in training.
+        """Return the same network under the p that a condition had in training.
 
         Raises:
             UnknownCondition: No condition has this name.
@@ -245,11 +243,11 @@ class BodySchema:
         return self.with_bias(self.biases[condition])
 
     def with_normal(self, normal: Normal | None) -> "BodySchema":
-        """The same body with other statistics of the normal."""
+        """Return the same body with other statistics of prediction errors."""
         return replace(self, normal=normal)
 
     def with_manifest(self, **facts: Any) -> "BodySchema":
-        """The same body with more facts kept beside it."""
+        """Return the same body with more facts in its manifest."""
         return replace(self, manifest={**self.manifest, **facts})
 
 

@@ -1,4 +1,4 @@
-"""Named vectors and the one long vector they are parts of."""
+"""Named vectors and the one long vector that they are parts of."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -15,7 +15,7 @@ class Signal:
 
     Attributes:
         name: Such as `joint_position`.
-        size: How many elements.
+        size: Number of elements.
         unit: SI unit of every element.
         elements: Names of the elements; numbered if not given.
     """
@@ -49,13 +49,13 @@ def check_samples(samples: object) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Several signals in a fixed order: where each lies in the vector of all of them.
+    """Several signals in a fixed order, and their places in the vector of all elements.
 
     Attributes:
-        signals: In their order.
-        names: Of the signals.
-        size: Elements of all signals together.
-        slices: Signal -> where it lies in the vector.
+        signals: The signals in their order.
+        names: Their names.
+        size: Number of elements of all signals together.
+        slices: Signal -> its place in the vector.
     """
 
     signals: tuple[Signal, ...]
@@ -81,7 +81,7 @@ class Layout:
         object.__setattr__(self, "_starts", np.array([span.start for span in slices.values()], int))
 
     def slice(self, name: str) -> slice:
-        """Where a signal lies in the vector.
+        """Return the place of a signal in the vector.
 
         Raises:
             UnknownSignal: No signal has this name.
@@ -93,25 +93,25 @@ class Layout:
             raise UnknownSignal(f"Signal '{name}' is not in the schema. Known signals: {known}.") from None
 
     def signal(self, name: str) -> Signal:
-        """The signal of a name."""
+        """Return the signal of a name."""
         self.slice(name)
         return self.signals[self.names.index(name)]
 
     def subset(self, names: Iterable[str]) -> "Layout":
-        """The layout of some of the signals, in the order of this one."""
-        wanted = set(names)
-        for name in wanted:
+        """Return the layout of some of the signals, in the order of this one."""
+        chosen = set(names)
+        for name in chosen:
             self.slice(name)
-        return Layout(tuple(signal for signal in self.signals if signal.name in wanted))
+        return Layout(tuple(signal for signal in self.signals if signal.name in chosen))
 
     def indices(self, names: Iterable[str]) -> np.ndarray:
-        """Positions of the elements of some signals in the vector, in the order of the layout, shape (n,)."""
+        """Return the positions of the elements of some signals, in the order of the layout, shape (n,)."""
         subset = self.subset(names)
         parts = [np.arange(self.slices[name].start, self.slices[name].stop) for name in subset.names]
         return np.concatenate(parts) if parts else np.zeros(0, int)
 
     def element(self, index: int) -> str:
-        """`signal.element` at a position of the vector."""
+        """Return the name `signal.element` of a position in the vector."""
         for signal in self.signals:
             span = self.slices[signal.name]
             if span.start <= index < span.stop:
@@ -119,7 +119,7 @@ class Layout:
         raise UnknownSignal(f"Element {index} is outside of the layout of {self.size} elements.")
 
     def join(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Named arrays -> one vector.
+        """Join named arrays into one vector.
 
         Args:
             values: Signal -> array [its unit], shape (n,) or (samples, n). Absent signals become NaN.
@@ -128,8 +128,9 @@ class Layout:
             Shape (size,) or (samples, size), float64.
 
         Raises:
-            UnknownSignal: A name is not of this layout.
-            WrongSize: An array does not have its signal's size, or another number of samples than the rest.
+            UnknownSignal: A name is not in this layout.
+            WrongSize: An array does not have its signal's size, or has another number of samples than the others.
+            WrongKind: The values are not a mapping.
         """
         try:
             return self._join_sample(values)
@@ -159,7 +160,7 @@ class Layout:
             try:
                 array = np.asarray(value, float)
             except (TypeError, ValueError):
-                raise WrongSize(f"Signal '{name}' needs {size} numbers; what was given are none.") from None
+                raise WrongSize(f"Signal '{name}' needs {size} numbers, not {described(value)}.") from None
             if array.ndim not in (1, 2) or array.shape[-1] != size:
                 raise WrongSize(f"Signal '{name}' has {size} elements, but the array has shape {array.shape}.")
             if leading is not None and array.shape[:-1] != leading:
@@ -182,20 +183,20 @@ class Layout:
         joined = self.join(values)
         if joined.ndim != 1:
             raise WrongSize(
-                f"One sample at a time is taken, an array of shape (n,) per signal; here are {len(joined)}. Give them "
-                "one after the other."
+                f"One sample at a time is taken, an array of shape (n,) per signal; there are {len(joined)} samples. "
+                "Give them one after the other."
             )
         return joined
 
     def split(self, vector: np.ndarray) -> dict[str, np.ndarray]:
-        """One vector, shape (..., size) -> signal -> array, shape (..., n). The arrays are views."""
+        """Split a vector, shape (..., size), into signal -> array, shape (..., n). The arrays are views."""
         if vector.shape[-1] != self.size:
             raise WrongSize(f"The layout has {self.size} elements, but the array has shape {vector.shape}.")
         return {name: vector[..., span] for name, span in self.slices.items()}
 
     def whole(self, finite: np.ndarray) -> frozenset[str]:
-        """Signals of which every element is there; `finite` is a truth value per element, shape (size,)."""
+        """Return the signals that are complete; `finite` has a truth value per element, shape (size,)."""
         if not self.signals:
             return frozenset()
-        there = np.logical_and.reduceat(finite, self._starts).tolist()
-        return frozenset(name for name, is_there in zip(self.slices, there, strict=True) if is_there)
+        complete = np.logical_and.reduceat(finite, self._starts).tolist()
+        return frozenset(name for name, is_complete in zip(self.slices, complete, strict=True) if is_complete)

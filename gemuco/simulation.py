@@ -9,9 +9,9 @@ import numpy as np
 from gemuco.errors import NotFinite, NotObservable, SchemaError, check_kind
 from gemuco.masks import Mask, best, label
 from gemuco.schema import BodySchema, check_schema
-from gemuco.search.asked import Asked, check_present, signals_of
 from gemuco.search.descent import DescentConfig, NewtonConfig
 from gemuco.search.losses import Hold, Match, Term
+from gemuco.search.request import Request, signals_of
 from gemuco.search.routes import Limits, bounds_of, checked_mask, checked_route
 from gemuco.search.search import Search
 
@@ -20,15 +20,15 @@ SEARCH = NewtonConfig()
 
 @dataclass(frozen=True, slots=True)
 class Simulated:
-    """The body after a command.
+    """State of the body after a command.
 
     Attributes:
-        values: Signal -> value [its unit], shape (n,); of the command what was reached, which may not be what was sent.
+        values: Signal -> value [its unit], shape (n,); of the command the value reached.
         loss: Sum of the terms.
-        residual: How far the network, asked again, contradicts the state (root mean square over x_out, standard
-            deviations): a state beside the data's manifold, or a command that is not reached; NaN if no mask can tell.
+        residual: Root mean square over x_out of the state minus the network's prediction from it [standard deviations],
+            large for a state beside the manifold of the data and a command that is not reached; NaN without a mask.
         route: `mask` (usages a and b), `latent` (e) or `input` (f).
-        mask: The signals that the network was given; empty for `latent`.
+        mask: The signals given to the network; empty for `latent`.
     """
 
     values: dict[str, np.ndarray]
@@ -39,13 +39,13 @@ class Simulated:
 
 
 class Simulator:
-    """Steps from state to state, each search beginning where the last one ended.
+    """A simulation from state to state; each search begins at the end of the last one.
 
-    Route `auto` is the paper's rule, that of estimation. `mask`: without terms, and a feasible mask within what is
-    commanded and held; `latent`: z descends over terms about x_out; `input`: some x_in descend.
+    Route `auto` is the paper's rule, that of estimation. `mask`: there are no terms, and commanded and held signals
+    cover a feasible mask; `latent`: z is searched for terms about x_out; `input`: some x_in are searched.
 
-    With route `input` a mask may be named. What is commanded is given to the network if it is in the mask, and else
-    inferred and matched, as l is under (theta, f): every state then is one that the network takes for consistent.
+    With route `input` a mask can be named. The command is given to the network if it is in the mask, and else inferred
+    and matched, as l is under (theta, f): every state is then consistent for the network.
     """
 
     def __init__(
@@ -62,15 +62,15 @@ class Simulator:
 
         Args:
             schema: The body schema.
-            terms: Constraints. To match the command is added when none of them is about it.
+            terms: Constraints; a `Match` of the command is added if they lack one.
             command: The signal that is commanded.
             route: `auto`, `mask`, `latent` or `input`.
-            search: How to descend.
-            mask: Signals that the network is given; chosen if not given.
-            limits: Signal -> bounds of what may be tried.
+            search: Settings of the search.
+            mask: Signals given to the network; chosen if not given.
+            limits: Signal -> bounds of the search.
 
         Raises:
-            SchemaError: The route is not known, or terms or limits make no sense.
+            SchemaError: The route is not known, or terms or limits are contradictory.
             UnknownSignal: A name is not in the layout.
             NotObservable: The schema does not know the command, or the mask is not feasible.
         """
@@ -85,13 +85,13 @@ class Simulator:
             if route in ("latent", "auto"):
                 raise SchemaError(f"A mask goes with route mask or input, not with '{route}'.")
         if command not in (*schema.x_in, *schema.x_out):
-            raise NotObservable(f"'{command}' is commanded, but this schema neither infers nor takes it.")
+            raise NotObservable(f"'{command}' is commanded, but is neither input nor output of this schema.")
         bounds_of(schema, self.limits)
         self.terms: tuple[Term | Hold, ...] = ()
         self.constrain(terms)
 
     def constrain(self, terms: Sequence[Term | Hold]) -> None:
-        """Go on under other constraints.
+        """Continue under other constraints.
 
         Raises:
             UnknownSignal: A term is about a signal that is not in the layout.
@@ -101,7 +101,7 @@ class Simulator:
                 self.schema.layout.slice(name)
         is_matched = any(isinstance(term, Match | Hold) and term.signal == self.command for term in terms)
         self.terms = tuple(terms) if is_matched else (Match(self.command), *terms)
-        self._asked = Asked(self.schema, self.terms)
+        self._request = Request(self.schema, self.terms)
         self._search.drop()
 
     def restart(self) -> None:
@@ -114,16 +114,16 @@ class Simulator:
         given: Mapping[str, np.ndarray] | None = None,
         now: Mapping[str, np.ndarray] | None = None,
     ) -> Simulated:
-        """The state that a command brings about.
+        """Return the state that a command brings about.
 
         Args:
-            command: What is sent [unit of the commanded signal], shape (n,).
-            given: Signal -> reference of other terms [its unit], such as the posture that `Hold` forces.
+            command: The command [unit of the commanded signal], shape (n,).
+            given: Signal -> reference of other terms [its unit], such as the posture of a `Hold`.
             now: Signal -> value [its unit] of the state to begin from, at the first step.
 
         Raises:
             WrongSize: An array does not have its signal's size.
-            NotFinite: The command holds something that is not a number.
+            NotFinite: An element of the command is not a number.
             NotObservable: A term or the route cannot work with this schema.
         """
         schema = self.schema
@@ -132,13 +132,15 @@ class Simulator:
         if not np.isfinite(sent[schema.layout.slice(self.command)]).all():
             raise NotFinite(f"The command of '{self.command}' is not finite; every element needs a number.")
         self._check(target)
-        check_present(schema, now or {})
-        self._asked.read(target, now or {})
-        fixed = np.where(np.isfinite(sent), sent, self._asked.held)
-        found = self._search.find(self._asked, fixed, self._choose, lambda: schema.normalise_one(now or {}))
-        values = schema.layout.split(schema.scaler.restore(found.x))
+        now = {} if now is None else now
+        schema.layout.join_one(now)
+        self._request.read(target, now)
+        fixed = np.where(np.isfinite(sent), sent, self._request.held)
+        outcome = self._search.find(self._request, fixed, self._choose, lambda: schema.normalise_one(now))
+        values = schema.layout.split(schema.scaler.restore(outcome.x))
         state = {name: part.copy() for name, part in values.items() if np.isfinite(part).all()}
-        return Simulated(state, found.loss, self._residual(found.x, sent, found.mask), found.route, found.mask)
+        residual = self._residual(outcome.x, sent, outcome.mask)
+        return Simulated(state, outcome.loss, residual, outcome.route, outcome.mask)
 
     def run(
         self,
@@ -146,26 +148,26 @@ class Simulator:
         given: Mapping[str, np.ndarray] | None = None,
         now: Mapping[str, np.ndarray] | None = None,
     ) -> Iterator[Simulated]:
-        """The states that commands bring about one after the other; see `step`."""
+        """Yield the states that commands bring about one after the other; see `step`."""
         for command in commands:
             yield self.step(command, given, now)
 
     def _check(self, target: Mapping[str, np.ndarray]) -> None:
         for name in target:
             self.schema.layout.slice(name)
-            if name not in self._asked.needed:
-                known = ", ".join(self._asked.needed)
-                raise NotObservable(f"'{name}' was given, but no term is about it; they are about {known}.")
+            if name not in self._request.needed:
+                known = ", ".join(self._request.needed)
+                raise NotObservable(f"The reference '{name}' is in no term. Signals of the terms: {known}.")
 
     def _choose(self, fixed: Mask) -> tuple[str, Mask]:
-        """Route and mask; `fixed` are the signals that are commanded or held whole."""
-        schema, wishes = self.schema, self._asked.wishes
+        """Choose route and mask; `fixed` are the signals that are commanded or held completely."""
+        schema, terms = self.schema, self._request.terms
         if self.mask is not None:
             if self.route == "mask" and not self.mask <= fixed:
                 missing = label(self.mask - fixed, schema.layout.names)
                 raise NotObservable(f"Route mask needs {missing} commanded or held; use route input.")
             return self.route, self.mask
-        free = [wish for wish in wishes if not (isinstance(wish, Match) and wish.signal == self.command)]
+        free = [term for term in terms if not (isinstance(term, Match) and term.signal == self.command)]
         covering = best(schema.masks, fixed, lambda m: -len(m))
         if self.route == "mask" or (self.route == "auto" and not free):
             if covering is not None:
@@ -173,7 +175,7 @@ class Simulator:
             if self.route == "mask":
                 known = label(fixed, schema.layout.names)
                 raise NotObservable(f"Route mask needs a feasible mask within {known}; use route latent or input.")
-        about = {name for wish in wishes for name in wish.signals}
+        about = {name for term in terms for name in term.signals}
         if self.route == "latent" or (self.route == "auto" and about <= set(schema.x_out)):
             for name in sorted(about - set(schema.x_out)):
                 raise NotObservable(f"Route latent predicts only x_out, but a term is about '{name}'; use route input.")
@@ -184,20 +186,20 @@ class Simulator:
         return "input", max(inferring, key=lambda m: (self.command not in m, len(m)))
 
     def _residual(self, x: np.ndarray, sent: np.ndarray, mask: Mask) -> float:
-        """The network asked again with what was sent, under the mask in use or the least one that holds the command."""
+        """Return the error of the state when the network predicts it from the sent command and a mask."""
         schema = self.schema
         if not mask:
-            there = schema.layout.whole(np.isfinite(x))
+            known = schema.layout.whole(np.isfinite(x))
             mask = min(
-                (m for m in schema.masks if m <= there),
+                (m for m in schema.masks if m <= known),
                 key=lambda m: (self.command not in m, len(m)),
                 default=frozenset(),
             )
             if not mask:
                 return float("nan")
         state = np.where(np.isfinite(sent), sent, x)
-        again = schema.infer(np.where(np.isfinite(state), state, 0.0), mask)
-        return float(np.sqrt(np.mean((again - state[schema.out_index]) ** 2)))
+        prediction = schema.infer(np.where(np.isfinite(state), state, 0.0), mask)
+        return float(np.sqrt(np.mean((prediction - state[schema.out_index]) ** 2)))
 
 
 def simulate(
@@ -214,7 +216,7 @@ def simulate(
 
     Args:
         schema: The body schema.
-        commands: What is sent [unit of the commanded signal], each of shape (n,).
+        commands: The commands [unit of the commanded signal], each of shape (n,).
         command: The signal that is commanded.
         terms: Constraints.
         given: Signal -> reference of terms that take one [its unit].

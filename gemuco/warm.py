@@ -1,9 +1,9 @@
-"""Makes all compiled code ready, so that the first tick of a loop does not wait for a compiler.
+"""Compilation of all code ahead of the first tick of a loop.
 
     python -m gemuco.warm
 
-The first time on a machine this takes a minute; what was compiled is kept (`gemuco.compiled.jit`), and later it is
-loaded within a second or two. It is done by using a small body in every way that a service does.
+The first time on a machine this takes a minute; the code is kept (`gemuco.compiled.jit`) and later loaded within a
+second or two. A small body is used in every way that a service does.
 """
 
 import time
@@ -36,7 +36,7 @@ STEPS = {"running": 9, "learning": 2}
 
 
 def body(outputs: tuple[str, ...] = OUTPUTS) -> BodySchema:
-    """A body that knows nothing, with every kind of signal."""
+    """Return an untrained body with every kind of signal."""
     random = np.random.default_rng(0)
     layout = Layout(tuple(Signal(name, size, unit) for name, (size, unit) in SIGNALS.items()))
     sizes = (layout.size + len(SIGNALS) + 2, 4, 3, 4, layout.subset(outputs).size)
@@ -64,7 +64,7 @@ def body(outputs: tuple[str, ...] = OUTPUTS) -> BodySchema:
 
 
 def running(schema: BodySchema) -> Iterator[str]:
-    """Use the body in every way that a service does; before each step what it is for."""
+    """Use the body in every way that a service does; yield the name of each step before it."""
     whole = {name: np.zeros(size) for name, (size, _) in SIGNALS.items()}
     yield "samples"
     received = np.frombuffer(bytes(8), "<f8"), np.frombuffer(bytes(1), bool), np.frombuffer(bytes(8), "<f8")
@@ -92,7 +92,7 @@ def running(schema: BodySchema) -> Iterator[str]:
 
 
 def learning(schema: BodySchema) -> Iterator[str]:
-    """Use it as training and the paper's experiments do."""
+    """Use the body as training and the paper's experiments do; yield the name of each step before it."""
     from gemuco.structure.mask_errors import MaskErrors
     from gemuco.structure.mask_judge import Judge, Thresholds
 
@@ -107,27 +107,27 @@ def learning(schema: BodySchema) -> Iterator[str]:
     Judge(schema.layout.names, (errors,), Thresholds()).measure(np.eye(len(SIGNALS), dtype=bool))
 
 
-def warm(tell: Callable[[float, str], None] | None = None, is_service: bool = False) -> float:
-    """Make everything ready.
+def warm(report: Callable[[float, str], None] | None = None, is_service: bool = False) -> float:
+    """Compile everything.
 
     Args:
-        tell: Told the share that is done, 0 to 1, and what comes next.
-        is_service: Leave out what a service never does, and let the compiler go: both only take memory there.
+        report: Called with the share done, 0 to 1, and the name of the next step.
+        is_service: Whether to leave out code that a service never uses and to unload the compiler, to save memory.
 
     Returns:
-        How long it took [s].
+        Duration [s].
     """
     begun, schema = time.monotonic(), body()
-    for index, what in enumerate(chain(running(schema), () if is_service else learning(schema))):
-        if tell is not None:
-            tell(index / (STEPS["running"] if is_service else sum(STEPS.values())), what)
+    for index, step in enumerate(chain(running(schema), () if is_service else learning(schema))):
+        if report is not None:
+            report(index / (STEPS["running"] if is_service else sum(STEPS.values())), step)
     if is_service:
         let_compiler_go()
     return time.monotonic() - begun
 
 
 def main() -> None:
-    """Compile with a bar, once."""
+    """Compile everything and show a progress bar."""
     from rich.progress import BarColumn, Progress, TextColumn
 
     with Progress(TextColumn("compiling"), BarColumn(), TextColumn("{task.description}"), transient=True) as bar:

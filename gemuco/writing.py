@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all, and a sentence when they cannot be."""
+"""One sentence for files that cannot be written."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,11 +11,11 @@ from gemuco.errors import NotWritten
 
 @contextmanager
 def writing(what: str, path: Path) -> Iterator[None]:
-    """Make what the file system refuses inside one sentence.
+    """Turn an error of the file system inside into one sentence.
 
     Args:
         what: Begins the sentence, such as `The model`.
-        path: Where it was to be.
+        path: The file or folder.
 
     Raises:
         NotWritten: The disk is full, the place is read-only, a folder is a file, ...
@@ -25,6 +25,5 @@ def writing(what: str, path: Path) -> Iterator[None]:
     except (OSError, SafetensorError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise NotWritten(
-            f"{what} cannot be written to '{path}': {reason}. Make room or get leave to write there, or name another "
-            "place."
+            f"{what} cannot be written to '{path}': {reason}. Make room, get permission, or name another place."
         ) from None

@@ -11,24 +11,24 @@ METHODS = ("ekf", "gauss_newton", "gradient")
 
 @dataclass(frozen=True, slots=True)
 class UpdateConfig:
-    """What to update, and how.
+    """Settings of the online update.
 
     Attributes:
         what: `weights`, `bias`, `both` at once by gradient, or `bias_then_weights`: W moves only while p is settled.
             Without parametric bias this is the same as `weights`.
         bias_method: `ekf`, `gauss_newton` (both from the first sample), or `gradient`, the paper's.
-        window: Samples kept; the oldest are dropped.
+        window: Maximum number of samples kept; the oldest are dropped.
         minimum: Samples needed before the first gradient step.
-        batch: Samples per gradient step, drawn from window, constraints and replay; each under every mask it allows.
+        batch: Samples per gradient step, drawn from window, constraints and replay; each under every mask it covers.
         steps: Gradient steps per `Updater.step`.
         rate: Learning rate of W.
         bias_rate: Learning rate of p, for `gradient` and `both`.
         optimiser: `adam` or `sgd` (with momentum 0.9), for W and p.
-        replay: As how many samples of the window the training data counts, each under the p of its own condition. A
-            young window then cannot pull W far from what was known, and a full one outweighs what is known to be old.
-        held_out: Every so many-th sample is never learned from and judges W, which goes back when it does worse there;
-            0 learns from all and never goes back.
-        seed: For the draws.
+        replay: Weight of the training data, in window samples, each under the p of its own condition. So a young window
+            cannot pull W far from the training data, and a full one outweighs them.
+        held_out: k: every k-th sample only judges W, which goes back to the best one when its error there grows; 0: all
+            samples are learned from, and W never goes back.
+        seed: Seed of the draws.
     """
 
     what: str = "bias_then_weights"

@@ -1,4 +1,4 @@
-"""What a sample says about p: the errors of everything that was predicted without being told, and how p moves them."""
+"""Information of a sample about p: errors of predictions, and their derivatives by p."""
 
 from dataclasses import dataclass
 
@@ -10,24 +10,24 @@ from gemuco.masks import Mask
 from gemuco.schema import BodySchema
 
 SHRINK = 0.05
-"""Share of the covariance that is replaced by its diagonal."""
+"""This share of the covariance is replaced by its diagonal."""
 FLOOR = 0.01
-"""Smallest standard deviation of an error [standard deviations of the signal]."""
+"""The standard deviation of an error is at least this [standard deviations of the signal]."""
 MOST = 96
-"""Errors judged at once; with more masks than fill this, those of the fewest signals come first."""
+"""At most this many errors are judged at once, those of masks with few signals first."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pairs:
-    """Which errors a sample allows: for each, a mask and an element of x_out that the mask does not contain.
+    """The errors of a sample: each has a mask and an element of x_out that the mask does not contain.
 
     Attributes:
-        masks: The masks that are whole.
-        index: Position of every error in the (masks, out_size) table, flattened, shape (n,).
-        whiten: Turns errors into independent ones of variance 1, shape (n, n).
+        masks: The masks that the sample covers.
+        index: Position of every error in the flattened table (masks, out_size), shape (n,).
+        whiten: Matrix that makes errors independent with variance 1, shape (n, n).
         log_volume: Logarithm of the determinant of the errors' covariance.
-        through: What each mask lets through, shape (masks, in_size).
-        tails: m of each mask, and room for p, shape (masks, x_in signals + bias_size).
+        through: Gate of each mask, shape (masks, in_size).
+        tails: m of each mask, and space for p, shape (masks, x_in signals + bias_size).
     """
 
     masks: tuple[Mask, ...]
@@ -41,10 +41,10 @@ class Pairs:
 class Innovations:
     """Errors and their derivatives by p, with the covariance that errors had in training.
 
-    All feasible masks that are whole for a sample contribute. Their errors are of the same measurements and of the same
-    network, so they are far from independent: the covariance of all of them together is measured on the anchors, under
-    the p of each anchor's own condition, and enlarged to the errors of held-out data. A signal that is part of the mask
-    is left out, for the network then copies it, whatever p is.
+    All feasible masks that a sample covers contribute. Their errors come from the same measurements and the same
+    network, so they are far from independent: their joint covariance is measured on the anchors, under the p of each
+    anchor's own condition, and enlarged to the errors of held-out data. Signals of the mask are left out, for the
+    network copies them whatever p is.
     """
 
     def __init__(self, schema: BodySchema) -> None:
@@ -58,23 +58,23 @@ class Innovations:
         self._anchor_errors: dict[Mask, np.ndarray] = {}
 
     def pairs(self, finite: np.ndarray) -> Pairs:
-        """What a sample allows whose measured elements are given as truth values, shape (size,)."""
+        """Return the pairs of a sample by its measured elements, truth values, shape (size,)."""
         key = finite.tobytes()
-        found = self._pairs.get(key)
-        if found is None:
-            found = self._pairs[key] = self._allowed(finite)
-        return found
+        pairs = self._pairs.get(key)
+        if pairs is None:
+            pairs = self._pairs[key] = self._allowed(finite)
+        return pairs
 
     def _allowed(self, finite: np.ndarray) -> Pairs:
         schema = self._schema
         whole = schema.layout.whole(finite)
         masks = sorted((m for m in schema.masks if m <= whole), key=lambda m: (len(m), sorted(m)))
-        there = finite[schema.out_index]
-        table = np.array([there & self._blind(m) for m in masks]).reshape(len(masks), len(there))
+        measured = finite[schema.out_index]
+        table = np.array([measured & self._blind(m) for m in masks]).reshape(len(masks), len(measured))
         if not table.any():
-            table = np.repeat(there[None], len(masks), axis=0)
+            table = np.repeat(measured[None], len(masks), axis=0)
         index = np.flatnonzero(table)[:MOST]
-        used = len(there) and (index[-1] // len(there) + 1 if len(index) else 0)
+        used = len(measured) and (index[-1] // len(measured) + 1 if len(index) else 0)
         chosen = tuple(masks[:used])
         covariance = self._covariance(chosen)[np.ix_(index, index)] if len(index) else np.zeros((0, 0))
         lower = np.linalg.cholesky(covariance)
@@ -89,7 +89,7 @@ class Innovations:
         return ~np.repeat(inside, sizes)
 
     def _covariance(self, masks: tuple[Mask, ...]) -> np.ndarray:
-        """Covariance of the errors of all elements under all masks, shape (masks * out_size, masks * out_size)."""
+        """Return the covariance of the errors of all elements under all masks, shape (n, n), n = masks * out_size."""
         schema = self._schema
         scale = schema.scaler.std[schema.out_index]
         held = np.concatenate([schema.errors.get(("mask", m), scale) / scale for m in masks])
@@ -109,18 +109,18 @@ class Innovations:
         if known is None:
             schema = self._schema
             inputs = schema.network_input(self._anchors, mask, self._biases)
-            found = run(schema.weights.whole, inputs).astype(float)
-            known = self._anchor_errors[mask] = self._anchors[:, schema.out_index] - found
+            prediction = run(schema.weights.whole, inputs).astype(float)
+            known = self._anchor_errors[mask] = self._anchors[:, schema.out_index] - prediction
         return known
 
     def of(
         self, schema: BodySchema, pairs: Pairs, rows: np.ndarray, biases: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Whitened errors and their derivatives: error(p + dp) = error - derivative dp.
+        """Return whitened errors and their derivatives: error(p + dp) = error - derivative dp.
 
         Args:
-            schema: Whose W predicts.
-            pairs: Which errors; every row must allow them.
+            schema: The schema whose W predicts.
+            pairs: The errors; every row must have them.
             rows: Samples [standard deviations], shape (rows, size).
             biases: p of every row, shape (rows, bias_size).
 
@@ -133,7 +133,7 @@ class Innovations:
 
 
 def own_bias(schema: BodySchema, count: int) -> np.ndarray:
-    """The p of the condition that every anchor was recorded under, shape (count, bias_size), or the present p."""
+    """Return the p of every anchor's own condition, shape (count, bias_size), or the present p."""
     if len(schema.anchor_conditions) == count and schema.biases and count:
         return np.stack(list(schema.biases.values()))[schema.anchor_conditions]
     return np.repeat(schema.bias[None], count, axis=0)

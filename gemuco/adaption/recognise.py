@@ -1,12 +1,12 @@
 """Recognition of p from samples (paper, usage (d), done with second-order information instead of gradient steps).
 
-`Kalman` is a bank of extended Kalman filters that differ in when they believe the body last changed (Bayesian change
-point detection): at every sample a new one begins from the spread of the trained p, and each is weighed by how well it
-foretold what came since. A tool that was put down is recognised as soon as the evidence of the newcomers outweighs the
-old belief, at once where one sample says enough, after many where each says little; without a change nothing is
-forgotten. The errors are taken as t-distributed, so one odd sample moves nothing.
+`Kalman` is a bank of extended Kalman filters, each with another time of the last change of the body (Bayesian change
+point detection): at every sample a new one begins from the spread of the trained p, and each is weighted by how well it
+predicted the samples since. A tool that was put down is recognised as soon as the evidence of new filters outweighs the
+old ones, at once if one sample is decisive, else after several; without a change nothing is forgotten. The errors are
+taken as t-distributed, so that a single outlier has little effect.
 
-`GaussNewton` minimises the errors over the newest samples of a window from the same prior. It has no memory but that.
+`GaussNewton` minimises the errors over the newest samples of a window from the same prior, without further memory.
 """
 
 from collections.abc import Callable
@@ -20,46 +20,47 @@ from gemuco.compiled import bank, beliefs
 from gemuco.schema import BodySchema
 
 HAZARD = 0.01
-"""How often the body changes, per sample."""
+"""The body changes with this probability per sample."""
 BANK = 8
-"""Filters kept."""
+"""At most this many filters without a known condition are kept."""
 DRIFT = 0.01
-"""Share of the prior's standard deviation by which p may wander per sample."""
+"""p drifts by this share of the prior's standard deviation per sample."""
 TRUST = 0.5
-"""How likely the p in use when recognition begins is right."""
+"""The p in use when recognition begins is right with this probability."""
 FREEDOM = 8.0
-"""Degrees of freedom of the errors' t-distribution."""
+"""The errors' t-distribution has this many degrees of freedom."""
 NARROW = 0.05
-"""Standard deviation of p within a known condition, as a share of the prior's."""
+"""The standard deviation of p within a known condition is this share of the prior's."""
 FAMILIAR = 0.9
-"""How often the body that comes is one of the known conditions."""
+"""After a change the body is in a known condition with this probability."""
 FAINTEST = -60.0
-"""Logarithm of the smallest weight against the largest, so that no condition becomes impossible."""
+"""The logarithm of a weight relative to the largest is at least this, so that no condition becomes impossible."""
 PASSES = 2
-"""How often a sample is linearised at most; for known conditions once, a straight line is enough over `NARROW`."""
+"""A sample is linearised at most this often, for known conditions once: p is nearly linear over `NARROW`."""
 NEAR = 0.02
-"""Beliefs this near to each other [share of the prior's standard deviation] are linearised at one p, and one that the
+"""Beliefs closer than this [share of the prior's standard deviation] are linearised at one p, and a belief that a
 sample moves less than this is not linearised again."""
 SCALE_MEMORY = 50
-"""Samples over which it is learned that errors are larger here than in training; at first fewer, to be there soon."""
+"""The scale of errors relative to training is a mean over this many samples."""
 SCALE_FIRST = 5
+"""The first mean of that scale is over this many samples, so that it adapts quickly."""
 SETTLED = 0.3
 """p is settled when its standard deviation is below this share of the prior's in every direction."""
 RECENT = 20
-"""Samples that Gauss-Newton looks at."""
+"""Gauss-Newton uses this many samples."""
 FEW = 3
-"""Newest samples by which Gauss-Newton chooses among the trained p where to begin."""
+"""Gauss-Newton chooses its start among the trained p by this many of the newest samples."""
 FADE = 0.9
-"""Weight of a sample against the one after it, for Gauss-Newton."""
+"""Gauss-Newton weights a sample by this relative to the next one."""
 
 
 @dataclass(frozen=True, slots=True)
 class Prior:
-    """What p can be: the spread of the trained ones.
+    """Prior distribution of p: the spread of the trained ones.
 
     Attributes:
-        mean: Shape (bias_size,).
-        covariance: Shape (bias_size, bias_size).
+        mean: Mean, shape (bias_size,).
+        covariance: Covariance, shape (bias_size, bias_size).
         known: The trained p, shape (conditions, bias_size).
     """
 
@@ -69,17 +70,17 @@ class Prior:
 
     @classmethod
     def of(cls, schema: BodySchema) -> "Prior":
-        """From the p of the trained conditions; from the present one alone if there are none."""
+        """Make the prior of the trained conditions; of the present p alone if there are none."""
         known = np.stack([p.astype(float) for p in schema.biases.values()] or [schema.bias.astype(float)])
-        away = known - known.mean(axis=0)
-        covariance = away.T @ away / max(1, len(known) - 1)
+        deviation = known - known.mean(axis=0)
+        covariance = deviation.T @ deviation / max(1, len(known) - 1)
         floor = 0.01 * (np.trace(covariance) / max(1, len(covariance))) + 1e-4
         return cls(known.mean(axis=0), covariance + floor * np.eye(len(covariance)), known)
 
-    def between(self, one: np.ndarray, other: np.ndarray) -> float:
-        """Distance of two p, in standard deviations of the trained ones."""
-        away = np.asarray(one, float) - other
-        return float(np.sqrt(away @ np.linalg.solve(self.covariance, away)))
+    def between(self, p: np.ndarray, other: np.ndarray) -> float:
+        """Return the distance of two p, in standard deviations of the trained ones."""
+        difference = np.asarray(p, float) - other
+        return float(np.sqrt(difference @ np.linalg.solve(self.covariance, difference)))
 
     def is_settled(self, covariance: np.ndarray) -> bool:
         """Whether a p of this covariance, shape (bias_size, bias_size), is well known in every direction."""
@@ -88,12 +89,12 @@ class Prior:
 
 @dataclass(frozen=True, slots=True)
 class Recognition:
-    """What is believed about p.
+    """Estimate of p.
 
     Attributes:
         bias: p, shape (bias_size,).
-        covariance: Its uncertainty, shape (bias_size, bias_size).
-        since: Samples since which this is believed to be the body.
+        covariance: Its covariance, shape (bias_size, bias_size).
+        since: Number of samples since the last change of the body.
         is_settled: Whether p is well known.
     """
 
@@ -104,7 +105,7 @@ class Recognition:
 
 
 class Recogniser(Protocol):
-    """Finds p from samples, one at a time."""
+    """An estimator of p from samples, one at a time."""
 
     def see(self, schema: BodySchema, row: np.ndarray) -> Recognition:
         """Take one sample [standard deviations], shape (size,), predicted by the W of a schema."""
@@ -112,10 +113,10 @@ class Recogniser(Protocol):
 
 
 class Kalman:
-    """A bank of beliefs about p, weighed by how well each foretells what comes.
+    """A bank of beliefs about p, weighted by their predictions of new samples.
 
-    First the trained conditions, whose p stays; then filters that know no condition, one per moment at which the body
-    may have become a new one.
+    First come the trained conditions, whose p is constant; then filters of an unknown condition, one per sample at
+    which the body may have changed.
     """
 
     def __init__(self, schema: BodySchema) -> None:
@@ -124,9 +125,9 @@ class Kalman:
         self._known = known = len(schema.biases)
         mean = self.prior.known[:known]
         share = np.full(known, (1.0 - TRUST) / max(1, known))
-        away = [self.prior.between(schema.bias, p) for p in mean]
-        if known and min(away) < NARROW:
-            share[int(np.argmin(away))] += TRUST
+        distances = [self.prior.between(schema.bias, p) for p in mean]
+        if known and min(distances) < NARROW:
+            share[int(np.argmin(distances))] += TRUST
         else:
             mean = np.concatenate([mean, schema.bias.astype(float)[None]])
             share = np.append(share, TRUST)
@@ -143,7 +144,7 @@ class Kalman:
         self._seen = 0
 
     def see(self, schema: BodySchema, row: np.ndarray) -> Recognition:
-        """Weigh all beliefs by a sample, and move those that are not of a known condition."""
+        """Weight all beliefs by a sample, and move those of no known condition."""
         pairs = self._innovations.pairs(np.isfinite(row))
         if len(pairs.index):
             prior, shape = self.prior, (pairs.through, pairs.tails, pairs.index, pairs.whiten)
@@ -158,7 +159,7 @@ class Kalman:
 
 
 class GaussNewton:
-    """The p that explains the newest samples best."""
+    """An estimator by the p that explains the newest samples best."""
 
     def __init__(self, schema: BodySchema) -> None:
         self.prior = Prior.of(schema)
@@ -167,7 +168,7 @@ class GaussNewton:
         self._bias = schema.bias.astype(float)
 
     def see(self, schema: BodySchema, row: np.ndarray) -> Recognition:
-        """Take a sample and find p anew."""
+        """Take a sample and solve for p."""
         self._rows = [row, *self._rows[: RECENT - 1]]
         self._bias, covariance = solve(schema, self._innovations, self.prior, np.stack(self._rows), self._bias, FADE)
         return Recognition(self._bias.copy(), covariance, len(self._rows), self.prior.is_settled(covariance))
@@ -182,16 +183,16 @@ def solve(
     fade: float = 1.0,
     iterations: int = 6,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Gauss-Newton with damping: the p of the least squares of whitened errors and of the distance from the prior.
+    """Solve for the p of least squares of whitened errors and of the distance from the prior, by damped Gauss-Newton.
 
     Args:
-        schema: Whose W predicts.
+        schema: The schema whose W predicts.
         innovations: The errors and their covariance.
-        prior: What p can be.
+        prior: The prior of p.
         rows: Samples [standard deviations], newest first, shape (n, size).
-        start: First p, shape (bias_size,); the trained ones are tried as well.
-        fade: Weight of a sample against the one after it.
-        iterations: At most so many steps.
+        start: First p, shape (bias_size,); the trained ones are tried too.
+        fade: Weight of a sample relative to the next one.
+        iterations: Maximum number of steps.
 
     Returns:
         p and its covariance.
@@ -202,11 +203,11 @@ def solve(
     precision = np.linalg.inv(prior.covariance)
 
     def fit(bias: np.ndarray, newest: int) -> tuple[float, np.ndarray, np.ndarray]:
-        """Cost, gradient and curvature over the newest samples."""
-        away = bias - prior.mean
-        cost, gradient, curvature = float(away @ precision @ away), precision @ away, precision.copy()
-        for pairs, everything in groups:
-            index = everything[everything < newest]
+        """Return cost, gradient and curvature over the newest samples."""
+        distance = bias - prior.mean
+        cost, gradient, curvature = float(distance @ precision @ distance), precision @ distance, precision.copy()
+        for pairs, members in groups:
+            index = members[members < newest]
             if len(pairs.index) and len(index):
                 biases = np.repeat(bias[None], len(index), axis=0).astype(np.float32)
                 error, slope = innovations.of(schema, pairs, rows[index], biases)

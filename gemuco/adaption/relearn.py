@@ -1,4 +1,4 @@
-"""Gradient steps on W, on p, or on both (paper, usages (c) and (d)), with replay, and a way back from harm."""
+"""Gradient steps on W, on p, or on both (paper, usages (c) and (d)), with replay and rollback."""
 
 import numpy as np
 
@@ -12,22 +12,22 @@ from gemuco.optimiser import Optimiser
 from gemuco.schema import BodySchema
 
 JUDGED = 60
-"""Held-out samples that W is judged by, the newest."""
+"""W is judged by at most this many of the newest held-out samples."""
 JUDGE_EVERY = 5
-"""Calls of `step` between two judgements."""
+"""W is judged at every call of `step` whose number is a multiple of this."""
 RECOVERY = 1.2
-"""By how much the learning rate grows with every better W, after it was halved."""
+"""The learning rate, once halved, grows by this factor with every better W."""
 WORSE = 1.1
 """W goes back when its held-out squared error exceeds that of the best W so far by this factor."""
 
 
 class Window:
-    """Samples [standard deviations] in a ring.
+    """Samples [standard deviations] in a ring: the oldest are replaced, and every k-th is held out.
 
     Args:
-        size: Samples kept.
+        size: Maximum number of samples.
         width: Elements of a sample.
-        held_out: Every so many-th sample is for judging and never learned from; 0 holds none out.
+        held_out: k; 0 holds none out.
     """
 
     def __init__(self, size: int, width: int, held_out: int) -> None:
@@ -39,40 +39,40 @@ class Window:
         self.dropped = 0
 
     def __len__(self) -> int:
-        """Samples in the window."""
+        """Return the number of samples in the window."""
         return int((self._serial >= 0).sum())
 
     def add(self, row: np.ndarray) -> None:
         """Put a sample in, shape (width,), in place of the oldest if the window is full."""
-        place = self.added % len(self._rows)
-        self.dropped += bool(self._serial[place] >= 0)
-        self._rows[place] = row
-        self._serial[place] = self.added
+        slot = self.added % len(self._rows)
+        self.dropped += bool(self._serial[slot] >= 0)
+        self._rows[slot] = row
+        self._serial[slot] = self.added
         self.added += 1
         self._learned = None
 
     def forget_before(self, serial: int) -> None:
-        """Drop the samples that came before the one of a number (the first has number 0)."""
+        """Drop the samples before the one with a number; the first sample has number 0."""
         old = (self._serial >= 0) & (self._serial < serial)
         self.dropped += int(old.sum())
         self._serial[old] = -1
         self._learned = None
 
     def learned(self) -> np.ndarray:
-        """The samples to learn from, shape (n, width), in no particular order."""
+        """Return the samples to learn from, shape (n, width), in no particular order."""
         if self._learned is None:
-            there = self._serial >= 0
-            self._learned = self._rows[there & ~self._held()] if self._held_out else self._rows[there]
+            kept = self._serial >= 0
+            self._learned = self._rows[kept & ~self._held()] if self._held_out else self._rows[kept]
         return self._learned
 
     def held(self, most: int) -> np.ndarray:
-        """At most so many of the newest held-out samples, newest first, shape (n, width)."""
+        """Return at most this many of the newest held-out samples, newest first, shape (n, width)."""
         if not self._held_out:
             return self._rows[:0]
         return self._newest((self._serial >= 0) & self._held(), most)
 
     def newest(self, most: int) -> np.ndarray:
-        """At most so many of the newest samples, newest first, shape (n, width)."""
+        """Return at most this many of the newest samples, newest first, shape (n, width)."""
         return self._newest(self._serial >= 0, most)
 
     def _held(self) -> np.ndarray:
@@ -84,20 +84,20 @@ class Window:
 
 
 class Relearner:
-    """Learns from a window, from constraints and from the training data of other conditions.
+    """A learner from a window, from constraints and from the training data of other conditions.
 
-    Every `held_out`-th sample only judges. W goes back to the best one so far when it foretells those samples worse,
-    and its learning rate is halved until it does well again.
+    Every `held_out`-th sample only judges. W goes back to the best one so far when its error on those samples grows,
+    and the learning rate is halved until the error falls again.
 
     Args:
-        schema: Where to begin.
-        config: What to update, and how.
+        schema: The schema to begin with.
+        config: Settings of the update.
         constraints: Samples that never grow old [standard deviations], shape (n, size).
 
     Attributes:
-        window: What the body lived through.
+        window: Samples of the body.
         held_out: Mean squared error on held-out samples when last judged; NaN before.
-        rolled_back: How often W went back so far.
+        rolled_back: Number of times W went back.
     """
 
     def __init__(self, schema: BodySchema, config: UpdateConfig, constraints: np.ndarray) -> None:
@@ -108,7 +108,7 @@ class Relearner:
         self.restart(schema)
 
     def restart(self, schema: BodySchema) -> None:
-        """Forget momentum and judgements, and go on from the W and p of a schema."""
+        """Forget momentum and judgements, and continue from the W and p of a schema."""
         config = self._config
         self._chain = pack(schema.weights.whole)
         self._bias = schema.bias.copy()
@@ -121,16 +121,16 @@ class Relearner:
         self.held_out = float("nan")
 
     def step(self, schema: BodySchema, weights: bool, bias: bool) -> tuple[BodySchema, float]:
-        """A few gradient steps.
+        """Take a few gradient steps.
 
         Args:
-            schema: The schema in use; its p is taken over.
+            schema: The schema in use, with its p.
             weights: Whether W moves.
             bias: Whether p moves.
 
         Returns:
-            The schema after the steps, and the mean squared error of the first batch before them; the schema as it
-            was and infinity where a step led out of the numbers.
+            The schema after the steps, and the mean squared error of the first batch before them; the unchanged schema
+            and infinity if a step led to an infinite number.
         """
         self._bias[:] = schema.bias
         first = float("nan")
@@ -147,9 +147,9 @@ class Relearner:
         return schema, first
 
     def _descend(self, schema: BodySchema, weights: bool, bias: bool) -> float:
-        """One gradient step in place; returns the loss before it."""
-        inputs, wanted, present = self._batch(schema)
-        loss, by_weights, by_input = gradients(self._chain, inputs, wanted, SQUARED, weights, bias)
+        """Take one gradient step in place and return the loss before it."""
+        inputs, outputs, present = self._batch(schema)
+        loss, by_weights, by_input = gradients(self._chain, inputs, outputs, SQUARED, weights, bias)
         if weights:
             self._optimiser.move(self._chain.flat, by_weights)
         if bias:
@@ -157,28 +157,28 @@ class Relearner:
         return float(loss)
 
     def _batch(self, schema: BodySchema) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Each drawn sample once per mask it allows.
+        """Draw samples, each under every mask it covers.
 
         Returns:
-            Inputs (rows, inputs), wanted x_out (rows, out_size), and which rows are of the present body (rows,).
+            Inputs (rows, inputs), measured x_out (rows, out_size), and whether rows are of the present body (rows,).
         """
         config = self._config
-        lived = self.window.learned()
+        samples = self.window.learned()
         if len(self._constraints):
-            lived = np.concatenate([lived, self._constraints])
+            samples = np.concatenate([samples, self._constraints])
         old = config.replay if len(self._anchors) else 0
-        drawn = self._random.random(config.batch) * (len(lived) + old)
-        now = lived[drawn[drawn < len(lived)].astype(int)]
+        drawn = self._random.random(config.batch) * (len(samples) + old)
+        now = samples[drawn[drawn < len(samples)].astype(int)]
         replayed = self._random.integers(0, max(1, len(self._anchors)), config.batch - len(now))
         rows, biases = now, np.repeat(self._bias[None], len(now), axis=0)
         if old:
             rows = np.concatenate([rows, self._anchors[replayed]])
             biases = np.concatenate([biases, self._anchor_biases[replayed]])
-        inputs, wanted, whose = under_masks(_plain(rows), _plain(biases), *self._gates, schema.predictor)
-        return inputs, wanted, whose < len(now)
+        inputs, outputs, origin = under_masks(_plain(rows), _plain(biases), *self._gates, schema.predictor)
+        return inputs, outputs, origin < len(now)
 
     def _judge(self, schema: BodySchema) -> BodySchema:
-        """The schema, or the best W so far where the new one does worse on held-out samples."""
+        """Return the schema, or the best W so far if the new one is worse on held-out samples."""
         self._calls += 1
         rows = self.window.held(JUDGED)
         if self._calls % JUDGE_EVERY or not len(rows):
@@ -200,10 +200,10 @@ class Relearner:
 
 
 def mean_error(schema: BodySchema, rows: np.ndarray) -> float:
-    """Mean squared error of samples under all masks they allow [standard deviations squared]."""
+    """Return the mean squared error of samples under all masks they cover [standard deviations squared]."""
     biases = np.repeat(schema.bias[None], len(rows), axis=0)
-    inputs, wanted, _ = under_masks(_plain(rows), _plain(biases), *gates(schema), schema.predictor)
-    return float(loss(schema.predictor.chain, inputs, wanted, SQUARED))
+    inputs, outputs, _ = under_masks(_plain(rows), _plain(biases), *gates(schema), schema.predictor)
+    return float(loss(schema.predictor.chain, inputs, outputs, SQUARED))
 
 
 def _plain(rows: np.ndarray) -> np.ndarray:
@@ -211,16 +211,16 @@ def _plain(rows: np.ndarray) -> np.ndarray:
 
 
 def gates(schema: BodySchema) -> tuple[np.ndarray, np.ndarray]:
-    """Of every mask, which elements of x_in it lets through, shape (masks, in_size), and m, (masks, x_in)."""
+    """Return the gate of every mask over x_in, shape (masks, in_size), and m, shape (masks, x_in)."""
     through, tails = (np.stack(column) for column in zip(*(schema.gate(m) for m in schema.masks), strict=True))
     return through, np.ascontiguousarray(tails[:, : len(schema.x_in)])
 
 
 def _others(schema: BodySchema) -> tuple[np.ndarray, np.ndarray]:
-    """The anchors of conditions other than the present one, and p of each.
+    """Return the anchors of conditions other than the present one, and the p of each.
 
-    A trained condition is the present one where p is nearer to it than half the way to its nearest neighbour: what was
-    learned of it then must not hold back what is learned of it now. Without parametric bias all anchors count.
+    A trained condition is the present one if p is nearer to it than half the distance to its nearest neighbour: its old
+    samples must not hold back the new ones. Without parametric bias all anchors count.
     """
     anchors = schema.anchors
     biases = own_bias(schema, len(anchors))
@@ -228,10 +228,10 @@ def _others(schema: BodySchema) -> tuple[np.ndarray, np.ndarray]:
     if not len(anchors) or len(known) < 2 or len(schema.anchor_conditions) != len(anchors):
         return anchors, biases
     prior = Prior.of(schema)
-    away = [prior.between(schema.bias, p) for p in known]
-    nearest = int(np.argmin(away))
+    distances = [prior.between(schema.bias, p) for p in known]
+    nearest = int(np.argmin(distances))
     apart = min(prior.between(known[nearest], p) for i, p in enumerate(known) if i != nearest)
-    if away[nearest] > 0.5 * apart:
+    if distances[nearest] > 0.5 * apart:
         return anchors, biases
     others = schema.anchor_conditions != nearest
     return anchors[others], biases[others]

@@ -1,9 +1,9 @@
-"""Online update (paper, II-F): p and W follow the body, each at its own pace, on a bounded window of samples.
+"""Online update (paper, II-F): p and W follow the body on a bounded window of samples, p faster than W.
 
-The default has two time scales. p is recognised from every sample by an extended Kalman filter
-(`gemuco.adaption.recognise`); once it has settled W takes small gradient steps under that p, mixed with training data
-of the other conditions under their own, and goes back when it predicts held-out samples worse than it did. The paper's
-three ways are the other choices.
+The default has two time scales. p is recognised from every sample by extended Kalman filters
+(`gemuco.adaption.recognise`); once it has settled, W takes small gradient steps under that p, mixed with training data
+of the other conditions under their own p, and goes back when its error on held-out samples grows. The paper's three
+methods are the other choices.
 """
 
 from collections.abc import Iterable, Mapping
@@ -19,28 +19,28 @@ from gemuco.schema import BodySchema, check_schema
 from gemuco.signals import check_samples
 
 FORGET = 0.01
-"""Share by which each new sample moves the running estimate of the model's errors."""
+"""Each new sample moves the running mean of the model's errors by this share."""
 ANOTHER = 0.3
-"""The body is another one when p is this far from where it was [standard deviations of the trained p]."""
+"""The body has changed when p is this far from the p in use [standard deviations of the trained p]."""
 STEADY = 0.02
-"""p found by gradient is settled when a step moves it less than this [standard deviations of the trained p]."""
+"""p is settled, by gradient, when a step moves it less than this [standard deviations of the trained p]."""
 
 
 @dataclass(frozen=True, slots=True)
 class UpdateResult:
-    """What one step did.
+    """Result of one step.
 
     Attributes:
         loss: Mean squared error of the first batch before the step [standard deviations squared]; NaN if no gradient
-            step was taken, infinite if it led out of the numbers and was undone.
-        window: Samples in the window.
-        dropped: Samples dropped so far: the oldest, and those of the body before it changed.
+            step was taken, infinite if a step led to an infinite number and was undone.
+        window: Number of samples in the window.
+        dropped: Number of dropped samples: the oldest, and those before a change of the body.
         bias: p now, shape (bias_size,).
         bias_std: Its standard deviation, shape (bias_size,); NaN by gradient.
-        settled: Whether p is well known; always so when p is not updated.
-        changed: Whether this step found that the body is another one since some samples.
+        settled: Whether p is well known; true if p is not updated.
+        changed: Whether this step recognised a change of the body.
         held_out: Mean squared error of held-out samples when last judged [standard deviations squared].
-        rolled_back: How often W went back so far.
+        rolled_back: Number of times W went back.
     """
 
     loss: float
@@ -55,20 +55,20 @@ class UpdateResult:
 
 
 class Updater:
-    """Updates p and W while the body moves. One thread may use it; every schema it hands out is immutable.
+    """Online update of p and W, for use by one thread; every resulting schema is immutable.
 
-    The errors of the schema it hands out are measured on each new sample before that sample is learned from, so the
-    std of later estimates is honest about the body of today.
+    The errors of the schema are measured on each new sample before that sample is learned from, so that the std of
+    later estimates is that of the present body.
 
     Args:
-        schema: Where to begin.
-        config: What to update, and how.
-        constraints: What is known of the body whatever its condition (origin, geometric model, ends of travel): signal
-            -> arrays [its unit], shape (n, size), NaN where nothing is known. They count as samples of the window that
-            never grow old.
+        schema: The schema to begin with.
+        config: Settings of the update.
+        constraints: Known facts of the body in every condition (origin, geometric model, ends of travel): signal ->
+            array [its unit], shape (n, size), NaN where not known. They count as samples of the window that never grow
+            old.
 
     Raises:
-        SchemaError: p shall be updated, but the schema has none.
+        SchemaError: p is to be updated, but the schema has none.
         UnknownSignal: A constraint names a signal that is not in the layout.
         WrongSize: A constraint does not have its signal's size.
     """
@@ -117,7 +117,7 @@ class Updater:
             values: Signal -> measured array [its unit], shape (n,); NaN where nothing was measured.
 
         Returns:
-            Whether it is of use: some mask must be whole, and something inferred must have been measured.
+            Whether the sample is of use: it must cover a mask and have a measured element of x_out.
 
         Raises:
             UnknownSignal: A name is not in the layout.
@@ -172,26 +172,27 @@ class Updater:
         )
 
     def _recognise(self) -> bool:
-        """Let every new sample move p; whether the body turned out to be another one."""
+        """Update p by every new sample; return whether the body has changed."""
         rows, self._pending = self._pending, []
         if self._recogniser is None:
             return False
         has_changed = False
         window = self._relearner.window
         for index, row in enumerate(rows):
-            found = self._recogniser.see(self.schema, row)
-            since = window.added - len(rows) + index + 1 - found.since
-            if since > self._since and self._prior.between(found.bias, self.schema.bias) > ANOTHER:
+            recognition = self._recogniser.see(self.schema, row)
+            since = window.added - len(rows) + index + 1 - recognition.since
+            if since > self._since and self._prior.between(recognition.bias, self.schema.bias) > ANOTHER:
                 window.forget_before(since)
                 self._since, has_changed = since, True
-            self._is_settled, self._bias_std = found.is_settled, np.sqrt(np.diag(found.covariance))
-            self.schema = self.schema.with_bias(found.bias)
+            self._is_settled = recognition.is_settled
+            self._bias_std = np.sqrt(np.diag(recognition.covariance))
+            self.schema = self.schema.with_bias(recognition.bias)
         if has_changed:
             self._relearner.restart(self.schema)
         return has_changed
 
     def rollback(self) -> BodySchema:
-        """Back to the schema it began with; the window is kept."""
+        """Go back to the first schema; the window is kept."""
         self._begin(self._first)
         return self.schema
 
@@ -202,9 +203,9 @@ def adapt(
     """Return the schema after the online update on samples, one step each; `Updater` takes them singly.
 
     Args:
-        schema: Where to begin.
+        schema: The schema to begin with.
         samples: Signal -> value [its unit], shape (n,), oldest first.
-        config: What to update, and how.
+        config: Settings of the update.
     """
     check_schema(schema)
     check_samples(samples)

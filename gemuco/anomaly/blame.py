@@ -1,13 +1,13 @@
-"""Which element is wrong: the one whose free choice would make a whole window of samples most normal.
+"""The wrong element: the one whose free choice makes a window of samples most normal.
 
-For every candidate the hypothesis is that its values say nothing, over all the samples. Its values are then chosen so
-that the prediction errors become as normal as they can; what remains, and what the freedom costs (two elements always
-explain more than one), tells how good the hypothesis is. One wrong element upsets every prediction that is made from
-it, so the largest contributor is often not the culprit.
+For every candidate the hypothesis is that its values are arbitrary in all samples. They are then chosen so that the
+prediction errors become as normal as possible; the remaining distance, and a cost of the freedom (two elements always
+explain more than one), rate the hypothesis. One wrong element disturbs every prediction that is made from it, so the
+largest contributor is often not the cause.
 
-Candidates are the single elements, and parts: elements of one name in several signals. A muscle has a tension and a
-length, and when it is cut neither goes with the joints any more. The others then pull its joint away, which is nearly
-what a wrong joint sensor looks like; so a part that says what training never saw (no tension at all) is preferred.
+Candidates are single elements, and parts: elements of one name in several signals. A muscle has a tension and a length,
+and when it is cut neither fits the joints any more. The others then pull its joint away, which looks much like a wrong
+joint sensor; so a part with values outside of the training data (no tension at all) is preferred.
 """
 
 from typing import NamedTuple
@@ -20,21 +20,21 @@ from gemuco.normal import Normal
 from gemuco.schema import BodySchema
 
 ANYTHING = 3.0
-"""How far a wrong value may be from what is right [standard deviations of the signal]."""
+"""A wrong value is this far from the right one [standard deviations of the signal]."""
 REFINED = 5
-"""Candidates of a kind, the best, whose values are found anew from where the first step led."""
+"""This many best candidates of a kind are linearised a second time, at the end of their first step."""
 STRANGE = 0.2
-"""What remains under a part counts so much less if the part says what training never saw."""
+"""The remaining distance of a part is multiplied by this if its values lie outside of the training data."""
 
 
 class Suspect(NamedTuple):
-    """A candidate.
+    """A candidate for the wrong element.
 
     Attributes:
         name: `signal.element`; of a part, the element that explains most by itself.
         elements: Positions in the layout.
-        remains: Share of the squared distances of the samples that is left if this is wrong, its cost included; less
-            for a part that says what training never saw.
+        remains: Share of the squared distances of the samples that remains if these elements are wrong, with the cost
+            of their freedom; less for a part with values outside of the training data.
     """
 
     name: str
@@ -43,31 +43,31 @@ class Suspect(NamedTuple):
 
 
 def suspects(schema: BodySchema, rows: np.ndarray) -> list[Suspect]:
-    """Every candidate, the most suspect first; empty without normal data or without anything to judge.
+    """Return every candidate, the most suspect first; none if no error can be judged.
 
     Args:
-        schema: With statistics of the normal.
-        rows: Samples [standard deviations], shape (n, size). Only those that lack no more than the most complete count.
+        schema: A schema with statistics of prediction errors.
+        rows: Samples [standard deviations], shape (n, size). Only those as complete as the most complete one count.
     """
     normal = schema.normal
     if normal is None or not len(rows):
         return []
-    there = np.isfinite(prediction_errors(schema, rows)) & np.isfinite(normal.mean)
-    pattern = there[int(np.argmax(there.sum(axis=1)))]
+    known = np.isfinite(prediction_errors(schema, rows)) & np.isfinite(normal.mean)
+    pattern = known[int(np.argmax(known.sum(axis=1)))]
     if not pattern.any():
         return []
-    case = _Case(schema, normal, rows[(there == pattern).all(axis=1)], np.flatnonzero(pattern))
+    case = _Case(schema, normal, rows[(known == pattern).all(axis=1)], np.flatnonzero(pattern))
     single = _ranked(case, [(index,) for index in case.movable])
     shared = _ranked(case, parts(schema, case.movable))
-    found = [Suspect(schema.layout.element(s[0]), s, left) for s, left in single.items()]
+    candidates = [Suspect(schema.layout.element(s[0]), s, left) for s, left in single.items()]
     for part, left in shared.items():
         share = STRANGE if case.is_strange(part) else 1.0
-        found.append(Suspect(schema.layout.element(min(part, key=lambda i: single[(i,)])), part, share * left))
-    return sorted(found, key=lambda suspect: suspect.remains)
+        candidates.append(Suspect(schema.layout.element(min(part, key=lambda i: single[(i,)])), part, share * left))
+    return sorted(candidates, key=lambda suspect: suspect.remains)
 
 
 def parts(schema: BodySchema, movable: list[int]) -> list[tuple[int, ...]]:
-    """Elements of one name in several signals, as positions in the layout; axes and numbers (`x`, `3`) are no names."""
+    """Return positions of elements with one name in several signals; axes and numbers (`x`, `3`) are not names."""
     named: dict[str, list[int]] = {}
     for index in movable:
         name = schema.layout.element(index).partition(".")[2]
@@ -77,7 +77,7 @@ def parts(schema: BodySchema, movable: list[int]) -> list[tuple[int, ...]]:
 
 
 class _Case:
-    """Samples that lack the same elements, and how their errors answer to every element."""
+    """Samples that lack the same elements, and the derivatives of their errors by every element."""
 
     def __init__(self, schema: BodySchema, normal: Normal, rows: np.ndarray, judged: np.ndarray) -> None:
         self._schema, self._rows, self._judged = schema, rows, judged
@@ -88,7 +88,7 @@ class _Case:
         self._error, self._slope = self._at(rows, self.movable)
 
     def _at(self, rows: np.ndarray, elements: list[int]) -> tuple[np.ndarray, np.ndarray]:
-        """Whitened errors (n, judged) and their derivatives by elements (n, judged, elements)."""
+        """Return whitened errors (n, judged) and their derivatives by elements (n, judged, elements)."""
         schema = self._schema
         error = prediction_errors(schema, rows)[:, self._judged] - self._mean
         slope = np.zeros((len(rows), schema.out_layout.size, len(elements)))
@@ -104,23 +104,23 @@ class _Case:
         return error @ self._whiten.T, np.einsum("ij,njk->nik", self._whiten, slope[:, self._judged])
 
     def _predicted(self, mask: frozenset[str], rows: np.ndarray, elements: list[int]) -> np.ndarray:
-        """Derivatives of the prediction under a mask by elements, shape (n, out_size, elements)."""
+        """Return derivatives of the prediction under a mask by elements, shape (n, out_size, elements)."""
         schema = self._schema
         chain = schema.weights.whole
         inputs = schema.network_input(rows, mask)
         values = trace(chain, inputs)
         through, _ = schema.gate(mask)
-        found = np.zeros((len(rows), schema.out_layout.size, len(elements)))
+        slope = np.zeros((len(rows), schema.out_layout.size, len(elements)))
         for column, element in enumerate(elements):
-            place = np.flatnonzero(schema.in_index == element)
-            if len(place) and through[place[0]] > 0:
+            position = np.flatnonzero(schema.in_index == element)
+            if len(position) and through[position[0]] > 0:
                 tangent = np.zeros_like(inputs)
-                tangent[:, place[0]] = 1.0
-                found[:, :, column] = push(chain, values, tangent)
-        return found
+                tangent[:, position[0]] = 1.0
+                slope[:, :, column] = push(chain, values, tangent)
+        return slope
 
     def is_strange(self, group: tuple[int, ...]) -> bool:
-        """Whether some element of a group is out of the range of the training data in most samples."""
+        """Whether an element of a group is outside of the training data in most samples."""
         scaler, index = self._schema.scaler, list(group)
         low = scaler.normalise(scaler.low)[index]
         high = scaler.normalise(scaler.high)[index]
@@ -128,7 +128,7 @@ class _Case:
         return bool((((values < low) | (values > high)).mean(axis=0) > 0.5).any())
 
     def remains(self, group: tuple[int, ...], passes: int = 1) -> float:
-        """Share of the squared distances that is left if a group of elements is wrong in all samples."""
+        """Return the share of the squared distances that remains if a group of elements is wrong in all samples."""
         elements = list(group)
         error, slope = self._error, self._slope[:, :, [self.movable.index(e) for e in elements]]
         moved = np.zeros((len(self._rows), len(elements)))
@@ -141,15 +141,15 @@ class _Case:
                 error = error - np.einsum("nik,nk->ni", slope, moved)
             information = np.einsum("nij,nik->njk", slope, slope) + prior
             moved = -np.linalg.solve(information, np.einsum("nij,ni->nj", slope, error)[..., None])[..., 0]
-        left = np.sum((error + np.einsum("nik,nk->ni", slope, moved)) ** 2, axis=1)
-        left += np.sum(moved**2, axis=1) / ANYTHING**2
+        remaining = np.sum((error + np.einsum("nik,nk->ni", slope, moved)) ** 2, axis=1)
+        remaining += np.sum(moved**2, axis=1) / ANYTHING**2
         cost = np.linalg.slogdet(information)[1] + 2.0 * len(elements) * np.log(ANYTHING)
-        return float(np.sum(left + cost)) / max(float(np.sum(self._error**2)), 1e-9)
+        return float(np.sum(remaining + cost)) / max(float(np.sum(self._error**2)), 1e-9)
 
 
 def _ranked(case: _Case, candidates: list[tuple[int, ...]]) -> dict[tuple[int, ...], float]:
-    """What remains under every candidate, the best of them judged twice."""
-    found = {candidate: case.remains(candidate) for candidate in candidates}
-    for candidate in sorted(found, key=found.__getitem__)[:REFINED]:
-        found[candidate] = case.remains(candidate, 2)
-    return found
+    """Return the remaining distance of every candidate, linearised twice for the best of them."""
+    remaining = {candidate: case.remains(candidate) for candidate in candidates}
+    for candidate in sorted(remaining, key=remaining.__getitem__)[:REFINED]:
+        remaining[candidate] = case.remains(candidate, 2)
+    return remaining

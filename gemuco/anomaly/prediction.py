@@ -1,4 +1,4 @@
-"""Prediction errors of samples: the masks that predict, the errors, and which of them are judged (paper, II-K)."""
+"""Prediction errors of samples: the masks that predict, the errors, and the judged elements (paper, II-K)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from gemuco.schema import BodySchema, check_schema
 def judging_masks(schema: BodySchema) -> dict[str, Mask]:
     """Choose the mask that predicts each signal of x_out for anomaly detection.
 
-    A mask without the signal itself where there is one, since a signal explains itself even when it is wrong.
+    If possible the mask lacks the signal itself, which the network would copy even when it is wrong.
     """
     chosen: dict[str, Mask] = {}
     for name in schema.x_out:
@@ -66,12 +66,12 @@ def prediction_errors(schema: BodySchema, x: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True)
 class Judgement:
-    """How a schema judges samples that lack the same elements.
+    """Judgement of samples that lack the same elements.
 
     Attributes:
-        index: The elements of x_out that are judged, positions, shape (n,).
+        index: Positions of the judged elements in x_out, shape (n,).
         precision: The inverse covariance of their errors, shape (n, n).
-        threshold: The score above which such a sample is an anomaly; NaN if nothing is judged.
+        threshold: Score above which such a sample is an anomaly; NaN if no element is judged.
     """
 
     index: np.ndarray
@@ -80,19 +80,19 @@ class Judgement:
 
     @classmethod
     def of(cls, schema: BodySchema, finite: np.ndarray) -> "Judgement":
-        """For samples of which these elements are there, truth values, shape (size,).
+        """Prepare for samples with these finite elements, truth values, shape (size,).
 
-        A schema without statistics of the normal judges nothing.
+        A schema without statistics of prediction errors judges no element.
         """
         if schema.normal is None:
             return cls(np.zeros(0, int), np.zeros((0, 0)), float("nan"))
         by = schema.derived(judges)
         complete = np.array([finite[schema.in_index[through > 0]].all() for through in by.through])
-        there = finite[schema.out_index] & complete[by.mask] & np.isfinite(schema.normal.mean)
-        index, precision = schema.normal.precision(there)
+        judged = finite[schema.out_index] & complete[by.mask] & np.isfinite(schema.normal.mean)
+        index, precision = schema.normal.precision(judged)
         return cls(index, precision, float(schema.normal.threshold_of(len(index))))
 
 
 def judgements(schema: BodySchema) -> ByPattern[Judgement]:
-    """Return how a schema judges samples, by which of their elements were measured."""
+    """Return the judgements of a schema, by the finite elements of a sample."""
     return ByPattern(partial(Judgement.of, schema))

@@ -1,4 +1,4 @@
-"""Anomaly detection (paper, II-K): the Mahalanobis distance of the prediction error, and which element is to blame."""
+"""Anomaly detection (paper, II-K): the Mahalanobis distance of the prediction error, and its most likely cause."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -7,20 +7,20 @@ import numpy as np
 
 from gemuco.anomaly.blame import suspects
 from gemuco.anomaly.prediction import judgements, judges
-from gemuco.compiled.score import deviation
+from gemuco.compiled import score as compiled
 from gemuco.schema import BodySchema, check_schema
 
 
 @dataclass(frozen=True, slots=True)
 class AnomalyScore:
-    """How unlike normal one sample is.
+    """Distance of one sample from the normal.
 
     Attributes:
-        score: Mahalanobis distance; NaN without normal data or without any error to judge.
-        threshold: Score above which it counts as an anomaly.
-        contribution: Signal of x_out -> by how much score^2 drops without an element, shape (n,); NaN if unknown.
-        blamed: `signal.element` that is most likely wrong if the score is above the threshold (a window of samples
-            tells better: `gemuco.anomaly.blame`), else the one that contributes most; empty if the score is NaN.
+        score: Mahalanobis distance; NaN without statistics of prediction errors or without any error to judge.
+        threshold: Score above which a sample is an anomaly.
+        contribution: Signal of x_out -> drop of score^2 without an element, shape (n,); NaN if unknown.
+        blamed: `signal.element` that is most likely wrong if the score is above the threshold (a window of samples is
+            more reliable: `judge`), else the one that contributes most; empty if the score is NaN.
     """
 
     score: float
@@ -35,51 +35,52 @@ class AnomalyScore:
 
 
 def score(schema: BodySchema, values: Mapping[str, np.ndarray], blame: bool = True) -> AnomalyScore:
-    """Score how unlike normal a sample is (paper, II-K).
+    """Return the distance of a sample from the normal (paper, II-K).
 
     Args:
-        schema: With statistics of the normal.
+        schema: A schema with statistics of prediction errors.
         values: Signal -> measured array [its unit], shape (n,).
-        blame: Whether to find what is most likely wrong, which costs many times the score; else the element that
-            contributes most is named.
+        blame: Whether to search the element that is most likely wrong, which takes many times as long as the score;
+            else the one that contributes most is named.
     """
     check_schema(schema)
     joined = schema.layout.join_one(values)
     joined.setflags(write=False)
-    found = judged(schema, joined)
-    blamed = found.blamed(schema)
-    if blame and found.distance > found.threshold:
+    deviation = deviation_of(schema, joined)
+    blamed = deviation.largest(schema)
+    if blame and deviation.distance > deviation.threshold:
         blamed = suspects(schema, schema.normalise_one(values)[None])[0].name
-    return AnomalyScore(found.distance, found.threshold, schema.out_layout.split(found.contribution), blamed)
+    contribution = schema.out_layout.split(deviation.contribution)
+    return AnomalyScore(deviation.distance, deviation.threshold, contribution, blamed)
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
-    """The score of a sample; see `AnomalyScore`.
+class Deviation:
+    """Distance of one sample from the normal, without a cause; see `AnomalyScore`.
 
     Attributes:
         distance: Mahalanobis distance.
-        threshold: Above which it counts as an anomaly.
-        contribution: Of every element of x_out, shape (out_size,).
+        threshold: Distance above which a sample is an anomaly.
+        contribution: Contribution of every element of x_out, shape (out_size,).
     """
 
     distance: float
     threshold: float
     contribution: np.ndarray
 
-    def blamed(self, schema: BodySchema) -> str:
-        """`signal.element` that contributes most; empty if nothing was judged."""
+    def largest(self, schema: BodySchema) -> str:
+        """Return the `signal.element` that contributes most; empty if no element was judged."""
         if np.isnan(self.distance):
             return ""
         return schema.out_layout.element(int(np.fmax(self.contribution, -1.0).argmax()))
 
 
-def judged(schema: BodySchema, joined: np.ndarray) -> Judged:
-    """The score of a sample in one array, as `estimate.fill` takes it."""
+def deviation_of(schema: BodySchema, joined: np.ndarray) -> Deviation:
+    """Return the deviation of a sample in one read-only array, as `gemuco.estimation.fill` takes it."""
     by = schema.derived(judgements)(np.isfinite(joined))
     if schema.normal is None or not len(by.index):
-        return Judged(float("nan"), float("nan"), np.full(schema.out_layout.size, np.nan))
-    distance, contribution = deviation(
+        return Deviation(float("nan"), float("nan"), np.full(schema.out_layout.size, np.nan))
+    distance, contribution = compiled.deviation(
         schema.predictor, schema.derived(judges), joined, schema.normal.mean, by.index, by.precision
     )
-    return Judged(distance, by.threshold, contribution)
+    return Deviation(distance, by.threshold, contribution)

@@ -1,4 +1,4 @@
-"""Environment change or anomaly: the decision that the paper leaves open (II-K), by whether another p explains it."""
+"""Environment change or anomaly: the decision that the paper leaves open (II-K), by a test of another p."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -13,20 +13,20 @@ from gemuco.schema import BodySchema, check_schema
 from gemuco.signals import check_samples
 
 PLAUSIBLE = 3.0
-"""How far p may be from the mean of the trained ones [their standard deviations] to be a condition of a body."""
+"""A p of an environment is at most this far from the mean of the trained ones [their standard deviations]."""
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What is the matter with a body, judged by its last samples.
+    """Judgement of a body by its last samples.
 
     Attributes:
-        kind: `normal`; `environment` if the body is in another condition that a p describes; `anomaly` if none does.
-            Without parametric bias every change is an anomaly. Empty without normal data or anything to judge.
+        kind: `normal`; `environment` if another p explains the samples; `anomaly` if none does. Without parametric bias
+            every change is an anomaly. Empty if no error can be judged.
         score: Root mean square over the samples of the anomaly score as a share of its threshold, under the p in use.
-        explained: The same under the p that explains the samples best; equal to `score` if none was sought.
-        bias: That p, shape (bias_size,); the one in use if none was sought.
-        blamed: `signal.element` whose being wrong explains the samples best; empty unless an anomaly.
+        explained: The same under the p that explains the samples best; equal to `score` if none was searched.
+        bias: That p, shape (bias_size,); the one in use if none was searched.
+        blamed: `signal.element` that is most likely wrong; empty unless the kind is an anomaly.
     """
 
     kind: str
@@ -37,16 +37,16 @@ class Verdict:
 
 
 def judge(schema: BodySchema, samples: Iterable[Mapping[str, np.ndarray]]) -> Verdict:
-    """Normal, another condition, or something wrong.
+    """Judge whether samples are normal, of another condition, or an anomaly.
 
-    If the samples are unlikely under the p in use, p is sought anew on all of them. If they are normal under what is
-    found and it is like the trained ones, the environment has changed (a tool, a load, a grip) and an update of p will
-    do. What no p explains is an anomaly.
+    If the samples are unlikely under the p in use, p is recognised anew from all of them. If they are normal under the
+    result and it is like the trained ones, the environment has changed (a tool, a load, a grip) and an update of p is
+    enough. Samples that no p explains are an anomaly.
 
     Args:
-        schema: With statistics of the normal.
-        samples: The last ones, each signal -> measured array [its unit], shape (n,). All of them count alike, so they
-            should be of the time since things look odd.
+        schema: A schema with statistics of prediction errors.
+        samples: The last samples, each signal -> measured array [its unit], shape (n,). All count alike, so they should
+            begin when the score rose.
 
     Raises:
         UnknownSignal: A name is not in the layout.
@@ -71,7 +71,7 @@ def judge(schema: BodySchema, samples: Iterable[Mapping[str, np.ndarray]]) -> Ve
 
 
 def window_score(schema: BodySchema, rows: np.ndarray) -> float:
-    """Root mean square of the scores as shares of their thresholds, of samples [standard deviations], (n, size)."""
+    """Return the root mean square of score / threshold over samples [standard deviations], shape (n, size)."""
     normal = schema.normal
     if normal is None or not len(rows):
         return float("nan")

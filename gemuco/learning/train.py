@@ -115,7 +115,7 @@ def fine_tune(
         DatasetError: A signal is missing, or has other elements or another unit.
         NotEnoughData: Too few samples to hold some out, or none that fits a mask.
     """
-    dataset = dataset.of(schema.layout)
+    dataset = dataset.with_layout(schema.layout)
     task = Task(schema.layout, schema.masks, schema.x_out)
     train_data, held_data = dataset.split(config.held_out, config.seed)
     fresh = dataset.conditions

@@ -1,12 +1,12 @@
-"""The one optimiser (paper, II-G): gradient descent that tries many step sizes at once.
+"""Gradient descent that tries many step sizes at once (paper, II-G), and the entry to the compiled searches.
 
-It knows no loss and no robot. From the present point it takes the gradient, makes one candidate per step size in
-[0, gamma_max], evaluates all of them as a batch, and goes on from the best. Because the step size 0 is among them the
-loss never rises; where it wins, every other step was too long, and the next ones are spread between 0 and the shortest
-of them. A single candidate is plain descent with the constant step gamma_max.
+The descent depends on no loss and no robot. From the present point it takes the gradient, makes one candidate per step
+size in [0, gamma_max], evaluates all of them as a batch, and goes on from the best. The step size 0 is among them, so
+the loss never rises; where it wins, every other step was too long, and the next ones are spread between 0 and the
+shortest of them. A single candidate is plain descent with the constant step gamma_max.
 
-A constraint is met at every candidate, not weighed against the loss: steps go along it, and what the steps bend away
-from it Newton steps bring back.
+A constraint is met at every candidate, not weighed against the loss: steps go along it, and Newton steps correct the
+deviation.
 """
 
 import math
@@ -20,28 +20,30 @@ from gemuco.compiled.problem import Problem
 from gemuco.errors import SchemaError
 
 Objective = Callable[[np.ndarray, bool], tuple[np.ndarray, np.ndarray]]
-"""Points (candidates, n) -> losses (candidates,) and, if wanted, gradients (candidates, n). Of all candidates only
-the best needs one, so the many are evaluated without."""
+"""An objective maps points (candidates, n) to losses (candidates,) and, if the flag is set, gradients (candidates, n).
+Only the best candidate needs a gradient."""
 Constraint = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""Points (candidates, n) -> what must be zero (candidates, k) and its Jacobian (candidates, k, n)."""
+"""A constraint maps points (candidates, n) to values that must be zero (candidates, k) and their Jacobian
+(candidates, k, n)."""
 
 RETURNS = 3
-"""Newton steps back to the constraint after every step."""
+"""This many Newton steps follow every step, back to the constraint."""
 LAST_RETURNS = 10
-"""And after the last one."""
+"""This many Newton steps follow the last step."""
 BREACH = 100.0
-"""Loss per unit of a constraint that is not met after all: a candidate that could not be brought back does not win."""
+"""A constraint that stays violated costs this loss per unit, so that such a candidate does not win."""
 DAMPING = 1e-6
+"""This is added to the diagonal of J J^T, which may be singular."""
 
 
 @dataclass(frozen=True, slots=True)
 class DescentConfig:
-    """How far and how often.
+    """Settings of the gradient descent.
 
     Attributes:
         gamma_max: Largest step size.
-        candidates: How many step sizes are tried at once (the paper's N_batch); 1 is a constant step.
-        iterations: How many steps.
+        candidates: Number of step sizes tried at once (the paper's N_batch); 1 is a constant step.
+        iterations: Number of steps.
     """
 
     gamma_max: float = 0.5
@@ -58,11 +60,11 @@ class DescentConfig:
 
 @dataclass(frozen=True, slots=True)
 class NewtonConfig:
-    """How far the second-order search goes (`gemuco.compiled.newton`).
+    """Settings of the second-order search (`gemuco.compiled.newton`).
 
     Attributes:
-        iterations: At most so many steps.
-        tolerance: It ends when two steps in a row lower the loss by less than this share of it.
+        iterations: Maximum number of steps.
+        tolerance: The search ends when two steps in a row lower the loss by less than this share of it.
     """
 
     iterations: int = 30
@@ -78,13 +80,13 @@ class NewtonConfig:
 
 @dataclass(frozen=True, slots=True)
 class Descent:
-    """Where a descent ended.
+    """Result of a search.
 
     Attributes:
         point: The best point, shape (n,).
         loss: Its loss.
         losses: Loss at the start and after every iteration.
-        is_late: Whether time was up before the end.
+        is_late: Whether the deadline ended it.
     """
 
     point: np.ndarray
@@ -101,15 +103,15 @@ def descend(
     high: np.ndarray | None = None,
     constraint: Constraint | None = None,
 ) -> Descent:
-    """Minimise an objective.
+    """Minimise an objective in numpy.
 
     Args:
         objective: Losses and gradients of points.
-        start: First point, shape (n,), or several to begin from the best of, shape (starts, n).
+        start: First point, shape (n,), or several of which the best is taken, shape (starts, n).
         config: Step sizes and iterations.
         low: Lower bounds of a point, shape (n,); candidates are moved inside.
         high: Upper bounds of a point, shape (n,).
-        constraint: What must be zero.
+        constraint: Values that must be zero.
     """
     points = np.atleast_2d(start)
     if config.candidates > 1:
@@ -123,21 +125,21 @@ def descend(
         breach: np.ndarray | float = 0.0
         if constraint is not None:
             points = _back(constraint, points, RETURNS, low, high)
-            amiss, jacobian = constraint(points)
-            breach = BREACH * np.abs(amiss).sum(axis=1)
+            deviation, jacobian = constraint(points)
+            breach = BREACH * np.abs(deviation).sum(axis=1)
         losses = objective(points, False)[0] + breach
-        chosen = int(np.argmin(losses))
-        loss = float(losses[chosen])
+        best = int(np.argmin(losses))
+        loss = float(losses[best])
         history.append(loss)
         if loss < best_loss:
-            best_point, best_loss = points[chosen].copy(), loss
+            best_point, best_loss = points[best].copy(), loss
         if iteration < config.iterations:
-            if iteration and config.candidates > 1 and chosen == 0:
+            if iteration and config.candidates > 1 and best == 0:
                 gammas = gammas / np.float32(config.candidates - 1)
-            gradient = objective(points[chosen : chosen + 1], True)[1][0]
+            gradient = objective(points[best : best + 1], True)[1][0]
             if constraint is not None:
-                gradient = gradient - _least(jacobian[chosen : chosen + 1], jacobian[chosen : chosen + 1] @ gradient)[0]
-            points = points[chosen] - gammas * gradient
+                gradient = gradient - _least(jacobian[best : best + 1], jacobian[best : best + 1] @ gradient)[0]
+            points = points[best] - gammas * gradient
     if constraint is not None:
         last = _back(constraint, best_point[None], LAST_RETURNS, low, high)
         best_point, best_loss = last[0], float(objective(last, False)[0][0])
@@ -147,13 +149,13 @@ def descend(
 def minimise(
     problem: Problem, starts: np.ndarray, config: DescentConfig | NewtonConfig, until: float = math.inf
 ) -> Descent:
-    """Minimise a folded problem, in one call that needs no interpreter.
+    """Minimise a folded problem in one compiled call.
 
     Args:
         problem: From `gemuco.search.fold`.
         starts: First points, shape (starts, n) or (n,).
-        config: Which search, and how far.
-        until: When a second-order search ends at the latest [s of `time.monotonic`].
+        config: Settings; their class selects the search.
+        until: Deadline of a second-order search [s of `time.monotonic`].
     """
     points = np.ascontiguousarray(np.atleast_2d(starts), problem.direct.dtype)
     if isinstance(config, DescentConfig):
@@ -161,8 +163,8 @@ def minimise(
             problem, points, float(config.gamma_max), config.candidates, config.iterations
         )
         return Descent(point, float(loss), tuple(history))
-    found = newton.search(problem, points, config.iterations, float(config.tolerance), float(until))
-    point, loss, history, is_late = found
+    result = newton.search(problem, points, config.iterations, float(config.tolerance), float(until))
+    point, loss, history, is_late = result
     return Descent(point, float(loss), tuple(history), bool(is_late))
 
 
@@ -173,16 +175,16 @@ def _inside(points: np.ndarray, low: np.ndarray | None, high: np.ndarray | None)
 def _back(
     constraint: Constraint, points: np.ndarray, steps: int, low: np.ndarray | None, high: np.ndarray | None
 ) -> np.ndarray:
-    """Newton steps of least length towards the constraint."""
+    """Take Newton steps of least length towards the constraint."""
     for _ in range(steps):
-        amiss, jacobian = constraint(points)
-        points = _inside(points - _least(jacobian, amiss), low, high)
+        deviation, jacobian = constraint(points)
+        points = _inside(points - _least(jacobian, deviation), low, high)
     return points
 
 
-def _least(jacobian: np.ndarray, amiss: np.ndarray) -> np.ndarray:
-    """The shortest step that changes the constraint by so much: J^T (J J^T)^-1 amiss, shape (candidates, n)."""
+def _least(jacobian: np.ndarray, change: np.ndarray) -> np.ndarray:
+    """Return the shortest step with a given change of the constraint: J^T (J J^T)^-1 change, shape (candidates, n)."""
     square = jacobian @ jacobian.transpose(0, 2, 1)
     square = square + DAMPING * np.eye(square.shape[1], dtype=square.dtype)
-    step = jacobian.transpose(0, 2, 1) @ np.linalg.solve(square, amiss[:, :, None])
+    step = jacobian.transpose(0, 2, 1) @ np.linalg.solve(square, change[:, :, None])
     return step[:, :, 0].astype(jacobian.dtype)

@@ -1,9 +1,9 @@
-"""A route and its terms made one: the problem that compiled searches solve (`gemuco.compiled.problem`).
+"""The problem that compiled searches solve (`gemuco.compiled.problem`), folded from a route and its terms.
 
 Every term but the caller's own is a norm of something linear in the prediction, and a prediction is linear in the last
-layer of the network and in what moves. So the terms are multiplied into the last layer and what is given into the
-first, and the search then looks at differences only. What is wanted and given are numbers in a few rows of that: a
-controller lays the problem out once and writes those rows before every solve.
+layer of the network and in the searched point. So the terms are multiplied into the last layer and the given values
+into the first, and the search evaluates differences only. References and given values are numbers in a few rows of
+that: a controller folds the problem once and writes those rows before every solve.
 """
 
 from collections.abc import Sequence
@@ -17,21 +17,21 @@ from gemuco.compiled.problem import POSTURE, STD, STIFFNESS, TORQUE, Balance, Pr
 from gemuco.layers import Chain, Layer
 from gemuco.schema import BodySchema
 from gemuco.search.norms import Bound, Norm
-from gemuco.search.torque import Balanced
+from gemuco.search.torque import TorqueNorm
 
 
 class Lines(NamedTuple):
-    """A route as straight lines and a net: x = direct^T p + constant, but x[outputs] = net(p) for what is inferred.
+    """A route as linear parts and a net of the point p: x = direct^T p + constant, but x[outputs] = net(p).
 
-    What is given lies in `known` and in the offset of the net's first layer, and may change from solve to solve.
+    The given values lie in `known` and in the offset of the net's first layer, and may change from solve to solve.
 
     Attributes:
-        chain: net, from p to `outputs`.
-        outputs: Elements of the layout that it infers.
-        free: Elements of the layout that p is, in its order; empty where p is no signal (z).
-        known: Every element of the layout that is given [standard deviations], shape (size,); 0 elsewhere.
-        low: Bounds of p, shape (n,).
-        high: Shape (n,).
+        chain: The net, from p to `outputs`.
+        outputs: Elements of the layout that the net infers.
+        free: Elements of the layout that make up p, in its order; empty where p is not a signal (z).
+        known: Every given element of the layout [standard deviations], shape (size,); 0 elsewhere.
+        low: Lower bounds of p, shape (n,).
+        high: Upper bounds of p, shape (n,).
     """
 
     chain: Chain
@@ -43,11 +43,10 @@ class Lines(NamedTuple):
 
 
 def latent_lines(schema: BodySchema) -> Lines:
-    """Usage (e): p is z, and every x_out is decoded from it."""
+    """Return the lines of usage (e): p is z, and every x_out is decoded from it."""
     decoder = schema.weights.decoder
     far = np.full(len(decoder[0].matrix), np.inf)
-    nowhere, nothing = np.zeros(0, int), np.zeros(schema.layout.size)
-    return Lines(decoder, schema.out_index, nowhere, nothing, -far, far)
+    return Lines(decoder, schema.out_index, np.zeros(0, int), np.zeros(schema.layout.size), -far, far)
 
 
 def input_lines(
@@ -60,17 +59,17 @@ def input_lines(
     low: np.ndarray,
     high: np.ndarray,
 ) -> Lines:
-    """Usage (f): p is some inputs of the network, and the network infers x_out.
+    """Return the lines of usage (f): p is some inputs of the network, and the network infers x_out.
 
     Args:
         schema: The body schema.
-        base: Input of the network, shape (inputs,), as it is where p is 0.
-        columns: Where p lies in it, shape (n,).
-        free: Where p lies in the layout, shape (n,).
-        inferred: Which elements of x_out the network says, truth values, shape (out_size,).
-        known: Every element of the layout that is given [standard deviations], shape (size,).
-        low: Bounds of p, shape (n,).
-        high: Shape (n,).
+        base: Input of the network where p is 0, shape (inputs,).
+        columns: Positions of p in the input, shape (n,).
+        free: Positions of p in the layout, shape (n,).
+        inferred: Whether the network infers each element of x_out, shape (out_size,).
+        known: Every given element of the layout [standard deviations], shape (size,).
+        low: Lower bounds of p, shape (n,).
+        high: Upper bounds of p, shape (n,).
     """
     chain, outputs = schema.weights.whole, schema.out_index[inferred]
     begin, end = chain[0], chain[-1]
@@ -82,102 +81,102 @@ def input_lines(
 
 
 def give(lines: Lines, begin: Layer, base: np.ndarray, columns: np.ndarray, known: np.ndarray) -> None:
-    """Write what is given into the lines of usage (f).
+    """Write given values into the lines of usage (f).
 
     Args:
-        lines: Of `input_lines`.
+        lines: The result of `input_lines`.
         begin: First layer of the network.
         base: See `input_lines`.
         columns: See `input_lines`.
         known: See `input_lines`.
     """
-    still = base.astype(begin.matrix.dtype)
-    still[columns] = 0.0
-    np.add(begin.offset, still @ begin.matrix, out=lines.chain[0].offset)
+    constant = base.astype(begin.matrix.dtype)
+    constant[columns] = 0.0
+    np.add(begin.offset, constant @ begin.matrix, out=lines.chain[0].offset)
     lines.known[:] = known
     lines.known[lines.free] = 0.0
     lines.known[lines.outputs] = 0.0
 
 
 def fitting(lines: Lines, data: np.ndarray) -> Problem:
-    """How far x is from data (paper, eq. state-loss), shape (size,) [standard deviations]; NaN where none is given."""
+    """Return the problem of fitting x to data, shape (size,) [standard deviations]; NaN where there is none."""
     given = np.flatnonzero(np.isfinite(data))
     rows = np.eye(len(data))[given]
     none = no_balance()
     return _problem(lines, rows, data[given], np.array([0, len(given)]), np.ones(1), none, 0)
 
 
-class Folded:
-    """The problem of a route and its terms, laid out once; `fill` writes the numbers of a solve into it.
+class FoldedProblem:
+    """The problem of a route and its terms, folded once; `fill` writes the numbers of a solve into it.
 
     Attributes:
-        problem: For `gemuco.search.descent`.
+        problem: Argument of `gemuco.search.descent.minimise`.
         moving: The torque balance at the predicted posture; None if there is none.
     """
 
     def __init__(self, lines: Lines, bounds: Sequence[Bound], held: np.ndarray) -> None:
-        """Lay the problem out for these terms; see `fold`."""
+        """Fold these terms; see `fold`."""
         self._lines = lines
         self._norms = [bound for bound in bounds if isinstance(bound, Norm)]
-        self._balanced = next((bound for bound in bounds if isinstance(bound, Balanced)), None)
-        self.moving = self._balanced if self._balanced is not None and self._balanced.posture is None else None
+        self._torque = next((bound for bound in bounds if isinstance(bound, TorqueNorm)), None)
+        self.moving = self._torque if self._torque is not None and self._torque.posture is None else None
         size = len(lines.known)
         rows = [norm.difference.rows(size)[0] for norm in self._norms]
         ends = np.cumsum([0, *map(len, rows)])
         weights = np.array([norm.weight for norm in self._norms], float)
         balance = no_balance()
-        if (bound := self._balanced) is not None:
-            fed = [bound.f] if bound.posture is not None else [bound.f, bound.theta]
+        if (bound := self._torque) is not None:
+            spans = [bound.f] if bound.posture is not None else [bound.f, bound.theta]
             first = int(ends[-1])
             second = -1 if bound.posture is not None else first + bound.f.stop - bound.f.start
-            rows += [np.eye(size)[span] for span in fed]
+            rows += [np.eye(size)[span] for span in spans]
             balance = _balance(bound, (first, second))
         self._index = np.flatnonzero(np.isfinite(held))
         rows.append(np.eye(size)[self._index])
         self._rows = np.concatenate(rows)
-        self._wanted = np.zeros(len(self._rows))
+        self._reference = np.zeros(len(self._rows))
         self._slots = [slice(begin, end) for begin, end in pairwise(ends)]
-        self.problem = _problem(lines, self._rows, self._wanted, ends, weights, balance, len(self._index))
+        self.problem = _problem(lines, self._rows, self._reference, ends, weights, balance, len(self._index))
         wide, narrow, place = self.problem.chain.form[0, [WIDE, NARROW, PLACE]]
         self._offset = self.problem.chain.flat[place + wide * narrow : place + (wide + 1) * narrow]
         self.fill(held)
 
     def fill(self, held: np.ndarray) -> None:
-        """Write what is given, wanted and held now; as many elements as before.
+        """Write the given values, references and held values of a solve; the same elements as before.
 
         Args:
-            held: What predictions must equal [standard deviations], shape (size,); NaN where free.
+            held: Values that predictions must equal [standard deviations], shape (size,); NaN where free.
         """
         for slot, norm in zip(self._slots, self._norms, strict=True):
             difference = norm.difference
-            self._wanted[slot] = difference.wanted[difference.asked]
+            self._reference[slot] = difference.reference[difference.counts]
         if len(self._index):
-            self._wanted[-len(self._index) :] = held[self._index]
-        np.subtract(self._rows @ self._lines.known, self._wanted, out=self.problem.direct[-1], casting="same_kind")
-        if len(self._lines.chain) > 1:  # the only layer of a net takes nothing that is given, and the terms are in it
+            self._reference[-len(self._index) :] = held[self._index]
+        np.subtract(self._rows @ self._lines.known, self._reference, out=self.problem.direct[-1], casting="same_kind")
+        if len(self._lines.chain) > 1:  # else the only layer holds the terms
             self._offset[:] = self._lines.chain[0].offset
-        if self._balanced is not None and self._balanced.posture is not None:
-            _stand(self.problem.balance, self._balanced, self._balanced.posture)
+        if self._torque is not None and self._torque.posture is not None:
+            _set_posture(self.problem.balance, self._torque, self._torque.posture)
 
 
-def fold(lines: Lines, bounds: Sequence[Bound], held: np.ndarray) -> Folded | None:
-    """The problem of a route and its terms; None if a term is the caller's own, or two of them balance torques.
+def fold(lines: Lines, bounds: Sequence[Bound], held: np.ndarray) -> FoldedProblem | None:
+    """Fold a route and its terms; None if a term is the caller's own, or two of them balance torques.
 
     Args:
         lines: The route.
         bounds: The terms.
-        held: What predictions must equal [standard deviations], shape (size,); NaN where free.
+        held: Values that predictions must equal [standard deviations], shape (size,); NaN where free.
     """
-    balances = [bound for bound in bounds if isinstance(bound, Balanced)]
-    if len(balances) > 1 or not all(isinstance(bound, Norm | Balanced) for bound in bounds):
+    balances = [bound for bound in bounds if isinstance(bound, TorqueNorm)]
+    if len(balances) > 1 or not all(isinstance(bound, Norm | TorqueNorm) for bound in bounds):
         return None
-    return Folded(lines, bounds, held)
+    return FoldedProblem(lines, bounds, held)
 
 
 def _problem(
     lines: Lines,
     rows: np.ndarray,
-    wanted: np.ndarray,
+    reference: np.ndarray,
     ends: np.ndarray,
     weights: np.ndarray,
     balance: Balance,
@@ -190,37 +189,37 @@ def _problem(
     direct = np.zeros((len(lines.low) + 1, len(rows)), dtype)
     if len(lines.free):
         direct[:-1] = rows[:, lines.free].T
-    direct[-1] = rows @ lines.known - wanted
+    direct[-1] = rows @ lines.known - reference
     limits = np.stack([lines.low, lines.high]).astype(dtype)
     return Problem(pack(chain), direct, ends, weights, balance, held, limits)
 
 
 def no_balance() -> Balance:
-    """Torque balance of nothing."""
+    """Return a torque balance without joints."""
     none = np.zeros((0, 3), np.float32)
     chain = Packed(np.zeros(0, np.float32), np.zeros((0, 5), np.int64))
     return Balance(chain, chain.flat, none, none, (-1, -1), 0.0)
 
 
-def _balance(bound: Balanced, rows: tuple[int, int]) -> Balance:
+def _balance(bound: TorqueNorm, rows: tuple[int, int]) -> Balance:
     muscles = bound.muscles
     joints = np.zeros((len(bound.mean), 3 + len(bound.mean)), np.float32)
     joints[:, STD] = muscles.theta_std
     lines = np.stack([muscles.f_std, muscles.f_mean, muscles.l_std], axis=1).astype(np.float32)
     balance = Balance(muscles.packed, muscles.back, joints, lines, rows, float(bound.weight))
     if bound.posture is None:
-        _stand(balance, bound, bound.mean)
+        _set_posture(balance, bound, bound.mean)
     return balance
 
 
-def _stand(balance: Balance, bound: Balanced, posture: np.ndarray) -> None:
-    """Write the posture [rad], shape (joints,), that torque is balanced at."""
+def _set_posture(balance: Balance, bound: TorqueNorm, posture: np.ndarray) -> None:
+    """Write the posture [rad], shape (joints,), at which torque is balanced."""
     balance.joints[:, POSTURE] = (posture - bound.mean) / bound.std
     balance.joints[:, TORQUE] = bound.torques(posture[None])[0]
 
 
-def around(problem: Problem, bound: Balanced, x: np.ndarray) -> Problem:
-    """The problem with its torque as it is near a prediction, shape (size,) [standard deviations]."""
+def around(problem: Problem, bound: TorqueNorm, x: np.ndarray) -> Problem:
+    """Return the problem with its torque linearised at a prediction, shape (size,) [standard deviations]."""
     posture = (x[bound.theta] * bound.std + bound.mean)[None]
     torque = bound.torques(posture)
     joints = problem.balance.joints.copy()

@@ -1,14 +1,14 @@
-"""What is asked of a prediction: terms that add up to a loss (paper, II-H, II-I and III).
+"""Terms that add up to a loss of predictions (paper, II-H, II-I and III).
 
-A term says what is wanted (`Match("joint_position")`). Bound to a body schema, the references of this solve and the
-present, it becomes a function of predictions: every signal of the layout in standard deviations, shape
+A term such as `Match("joint_position")` states an aim. Bound to a body schema, the references of this solve and the
+present values, it is a function of predictions: every signal of the layout in standard deviations, shape
 (candidates, size), to losses (candidates,) and their gradients (candidates, size). A new term is a class with
 `signals` and `bind`.
 
 Units: the paper adds metres, radians and newtons and does not say how. Here `Match`, `StayNear` and `StaySmall` measure
 in standard deviations of the training data (`unit="std"`), so that one weight means the same for every signal, or in
-the signal's own unit (`unit="si"`). `StaySmall` measures from the physical zero either way, not from the mean.
-`TorqueBalance` (in `gemuco.search.torque`) measures in N m. `Hold` has no weight: it is met exactly.
+the signal's own unit (`unit="si"`). `StaySmall` measures from the physical zero, not from the mean. `TorqueBalance` (in
+`gemuco.search.torque`) measures in N m. `Hold` has no weight: it is met exactly.
 """
 
 from collections.abc import Mapping
@@ -17,29 +17,27 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from gemuco.errors import NotFinite, NotObservable, SchemaError, WrongSize
+from gemuco.errors import NotFinite, NotObservable, SchemaError, WrongSize, described
 from gemuco.schema import BodySchema
 from gemuco.search.norms import Bound, Difference, Norm
 
 Values = Mapping[str, np.ndarray]
-
-
 UNITS = ("std", "si")
 
 
 class Term(Protocol):
-    """One wish."""
+    """One part of a loss."""
 
     @property
     def signals(self) -> tuple[str, ...]:
-        """The signals whose prediction the loss depends on."""
+        """Signals whose predictions the loss depends on."""
         ...
 
     def bind(self, schema: BodySchema, target: Values, now: Values) -> Bound:
-        """The wish as a function of predictions.
+        """Return the loss as a function of predictions.
 
         Args:
-            schema: Whose predictions.
+            schema: The schema that predicts.
             target: Signal -> reference of this solve [its unit].
             now: Signal -> measured value [its unit]; NaN where nothing was measured.
         """
@@ -47,11 +45,11 @@ class Term(Protocol):
 
 
 @runtime_checkable
-class Lasting(Term, Protocol):
-    """A wish that depends on references and the present by its numbers alone: what it was bound to is kept."""
+class LastingTerm(Term, Protocol):
+    """A term whose bound form stays the same but for the numbers of references and present values."""
 
     def renew(self, bound: Bound, schema: BodySchema, target: Values, now: Values) -> None:
-        """Tell what `bind` returned other references and another present, in place; raises what `bind` does."""
+        """Write other references and present values into the result of `bind`; raises the same errors."""
         ...
 
 
@@ -60,10 +58,10 @@ class Match:
     """weight * ||A x - reference||: reach the reference of a signal.
 
     Attributes:
-        signal: What to predict.
+        signal: The predicted signal.
         weight: Loss per unit of the norm.
-        matrix: Rows of A, which acts on the signal in its own unit; the signal itself if not given.
-        value: A reference that is always the same, such as (0, 0) for the center of gravity; else the target's.
+        matrix: Rows of A, which acts on the signal in its own unit; the identity if not given.
+        value: A constant reference, such as (0, 0) for the center of gravity; else the target's.
         unit: `std`: every row of A x in its own standard deviation; `si`: in the unit of A x.
     """
 
@@ -81,11 +79,11 @@ class Match:
 
     @property
     def signals(self) -> tuple[str, ...]:
-        """The signals whose prediction the loss depends on."""
+        """Signals whose predictions the loss depends on."""
         return (self.signal,)
 
     def reference(self, target: Values) -> np.ndarray:
-        """What A x shall be [its unit], shape (rows,).
+        """Return the reference of A x [its unit], shape (rows,).
 
         Raises:
             NotObservable: There is neither a value nor a target.
@@ -93,21 +91,21 @@ class Match:
         if self.value is not None:
             return np.asarray(self.value, float)
         if self.signal not in target:
-            raise NotObservable(f"Nothing was asked of '{self.signal}', but the loss wants to match it; give a target.")
+            raise NotObservable(f"The loss matches '{self.signal}', but it has no reference; give a target.")
         return _numbers(self.signal, target[self.signal])
 
     def bind(self, schema: BodySchema, target: Values, now: Values) -> Norm:
-        """See `Term.bind`; nothing is asked where the reference is NaN."""
+        """Bind the term; see `Term.bind`. An element whose reference is NaN does not count."""
         return Norm(self.difference(schema, target), self.weight)
 
     def renew(self, bound: Norm, schema: BodySchema, target: Values, now: Values) -> None:
-        """See `Lasting.renew`."""
+        """Take other references; see `LastingTerm.renew`."""
         if self.value is None:
-            bound.difference.ask(self.reference(target))
+            bound.difference.take(self.reference(target))
 
     def difference(self, schema: BodySchema, target: Values) -> Difference:
-        """A x - reference as a function of predictions."""
-        return Difference.of(schema, self.signal, self.matrix, self.unit).ask(self.reference(target))
+        """Return A x - reference as a function of predictions."""
+        return Difference.of(schema, self.signal, self.matrix, self.unit).take(self.reference(target))
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,9 +113,9 @@ class StayNear:
     """weight * ||x - near||: keep a signal near a posture, such as 0.3 ||theta - theta_orig||.
 
     Attributes:
-        signal: What to keep.
+        signal: The signal that stays near.
         weight: Loss per unit of the norm.
-        value: Where; if not given, the reference of this solve, and without one where the signal is now.
+        value: The posture; if not given, the reference of this solve, and without one the present value.
         unit: `std` or `si`.
     """
 
@@ -132,21 +130,21 @@ class StayNear:
 
     @property
     def signals(self) -> tuple[str, ...]:
-        """The signals whose prediction the loss depends on."""
+        """Signals whose predictions the loss depends on."""
         return (self.signal,)
 
     def bind(self, schema: BodySchema, target: Values, now: Values) -> Norm:
-        """See `Term.bind`; nothing is asked where it is not known what to stay near."""
+        """Bind the term; see `Term.bind`. An element without a known value to stay near does not count."""
         near = Difference.of(schema, self.signal, None, self.unit)
-        return Norm(near.ask(self.reference(schema, target, now)), self.weight)
+        return Norm(near.take(self.reference(schema, target, now)), self.weight)
 
     def renew(self, bound: Norm, schema: BodySchema, target: Values, now: Values) -> None:
-        """See `Lasting.renew`."""
+        """Take other references; see `LastingTerm.renew`."""
         if self.value is None:
-            bound.difference.ask(self.reference(schema, target, now))
+            bound.difference.take(self.reference(schema, target, now))
 
     def reference(self, schema: BodySchema, target: Values, now: Values) -> np.ndarray:
-        """What to stay near [its unit], shape (n,); NaN where that is not known."""
+        """Return the value to stay near [its unit], shape (n,); NaN where it is not known."""
         if self.value is not None:
             return np.asarray(self.value, float)
         unknown = np.full(schema.layout.signal(self.signal).size, np.nan)
@@ -166,28 +164,28 @@ class StaySmall:
 
     @property
     def signals(self) -> tuple[str, ...]:
-        """The signals whose prediction the loss depends on."""
+        """Signals whose predictions the loss depends on."""
         return (self.signal,)
 
     def bind(self, schema: BodySchema, target: Values, now: Values) -> Norm:
-        """See `Term.bind`."""
+        """Bind the term; see `Term.bind`."""
         zero = np.zeros(schema.layout.signal(self.signal).size)
-        return Norm(Difference.of(schema, self.signal, None, self.unit).ask(zero), self.weight)
+        return Norm(Difference.of(schema, self.signal, None, self.unit).take(zero), self.weight)
 
     def renew(self, bound: Norm, schema: BodySchema, target: Values, now: Values) -> None:
-        """See `Lasting.renew`; zero stays zero."""
+        """Change nothing; zero stays zero."""
 
 
 @dataclass(frozen=True, slots=True)
 class Hold:
-    """A signal is forced to a value: a condition that every prediction meets, not a wish that others can outweigh.
+    """A constraint: every prediction has this value of a signal, whatever the other terms weigh.
 
-    Where the signal is an input of the route's mask it is given to the network and not searched for; where it is
-    predicted, the search moves only along predictions that meet it.
+    A signal in the route's mask is given to the network and not searched; for a predicted signal the search moves only
+    along predictions that meet it.
 
     Attributes:
-        signal: What is held.
-        value: Where, NaN for elements that are free; the reference of this solve if not given.
+        signal: The held signal.
+        value: Its value, NaN for free elements; the reference of this solve if not given.
     """
 
     signal: str
@@ -196,19 +194,19 @@ class Hold:
     def __post_init__(self) -> None:
         _freeze_value(self)
 
-    def wanted(self, schema: BodySchema, target: Values) -> np.ndarray:
-        """Every element of the layout [standard deviations], shape (size,); NaN where nothing is held.
+    def value_of(self, schema: BodySchema, target: Values) -> np.ndarray:
+        """Return every element of the layout [standard deviations], shape (size,); NaN where it is free.
 
         Raises:
             NotObservable: There is neither a value nor a reference.
             NotFinite: No element is held.
         """
         if self.value is None and self.signal not in target:
-            raise NotObservable(f"'{self.signal}' shall be held, but nobody says where; give a value or a reference.")
+            raise NotObservable(f"'{self.signal}' is to be held, but has no value; give a value or a reference.")
         value = _numbers(self.signal, self.value if self.value is not None else target[self.signal])
         x = schema.normalise({self.signal: value})
         if not np.isfinite(x).any():
-            raise NotFinite(f"'{self.signal}' shall be held, but no element of where is a number.")
+            raise NotFinite(f"'{self.signal}' is to be held, but no element of its value is a number.")
         return x
 
 
@@ -216,17 +214,17 @@ def _numbers(signal: str, value: object) -> np.ndarray:
     try:
         array = np.asarray(value, float)
     except (TypeError, ValueError):
-        raise WrongSize(f"The reference of '{signal}' needs numbers; what was given are none.") from None
+        raise WrongSize(f"The reference of '{signal}' needs numbers, not {described(value)}.") from None
     if array.ndim != 1:
         raise WrongSize(f"The reference of '{signal}' has shape {array.shape}; it is one array, of shape (n,).")
     return array
 
 
 def check_weight(weight: float, what: str) -> None:
-    """Refuse a weight that would reward what it should punish.
+    """Refuse a weight that is negative, infinite or not a number.
 
     Raises:
-        SchemaError: It is negative, infinite or no number.
+        SchemaError: The weight is refused.
     """
     if not (np.isfinite(weight) and weight >= 0.0):
         raise SchemaError(f"The weight of {what} is {weight}; it must be a finite number that is not negative.")

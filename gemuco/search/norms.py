@@ -20,23 +20,23 @@ class Bound(Protocol):
 
         Args:
             x: Predictions [standard deviations], shape (candidates, size).
-            slope: Whether gradients are wanted; they may be anything if not.
+            slope: Whether gradients are needed; without, they may be anything.
         """
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """M x - w of one signal's prediction [standard deviations]: scaled, and zero where nothing is asked.
+    """M x - w of one signal's prediction [standard deviations]: scaled, and zero in rows that do not count.
 
     Attributes:
-        what: The beginning of what is said of a reference of another size.
-        span: Where the signal lies in the layout.
-        matrix: M, shape (rows, n); None for one.
-        middle: What is wanted where w is 0 [unit of A x], shape (rows,).
-        scale: What is wanted where w is 1 more than that [unit of A x], shape (rows,).
-        wanted: w, shape (rows,).
-        asked: Which rows count, shape (rows,).
+        what: The beginning of the message about a reference of another size.
+        span: Place of the signal in the layout.
+        matrix: M, shape (rows, n); None for the identity.
+        middle: Reference at which w is 0 [unit of A x], shape (rows,).
+        scale: Change of the reference that changes w by 1 [unit of A x], shape (rows,).
+        reference: w, shape (rows,).
+        counts: Whether each row counts, shape (rows,).
     """
 
     what: str
@@ -44,12 +44,12 @@ class Difference:
     matrix: np.ndarray | None
     middle: np.ndarray
     scale: np.ndarray
-    wanted: np.ndarray
-    asked: np.ndarray
+    reference: np.ndarray
+    counts: np.ndarray
 
     @classmethod
     def of(cls, schema: BodySchema, signal: str, matrix: Sequence[Sequence[float]] | None, unit: str) -> "Difference":
-        """From the signal's own unit; nothing is asked yet.
+        """Make the difference of a signal; no row counts yet.
 
         Raises:
             UnknownSignal: The signal is not in the layout.
@@ -71,31 +71,31 @@ class Difference:
         what = f"The matrix of '{signal}' has {len(rows)} rows, but its reference"
         return cls(what, span, rows * std / scale[:, None], rows @ mean, scale, *_nothing(len(rows)))
 
-    def ask(self, reference: np.ndarray) -> "Difference":
-        """Want a reference [unit of A x], shape (rows,), in place of the one before; nothing where it is NaN.
+    def take(self, reference: np.ndarray) -> "Difference":
+        """Take another reference [unit of A x], shape (rows,); a row does not count where it is NaN.
 
         Raises:
             WrongSize: It does not have as many elements as there are rows.
         """
-        if reference.shape != self.wanted.shape:
+        if reference.shape != self.reference.shape:
             raise WrongSize(f"{self.what} has shape {reference.shape}.")
-        np.subtract(reference, self.middle, out=self.wanted)
-        np.divide(self.wanted, self.scale, out=self.wanted)
-        np.isfinite(self.wanted, out=self.asked)
-        if not self.asked.all():
-            self.wanted[~self.asked] = 0.0
+        np.subtract(reference, self.middle, out=self.reference)
+        np.divide(self.reference, self.scale, out=self.reference)
+        np.isfinite(self.reference, out=self.counts)
+        if not self.counts.all():
+            self.reference[~self.counts] = 0.0
         return self
 
     def at(self, x: np.ndarray) -> np.ndarray:
-        """The difference at predictions, shape (candidates, size) -> (candidates, rows)."""
+        """Return the difference at predictions, shape (candidates, size) -> (candidates, rows)."""
         part = x[:, self.span]
-        return ((part if self.matrix is None else part @ self.matrix.T) - self.wanted) * self.asked
+        return ((part if self.matrix is None else part @ self.matrix.T) - self.reference) * self.counts
 
     def rows(self, size: int) -> tuple[np.ndarray, np.ndarray]:
-        """What is asked as rows over the whole layout, shape (asked, size), and what they shall be, shape (asked,)."""
-        found = np.zeros((len(self.wanted), size))
-        found[:, self.span] = np.eye(len(self.wanted)) if self.matrix is None else self.matrix
-        return found[self.asked], self.wanted[self.asked]
+        """Return the counting rows over the whole layout, shape (rows, size), and their references, shape (rows,)."""
+        rows = np.zeros((len(self.reference), size))
+        rows[:, self.span] = np.eye(len(self.reference)) if self.matrix is None else self.matrix
+        return rows[self.counts], self.reference[self.counts]
 
 
 def _nothing(rows: int) -> tuple[np.ndarray, np.ndarray]:
@@ -110,22 +110,22 @@ class Norm:
     weight: float
 
     def __call__(self, x: np.ndarray, slope: bool = True) -> tuple[np.ndarray, np.ndarray]:
-        """See `Bound`."""
+        """Return losses and gradients; see `Bound`."""
         difference = self.difference.at(x)
         norm = np.sqrt(np.einsum("ij,ij->i", difference, difference))
         gradient = np.zeros_like(x)
         if slope:
-            way = difference * (self.weight / np.maximum(norm, TINY))[:, None]
+            slopes = difference * (self.weight / np.maximum(norm, TINY))[:, None]
             matrix = self.difference.matrix
-            gradient[:, self.difference.span] = way if matrix is None else way @ matrix
+            gradient[:, self.difference.span] = slopes if matrix is None else slopes @ matrix
         return self.weight * norm, gradient
 
 
 def total(bounds: Sequence[Bound], x: np.ndarray, slope: bool = True) -> tuple[np.ndarray, np.ndarray]:
-    """Sum of bound terms and its gradient; nothing wanted loses nothing."""
+    """Return the sum of bound terms and its gradient; the sum of no term is 0."""
     loss, gradient = np.zeros(len(x), x.dtype), np.zeros_like(x)
     for bound in bounds:
-        part, way = bound(x, slope)
+        part, slopes = bound(x, slope)
         loss = loss + part
-        gradient = gradient + way
+        gradient = gradient + slopes
     return loss, gradient

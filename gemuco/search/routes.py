@@ -1,5 +1,5 @@
-"""What a descent moves (paper, II-C): z, from which every x_out is decoded (e), or some x_in, from which the network
-infers the rest (f). Estimation, control and simulation differ in what they ask; what moves is here for all three.
+"""Routes of a search (paper, II-C): z, from which every x_out is decoded (e), or some x_in, from which the network
+infers the rest (f). Estimation, control and simulation have different losses and share the routes.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -10,7 +10,7 @@ import numpy as np
 from gemuco.compiled.chain import output, pack
 from gemuco.errors import NotObservable, SchemaError, WrongSize
 from gemuco.layers import pull, run, trace
-from gemuco.masks import Mask, label
+from gemuco.masks import Mask, covered_by, label
 from gemuco.scaler import CLIP
 from gemuco.schema import BodySchema
 from gemuco.search.fold import Lines, give, input_lines, latent_lines
@@ -19,39 +19,53 @@ STARTS = 64
 """A descent chooses its start from at most this many anchors of the training data."""
 ROUTES = ("auto", "mask", "latent", "input")
 Limits = Mapping[str, tuple[np.ndarray, np.ndarray]]
-"""Signal -> lowest and highest value [its unit], shapes (n,)."""
+"""Limits map a signal to its lowest and highest value [its unit], shapes (n,)."""
 Back = Callable[[np.ndarray], np.ndarray]
-"""Gradient with respect to predictions, (candidates, size) -> with respect to points, (candidates, n)."""
+"""This maps a gradient by predictions, (candidates, size), to one by points, (candidates, n)."""
 
 
 class Route(Protocol):
-    """A way from points to predictions."""
+    """A map from points to predictions.
+
+    Attributes:
+        lines: The route for compiled searches.
+    """
+
+    lines: Lines
+
+    def give(self, given: np.ndarray) -> None:
+        """Take other given values [standard deviations], shape (size,); NaN for the same elements as before."""
+        ...
 
     def predict(self, points: np.ndarray) -> tuple[np.ndarray, Back]:
-        """Points (candidates, n) -> predictions [standard deviations], (candidates, size), and how gradients return.
+        """Map points (candidates, n) to predictions [standard deviations], (candidates, size), and gradients back.
 
-        A signal that the route says nothing about is 0, and gradients with respect to it are dropped.
+        A signal outside of the route is 0, and gradients by it are dropped.
         """
         ...
 
-    def give(self, given: np.ndarray) -> None:
-        """Take other values of what is given [standard deviations], shape (size,); NaN where it was NaN before."""
+    def final(self, point: np.ndarray) -> np.ndarray:
+        """Return the prediction of a point, shape (size,) [standard deviations]; NaN outside of the route."""
+        ...
+
+    def starts(self, begin: np.ndarray, only_there: bool = False) -> np.ndarray:
+        """Return points of the known start and of training data, shape (starts, n); see `Search.find`."""
         ...
 
 
 class LatentRoute:
-    """Usage (e): z moves, and every x_out is decoded from it."""
+    """Usage (e): z is searched, and every x_out is decoded from it; see `Route`."""
 
     def __init__(self, schema: BodySchema) -> None:
         self._schema = schema
         self._decoder = schema.weights.decoder
-        self._packed, self._lines = pack(self._decoder), latent_lines(schema)
+        self._packed, self.lines = pack(self._decoder), latent_lines(schema)
 
     def give(self, given: np.ndarray) -> None:
-        """See `Route.give`; nothing is given to a decoder but z."""
+        """Take nothing: a decoder has no input but z."""
 
     def predict(self, points: np.ndarray) -> tuple[np.ndarray, Back]:
-        """See `Route.predict`."""
+        """Decode points."""
         values = trace(self._decoder, points)
         x = np.zeros((len(points), self._schema.layout.size), points.dtype)
         x[:, self._schema.out_index] = values[-1]
@@ -61,27 +75,22 @@ class LatentRoute:
 
         return x, back
 
-    def lines(self) -> Lines:
-        """For compiled searches."""
-        return self._lines
-
     def final(self, point: np.ndarray) -> np.ndarray:
-        """What was found, shape (size,) [standard deviations]; NaN for what is not in x_out."""
+        """Decode a point, shape (size,) [standard deviations]; NaN outside of x_out."""
         x = np.full(self._schema.layout.size, np.nan)
         x[self._schema.out_index] = output(self._packed, point.astype(np.float32))
         return x
 
     def starts(self, begin: np.ndarray, only_there: bool = False) -> np.ndarray:
-        """Latent states of what is known and of training data, shape (starts, latent); see `Search.find`."""
+        """Encode the known start and training data."""
         schema = self._schema
-        found = []
-        there = schema.layout.whole(np.isfinite(begin))
-        covered = [mask for mask in schema.masks if mask <= there]
+        starts = []
+        covered = covered_by(schema.masks, schema.layout.whole(np.isfinite(begin)))
         if covered:
-            found.append(run(schema.weights.encoder, schema.network_input(begin, covered[0]))[None])
-        if not found or (len(schema.anchors) and not only_there):
-            found.append(schema.derived(latent_starts))
-        return np.concatenate(found)
+            starts.append(run(schema.weights.encoder, schema.network_input(begin, covered[0]))[None])
+        if not starts or (len(schema.anchors) and not only_there):
+            starts.append(schema.derived(latent_starts))
+        return np.concatenate(starts)
 
 
 def latent_starts(schema: BodySchema) -> np.ndarray:
@@ -92,7 +101,7 @@ def latent_starts(schema: BodySchema) -> np.ndarray:
 
 
 class InputRoute:
-    """Usage (f): inputs under a mask move as far as they are not given, and the network infers the rest of x_out."""
+    """Usage (f): inputs of a mask that are not given are searched, and the network infers the rest of x_out."""
 
     def __init__(
         self, schema: BodySchema, mask: Mask, given: np.ndarray, needed: Sequence[str], limits: Limits | None = None
@@ -102,8 +111,8 @@ class InputRoute:
         Args:
             schema: The body schema.
             mask: The inputs.
-            given: Inputs that are not searched for [standard deviations], shape (size,); NaN where free.
-            needed: Signals whose prediction somebody looks at; the network runs if one of them is not in the mask.
+            given: Inputs that are not searched [standard deviations], shape (size,); NaN where free.
+            needed: Signals of the loss; the network runs if one of them is not in the mask.
             limits: Narrower bounds of the inputs than those of the training data.
 
         Raises:
@@ -117,9 +126,9 @@ class InputRoute:
                 )
         inside = schema.layout.indices(mask)
         self.mask, self._schema, self._chain = mask, schema, schema.weights.whole
-        self._inside, self._there = inside, np.isfinite(given)
-        self.free = inside[~self._there[inside]]
-        self._known = np.where(self._there, given, 0.0)
+        self._inside, self._given = inside, np.isfinite(given)
+        self.free = inside[~self._given[inside]]
+        self._known = np.where(self._given, given, 0.0)
         self._base = schema.network_input(self._known, mask).astype(self._chain[0].matrix.dtype)
         is_free, is_inside = np.zeros((2, schema.layout.size), bool)
         is_free[self.free] = is_inside[inside] = True
@@ -127,21 +136,17 @@ class InputRoute:
         self._inferred = ~is_inside[schema.out_index]
         self._outputs = schema.out_index[self._inferred]
         self._runs = any(name not in mask for name in needed)
-        low, high = bounds_of(schema, limits)
-        dtype = self._base.dtype
-        self.low, self.high = low[self.free].astype(dtype), high[self.free].astype(dtype)
-        self._lines = input_lines(
-            schema, self._base, self._columns, self.free, self._inferred, self._known, self.low, self.high
-        )
+        low, high = (bound[self.free].astype(self._base.dtype) for bound in bounds_of(schema, limits))
+        self.lines = input_lines(schema, self._base, self._columns, self.free, self._inferred, self._known, low, high)
 
     def give(self, given: np.ndarray) -> None:
-        """See `Route.give`."""
-        np.copyto(self._known, given, where=self._there)
+        """Write other given values into the network's input."""
+        np.copyto(self._known, given, where=self._given)
         self._base[:] = self._schema.network_input(self._known, self.mask)
-        give(self._lines, self._chain[0], self._base, self._columns, self._known)
+        give(self.lines, self._chain[0], self._base, self._columns, self._known)
 
     def predict(self, points: np.ndarray) -> tuple[np.ndarray, Back]:
-        """See `Route.predict`."""
+        """Run the network on points."""
         x = np.repeat(self._known[None].astype(points.dtype), len(points), axis=0)
         x[:, self.free] = points
         if not self._runs:
@@ -158,12 +163,8 @@ class InputRoute:
 
         return x, back
 
-    def lines(self) -> Lines:
-        """For compiled searches."""
-        return self._lines
-
     def final(self, point: np.ndarray) -> np.ndarray:
-        """What was found, shape (size,) [standard deviations]; NaN for what is neither input nor output."""
+        """Run the network on a point, shape (size,) [standard deviations]; NaN for what is neither input nor output."""
         schema = self._schema
         inputs = self._base.astype(np.float32)
         inputs[self._columns] = point
@@ -174,24 +175,25 @@ class InputRoute:
         return x
 
     def starts(self, begin: np.ndarray, only_there: bool = False) -> np.ndarray:
-        """What is known, and training data, shape (starts, free); see `Search.find`."""
-        found = []
+        """Take the inputs of the known start and of training data."""
+        starts = []
         if np.isfinite(begin[self.free]).all():
-            found.append(begin[None, self.free])
-        if len(self._schema.anchors) and not (found and only_there):
-            found.append(self._schema.anchors[:STARTS, self.free])
-        return np.concatenate(found or [np.zeros((1, len(self.free)))]).astype(np.float32)
+            starts.append(begin[None, self.free])
+        if len(self._schema.anchors) and not (starts and only_there):
+            starts.append(self._schema.anchors[:STARTS, self.free])
+        return np.concatenate(starts or [np.zeros((1, len(self.free)))]).astype(np.float32)
 
 
 def bounds_of(schema: BodySchema, limits: Limits | None) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest value of every element that a search may try [standard deviations], shapes (size,).
-
-    The range of the training data, narrowed by the limits.
+    """Return the bounds of a search: the range of the training data, narrowed by the limits.
 
     Raises:
         UnknownSignal: A limit is of a signal that is not in the layout.
         WrongSize: A limit does not have its signal's size.
         SchemaError: A lower limit is above its upper limit.
+
+    Returns:
+        Lowest and highest value of every element [standard deviations], shapes (size,).
     """
     scaler = schema.scaler
     low, high = scaler.normalise(scaler.low).clip(-CLIP, CLIP), scaler.normalise(scaler.high).clip(-CLIP, CLIP)
@@ -202,16 +204,16 @@ def bounds_of(schema: BodySchema, limits: Limits | None) -> tuple[np.ndarray, np
         bounds = [schema.layout.join({name: np.asarray(bound, float)}) for bound in pair]
         below, above = (scaler.normalise(bound)[span] for bound in bounds)
         if not (below <= above).all():
-            raise SchemaError(f"A lower limit of '{name}' is above its upper limit, or one of them is no number.")
+            raise SchemaError(f"A lower limit of '{name}' is above its upper limit, or is not a number.")
         low[span], high[span] = low[span].clip(below, above), high[span].clip(below, above)
     return low, high
 
 
 def checked_mask(schema: BodySchema, mask: Mask) -> Mask:
-    """A mask that was found feasible.
+    """Return a mask after a check that it is feasible.
 
     Raises:
-        NotObservable: This schema was not trained with it.
+        NotObservable: The schema was not trained with it.
     """
     if mask not in schema.masks:
         known = ", ".join(label(m, schema.layout.names) for m in schema.masks)
@@ -223,10 +225,10 @@ def checked_mask(schema: BodySchema, mask: Mask) -> Mask:
 
 
 def checked_route(route: str) -> str:
-    """A route that exists.
+    """Return the name of a route after a check.
 
     Raises:
-        SchemaError: It does not.
+        SchemaError: There is no such route.
     """
     if route not in ROUTES:
         raise SchemaError(f"Route '{route}' is not known. Known routes: {', '.join(ROUTES)}.")

@@ -1,4 +1,4 @@
-"""Torque balance of muscles (paper, III-B): the muscle Jacobian G = dl/dtheta, had by differentiating the network."""
+"""Torque balance of muscles (paper, III-B): the muscle Jacobian G = dl/dtheta is the derivative of the network."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,19 +15,19 @@ from gemuco.search.norms import TINY
 
 POSTURES = ("reference", "predicted")
 STEP = 1e-5
-"""Change of a posture [rad] by which the caller's torque is differentiated."""
+"""The caller's torque is differentiated by this change of a posture [rad]."""
 
 
 @dataclass(frozen=True, slots=True)
 class TorqueBalance:
     """weight * ||tau_ext + G^T f||: muscle tensions that hold a posture.
 
-    G is taken at the predicted tensions, and at the reference posture (control: the posture is decided) or at the
-    predicted one (simulation: it is what is sought).
+    G is taken at the predicted tensions, and at the reference posture (control, where the posture is given) or at the
+    predicted one (simulation, where it is searched).
 
     Attributes:
         torque: Posture [rad], shape (joints,) -> tau_ext, the joint torque that the muscles must supply [N m], shape
-            (joints,): what gravity asks, minus what an external force F does already, gravity(theta) - J^T F.
+            (joints,): that of gravity minus that of an external force F, gravity(theta) - J^T F.
         weight: Loss per N m.
         position: theta, rad.
         tension: f, N.
@@ -49,40 +49,40 @@ class TorqueBalance:
 
     @property
     def signals(self) -> tuple[str, ...]:
-        """The signals whose prediction the loss depends on."""
+        """Signals whose predictions the loss depends on."""
         return (self.tension,) if self.at == "reference" else (self.position, self.tension)
 
-    def bind(self, schema: BodySchema, target: Values, now: Values) -> "Balanced":
-        """See `Term.bind`."""
+    def bind(self, schema: BodySchema, target: Values, now: Values) -> "TorqueNorm":
+        """Bind the term; see `Term.bind`."""
         muscles = muscle_model(schema, self)
         theta, f = schema.layout.slice(self.position), schema.layout.slice(self.tension)
         mean, std = schema.scaler.mean[theta], schema.scaler.std[theta]
         posture = None if self.at == "predicted" else np.empty(len(mean))
-        bound = Balanced(muscles, theta, f, mean, std, self.torque, self.weight, posture)
+        bound = TorqueNorm(muscles, theta, f, mean, std, self.torque, self.weight, posture)
         self.renew(bound, schema, target, now)
         return bound
 
-    def renew(self, bound: "Balanced", schema: BodySchema, target: Values, now: Values) -> None:
-        """See `Lasting.renew`; a predicted posture needs no reference."""
+    def renew(self, bound: "TorqueNorm", schema: BodySchema, target: Values, now: Values) -> None:
+        """Take another reference; see `LastingTerm.renew`. A predicted posture needs none."""
         if bound.posture is None:
             return
         if self.position not in target or not np.isfinite(target[self.position]).all():
-            raise NotFinite(f"Torque balance needs a whole reference of '{self.position}'; some of it is missing.")
+            raise NotFinite(f"Torque balance needs a reference of every element of '{self.position}'.")
         if np.shape(target[self.position]) != bound.posture.shape:
             schema.layout.join_one({self.position: target[self.position]})
         bound.posture[:] = target[self.position]
 
 
 @dataclass(frozen=True, slots=True)
-class Balanced:
+class TorqueNorm:
     """Torque balance bound to a schema; a `Bound` that compiled searches know (`gemuco.search.fold`).
 
     Attributes:
-        muscles: The muscles as the network knows them.
-        theta: Where the posture lies in the layout.
-        f: Where the tension does.
-        mean: Of the posture [rad], shape (joints,).
-        std: Of the posture [rad], shape (joints,).
+        muscles: The muscles in the network.
+        theta: Place of the posture in the layout.
+        f: Place of the tension in the layout.
+        mean: Mean of the posture [rad], shape (joints,).
+        std: Standard deviation of the posture [rad], shape (joints,).
         torque: Posture [rad] -> tau_ext [N m].
         weight: Loss per N m.
         posture: The given posture [rad], shape (joints,); None where it is the predicted one.
@@ -98,42 +98,42 @@ class Balanced:
     posture: np.ndarray | None
 
     def __call__(self, x: np.ndarray, slope: bool = True) -> tuple[np.ndarray, np.ndarray]:
-        """See `Bound`."""
+        """Return losses and gradients; see `Bound`."""
         postures = x[:, self.theta] * self.std + self.mean
         if self.posture is not None:
             postures = np.repeat(self.posture[None], len(x), axis=0)
         torques = self.torques(postures if self.posture is None else postures[:1])
-        missing = self.muscles.missing((postures - self.mean) / self.std, x[:, self.f], torques)
+        deficit = self.muscles.deficit((postures - self.mean) / self.std, x[:, self.f], torques)
         gradient = np.zeros_like(x)
         if slope:
-            by_posture, by_tension = missing.slopes()
+            by_posture, by_tension = deficit.slopes()
             gradient[:, self.f] = self.weight * by_tension
             if self.posture is None:
-                turned = np.einsum("ij,ijk->ik", missing.way, self.stiffness(postures, torques))
-                gradient[:, self.theta] = self.weight * (by_posture + turned * self.std)
-        return self.weight * missing.norm, gradient
+                by_torque = np.einsum("ij,ijk->ik", deficit.gradient, self.stiffness(postures, torques))
+                gradient[:, self.theta] = self.weight * (by_posture + by_torque * self.std)
+        return self.weight * deficit.norm, gradient
 
     def torques(self, postures: np.ndarray) -> np.ndarray:
-        """tau_ext at postures [N m], shape (n, joints)."""
+        """Return tau_ext at postures [N m], shape (n, joints)."""
         return np.stack([np.asarray(self.torque(posture), float) for posture in postures])
 
     def stiffness(self, postures: np.ndarray, torques: np.ndarray) -> np.ndarray:
-        """How tau_ext changes with the posture [N m/rad], shape (n, joints, joints), by differences."""
-        found = np.empty((*torques.shape, postures.shape[1]))
+        """Return the derivative of tau_ext by the posture [N m/rad], shape (n, joints, joints), by differences."""
+        stiffness = np.empty((*torques.shape, postures.shape[1]))
         for joint in range(postures.shape[1]):
             moved = postures.copy()
             moved[:, joint] += STEP
-            found[:, :, joint] = (self.torques(moved) - torques) / STEP
-        return found
+            stiffness[:, :, joint] = (self.torques(moved) - torques) / STEP
+        return stiffness
 
 
 class MuscleModel:
-    """The muscles as the network knows them under the mask (position, tension): from theta and f to l, no more."""
+    """The part of the network that infers l from theta and f under the mask (position, tension)."""
 
     __slots__ = ("back", "chain", "f", "f_mean", "f_std", "l_std", "packed", "theta", "theta_std")
 
     def __init__(self, schema: BodySchema, names: TorqueBalance) -> None:
-        """Prepare the network.
+        """Cut the part out of the network.
 
         Raises:
             NotObservable: The schema does not infer length from position and tension.
@@ -144,7 +144,7 @@ class MuscleModel:
         if mask not in schema.masks or names.length not in schema.x_out:
             raise NotObservable(
                 f"Torque balance differentiates '{names.length}' by '{names.position}', but this schema does not infer "
-                f"it from '{names.position}' and '{names.tension}'; see the masks that structure determination found."
+                f"it from '{names.position}' and '{names.tension}'; see its feasible masks."
             )
         begin, *between, end = schema.weights.whole
         dtype = begin.matrix.dtype
@@ -163,8 +163,8 @@ class MuscleModel:
         self.theta_std, self.f_std, self.l_std = (scaler.std[s].astype(dtype) for s in (theta, f, length))
         self.f_mean = scaler.mean[f].astype(dtype)
 
-    def missing(self, posture: np.ndarray, tension: np.ndarray, torque: np.ndarray) -> "Missing":
-        """What the muscles lack, torque + G^T f.
+    def deficit(self, posture: np.ndarray, tension: np.ndarray, torque: np.ndarray) -> "Deficit":
+        """Return the torque that the muscles lack, torque + G^T f.
 
         Args:
             posture: theta [standard deviations], shape (candidates, joints).
@@ -174,10 +174,10 @@ class MuscleModel:
         muscles = self._at(posture, tension)
         rest = torque.astype(self.f_std.dtype) + muscles.gradient[:, self.theta] / self.theta_std
         norm = np.sqrt(np.einsum("ij,ij->i", rest, rest))
-        return Missing(norm, rest / np.maximum(norm, TINY)[:, None], self, muscles)
+        return Deficit(norm, rest / np.maximum(norm, TINY)[:, None], self, muscles)
 
     def torque(self, posture: np.ndarray, tension: np.ndarray) -> np.ndarray:
-        """G^T f [N m], shape (candidates, joints), of postures and tensions [standard deviations]."""
+        """Return G^T f [N m], shape (candidates, joints), of postures and tensions [standard deviations]."""
         return self._at(posture, tension).gradient[:, self.theta] / self.theta_std
 
     def _at(self, posture: np.ndarray, tension: np.ndarray) -> Curvature:
@@ -188,7 +188,7 @@ class MuscleModel:
 
 @lru_cache(maxsize=4)
 def muscle_model(schema: BodySchema, names: TorqueBalance) -> MuscleModel:
-    """The muscles of a schema; those of the newest schemas are kept, for a solve takes less time than to lay them out.
+    """Return the muscles of a schema; the newest four are kept, for cutting them out takes longer than a solve.
 
     Raises:
         NotObservable: The schema does not infer length from position and tension.
@@ -197,30 +197,30 @@ def muscle_model(schema: BodySchema, names: TorqueBalance) -> MuscleModel:
 
 
 @dataclass(frozen=True, slots=True)
-class Missing:
-    """What the muscles lack to hold a posture.
+class Deficit:
+    """Torque that the muscles lack to hold a posture.
 
     Attributes:
         norm: ||torque + G^T f|| [N m], shape (candidates,).
-        way: Its gradient with respect to torque, shape (candidates, joints).
+        gradient: Its gradient with respect to torque, shape (candidates, joints).
         model: The muscles.
-        at: Their network where it was asked.
+        at: Derivatives of their network at the candidates.
     """
 
     norm: np.ndarray
-    way: np.ndarray
+    gradient: np.ndarray
     model: MuscleModel
     at: Curvature
 
     def slopes(self) -> tuple[np.ndarray, np.ndarray]:
-        """Gradients of the norm with respect to theta and to f [N m per standard deviation], torque held constant."""
+        """Return the gradients of the norm by theta and by f [N m per standard deviation] at constant torque."""
         model = self.model
         tangent = np.zeros_like(self.at.gradient)
-        tangent[:, model.theta] = self.way / model.theta_std
+        tangent[:, model.theta] = self.gradient / model.theta_std
         pushed, bent = self.at.mixed(tangent)
         return bent[:, model.theta], model.f_std * model.l_std * pushed + bent[:, model.f]
 
 
 def _columns(index: np.ndarray, span: slice) -> np.ndarray:
-    """Where the elements of a span of the layout lie among those of an index."""
+    """Return the positions, within an index, of the elements of a span of the layout."""
     return np.flatnonzero((index >= span.start) & (index < span.stop))

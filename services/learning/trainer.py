@@ -66,7 +66,7 @@ def train(
         NotEnoughData: The samples are too few, or no signal can be inferred.
     """
     try:
-        own = dataset.of(layout_of(robot))
+        own = dataset.with_layout(layout_of(robot))
     except DatasetError as error:
         raise DatasetError(
             f"The data do not fit '{robot.robot}': {error} Record data of this robot with `gemuco collect`."

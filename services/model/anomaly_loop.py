@@ -5,7 +5,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-from gemuco.anomaly.score import Judged, judged
+from gemuco.anomaly.score import Deviation, deviation_of
 from gemuco.anomaly.verdict import Verdict, judge
 from gemuco.schema import BodySchema
 from hal.by_signal import Elements, Numbers
@@ -49,7 +49,7 @@ class AnomalyWatch:
         self._above_since = math.inf
         self._odd: deque[Numbers] = deque(maxlen=ODD)
         self._last_cycle = -1
-        self._scored: tuple[BodySchema, Numbers, Judged, str] | None = None
+        self._scored: tuple[BodySchema, Numbers, Deviation, str] | None = None
         self._judged: tuple[float, float, Verdict] | None = None
         """When the scores that were judged rose above the threshold, when the verdict was made, and the verdict."""
         self.latest: Anomaly | None = None
@@ -59,8 +59,8 @@ class AnomalyWatch:
         fresh, values = self._freshness.take()
         schema, known = self._schema(), self._scored
         if known is None or known[0] is not schema or known[1] is not values:  # a sample is scored once
-            score = judged(schema, in_order(schema, values).flat)
-            known = self._scored = schema, values, score, score.blamed(schema)
+            score = deviation_of(schema, in_order(schema, values).flat)
+            known = self._scored = schema, values, score, score.largest(schema)
         found = known[2]
         now = self._clock.monotonic()
         cycle = -1 if fresh is None else fresh.message.cycle
@@ -88,7 +88,7 @@ class AnomalyWatch:
             return {}
         return {name: getattr(latest, name) for name in ("score", "threshold", "is_anomaly", "verdict", "blamed")}
 
-    def _tell(self, schema: BodySchema, found: Judged, largest: str, cycle: int, now: float) -> None:
+    def _tell(self, schema: BodySchema, found: Deviation, largest: str, cycle: int, now: float) -> None:
         known = self._judged
         verdict = known[2] if known is not None and known[0] == self._above_since else None
         kind = "normal" if found.distance <= found.threshold else "" if verdict is None else verdict.kind

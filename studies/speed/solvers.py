@@ -15,10 +15,10 @@ import torch
 
 from gemuco.compiled.problem import Problem
 from gemuco.schema import BodySchema
-from gemuco.search.asked import Asked
 from gemuco.search.descent import Descent, DescentConfig, NewtonConfig, minimise
 from gemuco.search.fold import fold
 from gemuco.search.losses import Match, StayNear, StaySmall, Term
+from gemuco.search.request import Request
 from gemuco.search.routes import InputRoute, LatentRoute
 from gemuco.search.torque import TorqueBalance
 from studies.speed.bodies import body, modules
@@ -41,14 +41,14 @@ class Ours:
     """One problem, solved by the library."""
 
     def __init__(self, schema: BodySchema, route: str, terms: tuple[Term, ...]) -> None:
-        self.asked = Asked(schema, terms)
-        self.asked.read(TARGET, {})
+        self.request = Request(schema, terms)
+        self.request.read(TARGET, {})
         self.given = np.full(schema.layout.size, np.nan)
         if route == "f":
             self.given[schema.layout.slice("joint_position")] = TARGET["joint_position"]
         names = schema.layout.names
         self.route = LatentRoute(schema) if route == "e" else InputRoute(schema, MASK, self.given, names)
-        folded = fold(self.route.lines(), self.asked.bounds, self.asked.held)
+        folded = fold(self.route.lines, self.request.bounds, self.request.held)
         assert folded is not None
         self.folded, limits = folded, folded.problem.bounds
         limits[:] = np.array([[-np.inf], [np.inf]])
@@ -56,9 +56,9 @@ class Ours:
 
     def fold(self) -> Problem:
         """Return the problem as at the beginning of every solve."""
-        self.asked.read(TARGET, {})
+        self.request.read(TARGET, {})
         self.route.give(self.given)
-        self.folded.fill(self.asked.held)
+        self.folded.fill(self.request.held)
         return self.folded.problem
 
     def solve(self, config: DescentConfig | NewtonConfig) -> Descent:

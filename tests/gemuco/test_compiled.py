@@ -50,7 +50,7 @@ def way_of(schema, route):
 def bound_problem(schema, route, names):
     bounds = [TERMS[name].bind(schema, TARGET, NOW) for name in names]
     way = way_of(schema, route)
-    folded = fold(way.lines(), bounds, np.full(schema.layout.size, np.nan))
+    folded = fold(way.lines, bounds, np.full(schema.layout.size, np.nan))
     assert folded is not None
     return way, bounds, folded.problem
 

@@ -77,7 +77,7 @@ def test_infinite_is_not_measured(arm):
 
 def test_takes_the_signals_of_another_layout(data):
     swapped = Layout((LAYOUT.signal("muscle_length"), LAYOUT.signal("joint_position")))
-    part = data.of(swapped)
+    part = data.with_layout(swapped)
     np.testing.assert_array_equal(part.rows()[:, 5:], data.rows()[:, :2])
     np.testing.assert_array_equal(part.rows()[:, :5], data.rows()[:, 7:])
 
@@ -85,14 +85,14 @@ def test_takes_the_signals_of_another_layout(data):
 @pytest.mark.parametrize(
     ("signal", "text"),
     [
-        (Signal("wire", 2, "m"), "Signal 'wire' is not in the data. They hold: joint_position, muscle_tension"),
-        (Signal("joint_position", 2, "deg", ("shoulder", "elbow")), "is in rad in the data, but deg is wanted"),
+        (Signal("wire", 2, "m"), "Signal 'wire' is not in the data. Its signals: joint_position, muscle_tension"),
+        (Signal("joint_position", 2, "deg", ("shoulder", "elbow")), "is in rad in the data, but must be in deg"),
         (Signal("joint_position", 2, "rad", ("elbow", "shoulder")), "has the elements shoulder, elbow in the data"),
-        (Signal("joint_position", 3, "rad"), "has the elements shoulder, elbow in the data, but 0, 1, 2"),
+        (Signal("joint_position", 3, "rad"), "has the elements shoulder, elbow in the data, but must have 0, 1, 2"),
     ],
 )
 def test_other_signals_are_a_sentence(data, signal, text):
     with pytest.raises(DatasetError) as caught:
-        data.of(Layout((signal,)))
+        data.with_layout(Layout((signal,)))
     assert text in str(caught.value)
     assert "\n" not in str(caught.value)

@@ -101,7 +101,7 @@ def test_a_kept_controller_is_a_fresh_one(schema, arm, case, search):
         if random.random() < 0.3:
             kept.restart()
         fresh = Controller(kept.schema, terms, LENGTH, route, search, mask, limits)
-        fresh._search._warm, fresh._search._way = kept._search._warm, kept._search._way
+        fresh._search._warm, fresh._search._last = kept._search._warm, kept._search._last
         target, now = asks(arm, random, terms)
         one, other = (outcome(controller.solve, target, now) for controller in (kept, fresh))
         same(one, other)
@@ -125,7 +125,7 @@ def test_a_kept_simulator_is_a_fresh_one(schema, arm, route):
             terms = choices[int(random.integers(len(choices)))]
             kept.constrain(terms)
         fresh = Simulator(schema, terms, LENGTH, route, mask=mask)
-        fresh._search._warm, fresh._search._way = kept._search._warm, kept._search._way
+        fresh._search._warm, fresh._search._last = kept._search._warm, kept._search._last
         theta, tension = random.uniform(LOW + 0.2, HIGH - 0.2), random.uniform(20.0, 80.0, 5)
         length = arm.length(theta[None], tension[None])[0]
         given = {} if terms is choices[0] else {POSITION: part(random, theta)}
@@ -166,6 +166,6 @@ def test_what_is_kept_is_bounded_and_goes_with_the_schema(schema):
     kept = Controller(schema, (Match(POSITION), StayNear(TENSION, 0.3)), LENGTH, "latent")
     for _ in range(60):
         kept.solve({POSITION: np.array([0.3, 0.9])}, {TENSION: part(random, np.full(5, 40.0), 0.5)})
-        assert len(kept._search._laid) <= 16
+        assert len(kept._search._setups) <= 16
     kept.swap(others(schema, random))
-    assert not kept._search._laid
+    assert not kept._search._setups

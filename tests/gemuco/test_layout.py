@@ -47,7 +47,7 @@ def test_names_elements_by_signal():
         (
             {"joint_position": ["one", "two"]},
             WrongSize,
-            "Signal 'joint_position' needs 2 numbers; what was given are none.",
+            "Signal 'joint_position' needs 2 numbers, not a list.",
         ),
     ],
 )

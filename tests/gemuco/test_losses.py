@@ -72,7 +72,7 @@ def test_network_knows_the_moment_arms(schema, arm):
 def test_says_what_is_wrong(schema):
     with pytest.raises(NotObservable, match="give a target"):
         Match("joint_position").bind(schema, {}, {})
-    with pytest.raises(NotFinite, match="whole reference"):
+    with pytest.raises(NotFinite, match="reference of every element"):
         TorqueBalance(gravity).bind(schema, {"joint_position": np.array([0.0, np.nan])}, {})
     with pytest.raises(UnknownSignal, match="Known signals"):
         StaySmall("effort").bind(schema, {}, {})

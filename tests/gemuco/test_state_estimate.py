@@ -147,7 +147,7 @@ def test_says_what_is_wrong(schema):
         estimate(schema, {"joint_torque": np.zeros(2)})
     with pytest.raises(WrongSize, match="has 2 elements"):
         estimate(schema, {"joint_position": np.zeros(3)})
-    with pytest.raises(SchemaError, match="the layout asks for"):
+    with pytest.raises(SchemaError, match="the layout needs"):
         replace(schema, x_out=("joint_position",))
 
 

@@ -192,10 +192,10 @@ def test_another_model_is_used_at_once_and_a_reference_that_moves_keeps_the_layo
     solver = ModelSolver(living, robot, config)
     target = {config.target: np.full(robot.signals[config.target].size, 0.1)}
     solver(target, {})
-    laid = list(solver._controller._search._laid.values())
+    laid = list(solver._controller._search._setups.values())
     moved = {config.target: target[config.target] + 0.01}
     solver(moved, {})
-    assert list(solver._controller._search._laid.values()) == laid
+    assert list(solver._controller._search._setups.values()) == laid
     arrays = [array * np.float32(1.02) for array in living.schema.weights.arrays()]
     living.swap(living.schema.with_weights(living.schema.weights.replaced(arrays)))
     before = solver._command

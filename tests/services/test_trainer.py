@@ -76,7 +76,7 @@ def test_data_in_another_unit_are_refused(robot, dataset):
     other = Dataset(Layout(signals), dataset.episodes)
     with pytest.raises(DatasetError) as caught:
         trainer.train(robot, other, 0, quiet)
-    assert "'joint_position' is in deg in the data, but rad is wanted" in str(caught.value)
+    assert "'joint_position' is in deg in the data, but must be in rad" in str(caught.value)
     assert "gemuco collect" in str(caught.value)
 
 
