@@ -1,7 +1,7 @@
 """Values that a room works out of a body schema once, kept with the schema (`BodySchema.derived`)."""
 
 from collections.abc import Callable
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -36,16 +36,3 @@ class ByPattern(Generic[T]):
         """Work out the value for the pattern that another one was asked for last."""
         if other._last is not None:
             self(np.frombuffer(other._last, bool))
-
-
-def prepare(old: dict[Any, Any], new: Callable[[Callable[..., Any]], Any]) -> None:
-    """Work out for a new schema what was worked out for an old one, before a loop that keeps time asks for it.
-
-    Args:
-        old: Kind -> value of the old schema.
-        new: `BodySchema.derived` of the new schema.
-    """
-    for kind, value in list(old.items()):
-        fresh = new(kind)
-        if isinstance(fresh, ByPattern):
-            fresh.follow(value)

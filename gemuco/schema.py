@@ -12,7 +12,7 @@ import numpy as np
 
 from gemuco.compiled.chain import pack
 from gemuco.compiled.inference import Parts, Predictor
-from gemuco.derived import prepare
+from gemuco.derived import ByPattern
 from gemuco.errors import NotFinite, UnknownCondition, UnknownSignal, WrongSize, check_kind
 from gemuco.layers import Weights, run
 from gemuco.masks import Mask, bits, label
@@ -128,8 +128,11 @@ class BodySchema:
         return kept
 
     def prepare(self, before: "BodySchema") -> None:
-        """Derive now what was derived from the schema before, so that a loop that keeps time does not wait for it."""
-        prepare(before._derived, self.derived)
+        """Derive all that was derived from another schema, so that no loop has to wait for it later."""
+        for kind, value in list(before._derived.items()):
+            fresh = self.derived(kind)
+            if isinstance(fresh, ByPattern):
+                fresh.follow(value)
 
     @property
     def predictor(self) -> Predictor:

@@ -53,8 +53,20 @@ class LastingTerm(Term, Protocol):
         ...
 
 
+class _OneSignal:
+    """A term of one signal."""
+
+    __slots__ = ()
+    signal: str
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """Signals whose predictions the loss depends on."""
+        return (self.signal,)
+
+
 @dataclass(frozen=True, slots=True)
-class Match:
+class Match(_OneSignal):
     """weight * ||A x - reference||: reach the reference of a signal.
 
     Attributes:
@@ -76,11 +88,6 @@ class Match:
         if self.matrix is not None:
             object.__setattr__(self, "matrix", tuple(tuple(float(a) for a in row) for row in self.matrix))
         _freeze_value(self)
-
-    @property
-    def signals(self) -> tuple[str, ...]:
-        """Signals whose predictions the loss depends on."""
-        return (self.signal,)
 
     def reference(self, target: Values) -> np.ndarray:
         """Return the reference of A x [its unit], shape (rows,).
@@ -109,7 +116,7 @@ class Match:
 
 
 @dataclass(frozen=True, slots=True)
-class StayNear:
+class StayNear(_OneSignal):
     """weight * ||x - near||: keep a signal near a posture, such as 0.3 ||theta - theta_orig||.
 
     Attributes:
@@ -127,11 +134,6 @@ class StayNear:
     def __post_init__(self) -> None:
         _check(self)
         _freeze_value(self)
-
-    @property
-    def signals(self) -> tuple[str, ...]:
-        """Signals whose predictions the loss depends on."""
-        return (self.signal,)
 
     def bind(self, schema: BodySchema, target: Values, now: Values) -> Norm:
         """Bind the term; see `Term.bind`. An element without a known value to stay near does not count."""
@@ -152,7 +154,7 @@ class StayNear:
 
 
 @dataclass(frozen=True, slots=True)
-class StaySmall:
+class StaySmall(_OneSignal):
     """weight * ||x||: keep a signal near its physical zero."""
 
     signal: str
@@ -161,11 +163,6 @@ class StaySmall:
 
     def __post_init__(self) -> None:
         _check(self)
-
-    @property
-    def signals(self) -> tuple[str, ...]:
-        """Signals whose predictions the loss depends on."""
-        return (self.signal,)
 
     def bind(self, schema: BodySchema, target: Values, now: Values) -> Norm:
         """Bind the term; see `Term.bind`."""
