@@ -30,7 +30,7 @@ OFF = 0.3  # [rad]
 WINDOW = 20
 
 
-def learned(robot: RobotConfig, schema: BodySchema, arm: int) -> BodySchema:
+def learn(robot: RobotConfig, schema: BodySchema, arm: int) -> BodySchema:
     """Return the model of one actual arm, with its normal errors."""
     config = model_config(robot).update
     lived, fresh = record(robot, arm, 100 + arm, 10.0, 240.0), record(robot, arm, 500 + arm, 20.0, 60.0)
@@ -42,7 +42,7 @@ def learned(robot: RobotConfig, schema: BodySchema, arm: int) -> BodySchema:
     return schema.with_normal(Normal.fit(predict_error(schema, fresh), schema.scaler.std[schema.out_index]))
 
 
-def judged(schema: BodySchema, rows: dict[str, np.ndarray], right: str) -> tuple[float, float] | None:
+def judge(schema: BodySchema, rows: dict[str, np.ndarray], right: str) -> tuple[float, float] | None:
     """Return the share of single samples that blame the right name, and 1.0 if the window does; None if too few."""
     x = schema.normalise(rows)
     assert schema.normal is not None
@@ -62,7 +62,7 @@ if __name__ == "__main__":
     trained = model(robot, console)
     table = Table("arm", "fault", "cases", "single sample right", "window right")
     for arm in range(options.arms):
-        schema = learned(robot, trained, arm)
+        schema = learn(robot, trained, arm)
         cut = {m: record(robot, arm, 900 + arm, 20.0, 8.0, f"muscle_cut:{m}") for m in robot.signals[TENSIONS].elements}
         healthy = record(robot, arm, 700 + arm, 5.0, 20.0)
         off = {
@@ -70,7 +70,7 @@ if __name__ == "__main__":
             for index, joint in enumerate(robot.signals[JOINTS].elements)
         }
         for label, faults in (("muscle cut", cut), ("encoder off", off)):
-            verdicts = [verdict for name, rows in faults.items() if (verdict := judged(schema, rows, name)) is not None]
+            verdicts = [verdict for name, rows in faults.items() if (verdict := judge(schema, rows, name)) is not None]
             single, window = np.mean(verdicts, axis=0) if verdicts else (np.nan, np.nan)
             table.add_row(str(arm), label, str(len(verdicts)), f"{single:.2f}", f"{window:.2f}")
     console.print(table)

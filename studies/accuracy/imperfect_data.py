@@ -22,7 +22,7 @@ from services.learning.collector import Request, collect_direct
 from services.learning.trainer import train_config
 from services.model.artifacts import robot_file
 from services.model.model_config import model_config
-from studies.paper.pr2.actual import flexible, parted
+from studies.paper.pr2.actual import flexible_grasps, split
 from studies.paper.pr2.arm import JOINTS
 from studies.paper.pr2.simulated import errors_by_grasp
 
@@ -31,7 +31,7 @@ TUNING = 1e-3
 """Peak learning rate of fine-tuning."""
 
 
-def spoilt(data: Dataset) -> Dataset:
+def with_outliers(data: Dataset) -> Dataset:
     """Return the same episodes with outliers, each in a random direction."""
     random = np.random.default_rng(0)
     spread = np.nanstd(data.rows(), axis=0)
@@ -55,7 +55,7 @@ def main() -> None:
     config = train_config(model, model.training.epochs, 0)
     clean = collect_direct(robot, "nominal", 0).dataset
     fresh = collect_direct(robot, "nominal", 1000, Request(samples=100)).dataset
-    dirty, masks = spoilt(clean), [{JOINTS}]
+    dirty, masks = with_outliers(clean), [{JOINTS}]
     table = Table("training", "tool tip [mm]")
     known = None
     for name, data, outliers in (
@@ -68,8 +68,8 @@ def main() -> None:
         known = known or schema
         table.add_row(name, f"{error(schema, fresh):.1f}")
     assert known is not None
-    recorded = collect_direct(robot, "actual", 0, Request(conditions=flexible(robot), samples=310)).dataset
-    few, judged = parted(recorded, 250 / 310)
+    recorded = collect_direct(robot, "actual", 0, Request(conditions=flexible_grasps(robot), samples=310)).dataset
+    few, judged = split(recorded, 250 / 310)
     for name, replay in (("with replay", config.replay), ("without replay", 0.0)):
         tuned, _ = fine_tune(known, few, replace(config, rate=TUNING, replay=replay))
         old = known.with_weights(tuned.weights)

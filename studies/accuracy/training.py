@@ -21,7 +21,7 @@ from services.show import progress
 
 ROBOTS = ("pr2_duster", "musashi_arm", "kxr_humanoid")
 BAR = 240.0
-"""All three together [s]."""
+"""Limit of the training time of all three robots [s]."""
 PUBLISHED = {
     "pr2_duster": {
         "network": {"hidden": [300, 300], "latent": 300, "bias": 2},

@@ -18,7 +18,7 @@ from services.learning.collector import Request, collect_direct
 CYCLES = 2000
 
 
-def collected(config: RobotConfig, samples: int, repeat: int) -> tuple[float, float, float]:
+def collect(config: RobotConfig, samples: int, repeat: int) -> tuple[float, float, float]:
     """Return robot time, wall time and CPU time [s] of the run that took least CPU."""
     condition = condition_of(config, None)
     runs = []
@@ -55,7 +55,7 @@ def main() -> None:
     print(f"{'robot':16} {'cycle Hz':>9} {'x real time':>12} {'by CPU':>8} {'cycle without step':>19}")
     for path in arguments.robots:
         config = load_robot(path)
-        robot_time, wall, cpu = collected(config, arguments.samples, arguments.repeat)
+        robot_time, wall, cpu = collect(config, arguments.samples, arguments.repeat)
         robot = simulator_of(config).direct(config, variant_of(config, None), 0, condition_of(config, None))
         cycle = cost_of_a_cycle(robot, arguments.repeat)
         print(

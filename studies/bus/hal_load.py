@@ -114,7 +114,7 @@ def follow(robot: Robot, clock: WaitMeter, cycles: int) -> tuple[np.ndarray, dic
     return times, counts
 
 
-def received(robot: Robot) -> int:
+def count_frames(robot: Robot) -> int:
     """Return the number of frames received on all buses."""
     return sum(bus["counters"]["received"] for bus in robot.health()["buses"].values())
 
@@ -130,11 +130,11 @@ def run(robot: Robot, clock: WaitMeter, seconds: float) -> None:
     robot.enable()
     follow(robot, clock, round(WARM_UP / robot.period))
     realtime.freeze()
-    cycles, frames = round(seconds / robot.period), received(robot)
+    cycles, frames = round(seconds / robot.period), count_frames(robot)
     wall, process, thread = time.monotonic(), time.process_time(), time.thread_time()
     times, counts = follow(robot, clock, cycles)
     wall, process, thread = time.monotonic() - wall, time.process_time() - process, time.thread_time() - thread
-    frames = received(robot) - frames
+    frames = count_frames(robot) - frames
     p50, p99 = 1e3 * np.percentile(times, [50, 99])
     print(f"rate           {cycles / wall:.1f} Hz of {1 / robot.period:.0f}; {scheduling}")
     print(f"complete       {1 - counts['incomplete'] / cycles:.3%} of {cycles} cycles (bar 99.9 %); {counts}")

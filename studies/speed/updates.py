@@ -21,7 +21,7 @@ SAMPLES = 50
 
 
 def rows() -> Iterator[Row]:
-    """Measure both."""
+    """Measure estimation and the step on W."""
     torch.set_num_threads(1)
     freeze()  # as the service does
     yield from inference()

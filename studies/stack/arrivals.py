@@ -8,7 +8,7 @@ import numpy as np
 
 
 class Arrivals:
-    """Counts the estimates of one robot, those that are lost, and pauses between them.
+    """Counter of the estimates of one robot, of lost ones, and of pauses between them.
 
     Args:
         gap: A longer pause [s] between two estimates is a gap.

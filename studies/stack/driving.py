@@ -46,10 +46,10 @@ def engage(client: Client) -> None:
 
 
 class Mover:
-    """Keeps the robot engaged and sends random targets in a thread.
+    """Thread that keeps the robot engaged and sends random targets.
 
     Args:
-        client: Sends them.
+        client: A client of the robot.
         robot: The robot file's content.
         every: Time [s] between targets.
         reach: Share of the joint range from which targets are drawn.

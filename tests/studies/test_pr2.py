@@ -9,7 +9,7 @@ from gemuco.search.descent import DescentConfig
 from hal.config import RobotConfig, load_robot
 from studies.paper.pr2 import arm as pr2_arm
 from studies.paper.pr2 import trials as pr2_trials
-from studies.paper.pr2.actual import actual, flexible, parted
+from studies.paper.pr2.actual import actual, flexible_grasps, split
 from studies.paper.pr2.arm import JOINTS, TIP, Arm, Geometry, duster_motion
 from studies.paper.pr2.experiment import Outcome, summary
 from studies.paper.pr2.figures import draw
@@ -58,8 +58,8 @@ def test_the_arm_arrives_within_its_limits_and_takes_another_duster():
 
 
 def test_the_flexible_duster_has_six_grasps_that_the_file_does_not_list():
-    assert len(flexible(ROBOT)) == 6
-    assert not set(flexible(ROBOT)) & set(ROBOT.conditions)
+    assert len(flexible_grasps(ROBOT)) == 6
+    assert not set(flexible_grasps(ROBOT)) & set(ROBOT.conditions)
 
 
 @pytest.mark.long
@@ -84,5 +84,5 @@ def test_both_experiments_run_and_tell_their_figures(tmp_path, monkeypatch):
     }
     again = simulate(open_run(small(ROBOT), tmp_path, seed=0), lambda share, text: None)
     assert again.held_out == simulated.held_out
-    first, last = parted(run.cached("nominal", lambda: pytest.fail("collected again")), 0.5)
+    first, last = split(run.cached("nominal", lambda: pytest.fail("collected again")), 0.5)
     assert len(first) + len(last) == 9 * 60

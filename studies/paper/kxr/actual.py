@@ -60,10 +60,8 @@ def actual(run: Run, simulated: BodySchema, tell: Tell) -> Actual:
     """Collect on the actual robot, fine-tune the simulated model, and run every trial of one seed."""
     tell(0.0, "collecting on the actual robot")
     settings = {"grid": TAUGHT_GRID, "margin": TAUGHT_MARGIN, "random": RANDOM}
-    data = run.cached("actual", lambda: _collected(run), **settings)
-    schema = run.cached(
-        "actual_model", lambda: _tuned(run, simulated, data, tell), epochs=EPOCHS, rate=RATE, **settings
-    )
+    data = run.cached("actual", lambda: _collect(run), **settings)
+    schema = run.cached("actual_model", lambda: _tune(run, simulated, data, tell), epochs=EPOCHS, rate=RATE, **settings)
     tell(0.8, "trials on the actual robot")
     paths = leads(run, schema, ACTUAL)
     needed = {tool: samples_until(paths[f"to {tool}, ekf"], schema, tool) for tool in LEADS}
@@ -78,7 +76,7 @@ def taught_postures(robot: RobotConfig) -> np.ndarray:
     return low + (high - low) * np.array(list(product(*shares)))
 
 
-def _collected(run: Run) -> Dataset:
+def _collect(run: Run) -> Dataset:
     """Collect one sample per posture; signals out of sight are missing."""
     robot, episodes = run.robot, []
     layout, random = layout_of(robot), np.random.default_rng([FRESH + run.seed, 200])
@@ -91,7 +89,7 @@ def _collected(run: Run) -> Dataset:
     return Dataset(layout, tuple(episodes))
 
 
-def _tuned(run: Run, simulated: BodySchema, data: Dataset, tell: Tell) -> BodySchema:
+def _tune(run: Run, simulated: BodySchema, data: Dataset, tell: Tell) -> BodySchema:
     config = replace(train_config(model_config(run.robot), EPOCHS, run.seed), rate=RATE, replay=0.0)
     return fine_tune(simulated, data, config, lambda done, text: tell(0.1 + 0.7 * done, text))[0]
 

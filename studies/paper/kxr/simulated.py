@@ -57,7 +57,7 @@ SEQUENCE = ("long_light", "long_heavy", "short_heavy")
 STEPS = 30
 """Number of control steps with each tool."""
 SETTLED = 10
-"""Number of steps after a change, after which the error is to be small."""
+"""Number of steps after a change of the tool until the error is to be small."""
 PAPER_WEIGHT = 0.01
 FRESH = 1000
 """Offset of the seed in trials."""

@@ -59,11 +59,11 @@ def actual(run: Run, simulated: BodySchema, tell: Tell) -> Actual:
     """Collect on the actual arm, fine-tune the simulated model, and run every trial of one seed."""
     tell(0.0, "collecting on the actual arm")
     count = round(COLLECTED * collect_config(run.robot).samples)
-    request = Request(flexible(run.robot), samples=count)
+    request = Request(flexible_grasps(run.robot), samples=count)
     data = run.cached("actual", lambda: collect_direct(run.robot, ACTUAL, run.seed, request).dataset, samples=count)
-    learned, judged = parted(data, LEARNED / COLLECTED)
+    learned, judged = split(data, LEARNED / COLLECTED)
     schema = run.cached(
-        "actual_model", lambda: _tuned(run, simulated, learned, tell), samples=len(learned), epochs=EPOCHS, rate=RATE
+        "actual_model", lambda: _tune(run, simulated, learned, tell), samples=len(learned), epochs=EPOCHS, rate=RATE
     )
     tell(0.6, "trials on the actual arm")
     geometry = Geometry(run.robot)
@@ -78,12 +78,12 @@ def actual(run: Run, simulated: BodySchema, tell: Tell) -> Actual:
     )
 
 
-def flexible(robot: RobotConfig) -> tuple[str, ...]:
+def flexible_grasps(robot: RobotConfig) -> tuple[str, ...]:
     """Return the grasps of the flexible duster, which the simulator knows and the robot file does not list."""
     return tuple(name for name in simulator_of(robot).conditions if name.startswith(("short", "long")))
 
 
-def parted(data: Dataset, share: float) -> tuple[Dataset, Dataset]:
+def split(data: Dataset, share: float) -> tuple[Dataset, Dataset]:
     """Split the episodes of every condition into the first `share` and the rest."""
     first: list[Episode] = []
     for condition in data.conditions:
@@ -94,7 +94,7 @@ def parted(data: Dataset, share: float) -> tuple[Dataset, Dataset]:
     return Dataset(data.layout, tuple(first)), Dataset(data.layout, tuple(last))
 
 
-def _tuned(run: Run, simulated: BodySchema, learned: Dataset, tell: Tell) -> BodySchema:
+def _tune(run: Run, simulated: BodySchema, learned: Dataset, tell: Tell) -> BodySchema:
     model = model_config(run.robot)
     config = replace(train_config(model, round(EPOCHS * model.training.epochs), run.seed), rate=RATE, replay=0.0)
     schema, _ = fine_tune(simulated, learned, config, lambda done, text: tell(0.2 + 0.4 * done, text))
@@ -112,7 +112,7 @@ def _errors(
             geometry.tips(_stiff(condition), mine[:, judged.layout.slice(JOINTS)]) - mine[:, judged.layout.slice(TIP)]
         )
         errors["geometry"][condition] = float(np.linalg.norm(away, axis=1).mean())
-        errors["simulated"][condition] = model_error(_recognised(simulated, learned, condition), mine)
+        errors["simulated"][condition] = model_error(_recognise(simulated, learned, condition), mine)
     return errors | {"fine-tuned": errors_by_grasp(tuned, judged)}
 
 
@@ -120,7 +120,7 @@ def _stiff(condition: str) -> str:
     return f"{STIFF}_{condition.split('_')[1]}"
 
 
-def _recognised(schema: BodySchema, learned: Dataset, condition: str) -> BodySchema:
+def _recognise(schema: BodySchema, learned: Dataset, condition: str) -> BodySchema:
     """Return the schema under the p that explains the samples of a grasp best."""
     updater = Updater(schema, UpdateConfig(what="bias"))
     for episode in learned.episodes:
