@@ -21,7 +21,7 @@ from simulators.world import World
 _log = logging.getLogger(__name__)
 
 PERIOD = 0.005
-"""Step of the physics thread [s]; half of it costs a few percent of a core more (studies/bus/simulated_nodes.py)."""
+"""Step of the physics thread [s]; half of it costs a few percent of a core more."""
 _SWITCH_INTERVAL = 5e-4
 """Longest time [s] that one Python thread keeps the others waiting; the default delays answers to SYNC by 5 ms."""
 

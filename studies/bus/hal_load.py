@@ -1,4 +1,4 @@
-"""Cost of the HAL while it runs.
+"""Cost of the HAL while it runs, and of the simulated nodes in front of it.
 
     python -m studies.bus.hal_load [--seconds 300] [ROBOT.yaml]
 
@@ -30,7 +30,7 @@ from hal.wire.budget import budgets
 from services.hardware.hal_service import CYCLE_PRIORITY, RECEIVE_PRIORITY
 from services.hardware.simulator_service import PRIORITY, THREADS
 from services.process import realtime
-from studies.stack.processes import BareLoops
+from studies.stack.processes import BareLoops, cpu
 
 ARM = Path(__file__).parents[2] / "robots" / "musashi_arm.yaml"
 RATE = 200.0
@@ -161,10 +161,12 @@ def main() -> None:
         nodes.start()
         ready.wait()
         try:
-            begun = time.monotonic()
+            begun, used = time.monotonic(), cpu(nodes.pid or 0)
             with BareLoops({"bare": (config.rates.hal, CYCLE_PRIORITY)}) as bare, open_robot(config, clock) as robot:
                 print(f"commissioning  {time.monotonic() - begun:.2f} s for {len(config.devices)} nodes")
                 run(robot, clock, options.seconds)
+                share = (cpu(nodes.pid or 0) - used) / (time.monotonic() - begun)
+                print(f"simulation     {share:.1%} of a core for nodes, hub and physics")
                 for name, bus in robot.health()["buses"].items():
                     print(f"bus {name:11}{bus['counters']}")
                 late = bare.counted()["bare"]
