@@ -1,6 +1,6 @@
-"""PyBullet as the carrier of rigid bodies: torques in, joint positions and velocities out.
+"""Rigid bodies in PyBullet: torques in, joint positions and velocities out.
 
-The only file that knows pybullet. Every call names its physics client, so that worlds do not see each other.
+This is the only file that imports pybullet. Every call names its physics client, so that worlds do not see each other.
 """
 
 import contextlib
@@ -26,7 +26,7 @@ def _without_greeting() -> Iterator[None]:
         os.close(sink)
 
 
-with _without_greeting():  # pybullet tells its build time when it is imported
+with _without_greeting():  # pybullet prints its build time when it is imported
     import pybullet
 
 
@@ -65,7 +65,7 @@ class BulletBody:
         self._step_size = 0.0
 
     def step(self, torque: np.ndarray, duration: float) -> None:
-        """One physics step of `duration` [s] under joint torques [N m], shape (n,)."""
+        """Advance the physics by one step of `duration` [s] under joint torques [N m], shape (n,)."""
         client = self._client
         if duration != self._step_size:
             pybullet.setTimeStep(duration, physicsClientId=client)
@@ -79,9 +79,9 @@ class BulletBody:
         self.velocity[:] = [state[1] for state in states]
 
     def inertia(self) -> tuple[np.ndarray, np.ndarray]:
-        """Mass matrix [kg m^2], shape (n, n), and the torques [N m] of gravity and velocity, shape (n,).
+        """Return the mass matrix [kg m^2], shape (n, n), and the torques [N m] of gravity and velocity, shape (n,).
 
-        The torques are those that it takes to keep the present velocity.
+        These torques keep the present velocity.
         """
         client, position, velocity = self._client, self.position.tolist(), self.velocity.tolist()
         mass = pybullet.calculateMassMatrix(self._body, position, physicsClientId=client)
@@ -96,14 +96,16 @@ class BulletBody:
         self.velocity[:] = 0.0
 
     def frame(self, joint: str) -> tuple[np.ndarray, np.ndarray]:
-        """Where the link behind `joint` is: orientation (3, 3) and origin [m] (3,) of its frame in the base's."""
+        """Return the pose of the link behind `joint`: orientation (3, 3) and origin [m] (3,) of its frame in the
+        base's.
+        """
         index = self._index[joint]
         state = pybullet.getLinkState(self._body, index, computeForwardKinematics=1, physicsClientId=self._client)
         rotation = pybullet.getMatrixFromQuaternion(state[5])
         return np.array(rotation).reshape(3, 3), np.array(state[4])
 
     def energy(self) -> float:
-        """Kinetic and potential energy of the links [J]."""
+        """Return the kinetic and potential energy of the links [J]."""
         joints = range(pybullet.getNumJoints(self._body, physicsClientId=self._client))
         mass, _ = self.inertia()
         states = pybullet.getLinkStates(self._body, joints, computeForwardKinematics=1, physicsClientId=self._client)
@@ -125,7 +127,7 @@ class BulletBody:
         )
 
     def close(self) -> None:
-        """Let go of the physics client. Safe to call twice."""
+        """Disconnect the physics client. Safe to call twice."""
         if self._client >= 0:
             pybullet.disconnect(physicsClientId=self._client)
             self._client = -1

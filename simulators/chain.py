@@ -9,12 +9,12 @@ from typing import Self
 import numpy as np
 
 GRAVITY = 9.81
-"""[m/s^2], along -z of the base."""
+"""Gravity acts along -z of the base with this acceleration [m/s^2]."""
 
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """Where every frame of a chain is, in base coordinates.
+    """Pose of every frame of a chain, in base coordinates.
 
     Frame 0 is the base, frame k the link behind joint k - 1.
 
@@ -29,7 +29,7 @@ class Pose:
     axes: np.ndarray
 
     def screws(self) -> np.ndarray:
-        """Joint screws, shape (6, n).
+        """Return the joint screws, shape (6, n).
 
         A wrench (force [N], moment about the base origin [N m]) times column j is its torque about joint j [N m].
         """
@@ -39,7 +39,9 @@ class Pose:
         return screws
 
     def points(self, frames: np.ndarray, local: np.ndarray) -> np.ndarray:
-        """Points fixed in frames (p,), local coordinates [m] (p, 3), in base coordinates [m], shape (p, 3)."""
+        """Return points fixed in frames (p,) with local coordinates [m] (p, 3) in base coordinates [m], shape (p,
+        3).
+        """
         turned: np.ndarray = np.matmul(self.rotations.take(frames, 0), local[:, :, None])[:, :, 0]
         turned += self.origins.take(frames, 0)
         return turned
@@ -47,7 +49,7 @@ class Pose:
 
 @dataclass(frozen=True, slots=True)
 class Chain:
-    """What a URDF says of a serial chain of n revolute joints.
+    """Serial chain of n revolute joints, as a URDF describes it.
 
     Attributes:
         joints: Joint names, base first.
@@ -108,7 +110,7 @@ class Chain:
         )
 
     def pose(self, position: np.ndarray) -> Pose:
-        """Forward kinematics of joint positions [rad], shape (n,)."""
+        """Return the forward kinematics of joint positions [rad], shape (n,)."""
         size = len(self.joints)
         turns = np.sin(position)[:, None, None] * self._cross
         turns += (1.0 - np.cos(position))[:, None, None] * self._cross_squared
@@ -124,7 +126,7 @@ class Chain:
         return Pose(rotations, origins, axes)
 
     def frames(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Every frame at many joint positions [rad], shape (k, n); see `Pose` for their numbers.
+        """Return every frame at many joint positions [rad], shape (k, n); see `Pose` for their numbers.
 
         Returns:
             Orientations, shape (n + 1, k, 3, 3), and origins [m], shape (n + 1, k, 3), in base coordinates.
@@ -143,12 +145,16 @@ class Chain:
         return rotations, origins
 
     def ends(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The last frame at many joint positions [rad], shape (k, n): orientations (k, 3, 3), origins [m] (k, 3)."""
+        """Return the last frame at many joint positions [rad], shape (k, n): orientations (k, 3, 3), origins [m] (k,
+        3).
+        """
         rotations, origins = self.frames(positions)
         return rotations[-1], origins[-1]
 
     def gravity_torque(self, position: np.ndarray) -> np.ndarray:
-        """Joint torques [N m] that hold the links against gravity at joint positions [rad]; both of shape (n,)."""
+        """Return the joint torques [N m] that hold the links against gravity at joint positions [rad]; both of shape
+        (n,).
+        """
         pose = self.pose(position)
         moments = np.matmul(pose.rotations[1:], self.centers[:, :, None])[:, :, 0] + pose.origins[1:]
         moments *= self.masses[:, None]
@@ -164,17 +170,17 @@ _LAST = np.array([2, 0, 1])
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Row-wise cross product, shapes (p, 3); a third of the time of `np.cross` on a few rows."""
+    """Return the row-wise cross product, shapes (p, 3), in a third of the time of `np.cross` on a few rows."""
     product: np.ndarray = a.take(_NEXT, 1) * b.take(_LAST, 1)
     product -= a.take(_LAST, 1) * b.take(_NEXT, 1)
     return product
 
 
 def _child(element: ElementTree.Element, tag: str) -> ElementTree.Element:
-    found = element.find(tag)
-    if found is None:
+    child = element.find(tag)
+    if child is None:
         raise ValueError(f"The URDF's {element.tag} '{element.get('name', '')}' has no <{tag}>.")
-    return found
+    return child
 
 
 def _vector(text: str | None) -> np.ndarray:

@@ -21,11 +21,11 @@ class WorldClock:
         self._start_ns = time.time_ns()
 
     def monotonic(self) -> float:
-        """Simulated time [s]."""
+        """Return the simulated time [s]."""
         return self._now
 
     def now_ns(self) -> int:
-        """Simulated time after the wall-clock time at which this clock was made [ns since 1970]."""
+        """Return the simulated time after the wall-clock time at which this clock was made [ns since 1970]."""
         return self._start_ns + round(self._now * 1e9)
 
     def sleep_until(self, deadline: float) -> None:
@@ -98,7 +98,7 @@ class DirectDevice(Device):
 
 
 def direct_robot(config: RobotConfig, world: World) -> Robot:
-    """A whole robot that is a world without a bus, as fast as it computes; not opened yet."""
+    """Return a robot made of a world without a bus, as fast as it computes, not opened yet."""
     clock = WorldClock(world)
     device = DirectDevice(config, world, clock)
     return Robot(config, devices=[device], buses=(), clock=clock, source="simulated")

@@ -13,7 +13,7 @@ TOOL_CHANGED = "tool_changed"
 
 
 def known_parts(muscles: Iterable[str]) -> list[str]:
-    """Every part of a muscle-driven body that can break."""
+    """Return every part of a muscle-driven body that can break."""
     return [*(f"{MUSCLE_CUT}:{muscle}" for muscle in muscles), HEAVY_OBJECT]
 
 
@@ -21,38 +21,38 @@ def check_part(part: str, muscles: Iterable[str]) -> tuple[str, str]:
     """Split a part into the kind of its fault and what it concerns (empty for the body as a whole).
 
     Raises:
-        UnknownPart: It is none of the known parts.
+        UnknownPart: The part is not known.
     """
     known = known_parts(muscles)
     if part not in known:
-        raise UnknownPart(f"'{part}' is no part that can break. Known parts: {', '.join(known)}.")
+        raise UnknownPart(f"'{part}' is not a part that can break. Known parts: {', '.join(known)}.")
     kind, _, what = part.partition(":")
     return kind, what
 
 
 def check_condition(condition: str | None, known: Sequence[str]) -> str | None:
-    """The condition of a body; the first of the known ones, or None where there are none, if not given.
+    """Return the condition of a body; if None, the first known one, or None without known ones.
 
     Raises:
-        UnknownPart: It is none of the known ones.
+        UnknownPart: The condition is not known.
     """
     if condition is None:
         return known[0] if known else None
     if condition not in known:
         raise UnknownPart(
-            f"'{condition}' is no condition of this body. Known conditions: {', '.join(known) or 'none'}."
+            f"'{condition}' is not a condition of this body. Known conditions: {', '.join(known) or 'none'}."
         )
     return condition
 
 
 def changed_tool(part: str, known: Sequence[str]) -> str:
-    """The condition that `tool_changed:<condition>` asks for.
+    """Return the condition that `tool_changed:<condition>` names.
 
     Raises:
-        UnknownPart: It asks for something else, or for a condition that is not known.
+        UnknownPart: The part is something else, or the condition is not known.
     """
     kind, _, condition = part.partition(":")
     if kind != TOOL_CHANGED or condition not in known:
         parts = ", ".join(f"{TOOL_CHANGED}:{name}" for name in known)
-        raise UnknownPart(f"'{part}' is no part that can break. Known parts: {parts}.")
+        raise UnknownPart(f"'{part}' is not a part that can break. Known parts: {parts}.")
     return condition

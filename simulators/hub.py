@@ -23,7 +23,7 @@ from simulators.wire_time import ERROR, EXTENDED, REMOTE
 __all__ = ["HubBus", "HubServer"]
 
 _PATIENCE = 1.0
-"""How long [s] a server may take to admit a program, and to take a frame unless the sender says otherwise."""
+"""A server has this time [s] to admit a program, and to take a frame unless the sender gives another."""
 
 
 class HubBus(can.BusABC):
@@ -44,12 +44,12 @@ class HubBus(can.BusABC):
 
         Args:
             channel: Name of the channel, or the absolute path of its socket.
-            can_filters: As for every python-can bus.
+            can_filters: Filters as for every python-can bus.
             receive_own_messages: Also receive what this object sends, at once.
-            **kwargs: `bitrate` and the like, which are the server's business.
+            **kwargs: `bitrate` and the like, which concern the server.
 
         Raises:
-            can.CanInitializationError: Nobody serves the channel.
+            can.CanInitializationError: No server has the channel.
         """
         path = socket_path(str(channel))
         self._socket = _join(str(channel), path)
@@ -103,9 +103,9 @@ class HubBus(can.BusABC):
                 raise self._gone() from None
 
     def receive_frames(self, timeout: float | None) -> list[tuple[int, bytes]]:
-        """What waits, as identifiers with flags and data, without filters; nothing after `timeout` [s], None: never.
+        """Return the waiting frames, as identifiers with flags and data, without filters; empty after `timeout` [s].
 
-        For who handles many frames: a `can.Message` each costs more than most of what is done with them.
+        This is faster than `recv`, whose `can.Message` costs more than most handlers of a frame.
         """
         frames = [(message_identifier(message), bytes(message.data)) for message in self._waiting]
         self._waiting.clear()
@@ -119,7 +119,7 @@ class HubBus(can.BusABC):
         return (self._waiting.popleft() if self._waiting else None), False
 
     def _packet(self, timeout: float | None) -> bytes:
-        """The next packet; empty if none came."""
+        """Return the next packet; empty if none came."""
         if not self._readable.poll(None if timeout is None else timeout * 1e3):
             return b""
         try:
@@ -152,7 +152,7 @@ class HubBus(can.BusABC):
 
 
 def _join(channel: str, path: Path) -> socket.socket:
-    """A socket that the server has admitted."""
+    """Return a socket that the server has admitted."""
     link = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     link.settimeout(_PATIENCE)
     try:
@@ -164,12 +164,12 @@ def _join(channel: str, path: Path) -> socket.socket:
         reason = error.strerror or "no answer"
     link.close()
     raise can.CanInitializationError(
-        f"Nobody serves the hub channel '{channel}' ({path}: {reason}). Is `gemuco simulate` running?"
+        f"No server has the hub channel '{channel}' ({path}: {reason}). Is `gemuco simulate` running?"
     )
 
 
 def message_identifier(message: can.Message) -> int:
-    """A message's identifier with the flags EXTENDED, REMOTE and ERROR."""
+    """Return a message's identifier with the flags EXTENDED, REMOTE and ERROR."""
     identifier = message.arbitration_id
     identifier |= EXTENDED if message.is_extended_id else 0
     identifier |= REMOTE if message.is_remote_frame else 0

@@ -1,4 +1,4 @@
-"""The server of a hub channel: hands every frame to everybody else, at once or at the pace of a real bus."""
+"""Server of a hub channel: it hands every frame to all other clients, at once or at the pace of a real bus."""
 
 import contextlib
 import fcntl
@@ -20,11 +20,11 @@ from simulators.wire_time import ERROR, Wire
 _log = logging.getLogger(__name__)
 
 _BACKLOG = 100_000 * RECORD.size
-"""Bytes kept for one program that does not read; more, and it is cut off. Ten seconds of a full 1 Mbit/s bus."""
+"""A program that does not read is cut off beyond this many waiting bytes, ten seconds of a full 1 Mbit/s bus."""
 _QUEUE = 256
-"""Frames that may wait for a timed bus before the server takes no more from the senders."""
+"""The server takes no more frames from senders when this many wait for a timed bus."""
 _GRAIN = 3e-4
-"""Shortest sleep [s] of a timed bus while more frames wait: two or three then leave together, at half the cost."""
+"""A timed bus sleeps at least this long [s] while frames wait: two or three leave together, at half the cost."""
 
 
 @dataclass(eq=False, slots=True)
@@ -72,7 +72,7 @@ class HubServer:
         self._thread.start()
 
     def close(self) -> None:
-        """Close the channel; whoever is on it gets a CanOperationError. Safe to call twice."""
+        """Close the channel; its clients get a CanOperationError. Safe to call twice."""
         if self._thread is None:
             return
         self._waker.send(b"x")
@@ -93,7 +93,7 @@ class HubServer:
         self.close()
 
     def stats(self) -> dict[str, float]:
-        """Counters since the start: frames, joined, cut_off, malformed; clients now; busy [s] of a timed bus."""
+        """Return counters since the start: frames, joined, cut_off, malformed; clients now; busy [s] of a timed bus."""
         busy = {"busy": self._wire.busy} if self._wire is not None else {}
         return {**self._counters, "clients": len(self._clients), **busy}
 

@@ -1,4 +1,4 @@
-"""Where the socket of a hub channel lies, and what passes through it."""
+"""Socket of a hub channel, and the records that pass through it."""
 
 import os
 import re
@@ -8,15 +8,15 @@ from pathlib import Path
 import can
 
 RECORD = struct.Struct("<IB3xd8s")
-"""Identifier with flags, length, time stamp [s since 1970], data."""
+"""A record holds identifier with flags, length, time stamp [s since 1970] and data."""
 PACKET = 128 * RECORD.size
-"""Most bytes in one packet."""
+"""A packet has at most this many bytes."""
 HELLO = b"gemuco hub 1"
-"""First packet from the server: from here on the program misses no frame."""
+"""This is the first packet from the server; from then on the program misses no frame."""
 
 
 def socket_path(channel: str) -> Path:
-    """Where the socket of a channel lies; an absolute path is taken as it is.
+    """Return the path of a channel's socket; an absolute path is taken as it is.
 
     Raises:
         can.CanInitializationError: The name cannot be a file name, or is too long for a socket.
@@ -42,5 +42,5 @@ def _folder() -> Path:
 
 
 def channels() -> list[str]:
-    """Names of the channels whose sockets exist, served or not."""
+    """Return names of the channels whose sockets exist, served or not."""
     return [path.stem for path in sorted(_folder().glob("*.can"))]

@@ -1,4 +1,4 @@
-"""What a muscle-driven body is made of, as plain numbers; no physics engine."""
+"""Parts of a muscle-driven body, as plain numbers; no physics engine."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ class Friction:
 
 @dataclass(frozen=True, slots=True)
 class Servo:
-    """What every spool can do.
+    """Abilities of every spool.
 
     Attributes:
         speed: Highest speed of the wire [m/s].
@@ -49,21 +49,21 @@ class Servo:
 
 @dataclass(frozen=True, slots=True)
 class Body:
-    """All that makes one variant of a muscle-driven robot.
+    """One variant of a muscle-driven robot.
 
     Attributes:
         urdf: Its rigid links.
         paths: Its wires.
         elastic: Their elastic elements.
-        slack: Wire length that counts as zero: path length minus what is reported [m], shape (m,).
+        slack: Wire length that counts as zero: path length minus reported length [m], shape (m,).
         joint_damping: Viscous torque of each joint [N m s/rad], shape (n,).
-        loss_time: Of the elastic elements: f = elastic(x) * (1 + loss_time * rate * dx/dt) [s].
+        loss_time: Loss time of the elastic elements [s]: f = elastic(x) * (1 + loss_time * rate * dx/dt).
         friction: Dry friction, or None.
-        noise: Standard deviation of what is measured, per signal [its unit].
+        noise: Standard deviation of measurements, per signal [its unit].
         rest: Joint positions at the start [rad], shape (n,).
         rest_tension: Tensions at the start [N], shape (m,).
-        object_mass: Of the heavy object [kg].
-        object_radius: Of the heavy object [m].
+        object_mass: Mass of the heavy object [kg].
+        object_radius: Radius of the heavy object [m].
     """
 
     urdf: Path

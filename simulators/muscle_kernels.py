@@ -1,4 +1,4 @@
-"""What a muscle-driven body computes in every physics step, as compiled loops over a few numbers.
+"""Computations of a muscle-driven body in every physics step, as compiled loops over a few numbers.
 
 The arrays are so small that numpy spends its time on calls, not on arithmetic: the loops take a tenth of it, and hold
 no interpreter lock, so that nodes answer meanwhile. numba keeps what it compiled beside this file.
@@ -23,7 +23,9 @@ def _compiled(function: Callable[..., Any]) -> Any:
 def _frames(
     position: np.ndarray, joint_axes: np.ndarray, offsets: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Forward kinematics as in `Chain.pose`: rotations (n + 1, 3, 3), origins [m] (n + 1, 3), joint axes (n, 3)."""
+    """Return forward kinematics as in `Chain.pose`: rotations (n + 1, 3, 3), origins [m] (n + 1, 3), joint axes (n,
+    3).
+    """
     size = len(position)
     rotations = np.zeros((size + 1, 3, 3))
     origins = np.zeros((size + 1, 3))
@@ -55,7 +57,7 @@ def _frames(
 
 @_compiled
 def _place(rotation: np.ndarray, origin: np.ndarray, local: np.ndarray, into: np.ndarray) -> None:
-    """A point of a frame [m] in base coordinates."""
+    """Return a point of a frame [m] in base coordinates."""
     for row in range(3):
         into[row] = origin[row]
         for inner in range(3):
@@ -66,10 +68,10 @@ def _place(rotation: np.ndarray, origin: np.ndarray, local: np.ndarray, into: np
 def _bend(
     start: np.ndarray, end: np.ndarray, center: np.ndarray, radius: float, pulls: np.ndarray, length: float
 ) -> float:
-    """Length [m] of a stretch of wire around a sphere, tangent, arc, tangent; the straight one if it touches none.
+    """Return the length [m] of a stretch of wire around a sphere: tangent, arc, tangent; straight if it touches none.
 
-    The shortest way lies in the plane of the centre and both ends. `pulls`, dL/d(start, end, centre), shape (3, 3), is
-    corrected in place; the sphere is pushed by what its wire's ends are not pulled with.
+    The shortest path lies in the plane of the centre and both ends. `pulls`, dL/d(start, end, centre), shape (3, 3), is
+    corrected in place; the sphere takes the rest of the forces on the wire's ends.
     """
     from_a = from_b = along = 0.0
     for row in range(3):
@@ -137,7 +139,7 @@ def paths(
 
 @_compiled
 def held(arms: np.ndarray, weight: np.ndarray, diagonal: np.ndarray) -> np.ndarray:
-    """The matrix arms^T diag(weight) arms + diag(diagonal), shape (n, n), from shapes (m, n), (m,) and (n,)."""
+    """Return the matrix arms^T diag(weight) arms + diag(diagonal), shape (n, n), from shapes (m, n), (m,) and (n,)."""
     size = arms.shape[1]
     matrix = np.zeros((size, size))
     for row in range(size):

@@ -25,7 +25,7 @@ class MuscleWorld(World):
     """World of a muscle-driven body. Signals: joint_position, muscle_tension, muscle_length."""
 
     _STEPS_PER_REFRESH = 2
-    """Moment arms and inertia are solved anew every so many steps; in between paths are linear in joint positions."""
+    """Moment arms and inertia are solved anew every this many steps; in between paths are linear in joint positions."""
 
     def __init__(self, body: Body, seed: int, servo: Servo | None = None, longest_step: float = 0.0025) -> None:
         """Put the body at rest, its brakes on.
@@ -133,7 +133,7 @@ class MuscleWorld(World):
         self._implicit = np.linalg.solve(resisted, mass).T
 
     def _hold_or_drive(self) -> None:
-        """The longest a wire's elastic element can get before its motor, or its brake, gives way [m]."""
+        """Return the largest elongation of each elastic element [m] before its motor, or its brake, gives way."""
         force = np.where(self._follows > 0, self._servo.force, self._servo.brake)
         self._grip[:] = self._body.elastic.elongation(force)
 
@@ -142,7 +142,7 @@ class MuscleWorld(World):
         self._bullet.step(self._bias + self._implicit @ (torque - self._bias), duration)
 
     def _pulled(self, duration: float, wires: np.ndarray, slid_joint: np.ndarray) -> np.ndarray:
-        """Torques [N m], shape (n,), of a step that moves wires and sliding joints on."""
+        """Advance wires and sliding joints by one step; return the torques [N m], shape (n,)."""
         torque: np.ndarray = pull(
             duration, self._bullet.position, self._bullet.velocity, self._solved_at, self._lengths, self._arms,
             wires, self._orders, self._build, slid_joint, self._joints, self._numbers,
@@ -151,7 +151,7 @@ class MuscleWorld(World):
 
 
 def _constants(body: Body, servo: Servo) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What `pull` is told of wires, joints and spools; shapes (4, m), (2, n), (6,)."""
+    """Return the constants of wires, joints and spools for `pull`; shapes (4, m), (2, n), (6,)."""
     muscles, joints = len(body.paths.names), len(body.paths.chain.joints)
     smooth = Friction(np.zeros(joints), 1.0, np.zeros(muscles), 1.0, np.zeros(muscles), 1.0)
     dry = body.friction or smooth

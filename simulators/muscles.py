@@ -65,13 +65,15 @@ class Paths:
         )
 
     def solve(self, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Path lengths [m], shape (m,), and moment arms dL/dq [m/rad], shape (m, n), at joint positions [rad] (n,)."""
+        """Return the path lengths [m], shape (m,), and moment arms dL/dq [m/rad], shape (m, n), at joint positions
+        [rad] (n,).
+        """
         lengths, arms = self._fixed.copy(), np.zeros((len(self._fixed), len(self.chain.joints)))
         paths(np.asarray(position, float), self.chain.axes, self.chain.offsets, *self._crossing, lengths, arms)
         return lengths, arms
 
     def lengths(self, position: np.ndarray) -> np.ndarray:
-        """Path lengths [m], shape (m,), at joint positions [rad], shape (n,)."""
+        """Return the path lengths [m], shape (m,), at joint positions [rad], shape (n,)."""
         return self.solve(position)[0]
 
 
@@ -89,21 +91,21 @@ class Elastic:
 
     @classmethod
     def of(cls, size: int, scale: float, rate: float) -> Self:
-        """The same element for `size` wires."""
+        """Return the same element for `size` wires."""
         return cls(np.full(size, scale), np.full(size, rate))
 
     def tension(self, elongation: np.ndarray) -> np.ndarray:
-        """Tension [N] at an elongation [m]; zero when slack."""
+        """Return the tension [N] at an elongation [m]; zero when slack."""
         tension: np.ndarray = self.scale * np.expm1(self.rate * np.maximum(elongation, 0.0))
         return tension
 
     def elongation(self, tension: np.ndarray) -> np.ndarray:
-        """Elongation [m] at a tension [N]."""
+        """Return the elongation [m] at a tension [N]."""
         elongation: np.ndarray = np.log1p(tension / self.scale) / self.rate
         return elongation
 
     def stiffness(self, tension: np.ndarray) -> np.ndarray:
-        """Slope df/dx [N/m] at a tension [N]."""
+        """Return the slope df/dx [N/m] at a tension [N]."""
         slope: np.ndarray = self.rate * (tension + self.scale)
         return slope
 

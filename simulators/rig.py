@@ -21,9 +21,11 @@ from simulators.world import World
 _log = logging.getLogger(__name__)
 
 PERIOD = 0.005
-"""Step of the physics thread [s]; half of it costs a few percent of a core more."""
+"""The physics thread has this step [s]; half of it costs a few percent of a core more
+(studies/bus/simulated_nodes.py).
+"""
 _SWITCH_INTERVAL = 5e-4
-"""Longest time [s] that one Python thread keeps the others waiting; the default delays answers to SYNC by 5 ms."""
+"""A Python thread keeps the others waiting at most this long [s]; the default delays answers to SYNC by 5 ms."""
 
 
 class UnknownFault(ValueError):
@@ -121,13 +123,13 @@ class Rig:
                 segment.tick(self._now)
 
     def fault(self, text: str) -> str:
-        """Break something, or mend a node; the sentence tells what was done.
+        """Break a part, or restore a node; return a sentence on what was done.
 
         `sensor_silent NODE`, `node_silent NODE`, `node_back NODE`, `node_reboot NODE`, `emcy NODE`; anything else is a
         part of the world, as in `muscle_cut biceps` or `tool_changed CONDITION`.
 
         Raises:
-            UnknownFault: There is no such fault, or no such node.
+            UnknownFault: The fault or the node does not exist.
         """
         words = text.split()
         if words and words[0] in _NODE_FAULTS:
@@ -141,12 +143,12 @@ class Rig:
         return f"The tool is now {words[1]}." if words[0] == TOOL_CHANGED else f"Broke {' '.join(words)}."
 
     def truth(self) -> Mapping[str, np.ndarray]:
-        """What is, without noise: every signal, shapes (n,)."""
+        """Return every signal without noise, shapes (n,)."""
         with self._world_lock:
             return self._world.truth()
 
     def stats(self) -> dict[str, object]:
-        """Counters of the physics, the buses and the hub, and the state of every node."""
+        """Return counters of the physics, the buses and the hub, and the state of every node."""
         buses = {
             name: {**segment.counters, **({"hub": self._servers[name].stats()} if name in self._servers else {})}
             for name, segment in self._segments.items()
@@ -155,10 +157,10 @@ class Rig:
         return {"physics": dict(self._ticks), "buses": buses, "nodes": nodes, "failure": self.failure}
 
     def node(self, name: str) -> SimulatedNode:
-        """One node by its name.
+        """Return a node by its name.
 
         Raises:
-            UnknownFault: There is no such node.
+            UnknownFault: The node does not exist.
         """
         nodes = self._nodes()
         if name not in nodes:
@@ -209,7 +211,9 @@ class Rig:
                 time.sleep(-late)
 
     def _guard(self, name: str, job: Callable[[], None]) -> None:
-        """A rig whose physics or bus failed falls silent: nodes must not go on with a world that stands still."""
+        """Run a thread's job; when it fails, stop the rig, because nodes must not go on with a world that stands
+        still.
+        """
         try:
             job()
         except Exception as error:

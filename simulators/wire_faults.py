@@ -1,7 +1,7 @@
-"""A wire between the HAL and its nodes that loses, repeats, cuts, delays and forges frames, as told and from a seed.
+"""A wire between the HAL and its nodes that loses, repeats, cuts, delays and forges frames, by settings and a seed.
 
 It joins two python-can buses of any interface, one with the HAL on it and one with the nodes, and moves frames between
-them only when it is told to, so that on interface `virtual` a test of seconds takes no time and runs the same way each
+them only on request, so that on interface `virtual` a test of seconds takes no time and runs the same way each
 time.
 """
 
@@ -13,26 +13,26 @@ from dataclasses import dataclass, field
 import can
 
 BUS_OFF, RESTARTED, NO_ACKNOWLEDGE, CONTROLLER = 0x40, 0x100, 0x20, 0x04
-"""Classes of error frames, and below details of `CONTROLLER` (linux/can/error.h)."""
+"""These are classes of error frames, and below them details of `CONTROLLER` (linux/can/error.h)."""
 WARNING, PASSIVE = 0x0C, 0x30
 _LARGEST = 8
 _NODE = 0x7F
 _SHARED = (0x000, 0x080)
-"""NMT and SYNC carry no node id."""
+"""The identifiers of NMT and SYNC carry no node id."""
 
 
 @dataclass(frozen=True, slots=True)
 class Chances:
-    """How probable it is that a frame meets each of these, 0 to 1.
+    """Probabilities, 0 to 1, of the faults of a frame.
 
     Attributes:
-        loss: It does not arrive.
-        duplicate: It arrives twice.
+        loss: The frame does not arrive.
+        duplicate: The frame arrives twice.
         short: Its last bytes are missing.
         long: Bytes are added, eight together at most.
-        corrupt: One of its bytes is another one; only from a node, since a checksum protects what is on the wire.
-        delay: It arrives `delayed_by` later, behind frames that were sent after it.
-        delayed_by: [s]
+        corrupt: One of its bytes is changed; only from a node, since a checksum protects what is on the wire.
+        delay: The frame arrives `delayed_by` later, behind frames that were sent after it.
+        delayed_by: Delay [s].
     """
 
     loss: float = 0.0
@@ -55,19 +55,19 @@ class _Direction:
 
 
 class FaultyWire:
-    """What lies between the HAL and the nodes of one bus; without any setting it only passes frames on.
+    """Wire between the HAL and the nodes of one bus; without settings it only passes frames on.
 
-    Chance is drawn from one stream per direction and identifier, so that a request that comes at another moment does
-    not change what happens to everybody else.
+    Random numbers are drawn from one stream per direction and identifier, so that a request that comes at another
+    moment does not change the faults of all others.
     """
 
     def __init__(self, hal: can.BusABC, nodes: can.BusABC, seed: int = 0) -> None:
         """Join two buses.
 
         Args:
-            hal: On the channel that the HAL opens; used by nobody else.
-            nodes: On the channel that the nodes open; used by nobody else.
-            seed: Of all chance.
+            hal: Bus on the channel that the HAL opens, for this wire only.
+            nodes: Bus on the channel that the nodes open, for this wire only.
+            seed: Seed of everything random.
         """
         self._hal, self._nodes = hal, nodes
         self._to_nodes = _Direction("to nodes", hal, nodes)
@@ -76,13 +76,13 @@ class FaultyWire:
         self._streams: dict[tuple[str, int], random.Random] = {}
         self.chances = Chances()
         self.is_cut = False
-        """Whether the wire is cut: nothing arrives, and nobody is told."""
+        """Whether the wire is cut: no frame arrives, without an error."""
         self.lost: frozenset[int] = frozenset()
         """Identifiers of which no frame arrives."""
         self.readdressed: Mapping[int, int] = {}
         """Node -> id under which it is on the bus instead of its own; of another node: both have it."""
         self.babble: Callable[[random.Random], list[tuple[int, bytes]]] | None = None
-        """What one more node says each time the wire is looked at."""
+        """Frames that one more node sends each time the wire is moved."""
         self.counters = {"passed": 0, "lost": 0, "changed": 0}
 
     def to_nodes(self, now: float) -> None:
@@ -97,15 +97,15 @@ class FaultyWire:
                 self.say(identifier, data)
 
     def say(self, identifier: int, data: bytes) -> None:
-        """A data frame to the HAL that no node has sent."""
+        """Send a data frame to the HAL that no node has sent."""
         self.pass_on(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
 
     def pass_on(self, message: can.Message) -> None:
-        """Any frame to the HAL that no node has sent."""
+        """Send any frame to the HAL that no node has sent."""
         _put(self._hal, message)
 
     def error(self, kind: int, detail: int = 0) -> None:
-        """An error frame to the HAL, as a CAN controller reports its own state."""
+        """Send an error frame to the HAL, as a CAN controller reports its own state."""
         data = bytes([0, detail, *bytes(6)])
         self._hal.send(can.Message(arbitration_id=kind, is_error_frame=True, data=data))
 
@@ -125,7 +125,7 @@ class FaultyWire:
                 self._pass(way, readdressed, now)
 
     def _addressed(self, way: _Direction, message: can.Message) -> list[can.Message]:
-        """The frame as those see it who are not where they should be: once, twice, or not at all."""
+        """Return the frame as readdressed nodes receive it: once, twice, or not at all."""
         node = message.arbitration_id & _NODE
         if not self.readdressed or message.is_error_frame or message.arbitration_id in _SHARED:
             return [message]

@@ -1,13 +1,15 @@
-"""How long a frame takes on a real CAN bus, and which one goes first (ISO 11898-1, classic frames)."""
+"""Duration of frames on a real CAN bus, and their arbitration (ISO 11898-1, classic frames)."""
 
 import heapq
 from dataclasses import dataclass
 
 EXTENDED, REMOTE, ERROR = 1 << 31, 1 << 30, 1 << 29
-"""Flags above the identifier, as SocketCAN has them."""
+"""These are flags above the identifier, as SocketCAN has them."""
 
 _TAIL_BITS = 13
-"""CRC delimiter, acknowledge slot and delimiter, end of frame, and the 3 bits between two frames; never stuffed."""
+"""CRC delimiter, acknowledge slot and delimiter, end of frame and the 3 bits between frames take these bits,
+unstuffed.
+"""
 
 
 def _crc_table() -> tuple[int, ...]:
@@ -41,10 +43,10 @@ _IDLE = 1 << 3
 
 
 def frame_bits(identifier: int, data: bytes, length: int | None = None) -> int:
-    """Bits that a frame takes, stuff bits and the gap after it included.
+    """Return the number of bits of a frame, with stuff bits and the gap after it.
 
     Args:
-        identifier: With the flags EXTENDED and REMOTE.
+        identifier: Identifier with the flags EXTENDED and REMOTE.
         data: Up to 8 bytes; empty for a remote frame.
         length: The length code, if it is not the number of bytes (a remote frame's).
     """
@@ -77,7 +79,7 @@ def frame_bits(identifier: int, data: bytes, length: int | None = None) -> int:
 
 
 def arbitration(identifier: int) -> int:
-    """What is compared on the wire: the lower number wins."""
+    """Return the number that is compared on the wire; the lower one wins."""
     remote = 1 if identifier & REMOTE else 0
     if identifier & EXTENDED:
         return (identifier >> 18 & 0x7FF) << 21 | 3 << 19 | (identifier & 0x3FFFF) << 1 | remote
@@ -117,7 +119,7 @@ class Wire:
         heapq.heappush(self._waiting, (arbitration(identifier), self._count, entry))
 
     def advance(self, now: float) -> list[tuple[object, bytes, float]]:
-        """Frames whose last bit has passed by now: sender, frame, and when it ended."""
+        """Return frames whose last bit has passed by now: sender, frame, and its end [s]."""
         done: list[tuple[object, bytes, float]] = []
         while True:
             if self._flying is None:
@@ -133,5 +135,5 @@ class Wire:
             self._flying = None
 
     def due(self) -> float | None:
-        """When the frame in flight ends; None on an idle bus."""
+        """Return the end of the frame in flight [s]; None on an idle bus."""
         return self._free_at if self._flying is not None else None

@@ -1,4 +1,4 @@
-"""The contract of a physics: what simulated nodes and the direct backend read, drive and break."""
+"""Contract of a simulated physics, which nodes and the direct backend read, drive and break."""
 
 from collections.abc import Mapping
 from typing import Protocol
@@ -7,7 +7,7 @@ import numpy as np
 
 
 class World(Protocol):
-    """A robot that does not exist, with its own time.
+    """Simulated robot with its own time.
 
     Signals and elements are those of the robot file; arrays are float64 in SI units and in the order of the elements.
     One thread steps a world; `measure` returns arrays that no later step changes.
@@ -21,15 +21,15 @@ class World(Protocol):
         ...
 
     def measure(self) -> Mapping[str, np.ndarray]:
-        """What ideal electronics would read from the sensors now: noise included, transmission not. Shapes (n,)."""
+        """Return the readings of ideal electronics now: with noise, without transmission; shapes (n,)."""
         ...
 
     def truth(self) -> Mapping[str, np.ndarray]:
-        """What is, without noise: every signal, shapes (n,)."""
+        """Return every signal without noise, shapes (n,)."""
         ...
 
     def drive(self, element: str, target: float, enabled: bool) -> None:
-        """Set-point of one servo [its signal's unit]; a servo that is not enabled holds by its brake."""
+        """Set the target of one servo [its signal's unit]; a servo that is not enabled holds by its brake."""
         ...
 
     def break_part(self, part: str) -> None:
@@ -37,5 +37,5 @@ class World(Protocol):
         ...
 
     def close(self) -> None:
-        """Let go of the physics engine. Safe to call twice."""
+        """Release the physics engine. Safe to call twice."""
         ...

@@ -20,12 +20,12 @@ _LARGEST = 0x7FFFFF
 
 @dataclass(frozen=True, slots=True)
 class DbcCellConstants:
-    """The cell.
+    """Constants of the cell.
 
     Attributes:
-        capacity: Force [N] beyond which it tells overload or underload.
-        unbalance: What it reads unloaded before a tare [N].
-        period: How often it sends [s].
+        capacity: Force [N] beyond which it reports overload or underload.
+        unbalance: Reading without load before a tare [N].
+        period: Period of its messages [s].
     """
 
     kind: ClassVar[str] = "dbc_cell"

@@ -1,4 +1,4 @@
-"""Which class plays which kind of node: one line per kind."""
+"""Constants -> class of the simulated node: one line per kind."""
 
 from collections.abc import Callable
 
@@ -25,5 +25,5 @@ KINDS: dict[type, Callable[[NodeSpec, Plant, list[Frame]], SimulatedNode]] = {
 
 
 def make(spec: NodeSpec, plant: Plant, outbox: list[Frame]) -> SimulatedNode:
-    """The node that a spec describes, not powered yet."""
+    """Make the node of a spec, not powered yet."""
     return KINDS[type(spec.constants)](spec, plant, outbox)

@@ -23,15 +23,15 @@ _MASTER_ID, _OWN_ID, _TIMEOUT, _MODE, _SERIAL = 7, 8, 9, 10, 15
 _RANGES = (21, 22, 23)
 _WRITABLE = (_MASTER_ID, _OWN_ID, _TIMEOUT, _MODE, *_RANGES)
 _TICKS_PER_SECOND = 20_000
-"""Unit of the timeout register."""
+"""The timeout register counts in this unit."""
 _SUBSTEP = 5e-4
-"""Of the rotor [s]; a firmware closes this loop at 20 to 40 kHz."""
+"""The rotor is advanced in steps of at most this [s]; a firmware closes this loop at 20 to 40 kHz."""
 _LAG = 0.2
-"""The rotor is never further than so much [rad] from where the world is: what blocks the one blocks the other."""
+"""The rotor is at most this far [rad] from the world's position, so an obstacle blocks both."""
 _AMBIENT = 25.0
-"""[degrees Celsius]"""
+"""The surroundings have this temperature [degrees Celsius]."""
 _COOLING = 120.0
-"""Time constant of the rotor's temperature [s]."""
+"""This is the time constant of the rotor's temperature [s]."""
 _TOO_HOT = {"t_motor": 1, "damiao": 0xC, "mini_cheetah": 0}
 _LOST = 0xD
 
@@ -41,23 +41,23 @@ class MitConstants:
     """A drive in MIT mode. position [rad or m] = zero + direction * angle / gear * (spool_radius or 1).
 
     Attributes:
-        make: Whose firmware it runs.
-        master_id: Identifier under which it answers; None: 0, and of Damiao its id + 16.
-        position: Range of its frames [rad].
-        velocity: [rad/s]
-        torque: [N m]
-        stiffness: [N m/rad]
-        damping: [N m s/rad]
+        make: Maker of its firmware.
+        master_id: Identifier of its answers; None: 0, or for Damiao its id + 16.
+        position: Range of positions in frames [rad].
+        velocity: Range of velocities [rad/s].
+        torque: Range of torques [N m].
+        stiffness: Range of stiffness [N m/rad].
+        damping: Range of damping [N m s/rad].
         gear: Turns of its output per turn of the joint or spool.
-        spool_radius: [m]; None for a joint.
+        spool_radius: Radius of the spool [m]; None for a joint.
         direction: +1 if its angle grows with the position, else -1.
         zero: Position where its angle is zero [rad or m].
-        inertia: At its output [kg m2].
-        friction: At its output [N m s/rad].
-        load: `signal.element` of the effort that pulls towards growing position [N m or N]; None: none does.
-        is_long: T-Motor: answers with temperature and error.
-        heating: Of the rotor [K/s per (N m)^2].
-        hottest: It powers off above [degrees Celsius].
+        inertia: Inertia at its output [kg m2].
+        friction: Friction at its output [N m s/rad].
+        load: `signal.element` of the effort that pulls towards growing position [N m or N]; None: no load.
+        is_long: Whether answers have temperature and error.
+        heating: Heating of the rotor [K/s per (N m)^2].
+        hottest: Temperature above which it powers off [degrees Celsius].
     """
 
     kind: ClassVar[str] = "mit_drive"
@@ -87,7 +87,7 @@ class MitConstants:
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
+class MitCommand:
     """The frame that is followed: position [rad], velocity [rad/s], gains, torque [N m]."""
 
     position: float = 0.0
@@ -112,14 +112,14 @@ class MitDriveNode(SimulatedNode, SimulatedDrive):
         self.is_on = False
         """Whether the motor has power, and follows."""
         self.error = 0
-        """As its answers tell it."""
+        """Error code as in its answers."""
         self.registers: dict[int, bytes] = {}
         self.temperature = _AMBIENT
-        """Of the rotor [degrees Celsius]."""
+        """Temperature of the rotor [degrees Celsius]."""
         self.torque = 0.0
-        """[N m]"""
+        """Torque of the rotor [N m]."""
         self._rotor = Rotor(self._constants.inertia, self._constants.friction)
-        self.wanted = Wanted()
+        self.command = MitCommand()
         """The frame that it follows."""
         self._heard = self._now = self._before = 0.0
 
@@ -154,7 +154,7 @@ class MitDriveNode(SimulatedNode, SimulatedDrive):
         self._switch_off()
         self.error = 0
         self.temperature = _AMBIENT
-        self.wanted = Wanted()
+        self.command = MitCommand()
         self._heard = self._now = now
         self._before = self._angle()
         master_id = constants.master_id
@@ -203,14 +203,14 @@ class MitDriveNode(SimulatedNode, SimulatedDrive):
         self._heat(duration)
 
     def _turn(self, duration: float) -> None:
-        wanted, rotor, constants = self.wanted, self._rotor, self._constants
+        command, rotor, constants = self.command, self._rotor, self._constants
         load = self.plant.read(constants.load) * constants.unit if constants.load else 0.0
         steps = max(1, math.ceil(duration / _SUBSTEP))
         for _ in range(steps):
             asked = (
-                wanted.stiffness * (wanted.position - rotor.position)
-                + wanted.damping * (wanted.velocity - rotor.velocity)
-                + wanted.torque
+                command.stiffness * (command.position - rotor.position)
+                + command.damping * (command.velocity - rotor.velocity)
+                + command.torque
             )
             self.torque = max(-constants.torque, min(asked, constants.torque))
             rotor.push(self.torque + load, duration / steps)
@@ -255,7 +255,7 @@ class MitDriveNode(SimulatedNode, SimulatedDrive):
         stiffness = data[3] % 16 * 256 + data[4]
         damping = data[5] * 16 + data[6] // 16
         torque = data[6] % 16 * 256 + data[7]
-        self.wanted = Wanted(
+        self.command = MitCommand(
             (position / 65535 * 2 - 1) * constants.position,
             (velocity / 4095 * 2 - 1) * constants.velocity,
             stiffness / 4095 * constants.stiffness,
@@ -315,7 +315,7 @@ class MitDriveNode(SimulatedNode, SimulatedDrive):
         self.is_on = False
         self.torque = 0.0
         if self._constants.make != "t_motor":
-            self.wanted = Wanted()
+            self.command = MitCommand()
 
     @staticmethod
     def _twelve_bits(value: float, end: float) -> int:

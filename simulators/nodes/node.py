@@ -1,4 +1,4 @@
-"""What anything simulated on a bus is, whatever it speaks."""
+"""Contract of a simulated node, whatever its protocol."""
 
 from collections.abc import Callable, Mapping
 from typing import Protocol, runtime_checkable
@@ -6,12 +6,12 @@ from typing import Protocol, runtime_checkable
 from simulators.nodes.canopen.spec import NodeSpec
 
 Frame = tuple[int, bytes]
-"""Identifier and data of a frame; an identifier of 29 bits has `EXTENDED` set."""
+"""A frame is identifier and data; an identifier of 29 bits has `EXTENDED` set."""
 Handler = Callable[[bytes, float], None]
-"""Called with a frame's data and the time [s]."""
+"""A handler is called with a frame's data and the time [s]."""
 EXTENDED = 1 << 31
 REMOTE = 1 << 30
-"""Set in the identifier of a route that is asked by a remote frame; its handler gets no data."""
+"""This flag marks the identifier of a route for remote frames; its handler gets no data."""
 
 
 class SimulatedNode(Protocol):
@@ -30,19 +30,19 @@ class SimulatedNode(Protocol):
 
     @property
     def condition(self) -> str:
-        """What it is doing, in a word or two, for a person."""
+        """Short text on its present activity."""
         ...
 
     def routes(self) -> Mapping[int, Handler]:
-        """Which identifiers it listens to, SYNC aside, and what takes the data."""
+        """Return identifier -> handler of its data, for all identifiers but SYNC."""
         ...
 
     def sync(self, now: float) -> None:
-        """A SYNC was on the bus."""
+        """Handle a SYNC."""
         ...
 
     def tick(self, now: float) -> None:
-        """Time passes; called every few milliseconds."""
+        """Advance to a time; called every few milliseconds."""
         ...
 
     def power_up(self, now: float) -> None:
@@ -66,5 +66,5 @@ class SimulatedDrive(Protocol):
 
     @property
     def servo(self) -> tuple[float, bool]:
-        """What the world's servo is to do: target [unit of `spec.element`], and whether it is enabled at all."""
+        """Target of the world's servo [unit of `spec.element`], and whether it is enabled."""
         ...

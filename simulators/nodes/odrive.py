@@ -20,18 +20,18 @@ from simulators.nodes.rotor import Rotor
 
 BROADCAST = 63
 INITIALIZING, DRV_FAULT, WATCHDOG_TIMER_EXPIRED, ESTOP_REQUESTED = 0x1, 0x20, 0x100_0000, 0x200_0000
-"""Errors of the axis."""
+"""These are errors of the axis."""
 SUCCESS, DISARMED = 0, 3
-"""Results of what it was asked for."""
+"""These are results of a request."""
 TORQUE, VELOCITY, POSITION = 1, 2, 3
-"""Control modes."""
+"""These are control modes."""
 
 _BOOT_TIME = 0.2
-"""Until it is idle after power-on [s]."""
+"""The axis is idle this long after power-on [s]."""
 _SUBSTEP = 5e-4
-"""Of the rotor [s]; the firmware closes its loops at 8 kHz."""
+"""The rotor is advanced in steps of at most this [s]; the firmware closes its loops at 8 kHz."""
 _LAG = 0.2
-"""The rotor is never further than so much [rad or m] from where the world is: what blocks the one blocks the other."""
+"""The rotor is at most this far [rad or m] from the world's position, so an obstacle blocks both."""
 
 
 class AxisState(IntEnum):
@@ -50,15 +50,15 @@ class OdriveConstants:
         gear: Motor turns per turn of the output.
         direction: +1 if the motor's turns grow with the position, else -1.
         zero: Position at zero turns [rad].
-        inertia: At the output [kg m2].
-        friction: At the output [N m s/rad].
-        load: `signal.element` of the effort [N m] that pulls towards growing position; None: none does.
-        position_gain: [1/s].
-        velocity_gain: [N m s per motor turn].
-        integrator_gain: [N m per motor turn].
-        velocity_limit: [motor turns/s].
-        torque_limit: Of the motor [N m], unless a current limit is set.
-        torque_constant: [N m/A].
+        inertia: Inertia at the output [kg m2].
+        friction: Friction at the output [N m s/rad].
+        load: `signal.element` of the effort [N m] that pulls towards growing position; None: no load.
+        position_gain: Gain of the position loop [1/s].
+        velocity_gain: Gain of the velocity loop [N m s per motor turn].
+        integrator_gain: Integrator gain [N m per motor turn].
+        velocity_limit: Limit of the velocity [motor turns/s].
+        torque_limit: Limit of the motor torque [N m], unless a current limit is set.
+        torque_constant: Torque constant [N m/A].
         watchdog: axis.config.watchdog_timeout [s]; None: not enabled.
         heartbeat: Period of the heartbeat [s].
         encoder: Period of the estimates [s].
@@ -95,7 +95,7 @@ class OdriveConstants:
 
 
 class OdriveAxis(SimulatedNode, SimulatedDrive):
-    """One axis: hears what is sent to its node id, and tells how it is by itself."""
+    """One axis: it handles frames to its node id and sends its state cyclically."""
 
     def __init__(self, spec: NodeSpec, plant: Plant, outbox: list[Frame]) -> None:
         assert isinstance(spec.constants, OdriveConstants)
@@ -186,7 +186,7 @@ class OdriveAxis(SimulatedNode, SimulatedDrive):
         self.fail(DRV_FAULT)
 
     def fail(self, error: int) -> None:
-        """Disarm at once and tell why."""
+        """Disarm at once with an error."""
         self.error |= error
         if self.state is AxisState.CLOSED_LOOP_CONTROL:
             self.result = DISARMED
@@ -205,11 +205,11 @@ class OdriveAxis(SimulatedNode, SimulatedDrive):
             self.fail(WATCHDOG_TIMER_EXPIRED)
         if duration > 0:
             self._turn(duration)
-        for tell, period in self._periods.items():
-            if period and now >= self._due[tell] - 1e-9:
-                self._due[tell] = max(self._due[tell] + period, now)
-                if not self.is_muted or tell == self._heartbeat:
-                    self._send(tell())
+        for message, period in self._periods.items():
+            if period and now >= self._due[message] - 1e-9:
+                self._due[message] = max(self._due[message] + period, now)
+                if not self.is_muted or message == self._heartbeat:
+                    self._send(message())
 
     def _turn(self, duration: float) -> None:
         position, rotor = self._position(), self._rotor
@@ -228,7 +228,7 @@ class OdriveAxis(SimulatedNode, SimulatedDrive):
             rotor.push(constants.direction * constants.gear * self.torque + load, duration / steps)
 
     def _cascade(self, rotor: Rotor, duration: float) -> float:
-        """Torque of the motor [N m], from position over velocity as far as the mode has them."""
+        """Return the motor torque [N m] of the cascade of position and velocity loops in the present mode."""
         constants, (speed_limit, torque_limit) = self.constants, self._limits
         torque = self.input[TORQUE]
         if self.control_mode >= VELOCITY:
@@ -248,7 +248,7 @@ class OdriveAxis(SimulatedNode, SimulatedDrive):
         self.torque = 0.0
 
     def _fed_by(self, act: Callable[[bytes], None]) -> Handler:
-        """Every frame to the axis feeds its watchdog, whatever it asks."""
+        """Return a handler that also feeds the watchdog, as every frame to the axis does."""
 
         def handle(data: bytes, now: float) -> None:
             if self.is_powered:
@@ -258,11 +258,11 @@ class OdriveAxis(SimulatedNode, SimulatedDrive):
         return handle
 
     def _request(self, data: bytes) -> None:
-        wanted = int.from_bytes(data[:4], "little")
-        if wanted == AxisState.IDLE and self.state is not AxisState.UNDEFINED:
+        requested = int.from_bytes(data[:4], "little")
+        if requested == AxisState.IDLE and self.state is not AxisState.UNDEFINED:
             self._disarm()
             self.result = SUCCESS
-        elif wanted == AxisState.CLOSED_LOOP_CONTROL and self.state is AxisState.IDLE:
+        elif requested == AxisState.CLOSED_LOOP_CONTROL and self.state is AxisState.IDLE:
             if self.error:
                 self.result = DISARMED
                 return

@@ -1,4 +1,4 @@
-"""What the nodes of a robot see of the world: the newest measurement, swapped whole."""
+"""View of the world for the nodes of a robot: the newest measurement, swapped whole."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -28,7 +28,7 @@ class Plant:
     snapshot: Snapshot
 
     def read(self, element: str) -> float:
-        """The newest value of an element [its signal's unit]."""
+        """Return the newest value of an element [its signal's unit]."""
         signal, index = self.places[element]
         return float(self.snapshot.values[signal][index])
 

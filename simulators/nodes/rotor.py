@@ -1,4 +1,6 @@
-"""What turns a torque or a speed into a place to go: drives that are not told a position need one to tell the world."""
+"""Rotor that turns a torque or a speed into a position: the world needs one from drives without a position
+set-point.
+"""
 
 import math
 from dataclasses import dataclass
@@ -9,10 +11,10 @@ class Rotor:
     """Inertia and viscous friction of motor and gear, seen at the output; the world's servo follows its position.
 
     Attributes:
-        inertia: [kg m2], or [kg] for a wire.
-        friction: [N m s/rad], or [N s/m] for a wire.
-        position: [rad or m].
-        velocity: [rad/s or m/s].
+        inertia: Inertia [kg m2], or [kg] for a wire.
+        friction: Friction [N m s/rad], or [N s/m] for a wire.
+        position: Position [rad or m].
+        velocity: Velocity [rad/s or m/s].
     """
 
     inertia: float
@@ -25,9 +27,10 @@ class Rotor:
         self.position, self.velocity = position, 0.0
 
     def push(self, effort: float, duration: float) -> float:
-        """Position [rad or m] after `effort` [N m or N], load already subtracted, has acted for `duration` [s].
+        """Return the position [rad or m] after `effort` [N m or N], load already subtracted, has acted for `duration`
+        [s].
 
-        The exact solution of inertia * dv/dt = effort - friction * v, so that no duration makes it unstable.
+        This is the exact solution of inertia * dv/dt = effort - friction * v, stable for every duration.
         """
         rate = self.friction / self.inertia
         if rate * duration < 1e-9:
@@ -42,7 +45,7 @@ class Rotor:
         return self.position
 
     def run(self, velocity: float, duration: float) -> float:
-        """Position [rad or m] after turning at `velocity` [rad/s or m/s] for `duration` [s]."""
+        """Return the position [rad or m] after turning at `velocity` [rad/s or m/s] for `duration` [s]."""
         self.velocity = velocity
         self.position += velocity * duration
         return self.position

@@ -1,1 +1,1 @@
-"""What each simulated robot is made of."""
+"""Simulated robots."""

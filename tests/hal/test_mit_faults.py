@@ -102,7 +102,7 @@ def test_closing_leaves_nothing_on():
     bench.close()
     for joint in ("elbow", "wrist", "finger"):
         assert not node(bench, joint).is_on
-        assert node(bench, joint).wanted.stiffness == 0
+        assert node(bench, joint).command.stiffness == 0
     assert int.from_bytes(node(bench, "elbow").registers[9], "little") == 0
 
 

@@ -42,14 +42,14 @@ def test_enabling_moves_nothing(bench):
         moved.append(np.abs(bench.world.position - before).max())
     assert bench.robot.mode == "hold"
     assert max(moved) < 1e-3
-    assert node(bench, "elbow").wanted.stiffness == pytest.approx(40.0, abs=0.1)
+    assert node(bench, "elbow").command.stiffness == pytest.approx(40.0, abs=0.1)
 
 
 def test_stiffness_grows_within_the_ramp(bench):
     bench.enable()
     grown = []
     for _ in range(25):
-        grown.append(node(bench, "elbow").wanted.stiffness)
+        grown.append(node(bench, "elbow").command.stiffness)
         bench.cycle()
     assert grown[0] < 10.0
     assert all(later >= earlier for earlier, later in itertools.pairwise(grown))
@@ -63,7 +63,7 @@ def test_a_drive_that_remembers_a_command_is_not_moved_by_it():
     for data in (mit.special(Special.ENTER), old):
         bench.wires["can0"].send(can.Message(arbitration_id=2, data=data, is_extended_id=False))
     bench.rig.step(0.0)
-    assert node(bench, "wrist").wanted.stiffness > 299  # the HAL died here, and now it starts again
+    assert node(bench, "wrist").command.stiffness > 299  # the HAL died here, and now it starts again
     bench.open()
     bench.cycle(3)
     before = bench.world.position.copy()
@@ -127,7 +127,7 @@ def test_damps_on_its_way_to_off(open_mit):
     bench.robot.stop("test")
     bench.cycle(60)
     assert bench.robot.mode == "stopping"
-    assert node(bench, "elbow").wanted.stiffness == 0
+    assert node(bench, "elbow").command.stiffness == 0
     # 4 N m against a damping of 2 and a friction of 0.1 N m s/rad
     assert bench.sample.values["joint_velocity"][0] == pytest.approx(4.0 / 2.1, abs=0.05)
     bench.until(lambda: bench.robot.mode == "off", "letting go", 200)
@@ -140,7 +140,7 @@ def test_quick_stop_brakes_and_lets_go(bench):
     bench.robot._devices[0].quick_stop()
     bench.cycle(30)
     assert node(bench, "elbow").is_on
-    assert (node(bench, "elbow").wanted.stiffness, node(bench, "elbow").wanted.damping > 1.9) == (0, True)
+    assert (node(bench, "elbow").command.stiffness, node(bench, "elbow").command.damping > 1.9) == (0, True)
     bench.cycle(40)
     assert not node(bench, "elbow").is_on
     assert bench.robot.mode == "fault"
@@ -156,7 +156,7 @@ def test_turns_at_a_velocity(open_mit):
     bench.follow([3.0], 60)
     # a friction of 0.1 against a damping of 2 N m s/rad
     assert bench.sample.values["joint_velocity"][0] == pytest.approx(3.0 * 2.0 / 2.1, abs=0.05)
-    assert node(bench, "elbow").wanted.stiffness == 0
+    assert node(bench, "elbow").command.stiffness == 0
 
 
 def test_pulls_with_an_effort(open_mit):
@@ -168,7 +168,7 @@ def test_pulls_with_an_effort(open_mit):
     bench.enable()
     bench.follow([0.5], 20)
     assert bench.sample.values["joint_effort"][0] == pytest.approx(0.5, abs=0.02)
-    assert (node(bench, "elbow").wanted.stiffness, node(bench, "elbow").wanted.damping) == (0, 0)
+    assert (node(bench, "elbow").command.stiffness, node(bench, "elbow").command.damping) == (0, 0)
 
 
 def test_identity_and_inspection(bench):

@@ -16,7 +16,6 @@ NOT_YET = {
     "gemuco/learning",
     "gemuco/structure",
     "hal",
-    "simulators",
     "services/client",
     "services/cli.py",
     "services/errors.py",

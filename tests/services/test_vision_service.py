@@ -275,7 +275,7 @@ def test_collected_data_have_what_the_camera_sees() -> None:
 def test_the_command_line_finds_who_plays_a_fault(robot: str, capsys: pytest.CaptureFixture[str]) -> None:
     def play(arguments: dict[str, str]) -> dict[str, str]:
         if arguments["text"] == "camera_dropped":
-            raise ValueError("'camera_dropped' is no part that can break.")
+            raise ValueError("'camera_dropped' is not a part that can break.")
         return {"text": f"The simulator plays {arguments['text']}."}
 
     with Truth(robot) as truth, camera_of(config(robot)), Client(robot) as client:

@@ -57,7 +57,7 @@ class SpringWorld:
 
     def break_part(self, part: str) -> None:
         if part != "muscle_cut:wire":
-            raise ValueError(f"'{part}' is no part that can break. Known parts: muscle_cut:wire.")
+            raise ValueError(f"'{part}' is not a part that can break. Known parts: muscle_cut:wire.")
         self.broken.append(part)
 
     def close(self) -> None:

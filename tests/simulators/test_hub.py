@@ -111,7 +111,7 @@ def test_twenty_thousand_frames_from_another_process_all_arrive_in_order(channel
 
 
 def test_opening_without_a_server_fails_at_once_and_says_what_to_check():
-    with pytest.raises(can.CanInitializationError, match="Nobody serves the hub channel 'no_such_bus'"):
+    with pytest.raises(can.CanInitializationError, match="No server has the hub channel 'no_such_bus'"):
         join("no_such_bus")
 
 

@@ -57,7 +57,7 @@ def test_what_cannot_be_is_refused_in_one_sentence(stack: Stack) -> None:
     for words, sentence in (
         (("estimate", "elbow"), "Signal 'elbow' is not in the schema. Known signals: joint_position"),
         (("dance",), "'dance' is not something to ask. Known: estimate, "),
-        (("fault", "coffee"), "'coffee' is no part that can break"),
+        (("fault", "coffee"), "'coffee' is not a part that can break"),
     ):
         answer = ask(stack, *words)
         assert answer.returncode == 1

@@ -14,10 +14,10 @@ from simulators.nodes.plant import Plant
 
 CHANNELS = 4
 RANGE = 10.0
-"""What the inputs read at full scale [V], in the floating point object 6403h."""
+"""The inputs read this at full scale [V], in the floating point object 6403h."""
 _OVERRANGE = 0x0004
 _BROKEN = 0x0020
-"""Bits of the maker's status object 2120h."""
+"""These are bits of the maker's status object 2120h."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,9 +26,9 @@ class AnalogConstants:
 
     Attributes:
         full_scale: Force [N] at full scale of the converter.
-        bits: Of the converter; what it reads lies in the highest bits of 6401h and 6402h.
-        unbalance: What an unloaded cell reads [N].
-        more: `signal.element` of the forces on channels 2 and up, empty where there is no cell; the first is the
+        bits: Bits of the converter; its value lies in the highest bits of 6401h and 6402h.
+        unbalance: Reading of an unloaded cell [N].
+        more: `signal.element` of the forces on channels 2 and up, empty for a missing cell; the first is the
             node's own.
     """
 
@@ -62,7 +62,7 @@ class AnalogInput(CanopenNode):
         self._is_broken = True
 
     def sample(self) -> None:
-        """Every channel that has a cell; the others read zero."""
+        """Measure every channel that has a cell; the others read zero."""
         values = self.objects.values
         status = _BROKEN if self._is_broken else 0
         half = 1 << self._constants.bits - 1

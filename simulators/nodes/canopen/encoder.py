@@ -11,9 +11,9 @@ from simulators.nodes.node import Frame
 from simulators.nodes.plant import Plant
 
 REVERSED, SCALED = 1, 4
-"""Bits of the operating parameters 6000h."""
+"""These are bits of the operating parameters 6000h."""
 POSITION_ERROR = 1
-"""Bit of the alarms 6503h."""
+"""This is a bit of the alarms 6503h."""
 
 
 class JointEncoder(CanopenNode):
@@ -47,7 +47,7 @@ class JointEncoder(CanopenNode):
         self.objects.values[0x6503, 0] = POSITION_ERROR
 
     def sample(self) -> None:
-        """Position and speed; the position keeps its value while the alarm stands."""
+        """Measure position and speed; the position keeps its value while the alarm stands."""
         values = self.objects.values
         values[0x6500, 0] = values[0x6000, 0]
         if values[0x6503, 0] == POSITION_ERROR:
@@ -61,7 +61,7 @@ class JointEncoder(CanopenNode):
         values[0x6004, 0] = position
 
     def _measured(self) -> int | None:
-        """Position before the preset's offset [units]; None if the world has none."""
+        """Return the position before the preset's offset [units]; None if the world has none."""
         values, constants = self.objects.values, self._constants
         angle = self.plant.read(self.spec.element)
         if not math.isfinite(angle):
@@ -76,7 +76,7 @@ class JointEncoder(CanopenNode):
         return counts % self._range()
 
     def _range(self) -> int:
-        """Units after which the position begins again."""
+        """Return the number of units after which the position begins again."""
         if int(self.objects.values[0x6000, 0]) & SCALED:
             return int(self.objects.values[0x6002, 0])
         return self._constants.counts_per_turn * self._constants.turns

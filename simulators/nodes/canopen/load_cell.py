@@ -12,13 +12,13 @@ from simulators.nodes.plant import Plant
 
 CHANNELS = 4
 ZERO = int.from_bytes(b"zero", "little")
-"""Signature that tares the input when written to 6125h."""
+"""This signature tares the input when written to 6125h."""
 
 NOT_VALID, POSITIVE_OVERLOAD, NEGATIVE_OVERLOAD = 1, 2, 4
-"""Bits of the status 6150h."""
+"""These are bits of the status 6150h."""
 
 _LARGEST = 1e9
-"""Process value beyond which the scaling that a master has set makes no sense."""
+"""The scaling that a master has set makes no sense for a process value beyond this."""
 
 
 class LoadCell(CanopenNode):
@@ -89,6 +89,6 @@ class LoadCell(CanopenNode):
 
 
 def _fitting(value: int, bits: int) -> int:
-    """The nearest number that a signed integer of so many bits can hold."""
+    """Return the nearest number that a signed integer of `bits` bits can hold."""
     half = 1 << bits - 1
     return min(max(value, -half), half - 1)

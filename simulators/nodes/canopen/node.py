@@ -16,14 +16,14 @@ from simulators.nodes.plant import Plant
 HEARTBEAT_LOST = 0x8130
 PDO_TOO_SHORT = 0x8210
 HARDWARE = 0x5000
-"""Emergency error codes (CiA 301, table 26)."""
+"""These are emergency error codes (CiA 301, table 26)."""
 
 GENERIC, COMMUNICATION = 0x01, 0x10
-"""Bits of the error register."""
+"""These are bits of the error register."""
 
 
 class Nmt(IntEnum):
-    """NMT states as a heartbeat tells them."""
+    """NMT states as in a heartbeat."""
 
     BOOT = 0x00
     STOPPED = 0x04
@@ -78,7 +78,7 @@ class CanopenNode(SimulatedNode):
         return True
 
     def connection_lost(self, code: int) -> None:
-        """The master is silent (code 8130h), or took the node out of operation (code 0)."""
+        """React to a silent master (code 8130h), or to a node taken out of operation (code 0)."""
 
     def break_down(self) -> None:
         """Report a fault of the device's own."""
@@ -109,7 +109,7 @@ class CanopenNode(SimulatedNode):
         self._restart_heartbeat()
 
     def routes(self) -> dict[int, Handler]:
-        """Which identifiers this node listens to, SYNC aside, and what takes the data."""
+        """Return identifier -> handler of its data, for all identifiers but SYNC."""
         routes: dict[int, Handler] = {0x000: self._on_nmt, 0x600 + self.spec.node: self._on_sdo}
         for node in self._watched:
             routes[0x700 + node] = lambda data, now, node=node: self._on_heartbeat(node, now)  # type: ignore[misc]
@@ -118,7 +118,7 @@ class CanopenNode(SimulatedNode):
         return routes
 
     def sync(self, now: float) -> None:
-        """SYNC: sample and send, then act on the set-points that came before it."""
+        """Handle SYNC: sample and send, then act on the set-points that came before it."""
         if self.nmt is not Nmt.OPERATIONAL or not self.is_powered:
             return
         self._now = now
@@ -135,7 +135,7 @@ class CanopenNode(SimulatedNode):
         self.follow(now)
 
     def tick(self, now: float) -> None:
-        """Time passes: heartbeats, event timers, and what the device does by itself. Call every few milliseconds."""
+        """Advance heartbeats, event timers and the device itself; called every few milliseconds."""
         if not self.is_powered:
             return
         self._now = now
@@ -255,7 +255,7 @@ class CanopenNode(SimulatedNode):
         self._send_emergency(code, info)
 
     def clear_errors(self) -> None:
-        """Tell that no error is left, if there was one."""
+        """Send that no error is left, if there was one."""
         if self.objects.values[0x1001, 0]:
             self.objects.values[0x1001, 0] = 0
             self._send_emergency(0, b"")

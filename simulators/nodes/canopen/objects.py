@@ -11,13 +11,13 @@ import canopen
 from canopen.objectdictionary import ODVariable
 
 Key = tuple[int, int]
-"""Index and sub-index."""
+"""A key is an index and a sub-index."""
 Value = int | float | str
 
 _FORMATS = {1: "?", 2: "b", 3: "h", 4: "i", 5: "B", 6: "H", 7: "I", 8: "f"}
 _STRING = 9
 STRING_LIMIT = 64
-"""Bytes that a writable string holds."""
+"""A writable string holds this many bytes."""
 
 
 class Abort(IntEnum):
@@ -52,7 +52,7 @@ class Refused(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """What the EDS says of one value."""
+    """Description of one value in the EDS."""
 
     format: str
     """As in `struct`; empty for a string."""
@@ -68,11 +68,11 @@ class Entry:
         return struct.calcsize("<" + self.format)
 
     def encode(self, value: Value) -> bytes:
-        """Value as it goes over the bus."""
+        """Return a value as bytes of the bus."""
         return value.encode() if isinstance(value, str) else struct.pack("<" + self.format, value)
 
     def decode(self, data: bytes) -> Value:
-        """Value from bytes of the right number.
+        """Return the value of bytes of the right number.
 
         Raises:
             Refused: The length does not fit.
@@ -97,7 +97,7 @@ class Entry:
 
 
 def read_eds(path: Path, node: int) -> dict[Key, Entry]:
-    """Every value of an EDS file, with the defaults that this node id gives."""
+    """Return every value of an EDS file, with the defaults for this node id."""
     entries = {}
     for key, (entry, is_relative) in _sheet(path).items():
         entries[key] = replace(entry, default=entry.default + node) if is_relative else entry  # type: ignore[operator]
@@ -105,9 +105,9 @@ def read_eds(path: Path, node: int) -> dict[Key, Entry]:
 
 
 def as_maker_says(ours: dict[Key, Entry], path: Path, node: int) -> dict[Key, Entry]:
-    """What a node of ours has, with the identity, defaults and limits of a maker's EDS file laid over it.
+    """Return our node's values with the identity, defaults and limits of a maker's EDS file.
 
-    Objects whose type is another one there than here stay ours, since the node computes with them.
+    Objects with another type in that file stay ours, since the node computes with them.
     """
     entries = dict(ours)
     for key, (entry, is_relative) in _sheet(path, others_too=True).items():
@@ -118,11 +118,11 @@ def as_maker_says(ours: dict[Key, Entry], path: Path, node: int) -> dict[Key, En
 
 @functools.cache
 def _sheet(path: Path, others_too: bool = False) -> dict[Key, tuple[Entry, bool]]:
-    """The values of an EDS file for node 0, and whether the node id is added to their defaults.
+    """Return the values of an EDS file for node 0, and whether the node id is added to their defaults.
 
     Args:
         path: The file.
-        others_too: Whether it may have types that no node of ours uses; those objects are left out.
+        others_too: Whether objects of types that our nodes do not use are left out rather than refused.
     """
     dictionary = canopen.import_od(str(path), node_id=0)
     variables = (v for v in _variables(dictionary) if not others_too or v.data_type in (*_FORMATS, _STRING))
@@ -177,10 +177,10 @@ class ObjectDictionary:
                 self.values[key] = self.power_on.get(key, entry.default)
 
     def entry(self, key: Key) -> Entry:
-        """The description of a value.
+        """Return the description of a value.
 
         Raises:
-            Refused: There is no such object or sub-index.
+            Refused: The object or sub-index does not exist.
         """
         try:
             return self.entries[key]
@@ -189,7 +189,7 @@ class ObjectDictionary:
             raise Refused(Abort.NO_SUBINDEX if known else Abort.NO_OBJECT) from None
 
     def read(self, key: Key) -> bytes:
-        """A value as a master reads it.
+        """Return a value as a master reads it.
 
         Raises:
             Refused: It does not exist or cannot be read.

@@ -9,7 +9,7 @@ from simulators.nodes.canopen.objects import Abort, Key, ObjectDictionary, Refus
 _INVALID = 1 << 31
 _EXTENDED = 1 << 29
 _EVENT = (254, 255)
-"""Transmission types that do not wait for SYNC."""
+"""These transmission types do not wait for SYNC."""
 
 
 @dataclass(slots=True)
@@ -20,7 +20,7 @@ class Pdo:
         cob: Identifier of its frames.
         type: Transmission type: 0 to 240 with SYNC, 254 and 255 by event.
         keys: Objects in the frame, in order.
-        layout: How they lie in it.
+        layout: Their layout in the frame.
         period: Event timer [s]; 0 if none.
         due: When the event timer next runs out [s].
         syncs: SYNCs since the last frame.
@@ -37,11 +37,11 @@ class Pdo:
     last: bytes | None = None
 
     def pack(self, values: dict[Key, Value]) -> bytes:
-        """Data of a frame from the object dictionary's values."""
+        """Return the data of a frame from the object dictionary's values."""
         return self.layout.pack(*[values[key] for key in self.keys])
 
     def is_due_at_sync(self, values: dict[Key, Value]) -> bytes | None:
-        """Data to send at this SYNC, or None."""
+        """Return the data to send at this SYNC, or None."""
         if self.type in _EVENT:
             return None
         self.syncs += 1
@@ -55,7 +55,7 @@ class Pdo:
         return data
 
     def is_due_at(self, now: float, values: dict[Key, Value]) -> bytes | None:
-        """Data to send because the event timer has run out, or None."""
+        """Return the data to send because the event timer has run out, or None."""
         if self.type not in _EVENT or not self.period or now < self.due:
             return None
         self.due = max(self.due + self.period, now)

@@ -33,7 +33,7 @@ class SdoServer:
         self._transfer = None
 
     def answer(self, request: bytes) -> bytes | None:
-        """The answer to one request of 8 bytes; None if there is none."""
+        """Return the answer to one request of 8 bytes; None if there is none."""
         if len(request) != 8:
             return None
         command = request[0] >> 5

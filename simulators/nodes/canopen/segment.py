@@ -18,11 +18,11 @@ _log = logging.getLogger(__name__)
 
 SYNC = 0x080
 TICK = 0.005
-"""How often nodes look at the time [s]."""
+"""Nodes are advanced at this interval [s]."""
 MOST_ANSWERING = 0.02
-"""How long [s] after a look at the time is due the frames that still come are answered first."""
+"""Frames are answered first for at most this long [s] after nodes are due to advance."""
 _REOPEN = 0.2
-"""Pause [s] before a bus that failed is opened again."""
+"""A failed bus is opened again after this pause [s]."""
 
 
 class Segment:
@@ -39,7 +39,7 @@ class Segment:
         """
         self.name = name
         self.lock = threading.Lock()
-        """Held by whoever uses the nodes."""
+        """Lock of every thread that uses the nodes."""
         self._outbox: list[Frame] = []
         self.nodes = {spec.name: make(spec, plant, self._outbox) for spec in specs}
         self._listeners = list(self.nodes.values())
@@ -80,7 +80,7 @@ class Segment:
             self._flush()
 
     def serve(self, monotonic: Callable[[], float], is_running: Callable[[], bool]) -> None:
-        """Answer and tick in real time, and open a failed bus again, until told to stop."""
+        """Answer and tick in real time, and open a failed bus again, until stopped."""
         due = monotonic()
         while is_running():
             try:
@@ -103,7 +103,7 @@ class Segment:
             self._flush()
 
     def _receive(self, timeout: float) -> list[Frame]:
-        """Frames that came, with the flags in their identifiers; none after `timeout` [s]."""
+        """Return frames that came, with the flags in their identifiers; none after `timeout` [s]."""
         assert self._bus is not None, "the segment is not open"
         if isinstance(self._bus, HubBus):
             return self._bus.receive_frames(timeout)

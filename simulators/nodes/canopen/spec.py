@@ -1,4 +1,4 @@
-"""What hangs on a bus: a simulated node's address, what it measures or moves, and its own electrical constants.
+"""Description of a simulated node: its address, what it measures or moves, and its own electrical constants.
 
 The constants are those of the device, not of the robot file: a robot file whose settings disagree with its hardware
 must read wrong values here as it would on a bench.
@@ -12,7 +12,7 @@ from typing import ClassVar, Protocol
 
 _CHECKOUT = Path(__file__).resolve().parents[3]
 EDS_FOLDER = (_CHECKOUT if (_CHECKOUT / "robots").is_dir() else Path.cwd()) / "robots" / "eds"
-"""Beside this package, or, where it is installed without the robot files, where their names are looked up too."""
+"""EDS files are beside this package, or, without a checkout, in the working directory's folder of robot files."""
 
 
 class Constants(Protocol):
@@ -41,11 +41,11 @@ class DriveConstants:
         modes: Modes of operation that it has (6502h): 1 profile position, 6 homing, 8, 9, 10 cyclic synchronous
             position, velocity, torque.
         velocity_unit: Object 60A9h; 00B50300h is encoder increments per second, 00B44700h revolutions per minute.
-        inertia: Of motor, gear and what hangs on them, seen at the output [kg m2], or [kg] for a wire.
-        friction: Viscous, seen at the output [N m s/rad], or [N s/m] for a wire.
+        inertia: Inertia of motor, gear and load, seen at the output [kg m2], or [kg] for a wire.
+        friction: Viscous friction, seen at the output [N m s/rad], or [N s/m] for a wire.
         switches: Lowest and highest position [m or rad] at which no limit switch is active.
-        heating: How much warmer than its surroundings (25 degC) the winding is at rated torque, in the end [K].
-        thermal_time: Time constant of that [s].
+        heating: Final temperature rise of the winding over its surroundings (25 degC) at rated torque [K].
+        thermal_time: Time constant of that rise [s].
     """
 
     kind: ClassVar[str] = "servo_drive"
@@ -74,16 +74,16 @@ class DriveConstants:
 
 @dataclass(frozen=True, slots=True)
 class CellConstants:
-    """Load cells, all alike, with a CiA 404 measuring amplifier.
+    """Equal load cells with a CiA 404 measuring amplifier.
 
     Attributes:
-        capacity: Force [N] beyond which the status tells overload.
-        counts_per_newton: Of the analogue-digital converter.
-        unbalance: What the unloaded cell reads before a tare [N].
-        decimal_digits: Of the integer process values: 2 means 0.01 of the unit.
-        unit: What the process value is in, as CiA 303-2 codes it.
-        unit_size: How much one of that unit is [N].
-        more: `signal.element` of the forces on channels 2 and up, empty where there is no cell; the first is the
+        capacity: Force [N] beyond which the status reports overload.
+        counts_per_newton: Counts of the analogue-digital converter per N.
+        unbalance: Reading of the unloaded cell before a tare [N].
+        decimal_digits: Decimal digits of the integer process values: 2 means 0.01 of the unit.
+        unit: Unit of the process value, coded as in CiA 303-2.
+        unit_size: One of that unit [N].
+        more: `signal.element` of the forces on channels 2 and up, empty for a missing cell; the first is the
             node's own.
     """
 
@@ -104,10 +104,10 @@ class EncoderConstants:
 
     Attributes:
         counts_per_turn: Physical resolution; the position value wraps after `turns` turns.
-        turns: Turns that the encoder tells apart.
+        turns: Number of turns that the encoder distinguishes.
         direction: +1 if counts grow with the angle, else -1.
         zero: Angle at zero counts [rad]; half a turn away from the middle of the joint's range avoids the wrap.
-        scaled_to: Units per turn that scaling was set to before delivery (6000h bit 2 and 6001h, kept without power);
+        scaled_to: Units per turn set before delivery (6000h bit 2 and 6001h, kept without power);
             None: no scaling.
         speed_unit: Multiplier and divider of the speed value (6031h).
     """
@@ -144,12 +144,12 @@ class NodeSpec:
 
     @property
     def kind(self) -> str:
-        """What kind of node it is, as in `servo_drive`."""
+        """Kind of node, such as `servo_drive`."""
         return self.constants.kind
 
     @property
     def eds(self) -> Path:
-        """The electronic data sheet of this kind of node, if it speaks CANopen."""
+        """Electronic data sheet of this kind of node, if it speaks CANopen."""
         return EDS_FOLDER / f"{self.kind}.eds"
 
     @property

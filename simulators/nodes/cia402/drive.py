@@ -18,14 +18,14 @@ from simulators.nodes.node import Frame
 from simulators.nodes.plant import Plant
 
 _VOLTAGE, _REMOTE, _REACHED, _LIMIT, _SPECIFIC, _DEVIATES = 1 << 4, 1 << 9, 1 << 10, 1 << 11, 1 << 12, 1 << 13
-"""Bits of the status word beside the state; 12 and 13 mean something else in each mode."""
+"""These are bits of the status word beside the state; 12 and 13 differ by mode."""
 
 _FOLLOWING_ERROR = 0x8611
 _NO_WINDOW = 2**32 - 1
 _STOP_TIME = 0.5
-"""Longest quick stop [s]; then the brake takes the rest."""
+"""A quick stop takes at most this long [s]; then the brake closes."""
 _STANDSTILL = 0.02
-"""Turns of the spool or joint per second below which the drive counts as standing."""
+"""The drive counts as standing below this speed of the spool or joint [turns/s]."""
 _CYCLIC = (CYCLIC_POSITION, CYCLIC_VELOCITY, CYCLIC_TORQUE)
 
 
@@ -59,7 +59,7 @@ class ServoDrive(CanopenNode):
 
     @property
     def servo(self) -> tuple[float, bool]:
-        """What the world's servo is to do: target [m or rad], and whether it is enabled at all."""
+        """Target of the world's servo [m or rad], and whether it is enabled."""
         enabled = self.state in (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE)
         return self._mechanics.target, enabled
 
@@ -72,7 +72,7 @@ class ServoDrive(CanopenNode):
             self._mechanics.restart()
 
     def sample(self) -> None:
-        """Position, velocity, torque, temperature and status from the newest measurement."""
+        """Measure position, velocity, torque, temperature and status from the newest measurement."""
         values = self.objects.values
         self._mechanics.measure(
             self._now, is_free=self.state is not State.OPERATION_ENABLED and not self._is_stopping()
@@ -142,7 +142,7 @@ class ServoDrive(CanopenNode):
         self.state = state
 
     def _watch_deviation(self, now: float) -> None:
-        """Fault when demand and position are further apart than 6065h for longer than 6066h."""
+        """Enter a fault when demand and position are further apart than 6065h for longer than 6066h."""
         values = self.objects.values
         window = int(values[0x6065, 0])
         if window == _NO_WINDOW or abs(int(values[0x60F4, 0])) <= window:
@@ -155,7 +155,7 @@ class ServoDrive(CanopenNode):
             self._react(_FOLLOWING_ERROR)
 
     def _react(self, code: int) -> None:
-        """Fault: stop by the fault reaction option code (605Eh), then FAULT."""
+        """Handle a fault: stop by the fault reaction option code (605Eh), then FAULT."""
         self.objects.values[0x603F, 0] = code
         if self.state is State.OPERATION_ENABLED and self.objects.values[0x605E, 0]:
             self._stop(State.FAULT_REACTION_ACTIVE, State.FAULT)
@@ -163,7 +163,7 @@ class ServoDrive(CanopenNode):
             self.state = State.FAULT
 
     def _stop(self, during: State, after: State) -> None:
-        """Come to rest at the quick stop deceleration (6085h) from the speed now."""
+        """Stop at the quick stop deceleration (6085h)."""
         self.sample()
         self._mechanics.brake()
         self._stop_ends = self._now + _STOP_TIME

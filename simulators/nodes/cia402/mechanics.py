@@ -19,18 +19,18 @@ from simulators.nodes.rotor import Rotor
 
 _INT16, _INT32 = 2**15, 2**31
 _AMBIENT = 25.0
-"""[degC]"""
+"""The surroundings have this temperature [degC]."""
 _START_HOMING = 1 << 4
 _NEGATIVE_LIMIT, _POSITIVE_LIMIT = 1, 2
-"""Bits of the digital inputs, object 60FDh."""
+"""These are bits of the digital inputs, object 60FDh."""
 _REVOLUTION, _MINUTE = 0xB4, 0x47
-"""Of a velocity unit (CiA 303-2)."""
+"""These codes are parts of a velocity unit (CiA 303-2)."""
 
 
 class DriveMechanics:
-    """What the drive measures and where it wants to be; all positions in encoder counts.
+    """Measured state and demand of the drive; all positions in encoder counts.
 
-    The encoder starts with the constants' zero; homing moves its origin until the next power-on.
+    The encoder starts at the constants' zero; homing moves its origin until the next power-on.
     """
 
     def __init__(self, constants: DriveConstants, element: str, plant: Plant, values: dict[Key, Value]) -> None:
@@ -53,7 +53,7 @@ class DriveMechanics:
         self._raw = 0.0
         self._demand = 0.0
         self.velocity = 0.0
-        """[counts/s]"""
+        """Measured velocity [counts/s]."""
         self._before: tuple[float, float] | None = None
         self._moved_at = 0.0
         self._measured_at: float | None = None
@@ -66,7 +66,7 @@ class DriveMechanics:
 
     @property
     def target(self) -> float:
-        """Where the world's servo shall go [m or rad]."""
+        """Target of the world's servo [m or rad]."""
         return self._constants.zero + (self._demand + self._origin) / self._constants.counts_per_unit
 
     def measure(self, now: float, is_free: bool) -> None:
@@ -95,7 +95,7 @@ class DriveMechanics:
         self.is_limited = (self.is_limited and not is_free) or abs(torque) >= int(values[0x6072, 0])
 
     def start(self, now: float) -> None:
-        """Operation is enabled, or the mode has changed: start from where the drive is, and from rest."""
+        """Start at rest from the present position, after enabling or a change of mode."""
         position = float(self._values[0x6064, 0])
         self._demand = position
         self._moved_at = now
@@ -107,7 +107,7 @@ class DriveMechanics:
         self.is_reached = False
 
     def command(self, mode: int, word: int, before: int) -> None:
-        """A control word that leaves the drive enabled."""
+        """Take a control word that leaves the drive enabled."""
         if mode == PROFILE_POSITION:
             self.set_points.take(word, before, int(self._values[0x607A, 0]), round(self._demand))
         elif mode == HOMING:
@@ -130,7 +130,7 @@ class DriveMechanics:
             self._turn(mode, duration)
 
     def brake(self) -> None:
-        """Demand where the drive comes to rest at the quick stop deceleration (6085h)."""
+        """Set the demand to the position where the drive stops at the quick stop deceleration (6085h)."""
         fall = int(self._values[0x6085, 0]) * self._per_unit()
         way = self.velocity * abs(self.velocity) / (2.0 * fall)
         self._push = 0
@@ -139,7 +139,7 @@ class DriveMechanics:
         self._demand = self._limited(_clip(int(self._values[0x6064, 0]) + way, _INT32))
 
     def _go(self, duration: float, word: int) -> None:
-        """Profile position mode."""
+        """Advance profile position mode."""
         points, values, unit = self.set_points, self._values, self._per_unit()
         if points.target is None:
             return
@@ -152,7 +152,7 @@ class DriveMechanics:
             points.reached(word)
 
     def _search(self, duration: float) -> None:
-        """Homing mode."""
+        """Advance homing mode."""
         if not self.homing.is_busy:
             if self.homing.is_attained:
                 self._take_home()
@@ -172,7 +172,7 @@ class DriveMechanics:
             self._origin, self._before = origin, None
 
     def _turn(self, mode: int, duration: float) -> None:
-        """Cyclic synchronous velocity and torque: the rotor turns, the demand is where it is."""
+        """Advance cyclic synchronous velocity or torque: the rotor turns, and the demand follows it."""
         constants, values, rotor = self._constants, self._values, self._rotor
         scale = constants.counts_per_unit
         fastest = self._fastest() / abs(scale)
@@ -182,9 +182,9 @@ class DriveMechanics:
             rotor.run(min(max(velocity, -fastest), fastest), duration)
         else:
             bound = int(values[0x6072, 0])
-            wanted = int(values[0x6071, 0])
-            self._push = min(max(wanted, -bound), bound)
-            self.is_limited = self._push != wanted
+            demand = int(values[0x6071, 0])
+            self._push = min(max(demand, -bound), bound)
+            self.is_limited = self._push != demand
             rotor.push(self._at_output(self._push - self._carried()), duration)
             if abs(rotor.velocity) > fastest:
                 rotor.velocity, self.is_limited = math.copysign(fastest, rotor.velocity), True
@@ -196,7 +196,7 @@ class DriveMechanics:
             self.is_limited = True
 
     def _limited(self, target: int) -> int:
-        """A set-point within 607Dh, and not further into a load that already takes the largest torque (6072h)."""
+        """Limit a set-point to 607Dh, and not further into a load that already takes the largest torque (6072h)."""
         values = self._values
         target = min(max(target, int(values[0x607D, 1])), int(values[0x607D, 2]))
         torque, position = int(values[0x6077, 0]), int(values[0x6064, 0])
@@ -205,12 +205,12 @@ class DriveMechanics:
         return target
 
     def _fastest(self) -> float:
-        """Of 607Fh and 6080h, the lower [counts/s]."""
+        """Return the lower of 607Fh and 6080h [counts/s]."""
         motor = int(self._values[0x6080, 0]) * self._constants.counts_per_turn / 60.0
         return min(int(self._values[0x607F, 0]) * self._per_unit(), motor)
 
     def _per_unit(self) -> float:
-        """Counts per second in one unit of velocity, by object 60A9h."""
+        """Return counts per second in one unit of velocity, by object 60A9h."""
         code = int(self._values[0x60A9, 0])
         exponent = (code >> 24 ^ 0x80) - 0x80
         counts = float(self._constants.counts_per_turn) if code >> 16 & 0xFF == _REVOLUTION else 1.0
@@ -225,7 +225,9 @@ class DriveMechanics:
             self._before = (time, position)
 
     def _carried(self) -> int:
-        """Motor torque that holds the load [thousandths of the rated one]; a taut wire pulls towards growing length."""
+        """Return the motor torque that holds the load [thousandths of the rated one]; a taut wire pulls towards
+        growing length.
+        """
         constants = self._constants
         if constants.load is None:
             return 0
@@ -235,13 +237,13 @@ class DriveMechanics:
         return _clip(share * 1e3, _INT16)
 
     def _at_output(self, thousandths: int) -> float:
-        """Effort at the output [N m or N] towards a growing position."""
+        """Return the effort at the output [N m or N] towards a growing position."""
         constants = self._constants
         torque = thousandths * 1e-3 * constants.rated_torque * constants.gear * constants.direction
         return torque / (constants.spool_radius or 1.0)
 
     def _warm(self, now: float, torque: int) -> None:
-        """The winding heats with the square of the torque, and cools by itself."""
+        """Advance the temperature of the winding, which heats with the square of the torque."""
         if self._measured_at is not None:
             end = self._constants.heating * (torque * 1e-3) ** 2
             part = -math.expm1(-(now - self._measured_at) / self._constants.thermal_time)
@@ -249,7 +251,7 @@ class DriveMechanics:
         self._measured_at = now
 
     def _switches(self) -> int:
-        """Limit switches, towards lower and higher counts."""
+        """Return the limit switches towards lower and higher counts."""
         low, high = self.homing.switches
         return _NEGATIVE_LIMIT * (self._raw <= low) | _POSITIVE_LIMIT * (self._raw >= high)
 
@@ -259,7 +261,7 @@ def _finite(value: float) -> float:
 
 
 def _clip(value: float, bound: int) -> int:
-    """The nearest integer that fits; 0 for what is no number."""
+    """Return the nearest integer that fits; 0 for NaN."""
     if math.isnan(value):
         return 0
     return round(min(max(value, -bound), bound - 1))

@@ -1,4 +1,4 @@
-"""How a simulated drive makes its demand position [counts] in each of its modes (CiA 402-2)."""
+"""Demand position [counts] of a simulated drive in each of its modes (CiA 402-2)."""
 
 import math
 from dataclasses import dataclass, field
@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 PROFILE_POSITION, HOMING, CYCLIC_POSITION, CYCLIC_VELOCITY, CYCLIC_TORQUE = 1, 6, 8, 9, 10
 
 _NEW_SET_POINT, _AT_ONCE, _RELATIVE, _HALT = 1 << 4, 1 << 5, 1 << 6, 1 << 8
-"""Bits of the control word in profile position mode."""
+"""These are bits of the control word in profile position mode."""
 
 
 @dataclass(slots=True)
@@ -14,8 +14,8 @@ class Profile:
     """A trapezoidal move.
 
     Attributes:
-        position: [counts].
-        velocity: [counts/s].
+        position: Position [counts].
+        velocity: Velocity [counts/s].
     """
 
     position: float = 0.0
@@ -26,23 +26,23 @@ class Profile:
         self.position, self.velocity = position, 0.0
 
     def step(self, target: float, speed: float, rise: float, fall: float, duration: float) -> float:
-        """Position [counts] after `duration` [s] on the way to `target` [counts].
+        """Return the position [counts] after `duration` [s] on the distance to `target` [counts].
 
         Args:
-            target: Where to go [counts].
-            speed: Highest [counts/s].
+            target: Target [counts].
+            speed: Highest speed [counts/s].
             rise: Acceleration [counts/s2].
             fall: Deceleration [counts/s2].
-            duration: [s].
+            duration: Duration [s].
         """
-        way = target - self.position
-        stoppable = fall * (math.sqrt(duration**2 + 2.0 * abs(way) / fall) - duration)  # after this step too
+        distance = target - self.position
+        stoppable = fall * (math.sqrt(duration**2 + 2.0 * abs(distance) / fall) - duration)  # after this step too
         allowed = min(speed, stoppable)
-        wanted = math.copysign(allowed, way)
-        is_braking = abs(wanted) < abs(self.velocity) or wanted * self.velocity < 0.0
+        target_velocity = math.copysign(allowed, distance)
+        is_braking = abs(target_velocity) < abs(self.velocity) or target_velocity * self.velocity < 0.0
         change = (fall if is_braking else rise) * duration
-        self.velocity += min(max(wanted - self.velocity, -change), change)
-        if abs(way) <= max(abs(self.velocity) * duration, 1.0) and abs(self.velocity) <= 2.0 * fall * duration:
+        self.velocity += min(max(target_velocity - self.velocity, -change), change)
+        if abs(distance) <= max(abs(self.velocity) * duration, 1.0) and abs(self.velocity) <= 2.0 * fall * duration:
             self.rest(target)
         else:
             self.position += self.velocity * duration
@@ -51,10 +51,10 @@ class Profile:
 
 @dataclass(slots=True)
 class SetPoints:
-    """The handshake of profile position mode: bit 4 of the control word against bit 12 of the status word.
+    """Handshake of profile position mode: bit 4 of the control word against bit 12 of the status word.
 
     Attributes:
-        target: Where the drive is going [counts]; None: nowhere.
+        target: Target of the drive [counts], or None.
         waiting: A set-point that is taken up when the one before is reached.
         is_acknowledged: Bit 12.
     """
@@ -88,7 +88,7 @@ class SetPoints:
                 self.waiting.append(base + position)
 
     def reached(self, word: int) -> None:
-        """The target is reached: go on to the one that waits."""
+        """Go on to the waiting set-point after the target is reached."""
         if self.waiting:
             self.target = self.waiting.pop(0)
             self.is_acknowledged = bool(word & _NEW_SET_POINT)
@@ -112,7 +112,7 @@ METHODS = (
     POSITIVE_INDEX,
     *WHERE_IT_IS,
 )
-"""Homing methods (CiA 402-2, object 6098h) that the drive has."""
+"""The drive has these homing methods (CiA 402-2, object 6098h)."""
 
 
 class Homing:
@@ -122,10 +122,10 @@ class Homing:
     """
 
     def __init__(self, switches: tuple[float, float], turn: float) -> None:
-        """Know the machine.
+        """Describe the machine.
 
         Args:
-            switches: Where the negative and the positive limit switch are [raw counts].
+            switches: Positions of the negative and the positive limit switch [raw counts].
             turn: Counts per motor turn.
         """
         self.switches = switches
@@ -160,14 +160,14 @@ class Homing:
             self._phase = ""
 
     def step(self, position: float, demand: float, fast: float, slow: float, duration: float) -> float:
-        """Demand [raw counts] after `duration` [s].
+        """Return the demand [raw counts] after `duration` [s].
 
         Args:
-            position: Where the drive is [raw counts].
+            position: Position of the drive [raw counts].
             demand: Demand before [raw counts].
             fast: Speed of the search for the switch [counts/s].
             slow: Speed of the search for its edge and the index [counts/s].
-            duration: [s].
+            duration: Duration [s].
         """
         upward = self._method in (POSITIVE_SWITCH, POSITIVE_SWITCH_AND_INDEX)
         sign = 1.0 if upward else -1.0
@@ -183,8 +183,8 @@ class Homing:
                     return demand
                 self._to_index(position, not upward)
             return demand - sign * slow * duration
-        way = self._index - position
-        if way * self._to <= 0.0:
+        distance = self._index - position
+        if distance * self._to <= 0.0:
             self._found(self._index)
             return demand
         return demand + self._to * slow * duration

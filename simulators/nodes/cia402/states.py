@@ -4,7 +4,7 @@ from enum import IntEnum
 
 
 class State(IntEnum):
-    """States, each with the bits that tell it in the status word."""
+    """States, each with its bits in the status word."""
 
     NOT_READY = 0x00
     SWITCH_ON_DISABLED = 0x40
@@ -17,7 +17,7 @@ class State(IntEnum):
 
 
 class Command(IntEnum):
-    """What the lower bits of a control word ask for."""
+    """Commands in the lower bits of a control word."""
 
     DISABLE_VOLTAGE = 0
     QUICK_STOP = 1
@@ -27,7 +27,7 @@ class Command(IntEnum):
 
 
 FAULT_RESET = 1 << 7
-"""Bit of the control word; its rising edge counts."""
+"""This is a bit of the control word; its rising edge counts."""
 
 _TABLE = {
     State.SWITCH_ON_DISABLED: {Command.SHUTDOWN: State.READY_TO_SWITCH_ON},
@@ -57,7 +57,7 @@ _TABLE = {
 
 
 def command(controlword: int) -> Command:
-    """What a control word asks for (CiA 402-2, table 27)."""
+    """Return the command of a control word (CiA 402-2, table 27)."""
     if not controlword & 0x02:
         return Command.DISABLE_VOLTAGE
     if not controlword & 0x04:
@@ -68,12 +68,12 @@ def command(controlword: int) -> Command:
 
 
 def following(state: State, controlword: int, before: int) -> State:
-    """The state after a control word.
+    """Return the state after a control word.
 
     Args:
         state: The state now.
-        controlword: The word that came.
-        before: The word before it: a fault is only reset by an edge.
+        controlword: The new control word.
+        before: The control word before it; a fault is only reset by an edge.
     """
     if state is State.FAULT:
         has_edge = controlword & FAULT_RESET and not before & FAULT_RESET

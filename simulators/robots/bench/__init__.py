@@ -2,7 +2,7 @@
 
     simulator: simulators.robots.bench:simulator
 
-What the nodes are is taken from the robot file, so a wrong gear or zero in it is not found here; a simulator that knows
+The nodes follow the robot file, so a wrong gear or zero in it has no effect here; a simulator that knows
 the hardware by itself, as those of the other robots do, finds it.
 """
 
@@ -23,16 +23,16 @@ __all__ = ["Bench", "hardware", "simulator"]
 
 
 class Bench:
-    """What stands in for hardware of which only the robot file is known."""
+    """Stand-in for hardware of which only the robot file is known."""
 
     variants = ("bench",)
     conditions: tuple[str, ...] = ()
 
     def rig(self, config: RobotConfig, variant: str, seed: int, condition: str | None = None) -> Rig:
-        """The bench behind simulated nodes on the robot file's buses; it has no noise, so no seed.
+        """Return the bench behind simulated nodes on the robot file's buses; it has no noise, so no seed.
 
         Raises:
-            ConfigError: A device of the file has no simulated counterpart.
+            ConfigError: A device of the robot file has no simulated counterpart.
         """
         from simulators.rig import Rig
 
@@ -40,7 +40,7 @@ class Bench:
         return Rig(config, BenchWorld(config), hardware(config))
 
     def direct(self, config: RobotConfig, variant: str, seed: int, condition: str | None = None) -> Robot:
-        """The bench behind no bus at all, as fast as it computes."""
+        """Return the bench without a bus, as fast as it computes."""
         from simulators.direct import direct_robot
 
         check_condition(condition, self.conditions)

@@ -15,10 +15,10 @@ from simulators.nodes.mit_drive import MitConstants
 from simulators.nodes.odrive import OdriveConstants
 
 FULL_SCALE = {"int16": 2**15, "int32": 2**31, "float32": 10.0, "zc_sg": 10.0}
-"""What an analogue input tells at its end, by preset."""
+"""Preset -> reading of an analogue input at its end."""
 
 SPEEDS = {"counts/s": 0x00B50300, "rps": 0x00B40300, "rpm": 0x00B44700, "0.1 rpm": 0xFFB44700, "mrpm": 0xFDB44700}
-"""Object 60A9h of a drive, by the unit that a robot file gives."""
+"""Unit in a robot file -> object 60A9h of a drive."""
 
 
 def _cia401(settings: Any) -> Constants:
@@ -56,12 +56,12 @@ def _cia406(settings: Any) -> Constants:
 
 
 def _first(given: Any) -> float:
-    """What all channels have, or the first of them."""
+    """Return the value of all channels, or of the first one."""
     return float(given[0] if isinstance(given, tuple) else given or 0.0)
 
 
 def _more(settings: Any, elements: dict[str, str]) -> tuple[str, ...]:
-    """`signal.element` of channels 2 and up; empty where there is no cell."""
+    """Return `signal.element` of channels 2 and up; empty for a missing cell."""
     by_number = {number: elements.get(f"{settings.measures}_{number}", "") for number in settings.channels}
     return tuple(by_number.get(number, "") for number in range(2, max(by_number) + 1))
 
@@ -115,16 +115,16 @@ CONSTANTS: dict[str, Callable[[Any], Constants]] = {
     "dbc": _dbc,
     "odrive": _odrive,
 }
-"""What a driver of `hal.registry` has at the other end of the wire: one line per kind."""
+"""Driver of `hal.registry` -> constants of its simulated counterpart: one line per kind."""
 
 MAIN = "position"
 
 
 def hardware(config: RobotConfig) -> list[NodeSpec]:
-    """A node for every device of a robot file.
+    """Return a node for every device of a robot file.
 
     Raises:
-        ConfigError: A device has a driver whose other end is not simulated, or settings that do not fit.
+        ConfigError: A device has a driver without a simulated counterpart, or settings that do not fit.
     """
     nodes = []
     for name, device in config.devices.items():

@@ -12,7 +12,7 @@ from simulators.world import World
 
 SET = "set"
 BANDWIDTH = 30.0
-"""Of the servos [rad/s]: a twentieth of a second behind."""
+"""The servos have this bandwidth [rad/s], a lag of a twentieth of a second."""
 
 
 class BenchWorld(World):
@@ -54,10 +54,10 @@ class BenchWorld(World):
         self._servos[element] = (target, enabled)
 
     def break_part(self, part: str) -> None:
-        """`set:ELEMENT:VALUE` has an element read a value [its signal's unit], as in `set:muscle_tension.biceps:50`.
+        """Let an element read a value by `set:ELEMENT:VALUE` [its signal's unit], as in `set:muscle_tension.biceps:50`.
 
         Raises:
-            UnknownPart: Anything else.
+            UnknownPart: The part is something else.
         """
         kind, _, rest = part.partition(":")
         element, _, text = rest.partition(":")

@@ -23,37 +23,37 @@ __all__ = ["KxrHumanoid", "forecast", "hardware", "simulator"]
 
 
 class KxrHumanoid:
-    """What stands in for the robot."""
+    """Simulator of the robot."""
 
     variants = VARIANTS
     conditions = tuple(TOOLS)
 
     def world(self, variant: str, seed: int, condition: str | None = None) -> HumanoidWorld:
-        """The physics of one variant; the seed chooses among actual robots, and their noise.
+        """Return the physics of one variant; the seed chooses among actual robots, and their noise.
 
         Raises:
-            ValueError: No such variant or condition.
+            ValueError: The variant or condition is not known.
         """
         return HumanoidWorld(make_body(variant, seed), seed, condition)
 
     def rig(self, config: RobotConfig, variant: str, seed: int, condition: str | None = None) -> Rig:
-        """The world behind simulated nodes on the robot file's bus."""
+        """Return the world behind simulated nodes on the robot file's bus."""
         from simulators.rig import Rig
 
         return Rig(config, self.world(variant, seed, condition), hardware())
 
     def direct(self, config: RobotConfig, variant: str, seed: int, condition: str | None = None) -> Robot:
-        """The world behind no bus at all, as fast as it computes."""
+        """Return the world without a bus, as fast as it computes."""
         from simulators.direct import direct_robot
 
         return direct_robot(config, self.world(variant, seed, condition))
 
     def vision(self, config: RobotConfig, variant: str, seed: int) -> Eye:
-        """The camera of one variant, by itself."""
+        """Return the camera of one variant."""
         return Eye(make_body(variant, seed), np.random.default_rng([seed, 13]))
 
     def geometric(self, condition: str | None, command: np.ndarray) -> Mapping[str, np.ndarray]:
-        """As `forecast`, of a body that does not give way at all: the model of a full-body inverse kinematics."""
+        """Return the forecast of a stiff body, the model of a full-body inverse kinematics."""
         return _told(condition, command, stiff=True)
 
 
@@ -61,14 +61,14 @@ simulator = KxrHumanoid()
 
 
 def forecast(config: RobotConfig, condition: str | None, command: np.ndarray) -> Mapping[str, np.ndarray]:
-    """What the designer's model, deflection included, says of commands [rad], shape (n, 4), under a condition.
+    """Return the designer's forecast, deflection included, for commands [rad], shape (n, 4), under a condition.
 
     Returns:
         center_of_gravity and tool_tip_position [m], shapes (n, 2), (n, 3), and tool_tip_pixel [px], shape (n, 2), which
         may be beyond the image and is NaN behind the camera.
 
     Raises:
-        UnknownPart: No such condition.
+        UnknownPart: The condition is not known.
     """
     return _told(condition, command, stiff=False)
 

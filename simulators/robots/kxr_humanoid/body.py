@@ -17,13 +17,15 @@ URDF = Path(__file__).resolve().parents[2] / "assets" / "kxr_humanoid" / "kxr_hu
 VARIANTS = ("nominal", "actual")
 
 CELLS = np.array([[x, y] for foot in (0.034, -0.034) for x in (0.050, -0.050) for y in (foot + 0.022, foot - 0.022)])
-"""Where the load cells touch the ground: four corners of the left sole, then of the right one [m], shape (8, 2)."""
+"""The load cells touch the ground at these points: four corners of the left sole, then of the right one [m], shape (8,
+2).
+"""
 
 REST = np.array([-0.6, 0.0, -0.9, 0.0])
-"""Commanded joint positions at which a robot starts [rad]: shoulder pitch, shoulder yaw, elbow pitch, ankle pitch."""
+"""A robot starts at these commanded joint positions [rad]: shoulder pitch, shoulder yaw, elbow pitch, ankle pitch."""
 
 ORDER = (1, 2, 3, 0)
-"""Which joint of the chain every element of the command is: the ankle is first in the chain, last in the command."""
+"""Element of the command -> joint of the chain; the ankle is first in the chain and last in the command."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,9 +33,9 @@ class Tool:
     """A stick with a weight on it, held in the right hand.
 
     Attributes:
-        mass: [kg].
-        length: From the grip to the tip [m].
-        center: From the tip back to the centre of mass [m]; it does not change with where the stick is gripped.
+        mass: Mass [kg].
+        length: Length from the grip to the tip [m].
+        center: Distance from the tip to the centre of mass [m], wherever the stick is gripped.
     """
 
     mass: float
@@ -46,21 +48,21 @@ TOOLS: Mapping[str, Tool] = {
     for size, length in (("short", 0.176), ("long", 0.236))
     for weight, mass in (("light", 0.040), ("middle", 0.080), ("heavy", 0.120))
 }
-"""The conditions of the paper (III-C)."""
+"""These are the conditions of the paper (III-C)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """A pinhole camera in the head; it leans with the body.
+    """Pinhole camera in the head; it leans with the body.
 
     Attributes:
-        position: In the body's frame, whose origin is the ankle [m], shape (3,).
-        pitch: Downwards from straight ahead [rad].
-        roll: About its optical axis [rad].
+        position: Position in the body's frame, whose origin is the ankle [m], shape (3,).
+        pitch: Angle downwards from straight ahead [rad].
+        roll: Angle about its optical axis [rad].
         focal: Focal length [px].
-        width: Of the image [px].
-        height: Of the image [px].
-        axes: Depth, down and right as columns in the body's frame, shape (3, 3).
+        width: Width of the image [px].
+        height: Height of the image [px].
+        axes: Directions of depth, down and right as columns in the body's frame, shape (3, 3).
     """
 
     position: np.ndarray
@@ -83,19 +85,19 @@ class Camera:
 
 @dataclass(frozen=True, slots=True)
 class Body:
-    """All that makes one variant of the robot.
+    """One variant of the robot.
 
     Attributes:
         chain: Links and joints, ankle first.
-        foot_mass: Of both feet [kg].
+        foot_mass: Mass of both feet [kg].
         foot_center: Their centre of mass [m], shape (2,), on the ground.
         deflection: Joint deflection per torque, ankle first [rad/(N m)], shape (4,).
-        joint_zero: Joint position where its servo says zero, ankle first [rad], shape (4,).
-        grip: Where the tool is held, in the last link's frame [m], shape (3,).
-        tool_direction: Which way it points from there, in the last link's frame, shape (3,).
-        tools: Condition -> what is held.
-        camera: In the head.
-        noise: Standard deviation of what is measured, per signal [its unit].
+        joint_zero: Joint position at zero of its servo, ankle first [rad], shape (4,).
+        grip: Place where the tool is held, in the last link's frame [m], shape (3,).
+        tool_direction: Direction of the tool from there, in the last link's frame, shape (3,).
+        tools: Condition -> tool.
+        camera: Camera in the head.
+        noise: Standard deviation of measurements, per signal [its unit].
     """
 
     chain: Chain
@@ -112,7 +114,7 @@ class Body:
 
 @cache
 def nominal() -> Body:
-    """The designer's robot: the URDF's figures, deflection as in the paper's simulation, no noise."""
+    """Return the designer's robot: the URDF's figures, deflection as in the paper's simulation, no noise."""
     return Body(
         chain=Chain.from_urdf(URDF),
         foot_mass=0.076864,
@@ -128,10 +130,10 @@ def nominal() -> Body:
 
 
 def make_body(variant: str, seed: int) -> Body:
-    """One variant of the robot; the seed chooses among the actual ones.
+    """Return one variant of the robot; the seed chooses among the actual ones.
 
     Raises:
-        ValueError: No such variant.
+        ValueError: The variant is not known.
     """
     if variant not in VARIANTS:
         raise ValueError(f"The robot has no variant '{variant}'. Known variants: {', '.join(VARIANTS)}.")
@@ -139,7 +141,7 @@ def make_body(variant: str, seed: int) -> Body:
 
 
 def _actual(body: Body, random: np.random.Generator) -> Body:
-    """A robot as it was really built: other stiffness and masses, links a few mm off, servos off zero, noise."""
+    """Return a robot as really built: other stiffness and masses, links a few mm off, servos off zero, noise."""
     chain = body.chain
     built = replace(
         chain,
@@ -178,4 +180,4 @@ def _actual(body: Body, random: np.random.Generator) -> Body:
 
 
 NOISE = {"joint_position": 0.002, "foot_force": 0.03, "tool_tip_position": 0.002, "tool_tip_pixel": 1.0}
-"""Of the actual robot's sensors [rad, N, m, px]."""
+"""The actual robot's sensors have these standard deviations [rad, N, m, px]."""

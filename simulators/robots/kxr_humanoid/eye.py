@@ -19,9 +19,9 @@ _FAULTS: Mapping[str, tuple[str, bool, str]] = {
 
 
 class Eye:
-    """What the camera's process makes of the scene; not thread-safe.
+    """Camera that measures the scene; not thread-safe.
 
-    The position is in the frame of the feet: a second marker, on the ground, tells the camera where it is.
+    The position is in the frame of the feet: a second marker, on the ground, gives the pose of the camera.
     """
 
     def __init__(self, body: Body, random: np.random.Generator) -> None:
@@ -31,10 +31,10 @@ class Eye:
         self._has_marker = self._is_open = True
 
     def see(self, truth: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Both signals [m, px], shapes (3,), (2,); NaN where the tip is out of sight, or for want of a marker.
+        """Return both signals [m, px], shapes (3,), (2,); NaN if the tip is out of sight or a marker is missing.
 
         Args:
-            truth: Signal -> what is; the image point may be beyond the image.
+            truth: Signal -> true value; the image point may be beyond the image.
         """
         seen = {name: np.full(len(truth[name]), np.nan) for name in (POSITION, PIXEL)}
         if not self._is_open or not is_in_view(self._camera, truth[PIXEL][None])[0]:
@@ -46,10 +46,10 @@ class Eye:
         return seen
 
     def fault(self, text: str) -> str:
-        """`marker_removed`, `marker_back`, `camera_covered` or `camera_back`; the sentence tells what was done.
+        """Apply `marker_removed`, `marker_back`, `camera_covered` or `camera_back`; return a sentence on it.
 
         Raises:
-            UnknownPart: It is none of them.
+            UnknownPart: The fault is another one.
         """
         if text not in _FAULTS:
             raise UnknownPart(f"'{text}' is no fault of the camera. Known faults: {', '.join(_FAULTS)}.")

@@ -1,7 +1,7 @@
-"""What hangs on the robot's bus: every node with its own electrical constants.
+"""Nodes of the robot's bus, each with its own electrical constants.
 
-Kept apart from the robot file on purpose: a robot file that disagrees with the hardware must read wrong values here as
-it would on a bench. tests/simulators/test_robots_hardware.py checks that ours agrees.
+These are apart from the robot file on purpose: a robot file that disagrees with the hardware must read wrong values
+here as it would on a bench. tests/simulators/test_robots_hardware.py checks that ours agrees.
 """
 
 from simulators.nodes.canopen.spec import CellConstants, DriveConstants, NodeSpec
@@ -12,7 +12,9 @@ SERVOS: dict[str, tuple[int, float]] = {
     "elbow_pitch": (1, -0.9),
     "ankle_pitch": (-1, 0.0),
 }
-"""Direction of the drive, and joint position [rad] at zero counts: the drives were zeroed at the rest posture."""
+"""Joint -> direction of the drive, and joint position [rad] at zero counts: the drives were zeroed at the rest
+posture.
+"""
 
 CORNERS: dict[str, float] = {
     "left_front_outer": 0.03,
@@ -24,11 +26,11 @@ CORNERS: dict[str, float] = {
     "right_back_inner": 0.0,
     "right_back_outer": -0.01,
 }
-"""What every cell reads without a load [N], which the robot file takes off again."""
+"""Every cell reads this without a load [N]; the robot file subtracts it."""
 
 
 def hardware() -> list[NodeSpec]:
-    """Four drives (nodes 1 to 4) and eight load cells (11 to 18)."""
+    """Return four drives (nodes 1 to 4) and eight load cells (11 to 18)."""
     nodes = []
     for index, (name, (direction, zero)) in enumerate(SERVOS.items()):
         drive = DriveConstants(

@@ -1,7 +1,7 @@
-"""Where the robot comes to rest: deflection in one pass, tool tip, centre of gravity, image; many postures at once.
+"""Resting states of the robot: deflection in one pass, tool tip, centre of gravity, image; many postures at once.
 
-The one pass of the paper's simulation: torques are those of gravity at the commanded posture, each joint gives way by
-its deflection per torque, and that is all. The equilibrium, where torques are those of the posture that results, does
+As in the paper's simulation, torques are those of gravity at the commanded posture, and each joint gives way by its
+deflection per torque in one pass. The equilibrium, where torques are those of the posture that results, does
 not exist at the paper's 30 degrees per N m: the ankles buckle under a body of 1.8 kg.
 """
 
@@ -21,7 +21,7 @@ class Rest:
         joints: Positions of the links, deflection included, in the order of the command [rad], shape (n, 4).
         tip: Tool tip in the frame of the feet [m], shape (n, 3).
         center: Centre of gravity on the ground, in the frame of the feet [m], shape (n, 2).
-        weight: Of robot and tool [N].
+        weight: Weight of robot and tool [N].
         pixel: Tool tip in the image [px], shape (n, 2), also beyond its edges; NaN behind the camera.
     """
 
@@ -33,13 +33,13 @@ class Rest:
 
 
 def rest(body: Body, tool: Tool, command: np.ndarray, stiff: bool = False) -> Rest:
-    """Where commands lead.
+    """Return the resting states of commands.
 
     Args:
         body: The robot.
-        tool: What it holds.
+        tool: The held tool.
         command: Motor-side joint positions: shoulder pitch, shoulder yaw, elbow pitch, ankle pitch [rad], shape (n, 4).
-        stiff: Without any deflection, as a geometric model would have it.
+        stiff: Whether to leave out deflection, as a geometric model does.
     """
     joints = np.empty((len(command), 4))
     joints[:, ORDER] = command
@@ -55,11 +55,11 @@ def rest(body: Body, tool: Tool, command: np.ndarray, stiff: bool = False) -> Re
 
 
 Frames = tuple[np.ndarray, np.ndarray]
-"""Orientations (5, n, 3, 3) and origins (5, n, 3) of feet, body, shoulder, upper arm and forearm."""
+"""Frames are orientations (5, n, 3, 3) and origins (5, n, 3) of feet, body, shoulder, upper arm and forearm."""
 
 
 def _image(camera: Camera, frames: Frames, tip: np.ndarray) -> np.ndarray:
-    """Where the camera sees the tips [m], shape (n, 3): u to the right, v down [px], shape (n, 2)."""
+    """Return the image of the tips [m], shape (n, 3): u to the right, v down [px], shape (n, 2)."""
     rotations, origins = frames
     seen = np.matmul((tip - origins[1])[:, None, :], rotations[1])[:, 0] - camera.position
     depth, down, right = (seen @ camera.axes).T
@@ -68,20 +68,22 @@ def _image(camera: Camera, frames: Frames, tip: np.ndarray) -> np.ndarray:
 
 
 def is_in_view(camera: Camera, pixel: np.ndarray) -> np.ndarray:
-    """Whether points of the image [px], shape (n, 2), lie within it, shape (n,)."""
+    """Return which points of the image [px], shape (n, 2), lie within it, booleans, shape (n,)."""
     inside: np.ndarray = np.all((pixel >= 0) & (pixel <= (camera.width, camera.height)), axis=1)
     return inside
 
 
 def _held(body: Body, frames: Frames, reach: float) -> np.ndarray:
-    """Points of the tool, `reach` [m] from the grip, in the frame of the feet [m], shape (n, 3)."""
+    """Return points of the tool, `reach` [m] from the grip, in the frame of the feet [m], shape (n, 3)."""
     rotations, origins = frames
     point: np.ndarray = rotations[-1] @ (body.grip + reach * body.tool_direction) + origins[-1]
     return point
 
 
 def _moments(body: Body, tool: Tool, frames: Frames) -> Frames:
-    """First moments of mass of the links, the tool with the last [kg m] (4, n, 3), and their masses [kg] (4,)."""
+    """Return the first moments of mass of the links, the tool with the last [kg m] (4, n, 3), and their masses [kg]
+    (4,).
+    """
     rotations, origins = frames
     chain = body.chain
     moments = np.matmul(rotations[1:], chain.centers[:, None, :, None])[..., 0] + origins[1:]
@@ -93,7 +95,9 @@ def _moments(body: Body, tool: Tool, frames: Frames) -> Frames:
 
 
 def _gravity_torques(body: Body, tool: Tool, joints: np.ndarray) -> np.ndarray:
-    """Torques by which gravity turns the joints, ankle first [N m], shape (n, 4), at positions [rad] of that shape."""
+    """Return the torques by which gravity turns the joints, ankle first [N m], shape (n, 4), at positions [rad] of
+    that shape.
+    """
     frames = rotations, origins = body.chain.frames(joints)
     moments, masses = _moments(body, tool, frames)
     levers = moments[::-1].cumsum(axis=0)[::-1] - masses[::-1].cumsum()[::-1, None, None] * origins[1:]
@@ -103,4 +107,4 @@ def _gravity_torques(body: Body, tool: Tool, joints: np.ndarray) -> np.ndarray:
 
 
 _NEAREST = 0.01
-"""Depth [m] from which the camera sees anything."""
+"""The camera sees points from this depth [m]."""

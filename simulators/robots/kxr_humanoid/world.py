@@ -17,9 +17,9 @@ COMMAND, FORCE, CENTER = "joint_position", "foot_force", "center_of_gravity"
 JOINTS = ("shoulder_pitch", "shoulder_yaw", "elbow_pitch", "ankle_pitch")
 
 FASTEST = 7.48
-"""Highest speed of a servo [rad/s]."""
+"""A servo has this highest speed [rad/s]."""
 LAG = 0.03
-"""Time constant of its position loop [s]."""
+"""The position loop of a servo has this time constant [s]."""
 
 
 class HumanoidWorld(World):
@@ -111,4 +111,4 @@ class HumanoidWorld(World):
 
 
 _STILL = 1e-5
-"""A motor that would move less than this in a step is where it should be [rad]: at rest nothing is computed anew."""
+"""A motor that would move less than this in a step [rad] is at rest, and nothing is computed anew."""

@@ -20,30 +20,30 @@ __all__ = ["MusashiArm", "force_torque", "gravity_torque", "hardware", "random_m
 
 
 class MusashiArm:
-    """What stands in for the arm. PyBullet is imported when the first world is made."""
+    """Simulator of the arm. PyBullet is imported when the first world is made."""
 
     variants = VARIANTS
     conditions: tuple[str, ...] = ()
 
     def world(self, variant: str, seed: int, condition: str | None = None) -> MuscleWorld:
-        """The physics of one variant; the seed chooses among actual arms, and their noise."""
+        """Return the physics of one variant; the seed chooses among actual arms, and their noise."""
         from simulators.muscle_world import MuscleWorld
 
         check_condition(condition, self.conditions)
         return MuscleWorld(make_body(variant, seed), seed)
 
     def rig(self, config: RobotConfig, variant: str, seed: int, condition: str | None = None) -> Rig:
-        """The world behind simulated nodes on the robot file's buses."""
+        """Return the world behind simulated nodes on the robot file's buses."""
         from simulators.rig import Rig
 
         return Rig(config, self.world(variant, seed, condition), hardware())
 
     def direct(self, config: RobotConfig, variant: str, seed: int, condition: str | None = None) -> Robot:
-        """The world behind no bus at all, as fast as it computes."""
+        """Return the world without a bus, as fast as it computes."""
         return self.without_bus(config, self.world(variant, seed, condition))
 
     def without_bus(self, config: RobotConfig, world: MuscleWorld) -> Robot:
-        """Likewise for a world that the caller keeps, to break parts of it on the way."""
+        """Return the robot without a bus for a world of the caller, who may break parts of it."""
         from simulators.direct import direct_robot
 
         return direct_robot(config, world)

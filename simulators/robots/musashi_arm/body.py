@@ -23,25 +23,25 @@ from simulators.robots.musashi_arm.model import (
 VARIANTS = ("geometric", "actual")
 
 REST = np.array([0.0, 0.0, 0.0, -0.6, 0.0])
-"""Joint positions at which a robot starts and its wire lengths are calibrated [rad]."""
+"""A robot starts, and its wire lengths are calibrated, at these joint positions [rad]."""
 REST_PRETENSION = 40.0
-"""[N]"""
+"""Every wire has this tension at rest [N]."""
 
 JOINT_DAMPING = np.array([0.8, 0.8, 0.3, 0.35, 0.08])
-"""[N m s/rad]"""
+"""Every joint has this damping [N m s/rad]."""
 ZERO_ERROR = 0.006
-"""Standard deviation of an actual robot's wire length calibration [m]."""
+"""This is the standard deviation of an actual robot's wire length calibration [m]."""
 LOSS_TIME = 0.025
-"""Of the elastic elements [s]."""
+"""The elastic elements have this loss time [s]."""
 NOISE = {"joint_position": 0.001, "muscle_tension": 0.5, "muscle_length": 0.05e-3}
-"""Of the actual robot's sensors [rad, N, m]."""
+"""The actual robot's sensors have these standard deviations [rad, N, m]."""
 
 
 def make_body(variant: str, seed: int) -> Body:
-    """One variant of the arm; the seed chooses among the actual ones.
+    """Return one variant of the arm; the seed chooses among the actual ones.
 
     Raises:
-        ValueError: No such variant.
+        ValueError: The variant is not known.
     """
     if variant not in VARIANTS:
         raise ValueError(f"The arm has no variant '{variant}'. Known variants: {', '.join(VARIANTS)}.")
@@ -62,7 +62,7 @@ def make_body(variant: str, seed: int) -> Body:
 
 
 def _actual(geometric: Body, random: np.random.Generator) -> Body:
-    """An arm as it was really built: every via point 7 to 10 mm off, bent wires, other elasticity, friction, noise."""
+    """Return an arm as really built: every via point 7 to 10 mm off, bent wires, other elasticity, friction, noise."""
     size = len(ROUTES)
     routes = {name: tuple(_moved(via, random) for via in route) for name, route in ROUTES.items()}
     radius = random.uniform(0.025, 0.035, 2)

@@ -1,7 +1,7 @@
-"""What hangs on the arm's two buses: every node with its own electrical constants.
+"""Nodes of the arm's two buses, each with its own electrical constants.
 
-Kept apart from the robot file on purpose: a robot file that disagrees with the hardware must read wrong values here as
-it would on a bench. tests/simulators/test_robots_hardware.py checks that ours agrees.
+These are apart from the robot file on purpose: a robot file that disagrees with the hardware must read wrong values
+here as it would on a bench. tests/simulators/test_robots_hardware.py checks that ours agrees.
 """
 
 import math
@@ -20,7 +20,9 @@ MUSCLES: dict[str, tuple[str, int, float]] = {
     "triceps": ("can1", 1, 0.256),
     "pronator": ("can1", -1, 0.113),
 }
-"""Bus, direction of the drive, and wire length [m] at zero counts: the drives were zeroed at about the rest posture."""
+"""Muscle -> bus, direction of the drive, and wire length [m] at zero counts: the drives were zeroed at about the rest
+posture.
+"""
 
 JOINTS: dict[str, tuple[str, int]] = {
     "shoulder_roll": ("can0", 1),
@@ -29,11 +31,11 @@ JOINTS: dict[str, tuple[str, int]] = {
     "elbow_pitch": ("can1", -1),
     "elbow_yaw": ("can1", 1),
 }
-"""Bus and direction of the encoder."""
+"""Joint -> bus and direction of the encoder."""
 
 
 def hardware() -> list[NodeSpec]:
-    """Ten drives (nodes 1 to 10), ten load cells (11 to 20), five encoders (21 to 25)."""
+    """Return ten drives (nodes 1 to 10), ten load cells (11 to 20), five encoders (21 to 25)."""
     nodes = []
     for index, (name, (bus, direction, zero)) in enumerate(MUSCLES.items()):
         drive = DriveConstants(direction=direction, zero=zero, load=f"muscle_tension.{name}")

@@ -14,13 +14,13 @@ from simulators.muscles import Elastic, Paths, Via
 URDF = Path(__file__).resolve().parents[2] / "assets" / "musashi_arm" / "musashi_arm.urdf"
 
 TORSO, UPPER_ARM, ULNA, RADIUS = 0, 3, 4, 5
-"""Frames of the chain: the base, and the links behind shoulder_yaw, elbow_pitch and elbow_yaw."""
+"""These are frames of the chain: the base, and the links behind shoulder_yaw, elbow_pitch and elbow_yaw."""
 
 LEAST_TENSION, MOST_TENSION = 10.0, 180.0
-"""Tensions that are ever asked for [N]."""
+"""Commanded tensions are between these [N]."""
 
 HAND = np.array([0.0, 0.0, -0.25])
-"""Where the hand ends, in the frame of the last link [m]."""
+"""The hand ends at this point in the frame of the last link [m]."""
 
 ROUTES: dict[str, tuple[Via, ...]] = {
     "deltoid_front": (Via(TORSO, 0.038, 0.005, 0.03), Via(UPPER_ARM, 0.029, -0.004, -0.129)),
@@ -56,29 +56,31 @@ ROUTES: dict[str, tuple[Via, ...]] = {
 
 @cache
 def chain() -> Chain:
-    """The links and joints, as the URDF has them."""
+    """Return the links and joints of the URDF."""
     return Chain.from_urdf(URDF)
 
 
 @cache
 def designed_paths() -> Paths:
-    """The wires as straight lines between their via points."""
+    """Return the wires as straight lines between their via points."""
     return Paths(chain(), ROUTES)
 
 
 @cache
 def designed_elastic() -> Elastic:
-    """The elastic elements as their data sheet would have them: 20 mm at 200 N."""
+    """Return the elastic elements as in their data sheet: 20 mm at 200 N."""
     return Elastic.of(len(ROUTES), 20.0, 120.0)
 
 
 def gravity_torque(position: np.ndarray) -> np.ndarray:
-    """Joint torques [N m] that hold the arm's own weight at joint positions [rad]; shapes (5,)."""
+    """Return the joint torques [N m] that hold the arm's own weight at joint positions [rad]; shapes (5,)."""
     return chain().gravity_torque(np.asarray(position, float))
 
 
 def force_torque(position: np.ndarray, force: np.ndarray) -> np.ndarray:
-    """Joint torques J^T F [N m], shape (5,), of a force on the hand [N], shape (3,), at joint positions [rad]."""
+    """Return the joint torques J^T F [N m], shape (5,), of a force on the hand [N], shape (3,), at joint positions
+    [rad].
+    """
     pose = chain().pose(np.asarray(position, float))
     hand = pose.points(np.array([RADIUS]), HAND[None])[0]
     wrench = np.concatenate([force, np.cross(hand, force)])
@@ -91,7 +93,8 @@ def wire_lengths(position: np.ndarray, tension: np.ndarray) -> np.ndarray:
 
 
 def balanced_tensions(position: np.ndarray, wish: np.ndarray) -> np.ndarray:
-    """Tensions [N] nearest to a wish (10,) that hold the arm at joint positions [rad] (5,), within what may be asked.
+    """Return the tensions [N] nearest to a wish (10,) that hold the arm at joint positions [rad] (5,), within the
+    commanded range.
 
     Each round corrects the free muscles by the least change that balances gravity, and pins those that would leave
     the range; what the free ones cannot balance any more stays unbalanced.
@@ -103,9 +106,9 @@ def balanced_tensions(position: np.ndarray, wish: np.ndarray) -> np.ndarray:
     for _ in range(len(tension)):
         missing = torque - arms.T @ tension
         change = np.linalg.pinv(arms[free].T, rcond=1e-3) @ missing
-        wanted = tension[free] + change
-        tension[free] = np.clip(wanted, LEAST_TENSION, MOST_TENSION)
-        inside = (wanted > LEAST_TENSION) & (wanted < MOST_TENSION)
+        proposed = tension[free] + change
+        tension[free] = np.clip(proposed, LEAST_TENSION, MOST_TENSION)
+        inside = (proposed > LEAST_TENSION) & (proposed < MOST_TENSION)
         if inside.all():
             break
         free[np.flatnonzero(free)[~inside]] = False

@@ -9,13 +9,13 @@ from simulators.robots.musashi_arm.body import REST
 from simulators.robots.musashi_arm.model import LEAST_TENSION, MOST_TENSION, balanced_tensions, wire_lengths
 
 HIGHEST_WISH = 110.0
-"""Random tensions are drawn below this, so that balancing gravity finds room above [N]."""
+"""Random tensions are drawn below this [N], so that balancing gravity has room above."""
 STEP = 0.02
-"""Time between set-points on the way [s]."""
+"""Set-points of a move have this distance in time [s]."""
 FASTEST_JOINT = 1.2
-"""Highest joint speed on the way [rad/s]."""
+"""A joint has at most this speed in a move [rad/s]."""
 SETTLE = 0.5
-"""Rest in every posture [s]."""
+"""The arm rests this long in every posture [s]."""
 
 
 def random_motion(config: RobotConfig, seed: int) -> Iterator[tuple[np.ndarray, float]]:
@@ -42,11 +42,11 @@ def random_motion(config: RobotConfig, seed: int) -> Iterator[tuple[np.ndarray, 
 
 
 def random_states(config: RobotConfig, count: int, seed: int) -> dict[str, np.ndarray]:
-    """States of the geometric model, whether the arm could rest in them or not (paper, III-B, initial training).
+    """Return states of the geometric model, also such in which the arm could not rest (paper, III-B, initial training).
 
-    Joint positions within the robot file's limits and tensions up to the highest that is ever asked for are drawn
+    Joint positions within the robot file's limits and tensions up to the highest commanded one are drawn
     independently; wire lengths follow. Motion alone shows only tensions that balance gravity, from which a model cannot
-    tell what an unusual load would do; and an arm that was built otherwise pulls harder than was asked.
+    predict an unusual load; and an arm that was built otherwise pulls harder than commanded.
 
     Returns:
         Signal -> values [its unit], shape (count, n).

@@ -23,35 +23,35 @@ __all__ = ["Pr2Duster", "forecast", "hardware", "simulator"]
 
 
 class Pr2Duster:
-    """What stands in for the arm. PyBullet is imported when the first world is made."""
+    """Simulator of the arm. PyBullet is imported when the first world is made."""
 
     variants = VARIANTS
     conditions = tuple(GRASPS)
 
     def world(self, variant: str, seed: int, condition: str | None = None) -> DusterWorld:
-        """The physics of one variant; the seed chooses among actual arms, and their noise.
+        """Return the physics of one variant; the seed chooses among actual arms, and their noise.
 
         Raises:
-            ValueError: No such variant or condition (UnknownPart).
+            ValueError: The variant or condition is not known (UnknownPart).
         """
         from simulators.robots.pr2_duster.world import DusterWorld
 
         return DusterWorld(make_body(variant, seed), seed, condition)
 
     def rig(self, config: RobotConfig, variant: str, seed: int, condition: str | None = None) -> Rig:
-        """The world behind simulated nodes on the robot file's bus."""
+        """Return the world behind simulated nodes on the robot file's bus."""
         from simulators.rig import Rig
 
         return Rig(config, self.world(variant, seed, condition), hardware())
 
     def direct(self, config: RobotConfig, variant: str, seed: int, condition: str | None = None) -> Robot:
-        """The world behind no bus at all, as fast as it computes."""
+        """Return the world without a bus, as fast as it computes."""
         from simulators.direct import direct_robot
 
         return direct_robot(config, self.world(variant, seed, condition))
 
     def vision(self, config: RobotConfig, variant: str, seed: int) -> DepthCamera:
-        """The camera of one variant, by itself."""
+        """Return the camera of one variant."""
         return DepthCamera(make_body(variant, seed), seed)
 
 
@@ -59,10 +59,10 @@ simulator = Pr2Duster()
 
 
 def forecast(config: RobotConfig, condition: str, command: np.ndarray) -> Mapping[str, np.ndarray]:
-    """What the designer's model says of commands (n, 7) [rad] under a condition: tool_tip_position [m], (n, 3).
+    """Return the designer's forecast for commands (n, 7) [rad] under a condition: tool_tip_position [m], (n, 3).
 
     Raises:
-        UnknownPart: No such condition.
+        UnknownPart: The condition is not known.
     """
     check_condition(condition, tuple(GRASPS))
     return {"joint_position": command, SIGNAL: tool_tip(GRASPS[condition], command)}

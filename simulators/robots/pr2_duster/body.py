@@ -17,29 +17,29 @@ URDF = Path(__file__).resolve().parents[2] / "assets" / "pr2_duster" / "pr2_arm.
 VARIANTS = ("nominal", "actual")
 
 REST = np.array([-0.6, 0.3, -0.9, -1.35, 0.1, -0.9, 0.1])
-"""Joint positions at which a robot starts [rad]."""
+"""A robot starts at these joint positions [rad]."""
 FASTEST = np.array([2.088, 2.082, 3.27, 3.3, 3.6, 3.078, 3.6])
-"""Highest joint speeds [rad/s]."""
+"""The joints have these highest speeds [rad/s]."""
 LAG = 0.02
-"""Time constant of the joints' position loops [s]."""
+"""The joints' position loops have this time constant [s]."""
 GRIP = 0.18
-"""From the wrist's axes to between the fingertips, along the hand's x axis [m]."""
+"""The grip is this far from the wrist's axes, along the hand's x axis [m]."""
 
 
 @dataclass(frozen=True, slots=True)
 class Body:
-    """All that makes one variant.
+    """One variant of the arm.
 
     Attributes:
-        zero: Joint positions minus what the encoders report [rad], shape (7,).
-        grip: Where the fingers grip, in the hand's frame [m], shape (3,).
-        camera_turn: Rotation from the base to the frame that the camera takes for it, shape (3, 3).
-        camera_shift: What it adds to every position [m], shape (3,).
-        encoder_noise: Standard deviation of what the encoders report [rad].
-        camera_noise: Standard deviation of what the camera reports [m].
+        zero: Joint positions minus positions of the encoders [rad], shape (7,).
+        grip: Place where the fingers grip, in the hand's frame [m], shape (3,).
+        camera_turn: Rotation from the base to its frame as the camera has it, shape (3, 3).
+        camera_shift: Offset of the camera's positions [m], shape (3,).
+        encoder_noise: Standard deviation of the encoders [rad].
+        camera_noise: Standard deviation of the camera [m].
         rough_length: Standard deviation of the lengths at which people put a duster into the hand [m].
-        rough_angle: Standard deviation of the angles [rad].
-        condition: The grasp it starts with.
+        rough_angle: Standard deviation of the angles of the grasp [rad].
+        condition: Grasp at the start.
     """
 
     zero: np.ndarray = field(default_factory=lambda: np.zeros(7))
@@ -54,10 +54,10 @@ class Body:
 
 
 def make_body(variant: str, seed: int) -> Body:
-    """One variant of the arm; the seed chooses among the actual ones.
+    """Return one variant of the arm; the seed chooses among the actual ones.
 
     Raises:
-        ValueError: No such variant.
+        ValueError: The variant is not known.
     """
     if variant not in VARIANTS:
         raise ValueError(f"The arm has no variant '{variant}'. Known variants: {', '.join(VARIANTS)}.")
@@ -78,7 +78,7 @@ def make_body(variant: str, seed: int) -> Body:
 
 
 def _turn(vector: np.ndarray) -> np.ndarray:
-    """The rotation by a vector [rad], shape (3, 3)."""
+    """Return the rotation by a vector [rad], shape (3, 3)."""
     angle = float(np.linalg.norm(vector))
     cross = np.cross(np.eye(3), vector / angle)
     turn: np.ndarray = np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * cross @ cross
@@ -87,16 +87,18 @@ def _turn(vector: np.ndarray) -> np.ndarray:
 
 @cache
 def chain() -> Chain:
-    """The links and joints, as the URDF has them."""
+    """Return the links and joints of the URDF."""
     return Chain.from_urdf(URDF)
 
 
 def hand(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The designer's hand at joint positions [rad] (k, 7): orientations (k, 3, 3), where it grips [m] (k, 3)."""
+    """Return the designer's hand at joint positions [rad] (k, 7): orientations (k, 3, 3), places of the grip [m] (k,
+    3).
+    """
     rotation, origin = chain().ends(positions)
     return rotation, origin + GRIP * rotation[:, :, 0]
 
 
 def tool_tip(grasp: Grasp, positions: np.ndarray) -> np.ndarray:
-    """The designer's tool tip [m], shape (k, 3), at joint positions [rad], shape (k, 7)."""
+    """Return the designer's tool tip [m], shape (k, 3), at joint positions [rad], shape (k, 7)."""
     return grasp.cloth(*hand(positions))

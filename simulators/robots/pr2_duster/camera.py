@@ -1,4 +1,4 @@
-"""The depth camera on the head, which follows the duster's cloth and tells where its centre is."""
+"""Depth camera on the head, which follows the duster's cloth and measures its centre."""
 
 import math
 from collections.abc import Mapping
@@ -10,13 +10,13 @@ from simulators.robots.pr2_duster.body import Body
 
 SIGNAL = "tool_tip_position"
 PLACE = np.array([-0.02, 0.0, 1.31])
-"""Of the camera [m] in the base's frame."""
+"""The camera is at this place [m] in the base's frame."""
 NEAREST, FARTHEST = 0.4, 4.0
-"""Distances at which depth is measured [m]."""
+"""Depth is measured between these distances [m]."""
 PAN = 2.8
-"""Farthest turn of the head to either side [rad]."""
+"""The head turns at most this far to either side [rad]."""
 TILT_LOW, TILT_HIGH = -1.77, 0.84
-"""Elevations that the head's tilt and half the height of the picture reach [rad]."""
+"""The head's tilt and half the height of the picture reach these elevations [rad]."""
 FAULTS = ("camera_covered", "camera_back")
 
 
@@ -24,16 +24,16 @@ class DepthCamera:
     """Sees the tool tip where the head can turn to it; not thread-safe."""
 
     def __init__(self, body: Body, seed: int) -> None:
-        """A camera of one variant; the seed chooses its noise."""
+        """Make a camera of one variant; the seed chooses its noise."""
         self._body = body
         self._random = np.random.default_rng([seed, 11])
         self._is_covered = False
 
     def see(self, truth: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """The tool tip as the camera reports it [m], shape (3,); NaN where it is covered or out of sight.
+        """Return the tool tip as the camera reports it [m], shape (3,); NaN if it is covered or out of sight.
 
         Args:
-            truth: Signal -> what is; only the tool tip is looked at.
+            truth: Signal -> true value; only the tool tip is used.
         """
         tip = truth[SIGNAL]
         if self._is_covered or not in_sight(tip):
@@ -45,10 +45,10 @@ class DepthCamera:
         return {SIGNAL: seen}
 
     def fault(self, text: str) -> str:
-        """`camera_covered` or `camera_back`; the sentence tells what was done.
+        """Apply `camera_covered` or `camera_back`; return a sentence on it.
 
         Raises:
-            UnknownPart: It is neither.
+            UnknownPart: The fault is another one.
         """
         if text not in FAULTS:
             raise UnknownPart(f"'{text}' is no fault of the camera. Known faults: {', '.join(FAULTS)}.")

@@ -1,4 +1,4 @@
-"""What the hand holds: a stiff duster, or a flexible one whose foam joint sags; and where its cloth hangs.
+"""Dusters in the hand: a stiff one, or a flexible one whose foam joint sags, and the place of its cloth.
 
 simulators/assets/pr2_duster/README.md says where the numbers come from. Pure numpy: no physics engine.
 """
@@ -12,12 +12,12 @@ import numpy as np
 from simulators.chain import GRAVITY
 
 CLOTH = 0.1
-"""Centre of the hanging cloth below the tip of the stick [m]."""
+"""The centre of the hanging cloth is this far below the tip of the stick [m]."""
 LENGTHS = (0.3, 0.5, 0.7)
 ANGLES = (0, 30, 60)
-"""Grasping angles of the paper [deg]."""
+"""The paper has these grasping angles [deg]."""
 BETWEEN = ((0.4, 15), (0.6, 45))
-"""Lengths [m] and angles [deg] that no model is trained on: what was never held must be recognised too."""
+"""No model is trained on these lengths [m] and angles [deg]; a grasp that was never held must be recognised too."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,9 +25,9 @@ class Foam:
     """A stick that continues the held one behind a piece of foam, which bends in any direction.
 
     Attributes:
-        length: Of the stick behind the foam [m].
+        length: Length of the stick behind the foam [m].
         stiffness: Torque that bends the foam [N m/rad].
-        moment: First mass moment about the foam of all that hangs on it [kg m].
+        moment: First mass moment about the foam of everything that hangs on it [kg m].
     """
 
     length: float
@@ -37,12 +37,12 @@ class Foam:
 
 @dataclass(frozen=True, slots=True)
 class Grasp:
-    """How a duster is held.
+    """Grasp of a duster.
 
     Attributes:
-        length: From the hand to the tip of the stick, or to the foam [m].
-        angle: By which the stick is turned out of the hand's x axis, about the axis across the fingers (y) [rad].
-        foam: What follows behind the foam; None for a stiff duster.
+        length: Length from the hand to the tip of the stick, or to the foam [m].
+        angle: Angle by which the stick is turned out of the hand's x axis, about the axis across the fingers (y) [rad].
+        foam: The foam and the stick behind it; None for a stiff duster.
     """
 
     length: float
@@ -50,11 +50,11 @@ class Grasp:
     foam: Foam | None = None
 
     def cloth(self, rotation: np.ndarray, origin: np.ndarray) -> np.ndarray:
-        """Where the cloth's centre is, at rest.
+        """Return the centre of the cloth, at rest.
 
         Args:
             rotation: Orientations of the hand, shape (k, 3, 3).
-            origin: Where it grips [m], shape (k, 3).
+            origin: Places of the grip [m], shape (k, 3).
 
         Returns:
             Positions [m], shape (k, 3), in the frame of `origin`, whose z is up.
@@ -67,7 +67,8 @@ class Grasp:
 
 
 def sagged(foam: Foam, along: np.ndarray) -> np.ndarray:
-    """Directions of the stick behind the foam, at rest; directions before it, both unit vectors of shape (k, 3).
+    """Return directions of the stick behind the foam, at rest, from directions before it; both unit vectors of shape
+    (k, 3).
 
     The stick falls in the vertical plane of the one before it, from the elevation a to b where the foam's torque
     carries the weight: stiffness (a - b) = moment g cos(b). With stiffness > moment g that is one posture.
@@ -103,6 +104,6 @@ GRASPS: Mapping[str, Grasp] = {
         for phi in ANGLES
     },
 }
-"""Condition -> grasp: nine of the normal duster and two between them, six of the flexible one."""
+"""Condition -> grasp, nine of the normal duster and two between them, six of the flexible one."""
 NORMAL = tuple(f"l{1e3 * length:.0f}_phi{phi}" for length in LENGTHS for phi in ANGLES)
 FLEXIBLE = tuple(name for name, grasp in GRASPS.items() if grasp.foam is not None)

@@ -1,7 +1,7 @@
-"""What hangs on the arm's bus: every drive with its own electrical constants.
+"""Drives of the arm's bus, each with its own electrical constants.
 
-Kept apart from the robot file on purpose: a robot file that disagrees with the hardware must read wrong values here as
-it would on a bench. tests/simulators/test_robots_hardware.py checks that ours agrees.
+These are apart from the robot file on purpose: a robot file that disagrees with the hardware must read wrong values
+here as it would on a bench. tests/simulators/test_robots_hardware.py checks that ours agrees.
 """
 
 from simulators.nodes.canopen.spec import DriveConstants, NodeSpec
@@ -15,11 +15,11 @@ JOINTS: dict[str, tuple[float, int, float]] = {
     "wrist_flex": (50.0, -1, -0.9),
     "wrist_roll": (50.0, 1, 0.1),
 }
-"""Gear, direction of the drive, and joint position [rad] at zero counts: the drives were zeroed at rest."""
+"""Joint -> gear, direction of the drive, and joint position [rad] at zero counts: the drives were zeroed at rest."""
 
 
 def hardware() -> list[NodeSpec]:
-    """Seven drives, nodes 1 to 7 on can0."""
+    """Return seven drives, nodes 1 to 7 on can0."""
     return [
         NodeSpec(
             f"{name}_drive",

@@ -31,7 +31,7 @@ class DusterWorld(World):
             condition: The grasp; the body's own if not given.
 
         Raises:
-            UnknownPart: There is no such grasp.
+            UnknownPart: The grasp is not known.
         """
         check_condition(condition, tuple(GRASPS))
         self.time = 0.0
