@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 import yaml
 
 from hal.config import RobotConfig
@@ -20,7 +21,10 @@ def test_the_first_program_prints_what_the_page_shows() -> None:
         [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=100, check=False
     )
     assert done.returncode == 0, done.stderr
-    assert done.stdout == shown
+    number = r"\d\.\d+"
+    assert re.sub(number, "#", done.stdout) == re.sub(number, "#", shown)
+    printed, expected = ([float(text) for text in re.findall(number, line)] for line in (done.stdout, shown))
+    assert printed == pytest.approx(expected, abs=0.02)  # rad; the last digit differs between processors
     assert len([line for line in program.splitlines() if line]) == 12
 
 
