@@ -8,16 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from gemuco.errors import NotFinite, NotObservable, SchemaError, check_kind
+from gemuco.errors import NotFinite, NotObservable, check_kind
 from gemuco.masks import Mask, label
-from gemuco.schema import BodySchema, check_schema
+from gemuco.schema import BodySchema
 from gemuco.search.descent import DescentConfig, NewtonConfig
 from gemuco.search.losses import Hold, Match, StayNear, Term
-from gemuco.search.request import Request, merged, signals_of
-from gemuco.search.routes import Limits, bounds_of, checked_mask, checked_route
+from gemuco.search.request import Request, checked_terms, merged, signals_of
+from gemuco.search.routes import Limits, check_command
 from gemuco.search.search import Outcome, Search
-
-SEARCH = NewtonConfig()
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,32 +133,17 @@ class Controller:
             UnknownSignal: The command is not in the layout.
             NotObservable: The command is neither input nor output of the network, or the mask is not feasible.
         """
-        self.terms = None if terms is None else tuple(terms)
-        self.command, self.route, self.mask = command, checked_route(route), mask
+        self.terms, self.command, self.route, self.mask = terms, command, route, mask
         self.limits = dict(limits or {})
-        self._search = Search(search or SEARCH, self.limits)
-        if mask is not None and route in ("latent", "auto"):
-            raise SchemaError(f"A mask goes with route mask or input, not with '{route}'.")
+        self._search = Search(search, self.limits)
         self.swap(schema)
 
     def swap(self, schema: BodySchema) -> None:
         """Continue with another schema of the same body; the warm start is kept."""
-        check_schema(schema)
-        check_kind("The command", self.command, str, "the name of a signal")
-        span = schema.layout.slice(self.command)
-        if self.command not in (*schema.x_in, *schema.x_out):
-            raise NotObservable(
-                f"'{self.command}' is commanded, but is neither input nor output of this schema. Inputs: "
-                f"{', '.join(schema.x_in)}. Outputs: {', '.join(schema.x_out)}."
-            )
-        if self.mask is not None:
-            checked_mask(schema, self.mask)
-        bounds_of(schema, self.limits)
-        for term in self.terms or ():
-            for name in signals_of(term):
-                schema.layout.slice(name)
-        self.schema, self._span = schema, span
-        self._mean, self._std = schema.scaler.mean[span], schema.scaler.std[span]
+        check_command(schema, self.command, self.route, self.mask, self.limits)
+        self.terms = None if self.terms is None else checked_terms(schema, self.terms)
+        self.schema, self._span = schema, schema.layout.slice(self.command)
+        self._mean, self._std = schema.scaler.mean[self._span], schema.scaler.std[self._span]
         self._names: tuple[str, ...] | None = None
         self._search.drop()
 

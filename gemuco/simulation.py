@@ -6,16 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from gemuco.errors import NotFinite, NotObservable, SchemaError, check_kind
+from gemuco.errors import NotFinite, NotObservable
 from gemuco.masks import Mask, best, label
-from gemuco.schema import BodySchema, check_schema
+from gemuco.schema import BodySchema
 from gemuco.search.descent import DescentConfig, NewtonConfig
 from gemuco.search.losses import Hold, Match, Term
-from gemuco.search.request import Request, signals_of
-from gemuco.search.routes import Limits, bounds_of, checked_mask, checked_route
+from gemuco.search.request import Request, checked_terms
+from gemuco.search.routes import Limits, check_command
 from gemuco.search.search import Search
-
-SEARCH = NewtonConfig()
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,19 +72,10 @@ class Simulator:
             UnknownSignal: A name is not in the layout.
             NotObservable: The schema does not know the command, or the mask is not feasible.
         """
-        check_schema(schema)
-        check_kind("The command", command, str, "the name of a signal")
-        schema.layout.slice(command)
-        self.schema, self.command, self.route, self.mask = schema, command, checked_route(route), mask
+        self.schema, self.command, self.route, self.mask = schema, command, route, mask
         self.limits = dict(limits or {})
-        self._search = Search(search or SEARCH, self.limits)
-        if mask is not None:
-            checked_mask(schema, mask)
-            if route in ("latent", "auto"):
-                raise SchemaError(f"A mask goes with route mask or input, not with '{route}'.")
-        if command not in (*schema.x_in, *schema.x_out):
-            raise NotObservable(f"'{command}' is commanded, but is neither input nor output of this schema.")
-        bounds_of(schema, self.limits)
+        check_command(schema, command, route, mask, self.limits)
+        self._search = Search(search, self.limits)
         self.terms: tuple[Term | Hold, ...] = ()
         self.constrain(terms)
 
@@ -96,11 +85,9 @@ class Simulator:
         Raises:
             UnknownSignal: A term is about a signal that is not in the layout.
         """
-        for term in terms:
-            for name in signals_of(term):
-                self.schema.layout.slice(name)
+        terms = checked_terms(self.schema, terms)
         is_matched = any(isinstance(term, Match | Hold) and term.signal == self.command for term in terms)
-        self.terms = tuple(terms) if is_matched else (Match(self.command), *terms)
+        self.terms = terms if is_matched else (Match(self.command), *terms)
         self._request = Request(self.schema, self.terms)
         self._search.drop()
 

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from gemuco.errors import check_kind
 from gemuco.schema import BodySchema
 from gemuco.search.losses import Hold, LastingTerm, Term
 from gemuco.search.norms import Bound, Norm
@@ -62,6 +63,20 @@ class Request:
         """Return a key of the rows of the terms and the elements of the layout that have a reference."""
         norms = [bound.difference.counts.tobytes() for bound in self.bounds if isinstance(bound, Norm)]
         return b"".join([*norms, np.isfinite(self.held).tobytes()])
+
+
+def checked_terms(schema: BodySchema, terms: Sequence[Term | Hold]) -> tuple[Term | Hold, ...]:
+    """Return terms after a check of their signals.
+
+    Raises:
+        WrongKind: The terms are not a sequence.
+        UnknownSignal: The signal of a term is not in the layout.
+    """
+    check_kind("The terms", terms, (tuple, list), "a tuple of terms, such as (Match('joint_position'),)")
+    for term in terms:
+        for name in signals_of(term):
+            schema.layout.slice(name)
+    return tuple(terms)
 
 
 def signals_of(term: Term | Hold) -> tuple[str, ...]:

@@ -8,11 +8,11 @@ from typing import Protocol
 import numpy as np
 
 from gemuco.compiled.chain import output, pack
-from gemuco.errors import NotObservable, SchemaError, WrongSize
+from gemuco.errors import NotObservable, SchemaError, WrongSize, check_kind
 from gemuco.layers import pull, run, trace
 from gemuco.masks import Mask, covered_by, label
 from gemuco.scaler import CLIP
-from gemuco.schema import BodySchema
+from gemuco.schema import BodySchema, check_schema
 from gemuco.search.fold import Lines, give, input_lines, latent_lines
 
 STARTS = 64
@@ -209,27 +209,31 @@ def bounds_of(schema: BodySchema, limits: Limits | None) -> tuple[np.ndarray, np
     return low, high
 
 
-def checked_mask(schema: BodySchema, mask: Mask) -> Mask:
-    """Return a mask after a check that it is feasible.
+def check_command(schema: BodySchema, command: str, route: str, mask: Mask | None, limits: Limits) -> None:
+    """Check a commanded signal, and the settings of its route.
 
     Raises:
-        NotObservable: The schema was not trained with it.
+        WrongKind: The first argument is not a body schema, or the command is not a name.
+        UnknownSignal: The command or a limit names a signal that is not in the layout.
+        SchemaError: The route is not known, does not go with a mask, or limits are contradictory.
+        NotObservable: The command is neither input nor output of the network, or the mask is not feasible.
     """
-    if mask not in schema.masks:
+    check_schema(schema)
+    check_kind("The command", command, str, "the name of a signal")
+    schema.layout.slice(command)
+    if route not in ROUTES:
+        raise SchemaError(f"Route '{route}' is not known. Known routes: {', '.join(ROUTES)}.")
+    if mask is not None and route in ("latent", "auto"):
+        raise SchemaError(f"A mask goes with route mask or input, not with '{route}'.")
+    if command not in (*schema.x_in, *schema.x_out):
+        raise NotObservable(
+            f"'{command}' is commanded, but is neither input nor output of this schema. Inputs: "
+            f"{', '.join(schema.x_in)}. Outputs: {', '.join(schema.x_out)}."
+        )
+    if mask is not None and mask not in schema.masks:
         known = ", ".join(label(m, schema.layout.names) for m in schema.masks)
         raise NotObservable(
             f"The mask {label(mask, schema.layout.names) or ', '.join(sorted(mask))} is not feasible for this schema. "
             f"Feasible masks: {known}."
         )
-    return mask
-
-
-def checked_route(route: str) -> str:
-    """Return the name of a route after a check.
-
-    Raises:
-        SchemaError: There is no such route.
-    """
-    if route not in ROUTES:
-        raise SchemaError(f"Route '{route}' is not known. Known routes: {', '.join(ROUTES)}.")
-    return route
+    bounds_of(schema, limits)

@@ -74,8 +74,8 @@ class Setup:
 class Search:
     """Searches one after the other, each beginning at the end of the last one if the route is the same."""
 
-    def __init__(self, config: DescentConfig | NewtonConfig, limits: Limits | None) -> None:
-        self.config, self.limits = config, limits
+    def __init__(self, config: DescentConfig | NewtonConfig | None, limits: Limits | None) -> None:
+        self.config, self.limits = config or NewtonConfig(), limits
         self._warm: np.ndarray | None = None
         self._last: tuple[str, Mask, int] | None = None
         self._setups: dict[tuple[Request, bytes, bytes], Setup] = {}

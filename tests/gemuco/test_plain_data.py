@@ -137,6 +137,7 @@ def test_a_schema_shows_itself(schema):
         (lambda s: control(s, {"joint_position": np.zeros(2)}, [0.0], command="muscle_length"), "Values must be a"),
         (lambda s: control({}, s, command="muscle_length"), "The first argument must be a BodySchema, not a dict."),
         (lambda s: simulate(s, np.zeros((1, 5)), command=np.zeros(5)), "The command must be the name of a signal, "),
+        (lambda s: control(s, {}, command="muscle_length", terms=gemuco.Match("q")), "The terms must be a tuple"),
         (lambda s: save("model", s), "The first argument must be a BodySchema, not a str."),
         (lambda s: fit({}, [{"a"}], TINY), "The settings of a training must be a TrainConfig, not a list."),
         (lambda s: determine(arrays(), {}, units=UNITS), "The settings of a training must be a TrainConfig, not a"),
