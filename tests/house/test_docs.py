@@ -7,9 +7,11 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+import typer
 import yaml
 
 import gemuco
+from services.cli import app
 
 ROOT = Path(__file__).parents[2]
 FRONT = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")
@@ -85,3 +87,9 @@ def test_files_and_modules_that_a_page_names_exist(page: Path) -> None:
         path = ROOT / module.replace(".", "/")
         missing += [] if path.is_dir() or path.with_suffix(".py").exists() else [module]
     assert not missing
+
+
+def test_every_verb_of_the_command_line_has_a_row() -> None:
+    rows = (ROOT / "docs" / "verbs.md").read_text().split("## ")[0]
+    listed = set(re.findall(r"`(\w+)[ \w]*`(?=[^|\n]*\|[^|\n]*\|\n)", rows))
+    assert set(typer.main.get_command(app).commands) <= listed  # type: ignore[attr-defined]
