@@ -37,7 +37,7 @@ _ROOMS = {
     "gemuco.search.losses": ("Hold", "Match", "StayNear", "StaySmall"),
     "gemuco.search.torque": ("TorqueBalance",),
     "gemuco.signals": ("Layout", "Signal"),
-    "gemuco.simulation": ("Simulated", "Simulator", "simulate"),
+    "gemuco.simulation": ("SimulatedState", "Simulator", "simulate"),
     "gemuco.structure.determination": ("Structure", "determine", "learn"),
     "gemuco.structure.mask_judge": ("Thresholds",),
 }
@@ -86,7 +86,7 @@ if TYPE_CHECKING:
     from gemuco.search.torque import TorqueBalance as TorqueBalance
     from gemuco.signals import Layout as Layout
     from gemuco.signals import Signal as Signal
-    from gemuco.simulation import Simulated as Simulated
+    from gemuco.simulation import SimulatedState as SimulatedState
     from gemuco.simulation import Simulator as Simulator
     from gemuco.simulation import simulate as simulate
     from gemuco.structure.determination import Structure as Structure

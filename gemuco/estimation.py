@@ -30,8 +30,8 @@ class Estimate:
         method: `measured`, `mask` (usages a and b), `latent` (e), `input` (f) or `none`.
         mask: The signals it was estimated from; empty where measured.
         residual: Root mean square of the given values minus the model's [standard deviations of the training data];
-            0 where measured, NaN without estimate. For `latent` at least the same of the estimate given to the network
-            again: a z beside the manifold of the data fits the measured values, but its body does not exist.
+            0 where measured, NaN without estimate. For `latent` the estimate is given to the network once more, and the
+            larger error counts: a z beside the manifold of the data may fit values that no body has.
     """
 
     value: np.ndarray

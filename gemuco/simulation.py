@@ -17,7 +17,7 @@ from gemuco.search.search import Search
 
 
 @dataclass(frozen=True, slots=True)
-class Simulated:
+class SimulatedState:
     """State of the body after a command.
 
     Attributes:
@@ -100,7 +100,7 @@ class Simulator:
         command: np.ndarray | Sequence[float],
         given: Mapping[str, np.ndarray] | None = None,
         now: Mapping[str, np.ndarray] | None = None,
-    ) -> Simulated:
+    ) -> SimulatedState:
         """Return the state that a command brings about.
 
         Args:
@@ -127,14 +127,14 @@ class Simulator:
         values = schema.layout.split(schema.scaler.restore(outcome.x))
         state = {name: part.copy() for name, part in values.items() if np.isfinite(part).all()}
         residual = self._residual(outcome.x, sent, outcome.mask)
-        return Simulated(state, outcome.loss, residual, outcome.route, outcome.mask)
+        return SimulatedState(state, outcome.loss, residual, outcome.route, outcome.mask)
 
     def run(
         self,
         commands: Iterable[np.ndarray | Sequence[float]],
         given: Mapping[str, np.ndarray] | None = None,
         now: Mapping[str, np.ndarray] | None = None,
-    ) -> Iterator[Simulated]:
+    ) -> Iterator[SimulatedState]:
         """Yield the states that commands bring about one after the other; see `step`."""
         for command in commands:
             yield self.step(command, given, now)
@@ -198,7 +198,7 @@ def simulate(
     given: Mapping[str, np.ndarray] | None = None,
     now: Mapping[str, np.ndarray] | None = None,
     **options: Any,
-) -> list[Simulated]:
+) -> list[SimulatedState]:
     """Return the states that commands bring about one after the other; `Simulator` takes them singly.
 
     Args:
