@@ -45,9 +45,9 @@ def schema():
     episodes = []
     for tool in TOOLS:
         commands = safe_postures(ROBOT, tool, 150, random)
-        told = designed(ROBOT, tool)(commands)
+        forecast = designed(ROBOT, tool)(commands)
         episodes += [
-            Episode(tool, {n: told[n][i : i + 15] for n in (JOINTS, CENTER, TIP, PIXEL)}) for i in range(0, 150, 15)
+            Episode(tool, {n: forecast[n][i : i + 15] for n in (JOINTS, CENTER, TIP, PIXEL)}) for i in range(0, 150, 15)
         ]
     config = TrainConfig(hidden=(40,), latent=8, bias_size=2, epochs=100, batch=50, rate=1e-2, patience=100)
     masks = [(JOINTS,), (JOINTS, CENTER), (JOINTS, CENTER, PIXEL), (JOINTS, CENTER, TIP)]
@@ -57,17 +57,17 @@ def schema():
 def test_safe_postures_keep_the_constraints():
     bounds = {name: one.bounds(2, name) for name, one in collect_config(ROBOT).constraints.items()}
     commands = safe_postures(ROBOT, "long_heavy", 40, np.random.default_rng(1))
-    told = designed(ROBOT, "long_heavy")(commands)
+    forecast = designed(ROBOT, "long_heavy")(commands)
     assert commands.shape == (40, 4)
     for name, (low, high) in bounds.items():
-        assert np.all((told[name] >= low) & (told[name] <= high))
+        assert np.all((forecast[name] >= low) & (forecast[name] <= high))
 
 
 def test_inverse_kinematics_reaches_what_its_own_model_says():
     targets = random_targets(ROBOT, "long_middle", 6, np.random.default_rng(2))
     for model in (designed(ROBOT, "long_middle"), stiff(ROBOT, "long_middle")):
-        told = model(inverse(ROBOT, model, targets))
-        assert np.linalg.norm(told[TIP] - targets, axis=1).mean() < 0.003
+        forecast = model(inverse(ROBOT, model, targets))
+        assert np.linalg.norm(forecast[TIP] - targets, axis=1).mean() < 0.003
 
 
 def test_a_stiff_model_misses_where_the_designers_reaches():

@@ -8,8 +8,7 @@ import pytest
 from gemuco.signals import Layout
 from hal.config import load_robot
 from services.learning.trainer import train
-from studies.paper.musashi import anomaly as anomaly
-from studies.paper.musashi import model as model
+from studies.paper.musashi import anomaly, model
 from studies.paper.musashi.control import OURS, WEIGHTS, controls
 from studies.paper.musashi.motion import LENGTH, POSITION, SENT, TENSION, record, signals
 
@@ -48,9 +47,9 @@ def test_the_area_under_a_roc_curve_counts_pairs():
 
 def test_an_exponential_is_found_again():
     time = np.arange(1.0, 601.0)
-    found = model.decay(time, 0.1 + 0.24 * np.exp(-time / 80.0))
-    assert found.at(0.0) == pytest.approx(0.34, abs=0.005)
-    assert found.at(600.0) == pytest.approx(0.1, abs=0.002)
+    fit = model.decay(time, 0.1 + 0.24 * np.exp(-time / 80.0))
+    assert fit.at(0.0) == pytest.approx(0.34, abs=0.005)
+    assert fit.at(600.0) == pytest.approx(0.1, abs=0.002)
     assert model.decay(time, 0.3 * np.exp(-time / 900.0), has_floor=False).floor == 0.0
 
 
@@ -65,7 +64,7 @@ def test_geometric_data_are_random_states_in_episodes(monkeypatch):
 
 
 @pytest.mark.long
-def test_what_training_found_is_read_from_the_model_it_made(monkeypatch):
+def test_the_structure_of_a_training_is_read_from_its_model(monkeypatch):
     monkeypatch.setattr(model, "SAMPLES", 1000)
     trained = train(ROBOT, model.geometric_data(ROBOT, 0), 0, lambda done, text: None)
     assert model.structure_of(ROBOT, trained.schema) == trained.structure

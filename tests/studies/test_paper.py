@@ -98,10 +98,10 @@ def test_two_components_are_enough_for_a_p_of_one_number(tmp_path):
     assert (tmp_path / "one.png").exists()
 
 
-def _seed_and_process(run: Run, tell: Tell) -> tuple[int, int]:
+def _seed_and_process(run: Run, progress: Tell) -> tuple[int, int]:
     if run.robot.robot == "killed":
         os.kill(os.getpid(), signal.SIGKILL)
-    tell(0.5, "counting")
+    progress(0.5, "counting")
     if run.robot.robot == "broken" and run.seed == 0:
         raise FileNotFoundError("of seed 0")
     return run.seed, os.getpid()

@@ -63,19 +63,19 @@ def test_the_flexible_duster_has_six_grasps_that_the_file_does_not_list():
 
 
 @pytest.mark.long
-def test_both_experiments_run_and_tell_their_figures(tmp_path, monkeypatch):
+def test_both_experiments_run_and_have_all_figures(tmp_path, monkeypatch):
     monkeypatch.setattr(pr2_arm, "STROKES", 2)
     monkeypatch.setattr(pr2_trials, "SEARCH", DescentConfig(0.5, 10, 10))
     run = open_run(small(ROBOT), tmp_path, seed=0)
-    told: list[float] = []
-    simulated = simulate(run, lambda share, text: told.append(share))
-    found = actual(run, simulated.schema, lambda share, text: told.append(share))
+    shares: list[float] = []
+    simulated = simulate(run, lambda share, text: shares.append(share))
+    tuned = actual(run, simulated.schema, lambda share, text: shares.append(share))
     assert simulated.schema.x_out == (TIP,)
-    assert max(told) <= 1.0
+    assert max(shares) <= 1.0
     assert simulated.controlled["p"].course.errors[0] == pytest.approx(0.26, abs=0.12)
-    report = summary([0], [Outcome(simulated, found)])
+    report = summary([0], [Outcome(simulated, tuned)])
     assert all(np.isfinite(row.values).all() for row in report.rows)
-    draw(tmp_path, [simulated], [found])
+    draw(tmp_path, [simulated], [tuned])
     assert {path.name for path in tmp_path.glob("*.png")} == {
         "bias_map.png",
         "estimation.png",

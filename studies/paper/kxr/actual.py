@@ -56,13 +56,15 @@ class Actual:
     controlled: Mapping[str, Course]
 
 
-def actual(run: Run, simulated: BodySchema, tell: Tell) -> Actual:
+def actual(run: Run, simulated: BodySchema, progress: Tell) -> Actual:
     """Collect on the actual robot, fine-tune the simulated model, and run every trial of one seed."""
-    tell(0.0, "collecting on the actual robot")
+    progress(0.0, "collecting on the actual robot")
     settings = {"grid": TAUGHT_GRID, "margin": TAUGHT_MARGIN, "random": RANDOM}
     data = run.cached("actual", lambda: _collect(run), **settings)
-    schema = run.cached("actual_model", lambda: _tune(run, simulated, data, tell), epochs=EPOCHS, rate=RATE, **settings)
-    tell(0.8, "trials on the actual robot")
+    schema = run.cached(
+        "actual_model", lambda: _tune(run, simulated, data, progress), epochs=EPOCHS, rate=RATE, **settings
+    )
+    progress(0.8, "trials on the actual robot")
     paths = leads(run, schema, ACTUAL)
     needed = {tool: samples_until(paths[f"to {tool}, ekf"], schema, tool) for tool in LEADS}
     recognised = {case: samples for (case, _), samples in recognitions(run, schema, ACTUAL, ["ekf"])[0].items()}
@@ -89,9 +91,9 @@ def _collect(run: Run) -> Dataset:
     return Dataset(layout, tuple(episodes))
 
 
-def _tune(run: Run, simulated: BodySchema, data: Dataset, tell: Tell) -> BodySchema:
+def _tune(run: Run, simulated: BodySchema, data: Dataset, progress: Tell) -> BodySchema:
     config = replace(train_config(model_config(run.robot), EPOCHS, run.seed), rate=RATE, replay=0.0)
-    return fine_tune(simulated, data, config, lambda done, text: tell(0.1 + 0.7 * done, text))[0]
+    return fine_tune(simulated, data, config, lambda done, text: progress(0.1 + 0.7 * done, text))[0]
 
 
 def _controlled(run: Run, simulated: BodySchema, tuned: BodySchema) -> dict[str, Course]:

@@ -53,9 +53,9 @@ class Outcome:
     actual: Actual
 
 
-def _of_seed(run: Run, tell: Tell) -> Outcome:
-    simulated = simulate(run, between(tell, 0.0, 0.9))
-    return Outcome(simulated, actual(run, simulated.schema, between(tell, 0.9, 1.0)))
+def _of_seed(run: Run, progress: Tell) -> Outcome:
+    simulated = simulate(run, between(progress, 0.0, 0.9))
+    return Outcome(simulated, actual(run, simulated.schema, between(progress, 0.9, 1.0)))
 
 
 def reproduce(seeds: Sequence[int], folder: Path, progress: Tell, fresh: bool) -> Report:

@@ -84,15 +84,15 @@ class Simulated:
     limit: Course
 
 
-def simulate(run: Run, tell: Tell) -> Simulated:
+def simulate(run: Run, progress: Tell) -> Simulated:
     """Collect, train, and run every trial of one seed."""
     robot, seed = run.robot, run.seed
-    tell(0.0, "collecting")
+    progress(0.0, "collecting")
     data = run.cached("nominal", lambda: collect_direct(robot, NOMINAL, seed).dataset)
-    schema = run.cached("nominal_model", lambda: train(robot, data, seed, between(tell, 0.2, 0.7)).schema)
-    tell(0.7, "recognising tools")
+    schema = run.cached("nominal_model", lambda: train(robot, data, seed, between(progress, 0.2, 0.7)).schema)
+    progress(0.7, "recognising tools")
     needed, paths = recognitions(run, schema, NOMINAL, UPDATES)
-    tell(0.85, "reaching targets while tools change")
+    progress(0.85, "reaching targets while tools change")
     controlled, limit = _controls(run, schema)
     return Simulated(schema, needed, paths, leads(run, schema, NOMINAL), controlled, limit)
 

@@ -13,9 +13,7 @@ import numpy as np
 from hal.config import load_robot
 from services.model.artifacts import robot_file
 from services.show import Tell
-from studies.paper.musashi import control as control
-from studies.paper.musashi import figures as figures
-from studies.paper.musashi import simulation as simulation
+from studies.paper.musashi import control, figures, simulation
 from studies.paper.musashi.model import decay
 from studies.paper.musashi.motion import LENGTH, POSITION, TENSION
 from studies.paper.musashi.seed import AFTER, BEFORE, HELD, Outcome, run_seed

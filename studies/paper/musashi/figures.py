@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from hal.config import RobotConfig
 from services.learning.structure_plot import plot as plot_structure
 from studies.paper.figures import bars, picture, score_over_time
-from studies.paper.musashi import simulation as simulation
+from studies.paper.musashi import simulation
 from studies.paper.musashi.control import OURS
 from studies.paper.musashi.model import decay
 from studies.paper.musashi.motion import POSITION, RATE, TENSION

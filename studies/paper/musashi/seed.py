@@ -10,10 +10,7 @@ from gemuco.schema import BodySchema
 from gemuco.structure.determination import Structure
 from services.learning.trainer import train
 from services.show import Tell
-from studies.paper.musashi import anomaly as anomaly
-from studies.paper.musashi import control as control
-from studies.paper.musashi import model as model
-from studies.paper.musashi import simulation as simulation
+from studies.paper.musashi import anomaly, control, model, simulation
 from studies.paper.musashi.motion import TENSION, record
 from studies.paper.runs import Run, between
 
@@ -72,26 +69,26 @@ class Outcome:
     forced: Mapping[str, Mapping[str, np.ndarray]]
 
 
-def run_seed(run: Run, tell: Tell) -> Outcome:
+def run_seed(run: Run, progress: Tell) -> Outcome:
     """Train, move the actual arm, learn from it, and judge the models before and after."""
     robot, seed = run.robot, run.seed
-    tell(0.0, "drawing states of the geometric model")
+    progress(0.0, "drawing states of the geometric model")
     data = run.cached("geometric", lambda: model.geometric_data(robot, seed))
-    before = run.cached("nominal_model", lambda: train(robot, data, seed, between(tell, 0.0, 0.2)).schema)
-    tell(0.2, "moving the actual arm")
+    before = run.cached("nominal_model", lambda: train(robot, data, seed, between(progress, 0.0, 0.2)).schema)
+    progress(0.2, "moving the actual arm")
     lived = _recorded(run, "lived", 100, LIVED)
-    tell(0.4, "learning from it")
+    progress(0.4, "learning from it")
     learned = model.learn(robot, before, lived, seed)
     normal = _recorded(run, "normal", 200, NORMAL)
     schemas = {
         BEFORE: anomaly.with_normal(before, normal),
         AFTER: anomaly.with_normal(learned.schema, normal),
     }
-    tell(0.5, "moving it with a heavy object and cut muscles")
+    progress(0.5, "moving it with a heavy object and cut muscles")
     motion, loaded = _recorded(run, "fresh", 300, FRESH), _recorded(run, "heavy", 400, FRESH, HEAVY)
     story = _story(run)
     cut = _cuts(run)
-    tell(0.7, "controlling and simulating it")
+    progress(0.7, "controlling and simulating it")
 
     def both(measure: Callable[[BodySchema, Dataset], np.ndarray], recording: Dataset) -> dict[str, np.ndarray]:
         return {name: measure(schema, recording) for name, schema in schemas.items()}

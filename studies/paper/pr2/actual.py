@@ -55,17 +55,17 @@ class Actual:
     samples: int
 
 
-def actual(run: Run, simulated: BodySchema, tell: Tell) -> Actual:
+def actual(run: Run, simulated: BodySchema, progress: Tell) -> Actual:
     """Collect on the actual arm, fine-tune the simulated model, and run every trial of one seed."""
-    tell(0.0, "collecting on the actual arm")
+    progress(0.0, "collecting on the actual arm")
     count = round(COLLECTED * collect_config(run.robot).samples)
     request = Request(flexible_grasps(run.robot), samples=count)
     data = run.cached("actual", lambda: collect_direct(run.robot, ACTUAL, run.seed, request).dataset, samples=count)
     learned, judged = split(data, LEARNED / COLLECTED)
     schema = run.cached(
-        "actual_model", lambda: _tune(run, simulated, learned, tell), samples=len(learned), epochs=EPOCHS, rate=RATE
+        "actual_model", lambda: _tune(run, simulated, learned, progress), samples=len(learned), epochs=EPOCHS, rate=RATE
     )
-    tell(0.6, "trials on the actual arm")
+    progress(0.6, "trials on the actual arm")
     geometry = Geometry(run.robot)
     controlled, course, change = _control(run, geometry, simulated, schema)
     return Actual(
@@ -94,10 +94,10 @@ def split(data: Dataset, share: float) -> tuple[Dataset, Dataset]:
     return Dataset(data.layout, tuple(first)), Dataset(data.layout, tuple(last))
 
 
-def _tune(run: Run, simulated: BodySchema, learned: Dataset, tell: Tell) -> BodySchema:
+def _tune(run: Run, simulated: BodySchema, learned: Dataset, progress: Tell) -> BodySchema:
     model = model_config(run.robot)
     config = replace(train_config(model, round(EPOCHS * model.training.epochs), run.seed), rate=RATE, replay=0.0)
-    schema, _ = fine_tune(simulated, learned, config, lambda done, text: tell(0.2 + 0.4 * done, text))
+    schema, _ = fine_tune(simulated, learned, config, lambda done, text: progress(0.2 + 0.4 * done, text))
     return schema
 
 

@@ -104,10 +104,10 @@ class Simulated:
         return self.schema.manifest[name]
 
 
-def simulate(run: Run, tell: Tell) -> Simulated:
+def simulate(run: Run, progress: Tell) -> Simulated:
     """Collect, train, and run every trial of one seed."""
     robot, seed = run.robot, run.seed
-    tell(0.0, "collecting")
+    progress(0.0, "collecting")
     data = run.cached("nominal", lambda: collect_direct(robot, NOMINAL, seed).dataset)
     count = round(FRESH_SHARE * collect_config(robot).samples)
     fresh = run.cached(
@@ -117,9 +117,9 @@ def simulate(run: Run, tell: Tell) -> Simulated:
     )
     schema = run.cached(
         "nominal_model",
-        lambda: train(robot, data, seed, between(tell, 0.3, 0.7)).schema,
+        lambda: train(robot, data, seed, between(progress, 0.3, 0.7)).schema,
     )
-    tell(0.7, "trials")
+    progress(0.7, "trials")
     errors = errors_by_grasp(schema, fresh)
     return Simulated(
         schema=schema,
