@@ -42,39 +42,17 @@ class Estimate:
     residual: float | np.ndarray
 
 
-class Completion(NamedTuple):
-    """A completed sample in one array; the attributes are those of `Estimate`.
-
-    Attributes:
-        value: Of every element, shape (size,).
-        std: Of every element, shape (size,).
-        estimated: Of every element, shape (size,).
-        method: Of every signal.
-        mask: Of every signal.
-        label: Of every signal, the mask as text.
-        residual: Of every signal.
-    """
-
-    value: np.ndarray
-    std: np.ndarray
-    estimated: np.ndarray
-    method: Mapping[str, str]
-    mask: Mapping[str, Mask]
-    label: Mapping[str, str]
-    residual: dict[str, float]
-
-
 @dataclass(frozen=True, slots=True)
 class Recipe:
     """The steps that complete samples which lack the same elements; all but the values is known beforehand.
 
     Attributes:
         steps: Method, mask, estimated elements as truth values, shape (size,), and their signals.
-        std: See `Completion`, and so for the others.
-        estimated: See there.
-        method: See there.
-        mask: See there.
-        label: See there.
+        std: Expected error of every element [unit], shape (size,); see `Estimate`.
+        estimated: Whether each element is estimated, shape (size,).
+        method: Signal -> method.
+        mask: Signal -> mask.
+        label: Signal -> mask as text.
     """
 
     steps: tuple[tuple[str, Mask, np.ndarray, tuple[str, ...]], ...]
@@ -110,6 +88,20 @@ class Recipe:
         return cls(tuple(steps), std, estimated, {name: of_signal[name][0] for name in slices}, masks, labels)
 
 
+class Completion(NamedTuple):
+    """A completed sample in one array.
+
+    Attributes:
+        value: Every element [its unit], shape (size,).
+        residual: Signal -> residual; see `Estimate`.
+        recipe: Everything that is known of it without its values.
+    """
+
+    value: np.ndarray
+    residual: dict[str, float]
+    recipe: Recipe
+
+
 def recipes(schema: BodySchema) -> ByPattern[Recipe]:
     """Return the recipes of a schema, by the finite elements of a sample."""
     return ByPattern(partial(Recipe.of, schema))
@@ -132,11 +124,11 @@ def estimate(schema: BodySchema, values: Mapping[str, np.ndarray]) -> dict[str, 
     joined.setflags(write=False)
     if joined.ndim == 2:
         return _batch(schema, [fill(schema, row) for row in joined])
-    completion = fill(schema, joined)
+    value, residual, recipe = fill(schema, joined)
     return {
         name: Estimate(
-            completion.value[span], completion.std[span], completion.estimated[span],
-            completion.method[name], completion.mask[name], completion.residual[name],
+            value[span], recipe.std[span], recipe.estimated[span],
+            recipe.method[name], recipe.mask[name], residual[name],
         )
         for name, span in schema.layout.slices.items()
     }  # fmt: skip
@@ -145,15 +137,14 @@ def estimate(schema: BodySchema, values: Mapping[str, np.ndarray]) -> dict[str, 
 def _batch(schema: BodySchema, samples: list[Completion]) -> dict[str, Estimate]:
     """Return the estimates of several samples, each attribute with a row per sample."""
     size = schema.layout.size
-    value, std, estimated = (
-        np.array([getattr(sample, name) for sample in samples]).reshape(-1, size)
-        for name in ("value", "std", "estimated")
-    )
+    value = np.array([sample.value for sample in samples]).reshape(-1, size)
+    std = np.array([sample.recipe.std for sample in samples]).reshape(-1, size)
+    estimated = np.array([sample.recipe.estimated for sample in samples], bool).reshape(-1, size)
     estimates = {}
     for name, span in schema.layout.slices.items():
         mask = np.empty(len(samples), object)
-        mask[:] = [sample.mask[name] for sample in samples]
-        method = np.array([sample.method[name] for sample in samples], object)
+        mask[:] = [sample.recipe.mask[name] for sample in samples]
+        method = np.array([sample.recipe.method[name] for sample in samples], object)
         residual = np.array([sample.residual[name] for sample in samples], float)
         estimates[name] = Estimate(value[:, span], std[:, span], estimated[:, span], method, mask, residual)
     return estimates
@@ -174,7 +165,7 @@ def fill(schema: BodySchema, joined: np.ndarray) -> Completion:
             np.copyto(value, prediction, where=missing)
         for name in names:
             residual[name] = error
-    return Completion(value, recipe.std, recipe.estimated, recipe.method, recipe.mask, recipe.label, residual)
+    return Completion(value, residual, recipe)
 
 
 def _route(schema: BodySchema, name: str, whole: Mask, finite: np.ndarray) -> tuple[str, Mask]:

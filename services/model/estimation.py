@@ -179,15 +179,16 @@ class Estimation:
 
 
 def _estimates(schema: BodySchema, values: Numbers, stamp_ns: int, cycle: int) -> Estimates:
-    found, elements = fill(schema, values.flat), values.elements
+    value, residual, recipe = fill(schema, values.flat)
+    elements = values.elements
     return Estimates(
         stamp_ns=stamp_ns,
         cycle=cycle,
         elements=elements,
-        values=Numbers(found.value, elements),
-        estimated=Truths(found.estimated, elements),
-        std=Numbers(found.std, elements),
-        method=dict(found.method),
-        mask=dict(found.label),
-        residual=found.residual,
+        values=Numbers(value, elements),
+        estimated=Truths(recipe.estimated, elements),
+        std=Numbers(recipe.std, elements),
+        method=dict(recipe.method),
+        mask=dict(recipe.label),
+        residual=residual,
     )

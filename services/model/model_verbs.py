@@ -221,8 +221,8 @@ class ModelVerbs:
 def _estimates(schema: BodySchema, values: Mapping[str, np.ndarray]) -> dict[str, dict[str, Any]]:
     joined = schema.layout.join_one(values)
     joined.setflags(write=False)
-    found = fill(schema, joined)
-    value, std, estimated = found.value.tolist(), found.std.tolist(), found.estimated.tolist()
+    completion, residual, recipe = fill(schema, joined)
+    value, std, estimated = completion.tolist(), recipe.std.tolist(), recipe.estimated.tolist()
     return {
         signal.name: {
             "signal": signal.name,
@@ -231,9 +231,9 @@ def _estimates(schema: BodySchema, values: Mapping[str, np.ndarray]) -> dict[str
             "values": value[span],
             "std": std[span],
             "estimated": estimated[span],
-            "method": found.method[signal.name],
-            "mask": found.label[signal.name],
-            "residual": found.residual[signal.name],
+            "method": recipe.method[signal.name],
+            "mask": recipe.label[signal.name],
+            "residual": residual[signal.name],
         }
         for signal, span in zip(schema.layout.signals, schema.layout.slices.values(), strict=True)
     }
