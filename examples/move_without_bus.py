@@ -6,12 +6,11 @@ python examples/move_without_bus.py
 from itertools import islice
 from pathlib import Path
 
-from hal import registry
-from hal.config import load_robot
+from hal import load_object, load_robot
 
 config = load_robot(Path(__file__).parents[1] / "robots" / "musashi_arm.yaml")
-motion = registry.load(config.collect["motion"])(config, seed=0)
-with registry.load(config.simulator).direct(config, "geometric", seed=0) as robot:
+motion = load_object(config.collect["motion"])(config, seed=0)
+with load_object(config.simulator).direct(config, "geometric", seed=0) as robot:
     deadline = robot.clock.monotonic()
     sample, _ = robot.cycle()
     robot.enable()

@@ -42,7 +42,7 @@ def function_of(config: RobotConfig, signal: str) -> Callable[[np.ndarray], np.n
     settings: dict[str, Any] = {
         key: np.array(value, float) if isinstance(value, list) else value for key, value in computed.settings.items()
     }
-    function: Callable[[np.ndarray], np.ndarray] = partial(registry.load(computed.by), **settings)
+    function: Callable[[np.ndarray], np.ndarray] = partial(registry.load_object(computed.by), **settings)
     where = f"signals.{signal}.computed of '{config.robot}'"
     size = config.signals[computed.inputs].size
     try:

@@ -6,16 +6,127 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import yaml
-from pydantic import Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from hal.errors import ConfigError
-from hal.limit_config import CommandConfig, LimitConfig, RangeConfig, StopConfig
-from hal.section import Finite, Positive, Rate, Section, explain
 
-__all__ = [
-    "BusConfig", "CommandConfig", "ComputedConfig", "DeviceConfig", "Finite", "KindConfig", "LimitConfig", "Positive",
-    "RangeConfig", "RatesConfig", "RobotConfig", "Section", "SignalConfig", "StopConfig", "explain", "load_robot",
-]  # fmt: skip
+
+class Section(BaseModel):
+    """A part of the robot file: frozen, and without room for a misspelt key."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Rate = Annotated[float, Field(gt=0, le=10_000, allow_inf_nan=False)]
+"""Ticks per second [Hz], and no more than a loop in Python could ever do."""
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+
+def per_element(value: float | tuple[float, ...] | None, size: int, where: str, default: float = np.nan) -> np.ndarray:
+    """One value per element, shape (size,), of one for all or one for each; `default` where nothing is stated.
+
+    Raises:
+        ValueError: Another number of values.
+    """
+    array = np.asarray(default if value is None else value, float)
+    if array.ndim and array.shape != (size,):
+        raise ValueError(f"{where} has {array.size} values, the signal has {size}.")
+    return np.broadcast_to(array, (size,)).copy()
+
+
+class RangeConfig(Section):
+    """Bounds of one signal, per element or one for all."""
+
+    low: Finite | tuple[Finite, ...] | None = None
+    high: Finite | tuple[Finite, ...] | None = None
+
+    def bounds(self, size: int, where: str) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest value, each of shape (size,); infinite where not stated.
+
+        Args:
+            size: How many elements the signal has.
+            where: Named in what is raised.
+
+        Raises:
+            ValueError: Another number of values, or low is not below high.
+        """
+        low = per_element(self.low, size, f"{where}.low", -np.inf)
+        high = per_element(self.high, size, f"{where}.high", np.inf)
+        if np.any(low >= high):
+            raise ValueError(f"{where}: low must be below high in every element.")
+        return low, high
+
+
+class LimitConfig(RangeConfig):
+    """What of a signal is allowed, per element or one for all. For a command: what may be applied."""
+
+    rate: Positive | tuple[Positive, ...] | None = None
+    """Largest change of a command [unit/s]: of a position its velocity, of a velocity its acceleration."""
+    acceleration: Positive | tuple[Positive, ...] | None = None
+    """Largest change of that rate [unit/s^2], for commanded positions."""
+    soft_high: Positive | tuple[Positive, ...] | None = None
+    """Measured load above which the command is relaxed: tension of a muscle, effort of a drive in either direction."""
+    trip_low: Finite | tuple[Finite, ...] | None = None
+    """Measured value below which the robot stops and disables, such as the tension of a slack muscle."""
+    trip_high: Finite | tuple[Finite, ...] | None = None
+    """Measured value above which the robot stops and disables."""
+
+    def check(self, size: int, where: str, is_commanded: bool) -> None:
+        """Whether the limits of a signal of `size` elements fit each other.
+
+        Raises:
+            ValueError: They do not.
+        """
+        self.bounds(size, where)
+        ladder = [
+            (label, per_element(getattr(self, label), size, f"{where}.{label}"))
+            for label in ("trip_low", "low", "high", "soft_high", "trip_high")
+        ]
+        for index, (lower, below) in enumerate(ladder):
+            for upper, above in ladder[index + 1 :]:
+                if (lower, upper) != ("high", "soft_high") and np.any(below >= above):
+                    raise ValueError(f"{where}: {lower} must be below {upper}.")
+        for label in ("rate", "acceleration"):
+            per_element(getattr(self, label), size, f"{where}.{label}")
+            if getattr(self, label) is not None and not is_commanded:
+                raise ValueError(f"{where}.{label} is of a command, but this signal is not the commanded one.")
+
+    @property
+    def is_watched(self) -> bool:
+        """Whether the HAL has to see the signal."""
+        return any(value is not None for value in (self.soft_high, self.trip_low, self.trip_high))
+
+
+class CommandConfig(Section):
+    """Which signal is commanded, how long a command lives, and what happens when none comes."""
+
+    signal: str
+    time_to_live: Annotated[float, Field(gt=0, le=10)] = 0.1
+    """Age [s] of a command beyond which it is not followed any more."""
+    hold: Annotated[float, Field(ge=0)] = 1.0
+    """How long [s] the last applied command is held before the robot stops; how long a stop holds or damps."""
+
+
+class StopConfig(Section):
+    """What the robot does when it is asked to stop, or when no command comes any more."""
+
+    behaviour: Literal["hold", "damp", "park", "off"] = "hold"
+    """`hold` its place for `command.hold` and let go; `damp` its motion for as long and let go; `park`: move slowly to
+    a safe posture and let go; `off`: let go at once."""
+    park: tuple[Finite, ...] | None = None
+    """The safe posture [unit of the commanded signal]."""
+    speed: Positive | None = None
+    """Highest speed on the way there [unit/s]."""
+
+    @model_validator(mode="after")
+    def _says_where(self) -> "StopConfig":
+        parks = self.behaviour == "park"
+        if parks and (self.park is None or self.speed is None):
+            raise ValueError("to park, say where (`park`, a value per element) and how fast (`speed`).")
+        if not parks and (self.park is not None or self.speed is not None):
+            raise ValueError(f"`park` and `speed` are for the behaviour park, not for '{self.behaviour}'.")
+        return self
 
 
 class ComputedConfig(Section):
@@ -261,3 +372,29 @@ def _beside(path: Path) -> str:
     beside = path.parent.glob("*.yaml") if path.parent.is_dir() else ()
     found = sorted(str(other) for other in beside if "." not in other.stem)  # x.calibration.yaml is no robot file
     return f"Robot files there: {', '.join(found)}." if found else f"Is '{path.parent}' the right folder?"
+
+
+def explain(error: ValidationError, model: type[BaseModel]) -> str:
+    """One problem in one sentence: an unknown key, with the keys that are known there, or else the first."""
+    problems = error.errors()
+    first = next((problem for problem in problems if problem["type"] == "extra_forbidden"), problems[0])
+    where = ".".join(str(part) for part in first["loc"])
+    if first["type"] == "extra_forbidden":
+        fields = _model_at(model, first["loc"][:-1]).model_fields
+        known = ", ".join(field.alias or name for name, field in fields.items())
+        return f"unknown key '{where}'. Known keys there: {known}."
+    message = first["msg"].removeprefix("Value error, ")
+    more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
+    sentence = f"{message.removesuffix('.')}{more}"
+    return f"{where + ': ' if where else ''}{sentence}{'' if sentence.endswith('?') else '.'}"
+
+
+def _model_at(model: type[BaseModel], location: tuple[int | str, ...]) -> type[BaseModel]:
+    for part in location:
+        field = model.model_fields.get(str(part))
+        if field is None:
+            continue  # a name inside a mapping, such as the device's
+        inner = [field.annotation, *getattr(field.annotation, "__args__", ())]
+        models = [kind for kind in inner if isinstance(kind, type) and issubclass(kind, BaseModel)]
+        model = models[0] if models else model
+    return model

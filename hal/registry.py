@@ -21,8 +21,8 @@ DRIVERS = {
 }
 
 
-def load(name: str) -> Any:
-    """The object that `module:name` stands for.
+def load_object(name: str) -> Any:
+    """Import and return the object that `module:name` stands for.
 
     Raises:
         ConfigError: The name is malformed, or there is no such module or no such object in it.
@@ -48,10 +48,10 @@ def driver(name: str) -> Any:
         ConfigError: Unknown.
     """
     if ":" in name:
-        return load(name)
+        return load_object(name)
     if name not in DRIVERS:
         raise ConfigError(f"There is no driver '{name}'. Known: {', '.join(DRIVERS)}, or 'module:name' of your own.")
-    return load(DRIVERS[name])
+    return load_object(DRIVERS[name])
 
 
 def equipment(config: RobotConfig, device: str, measured: Mapping[str, Any] | None = None) -> tuple[Any, Any]:

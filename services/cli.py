@@ -295,7 +295,7 @@ def reproduce(
     from hal import registry
     from services.show import progress
 
-    run = registry.load("studies.paper:experiment")(robot)  # by name: studies stand above services
+    run = registry.load_object("studies.paper:experiment")(robot)  # by name: studies stand above services
     with progress(f"reproduce {robot}") as tell:
         report = run(range(seeds), out / robot, tell, fresh)
     report.save(out / robot)

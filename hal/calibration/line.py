@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from hal.config import Section
 from hal.errors import HalError
-from hal.section import Section
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,9 +17,8 @@ from pydantic import ValidationError
 
 from hal import registry
 from hal.calibration.line import Calibration, Point
-from hal.config import RobotConfig
+from hal.config import RobotConfig, Section, explain
 from hal.errors import ConfigError
-from hal.section import Section, explain
 
 SIMULATED = ("hub", "virtual")
 """Interfaces behind which there is nothing to be calibrated."""

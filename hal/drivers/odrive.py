@@ -9,11 +9,11 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
+from hal.config import Positive
 from hal.drivers.can_device import Place
 from hal.drivers.dbc.servo import DbcServo
 from hal.drivers.dbc.settings import ServoSettings
 from hal.errors import ConfigError
-from hal.section import Positive
 
 COMMAND_BITS = 5
 """An identifier is the node id before so many bits of the command."""

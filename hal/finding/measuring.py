@@ -14,12 +14,11 @@ from hal.calibration import store
 from hal.calibration.line import CalibrationRefused, Line
 from hal.calibration.store import Point, Record
 from hal.clock import SystemClock
-from hal.config import RobotConfig
+from hal.config import LimitConfig, RobotConfig
 from hal.device import DeviceState
 from hal.errors import ConfigError, DeviceSilent
-from hal.finding.pulse import pulse
 from hal.fleet import build
-from hal.limit_config import LimitConfig
+from hal.wire.pulse import pulse
 
 TRIES = 3
 SETTLE = 10

@@ -4,13 +4,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hal.config import LimitConfig, RobotConfig
+from hal.config import LimitConfig, RobotConfig, per_element
 from hal.device import Device
-from hal.limit_config import per_element
 from hal.safety import roles
 from hal.safety.ends import RESPONSE, EndsOfEffort, EndsOfVelocity
-from hal.safety.limit import Arrays, Limit, Turn
-from hal.safety.motion import Acceleration, Range, Rate
+from hal.safety.limit import Acceleration, Arrays, Limit, Range, Rate, Turn
 from hal.safety.soft_effort import Load, SoftEffort, SoftEffortOfEffort, SoftEffortOfVelocity
 from hal.safety.trips import Trips
 

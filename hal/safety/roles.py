@@ -4,10 +4,9 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from hal.config import RobotConfig
+from hal.config import RobotConfig, per_element
 from hal.device import Device
 from hal.errors import ConfigError
-from hal.limit_config import per_element
 from hal.safety.ends import Way
 from hal.safety.soft_effort import Load
 

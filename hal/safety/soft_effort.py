@@ -5,8 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hal.safety.limit import Arrays, Turn, changed
-from hal.safety.motion import fastest
+from hal.safety.limit import Arrays, Turn, changed, fastest
 
 SOFT_BAND = 0.1
 """Part of `soft_high` below it within which the command is slowed down, so that it comes to rest at the limit instead

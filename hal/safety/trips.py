@@ -4,8 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hal.config import RobotConfig
-from hal.limit_config import per_element
+from hal.config import RobotConfig, per_element
 from hal.safety.ends import Way
 from hal.safety.limit import Arrays
 

@@ -23,8 +23,7 @@ from hal.wire.receive import OWN_NODE, Receiver
 from hal.wire.routes import Handler
 from hal.wire.send import PATIENCE, Sender
 from hal.wire.stamps import STAMPED, WAITED, ArrivalClock, FrameClock
-from hal.wire.state import UNUSABLE, BusState, BusWatch
-from hal.wire.thread import ThreadWatch
+from hal.wire.state import UNUSABLE, BusState, BusWatch, ThreadWatch
 
 __all__ = ["OWN_NODE", "PATIENCE", "Answers", "Bus", "BusState", "Handler"]
 

@@ -76,7 +76,7 @@ def _reached(
     margin = INSIDE * (high - low)
     postures = random.uniform(low + margin, high - margin, (DRAWN, low.size))
     postures = postures[~Forecast(robot, config, condition).outside(postures).any(axis=1)]
-    forecast = registry.load(config.forecast)(robot, condition, postures)
+    forecast = registry.load_object(config.forecast)(robot, condition, postures)
     if signal not in forecast:
         raise ConfigError(f"{config.forecast} forecasts {', '.join(forecast)}; the targets are of {signal}.")
     return postures, np.asarray(forecast[signal], float)

@@ -14,8 +14,7 @@ from rich.table import Table
 from hal.config import RobotConfig, load_robot
 from hal.errors import ConfigError
 from hal.finding import doctor
-from hal.finding.findings import Finding, Verdict, bad, ok, warning
-from hal.finding.interface import interfaces
+from hal.finding.doctor import Finding, Verdict, bad, interfaces, ok, warning
 from services import show
 from services.client import Client
 from services.errors import AlreadyRunning, ServiceError

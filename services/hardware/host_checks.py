@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from hal.finding.findings import Finding, ok, warning
+from hal.finding.doctor import Finding, ok, warning
 from services.hardware.hal_service import CYCLE_PRIORITY
 
 STEADY = 1e-3

@@ -55,7 +55,7 @@ def simulator_of(robot: RobotConfig) -> Simulator:
             f"Robot '{robot.robot}' names no simulator; add `simulator: module:name` to its file. "
             "simulators.robots.bench:simulator stands in for the devices of any robot file."
         )
-    simulator: Simulator = registry.load(robot.simulator)
+    simulator: Simulator = registry.load_object(robot.simulator)
     strange = [condition for condition in robot.conditions if condition not in simulator.conditions]
     if strange:
         known = ", ".join(simulator.conditions) or "none"

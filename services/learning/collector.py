@@ -152,7 +152,7 @@ def _motion(robot: RobotConfig, config: CollectConfig, condition: str | None, se
     if request.postures is not None:
         return taught(robot, config, load_postures(request.postures, robot, config.hold))
     if config.motion is not None:
-        own = registry.load(config.motion)
+        own = registry.load_object(config.motion)
         return lambda start: own(robot, seed)
     return random_postures(robot, config, condition, seed)
 
@@ -263,7 +263,7 @@ def _joined(parts: Sequence[Collection]) -> Collection:
 def _with_states(robot: RobotConfig, config: CollectConfig, recorded: Collection, seed: int) -> Collection:
     """Return a recording with random states of the designer's geometry added, in episodes of the same length."""
     count = max(1, round(config.states_share * len(recorded.dataset)))
-    states = registry.load(config.states or "")(robot, count, seed)
+    states = registry.load_object(config.states or "")(robot, count, seed)
     condition = recorded.dataset.conditions[0]
     parts = np.split(np.arange(count), range(round(EPISODE * config.rate), count, round(EPISODE * config.rate)))
     added = tuple(Episode(condition, {name: rows[part] for name, rows in states.items()}) for part in parts)

@@ -48,7 +48,7 @@ class Forecast:
         if not self._signals:
             return
         name = str(config.forecast)
-        self._model = partial(registry.load(name), robot, condition)
+        self._model = partial(registry.load_object(name), robot, condition)
         low, _ = robot.bounds(robot.command.signal)
         forecast = self._model(np.zeros((1, low.size)))
         for signal in self._signals:

@@ -76,7 +76,7 @@ class TermConfig(Section):
         kind = next(kind for kind in KINDS if getattr(self, kind) is not None)
         options = {name: getattr(self, name) for name in KINDS[kind] if getattr(self, name) is not None}
         if kind == "torque_balance":
-            return TorqueBalance(registry.load(str(self.torque_balance)), **options)
+            return TorqueBalance(registry.load_object(str(self.torque_balance)), **options)
         made: type[Match | StayNear | StaySmall | Hold]
         made = {"match": Match, "stay_near": StayNear, "stay_small": StaySmall, "hold": Hold}[kind]
         return made(getattr(self, kind), **options)

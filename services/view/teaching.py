@@ -16,8 +16,8 @@ import numpy as np
 
 from gemuco.errors import SchemaError
 from hal.clock import Clock, SystemClock
+from hal.config import per_element
 from hal.errors import HalError
-from hal.limit_config import per_element
 from services.client import Client
 from services.errors import ServiceError
 from services.process.loop import Loop

@@ -23,7 +23,7 @@ def motion(
 ) -> Iterator[Mapping[str, np.ndarray]]:
     """Yield samples [unit] at a rate [Hz] of random motion that lasts `duration` [s of the arm's time]."""
     playground = DirectPlayground(body, rate)
-    for command, hold in registry.load(robot.collect["motion"])(robot, seed):
+    for command, hold in registry.load_object(robot.collect["motion"])(robot, seed):
         yield from playground.play(command, hold)
         if playground.elapsed() > duration:
             return
@@ -33,7 +33,7 @@ def record(
     robot: RobotConfig, arm: int, seed: int, rate: float, duration: float, part: str = ""
 ) -> dict[str, np.ndarray]:
     """Return signal -> samples (count, n) [unit] of one actual arm."""
-    world = registry.load(robot.simulator or "").world("actual", arm)
+    world = registry.load_object(robot.simulator or "").world("actual", arm)
     if part:
         world.break_part(part)
     clock = WorldClock(world)

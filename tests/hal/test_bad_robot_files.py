@@ -12,10 +12,9 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from hal.clock import ManualClock
-from hal.config import RobotConfig, load_robot
+from hal.config import RobotConfig, explain, load_robot
 from hal.errors import CommandRefused, ConfigError, HalError
 from hal.robot import open_robot
-from hal.section import explain
 
 
 def refused(body, tmp_path):

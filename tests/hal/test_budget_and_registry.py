@@ -54,7 +54,7 @@ def test_finds_drivers_by_name_and_by_module():
 )
 def test_names_that_stand_for_nothing(name, told):
     with pytest.raises(ConfigError, match=told):
-        registry.load(name)
+        registry.load_object(name)
 
 
 def test_an_unknown_driver_lists_the_known():

@@ -212,7 +212,7 @@ def test_filters_let_in_what_is_wanted_and_what_tells_of_strangers():
 
 
 def test_a_stuck_interface_makes_the_bus_gone_though_nothing_is_raised(tmp_path, monkeypatch):
-    monkeypatch.setattr("hal.wire.thread.HANGS", 0.2)
+    monkeypatch.setattr("hal.wire.state.HANGS", 0.2)
     bus = Bus("can0", BusConfig(interface="virtual", channel=str(tmp_path)), ManualClock())
     release = threading.Event()
     bus.subscribe(0x181, lambda data, received: release.wait(10.0))

@@ -11,7 +11,7 @@ from hal.clock import ManualClock, SystemClock
 from hal.config import BusConfig
 from hal.wire.bus import Bus
 from hal.wire.stamps import DOUBT, FrameClock
-from hal.wire.thread import FROZEN
+from hal.wire.state import FROZEN
 
 DELAY = 0.0003
 LIMIT = 10.0

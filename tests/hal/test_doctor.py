@@ -10,8 +10,7 @@ from hal.calibration import store
 from hal.calibration.store import Point, Record
 from hal.config import BusConfig, RobotConfig
 from hal.finding import doctor
-from hal.finding.findings import Verdict
-from hal.finding.interface import interfaces, socketcan
+from hal.finding.doctor import Verdict, interfaces, socketcan
 from hal.finding.link import Link, look_up, parse
 from simulators.rig import Rig
 

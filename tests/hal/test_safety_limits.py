@@ -6,8 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hal.safety.ends import EndsOfEffort, EndsOfVelocity, Way
-from hal.safety.limit import Turn
-from hal.safety.motion import Acceleration, Range, Rate, fastest
+from hal.safety.limit import Acceleration, Range, Rate, Turn, fastest
 from hal.safety.soft_effort import Load, SoftEffort, SoftEffortOfEffort, SoftEffortOfVelocity
 
 PERIOD = 0.005

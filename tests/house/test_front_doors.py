@@ -13,11 +13,10 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 DOORS = ("gemuco", "hal", "services")
-CLOSED = {"hal", "services"}
+CLOSED = {"services"}
 """Packages that export no names yet; a line may only be deleted."""
 INSIDE = {
     "docs/tutorial.md",
-    "examples/move_without_bus.py",
     "examples/plot_estimates.py",
     "examples/publish_marker.py",
     "examples/watch_estimates.py",

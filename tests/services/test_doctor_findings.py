@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from hal.finding.findings import Verdict
+from hal.finding.doctor import Verdict
 from services.hardware import doctor, host_checks
 from services.security.init import init, placed
 from services.security.plan import Plan

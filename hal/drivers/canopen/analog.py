@@ -10,13 +10,13 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field
 
 from hal.commissioning.pdo_map import Pdo, PdoMap, lay_out
+from hal.config import Finite, Positive
 from hal.device import DeviceState
 from hal.drivers.can_device import Place
 from hal.drivers.canopen.node import HEARTBEAT, CanopenNode, NodeSettings, Taker, data_sheet
 from hal.errors import CommandRefused, ConfigError, DeviceRefused, HalError
 from hal.protocols import analog, cia301
 from hal.protocols.cia301 import Mapped
-from hal.section import Finite, Positive
 
 
 def _differ(values: tuple[int, ...]) -> tuple[int, ...]:

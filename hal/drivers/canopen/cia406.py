@@ -4,13 +4,13 @@ import math
 from typing import Any, Literal
 
 from hal.commissioning.pdo_map import Pdo, PdoMap, lay_out
+from hal.config import Finite, Positive
 from hal.device import DeviceState
 from hal.drivers.can_device import Place
 from hal.drivers.canopen.node import HEARTBEAT, CanopenNode, NodeSettings, Taker, data_sheet
 from hal.errors import DeviceRefused
 from hal.protocols import cia406
 from hal.protocols.cia301 import PDO_SIZE, Mapped
-from hal.section import Finite, Positive
 
 _SPEED_END = 2**15 - 1
 

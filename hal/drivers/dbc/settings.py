@@ -5,8 +5,8 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
+from hal.config import Finite, Positive, Section
 from hal.drivers.can_device import DeviceSettings
-from hal.section import Finite, Positive, Section
 
 
 def _no_switch(value: Any) -> Any:

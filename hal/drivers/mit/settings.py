@@ -4,11 +4,11 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from hal.config import Finite, Positive, Section
 from hal.drivers.can_device import DeviceSettings
 from hal.errors import ConfigError
 from hal.protocols import mit_motors
 from hal.protocols.mit import Layout, Ranges
-from hal.section import Finite, Positive, Section
 
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 

@@ -33,13 +33,13 @@ class Standing(Body):
 
 def designed(robot: RobotConfig, condition: str) -> Model:
     """Return the designer's model with its deflection: the robot file's `collect.forecast`."""
-    model: Model = partial(registry.load(str(collect_config(robot).forecast)), robot, condition)
+    model: Model = partial(registry.load_object(str(collect_config(robot).forecast)), robot, condition)
     return model
 
 
 def stiff(robot: RobotConfig, condition: str) -> Model:
     """Return the designer's geometry without deflection."""
-    model: Model = partial(registry.load(str(robot.simulator)).geometric, condition)
+    model: Model = partial(registry.load_object(str(robot.simulator)).geometric, condition)
     return model
 
 

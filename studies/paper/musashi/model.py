@@ -27,7 +27,7 @@ CONSTANTS = np.geomspace(1.0, 2000.0, 400)
 
 def geometric_data(robot: RobotConfig, seed: int) -> Dataset:
     """Draw random states of the designer's model, in episodes of independent samples."""
-    states = registry.load(robot.collect["states"])(robot, SAMPLES, seed)
+    states = registry.load_object(robot.collect["states"])(robot, SAMPLES, seed)
     parts = np.split(np.arange(SAMPLES), range(EPISODE, SAMPLES, EPISODE))
     episodes = tuple(Episode("geometric", {name: rows[part] for name, rows in states.items()}) for part in parts)
     return Dataset(layout_of(robot), episodes)

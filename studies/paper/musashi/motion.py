@@ -95,7 +95,7 @@ def record(
     rows: list[dict[str, np.ndarray]] = []
     left = list(parts)
     with ActualArm(robot, arm) as body:
-        for command, hold in registry.load(robot.collect["motion"])(robot, seed):
+        for command, hold in registry.load_object(robot.collect["motion"])(robot, seed):
             while left and body.elapsed() >= left[0][0]:
                 body.break_part(left.pop(0)[1])
             if body.elapsed() >= duration:

@@ -33,7 +33,7 @@ def losses(robot: RobotConfig) -> dict[str, Sequence[Term | Hold]]:
     paper = (
         Match(LENGTH),
         StaySmall(TENSION, 0.1),
-        TorqueBalance(registry.load(GRAVITY), 0.001, at="predicted"),
+        TorqueBalance(registry.load_object(GRAVITY), 0.001, at="predicted"),
     )
     return {OURS: terms_of(model_config(robot).simulation), PAPER: paper}
 
@@ -82,7 +82,7 @@ def forced(robot: RobotConfig, schema: BodySchema) -> dict[str, dict[str, np.nda
     if control is None:
         raise ValueError(f"Robot '{robot.robot}' has no `model.control` in its file.")
     sent = controller_of(schema, robot, control).solve({POSITION: BENT}).command
-    gravity, pushed = registry.load(GRAVITY), registry.load(FORCE)
+    gravity, pushed = registry.load_object(GRAVITY), registry.load_object(FORCE)
     terms = losses(robot)[OURS]
     keep = [term for term in terms if not isinstance(term, TorqueBalance)]
     weight = next(term.weight for term in terms if isinstance(term, TorqueBalance))

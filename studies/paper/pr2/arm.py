@@ -39,7 +39,7 @@ class Geometry:
 
     def __init__(self, robot: RobotConfig) -> None:
         self._robot = robot
-        self._forecast = registry.load(str(collect_config(robot).forecast))
+        self._forecast = registry.load_object(str(collect_config(robot).forecast))
         self.low, self.high = robot.bounds(JOINTS)
 
     def tips(self, condition: str, postures: np.ndarray) -> np.ndarray:
