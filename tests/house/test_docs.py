@@ -11,6 +11,7 @@ import typer
 import yaml
 
 import gemuco
+import hal
 from services.cli import app
 
 ROOT = Path(__file__).parents[2]
@@ -57,10 +58,11 @@ def anchors(page: Path) -> set[str]:
     return {re.sub(r"[^\w -]", "", heading.lower()).strip().replace(" ", "-") for heading in headings}
 
 
-@pytest.mark.parametrize("package", [gemuco], ids=lambda package: package.__name__)
+@pytest.mark.parametrize("package", [gemuco, hal], ids=lambda package: package.__name__)
 def test_reference_lists_every_exported_name(package: ModuleType) -> None:
     page = (ROOT / "docs" / f"api_{package.__name__}.md").read_text()
-    assert set(re.findall(rf"^::: {package.__name__}\.(\w+)$", page, re.MULTILINE)) == set(package.__all__)
+    listed = set(re.findall(rf"^::: {package.__name__}\.(\w+)$", page, re.MULTILINE))
+    assert listed == set(package.__all__), "a name has one line ':::' on this page"
 
 
 def test_every_test_that_safety_names_exists() -> None:
