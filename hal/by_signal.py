@@ -20,16 +20,14 @@ class Elements:
         counts: Signal -> how many elements, at least one.
         places: Signal -> where they lie.
         size: How many there are in all.
-        wire: Room for what a message has of it, so that it is made once.
     """
 
-    __slots__ = ("counts", "places", "size", "wire")
+    __slots__ = ("_hash", "counts", "places", "size")
     _known: ClassVar[dict[tuple[object, ...], "Elements"]] = {}
 
     def __init__(self, counts: Mapping[str, float]) -> None:
         self.counts: dict[str, int] = {}
         self.places: dict[str, slice] = {}
-        self.wire: object = None
         start = 0
         for name, count in counts.items():
             if not isinstance(name, str) or not isinstance(count, int | float) or not count >= 1 or count % 1:
@@ -38,12 +36,13 @@ class Elements:
             self.places[name] = slice(start, start + int(count))
             start += int(count)
         self.size = start
+        self._hash = hash(tuple(self.counts.items()))
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Elements) and list(self.counts.items()) == list(other.counts.items())
 
     def __hash__(self) -> int:
-        return hash(tuple(self.counts.items()))
+        return self._hash
 
     def __repr__(self) -> str:
         return f"Elements({self.counts})"

@@ -118,30 +118,9 @@ class HalService:
         self._cycles.note(sample.cycle, began)
         if applied.mode not in TAKES_COMMANDS:
             self._lease.end_stream()
-        self._samples.put(
-            messages.Sample(
-                stamp_ns=sample.stamp_ns,
-                cycle=sample.cycle,
-                source=sample.source,
-                complete=sample.complete,
-                elements=sample.values.elements,
-                values=sample.values,
-                age=sample.age,
-                valid=sample.valid,
-            )
-        )
-        self._applied.put(
-            messages.Applied(
-                stamp_ns=applied.stamp_ns,
-                cycle=applied.cycle,
-                mode=applied.mode,
-                signal=applied.signal,
-                desired=applied.desired,
-                values=applied.values,
-                limited_by=applied.limited_by,
-                sender=self._commands.sender if applied.mode == "follow" else 0,
-            )
-        )
+        self._samples.put(messages.Sample.of(sample, elements=sample.values.elements))
+        sender = self._commands.sender if applied.mode == "follow" else 0
+        self._applied.put(messages.Applied.of(applied, sender=sender))
 
     def status(self) -> Status:
         """Health of the robot and of the loop."""

@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 from msgspec.structs import force_setattr
 
+from hal.by_signal import KEPT, Elements
 from services.errors import ServiceError
 from services.wire.plain_text import plain, shown
 from services.wire.records import (
@@ -72,6 +73,8 @@ def _read(_: Any, value: Any) -> np.ndarray:
 
 
 _NUMBER = Numbers.DTYPE
+_packed_before: dict[Elements, msgspec.Raw] = {}
+"""Elements in their wire form, each packed once."""
 _to_bytes = msgspec.msgpack.Encoder(enc_hook=_packed).encode
 _readers: dict[type[Message], Decode] = {
     record: msgspec.msgpack.Decoder(record, dec_hook=_read).decode for record in RECORDS.values()
@@ -97,9 +100,12 @@ def encode(message: Message, **header: int) -> bytes:
 def _flatten(message: OfSignals) -> None:
     """Put what the wire has in place of what it stands for; quicker than a hook of msgspec for each."""
     elements = message.elements
-    if elements.wire is None:
-        elements.wire = msgspec.Raw(_to_bytes(elements.counts))
-    force_setattr(message, "elements", elements.wire)
+    packed = _packed_before.get(elements)
+    if packed is None:
+        if len(_packed_before) >= KEPT:
+            _packed_before.clear()
+        packed = _packed_before[elements] = msgspec.Raw(_to_bytes(elements.counts))
+    force_setattr(message, "elements", packed)
     for name, _, dtype, _ in message.parts:
         flat = getattr(message, name).flat
         if flat.dtype is not dtype:

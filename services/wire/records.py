@@ -1,6 +1,6 @@
 """What travels between the processes, as typed records; `services.wire.messages` puts them on the wire."""
 
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import msgspec
 import numpy as np
@@ -17,6 +17,8 @@ __all__ = [
 
 Array = NDArray[np.float64]
 if TYPE_CHECKING:
+    import hal
+
     WireElements = Elements
     WireNumbers = Numbers
     WireTruths = Truths
@@ -40,6 +42,11 @@ class Message(msgspec.Struct, frozen=True, kw_only=True, tag_field="type", tag=s
     stamp_ns: int = 0
     seq: int = 0
     boot: int = 0
+
+    @classmethod
+    def of(cls, record: "hal.Sample | hal.Applied", **more: Any) -> Self:
+        """Make the message of a record of the HAL, whose fields have the same names; `more` are the others."""
+        return cls(**{name: getattr(record, name) for name in record.__slots__}, **more)
 
 
 class OfSignals(Message, frozen=True, kw_only=True):
