@@ -21,9 +21,7 @@ from simulators.world import World
 _log = logging.getLogger(__name__)
 
 PERIOD = 0.005
-"""The physics thread has this step [s]; half of it costs a few percent of a core more
-(studies/bus/simulated_nodes.py).
-"""
+"""The physics thread has this step [s]; half of it costs a few percent of a core more."""
 _SWITCH_INTERVAL = 5e-4
 """A Python thread keeps the others waiting at most this long [s]; the default delays answers to SYNC by 5 ms."""
 
