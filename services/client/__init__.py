@@ -1,4 +1,4 @@
-"""A robot seen from another process: `Client` reads what is newest and asks its services."""
+"""Client of a robot in another process: it reads the newest messages and queries services."""
 
 from services.client.client import SLOW_TIMEOUT, Client
 

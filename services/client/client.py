@@ -1,44 +1,60 @@
 """A remote client in ten lines: read the newest of everything, ask for what a robot can do."""
 
 import time
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from types import TracebackType
+from typing import Any, Self, TypeVar
 
 import numpy as np
+import zenoh
 
 from hal.by_signal import Elements, Numbers, Truths
 from services.client import description
-from services.client.link import TIMEOUT
-from services.client.listening import Listening
-from services.client.live import FRESH
+from services.client.link import TIMEOUT, Link
+from services.client.live import DEADLINE, FRESH, FRESH_STATUS, Health, Live, LiveHealth
 from services.command.client_lease import SECONDS, ClientLease
 from services.errors import ServiceUnavailable
 from services.wire import history, keys, query
 from services.wire.history import History
-from services.wire.messages import Anomaly, Command, Estimates, Sample, Target
+from services.wire.messages import (
+    Anomaly,
+    Applied,
+    Command,
+    Estimates,
+    Holder,
+    Message,
+    Sample,
+    Status,
+    Target,
+    Update,
+)  # fmt: skip
+from services.wire.streams import Reader
+
+M = TypeVar("M", bound=Message)
 
 SLOW_TIMEOUT = 10.0
-"""Deadline [s] of a verb that computes."""
+"""A verb that computes has this deadline [s]."""
 LONG_TIMEOUT = 60.0
-"""Deadline [s] of a verb that computes step after step, or answers with much."""
+"""A verb that computes step after step, or has a long answer, has this deadline [s]."""
 
 Values = Mapping[str, Sequence[float] | np.ndarray]
-"""Signal -> values [its unit], shape (n,)."""
+"""Values map a signal to numbers [its unit], shape (n,)."""
 
 
-class Client(Listening):
-    """Reads a robot and asks it, from any process; needs no robot file, and nothing of the robot's code.
+class Client:
+    """Client of a robot, for any process; it needs no robot file, and nothing of the robot's code.
 
         with Client("musashi_arm") as arm:
             for now in arm.estimates():
                 print(now.values["joint_position"])
 
-    Three ways to listen: `sample`, `estimate` and the like return what is newest, or None rather than something old;
-    `sensors`, `estimates`, `anomalies` and `health` go on for ever and raise when nothing comes; verbs ask a service.
+    There are three ways to read: `sample`, `estimate` and the like return the newest message, or None rather than an
+    old one; `sensors`, `estimates`, `anomalies` and `health` iterate without end and raise when nothing comes; verbs
+    query a service.
 
-    Every call ends: verbs and iterators have deadlines. A verb raises what the service raised, as it would be raised
-    there. Nobody there is `ServiceUnavailable`; a role that may not is `NotAllowed`; another version of the wire format
-    is `WrongVersion`; somebody there who does not answer in time is `TooSlow`.
+    Every call ends: verbs and iterators have deadlines. A verb raises the error of the service, of the same class.
+    Without a service it is `ServiceUnavailable`; a role without the right gets `NotAllowed`; another version of the
+    wire format is `WrongVersion`; a service that does not answer in time is `TooSlow`.
 
     Verbs and readers may be used from several threads, each iterator and `command` and `target` from one at a time.
     The client goes on by itself when a service or a router was away.
@@ -46,58 +62,183 @@ class Client(Listening):
     Args:
         robot: The robot's name.
         connect: A router's endpoint, or the role file for it, for a robot on another machine.
-        name: Who this is, for people; user, host and pid if not given.
+        name: Name of this client for people; user, host and pid if not given.
     """
 
+    def __init__(self, robot: str, connect: Iterable[str] = (), name: str = "") -> None:
+        self.robot = robot
+        self._link = Link(robot, connect, name)
+
+    def __enter__(self) -> Self:
+        self._link.open()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._link.close()
+
+    def close(self) -> None:
+        """End the session and its threads; a thread that waits gets an error. Safe to call twice."""
+        self._link.close()
+
+    @property
+    def session(self) -> zenoh.Session:
+        """Open zenoh session.
+
+        Raises:
+            ServiceError: The client is not open.
+        """
+        return self._link.session
+
+    @property
+    def boot(self) -> int:
+        """Number that marks the messages of this client."""
+        return self._link.boot
+
+    def alive(self) -> set[str]:
+        """Return the names of the robot's services that run now, as far as this client is connected."""
+        return self._link.alive()
+
+    def reader(self, key: str, record: type[M]) -> Reader[M]:
+        """Return the reader of a key, made at the first call.
+
+        Raises:
+            NotAllowed: This client's role may not read the key.
+        """
+        return self._link.reader(key, record)
+
+    def ask(
+        self, service: str, verb: str, arguments: Mapping[str, Any] | None = None, timeout: float = TIMEOUT
+    ) -> dict[str, Any]:
+        """Query any verb of any service, as `query.ask`.
+
+        Raises:
+            NotAllowed: This client's role may not query the verb.
+            CommandHeld: Another client commands the robot, and the verb needs the lease.
+            LeaseLost: This client's lease was lost, and the verb needs it.
+        """
+        return self._link.ask(service, verb, arguments, timeout)
+
+    # Messages: the newest, or None.
+
+    def sample(self, max_age: float = FRESH, timeout: float = 0.0) -> Sample | None:
+        """Return the newest measurement; None if none arrived in the last `max_age` [s] or within `timeout` [s]."""
+        return self._link.fresh(keys.sample(self.robot), Sample, max_age, timeout)
+
+    def next_sample(self, timeout: float = TIMEOUT) -> Sample | None:
+        """Wait for the next measurement; None if none arrives within `timeout` [s]."""
+        return self.reader(keys.sample(self.robot), Sample).wait(timeout)
+
+    def vision(self, max_age: float = FRESH, timeout: float = 0.0) -> Sample | None:
+        """Return the newest measurement of a camera, or None, as `sample`."""
+        return self._link.fresh(keys.vision(self.robot), Sample, max_age, timeout)
+
+    def applied(self, max_age: float = FRESH, timeout: float = 0.0) -> Applied | None:
+        """Return the command last sent to the drives, or None, as `sample`."""
+        return self._link.fresh(keys.applied(self.robot), Applied, max_age, timeout)
+
+    def update(self, max_age: float = 4 * FRESH, timeout: float = 0.0) -> Update | None:
+        """Return the newest state of the online update, or None, as `sample`."""
+        return self._link.fresh(keys.update(self.robot), Update, max_age, timeout)
+
+    def truth(self, max_age: float = FRESH, timeout: float = 0.0) -> Sample | None:
+        """Return the newest truth of a simulator, or None, as `sample`."""
+        return self._link.fresh(keys.truth(self.robot), Sample, max_age, timeout)
+
+    def status(self, service: str, max_age: float = FRESH_STATUS, timeout: float = 0.0) -> Status | None:
+        """Return the newest status of a service, or None, as `sample`."""
+        return self._link.fresh(keys.status(self.robot, service), Status, max_age, timeout)
+
+    def holder(self, timeout: float = TIMEOUT) -> Holder:
+        """Return the lease holder; its `name` is empty without one.
+
+        Raises:
+            ServiceUnavailable: No HAL publishes the holder.
+        """
+        key = keys.holder(self.robot)
+        holder = self._link.fresh(key, Holder, FRESH_STATUS, timeout)
+        if holder is None:
+            raise self._link.silence(self.reader(key, Holder), timeout)
+        return holder
+
     def estimate(
-        self,
-        values: Values | None = None,
-        hide: Iterable[str] = (),
-        *,
-        max_age: float = FRESH,
-        timeout: float = 0.0,
+        self, values: Values | None = None, hide: Iterable[str] = (), *, max_age: float = FRESH, timeout: float = 0.0
     ) -> Estimates | None:
-        """The newest estimate of every signal, or None; see `sample`.
+        """Return the newest estimate of every signal, or None, as `sample`.
 
         With values, or with signals to hide, the model estimates from those instead, as `gemuco.estimate` does.
         """
         hidden = list(hide)
         if values is None and not hidden:
-            return self.fresh(keys.estimate(self.robot), Estimates, max_age, timeout)
-        found = self.ask("model", "estimate", _given(values) | {"hide": hidden}, SLOW_TIMEOUT)
-        signals: dict[str, dict[str, Any]] = found["signals"]
-        elements = Elements.of({name: len(one["values"]) for name, one in signals.items()})
+            return self._link.fresh(keys.estimate(self.robot), Estimates, max_age, timeout)
+        answer = self.ask("model", "estimate", _given(values) | {"hide": hidden}, SLOW_TIMEOUT)
+        signals: dict[str, dict[str, Any]] = answer["signals"]
+        elements = Elements.of({name: len(part["values"]) for name, part in signals.items()})
         return Estimates(
-            cycle=found["cycle"],
+            cycle=answer["cycle"],
             elements=elements,
             values=Numbers(_joined(signals, "values", float), elements),
             estimated=Truths(_joined(signals, "estimated", bool), elements),
             std=Numbers(_joined(signals, "std", float), elements),
-            method={name: one["method"] for name, one in signals.items()},
-            mask={name: one["mask"] for name, one in signals.items()},
-            residual={name: one["residual"] for name, one in signals.items()},
+            method={name: part["method"] for name, part in signals.items()},
+            mask={name: part["mask"] for name, part in signals.items()},
+            residual={name: part["residual"] for name, part in signals.items()},
         )
 
     def anomaly(
-        self,
-        values: Values | None = None,
-        hide: Iterable[str] = (),
-        *,
-        max_age: float = FRESH,
-        timeout: float = 0.0,
+        self, values: Values | None = None, hide: Iterable[str] = (), *, max_age: float = FRESH, timeout: float = 0.0
     ) -> Anomaly | None:
-        """The newest anomaly score, or None; see `sample`.
+        """Return the newest anomaly score, or None, as `sample`.
 
-        With values, or with signals to hide, the model judges those instead, as `gemuco.anomaly.score` does: one sample
-        by itself, however long.
+        With values, or with signals to hide, the model judges those instead, as `gemuco.score` does, as a single
+        sample.
         """
         hidden = list(hide)
         if values is None and not hidden:
-            return self.fresh(keys.anomaly(self.robot), Anomaly, max_age, timeout)
-        found = self.ask("model", "anomaly", _given(values) | {"hide": hidden}, SLOW_TIMEOUT)
-        contribution = Numbers.of(found["contribution"])
+            return self._link.fresh(keys.anomaly(self.robot), Anomaly, max_age, timeout)
+        answer = self.ask("model", "anomaly", _given(values) | {"hide": hidden}, SLOW_TIMEOUT)
+        contribution = Numbers.of(answer["contribution"])
         names = ("cycle", "score", "threshold", "is_anomaly", "blamed")
-        return Anomaly(contribution=contribution, **{name: found[name] for name in names})
+        return Anomaly(contribution=contribution, **{name: answer[name] for name in names})
+
+    # Iterators: always the newest message.
+
+    def sensors(self, service: str = "hal", deadline: float | None = DEADLINE) -> Iterator[Sample]:
+        """Return an iterator over measurements, always the newest; a slow caller skips some.
+
+        Args:
+            service: `hal`, or `vision` for a camera.
+            deadline: Time [s] to wait for the next one before an error; None waits without end.
+
+        Raises:
+            ServiceUnavailable, TooSlow, WrongVersion: From `next`, when none came in time; it may be called again.
+            NotAllowed: At once.
+        """
+        key = keys.vision(self.robot) if service == "vision" else keys.sample(self.robot)
+        return self._live(key, Sample, deadline)
+
+    def estimates(self, deadline: float | None = DEADLINE) -> Iterator[Estimates]:
+        """Return an iterator over estimates of every signal, as `sensors`."""
+        return self._live(keys.estimate(self.robot), Estimates, deadline)
+
+    def anomalies(self, deadline: float | None = DEADLINE) -> Iterator[Anomaly]:
+        """Return an iterator over anomaly scores, as `sensors`."""
+        return self._live(keys.anomaly(self.robot), Anomaly, deadline)
+
+    def health(self, deadline: float | None = DEADLINE) -> Iterator[Health]:
+        """Return an iterator over the health of the robot's services, after every change and status, as `sensors`."""
+        link = self._link
+        readers = [self.reader(keys.status(self.robot, service), Status) for service in keys.SERVICES]
+        return LiveHealth(
+            link.presence(), readers, link.changed, deadline, lambda waited: link.no_health(readers, waited)
+        )
+
+    def _live(self, key: str, record: type[M], deadline: float | None) -> Live[M]:
+        reader = self.reader(key, record)
+        return Live(reader, deadline, FRESH, lambda waited: self._link.silence(reader, waited))
+
+    # Commands.
 
     def command(self, signal: str, values: np.ndarray, answers: Sample) -> None:
         """Send desired values to the drives; the HAL follows while they are younger than the time to live.
@@ -112,23 +253,23 @@ class Client(Listening):
         """
         message = Command(
             stamp_ns=time.time_ns(), signal=signal, values=np.asarray(values, float), cycle=answers.cycle,
-            hal_boot=answers.boot, name=self.caller.name,
+            hal_boot=answers.boot, name=self._link.caller.name,
         )  # fmt: skip
-        self.check_lease()
-        self.publisher(keys.command(self.robot), Command).put(message)
+        self._link.check_lease()
+        self._link.publisher(keys.command(self.robot), Command).put(message)
 
     def target(self, signal: str, values: Sequence[float] | np.ndarray, timeout: float = TIMEOUT) -> None:
-        """Tell the controller where to bring the body; it moves only while engaged.
+        """Send a target to the controller; the robot moves only while engaged.
 
         Args:
             signal: Signal to reach, such as `joint_position`.
             values: Reference [its unit], shape (n,).
-            timeout: How long [s] to wait for a model service that listens.
+            timeout: Time [s] to wait for a model service that listens.
 
         Raises:
-            ServiceUnavailable: None listens.
+            ServiceUnavailable: No model service listens.
         """
-        publisher = self.publisher(keys.target(self.robot), Target)
+        publisher = self._link.publisher(keys.target(self.robot), Target)
         deadline = time.monotonic() + timeout
         while not publisher.has_listener:
             if time.monotonic() > deadline:
@@ -136,8 +277,8 @@ class Client(Listening):
                     f"No 'model' service of robot '{self.robot}' takes targets. Is `gemuco serve` running?"
                 )
             time.sleep(query.RETRY_AFTER)
-        hal_boot, cycle = self.seen()
-        self.check_lease()
+        hal_boot, cycle = self._link.seen()
+        self._link.check_lease()
         publisher.put(
             Target(
                 stamp_ns=time.time_ns(), signal=signal, values=np.asarray(values, float), cycle=cycle, hal_boot=hal_boot
@@ -145,60 +286,64 @@ class Client(Listening):
         )
 
     def lease(self, seconds: float = SECONDS) -> ClientLease:
-        """Command the robot, and nobody else, as a context manager.
+        """Return a context manager in which only this client commands the robot.
 
             with arm.lease():
                 arm.enable()
 
-        Entering raises `CommandHeld`, which names the holder, while somebody else commands. After the lease was lost
-        (this process was frozen, the HAL restarted) commands and verbs that need it raise `LeaseLost`. Everybody may
+        Entering raises `CommandHeld`, which names the holder, while another client commands. After the lease was lost
+        (this process was frozen, the HAL restarted) commands and verbs that need it raise `LeaseLost`. Every client may
         still stop the robot.
 
         Args:
-            seconds: How long the lease outlives this process; it is renewed in the background.
+            seconds: Time [s] that the lease outlives this process; it is renewed in the background.
         """
-        return ClientLease(self, seconds)
+        return ClientLease(self._link, seconds)
+
+    # Verbs of the HAL.
 
     def enable(self) -> dict[str, Any]:
-        """Ask the drives to follow commands; the answer tells the mode, which soon is `hold` or `fault`."""
+        """Let the drives follow commands; the answer has the mode, which soon is `hold` or `fault`."""
         return self.ask("hal", "enable")
 
     def disable(self) -> dict[str, Any]:
-        """Ask the drives to let go at once."""
+        """Disable the drives at once."""
         return self.ask("hal", "disable")
 
     def stop(self) -> dict[str, Any]:
-        """Hold where the robot is, then disable."""
+        """Hold the present position, then disable."""
         return self.ask("hal", "stop")
 
     def reset(self) -> dict[str, Any]:
-        """Leave a fault; never enables."""
+        """Leave a fault; this never enables."""
         return self.ask("hal", "reset")
 
     def home(self, device: str) -> dict[str, Any]:
-        """Ask one drive to find its zero, which moves it; the robot must be off, and its mode is then `homing`."""
+        """Let a drive search its zero, which moves it; the robot must be off, and its mode is then `homing`."""
         return self.ask("hal", "home", {"device": device})
 
     def tare(self, device: str) -> dict[str, Any]:
-        """Ask one sensor to take what it measures as zero while the robot is off; its health tells what came of it."""
+        """Let a sensor take its present reading as zero while the robot is off; its health has the result."""
         return self.ask("hal", "tare", {"device": device})
 
     def estop(self, reason: str = "") -> dict[str, Any]:
-        """Stop every drive as fast as it can, whatever the robot does; leave the fault with `reset`.
+        """Stop every drive as fast as possible, in every mode; leave the fault with `reset`.
 
         Returns:
-            `complete`: whether every drive stopped; `devices`: what each did (`device`, `stopped`, `text`); `text`:
-            what else is wrong; `mode`. If it is not complete, or nobody answers, cut the power: this is no safety-rated
-            emergency stop.
+            `complete`: whether every drive stopped; `devices`: the result of each (`device`, `stopped`, `text`);
+            `text`: other faults; `mode`. If it is not complete, or no HAL answers, cut the power: this is not a
+            safety-rated emergency stop.
         """
         return self.ask("hal", "estop", {"reason": reason}, SLOW_TIMEOUT)
+
+    # Verbs of the model.
 
     def engage(self) -> dict[str, Any]:
         """Let the controller command the drives."""
         return self.ask("model", "engage")
 
     def disengage(self) -> dict[str, Any]:
-        """Let the controller command no more."""
+        """End the controller's commands."""
         return self.ask("model", "disengage")
 
     def adapt(self, active: bool) -> dict[str, Any]:
@@ -206,23 +351,19 @@ class Client(Listening):
         return self.ask("model", "adapt", {"active": active}, SLOW_TIMEOUT)
 
     def rollback(self) -> dict[str, Any]:
-        """Go back to the model before the online update."""
+        """Return to the model before the online update."""
         return self.ask("model", "rollback", timeout=SLOW_TIMEOUT)
 
     def infer(self, signal: str, values: Values | None = None, hide: Iterable[str] = ()) -> dict[str, Any]:
-        """Ask the model for a signal, from given values or from the newest sample with some signals hidden."""
+        """Query the model for a signal, from given values or from the newest sample with some signals hidden."""
         return self.ask("model", "estimate", {"signal": signal, "hide": list(hide)} | _given(values), SLOW_TIMEOUT)
 
-    def control(
-        self,
-        target: Values,
-        values: Values | None = None,
-    ) -> dict[str, Any]:
-        """Ask for the command that brings about a target, and what is expected of it; nothing moves.
+    def control(self, target: Values, values: Values | None = None) -> dict[str, Any]:
+        """Query the command that brings about a target, and its expected result; the robot does not move.
 
         Args:
             target: Signal -> reference [its unit].
-            values: Where the body is [its unit]; the newest sample if not given.
+            values: Present state of the body [its unit]; the newest sample if not given.
         """
         return self.ask("model", "control", {"target": _plain(target)} | _given(values), SLOW_TIMEOUT)
 
@@ -232,53 +373,55 @@ class Client(Listening):
         given: Values | None = None,
         values: Values | None = None,
     ) -> dict[str, Any]:
-        """Ask for the states that commands bring about one after the other; nothing moves.
+        """Query the states that successive commands bring about; the robot does not move.
 
         Args:
-            commands: What is sent [unit of the commanded signal], each of shape (n,).
+            commands: Commands [unit of the commanded signal], each of shape (n,).
             given: References of the robot file's constraints that take one [its unit].
-            values: Where the body is [its unit]; the newest sample if not given.
+            values: Present state of the body [its unit]; the newest sample if not given.
         """
         arguments = {"commands": [np.asarray(command, float).tolist() for command in commands]}
         return self.ask("model", "simulate", arguments | {"given": _plain(given or {})} | _given(values), LONG_TIMEOUT)
 
-    def fault(self, text: str, service: str = "simulator") -> dict[str, Any]:
-        """Break something in the simulator (`sensor_silent elbow_pitch_encoder`, `muscle_cut biceps`).
-
-        Args:
-            text: What to break.
-            service: Who plays it: `simulator`, or `vision` for the camera (`camera_covered`).
-        """
-        return self.ask(service, "fault", {"text": text})
-
     def history(self, seconds: float, signals: Iterable[str] | None = None, timeout: float = SLOW_TIMEOUT) -> History:
-        """What was estimated in the last seconds, from the model service's memory of one minute.
+        """Return the estimates of the last seconds, from the model service's memory of one minute.
 
         Args:
-            seconds: How far back [s].
-            signals: Which; all if not given.
+            seconds: Length of time [s].
+            signals: Names of signals; all if not given.
             timeout: Deadline [s].
         """
         names = () if signals is None else (signals,) if isinstance(signals, str) else tuple(signals)
         return history.fetch(lambda given, left: self.ask("model", "history", given, left), seconds, names, timeout)
 
+    # Verbs of every service.
+
+    def fault(self, text: str, service: str = "simulator") -> dict[str, Any]:
+        """Break a part of the simulated robot (`sensor_silent elbow_pitch_encoder`, `muscle_cut biceps`).
+
+        Args:
+            text: The fault.
+            service: `simulator`, or `vision` for the camera (`camera_covered`).
+        """
+        return self.ask(service, "fault", {"text": text})
+
     def describe(self, service: str = "", timeout: float = TIMEOUT) -> dict[str, Any]:
-        """What this robot is, or who one of its services is and what it serves.
+        """Return a description of the robot, or of one of its services.
 
         Without a service: `signals` (unit, elements, source), `x_in`, `x_out`, `masks`, `conditions`, `rates`,
-        `limits`, `command`, `controls`, `devices`, `versions`, `services` that are alive, and `missing`: what could not
-        be told, because the service that knows it is away.
+        `limits`, `command`, `controls`, `devices`, `versions`, `services` that are alive, and `missing`: parts whose
+        service is away.
         """
-        return self.ask(service, "describe", timeout=timeout) if service else description.of(self, timeout)
+        return self.ask(service, "describe", timeout=timeout) if service else description.of(self._link, timeout)
 
 
 def _plain(values: Values) -> dict[str, list[float]]:
     return {name: np.asarray(value, float).tolist() for name, value in values.items()}
 
 
-def _joined(signals: dict[str, dict[str, Any]], what: str, kind: type) -> np.ndarray:
-    """What an answer tells of each signal's elements, in one array."""
-    return np.array([number for one in signals.values() for number in one[what]], kind)
+def _joined(signals: dict[str, dict[str, Any]], field: str, kind: type) -> np.ndarray:
+    """Return a field of all signals of an answer in one array."""
+    return np.array([number for part in signals.values() for number in part[field]], kind)
 
 
 def _given(values: Values | None) -> dict[str, Any]:

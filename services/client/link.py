@@ -1,14 +1,13 @@
-"""One robot's link: a session, readers and publishers made when first used, questions, and which error it is.
+"""Link to one robot: a session, readers and publishers made at their first use, queries, and the error of a silence.
 
-What a role may not do is refused here, with a sentence and at once; the router refuses it too, and says nothing.
+An exchange that the role may not do is refused here at once, with a sentence; the router refuses it too, silently.
 """
 
 import threading
 import time
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from types import TracebackType
-from typing import Any, Self, TypeVar
+from typing import Any, TypeVar
 
 import zenoh
 
@@ -26,22 +25,22 @@ from services.wire.streams import Publisher, Reader
 M = TypeVar("M", bound=Message)
 
 TIMEOUT = 2.0
-"""Deadline [s] of a verb."""
+"""A verb has this deadline [s]."""
 SEEN_WITHIN = 0.5
-"""How old [s] the newest sample may be that tells when a question was asked; how long to wait for one."""
+"""A query is dated by a sample of at most this age [s], waited for at most this long."""
 LATELY = 2.0
-"""For how long [s] a message of another version counts as the reason why there is no other."""
+"""A message of another version counts as the reason of a silence for this long [s]."""
 ENDS_WITHIN = 1.0
-"""How long [s] to wait for the readers' threads after the session was closed."""
+"""The threads of readers have this time [s] to end after the session was closed."""
 
 
 class Link:
-    """A client's session, as a context manager; `Client` says what can be done with it.
+    """Session of a client, with readers and publishers by key.
 
     Args:
         robot: The robot's name.
         connect: A router's endpoint, or the role file for it, for a robot on another machine.
-        name: Who this is, for people; user, host and pid if not given.
+        name: Name of the client for people; user, host and pid if not given.
     """
 
     def __init__(self, robot: str, connect: Iterable[str] = (), name: str = "") -> None:
@@ -49,11 +48,11 @@ class Link:
         self.boot = new_boot()
         self.caller = Caller(name or own_name(), self.boot)
         self.member = Member()
-        """The role, and the robots that it is for, as the role file says."""
+        """Role and its robots, from the role file."""
         self.held_lease: ClientLease | None = None
-        """The lease, while this client has or had one."""
+        """Lease of this client, also after it was lost, until its context ends."""
         self.changed = threading.Condition()
-        """Notified of every status, and of every service that comes or goes."""
+        """Condition that every status, and every service that comes or goes, notifies."""
         self._connect = (connect,) if isinstance(connect, str) else tuple(connect)
         self._session: zenoh.Session | None = None
         self._readers: dict[str, Reader[Any]] = {}
@@ -61,19 +60,18 @@ class Link:
         self._presence: Presence | None = None
         self._making = threading.Lock()
 
-    def __enter__(self) -> Self:
+    def open(self) -> None:
+        """Open the session.
+
+        Raises:
+            ServiceError: No session could be opened.
+        """
         configuration = settings(self.robot, CLIENT, self._connect)
         self.member = told_by(configuration)
         self._session = opened(configuration, f"a client of robot '{self.robot}'")
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
-        """End the session and all threads of it; whoever waits on another thread gets an error. Safe to call twice."""
+        """End the session and its threads; a thread that waits gets an error. Safe to call twice."""
         session, self._session = self._session, None
         if session is None:
             return
@@ -87,7 +85,7 @@ class Link:
 
     @property
     def session(self) -> zenoh.Session:
-        """The open session.
+        """Open zenoh session.
 
         Raises:
             ServiceError: The client is not open.
@@ -99,11 +97,11 @@ class Link:
         return self._session
 
     def alive(self) -> set[str]:
-        """Names of the robot's services that run now, as far as this client is connected."""
+        """Return the names of the robot's services that run now, as far as this client is connected."""
         return query.alive(self.session, self.robot)
 
     def presence(self) -> Presence:
-        """Which services are alive, kept up to date from the first use on."""
+        """Return the set of live services, kept up to date from the first call on."""
         with self._making:
             if self._presence is None:
                 self._presence = Presence(self.session, self.robot, self.changed)
@@ -112,11 +110,11 @@ class Link:
     def ask(
         self, service: str, verb: str, arguments: Mapping[str, Any] | None = None, timeout: float = TIMEOUT
     ) -> dict[str, Any]:
-        """Ask any verb of any service; see `query.ask`.
+        """Query any verb of any service, as `query.ask`.
 
         Raises:
-            NotAllowed: This client's role may not ask it.
-            CommandHeld: Somebody else commands the robot, and the verb is not for everybody.
+            NotAllowed: This client's role may not query the verb.
+            CommandHeld: Another client commands the robot, and the verb needs the lease.
             LeaseLost: This client's lease was lost, and the verb needs it.
         """
         if not self.member.may_ask(self.robot, service, verb):
@@ -126,7 +124,7 @@ class Link:
             self.check_lease()
         elif (service, verb) != ("hal", "lease"):
             return query.ask(self.session, key, arguments, timeout, self.caller)
-        return query.ask(self.session, key, arguments, timeout, self._who_saw)
+        return query.ask(self.session, key, arguments, timeout, self._dated_caller)
 
     def check_lease(self) -> None:
         """Raise `LeaseLost` if this client had a lease, and lost it."""
@@ -134,8 +132,9 @@ class Link:
             self.held_lease.check()
 
     def seen(self, timeout: float = SEEN_WITHIN) -> tuple[int, int]:
-        """Run and cycle of the HAL's newest sample here: what may move the robot tells them, so that it is done at once
-        or never. Zeros if none arrives in `timeout` [s].
+        """Return boot and cycle of the HAL's newest sample here; zeros if none arrives within `timeout` [s].
+
+        A verb that may move the robot carries them, so that it is done at once or never.
         """
         reader = self.reader(keys.sample(self.robot), Sample)
         last = reader.last()
@@ -143,15 +142,15 @@ class Link:
             last = reader.newer(last, timeout) or last
         return (0, 0) if last is None else (last.message.boot, last.message.cycle)
 
-    def _who_saw(self) -> Caller:
+    def _dated_caller(self) -> Caller:
         hal_boot, cycle = self.seen()
         return replace(self.caller, hal_boot=hal_boot, cycle=cycle)
 
     def reader(self, key: str, record: type[M]) -> Reader[M]:
-        """The reader of a key, made when first asked for.
+        """Return the reader of a key, made at the first call.
 
         Raises:
-            NotAllowed: This client's role may not read it.
+            NotAllowed: This client's role may not read the key.
         """
         with self._making:
             if key not in self._readers:
@@ -163,10 +162,10 @@ class Link:
             return self._readers[key]
 
     def publisher(self, key: str, record: type[M]) -> Publisher[M]:
-        """The publisher of a key, made when first asked for.
+        """Return the publisher of a key, made at the first call.
 
         Raises:
-            NotAllowed: This client's role may not publish it.
+            NotAllowed: This client's role may not publish the key.
         """
         with self._making:
             if key not in self._publishers:
@@ -177,10 +176,10 @@ class Link:
             return self._publishers[key]
 
     def fresh(self, key: str, record: type[M], max_age: float, timeout: float) -> M | None:
-        """The newest message of a key; None if none arrived in the last `max_age` [s], nor in `timeout` [s] from now.
+        """Return the newest message of a key; None if none arrived in the last `max_age` [s] or within `timeout` [s].
 
         Raises:
-            NotAllowed: This client's role may not read it.
+            NotAllowed: This client's role may not read the key.
             WrongVersion: Only messages of another version arrive.
         """
         reader = self.reader(key, record)
@@ -194,7 +193,7 @@ class Link:
         return message
 
     def silence(self, reader: Reader[Any], waited: float) -> NoAnswer:
-        """Why nothing came on a key for so long [s]: the error to raise."""
+        """Return the error for a key on which nothing came for `waited` [s]."""
         _, service, noun = keys.parse(reader.key)
         if reader.has_ended or self._session is None:
             return ServiceUnavailable(f"The client of robot '{self.robot}' was closed.")
@@ -212,11 +211,11 @@ class Link:
         )
 
     def no_health(self, readers: Iterable[Reader[Any]], waited: float) -> NoAnswer:
-        """Why nothing was heard of any service for so long [s]: the error to raise."""
+        """Return the error for a robot of which no service was heard for `waited` [s]."""
         if self._session is None:
             return ServiceUnavailable(f"The client of robot '{self.robot}' was closed.")
         for reader in readers:
             if text := reader.other_version(waited + LATELY):
                 return WrongVersion(f"{text} Update the older of both programs.")
-        found = instead(self._session, self.robot)
-        return ServiceUnavailable(f"Nothing was heard of robot '{self.robot}' for {waited:.1f} s.{found}")
+        others = instead(self._session, self.robot)
+        return ServiceUnavailable(f"Nothing was heard of robot '{self.robot}' for {waited:.1f} s.{others}")

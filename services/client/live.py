@@ -1,4 +1,4 @@
-"""Iterators over what a robot publishes, that always give the newest and never a backlog."""
+"""Iterators over the messages of a robot, always the newest and never a backlog."""
 
 import threading
 import time
@@ -14,31 +14,32 @@ from services.wire.streams import Arrival, Reader
 
 M = TypeVar("M", bound=Message)
 DEADLINE = 2.0
-"""How long [s] to wait for the next message before that is an error."""
+"""An iterator waits this long [s] for the next message before it raises."""
 FRESH = 0.25
-"""Age [s], on this machine's clock, up to which a message is handed out; an older one is not."""
+"""A message is returned up to this age [s], on this machine's clock."""
 FRESH_STATUS = 2.5
+"""A status is returned up to this age [s]."""
 
-Why = Callable[[float], Exception]
-"""Takes how long [s] nothing came; returns the error that tells why."""
+Silence = Callable[[float], Exception]
+"""A function of this type takes the time [s] in which nothing came, and returns the error to raise."""
 
 
 class Live(Generic[M]):
-    """Each `next` is the newest message that was not given yet, as soon as there is one.
+    """Iterator whose `next` returns the newest message that was not returned yet, as soon as there is one.
 
-    Whoever is slow skips. Nothing older than `max_age` is given. It goes on when a service or a router was away; an
-    error does not end it either, and `next` may be called again. For one thread.
+    A slow caller skips some. A message older than `max_age` is not returned. It goes on when a service or a router was
+    away; after an error `next` may be called again. For one thread.
 
     Args:
-        reader: Where messages come in.
-        deadline: How long [s] to wait for a message; None waits for ever.
-        max_age: Age [s] up to which a message is given.
-        why: The error when none came in time.
+        reader: Reader of the messages.
+        deadline: Time [s] to wait for a message; None waits without end.
+        max_age: Largest age of a message [s].
+        silence: Makes the error when none came in time.
     """
 
-    def __init__(self, reader: Reader[M], deadline: float | None, max_age: float, why: Why) -> None:
-        self._reader, self._deadline, self._max_age, self._why = reader, deadline, max_age, why
-        self._given: Arrival[M] | None = None
+    def __init__(self, reader: Reader[M], deadline: float | None, max_age: float, silence: Silence) -> None:
+        self._reader, self._deadline, self._max_age, self._silence = reader, deadline, max_age, silence
+        self._returned: Arrival[M] | None = None
 
     def __iter__(self) -> Self:
         return self
@@ -46,23 +47,23 @@ class Live(Generic[M]):
     def __next__(self) -> M:
         begun = time.monotonic()
         newest = self._reader.last()
-        while newest is None or newest is self._given or time.monotonic() - newest.received > self._max_age:
+        while newest is None or newest is self._returned or time.monotonic() - newest.received > self._max_age:
             left = None if self._deadline is None else begun + self._deadline - time.monotonic()
             arrival = self._reader.newer(newest, left) if left is None or left > 0 else None
             if arrival is None:
-                raise self._why(time.monotonic() - begun)
+                raise self._silence(time.monotonic() - begun)
             newest = arrival
-        self._given = newest
+        self._returned = newest
         return newest.message
 
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """How a robot's services are.
+    """Health of a robot's services.
 
     Attributes:
-        alive: Names of the services that are there; one that froze or was cut off counts for another second.
-        statuses: Service -> what it told last, if that was in the last 2.5 s.
+        alive: Names of live services; one that froze or was cut off counts for another second.
+        statuses: Service -> its newest status, if that came in the last 2.5 s.
     """
 
     alive: frozenset[str] = frozenset()
@@ -70,7 +71,7 @@ class Health:
 
 
 class Presence:
-    """Which services of a robot are alive, kept up to date by zenoh. Ends with the session."""
+    """Set of a robot's live services, kept up to date by zenoh until the session ends."""
 
     def __init__(self, session: zenoh.Session, robot: str, changed: threading.Condition) -> None:
         """`changed` is notified of every service that comes or goes."""
@@ -79,7 +80,7 @@ class Presence:
         self._subscriber = session.liveliness().declare_subscriber(keys.alive(robot, "*"), self._hear, history=True)
 
     def now(self) -> frozenset[str]:
-        """Names of the services that are there."""
+        """Return the names of live services."""
         with self._changed:
             return frozenset(self._alive)
 
@@ -91,16 +92,17 @@ class Presence:
 
 
 class LiveHealth:
-    """Each `next` is the robot's health after something was heard: a status, a service that came or went.
+    """Iterator whose `next` returns the robot's health after a status, or after a service came or went.
 
-    While nothing is heard it waits, like `Live`; a robot that vanishes is given once, as nobody alive. For one thread.
+    Meanwhile it waits, as `Live`; for a robot that vanishes it returns one health without live services. For one
+    thread.
 
     Args:
-        presence: Who is alive.
-        readers: The readers of all services' statuses, which notify the same condition as `presence`.
+        presence: Live services.
+        readers: Readers of all services' statuses, which notify the same condition as `presence`.
         changed: That condition.
-        deadline: How long [s] to wait; None waits for ever.
-        why: The error when nothing was heard in time.
+        deadline: Time [s] to wait; None waits without end.
+        silence: Makes the error when nothing was heard in time.
     """
 
     def __init__(
@@ -109,11 +111,11 @@ class LiveHealth:
         readers: Iterable[Reader[Status]],
         changed: threading.Condition,
         deadline: float | None,
-        why: Why,
+        silence: Silence,
     ) -> None:
         self._presence, self._readers, self._changed = presence, tuple(readers), changed
-        self._deadline, self._why = deadline, why
-        self._given: tuple[object, ...] = (frozenset(), *(None for _ in self._readers))
+        self._deadline, self._silence = deadline, silence
+        self._returned: tuple[object, ...] = (frozenset(), *(None for _ in self._readers))
 
     def __iter__(self) -> Self:
         return self
@@ -121,15 +123,15 @@ class LiveHealth:
     def __next__(self) -> Health:
         begun = time.monotonic()
         with self._changed:
-            heard = self._changed.wait_for(lambda: self._heard() != self._given or self._has_ended(), self._deadline)
+            heard = self._changed.wait_for(lambda: self._heard() != self._returned or self._has_ended(), self._deadline)
             if not heard or self._has_ended():
-                raise self._why(time.monotonic() - begun)
-            self._given = self._heard()
+                raise self._silence(time.monotonic() - begun)
+            self._returned = self._heard()
         fresh = [reader.get(FRESH_STATUS) for reader in self._readers]
         return Health(self._presence.now(), {status.service: status for status in fresh if status is not None})
 
     def _heard(self) -> tuple[object, ...]:
-        """What tells one moment from the next: who is alive, and when each status came."""
+        """Return the live services and the arrival of each status, which differ after every change."""
         return (self._presence.now(), *(None if (last := r.last()) is None else last.received for r in self._readers))
 
     def _has_ended(self) -> bool:

@@ -16,7 +16,7 @@ NOT_YET = {
     "gemuco/learning",
     "gemuco/structure",
     "hal",
-    "services/client",
+    
     "services/cli.py",
     "services/errors.py",
     "services/hardware",

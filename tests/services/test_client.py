@@ -92,7 +92,7 @@ def test_a_robot_is_described_as_far_as_it_is_there(robot: str, capsys: pytest.C
             assert half["signals"]["joint_position"]["source"] == "hal"
             assert "x_in" not in half
             assert half["missing"] == [
-                "Of 'model' nothing is told: there is no 'model' service. Is `gemuco serve` running?"
+                "'model' gives no description: there is no 'model' service. Is `gemuco serve` running?"
             ]
             with Service(robot, "model", describe=lambda: MODEL) as model:
                 found = client.describe()
@@ -120,7 +120,7 @@ def test_verbs_and_readers_may_be_used_from_several_threads(robot: str) -> None:
                 told = {"n": number, "turn": turn}
                 if client.ask("model", "echo", told, timeout=20.0) != told:
                     failed.append(told)
-                client.sample(), client.status("hal"), client.presence().now()
+                client.sample(), client.status("hal"), client.alive()
 
         threads = [threading.Thread(target=use, args=(number,)) for number in range(4)]
         for thread in threads:
