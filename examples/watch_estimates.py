@@ -6,8 +6,7 @@ python examples/watch_estimates.py ROBOT [tcp/ROUTER:7447 or a role file]
 import sys
 import time
 
-from services.client import Client
-from services.errors import ServiceError
+from services import Client, ServiceError
 
 try:
     with Client(sys.argv[1], sys.argv[2:]) as robot:

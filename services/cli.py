@@ -105,7 +105,7 @@ def serve(
 ) -> None:
     """Run the model: estimation, control, anomaly detection and online update, until Ctrl-C."""
     from services.model import artifacts
-    from services.model.gemuco_service import serve as run_model
+    from services.model.serve import serve as run_model
 
     config = load(robot)
     run_model(config, model or artifacts.model_folder(config.robot), connect or ())

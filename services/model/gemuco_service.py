@@ -3,8 +3,7 @@
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
-from pathlib import Path
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,6 @@ from gemuco.adaption import update as adapt
 from gemuco.errors import SchemaError
 from gemuco.schema import BodySchema
 from gemuco.search.descent import NewtonConfig
-from gemuco.warm import warm
 from hal.clock import SystemClock
 from hal.config import RobotConfig
 from services.command.intake import Intake
@@ -23,14 +21,13 @@ from services.model.anomaly_loop import VERDICTS, AnomalyWatch
 from services.model.control_config import ControlConfig, controller_of
 from services.model.control_loop import Control
 from services.model.estimation import Estimation, Freshness
-from services.model.living_model import LivingModel, load_model
+from services.model.living_model import LivingModel
 from services.model.model_config import ModelConfig, model_config
-from services.model.model_verbs import ModelVerbs
 from services.model.update_loop import OnlineUpdate
 from services.process.loop import Loop
 from services.process.one_core import OneCore
-from services.process.realtime import freeze, prepare_process, prepare_thread, promote_rest
-from services.process.service import Service, until_told
+from services.process.realtime import freeze, prepare_thread, promote_rest
+from services.process.service import Service
 from services.wire import keys, query
 from services.wire.caller import ASKING
 from services.wire.history import HistoryRing
@@ -46,8 +43,6 @@ SHARE = 0.5
 SETTLED = 1e-3
 """A solve that moves the command by less than this share of its range (of 1 where it has none) has found it; it stays
 until the reference or the model is another."""
-PATIENCE = 3.0
-"""Compiling is told about this often [s]; loading what was compiled before takes less."""
 NETWORK_PRIORITY = 45
 STATUS_PRIORITY = 10
 """A status takes a millisecond, once a second: a loop may not wait for it."""
@@ -110,7 +105,6 @@ class GemucoService:
         self.robot, self.config, self.service = robot, model_config(robot), service
         self.clock = SystemClock()
         self.living = LivingModel(schema)
-        self.verbs = ModelVerbs(self)
         self._samples = service.newest(keys.sample(robot.robot), Sample)
         self._seen = service.newest(keys.vision(robot.robot), Sample) if robot.seen else None
         self._applied = service.newest(keys.applied(robot.robot), Applied)
@@ -213,7 +207,6 @@ class GemucoService:
 
     def run(self, stop: threading.Event) -> None:
         """Serve until told to stop."""
-        self.verbs.serve(self.service)
         freeze()
         for loop in self.loops:
             loop.start()
@@ -291,39 +284,3 @@ class GemucoService:
         """Follow a published target."""
         if self.control is not None:
             self.control.try_target(target, self.permission.may_set)
-
-
-def make_ready() -> None:
-    """Have all compiled code before the first tick; says so where that means to wait for the compiler."""
-    said = time.monotonic()
-
-    def tell(done: float, what: str) -> None:
-        nonlocal said
-        if time.monotonic() - said > PATIENCE:
-            said = time.monotonic()
-            log.warning("Compiling for this machine, once: %d %% done, now %s", round(100 * done), what)
-
-    warm(tell, is_service=True)
-
-
-def serve(robot: RobotConfig, folder: Path, connect: Iterable[str] = (), stop: threading.Event | None = None) -> None:
-    """Run the model service of a robot until SIGTERM, SIGINT or `stop`.
-
-    Args:
-        robot: The robot file.
-        folder: Where the trained model lies.
-        connect: Endpoints, such as a router's, and role files.
-        stop: An event that ends it; signals are then left alone.
-
-    Raises:
-        CheckpointError: No model there, or one of another body.
-        AlreadyRunning: The robot already has a model service.
-    """
-    prepare_process()
-    schema = load_model(robot, folder)
-    make_ready()
-    made: list[GemucoService] = []
-    service = Service(robot.robot, "model", connect, lambda: made[0].verbs.describe() if made else {})
-    with until_told(stop) as told, service:
-        made.append(GemucoService(robot, schema, service))
-        made[0].run(told)

@@ -1,7 +1,7 @@
 """What the model service can be asked for, by anybody on the network."""
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -12,14 +12,12 @@ from gemuco.schema import BodySchema
 from services.errors import BadArguments, NotEngaged
 from services.model.control_config import controller_of, simulator_of
 from services.model.control_loop import Control
+from services.model.gemuco_service import GemucoService
 from services.process.service import Service
 from services.wire.caller import Caller
 from services.wire.messages import Target
 from services.wire.plain_text import shown
 from services.wire.query import Guard, Handler
-
-if TYPE_CHECKING:
-    from services.model.gemuco_service import GemucoService
 
 MOST_STEPS = 200
 """Commands that one question may simulate; a step takes some ten milliseconds."""
@@ -28,7 +26,7 @@ MOST_STEPS = 200
 class ModelVerbs:
     """Handlers of `gemuco/<robot>/model/do/...`; each takes and returns a map."""
 
-    def __init__(self, service: "GemucoService") -> None:
+    def __init__(self, service: GemucoService) -> None:
         self._service = service
 
     def handlers(self) -> dict[str, Handler]:
@@ -54,6 +52,7 @@ class ModelVerbs:
         guards |= {"engage": permission.may_move, "target": permission.may_move}
         for name, handler in self.handlers().items():
             service.verb(name, handler, guards.get(name), always=name == "disengage")
+        service.describe = self.describe
 
     def _may_change(self, caller: Caller) -> None:
         """Raise unless the caller may change the model; another model moves the robot while one is engaged."""

@@ -71,7 +71,7 @@ class Service:
         self.robot, self.name = robot, name
         self.boot = new_boot()
         self._connect = tuple(connect)
-        self._describe = describe
+        self.describe = describe
         self._lock = ServiceLock(robot, name)
         self._asked = query.UnderWay()
         self._statuses = _Statuses()
@@ -88,7 +88,7 @@ class Service:
             raise
         self._token = self.session.liveliness().declare_token(keys.alive(self.robot, self.name))
         self._status = self.publisher(keys.status(self.robot, self.name), Status)
-        self.verb("describe", lambda _: self.identity() | self._describe())
+        self.verb("describe", lambda _: self.identity() | self.describe())
         return self
 
     def __exit__(

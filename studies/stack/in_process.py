@@ -22,7 +22,7 @@ from hal.clock import SystemClock
 from hal.config import RobotConfig, load_robot
 from hal.robot import Robot
 from services.hardware.hal_service import HalService
-from services.model import gemuco_service
+from services.model.serve import serve
 from services.process.realtime import prepare_process
 from services.process.service import Service, until_told
 from services.wire import keys
@@ -78,7 +78,7 @@ def main(file: Path, model: Path | None, seed: int, endpoint: str) -> None:
             return
         threads = [
             threading.Thread(target=hal.run, args=(end,), name="hal service"),
-            threading.Thread(target=gemuco_service.serve, args=(config, model, connect, end), name="model service"),
+            threading.Thread(target=serve, args=(config, model, connect, end), name="model service"),
         ]
         for thread in threads:
             thread.start()

@@ -6,12 +6,10 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("gemuco", "hal", "simulators", "services", "studies")
-OPEN = {frozenset({"services.model.gemuco_service", "services.model.model_verbs"})}
-"""Circles that are still open, each the names of its modules; a line may only be deleted."""
 
 
 def test_there_is_no_import_circle() -> None:
-    assert circles() == OPEN
+    assert not circles()
 
 
 def test_a_circle_is_noticed() -> None:

@@ -16,7 +16,6 @@ NOT_YET = {
     "gemuco/learning",
     "gemuco/structure",
     "hal",
-    
     "services/cli.py",
     "services/errors.py",
     "services/hardware",

@@ -13,6 +13,7 @@ from services.client import Client
 from services.errors import BadArguments
 from services.model.control_config import controller_of, simulator_of
 from services.model.gemuco_service import GemucoService
+from services.model.model_verbs import ModelVerbs
 from services.process.service import Service
 from services.verbs.ask import ask_robot
 
@@ -22,7 +23,7 @@ def model(robot: str) -> Iterator[GemucoService]:
     config = arm().model_copy(update={"robot": robot})
     with Service(robot, "model", (), dict) as service:
         made = GemucoService(config, small_model(), service)
-        for name, handler in made.verbs.handlers().items():
+        for name, handler in ModelVerbs(made).handlers().items():
             service.verb(name, handler)
         yield made
 

@@ -1,0 +1,55 @@
+"""`gemuco serve`: the process of the body schema service."""
+
+import logging
+import threading
+import time
+from collections.abc import Iterable
+from pathlib import Path
+
+from gemuco.warm import warm
+from hal.config import RobotConfig
+from services.model.gemuco_service import GemucoService
+from services.model.living_model import load_model
+from services.model.model_verbs import ModelVerbs
+from services.process.realtime import prepare_process
+from services.process.service import Service, until_told
+
+log = logging.getLogger(__name__)
+
+PATIENCE = 3.0
+"""Compiling is reported at this interval [s]; loading code that was compiled before takes less."""
+
+
+def serve(robot: RobotConfig, folder: Path, connect: Iterable[str] = (), stop: threading.Event | None = None) -> None:
+    """Run the model service of a robot until SIGTERM, SIGINT or `stop`.
+
+    Args:
+        robot: The robot file.
+        folder: Folder of the trained model.
+        connect: Endpoints, such as a router's, and role files.
+        stop: An event that ends it; signals are then not handled.
+
+    Raises:
+        CheckpointError: The folder holds no model, or a model of another body.
+        AlreadyRunning: The robot already has a model service.
+    """
+    prepare_process()
+    schema = load_model(robot, folder)
+    make_ready()
+    with until_told(stop) as stopped, Service(robot.robot, "model", connect) as service:
+        model = GemucoService(robot, schema, service)
+        ModelVerbs(model).serve(service)
+        model.run(stopped)
+
+
+def make_ready() -> None:
+    """Load all compiled code before the first tick; report progress while the compiler runs."""
+    reported = time.monotonic()
+
+    def report(done: float, part: str) -> None:
+        nonlocal reported
+        if time.monotonic() - reported > PATIENCE:
+            reported = time.monotonic()
+            log.warning("Compiling for this machine, once: %d %% done, now %s", round(100 * done), part)
+
+    warm(report, is_service=True)
