@@ -8,15 +8,13 @@ import time
 
 import numpy as np
 
-from services.process.service import Service
-from services.wire import keys
-from services.wire.messages import Sample
+from services import Sample, Service
 
 robot = sys.argv[1] if len(sys.argv) > 1 else "pr2_duster"
 end = time.monotonic() + float(sys.argv[2] if len(sys.argv) > 2 else 10)
 frame = 0
 with Service(robot, "vision") as camera:
-    publish = camera.publisher(keys.vision(robot), Sample).put
+    publish = camera.publisher(f"gemuco/{robot}/vision/sample", Sample).put
     while time.monotonic() < end:
         taken_ns, taken = time.time_ns(), time.monotonic()
         marker = {"tool_tip_position": np.array([0.6, -0.2, 0.8])}  # your detector's result [m]; NaN without a result

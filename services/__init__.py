@@ -10,6 +10,9 @@ TYPE_CHECKING = False
 
 _ROOMS = {
     "services.client.client": ("Client",),
+    "services.learning.measured": ("load_measured", "read_measured"),
+    "services.process.service": ("Service",),
+    "services.wire.records": ("Sample",),
     "services.errors": (
         "CommandHeld",
         "LeaseLost",
@@ -32,6 +35,10 @@ if TYPE_CHECKING:
     from services.errors import ServiceUnavailable as ServiceUnavailable
     from services.errors import TooSlow as TooSlow
     from services.errors import WrongVersion as WrongVersion
+    from services.learning.measured import load_measured as load_measured
+    from services.learning.measured import read_measured as read_measured
+    from services.process.service import Service as Service
+    from services.wire.records import Sample as Sample
 else:
 
     def __getattr__(name: str) -> object:

@@ -166,7 +166,7 @@ def is_description(path: Path) -> bool:
     return isinstance(content, dict) and "recording" in content
 
 
-def read(config: MeasuredConfig, folder: Path) -> Dataset:
+def read_measured(config: MeasuredConfig, folder: Path) -> Dataset:
     """Read all episodes that a description names.
 
     Args:

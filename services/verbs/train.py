@@ -37,7 +37,7 @@ def run_training(
     if measured.is_description(file):
         described = measured.load_measured(file)
         folder_of_files = _only(data) or file.parent
-        name, dataset = described.recording, measured.read(described, folder_of_files)
+        name, dataset = described.recording, measured.read_measured(described, folder_of_files)
     else:
         robot = load_robot(file)
         name, dataset = robot.robot, _data(robot, data, condition)

@@ -19,7 +19,7 @@ from gemuco.learning.train import fit
 from gemuco.schema import BodySchema
 from gemuco.structure.determination import Judge, Thresholds, determine
 from gemuco.structure.mask_errors import train_masks
-from services.learning.measured import MeasuredConfig, load_measured, read
+from services.learning.measured import MeasuredConfig, load_measured, read_measured
 from services.learning.trainer import train_config
 
 ROOT = Path(__file__).parents[2]
@@ -31,7 +31,7 @@ def recording(name: str) -> tuple[MeasuredConfig, Dataset]:
     """Return a description of examples/ and the data it describes."""
     config = load_measured(ROOT / "examples" / f"{name}.yaml")
     folder = Path(os.environ.get("GEMUCO_DATA", ROOT.parent / "shared" / "data"))
-    return config, read(config, folder / name)
+    return config, read_measured(config, folder / name)
 
 
 def lost_boards(config: MeasuredConfig, data: Dataset, masks: tuple[frozenset[str], ...], seed: int) -> np.ndarray:

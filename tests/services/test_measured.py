@@ -7,7 +7,7 @@ import pytest
 from gemuco.errors import DatasetError
 from hal.config import load_robot
 from hal.errors import ConfigError
-from services.learning.measured import is_description, load_measured, read
+from services.learning.measured import is_description, load_measured, read_measured
 
 ROOT = Path(__file__).parents[2]
 DATA = Path(os.environ.get("GEMUCO_DATA", ROOT.parent / "shared" / "data"))
@@ -28,7 +28,7 @@ def table(folder: Path, *lines: str, name: str = "one.csv") -> None:
 def test_columns_are_gathered_and_converted(tmp_path):
     table(tmp_path, "180,0,1,0.0", "90,,nan,0.1")
     config = load_measured(describe(tmp_path))
-    data = read(config, tmp_path)
+    data = read_measured(config, tmp_path)
     assert data.layout.signal("angle").elements == ("a0", "a1")
     assert data.layout.signal("angle").unit == "rad"
     np.testing.assert_allclose(data.rows(), [[np.pi, 0.0, 1.0], [np.pi / 2, np.nan, np.nan]])
@@ -48,8 +48,8 @@ def test_files_in_a_folder_without_header_are_one_episode_each(tmp_path):
         "signals:\n  x: {unit: m, file: state.csv, columns: '{0..1}'}\n  f: {unit: N, file: input.csv, columns: 0}\n"
     )
     with pytest.raises(DatasetError, match=r"different numbers of rows: state\.csv 2, input\.csv 1.*cut_to_shortest"):
-        read(load_measured(describe(tmp_path, text)), tmp_path)
-    data = read(load_measured(describe(tmp_path, text + "cut_to_shortest: true\n")), tmp_path)
+        read_measured(load_measured(describe(tmp_path, text)), tmp_path)
+    data = read_measured(load_measured(describe(tmp_path, text + "cut_to_shortest: true\n")), tmp_path)
     assert [len(e.values["x"]) for e in data.episodes] == [3, 1]
     assert [e.condition for e in data.episodes] == ["light", "heavy"]
 
@@ -57,17 +57,17 @@ def test_files_in_a_folder_without_header_are_one_episode_each(tmp_path):
 def test_a_pause_or_a_step_back_begins_an_episode(tmp_path):
     table(tmp_path, *(f"0,0,0,{t}" for t in (0.0, 0.1, 5.0, 5.1, 5.2, 1.0)))
     config = load_measured(describe(tmp_path, HEAD + SIGNALS + "time: {columns: t, gap: 1.0}\n"))
-    assert [len(e.values["load"]) for e in read(config, tmp_path).episodes] == [2, 3, 1]
+    assert [len(e.values["load"]) for e in read_measured(config, tmp_path).episodes] == [2, 3, 1]
 
 
 def test_repetitions_become_one_episode(tmp_path):
     for index in range(4):
         table(tmp_path, *["0,0,0,0"] * (index + 1), name=f"{index}.csv")
     text = HEAD + SIGNALS + "together: [['1.csv', '3.csv']]\n"
-    data = read(load_measured(describe(tmp_path, text)), tmp_path)
+    data = read_measured(load_measured(describe(tmp_path, text)), tmp_path)
     assert [len(e.values["load"]) for e in data.episodes] == [6, 1, 3]
     with pytest.raises(DatasetError, match="match seven do not exist"):
-        read(load_measured(describe(tmp_path, text.replace("'1.csv', '3.csv'", "seven"))), tmp_path)
+        read_measured(load_measured(describe(tmp_path, text.replace("'1.csv', '3.csv'", "seven"))), tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -81,19 +81,19 @@ def test_repetitions_become_one_episode(tmp_path):
 def test_bad_rows_are_one_sentence(tmp_path, lines, sentence):
     table(tmp_path, *lines)
     with pytest.raises(DatasetError, match=sentence):
-        read(load_measured(describe(tmp_path)), tmp_path)
+        read_measured(load_measured(describe(tmp_path)), tmp_path)
 
 
 def test_missing_columns_and_files_are_one_sentence(tmp_path):
     config = load_measured(describe(tmp_path))
     with pytest.raises(DatasetError, match=r"Nothing in '.*' matches '\*\.csv'\. Is that the folder"):
-        read(config, tmp_path)
+        read_measured(config, tmp_path)
     (tmp_path / "one.csv").write_text("a0,a1\n1,2\n")
     with pytest.raises(DatasetError, match=r"no column 'load'\. Columns: a0, a1"):
-        read(config, tmp_path)
+        read_measured(config, tmp_path)
     (tmp_path / "one.csv").write_bytes(b"\xff\xfe\x00\x00")
     with pytest.raises(DatasetError, match="is not a text file"):
-        read(config, tmp_path)
+        read_measured(config, tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -124,6 +124,6 @@ def test_descriptions_and_robots_are_told_apart():
 @pytest.mark.skipif(not DATA.is_dir(), reason=f"no recordings in {DATA}; name their folder in GEMUCO_DATA")
 @pytest.mark.parametrize(("name", "samples", "episodes"), [("joint_capsule", 1263, 1), ("schunk_arm", 18720, 6)])
 def test_shipped_descriptions_fit_the_recordings(name, samples, episodes):
-    data = read(load_measured(ROOT / "examples" / f"{name}.yaml"), DATA / name)
+    data = read_measured(load_measured(ROOT / "examples" / f"{name}.yaml"), DATA / name)
     assert (len(data), len(data.episodes)) == (samples, episodes)
     assert np.isfinite(data.rows()).all()

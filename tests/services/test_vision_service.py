@@ -285,5 +285,5 @@ def test_the_command_line_finds_who_plays_a_fault(robot: str, capsys: pytest.Cap
         assert "The camera sees nothing." in capsys.readouterr().out
         ask_robot(robot, "fault", ("tool_changed", "long"), (), False, ())
         assert "The simulator plays tool_changed long." in capsys.readouterr().out
-        with pytest.raises(RemoteError, match=r"no part that can break.*nothing that can happen here"):
+        with pytest.raises(RemoteError, match=r"not a part that can break.*nothing that can happen here"):
             ask_robot(robot, "fault", ("camera_dropped",), (), False, ())
