@@ -12,6 +12,7 @@ import yaml
 
 import gemuco
 import hal
+import services
 from services.cli import app
 
 ROOT = Path(__file__).parents[2]
@@ -58,7 +59,7 @@ def anchors(page: Path) -> set[str]:
     return {re.sub(r"[^\w -]", "", heading.lower()).strip().replace(" ", "-") for heading in headings}
 
 
-@pytest.mark.parametrize("package", [gemuco, hal], ids=lambda package: package.__name__)
+@pytest.mark.parametrize("package", [gemuco, hal, services], ids=lambda package: package.__name__)
 def test_reference_lists_every_exported_name(package: ModuleType) -> None:
     page = (ROOT / "docs" / f"api_{package.__name__}.md").read_text()
     listed = set(re.findall(rf"^::: {package.__name__}\.(\w+)$", page, re.MULTILINE))
