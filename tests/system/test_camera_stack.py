@@ -16,7 +16,7 @@ from gemuco.learning.train import TrainConfig, fit
 from gemuco.schema import BodySchema
 from hal.config import load_robot
 from services.client import Client
-from services.learning.collector import Wanted, collect_bus
+from services.learning.collector import Request, collect_bus
 from services.model.living_model import layout_of
 from services.process.supervisor import Supervisor, gemuco_command
 from services.wire.messages import Estimates
@@ -165,7 +165,7 @@ def test_without_its_hal_the_camera_alone_is_told_for_what_it_is(stack: Stack) -
 def test_collecting_on_the_bus_records_what_the_camera_sees_under_the_told_condition(stack: Stack) -> None:
     robot = load_robot(stack.file)
     eventually(lambda: stack.method("joint_position") == "measured")
-    dataset = collect_bus(robot, 0, Wanted(("borrowed",), 20)).dataset
+    dataset = collect_bus(robot, 0, Request(("borrowed",), 20)).dataset
     assert dataset.conditions == ("borrowed",)
     assert dataset.rows().shape == (20, 6)
     assert np.isfinite(dataset.rows()).all()
