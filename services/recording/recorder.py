@@ -82,7 +82,7 @@ class EntryQueue:
         return content
 
 
-class ArrivalClock:
+class SteadyClock:
     """Clock that starts at wall-clock time and then is never set: arrivals never go back in time."""
 
     def __init__(self) -> None:
@@ -122,7 +122,7 @@ class Recorder:
         """Reason why writing ended early; empty otherwise."""
         self._session, self._robot = session, robot
         self._waiting = EntryQueue(limit, MOST_BYTES)
-        self._clock = ArrivalClock()
+        self._clock = SteadyClock()
         self._stop = threading.Event()
         self._hal_came = threading.Event()
         self._known = threading.Event()

@@ -9,9 +9,9 @@ from typing import Any, Literal
 import zenoh
 
 from services.security.authority import Authority, Identity, encoded
+from services.security.check_sessions import PAUSE, PAYLOAD, CheckSessions, Listener, answer, answered, until
 from services.security.init import CA, CA_KEY
-from services.security.plan import Plan
-from services.security.stage import PAUSE, PAYLOAD, Listener, Stage, answer, answered, until
+from services.security.plan import InstallationPlan
 from services.wire.roles import RATES, SIZES
 
 Verdict = Literal["refused", "NOT REFUSED", "works", "DOES NOT WORK", "not tried"]
@@ -43,30 +43,30 @@ def allowed(what: str, works: bool, text: str = "") -> Attempt:
     return Attempt(what, "works" if works else "DOES NOT WORK", text)
 
 
-def people(plan: Plan) -> tuple[str, str, str]:
+def people(plan: InstallationPlan) -> tuple[str, str, str]:
     """Return the names of an operator and a viewer of the attacked robot, and the robot's name."""
     robot = next(iter(plan.robots))
     named = {person.role: name for name, person in reversed(plan.people.items()) if {"*", robot} & set(person.robots)}
     return named.get("operator", ""), named.get("viewer", ""), robot
 
 
-def entering(stage: Stage, name: str, where: str = "", at: str = "the router") -> Iterator[Attempt]:
+def entering(sessions: CheckSessions, name: str, where: str = "", at: str = "the router") -> Iterator[Attempt]:
     """Try to connect without one of the things that a connection needs."""
-    stage.member(name, where)
+    sessions.member(name, where)
     yield allowed(f"{name} connects to {at}", True)
 
     def tried(what: str, change: Callable[[dict[str, Any], dict[str, Any], dict[str, Any]], None]) -> Attempt:
-        configured = stage.outside(name, where)
+        configured = sessions.outside(name, where)
         change(configured, configured["transport"]["link"]["tls"], configured["transport"]["auth"]["usrpwd"])
-        return refused(f"{what} at {at}", not stage.enters(configured))
+        return refused(f"{what} at {at}", not sessions.enters(configured))
 
     yield tried("clear text", _clear_text)
     yield tried("no certificate", _no_certificate)
     stranger = Authority.new()
     yield tried("certificate of a foreign authority", lambda _, tls, __: _as(tls, _signed(stranger, name)))
-    key = stage.folder / CA_KEY
+    key = sessions.folder / CA_KEY
     if key.exists():
-        ours = Authority(Identity((stage.folder / CA).read_bytes(), key.read_bytes()))
+        ours = Authority(Identity((sessions.folder / CA).read_bytes(), key.read_bytes()))
         ended = _signed(ours, name, timedelta(hours=-1))
         yield tried("expired certificate", lambda _, tls, __: _as(tls, ended))
     else:
@@ -76,18 +76,18 @@ def entering(stage: Stage, name: str, where: str = "", at: str = "the router") -
     yield tried("no password", lambda configured, _, __: configured["transport"].pop("auth"))
 
 
-def at_the_hal(stage: Stage, operator: str, viewer: str) -> Iterator[Attempt]:
+def at_the_hal(sessions: CheckSessions, operator: str, viewer: str) -> Iterator[Attempt]:
     """Try to use the robot's direct links without being one of its services."""
-    yield from entering(stage, f"model.{stage.robot}", stage.hal, "the HAL")
+    yield from entering(sessions, f"model.{sessions.robot}", sessions.hal, "the HAL")
     for name in (operator, viewer):
-        yield refused(f"{name} past the router, at the HAL", not stage.enters(stage.outside(name, stage.hal)))
-    heard = Listener(stage.hal_session, stage.key("hal", "command"))
-    recorder = stage.member(f"recorder.{stage.robot}", stage.hal)
-    model = stage.member(f"model.{stage.robot}", stage.hal)
+        yield refused(f"{name} past the router, at the HAL", not sessions.enters(sessions.outside(name, sessions.hal)))
+    heard = Listener(sessions.hal_session, sessions.key("hal", "command"))
+    recorder = sessions.member(f"recorder.{sessions.robot}", sessions.hal)
+    model = sessions.member(f"model.{sessions.robot}", sessions.hal)
     for _ in range(REPEATS):
-        recorder.put(stage.key("hal", "command"), NEVER_HEARD)
+        recorder.put(sessions.key("hal", "command"), NEVER_HEARD)
         time.sleep(PAUSE)
-    works = until(lambda: model.put(stage.key("hal", "command"), PAYLOAD) is None and heard.count(PAYLOAD))
+    works = until(lambda: model.put(sessions.key("hal", "command"), PAYLOAD) is None and heard.count(PAYLOAD))
     yield allowed("model commands at the HAL", works)
     yield refused("recorder commands at the HAL", not heard.count(NEVER_HEARD))
 
@@ -95,16 +95,16 @@ def at_the_hal(stage: Stage, operator: str, viewer: str) -> Iterator[Attempt]:
 class Inside:
     """Attacks by members that were accepted."""
 
-    def __init__(self, stage: Stage, operator: str, viewer: str) -> None:
-        self.stage = stage
-        self.command, self.target = stage.key("hal", "command"), stage.key("model", "target")
-        self.operator, self.viewer = stage.member(operator), stage.member(viewer)
+    def __init__(self, sessions: CheckSessions, operator: str, viewer: str) -> None:
+        self.sessions = sessions
+        self.command, self.target = sessions.key("hal", "command"), sessions.key("model", "target")
+        self.operator, self.viewer = sessions.member(operator), sessions.member(viewer)
         self.names = operator, viewer
-        self.recorder = stage.member(f"recorder.{stage.robot}")
-        self.hal = stage.member(f"hal.{stage.robot}")
+        self.recorder = sessions.member(f"recorder.{sessions.robot}")
+        self.hal = sessions.member(f"hal.{sessions.robot}")
         self.heard, self.seen = (
-            Listener(self.recorder, stage.key("**")),
-            Listener(self.viewer, stage.key("hal", "status")),
+            Listener(self.recorder, sessions.key("**")),
+            Listener(self.viewer, sessions.key("hal", "status")),
         )
         self._number = 0
 
@@ -121,14 +121,14 @@ class Inside:
 
     def allowed(self) -> Iterator[Attempt]:
         """Check what must work, since otherwise the rest would prove nothing."""
-        stage = self.stage
+        sessions = self.sessions
         yield allowed("operator commands", self.settled())
-        status = stage.key("hal", "status")
+        status = sessions.key("hal", "status")
         works = until(lambda: self.hal.put(status, PAYLOAD) is None and self.seen.count(PAYLOAD))
         yield allowed("viewer looks on", works)
-        if stage.is_running:
+        if sessions.is_running:
             return
-        describe = stage.key("hal", "do", "describe")
+        describe = sessions.key("hal", "do", "describe")
         yield allowed("operator asks the HAL", until(lambda: answered(self.operator, describe)))
         yield allowed("viewer asks who the HAL is", until(lambda: answered(self.viewer, describe)))
         yield allowed("viewer sees who is alive", until(lambda: "model" in self._alive(self.viewer)))
@@ -141,13 +141,13 @@ class Inside:
 
     def publishing(self) -> Iterator[Attempt]:
         """Publish as a viewer, who may publish nothing."""
-        stage, forged = self.stage, (("hal", "sample"), ("model", "estimate"), ("vision", "sample"))
+        sessions, forged = self.sessions, (("hal", "sample"), ("model", "estimate"), ("vision", "sample"))
         attacks = {
             "viewer commands": self.command,
             "viewer sets a target": self.target,
-            "viewer puts on wildcards": stage.key("hal", "*"),
+            "viewer puts on wildcards": sessions.key("hal", "*"),
             "viewer puts on every key": "gemuco/**",
-            **{f"viewer forges {service}/{noun}": stage.key(service, noun) for service, noun in forged},
+            **{f"viewer forges {service}/{noun}": sessions.key(service, noun) for service, noun in forged},
         }
         before = self.heard.count(b"")
         yield from self._published(self.viewer, attacks, lambda: self.viewer.delete(self.command))
@@ -171,29 +171,29 @@ class Inside:
     def foreign_password(self) -> Iterator[Attempt]:
         """Connect with one member's certificate and another's password, which must give no rights."""
         operator, viewer = self.names
-        configured = self.stage.outside(viewer)
-        configured["transport"]["auth"] = self.stage.outside(operator)["transport"]["auth"]
+        configured = self.sessions.outside(viewer)
+        configured["transport"]["auth"] = self.sessions.outside(operator)["transport"]["auth"]
         what = "viewer's certificate with the operator's password"
         try:
-            mixed = self.stage.open(configured)
+            mixed = self.sessions.open(configured)
         except zenoh.ZError:
             yield refused(what, True, "the connection was refused")
             return
-        listener = Listener(mixed, self.stage.key("hal", "status"))
+        listener = Listener(mixed, self.sessions.key("hal", "status"))
         yield from self._published(mixed, {f"{what}: commands": self.command})
         yield refused(f"{what}: looks on", not self._shown(listener))
 
     def _shown(self, *listeners: Listener) -> bool:
         """Whether a listener hears a status that the viewer hears."""
         self._number += 1
-        mark, key = PAYLOAD + str(self._number).encode(), self.stage.key("hal", "status")
+        mark, key = PAYLOAD + str(self._number).encode(), self.sessions.key("hal", "status")
         until(lambda: self.hal.put(key, mark) is None and self.seen.count(mark))
         return until(lambda: any(listener.count(mark) for listener in listeners), LISTENS)
 
     def spying(self) -> Iterator[Attempt]:
         """Subscribe to commands, which only the robot may hear."""
-        name, patterns = self.names[1], ("**", "gemuco/**", self.stage.key("**"), self.command)
-        spies = {pattern: Listener(self.stage.member(name), pattern) for pattern in patterns}
+        name, patterns = self.names[1], ("**", "gemuco/**", self.sessions.key("**"), self.command)
+        spies = {pattern: Listener(self.sessions.member(name), pattern) for pattern in patterns}
         if not (self.settled() and self.settled()):
             yield allowed("operator is heard meanwhile", False)
         until(lambda: all(spy.anything for spy in spies.values()), LISTENS)
@@ -202,11 +202,11 @@ class Inside:
 
     def querying(self) -> Iterator[Attempt]:
         """Query as a viewer what would change something, and query the router's admin space."""
-        stage, asked = self.stage, []
-        if not stage.is_running:
+        sessions, asked = self.sessions, []
+        if not sessions.is_running:
             for service, verb in (("hal", "enable"), ("model", "engage")):
-                session = stage.hal_session if service == "hal" else stage.model_session
-                key = stage.key(service, "do", verb)
+                session = sessions.hal_session if service == "hal" else sessions.model_session
+                key = sessions.key(service, "do", verb)
                 asked.append(answer(session, key, b"done"))
                 works = until(lambda key=key: answered(self.operator, key, b"done"))  # type: ignore[misc]
                 yield allowed(f"operator asks {service}/do/{verb}", works)
@@ -221,9 +221,9 @@ class Inside:
 
     def answering(self) -> Iterator[Attempt]:
         """Answer and declare liveliness in the place of a service."""
-        fake = self.stage.key("model", "do", "estimate")
+        fake = self.sessions.key("model", "do", "estimate")
         queryable = answer(self.viewer, fake, NEVER_HEARD)
-        token = self.viewer.liveliness().declare_token(self.stage.key("vision", "alive"))
+        token = self.viewer.liveliness().declare_token(self.sessions.key("vision", "alive"))
         self.settled()
         is_fooled = any(answered(self.operator, fake, NEVER_HEARD) for _ in range(REPEATS))
         yield refused("viewer answers in the model's place", not is_fooled)
@@ -233,14 +233,14 @@ class Inside:
 
     def robots(self) -> Iterator[Attempt]:
         """Publish as a service of another robot."""
-        stage = self.stage
-        other = next((name for name in stage.plan.robots if name != stage.robot), "")
+        sessions = self.sessions
+        other = next((name for name in sessions.plan.robots if name != sessions.robot), "")
         if not other:
             yield Attempt("HAL of one robot forges another's", "not tried", "the plan has one robot only")
             return
         listener, theirs = (
-            Listener(stage.member(f"recorder.{other}"), f"gemuco/{other}/**"),
-            stage.member(f"hal.{other}"),
+            Listener(sessions.member(f"recorder.{other}"), f"gemuco/{other}/**"),
+            sessions.member(f"hal.{other}"),
         )
         nouns = ("hal/sample", "model/estimate", "hal/command")
         for _ in range(REPEATS):
@@ -253,9 +253,9 @@ class Inside:
         )
         for noun in nouns:
             is_heard = listener.count(NEVER_HEARD + noun.encode())
-            yield refused(f"hal.{stage.robot} forges {noun} of '{other}'", not is_heard)
+            yield refused(f"hal.{sessions.robot} forges {noun} of '{other}'", not is_heard)
         yield from self._published(
-            self.hal, {f"hal.{stage.robot} forges model/estimate": stage.key("model", "estimate")}
+            self.hal, {f"hal.{sessions.robot} forges model/estimate": sessions.key("model", "estimate")}
         )
 
     def limits(self) -> Iterator[Attempt]:
@@ -283,19 +283,19 @@ class Inside:
         return until(lambda: self.operator.put(self.command, payload) is None and self.heard.count(payload))
 
     def _alive(self, session: zenoh.Session) -> set[str]:
-        replies = session.liveliness().get(self.stage.key("*", "alive"), timeout=2.0)
+        replies = session.liveliness().get(self.sessions.key("*", "alive"), timeout=2.0)
         return {str(reply.ok.key_expr).split("/")[2] for reply in replies if reply.ok is not None}
 
 
-def impostor(stage: Stage, name: str) -> Attempt:
+def impostor(sessions: CheckSessions, name: str) -> Attempt:
     """Check that a client does not send its password to a router of a foreign authority."""
-    stranger, fake = Authority.new(), stage.of("router")
-    fake["listen"]["endpoints"] = [where := stage.another_endpoint()]
+    stranger, fake = Authority.new(), sessions.of("router")
+    fake["listen"]["endpoints"] = [where := sessions.another_endpoint()]
     tls = fake["transport"]["link"]["tls"]
     _as(tls, _signed(stranger, "router", hosts=("127.0.0.1",)))
     tls |= {"root_ca_certificate_base64": encoded(stranger.identity.certificate), "enable_mtls": False}
-    stage.open(fake)
-    return refused("a router of a foreign authority", not stage.enters(stage.outside(name, where)))
+    sessions.open(fake)
+    return refused("a router of a foreign authority", not sessions.enters(sessions.outside(name, where)))
 
 
 def _clear_text(configured: dict[str, Any], tls: dict[str, Any], login: dict[str, Any]) -> None:

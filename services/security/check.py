@@ -7,7 +7,7 @@ import typer
 
 from services.errors import ServiceError
 from services.security.attacks import Attempt, Inside, at_the_hal, entering, impostor, people
-from services.security.stage import Stage, Weaken
+from services.security.check_sessions import CheckSessions, Weaken
 from services.wire.connect import checked_endpoint
 
 _BAD = ("NOT REFUSED", "DOES NOT WORK")
@@ -46,12 +46,12 @@ def attempts(folder: Path, running: str | None = None, weaken: Weaken | None = N
     """
     if running is not None:
         checked_endpoint(running)
-    with Stage(folder, running, weaken) as stage:
-        operator, viewer, robot = people(stage.plan)
+    with CheckSessions(folder, running, weaken) as sessions:
+        operator, viewer, robot = people(sessions.plan)
         if not operator or not viewer:
             raise ServiceError(f"The check needs an operator and a viewer of robot '{robot}' in plan.json.")
-        yield from entering(stage, viewer)
-        yield impostor(stage, viewer)
-        if stage.hal:
-            yield from at_the_hal(stage, operator, viewer)
-        yield from Inside(stage, operator, viewer).run()
+        yield from entering(sessions, viewer)
+        yield impostor(sessions, viewer)
+        if sessions.hal:
+            yield from at_the_hal(sessions, operator, viewer)
+        yield from Inside(sessions, operator, viewer).run()

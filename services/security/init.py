@@ -10,7 +10,7 @@ from typing import Any
 
 from services.errors import ServiceError
 from services.security.authority import Authority, Identity
-from services.security.plan import FILE, LISTENING, Plan
+from services.security.plan import FILE, LISTENING, InstallationPlan
 from services.security.role_files import Secrets, configuration, secrets_of, text_of, write
 from services.wire.connect import role_file
 
@@ -29,7 +29,7 @@ class Changes:
     left: list[str] = field(default_factory=list)
 
 
-def init(folder: Path, plan: Plan) -> Changes:
+def init(folder: Path, plan: InstallationPlan) -> Changes:
     """Make the authority and the missing role files, and update the others to the plan.
 
     Existing files keep their certificate and password. Entries that depend on other members (passwords, access control)
@@ -52,7 +52,7 @@ def init(folder: Path, plan: Plan) -> Changes:
         for name in plan.members():
             configured = configuration(plan, name, known, authority.certificate)
             _bring(folder / f"{name}.json", json.loads(text_of(configured)), changes)
-        if Plan.read(folder) != plan:
+        if InstallationPlan.read(folder) != plan:
             write(folder / FILE, plan.model_dump_json(indent=1) + "\n", 0o644)
     except OSError as error:
         raise ServiceError(f"'{folder}' cannot be written: {error.strerror} ('{error.filename}').") from None
@@ -65,7 +65,7 @@ def planned(
     routers: Sequence[str],
     protocol: str | None,
     days: int | None,
-) -> Plan:
+) -> InstallationPlan:
     """Return the folder's plan, or a new one, with these robots added.
 
     Raises:
@@ -73,14 +73,14 @@ def planned(
     """
     given: dict[str, Any] = {"protocol": protocol, "days": days, "routers": list(routers) or None}
     given = {name: value for name, value in given.items() if value is not None}
-    before = Plan.read(folder)
+    before = InstallationPlan.read(folder)
     if before is None:
         if not robots:
             raise ServiceError("A new folder needs at least one --robot NAME.")
-        return Plan.of(
+        return InstallationPlan.of(
             **{"routers": ["127.0.0.1"], **given, "robots": {name: dict(hosts) for name, hosts in robots.items()}}
         )
-    after = Plan.of(**before.model_dump() | given)
+    after = InstallationPlan.of(**before.model_dump() | given)
     for name in ("protocol", "routers"):
         if getattr(before, name) != getattr(after, name):
             raise ServiceError(
@@ -96,7 +96,7 @@ def planned(
                 f"'{folder}' has robot '{robot}' with {was}. To move it, edit plan.json, remove *.{robot}.json, and "
                 "run `gemuco security init` on it again."
             )
-    return Plan.of(
+    return InstallationPlan.of(
         **after.model_dump() | {"robots": {**before.robots, **{name: dict(hosts) for name, hosts in robots.items()}}}
     )
 
@@ -133,7 +133,7 @@ def _authority(folder: Path, changes: Changes) -> _KeptAuthority:
     return _KeptAuthority(certificate.read_bytes(), key.read_bytes() if key.exists() else None)
 
 
-def _new(authority: _KeptAuthority, folder: Path, plan: Plan, name: str) -> Secrets:
+def _new(authority: _KeptAuthority, folder: Path, plan: InstallationPlan, name: str) -> Secrets:
     if authority.key is None:
         raise ServiceError(
             f"{name}.json is missing, and signing a certificate for it needs '{folder / CA_KEY}'. Bring the key "

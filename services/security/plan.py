@@ -29,7 +29,7 @@ class Person(BaseModel):
     robots: list[str] = Field(default_factory=lambda: [ALL])
 
 
-class Plan(BaseModel):
+class InstallationPlan(BaseModel):
     """Hosts of all members.
 
     Attributes:

@@ -7,7 +7,7 @@ from pathlib import Path
 import typer
 
 from services.security.init import CA_KEY, Changes
-from services.security.plan import FILE, Plan
+from services.security.plan import FILE, InstallationPlan
 from services.wire.connect import role_file
 from services.wire.entering import WARN_BEFORE, ending
 from services.wire.roles import PEOPLE, ROUTER
@@ -15,7 +15,7 @@ from services.wire.roles import PEOPLE, ROUTER
 VERBS = {"simulator": "simulate", "hal": "hal", "vision": "vision", "model": "serve", "recorder": "record"}
 
 
-def report(folder: Path, plan: Plan, changes: Changes) -> None:
+def report(folder: Path, plan: InstallationPlan, changes: Changes) -> None:
     """Print what was made and changed, and what to do with it."""
     _list("made", changes.made)
     for name, parts in changes.changed.items():
@@ -44,7 +44,7 @@ def _list(word: str, names: Iterable[str]) -> None:
         typer.echo(f"{word:<8} {listed}")
 
 
-def _destinations(folder: Path, plan: Plan) -> Iterable[str]:
+def _destinations(folder: Path, plan: InstallationPlan) -> Iterable[str]:
     """Yield for each file its command, its host, and the port that must be open there."""
     for name, member in plan.members().items():
         path = folder / f"{name}.json"
@@ -58,7 +58,7 @@ def _destinations(folder: Path, plan: Plan) -> Iterable[str]:
             yield f"  gemuco {VERBS[member.role]} {member.robots[0]} --connect {path}{opened}"
 
 
-def _expiring(folder: Path, plan: Plan) -> Iterable[str]:
+def _expiring(folder: Path, plan: InstallationPlan) -> Iterable[str]:
     for name in plan.members():
         until = ending(role_file(folder / f"{name}.json"))
         if until is not None and until - datetime.now(UTC) < WARN_BEFORE:

@@ -11,7 +11,7 @@ from typing import Any
 from services.errors import ServiceError
 from services.security import access
 from services.security.authority import Identity, decoded, encoded
-from services.security.plan import LINKS, LISTENING, Plan, dialled, listened
+from services.security.plan import LINKS, LISTENING, InstallationPlan, dialled, listened
 from services.wire.connect import merged, role_file
 from services.wire.member import Member
 from services.wire.roles import ROLES, ROUTER
@@ -47,7 +47,7 @@ def secrets_of(path: Path) -> Secrets:
         raise ServiceError(f"'{path}' is not a role file that `gemuco security init` made.") from None
 
 
-def configuration(plan: Plan, name: str, known: Mapping[str, Secrets], authority: bytes) -> dict[str, Any]:
+def configuration(plan: InstallationPlan, name: str, known: Mapping[str, Secrets], authority: bytes) -> dict[str, Any]:
     """Return the role file of a member.
 
     Args:
@@ -91,7 +91,7 @@ def text_of(content: Mapping[str, Any]) -> str:
     return json.dumps(content, indent=1) + "\n"
 
 
-def _router(plan: Plan, known: Mapping[str, Secrets]) -> dict[str, Any]:
+def _router(plan: InstallationPlan, known: Mapping[str, Secrets]) -> dict[str, Any]:
     members = plan.members()
     subjects = {
         name: (access.identity_of(name, dials=True), access.rules_of(ROLES[member.role], member.robots))
@@ -113,7 +113,7 @@ def _router(plan: Plan, known: Mapping[str, Secrets]) -> dict[str, Any]:
     }
 
 
-def _service(plan: Plan, name: str, known: Mapping[str, Secrets]) -> dict[str, Any]:
+def _service(plan: InstallationPlan, name: str, known: Mapping[str, Secrets]) -> dict[str, Any]:
     service, _, robot = name.partition(".")
     hosts = plan.robots[robot]
     dials = LINKS.get(service, ())
@@ -147,7 +147,7 @@ def _service(plan: Plan, name: str, known: Mapping[str, Secrets]) -> dict[str, A
     return own
 
 
-def _person(plan: Plan) -> dict[str, Any]:
+def _person(plan: InstallationPlan) -> dict[str, Any]:
     return {
         "mode": "client",
         "connect": {"endpoints": [f"{plan.protocol}/{place}" for place in plan.routers]},

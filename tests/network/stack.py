@@ -18,7 +18,7 @@ from link import Link, inside
 from hal.config import load_robot
 from services.process.supervisor import Supervisor, gemuco_command
 from services.security.init import init, placed
-from services.security.plan import Plan
+from services.security.plan import InstallationPlan
 from services.wire.session import ROUTER_PORT, port
 
 HERE = Path(__file__).parent
@@ -225,6 +225,6 @@ class Stack:
     def _secured(self) -> dict[str, Path]:
         folder = self.folder / "security"
         hosts = placed(Link.ADDRESS["first"], Link.ADDRESS["second"])
-        init(folder, Plan(protocol=self.protocol, routers=[ROUTER], robots={self.robot: hosts}, days=2))
+        init(folder, InstallationPlan(protocol=self.protocol, routers=[ROUTER], robots={self.robot: hosts}, days=2))
         services = {name: folder / f"{name}.{self.robot}.json" for name in ("simulator", "hal", "model")}
         return services | {name: folder / f"{name}.json" for name in ("router", "operator", "viewer")}

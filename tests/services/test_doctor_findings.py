@@ -8,7 +8,7 @@ import pytest
 from hal.finding.doctor import Verdict
 from services.hardware import doctor, host_checks
 from services.security.init import init, placed
-from services.security.plan import Plan
+from services.security.plan import InstallationPlan
 from services.wire.messages import Status
 
 BUS = {"state": "ok", "text": "", "load": 0.41, "unknown": []}
@@ -76,12 +76,12 @@ def test_every_check_of_this_machine_says_something() -> None:
 
 def test_role_files_are_told_with_their_end(tmp_path: Path) -> None:
     folder, home = tmp_path / "keys", placed("127.0.0.1")
-    init(folder, Plan(routers=["127.0.0.1"], robots={"a": home}, days=400))
+    init(folder, InstallationPlan(routers=["127.0.0.1"], robots={"a": home}, days=400))
     viewer = folder / "viewer.json"
     assert [found.verdict for found in doctor.role_files([str(viewer)])] == [Verdict.OK]
     viewer.chmod(0o644)
     assert [found.verdict for found in doctor.role_files([str(viewer)])] == [Verdict.OK, Verdict.BAD]
-    init(tmp_path / "soon", Plan(routers=["127.0.0.1"], robots={"a": home}, days=9))
+    init(tmp_path / "soon", InstallationPlan(routers=["127.0.0.1"], robots={"a": home}, days=9))
     (found,) = doctor.role_files([str(tmp_path / "soon" / "viewer.json")])
     assert found.verdict is Verdict.WARNING
     assert "in 8 days" in found.text

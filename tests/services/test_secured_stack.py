@@ -20,7 +20,7 @@ from services.errors import NoAnswer, NotAllowed
 from services.process.supervisor import Supervisor, gemuco_command
 from services.security.authority import Authority, Identity, encoded
 from services.security.init import CA, CA_KEY, init, placed
-from services.security.plan import Plan
+from services.security.plan import InstallationPlan
 from services.wire.session import address
 
 LEFT = timedelta(seconds=6)
@@ -37,7 +37,7 @@ class Secured:
         with socket.socket(type=socket.SOCK_DGRAM) as probe:
             probe.bind(("127.0.0.1", 0))
             self.router = f"127.0.0.1:{probe.getsockname()[1]}"
-        init(self.keys, Plan(routers=[self.router], robots={self.robot: placed(address(self.robot))}))
+        init(self.keys, InstallationPlan(routers=[self.router], robots={self.robot: placed(address(self.robot))}))
         self.supervisor = Supervisor(folder / "logs")
 
     def start(self) -> None:

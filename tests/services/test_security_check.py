@@ -9,8 +9,8 @@ import pytest
 from services.errors import ServiceError
 from services.security.attacks import Attempt
 from services.security.check import attempts, run_check
+from services.security.check_sessions import CheckSessions, Weaken
 from services.security.init import init, placed, planned
-from services.security.stage import Stage, Weaken
 from services.wire.session import address
 
 
@@ -59,12 +59,12 @@ def test_the_password_is_what_counts(tmp_path: Path) -> None:
     def no_passwords(name: str, found: dict[str, Any]) -> None:
         found["transport"].pop("auth")
 
-    with Stage(folder, weaken=other_password) as stage:
+    with CheckSessions(folder, weaken=other_password) as stage:
         viewer = stage.outside("viewer")
         assert not stage.enters(viewer)
         viewer["transport"]["auth"]["usrpwd"]["password"] = "wrong"
         assert stage.enters(viewer)
-    with Stage(folder, weaken=no_passwords) as stage:
+    with CheckSessions(folder, weaken=no_passwords) as stage:
         viewer = stage.outside("viewer")
         del viewer["transport"]["auth"]
         assert stage.enters(viewer)
@@ -99,7 +99,7 @@ def test_a_folder_without_a_plan_is_told(tmp_path: Path) -> None:
 
 
 def test_nobody_at_the_running_router_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("services.security.stage.WITHIN", 0.2)
+    monkeypatch.setattr("services.security.check_sessions.WITHIN", 0.2)
     with pytest.raises(ServiceError, match=r"is refused at quic/127\.0\.0\.1:9 with its own role file"):
         run_check(made(tmp_path / "keys", "quic", "a"), "quic/127.0.0.1:9")
 

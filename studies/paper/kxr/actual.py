@@ -17,7 +17,7 @@ from services.show import Tell
 from studies.paper.body import JOINTS
 from studies.paper.kxr.robot import Standing, inverse, random_targets, safe_postures, stiff
 from studies.paper.kxr.simulated import AFTER, FRESH, LEADS, TOOLS, UPDATES, control_of, leads, recognitions
-from studies.paper.kxr.trials import Course, follow, follow_blindly, samples_until
+from studies.paper.kxr.trials import Trial, follow, follow_blindly, samples_until
 from studies.paper.runs import Run
 
 ACTUAL = "actual"
@@ -45,7 +45,7 @@ class Actual:
         leads: Label -> path of p to a tool with all sensors.
         needed: Tool -> samples until it is recognised by the default update.
         recognised: Case -> samples until long_middle is recognised by the default update, shape (runs,).
-        controlled: Model -> course with long_middle.
+        controlled: Model -> trial with long_middle.
     """
 
     schema: BodySchema
@@ -53,7 +53,7 @@ class Actual:
     leads: Mapping[str, np.ndarray]
     needed: Mapping[str, float]
     recognised: Mapping[str, np.ndarray]
-    controlled: Mapping[str, Course]
+    controlled: Mapping[str, Trial]
 
 
 def actual(run: Run, simulated: BodySchema, progress: Tell) -> Actual:
@@ -96,7 +96,7 @@ def _tune(run: Run, simulated: BodySchema, data: Dataset, progress: Tell) -> Bod
     return fine_tune(simulated, data, config, lambda done, text: progress(0.1 + 0.7 * done, text))[0]
 
 
-def _controlled(run: Run, simulated: BodySchema, tuned: BodySchema) -> dict[str, Course]:
+def _controlled(run: Run, simulated: BodySchema, tuned: BodySchema) -> dict[str, Trial]:
     robot, control = run.robot, control_of(run)
     targets = random_targets(robot, AFTER, TARGETS, np.random.default_rng([FRESH + run.seed, 300]))
 

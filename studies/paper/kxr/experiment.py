@@ -28,7 +28,7 @@ from studies.paper.kxr.simulated import (
     mask_errors,
     simulate,
 )
-from studies.paper.kxr.trials import Course, order, steps_until
+from studies.paper.kxr.trials import Trial, order, steps_until
 from studies.paper.report import Report, adder
 from studies.paper.runs import Run, between, each_seed
 
@@ -139,10 +139,10 @@ def _add_control(report: Report, outcomes: Sequence[Outcome], bounds: tuple[np.n
     row(share, lambda o: 100.0 * _inside(o[KNOWING], bounds), "%", bar=99.0, better="higher")
 
 
-def _inside(course: Course, bounds: tuple[np.ndarray, np.ndarray]) -> float:
+def _inside(trial: Trial, bounds: tuple[np.ndarray, np.ndarray]) -> float:
     """Return the share of steps with a known tool in which the center of gravity is within bounds [m]."""
-    known = np.arange(len(course.tips)) % STEPS > 0
-    inside = np.all((course.centers >= bounds[0]) & (course.centers <= bounds[1]), axis=1)
+    known = np.arange(len(trial.tips)) % STEPS > 0
+    inside = np.all((trial.centers >= bounds[0]) & (trial.centers <= bounds[1]), axis=1)
     return float(inside[known].mean())
 
 

@@ -102,7 +102,7 @@ def _control(path: Path, simulated: Sequence[Simulated]) -> None:
 
 
 def _curves(errors: Sequence[np.ndarray], smooth: bool) -> np.ndarray:
-    return np.stack([1e3 * (smoothed(course) if smooth else course) for course in errors])
+    return np.stack([1e3 * (smoothed(trial) if smooth else trial) for trial in errors])
 
 
 def _actual(path: Path, actual: Sequence[Actual]) -> None:

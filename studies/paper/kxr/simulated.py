@@ -25,7 +25,7 @@ from studies.paper.kxr.robot import (
     random_targets,
     safe_postures,
 )
-from studies.paper.kxr.trials import Course, follow, follow_blindly, recognise, samples_until
+from studies.paper.kxr.trials import Trial, follow, follow_blindly, recognise, samples_until
 from studies.paper.runs import Run, between
 
 NOMINAL = "nominal"
@@ -72,16 +72,16 @@ class Simulated:
         needed: (case, update) -> samples until the tool is recognised, shape (runs,).
         paths: (case, update) -> p along the first run, shape (samples + 1, bias_size).
         leads: Label -> path of p to a tool with all sensors.
-        controlled: Update -> course.
-        limit: Course of a perfect model of the robot.
+        controlled: Update -> trial of control.
+        limit: Trial of a perfect model of the robot.
     """
 
     schema: BodySchema
     needed: Mapping[tuple[str, str], np.ndarray]
     paths: Mapping[tuple[str, str], np.ndarray]
     leads: Mapping[str, np.ndarray]
-    controlled: Mapping[str, Course]
-    limit: Course
+    controlled: Mapping[str, Trial]
+    limit: Trial
 
 
 def simulate(run: Run, progress: Tell) -> Simulated:
@@ -130,7 +130,7 @@ def recognitions(
     return {key: np.array(values) for key, values in needed.items()}, paths
 
 
-def _controls(run: Run, schema: BodySchema) -> tuple[dict[str, Course], Course]:
+def _controls(run: Run, schema: BodySchema) -> tuple[dict[str, Trial], Trial]:
     robot = run.robot
     random = np.random.default_rng([FRESH + run.seed, 100])
     targets = np.concatenate([random_targets(robot, tool, STEPS, random) for tool in SEQUENCE])
@@ -151,7 +151,7 @@ def _controls(run: Run, schema: BodySchema) -> tuple[dict[str, Course], Course]:
         mine = targets[index : index + STEPS]
         commands = inverse(robot, designed(robot, tool), mine)
         parts.append(follow_blindly(Standing(robot, NOMINAL, run.seed, tool), mine, commands))
-    limit = Course(
+    limit = Trial(
         *(np.concatenate(part) for part in zip(*((p.tips, p.centers, p.biases) for p in parts), strict=True))
     )
     return controlled, limit

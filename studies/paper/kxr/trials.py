@@ -24,7 +24,7 @@ Sample = Mapping[str, np.ndarray]
 
 
 @dataclass(frozen=True, slots=True)
-class Course:
+class Trial:
     """Errors and p step by step while targets are given.
 
     Attributes:
@@ -72,7 +72,7 @@ def follow(
     targets: np.ndarray,
     update: UpdateConfig | None = None,
     changes: Mapping[int, str] | None = None,
-) -> Course:
+) -> Trial:
     """Bring the tool tip to targets [m], shape (n, 3), while p follows the body.
 
     Args:
@@ -98,17 +98,17 @@ def follow(
             updater.add(measured)
             updater.step()
             controller.swap(updater.schema)
-    return Course(np.array(tips), np.stack(centers), np.stack(biases))
+    return Trial(np.array(tips), np.stack(centers), np.stack(biases))
 
 
-def follow_blindly(body: Standing, targets: np.ndarray, commands: np.ndarray) -> Course:
-    """Return the course of given commands [rad], shape (n, 4)."""
+def follow_blindly(body: Standing, targets: np.ndarray, commands: np.ndarray) -> Trial:
+    """Apply given commands blindly [rad], shape (n, 4)."""
     tips, centers = [], []
     for target, command in zip(targets, commands, strict=True):
         body.go(command)
         tips.append(np.linalg.norm(body.truth(TIP) - target))
         centers.append(body.truth(CENTER))
-    return Course(np.array(tips), np.stack(centers), np.zeros((len(tips), 0)))
+    return Trial(np.array(tips), np.stack(centers), np.zeros((len(tips), 0)))
 
 
 def steps_until(errors: np.ndarray, bar: float) -> float:

@@ -99,7 +99,7 @@ def _add_simulation(row: Adder) -> None:
 
 
 def _simulated(loss: str, signal: str, when: str, outcome: Outcome) -> float:
-    return float(outcome.courses[loss][when].errors(signal).mean())
+    return float(outcome.motions[loss][when].errors(signal).mean())
 
 
 def _add_anomaly(row: Adder) -> None:

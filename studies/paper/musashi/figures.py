@@ -27,7 +27,7 @@ def draw(outcomes: Sequence[Outcome], robot: RobotConfig, folder: Path) -> None:
     _update(outcomes, folder / "a_online_update.png")
     _story(first, folder / "b_anomaly.png")
     _control(outcomes, folder / "c_control.png")
-    _course(first, robot, folder / "d_simulated_motion.png")
+    _motion(first, robot, folder / "d_simulated_motion.png")
     _simulation_errors(outcomes, folder / "e_simulation_errors.png")
     _forced(first, robot, folder / "f_forced.png")
 
@@ -95,17 +95,17 @@ def _control(outcomes: Sequence[Outcome], path: Path) -> None:
         axis.grid(axis="y", color="0.93")
 
 
-def _course(outcome: Outcome, robot: RobotConfig, path: Path) -> None:
+def _motion(outcome: Outcome, robot: RobotConfig, path: Path) -> None:
     """Draw simulated and measured joint positions and tensions."""
-    courses = outcome.courses[simulation.OURS]
+    motions = outcome.motions[simulation.OURS]
     joints, muscles = robot.signals[POSITION].elements, robot.signals[TENSION].elements
     chosen = [(POSITION, index) for index in (0, 1, 3)] + [(TENSION, index) for index in (0, 6, 8)]
     with picture(path, f"The arm and the model as its simulator (arm {outcome.seed})", columns=3, rows=2) as axes:
         for axis, (signal, index) in zip(axes, chosen, strict=True):
-            axis.plot(courses[AFTER].time, courses[AFTER].measured[signal][:, index], color="black", label="arm")
+            axis.plot(motions[AFTER].time, motions[AFTER].measured[signal][:, index], color="black", label="arm")
             for name in (BEFORE, AFTER):
-                values = courses[name].values[signal][:, index]
-                axis.plot(courses[name].time, values, linewidth=1, color=COLORS[name], label=f"simulated, {name}")
+                values = motions[name].values[signal][:, index]
+                axis.plot(motions[name].time, values, linewidth=1, color=COLORS[name], label=f"simulated, {name}")
             element, unit = (joints[index], "rad") if signal == POSITION else (muscles[index], "N")
             axis.set_ylabel(f"{element} [{unit}]")
             axis.set_xlabel("time [s]")
@@ -117,7 +117,7 @@ def _simulation_errors(outcomes: Sequence[Outcome], path: Path) -> None:
         for axis, (signal, unit) in zip(axes, ((POSITION, "rad"), (TENSION, "N")), strict=True):
             groups = {
                 loss: {
-                    name: [float(o.courses[loss][name].errors(signal).mean()) for o in outcomes]
+                    name: [float(o.motions[loss][name].errors(signal).mean()) for o in outcomes]
                     for name in (BEFORE, AFTER)
                 }
                 for loss in (simulation.OURS, simulation.PAPER)

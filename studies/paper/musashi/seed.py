@@ -48,7 +48,7 @@ class Outcome:
         scores: Anomaly scores then.
         threshold: Threshold of the scores after the update.
         control: Weights -> errors [rad], shape (targets, starts), before and after.
-        courses: Loss -> simulated motion, before and after.
+        motions: Loss -> simulated motion, before and after.
         forced: Figure (f), after the update; see `simulation.forced`.
     """
 
@@ -65,7 +65,7 @@ class Outcome:
     scores: Pair
     threshold: float
     control: Mapping[str, Pair]
-    courses: Mapping[str, Mapping[str, simulation.Course]]
+    motions: Mapping[str, Mapping[str, simulation.Trajectory]]
     forced: Mapping[str, Mapping[str, np.ndarray]]
 
 
@@ -112,7 +112,7 @@ def run_seed(run: Run, progress: Tell) -> Outcome:
             }
             for name, config in control.controls(robot).items()
         },
-        courses={
+        motions={
             name: {which: simulation.simulate(robot, schema, motion, terms) for which, schema in schemas.items()}
             for name, terms in simulation.losses(robot).items()
         },

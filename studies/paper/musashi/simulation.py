@@ -39,7 +39,7 @@ def losses(robot: RobotConfig) -> dict[str, Sequence[Term | Hold]]:
 
 
 @dataclass(frozen=True, slots=True)
-class Course:
+class Trajectory:
     """A simulated motion beside the measured one.
 
     Attributes:
@@ -57,7 +57,7 @@ class Course:
         return np.asarray(np.linalg.norm(self.values[signal] - self.measured[signal], axis=1))
 
 
-def simulate(robot: RobotConfig, schema: BodySchema, recording: Dataset, terms: Sequence[Term | Hold]) -> Course:
+def simulate(robot: RobotConfig, schema: BodySchema, recording: Dataset, terms: Sequence[Term | Hold]) -> Trajectory:
     """Send the recorded commands to the model, which starts at the arm's first state and sees no later one."""
     recorded = signals(recording)
     chosen = {name: values[::EVERY] for name, values in recorded.items()}
@@ -66,7 +66,7 @@ def simulate(robot: RobotConfig, schema: BodySchema, recording: Dataset, terms: 
     states = [simulator.step(command, now=begin).values for command in chosen[SENT]]
     names = (POSITION, TENSION)
     values = {name: np.array([state[name] for state in states]) for name in names}
-    return Course(np.arange(len(states), dtype=float), values, {name: chosen[name] for name in names})
+    return Trajectory(np.arange(len(states), dtype=float), values, {name: chosen[name] for name in names})
 
 
 def forced(robot: RobotConfig, schema: BodySchema) -> dict[str, dict[str, np.ndarray]]:

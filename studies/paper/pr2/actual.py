@@ -19,7 +19,7 @@ from services.show import Tell
 from studies.paper.body import JOINTS
 from studies.paper.pr2.arm import TIP, Arm, Geometry, duster_motion
 from studies.paper.pr2.simulated import BELIEVED, ELEVATION, errors_by_grasp
-from studies.paper.pr2.trials import Course, control_along, follow_blindly, model_error
+from studies.paper.pr2.trials import Trial, control_along, follow_blindly, model_error
 from studies.paper.runs import Run
 
 ACTUAL = "actual"
@@ -42,7 +42,7 @@ class Actual:
         schema: Fine-tuned; its p of the flexible duster's grasps only.
         errors: Model -> grasp -> mean error [m] on samples that were not learned from, under the best p of each.
         controlled: Model -> error [m] at every point of two motions, between which the grasp changes.
-        course: The fine-tuned model's course.
+        trial: Control with the fine-tuned model.
         change: Point before which the grasp changed.
         samples: Number of samples that were learned from.
     """
@@ -50,7 +50,7 @@ class Actual:
     schema: BodySchema
     errors: Mapping[str, Mapping[str, float]]
     controlled: Mapping[str, np.ndarray]
-    course: Course
+    trial: Trial
     change: int
     samples: int
 
@@ -67,12 +67,12 @@ def actual(run: Run, simulated: BodySchema, progress: Tell) -> Actual:
     )
     progress(0.6, "trials on the actual arm")
     geometry = Geometry(run.robot)
-    controlled, course, change = _control(run, geometry, simulated, schema)
+    controlled, trial, change = _control(run, geometry, simulated, schema)
     return Actual(
         schema=schema,
         errors=_errors(geometry, simulated, schema, learned, judged),
         controlled=controlled,
-        course=course,
+        trial=trial,
         change=change,
         samples=len(learned),
     )
@@ -133,7 +133,7 @@ def _recognise(schema: BodySchema, learned: Dataset, condition: str) -> BodySche
 
 def _control(
     run: Run, geometry: Geometry, simulated: BodySchema, tuned: BodySchema
-) -> tuple[dict[str, np.ndarray], Course, int]:
+) -> tuple[dict[str, np.ndarray], Trial, int]:
     motion = duster_motion()
     change = len(motion)
     targets = np.concatenate([motion, motion])
@@ -146,6 +146,6 @@ def _control(
         errors["geometry"] = np.concatenate([before, follow_blindly(arm, motion, second)])
     for name, schema in (("simulated", simulated.under(BELIEVED)), ("fine-tuned", tuned.under(BEGINS))):
         with Arm(run.robot, ACTUAL, run.seed, HELD) as arm:
-            course = control_along(arm, schema, targets, origins, geometry, UpdateConfig(), {change: CHANGED})
-        errors[name] = course.errors
-    return errors, course, change
+            trial = control_along(arm, schema, targets, origins, geometry, UpdateConfig(), {change: CHANGED})
+        errors[name] = trial.errors
+    return errors, trial, change

@@ -80,11 +80,11 @@ def _add_simulated(report: Report, outcomes: Sequence[Outcome]) -> None:
             bar = ESTIMATE_BAR if name == "ekf" and paper else None
             figure = lambda o, key=(case, name): o.estimated[key].mean(POINTS)
             row(f"estimate {case} after {POINTS} points, p by {name}", figure, "mm", paper, bar)
-    row("control, first point", lambda o: 1e3 * o.controlled["p"].course.errors[0], "mm", "240")
+    row("control, first point", lambda o: 1e3 * o.controlled["p"].trial.errors[0], "mm", "240")
     for update in UPDATES:
         during, afterwards = PAPER_CONTROL.get(update, ("", ""))
         same, others = (SAME_POSTURE_BAR, OTHERS_BAR) if update in CONTROL_BARS else (None, None)
-        control = lambda o, update=update: o.controlled[update].course.mean(POINTS)
+        control = lambda o, update=update: o.controlled[update].trial.mean(POINTS)
         row(f"control after {POINTS} points, update {update}", control, "mm", during, CONTROL_BARS.get(update))
         elsewhere = lambda o, update=update: o.controlled[update].elsewhere.mean()
         row(f"at the other posture, update {update}", elsewhere, "mm", afterwards, same)
@@ -106,7 +106,7 @@ def _add_actual(report: Report, outcomes: Sequence[Outcome]) -> None:
     for model in MODELS:
         error = lambda o, model=model: 1e3 * o.controlled[model][POINTS : o.change].mean()
         row(f"actual: control by {model}, after {POINTS} points", error, "mm")
-    row("actual: control, first point", lambda o: 1e3 * o.course.errors[0], "mm", "1000")
-    row(f"actual: after {POINTS} points", lambda o: o.course.mean(POINTS, o.change), "mm", "150")
-    row("actual: right after the tool was changed", lambda o: 1e3 * o.course.errors[o.change], "mm", "500")
-    row(f"actual: {POINTS} points later", lambda o: o.course.mean(o.change + POINTS), "mm", "200")
+    row("actual: control, first point", lambda o: 1e3 * o.trial.errors[0], "mm", "1000")
+    row(f"actual: after {POINTS} points", lambda o: o.trial.mean(POINTS, o.change), "mm", "150")
+    row("actual: right after the tool was changed", lambda o: 1e3 * o.trial.errors[o.change], "mm", "500")
+    row(f"actual: {POINTS} points later", lambda o: o.trial.mean(o.change + POINTS), "mm", "200")

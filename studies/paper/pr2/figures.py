@@ -25,7 +25,7 @@ def _maps(path: Path, simulated: Simulated, actual: Actual) -> None:
         figures.bias_map(left, simulated.schema.biases, paths)
         left.set_title("simulation: normal duster")
         flexible = {name: p for name, p in actual.schema.biases.items() if name not in simulated.schema.biases}
-        biases, change = actual.course.biases, actual.change
+        biases, change = actual.trial.biases, actual.change
         figures.bias_map(right, flexible, {"(1) start": biases[:change], "(2) tool changed": biases[change:]})
         right.set_title("actual: flexible duster")
 
@@ -44,7 +44,7 @@ def _estimation(path: Path, simulated: Sequence[Simulated]) -> None:
 def _control(path: Path, simulated: Sequence[Simulated]) -> None:
     with figures.picture(path, "Control error of the tool tip", columns=2) as (left, right):
         while_updated = {
-            update: np.stack([1e3 * seed.controlled[update].course.errors for seed in simulated]) for update in UPDATES
+            update: np.stack([1e3 * seed.controlled[update].trial.errors for seed in simulated]) for update in UPDATES
         }
         figures.over_steps(left, while_updated, "mm", "data points")
         left.set_title("while the model is updated")

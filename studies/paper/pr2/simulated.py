@@ -14,7 +14,7 @@ from services.learning.trainer import train
 from services.model.model_config import collect_config
 from services.show import Tell
 from studies.paper.pr2.arm import Arm, Geometry, duster_motion
-from studies.paper.pr2.trials import Course, control_along, estimate_along, model_error
+from studies.paper.pr2.trials import Trial, control_along, estimate_along, model_error
 from studies.paper.runs import Run, between
 
 NOMINAL = "nominal"
@@ -71,13 +71,13 @@ class Controlled:
     """Control under another grasp than the believed one.
 
     Attributes:
-        course: The motion during the update.
+        trial: The motion during the update.
         elsewhere: The same targets at the other posture, the update stopped.
         others: Mean error [m] of the model under the p of the other grasps after the update.
     """
 
-    course: Course
-    elsewhere: Course
+    trial: Trial
+    elsewhere: Trial
     others: float
 
 
@@ -96,7 +96,7 @@ class Simulated:
     schema: BodySchema
     held_out: float
     order: Order
-    estimated: Mapping[tuple[str, str], Course]
+    estimated: Mapping[tuple[str, str], Trial]
     controlled: Mapping[str, Controlled]
 
     def fact(self, name: str) -> Any:
@@ -157,14 +157,14 @@ def _explained(values: np.ndarray, p: np.ndarray) -> float:
     return float(1.0 - left @ left / np.sum((values - values.mean()) ** 2))
 
 
-def _estimations(run: Run, schema: BodySchema) -> dict[tuple[str, str], Course]:
+def _estimations(run: Run, schema: BodySchema) -> dict[tuple[str, str], Trial]:
     postures = Geometry(run.robot).follow(duster_motion(), BELIEVED, ELEVATION)
-    courses = {}
+    trials = {}
     for case, (believed, held) in CASES.items():
         for name, update in RECOGNISERS.items():
             with Arm(run.robot, NOMINAL, run.seed, held) as arm:
-                courses[case, name] = estimate_along(arm, schema.under(believed), postures, update)
-    return courses
+                trials[case, name] = estimate_along(arm, schema.under(believed), postures, update)
+    return trials
 
 
 def _controls(run: Run, schema: BodySchema, fresh: Dataset) -> dict[str, Controlled]:
@@ -174,8 +174,8 @@ def _controls(run: Run, schema: BodySchema, fresh: Dataset) -> dict[str, Control
     for name, update in UPDATES.items():
         with Arm(run.robot, NOMINAL, run.seed, HELD) as arm:
             believed = schema.under(BELIEVED if update else HELD)
-            course = control_along(arm, believed, targets, near, geometry, update)
-            again = control_along(arm, course.schema, targets, elsewhere, geometry, None)
-        errors = errors_by_grasp(course.schema, fresh)
-        results[name] = Controlled(course, again, float(np.mean([e for c, e in errors.items() if c != HELD])))
+            trial = control_along(arm, believed, targets, near, geometry, update)
+            again = control_along(arm, trial.schema, targets, elsewhere, geometry, None)
+        errors = errors_by_grasp(trial.schema, fresh)
+        results[name] = Controlled(trial, again, float(np.mean([e for c, e in errors.items() if c != HELD])))
     return results

@@ -21,7 +21,7 @@ STAY = 0.3
 
 
 @dataclass(frozen=True, slots=True)
-class Course:
+class Trial:
     """Errors and p along a motion.
 
     Attributes:
@@ -39,7 +39,7 @@ class Course:
         return float(self.errors[first:last].mean() * 1e3)
 
 
-def estimate_along(arm: Arm, schema: BodySchema, postures: np.ndarray, update: UpdateConfig) -> Course:
+def estimate_along(arm: Arm, schema: BodySchema, postures: np.ndarray, update: UpdateConfig) -> Trial:
     """Move through postures [rad], (n, 7), and estimate the tool tip from the joints alone while p is updated."""
     updater = Updater(schema, update)
     errors, biases = [], []
@@ -50,7 +50,7 @@ def estimate_along(arm: Arm, schema: BodySchema, postures: np.ndarray, update: U
         biases.append(now.bias)
         updater.add(measured)
         updater.step()
-    return Course(np.array(errors), np.stack(biases), updater.schema)
+    return Trial(np.array(errors), np.stack(biases), updater.schema)
 
 
 def control_along(
@@ -61,7 +61,7 @@ def control_along(
     geometry: Geometry,
     update: UpdateConfig | None,
     events: Mapping[int, str] | None = None,
-) -> Course:
+) -> Trial:
     """Bring the tool tip to targets [m], (n, 3), near postures theta_orig [rad], (n, 7).
 
     Args:
@@ -94,7 +94,7 @@ def control_along(
             updater.add(measured)
             updater.step()
             controller.swap(updater.schema)
-    return Course(np.array(errors), np.stack(biases), controller.schema)
+    return Trial(np.array(errors), np.stack(biases), controller.schema)
 
 
 def follow_blindly(arm: Arm, targets: np.ndarray, postures: np.ndarray) -> np.ndarray:

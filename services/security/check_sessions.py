@@ -13,7 +13,7 @@ from typing import Any, Self
 import zenoh
 
 from services.errors import ServiceError
-from services.security.plan import Plan
+from services.security.plan import InstallationPlan
 from services.wire import keys
 from services.wire.connect import merged, role_file
 from services.wire.entering import usable
@@ -56,7 +56,7 @@ class Listener:
             return sum(said == payload and (not key or on == key) for on, said in self._heard)
 
 
-class Stage:
+class CheckSessions:
     """The sessions of one check, as a context manager.
 
     Args:
@@ -71,7 +71,7 @@ class Stage:
     """
 
     def __init__(self, folder: Path, running: str | None = None, weaken: Weaken | None = None) -> None:
-        plan = Plan.read(folder)
+        plan = InstallationPlan.read(folder)
         if plan is None or not plan.robots:
             raise ServiceError(f"'{folder}' was not made by `gemuco security init`: it has no plan.json with a robot.")
         self.plan, self.folder, self.robot = plan, folder, next(iter(plan.robots))
