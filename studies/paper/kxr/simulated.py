@@ -151,9 +151,7 @@ def _controls(run: Run, schema: BodySchema) -> tuple[dict[str, Trial], Trial]:
         mine = targets[index : index + STEPS]
         commands = inverse(robot, designed(robot, tool), mine)
         parts.append(follow_blindly(Standing(robot, NOMINAL, run.seed, tool), mine, commands))
-    limit = Trial(
-        *(np.concatenate(part) for part in zip(*((p.tips, p.centers, p.biases) for p in parts), strict=True))
-    )
+    limit = Trial(*(np.concatenate(part) for part in zip(*((p.tips, p.centers, p.biases) for p in parts), strict=True)))
     return controlled, limit
 
 
