@@ -72,7 +72,7 @@ def test_both_experiments_run_and_have_all_figures(tmp_path, monkeypatch):
     tuned = actual(run, simulated.schema, lambda share, text: shares.append(share))
     assert simulated.schema.x_out == (TIP,)
     assert max(shares) <= 1.0
-    assert simulated.controlled["p"].course.errors[0] == pytest.approx(0.26, abs=0.12)
+    assert simulated.controlled["p"].trial.errors[0] == pytest.approx(0.26, abs=0.12)
     report = summary([0], [Outcome(simulated, tuned)])
     assert all(np.isfinite(row.values).all() for row in report.rows)
     draw(tmp_path, [simulated], [tuned])
