@@ -1,1 +1,1 @@
-"""The process that owns a robot's hardware, what stands in for it, and its tools."""
+"""The hardware process of a robot, its simulated replacement, and its tools."""

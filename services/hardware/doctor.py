@@ -1,4 +1,4 @@
-"""`gemuco doctor`: everything that a robot needs, looked at, one line each, with what to do."""
+"""`gemuco doctor`: check everything that a robot needs, and print one line per check with its remedy."""
 
 import socket
 import struct
@@ -28,37 +28,37 @@ from services.wire.messages import Status
 from services.wire.session import port
 
 APPEARS_WITHIN = 3.0
-"""How long [s] to wait for the status of a HAL."""
+"""The status of a running HAL arrives within this time [s]."""
 CONNECTS_WITHIN = 0.5
-"""How long [s] a new client may take to see services that run."""
+"""A new client sees running services within this time [s]."""
 LATE = 0.005
-"""p99 of the cycle's lateness [s] that is worth a warning."""
+"""A p99 of the cycle's lateness above this value [s] is a warning."""
 _MARKS = {Verdict.OK: "[green]ok[/]", Verdict.WARNING: "[yellow]warning[/]", Verdict.BAD: "[bold red]bad[/]"}
-_WAITS = {"tcp": "0A", "udp": "07"}
-"""State of a socket that waits for others, in /proc/net."""
+_LISTENING = {"tcp": "0A", "udp": "07"}
+"""In /proc/net, a listening socket has this state."""
 
 
 def run_doctor(robot: str, connect: Iterable[str] = ()) -> int:
-    """Look at everything, print it, return the exit code: 1 if anything is bad.
+    """Print all findings and return the exit code: 1 if anything is bad.
 
     Args:
         robot: Name or file.
-        connect: Where a secured robot is entered: endpoints and role files.
+        connect: Endpoints, such as a router's, and role files.
     """
-    worst = dict.fromkeys(Verdict, 0)
+    counts = dict.fromkeys(Verdict, 0)
     console = show.console()
     for finding in _findings(robot, tuple(connect)):
-        worst[finding.verdict] += 1
+        counts[finding.verdict] += 1
         if console.is_terminal:
             row = Table.grid(padding=(0, 2))
             row.add_column(width=7)
             row.add_column(width=24)
             row.add_row(_MARKS[finding.verdict], finding.what, escape(finding.text))
             console.print(row)
-        else:  # in a file or a pipe a line is a line
+        else:  # a table would wrap lines in a file or pipe
             print(f"{finding.verdict:<8} {finding.what:<24} {finding.text}")
-    console.print(f"{worst[Verdict.OK]} ok, {worst[Verdict.WARNING]} warnings, {worst[Verdict.BAD]} bad.")
-    return 1 if worst[Verdict.BAD] else 0
+    console.print(f"{counts[Verdict.OK]} ok, {counts[Verdict.WARNING]} warnings, {counts[Verdict.BAD]} bad.")
+    return 1 if counts[Verdict.BAD] else 0
 
 
 def _findings(robot: str, connect: tuple[str, ...]) -> Iterator[Finding]:
@@ -67,9 +67,9 @@ def _findings(robot: str, connect: tuple[str, ...]) -> Iterator[Finding]:
     except ConfigError as error:
         yield bad("robot file", str(error))
         return
-    described = list(doctor.described(config))
-    yield from described
-    is_sound = all(finding.what != "robot file" or finding.verdict is Verdict.OK for finding in described)
+    findings = list(doctor.described(config))
+    yield from findings
+    is_sound = all(finding.what != "robot file" or finding.verdict is Verdict.OK for finding in findings)
     if is_sound:
         yield from interfaces(config)
         yield from _devices(config, connect)
@@ -80,10 +80,10 @@ def _findings(robot: str, connect: tuple[str, ...]) -> Iterator[Finding]:
 
 
 def _devices(config: RobotConfig, connect: tuple[str, ...]) -> Iterator[Finding]:
-    """From the HAL of this machine if it runs, or else by opening the buses in its place."""
+    """Yield findings from the HAL of this machine if it runs; otherwise open the buses here."""
     try:
         with instead_of(config.robot, "hal"):
-            yield ok("HAL", "None runs: the buses are opened here, with the motors off.")
+            yield ok("HAL", "It does not run. The buses are opened here, with the motors off.")
             yield from doctor.examine(config)
     except ConfigError as error:
         yield bad("devices", str(error))
@@ -91,30 +91,30 @@ def _devices(config: RobotConfig, connect: tuple[str, ...]) -> Iterator[Finding]
         try:
             with Client(config.robot, connect) as client:
                 status = client.status("hal", timeout=APPEARS_WITHIN)
-        except ServiceError as why:
-            yield bad("HAL", f"{error} It cannot be asked: {why}")
+        except ServiceError as cause:
+            yield bad("HAL", f"{error} Its status cannot be read: {cause}")
             return
         if status is None:
-            yield bad("HAL", f"{error} It publishes no status: is it still starting?")
+            yield bad("HAL", f"{error} It publishes no status. Is it still starting?")
         else:
             yield from from_status(status)
 
 
 def from_status(status: Status) -> Iterator[Finding]:
-    """What a running HAL says of its buses and devices; nothing is disturbed."""
+    """Yield findings from the status of a running HAL, without access to its buses."""
     facts = status.facts
-    yield ok("HAL", f"Runs, mode '{facts.get('mode')}'; it is asked, and the buses are left alone.")
+    yield ok("HAL", f"Runs, mode '{facts.get('mode')}'. It reports its state; the buses are not opened here.")
     if facts.get("fault"):
         yield bad("fault", str(facts["fault"]))
     for name, bus in facts.get("buses", {}).items():
         yield from _bus(name, bus)
     devices: dict[str, Any] = facts.get("devices", {})
-    ill = {name: device for name, device in devices.items() if device["text"]}
-    for name, device in ill.items():
+    faulty = {name: device for name, device in devices.items() if device["text"]}
+    for name, device in faulty.items():
         is_bad = device["state"] in ("silent", "fault", "opening", "closed")
         yield (bad if is_bad else warning)(f"node {name}", device["text"])
-    if not ill:
-        yield ok("nodes", f"All {len(devices)} answer; identity and mapping were checked when they were opened.")
+    if not faulty:
+        yield ok("nodes", f"All {len(devices)} answer. Identity and mapping were checked when they were opened.")
     cycles, incomplete = int(facts.get("cycles", 0)), int(facts.get("incomplete", 0))
     if cycles:
         text = f"{1 - incomplete / cycles:.1%} of {cycles} cycles were complete."
@@ -133,30 +133,30 @@ def _bus(name: str, bus: dict[str, Any]) -> Iterator[Finding]:
     verdict = {"ok": ok, "warning": warning}.get(bus["state"], bad)
     yield verdict(f"bus {name}", text)
     if bus.get("unknown"):
-        strangers = ", ".join(str(stranger) for stranger in bus["unknown"])
-        yield warning(f"strangers {name}", f"Frames of nobody in the robot file: {strangers}.")
+        senders = ", ".join(map(str, bus["unknown"]))
+        yield warning(f"unknown nodes {name}", f"Frames of nodes that are not in the robot file: {senders}.")
 
 
 def role_files(connect: Iterable[str]) -> Iterator[Finding]:
-    """How long the certificates in these role files are valid, and who may read them."""
+    """Check that the certificates in these role files are valid, and that only their owner can read the files."""
     try:
         for file in sorted_out(connect)[1]:
             configuration = role_file(file)
             until = ending(configuration)
             if until is None:
                 yield warning("role file", f"'{file}' holds no certificate.")
-            elif said := expiry(configuration):
-                yield (bad if until <= datetime.now(UTC) else warning)("role file", said)
+            elif text := expiry(configuration):
+                yield (bad if until <= datetime.now(UTC) else warning)("role file", text)
             else:
                 yield ok("role file", f"The certificate in '{file}' is valid until {until:%Y-%m-%d}.")
-            if said := exposed(file):
-                yield bad("role file", said)
+            if text := exposed(file):
+                yield bad("role file", text)
     except (ServiceError, OSError) as error:
         yield bad("role file", str(error))
 
 
 def _network(config: RobotConfig, connect: tuple[str, ...]) -> Iterator[Finding]:
-    """Can a session be opened, and can anybody else than this machine reach the robot?"""
+    """Check that a session opens, and list ports that other machines can reach."""
     try:
         with Client(config.robot, connect) as client:
             deadline = time.monotonic() + CONNECTS_WITHIN
@@ -165,26 +165,26 @@ def _network(config: RobotConfig, connect: tuple[str, ...]) -> Iterator[Finding]
     except ServiceError as error:
         yield bad("zenoh", str(error))
         return
-    yield ok("zenoh", f"A session opens; services that are seen: {', '.join(alive) or 'none'}.")
+    yield ok("zenoh", f"A session opens. Running services: {', '.join(alive) or 'none'}.")
     ports = {port(config.robot, service) for service in keys.SERVICES}
     outside: dict[str, set[int]] = {"tcp": set(), "udp": set()}
     for protocol, address, number in listening():
         if number in ports and not _is_loopback(address):
             outside[protocol].add(number)
     if outside["tcp"]:
-        told = ", ".join(map(str, sorted(outside["tcp"])))
-        text = f"Port {told} is open to other machines: whoever reaches it may move the robot, unless a role file"
-        yield warning("outside", f"{text} asks for a certificate. Is that meant?")
+        numbers = ", ".join(map(str, sorted(outside["tcp"])))
+        text = f"Port {numbers} is open to other machines. Any client that reaches it may move the robot, unless a role"
+        yield warning("outside", f"{text} file requires a certificate. Is that intended?")
     if outside["udp"]:
-        told = ", ".join(map(str, sorted(outside["udp"])))
-        yield ok("outside", f"Port {told} is open to other machines over QUIC, which role files ask a certificate for.")
+        numbers = ", ".join(map(str, sorted(outside["udp"])))
+        yield ok("outside", f"Port {numbers} is open to other machines over QUIC. Role files require a certificate.")
     if not any(outside.values()):
         yield ok("outside", "No port of this robot is open to other machines.")
 
 
 def listening() -> Iterator[tuple[str, str, int]]:
-    """Protocol (`tcp` or `udp`), address and port of every socket of this machine that waits for others."""
-    for protocol, state in _WAITS.items():
+    """Yield protocol (`tcp` or `udp`), address and port of every listening socket of this machine."""
+    for protocol, state in _LISTENING.items():
         for path in (Path(f"/proc/net/{protocol}"), Path(f"/proc/net/{protocol}6")):
             if not path.exists():
                 continue
@@ -196,7 +196,7 @@ def listening() -> Iterator[tuple[str, str, int]]:
 
 
 def _address(text: str) -> str:
-    """An address as /proc writes it: words of four bytes in the machine's own order."""
+    """Convert an address from /proc: words of four bytes in the machine's byte order."""
     raw = b"".join(struct.pack("=I", int(text[start : start + 8], 16)) for start in range(0, len(text), 8))
     return socket.inet_ntop(socket.AF_INET if len(raw) == 4 else socket.AF_INET6, raw)
 

@@ -1,4 +1,4 @@
-"""`gemuco can dump`: live frames in words; sends nothing."""
+"""`gemuco can dump`: live frames in words; it sends nothing."""
 
 import sys
 import time
@@ -18,14 +18,14 @@ from services import show
 
 
 @dataclass(slots=True)
-class Wanted:
-    """Which frames, and how many.
+class DumpOptions:
+    """Options of a dump.
 
     Attributes:
-        node: Only those of this node; None for all.
-        count: How many frames; None for no end.
-        seconds: How long [s].
-        summary: One line per identifier at the end in place of one per frame.
+        node: Show only frames of this node; None for all.
+        count: Number of frames; None for no limit.
+        seconds: Duration [s].
+        summary: Print one line per identifier at the end instead of one per frame.
     """
 
     node: int | None
@@ -35,8 +35,8 @@ class Wanted:
 
 
 @dataclass(slots=True)
-class _Seen:
-    """What passed under one identifier."""
+class _Traffic:
+    """Frames of one identifier: the last one, and counts."""
 
     line: Line
     frame: Frame
@@ -44,65 +44,69 @@ class _Seen:
     count: int = 0
 
 
-def run_dump(buses: Mapping[str, BusConfig], config: RobotConfig | None, wanted: Wanted) -> int:
-    """Print frames as they come, or a summary at the end."""
+def run_dump(buses: Mapping[str, BusConfig], config: RobotConfig | None, options: DumpOptions) -> int:
+    """Print frames as they arrive, or a summary at the end."""
     known = books(config) if config else {name: Book() for name in buses}
-    begun, shown = time.monotonic(), 0
-    seen: dict[tuple[str, int, bool], _Seen] = {}
+    start, shown = time.monotonic(), 0
+    traffic: dict[tuple[str, int, bool], _Traffic] = {}
     try:
-        for bus, frame in frames(buses, wanted.seconds):
+        for bus, frame in frames(buses, options.seconds):
             book = known[bus]
             book.learn(frame)
             line = describe(frame, book)
-            if wanted.node is not None and line.node != wanted.node:
+            if options.node is not None and line.node != options.node:
                 continue
             shown += 1
-            if wanted.summary:
-                _count(seen, bus, frame, line)
+            if options.summary:
+                _count(traffic, bus, frame, line)
             else:
-                sys.stdout.write(_printed(bus, frame, line, book) + "\n")
+                sys.stdout.write(_line(bus, frame, line, book) + "\n")
                 sys.stdout.flush()
-            if shown == wanted.count:
+            if shown == options.count:
                 break
     except KeyboardInterrupt:
         print(file=sys.stderr)
-    if wanted.summary:
-        _summarise(seen, known, time.monotonic() - begun)
+    if options.summary:
+        _summarise(traffic, known, time.monotonic() - start)
     elif not shown:
-        print("No frame came. Is a node powered? A silent bus stays silent until a HAL runs.", file=sys.stderr)
+        print("No frame came. Is a node powered? Its nodes may send nothing until a HAL runs.", file=sys.stderr)
     return 0
 
 
-def _printed(bus: str, frame: Frame, line: Line, book: Book) -> str:
+def _line(bus: str, frame: Frame, line: Line, book: Book) -> str:
     seconds, fraction = divmod(frame.stamp, 1.0)
     clock = time.strftime("%H:%M:%S", time.localtime(seconds))
     width = 8 if frame.is_extended else 3
-    who = "" if line.node is None else f"{line.node} {book.names.get(line.node, '')}".strip()
     data = frame.data.hex(" ").upper()
     return (
         f"{clock}.{round(fraction * 1e6) % 1_000_000:06d} {bus} {frame.identifier:0{width}X} [{len(frame.data)}] "
-        f"{data:<23}  {line.kind:<9} {who:<24} {line.text}"
+        f"{data:<23}  {line.kind:<9} {_node(line, book):<24} {line.text}"
     ).rstrip()
 
 
-def _count(seen: dict[tuple[str, int, bool], _Seen], bus: str, frame: Frame, line: Line) -> None:
+def _node(line: Line, book: Book) -> str:
+    """Return number and name of the node of a line; empty if it has no node."""
+    return "" if line.node is None else f"{line.node} {book.names.get(line.node, '')}".strip()
+
+
+def _count(traffic: dict[tuple[str, int, bool], _Traffic], bus: str, frame: Frame, line: Line) -> None:
     key = (bus, frame.identifier, frame.is_extended)
-    one = seen.setdefault(key, _Seen(line, frame))
-    one.line, one.frame = line, frame
-    one.kinds[line.kind] += 1
-    one.count += 1
+    entry = traffic.setdefault(key, _Traffic(line, frame))
+    entry.line, entry.frame = line, frame
+    entry.kinds[line.kind] += 1
+    entry.count += 1
 
 
-def _summarise(seen: dict[tuple[str, int, bool], _Seen], known: Mapping[str, Book], duration: float) -> None:
+def _summarise(traffic: dict[tuple[str, int, bool], _Traffic], known: Mapping[str, Book], duration: float) -> None:
     table = Table(box=None, pad_edge=False)
     for column in ("bus", "id", "frames", "rate", "kind", "node", "last"):
         table.add_column(column, justify="right" if column in ("frames", "rate") else "left")
-    for (bus, identifier, extended), one in sorted(seen.items()):
-        node = one.line.node
-        who = "" if node is None else f"{node} {known[bus].names.get(node, '')}".strip()
-        last = one.line.text or one.frame.data.hex(" ").upper()
-        rate = f"{one.count / duration:.1f} Hz"
+    for (bus, identifier, extended), entry in sorted(traffic.items()):
+        last = entry.line.text or entry.frame.data.hex(" ").upper()
+        rate = f"{entry.count / duration:.1f} Hz"
         name = f"{identifier:08X}" if extended else f"{identifier:03X}"
-        kinds = ", ".join(one.kinds)
-        table.add_row(*(escape(cell) for cell in (bus, name, str(one.count), rate, kinds, who, last)))
+        kinds = ", ".join(entry.kinds)
+        table.add_row(
+            *(escape(cell) for cell in (bus, name, str(entry.count), rate, kinds, _node(entry.line, known[bus]), last))
+        )
     show.console().print(table)

@@ -1,13 +1,13 @@
-"""The process that owns a robot's hardware: cycles it, publishes what was measured and applied, takes commands.
+"""The process that owns a robot's hardware: it cycles the robot, publishes samples, takes commands.
 
-Safety lives in `hal.robot`; here is only what travels.
+Safety is in `hal.robot`.
 """
 
 import logging
 import math
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from hal.calibration import store
@@ -30,16 +30,17 @@ log = logging.getLogger(__name__)
 
 CYCLE_PRIORITY = 50
 RECEIVE_PRIORITY = 51
-"""Above the cycle, which waits for what the receive threads bring."""
+"""The receive threads run above the cycle, which waits for their frames."""
 NETWORK_PRIORITY = 45
-TOLD_TO_END = "The HAL was told to end."
+END_REASON = "The HAL ends."
 HOLDER_EVERY = 1.0
+"""The lease holder is published at least this often [s]."""
 TAKES_COMMANDS = ("hold", "follow")
-"""Modes in which somebody commands who has no more than a stream of commands."""
+"""In these modes a client without a lease commands as long as it streams commands."""
 STUCK_AFTER = 2.0
-"""A cycle that did not end for so long [s] will not end any more; the HAL goes without it."""
+"""A cycle that has not ended after this time [s] is stuck, and the HAL ends without it."""
 AT_REST_WITHIN = 60.0
-"""How long [s] the robot may take to come to rest when the HAL is told to end; parking takes longest."""
+"""When the HAL ends, the robot comes to rest within this time [s]; parking takes longest."""
 
 
 class HalService:
@@ -47,7 +48,7 @@ class HalService:
 
     Args:
         config: The robot file.
-        robot: Not opened yet.
+        robot: A robot that is not open yet.
         service: The process's session.
     """
 
@@ -61,7 +62,7 @@ class HalService:
         self._cycles = Cycles(config.rates.hal, service.boot, robot.clock)
         self._commands = Commands(robot, config.command.signal, service.boot, self._lease)
         self._intake = Intake(service.session, keys.command(config.robot), messages.Command, self._commands.follow)
-        self._told_holder: tuple[int, int, int] | None = None
+        self._published_holder: tuple[int, int, int] | None = None
         self._holder_due = -math.inf
         self._loop = Loop("hal", config.rates.hal, self.tick, robot.clock, CYCLE_PRIORITY)
         service.watch(self._loop)
@@ -71,12 +72,12 @@ class HalService:
         self._serve()
 
     def _serve(self) -> None:
-        """What stops is for everybody, whatever comes with the question; the rest for who commands, and at once."""
+        """Declare the verbs. Any client may stop the robot; a motion needs the lease and a recent cycle."""
         robot, verb = self._robot, self._service.verb
         verb("enable", lambda _: self._enable(), self._may_move)
         verb("reset", lambda _: self._do(robot.reset), self._may_move)
-        verb("home", lambda given: self._do(lambda: robot.home(_named("home", given))), self._may_move)
-        verb("tare", lambda given: self._do(lambda: robot.tare(_named("tare", given))), self._may_move)
+        verb("home", lambda arguments: self._do(lambda: robot.home(_device("home", arguments))), self._may_move)
+        verb("tare", lambda arguments: self._do(lambda: robot.tare(_device("tare", arguments))), self._may_move)
         verb("disable", lambda _: self._do(robot.disable), self._lease.check)
         verb("stop", lambda _: self._do(lambda: robot.stop("A client asked to stop.")), always=True)
         verb("estop", self._estop, always=True)
@@ -84,7 +85,7 @@ class HalService:
         verb("release", lambda _: self._lease.give_back(ASKING.get()))
 
     def run(self, stop: threading.Event) -> None:
-        """Cycle the robot until `stop` is set, then let the drives go; commissioning comes first."""
+        """Commission the devices, cycle the robot until `stop` is set, and release the drives."""
         self._service.publish_status(self.status)
         try:
             self._robot.open()
@@ -100,22 +101,22 @@ class HalService:
             self._robot.close()
 
     def _come_to_rest(self) -> None:
-        """Stop as the robot file says, and go on cycling meanwhile; a fault or `AT_REST_WITHIN` ends it too."""
+        """Stop as the robot file says, and cycle until the robot is off, has a fault, or `AT_REST_WITHIN` is over."""
         try:
-            self._robot.stop(TOLD_TO_END)
-        except CommandRefused:  # a stuck cycle; whoever told us to end may have to kill us
-            self._robot.estop(TOLD_TO_END)
+            self._robot.stop(END_REASON)
+        except CommandRefused:  # a stuck cycle: the process may have to be killed
+            self._robot.estop(END_REASON)
         deadline = time.monotonic() + AT_REST_WITHIN
         while self._robot.mode not in ("off", "fault") and time.monotonic() < deadline:
             time.sleep(0.01)
 
     def tick(self) -> None:
-        """Take the commands that came, turn the robot once, publish."""
-        began = self._robot.clock.monotonic()
+        """Take new commands, cycle the robot once, publish."""
+        start = self._robot.clock.monotonic()
         self._intake.take()
-        self._tell_holder(began)
+        self._publish_holder(start)
         sample, applied = self._robot.cycle()
-        self._cycles.note(sample.cycle, began)
+        self._cycles.note(sample.cycle, start)
         if applied.mode not in TAKES_COMMANDS:
             self._lease.end_stream()
         self._samples.put(messages.Sample.of(sample, elements=sample.values.elements))
@@ -123,14 +124,14 @@ class HalService:
         self._applied.put(messages.Applied.of(applied, sender=sender))
 
     def status(self) -> Status:
-        """Health of the robot and of the loop."""
+        """Return the health of the robot and of the loop."""
         health = self._robot.health()
         loops = {"hal": self._loop.statistics()}
         problem = _problem(health) or self._loop.trouble
         state = "starting" if not self._is_open else "degraded" if problem else "running"
         if health["mode"] == "fault":
             state = "fault"
-        # A receive thread is a new one after its bus was closed and opened again.
+        # A bus that was closed and opened again has a new receive thread.
         realtime.promote("bus ", RECEIVE_PRIORITY)
         return Status(
             stamp_ns=time.time_ns(),
@@ -143,81 +144,82 @@ class HalService:
                 "camera": self._has_camera,
                 "uncalibrated": self._uncalibrated,
                 "commands": {**self._intake.facts(), "sender": self._commands.sender},
-                "holder": "" if (held := self._lease.tenure) is None else str(held.caller),
+                "holder": "" if (tenure := self._lease.tenure) is None else str(tenure.caller),
                 "scheduling": self._loop.scheduling,
             },
         )
 
     def _may_move(self, caller: Caller) -> None:
-        """Raise unless the caller commands, or nobody does, and it asks now."""
+        """Raise unless the request is recent and its caller holds the lease, or no client does."""
         self._lease.check(caller)
         self._cycles.check(caller)
 
     def _enable(self) -> dict[str, str]:
-        """Enable; what asks on behalf of who commands may then command for it."""
-        answer, caller = self._do(self._robot.enable), ASKING.get()
+        """Enable the robot. A service that asks on behalf of the lease holder may then command for it."""
+        reply, caller = self._do(self._robot.enable), ASKING.get()
         if caller.through:
             self._lease.delegate(caller)
-        return answer
+        return reply
 
-    def _take_lease(self, given: dict[str, Any]) -> dict[str, Any]:
-        """Let the caller command, and nobody else, or go on with it."""
-        if not {"seconds"} <= set(given) <= {"seconds", "number"}:
-            raise BadArguments("lease takes {seconds}, and to renew it {seconds, number}, the number that it answered.")
+    def _take_lease(self, arguments: dict[str, Any]) -> dict[str, Any]:
+        """Give the caller the lease, or renew it."""
+        if not {"seconds"} <= set(arguments) <= {"seconds", "number"}:
+            raise BadArguments("lease takes {seconds}; a renewal takes {seconds, number} with the number of the lease.")
         caller = ASKING.get()
-        if "number" in given:
-            held = self._lease.renew(caller, given["seconds"], given["number"])
+        if "number" in arguments:
+            tenure = self._lease.renew(caller, arguments["seconds"], arguments["number"])
         else:
-            held = self._lease.take(caller, given["seconds"])
-        return {"name": str(held.caller), "holder": held.caller.boot, "number": held.number, "left": self._lease.left()}
+            tenure = self._lease.take(caller, arguments["seconds"])
+        name, holder = str(tenure.caller), tenure.caller.boot
+        return {"name": name, "holder": holder, "number": tenure.number, "left": self._lease.left()}
 
-    def _tell_holder(self, now: float) -> None:
-        """Publish who commands when that has changed, and once a second."""
-        held = self._lease.tenure
-        told = (0, 0, 0) if held is None else (held.caller.boot, held.through, held.number)
-        if told == self._told_holder and now < self._holder_due:
+    def _publish_holder(self, now: float) -> None:
+        """Publish the lease holder when it has changed, and once per `HOLDER_EVERY`."""
+        tenure = self._lease.tenure
+        holder = (0, 0, 0) if tenure is None else (tenure.caller.boot, tenure.through, tenure.number)
+        if holder == self._published_holder and now < self._holder_due:
             return
-        self._told_holder, self._holder_due = told, now + HOLDER_EVERY
-        name, left = ("", 0.0) if held is None else (str(held.caller), self._lease.left())
+        self._published_holder, self._holder_due = holder, now + HOLDER_EVERY
+        name, left = ("", 0.0) if tenure is None else (str(tenure.caller), self._lease.left())
         self._holder.put(
-            messages.Holder(stamp_ns=time.time_ns(), name=name, holder=told[0], through=told[1], left=left)
+            messages.Holder(stamp_ns=time.time_ns(), name=name, holder=holder[0], through=holder[1], left=left)
         )
 
-    def _estop(self, given: dict[str, Any]) -> dict[str, Any]:
-        """Stop everything; what every drive did, in the order of the robot file."""
-        found = self._robot.estop(plain(str(given.get("reason", ""))) or "A client asked for it.")
-        devices = [{"device": one.device, "stopped": one.has_stopped, "text": one.text} for one in found.devices]
-        return {"complete": found.is_complete, "devices": devices, "text": found.text, "mode": self._robot.mode}
+    def _estop(self, arguments: dict[str, Any]) -> dict[str, Any]:
+        """Stop all drives; return the result of each in the order of the robot file."""
+        report = self._robot.estop(plain(str(arguments.get("reason", ""))) or "A client asked for it.")
+        devices = [{"device": one.device, "stopped": one.has_stopped, "text": one.text} for one in report.devices]
+        return {"complete": report.is_complete, "devices": devices, "text": report.text, "mode": self._robot.mode}
 
-    def _do(self, act: Any) -> dict[str, str]:
-        """Ask the robot; the answer tells where it stands, which may be on the way."""
-        act()
+    def _do(self, action: Callable[[], object]) -> dict[str, str]:
+        """Call a function of the robot, and return the mode and fault after it; the mode may still change."""
+        action()
         return {"mode": self._robot.mode, "fault": self._robot.fault_text}
 
 
-def _named(verb: str, given: dict[str, Any]) -> str:
-    if set(given) != {"device"}:
-        raise BadArguments(f"{verb} takes {{device: name}}, not {{{', '.join(given)}}}.")
-    return str(given["device"])
+def _device(verb: str, arguments: dict[str, Any]) -> str:
+    if set(arguments) != {"device"}:
+        raise BadArguments(f"{verb} takes {{device: name}}, not {{{', '.join(arguments)}}}.")
+    return str(arguments["device"])
 
 
 def _problem(health: dict[str, Any]) -> str:
-    """The most important thing that is wrong, in one sentence; empty when nothing is."""
+    """Return the most important fault in one sentence; empty if there is none."""
     if health["fault"]:
         return str(health["fault"])
     for name, bus in health["buses"].items():
         if bus["state"] != "ok":
             return f"Bus '{name}' is {bus['state']}. {bus['text']}".strip()
-    ill = [(name, device) for name, device in health["devices"].items() if device["text"]]
-    if ill:
-        name, device = ill[0]
-        more = f" (and {len(ill) - 1} more devices)" if len(ill) > 1 else ""
+    faulty = [(name, device) for name, device in health["devices"].items() if device["text"]]
+    if faulty:
+        name, device = faulty[0]
+        more = f" (and {len(faulty) - 1} more devices)" if len(faulty) > 1 else ""
         return f"{name}: {device['text']}{more}"
     return str(health["limits"])
 
 
 def _describe(config: RobotConfig) -> dict[str, Any]:
-    """What a client must know of the robot: signals with units and elements, command, limits, rates, devices."""
+    """Return the description for clients: signals with units and elements, command, limits, rates, devices."""
     signals = {
         name: {"unit": signal.unit, "elements": list(signal.elements), "source": signal.source}
         for name, signal in config.signals.items()
@@ -245,13 +247,13 @@ def run_hal(config: RobotConfig, connect: Iterable[str] = (), stop: threading.Ev
         The process's exit code.
 
     Raises:
-        ConfigError: The robot file names what is not there.
+        ConfigError: The robot file names a driver, file or element that does not exist.
         AlreadyRunning: The robot has this service already.
-        ServiceError: No session.
+        ServiceError: No session opens.
     """
     realtime.prepare_process()
     robot = open_robot(config)
-    with until_told(stop) as told, Service(config.robot, "hal", connect, lambda: _describe(config)) as service:
+    with until_told(stop) as end, Service(config.robot, "hal", connect, lambda: _describe(config)) as service:
         log.info("HAL of robot '%s' runs (boot %d)", config.robot, service.boot)
-        HalService(config, robot, service).run(told)
+        HalService(config, robot, service).run(end)
     return 0

@@ -1,4 +1,4 @@
-"""Whether this machine keeps time, and lets the HAL keep it: clocks, real-time scheduling, memory, processor."""
+"""Checks of this machine: clocks, real-time scheduling, memory, processor."""
 
 import ctypes
 import os
@@ -12,88 +12,89 @@ from hal.finding.doctor import Finding, ok, warning
 from services.hardware.hal_service import CYCLE_PRIORITY
 
 STEADY = 1e-3
-"""Largest change [s] of the offset between wall clock and monotonic clock while they are watched."""
-WATCHED = 0.3
+"""A steady wall clock moves by at most this much [s] against the monotonic clock within `OBSERVED`."""
+OBSERVED = 0.3
+"""The two clocks are compared over this time [s]."""
 _TIMEX_BYTES = 256
 _MAX_ERROR_AT = 24
-"""Where `maxerror` [us] is in `struct timex` (64 bit)."""
+"""`maxerror` [us] has this offset in `struct timex` (64 bit)."""
 _TIME_ERROR = 5
-"""What adjtimex(2) returns while the clock is not synchronised."""
-_QUICK_SOURCES = ("tsc", "arch_sys_counter", "kvm-clock", "hyperv_clocksource_tsc_page", "riscv_clocksource")
+"""adjtimex(2) returns this value while the clock is not synchronised."""
+_FAST_SOURCES = ("tsc", "arch_sys_counter", "kvm-clock", "hyperv_clocksource_tsc_page", "riscv_clocksource")
 _SYSTEM = Path("/sys/devices/system")
 
 
 def clocks() -> Iterator[Finding]:
-    """Is the wall clock synchronised and steady, and is the clock source a quick one?"""
+    """Check that the wall clock is synchronised and steady, and that its source is fast to read."""
     timex = ctypes.create_string_buffer(_TIMEX_BYTES)
     state = ctypes.CDLL(None, use_errno=True).adjtimex(timex)
     error = int.from_bytes(timex.raw[_MAX_ERROR_AT : _MAX_ERROR_AT + 8], "little") * 1e-6
     if state == _TIME_ERROR or state < 0:
         yield warning(
             "wall clock",
-            "Not synchronised: stamps of several machines do not agree. `timedatectl set-ntp true`, or run chrony.",
+            "Not synchronised: stamps of several machines do not agree. Run `timedatectl set-ntp true` or chrony.",
         )
     else:
-        yield ok("wall clock", f"Synchronised, at most {error * 1e3:.3g} ms off.")
+        yield ok("wall clock", f"Synchronised; largest error {error * 1e3:.3g} ms.")
     before = time.time() - time.monotonic()
-    time.sleep(WATCHED)
+    time.sleep(OBSERVED)
     moved = abs(time.time() - time.monotonic() - before)
     if moved > STEADY:
-        yield warning("clock steps", f"The wall clock moved by {moved * 1e3:.3g} ms within {WATCHED} s. What sets it?")
+        yield warning("clock steps", f"The wall clock moved by {moved * 1e3:.3g} ms within {OBSERVED} s. What sets it?")
     else:
-        yield ok("clock steps", f"Wall clock and monotonic clock agree within {moved * 1e6:.0f} us over {WATCHED} s.")
+        yield ok("clock steps", f"Wall clock and monotonic clock agree within {moved * 1e6:.0f} us over {OBSERVED} s.")
     source = _read(_SYSTEM / "clocksource/clocksource0/current_clocksource")
-    if source and source not in _QUICK_SOURCES:
+    if source and source not in _FAST_SOURCES:
         yield warning("clock source", f"'{source}' is slow to read. Is `tsc` usable on this machine?")
     else:
-        yield ok("clock source", source or "not told by this system.")
+        yield ok("clock source", source or "This system does not report it.")
 
 
 def real_time() -> Iterator[Finding]:
-    """May the HAL's threads run before all others, and is there anything that holds them up?"""
-    refused = _try_fifo()
-    if refused:
+    """Check that the HAL's threads can run before all others without waiting for memory or the processor."""
+    refusal = _try_fifo()
+    if refusal:
         yield warning(
             "scheduling",
-            f"No real-time priority ({refused}). Put `@robot - rtprio 90` into /etc/security/limits.conf, or give the "
+            f"No real-time priority ({refusal}). Put `@robot - rtprio 90` into /etc/security/limits.conf, or give the "
             "container CAP_SYS_NICE.",
         )
     else:
         yield ok("scheduling", f"SCHED_FIFO {CYCLE_PRIORITY} is allowed.")
     limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
     swaps = (_read(Path("/proc/swaps")) or "").splitlines()[1:]
-    told = "no limit" if limit == resource.RLIM_INFINITY else f"{limit / 2**20:.0f} MiB"
+    lockable = "no limit" if limit == resource.RLIM_INFINITY else f"{limit / 2**20:.0f} MiB"
     if swaps and limit != resource.RLIM_INFINITY:
         yield warning(
             "memory",
-            f"There is swap, and only {told} may be locked: a page that is away costs a cycle. `sudo swapoff -a`.",
+            f"Swap is on, and only {lockable} may be locked: a swapped page costs a cycle. Run `sudo swapoff -a`.",
         )
     else:
-        yield ok("memory", f"{'No swap' if not swaps else 'Swap'}; memory that may be locked: {told}.")
+        yield ok("memory", f"{'Swap' if swaps else 'No swap'}; lockable memory: {lockable}.")
     slow = sorted({governor for governor in _governors() if governor in ("powersave", "ondemand", "conservative")})
     if slow:
         yield warning(
-            "processor", f"Governor {', '.join(slow)} wakes up slowly. `sudo cpupower frequency-set -g performance`."
+            "processor", f"Governor {', '.join(slow)} reacts slowly. Run `sudo cpupower frequency-set -g performance`."
         )
     else:
-        yield ok("processor", f"{os.cpu_count()} cores, governor {', '.join(sorted(set(_governors()))) or 'not told'}.")
+        yield ok("processor", f"{os.cpu_count()} cores, governor {', '.join(sorted(set(_governors()))) or 'unknown'}.")
 
 
 def _try_fifo() -> str:
-    """Why a thread of this process cannot have real-time priority; empty if it can."""
-    found = []
+    """Return why a thread of this process cannot have real-time priority; empty if it can."""
+    refusals = []
 
     def attempt() -> None:
         try:
             flags = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
             os.sched_setscheduler(0, flags, os.sched_param(CYCLE_PRIORITY))
         except OSError as error:
-            found.append(error.strerror or str(error))
+            refusals.append(error.strerror or str(error))
 
     thread = threading.Thread(target=attempt)
     thread.start()
     thread.join()
-    return found[0] if found else ""
+    return refusals[0] if refusals else ""
 
 
 def _governors() -> list[str]:

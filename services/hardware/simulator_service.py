@@ -1,4 +1,4 @@
-"""The process that pretends to be the robot: simulated nodes on the robot file's buses; faults in, truth out."""
+"""The process that simulates the robot: nodes on the robot file's buses. It takes faults and publishes the truth."""
 
 import logging
 import threading
@@ -20,9 +20,10 @@ from services.wire.messages import MessageError, Status
 log = logging.getLogger(__name__)
 
 TRUTH_RATE = 100.0
+"""The truth is published at this rate [Hz]."""
 PRIORITY = 15
-"""Above every normal program, below HAL and service: above them it would wake for each of the HAL's frames instead of
-once for all of a cycle, which costs a fifth of a core and the service every thirtieth anomaly tick."""
+"""The simulator runs above normal programs and below HAL and model. Above them it would wake for each frame of the HAL
+instead of once per cycle, which costs a fifth of a core and the model every thirtieth anomaly tick."""
 NETWORK_PRIORITY = 15
 THREADS = ("physics", "nodes ", "hub ")
 
@@ -41,15 +42,15 @@ class Rig(Protocol):
         ...
 
     def fault(self, text: str) -> str:
-        """Break something; the sentence tells what was done."""
+        """Apply a fault, and return a sentence about it."""
         ...
 
     def truth(self) -> Mapping[str, np.ndarray]:
-        """Every signal as it is [its unit], shapes (n,)."""
+        """Return the true values of all signals [their units], shapes (n,)."""
         ...
 
     def stats(self) -> dict[str, Any]:
-        """Counters."""
+        """Return counters."""
         ...
 
 
@@ -58,9 +59,9 @@ class SimulatorService:
 
     Args:
         robot: The robot's name.
-        rig: Not started yet.
+        rig: A rig that is not started yet.
         service: The process's session.
-        variant: Which variant of the robot it is; told in the status.
+        variant: Variant of the robot, for the status.
     """
 
     def __init__(self, robot: str, rig: Rig, service: Service, variant: str) -> None:
@@ -74,7 +75,7 @@ class SimulatorService:
         service.verb("fault", self._fault)
 
     def run(self, stop: threading.Event) -> int:
-        """Run the rig until `stop` is set or it fails; the exit code."""
+        """Run the rig until `stop` is set or the rig fails; return the exit code."""
         self._rig.start()
         try:
             for prefix in THREADS:
@@ -89,7 +90,7 @@ class SimulatorService:
         return 1 if self._rig.failure else 0
 
     def tick(self) -> None:
-        """Publish what is true now."""
+        """Publish the true values."""
         values = Numbers.of(self._rig.truth())
         self._cycle += 1
         self._truth.put(
@@ -136,13 +137,13 @@ def run_simulator(
     connect: Iterable[str] = (),
     stop: threading.Event | None = None,
 ) -> int:
-    """Run what stands in for a robot's hardware until SIGTERM, SIGINT or `stop`.
+    """Run the simulated hardware of a robot until SIGTERM, SIGINT or `stop`.
 
     Args:
         config: The robot file.
-        variant: One of the simulator's variants; the designer's if None.
+        variant: One of the simulator's variants; None for the designer's.
         seed: Chooses among the robots of a variant, and their noise.
-        condition: One of the robot file's conditions; the first if None.
+        condition: One of the robot file's conditions; None for the first.
         connect: Endpoints, such as a router's, and role files.
         stop: Ends the service in place of the signals.
 
@@ -150,21 +151,21 @@ def run_simulator(
         The process's exit code; 1 if the simulation failed.
 
     Raises:
-        ConfigError: The robot file names no simulator, or one that is not there; an unknown variant or condition.
-        AlreadyRunning: The robot is simulated already.
-        ServiceError: No session.
+        ConfigError: The robot file names no existing simulator, or the variant or condition is unknown.
+        AlreadyRunning: The robot has a simulator already.
+        ServiceError: No session opens.
     """
     realtime.prepare_process()
     simulator = simulator_of(config)
     variant, condition = variant_of(config, variant), condition_of(config, condition)
-    told_apart = {
+    identity = {
         "variant": variant,
         "condition": condition,
         "seed": seed,
         "variants": list(simulator.variants),
         "conditions": list(simulator.conditions),
     }
-    with until_told(stop) as told, Service(config.robot, "simulator", connect, lambda: told_apart) as service:
+    with until_told(stop) as end, Service(config.robot, "simulator", connect, lambda: identity) as service:
         log.info("Simulator of robot '%s' runs (%s, seed %d)", config.robot, variant, seed)
         rig = simulator.rig(config, variant, seed, condition)
-        return SimulatorService(config.robot, rig, service, variant).run(told)
+        return SimulatorService(config.robot, rig, service, variant).run(end)

@@ -1,4 +1,4 @@
-"""What a robot file names as its simulator, as far as services go into it."""
+"""The simulator that a robot file names, and the interface that services use."""
 
 from collections.abc import Mapping
 from typing import Any, Protocol
@@ -15,40 +15,40 @@ class Camera(Protocol):
     """The camera of a simulated robot."""
 
     def see(self, truth: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
-        """The vision signals [their units], shapes (n,), when every signal is so; NaN where it sees nothing."""
+        """Return the vision signals [their units], shapes (n,), for true values of all signals; NaN if not visible."""
         ...
 
     def fault(self, text: str) -> str:
-        """Break or mend something; the sentence tells what was done. A ValueError lists what can break."""
+        """Apply or end a fault, and return a sentence about it. A ValueError lists the known faults."""
         ...
 
 
 class Simulator(Protocol):
-    """What stands in for a robot. A condition of None is the first of `conditions`."""
+    """Simulator of a robot. A condition of None is the first of `conditions`."""
 
     variants: tuple[str, ...]
-    """The designer's model first."""
+    """The first variant is the designer's model."""
     conditions: tuple[str, ...]
-    """Ways the body can be; empty if there is only one."""
+    """The body can have these conditions; empty if it has only one."""
 
     def rig(self, config: RobotConfig, variant: str, seed: int, condition: str | None = None) -> Any:
-        """The simulated hardware behind the robot file's buses (`simulators.rig.Rig`); not started yet."""
+        """Return the simulated hardware behind the robot file's buses (`simulators.rig.Rig`), not started yet."""
         ...
 
     def direct(self, config: RobotConfig, variant: str, seed: int, condition: str | None = None) -> Robot:
-        """The simulated robot without a bus; not opened yet."""
+        """Return the simulated robot without a bus, not open yet."""
         ...
 
     def vision(self, config: RobotConfig, variant: str, seed: int) -> Camera:
-        """The robot's camera; only of a robot that has signals of source `vision`."""
+        """Return the camera of a robot that has signals of source `vision`."""
         ...
 
 
 def simulator_of(robot: RobotConfig) -> Simulator:
-    """What the robot file names as its simulator.
+    """Load the simulator that the robot file names.
 
     Raises:
-        ConfigError: It names none, or one that is not there, or one that does not know the file's conditions.
+        ConfigError: The file names no existing simulator, or the simulator lacks one of the file's conditions.
     """
     if robot.simulator is None:
         raise ConfigError(
@@ -56,17 +56,17 @@ def simulator_of(robot: RobotConfig) -> Simulator:
             "simulators.robots.bench:simulator stands in for the devices of any robot file."
         )
     simulator: Simulator = registry.load_object(robot.simulator)
-    strange = [condition for condition in robot.conditions if condition not in simulator.conditions]
-    if strange:
+    unknown = [condition for condition in robot.conditions if condition not in simulator.conditions]
+    if unknown:
         known = ", ".join(simulator.conditions) or "none"
         raise ConfigError(
-            f"The simulator of '{robot.robot}' has no condition '{strange[0]}'. Known conditions: {known}."
+            f"The simulator of '{robot.robot}' has no condition '{unknown[0]}'. Known conditions: {known}."
         )
     return simulator
 
 
 def variant_of(robot: RobotConfig, variant: str | None) -> str:
-    """The variant that was asked for, or the designer's.
+    """Return the given variant, or the designer's.
 
     Raises:
         ConfigError: The simulator has no such variant.
@@ -79,7 +79,7 @@ def variant_of(robot: RobotConfig, variant: str | None) -> str:
 
 
 def condition_of(robot: RobotConfig, condition: str | None) -> str | None:
-    """The condition that was asked for, or the robot file's first; None if the file has none.
+    """Return the given condition, or the robot file's first; None if the file has none.
 
     Raises:
         ConfigError: Neither the robot file nor its simulator knows it.
@@ -88,6 +88,6 @@ def condition_of(robot: RobotConfig, condition: str | None) -> str | None:
         return robot.conditions[0] if robot.conditions else None
     known = dict.fromkeys((*robot.conditions, *simulator_of(robot).conditions))
     if condition not in known:
-        told = ", ".join(known) or "none"
-        raise ConfigError(f"Robot '{robot.robot}' has no condition '{condition}'. Known conditions: {told}.")
+        names = ", ".join(known) or "none"
+        raise ConfigError(f"Robot '{robot.robot}' has no condition '{condition}'. Known conditions: {names}.")
     return condition

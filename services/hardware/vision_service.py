@@ -1,6 +1,6 @@
-"""The process that plays the camera of a simulated robot: it looks at what is true, and publishes what it sees.
+"""The process that is the camera of a simulated robot: it computes the vision signals from the simulator's truth.
 
-A real camera's program takes its place by publishing on the same key; examples/publish_marker.py does, in a few lines.
+The program of a real camera publishes on the same key instead; examples/publish_marker.py shows this in a few lines.
 """
 
 import logging
@@ -24,20 +24,20 @@ from services.wire.messages import MessageError, Status
 log = logging.getLogger(__name__)
 
 RATE = 30.0
-"""Frames per second [Hz]."""
+"""The camera publishes frames at this rate [Hz]."""
 
 
 class VisionService:
     """A simulated camera on zenoh.
 
-    It publishes a frame for a new truth, and nothing while the simulator is silent: a camera that repeats itself would
-    make a body that moves look still.
+    It publishes one frame for each new truth, and nothing while the simulator is silent: with repeated frames a moving
+    body would seem to be at rest.
 
     Args:
         robot: The robot file.
-        camera: What sees.
+        camera: The simulated camera.
         service: The process's session.
-        variant: Which variant of the robot it looks at; told in the status.
+        variant: Variant of the robot, for the status.
     """
 
     def __init__(self, robot: RobotConfig, camera: Camera, service: Service, variant: str) -> None:
@@ -47,15 +47,15 @@ class VisionService:
         self._frames = service.publisher(keys.vision(robot.robot), messages.Sample)
         self._loop = Loop("camera", RATE, self.tick, self._clock)
         self._lock = threading.Lock()
-        self._looked_at: messages.Sample | None = None
-        self._looked_when = -np.inf
+        self._last_truth: messages.Sample | None = None
+        self._last_frame_at = -np.inf
         self._cycle = 0
         self._hidden: list[str] = []
         service.watch(self._loop)
         service.verb("fault", self._fault)
 
     def run(self, stop: threading.Event) -> None:
-        """Look until `stop` is set."""
+        """Publish frames until `stop` is set."""
         self._loop.start()
         try:
             self._service.run(self.status, stop)
@@ -63,17 +63,17 @@ class VisionService:
             self._loop.stop()
 
     def tick(self) -> None:
-        """Publish a frame if there is a new truth to look at."""
+        """Publish a frame if a new truth has arrived."""
         last = self._truth.last()
-        if last is None or last.message is self._looked_at:
+        if last is None or last.message is self._last_truth:
             return
         truth, received = last
         with self._lock:
-            seen = self._camera.see(truth.values)
-        values = Numbers.of({name: seen[name] for name in self._robot.seen})
+            frame = self._camera.see(truth.values)
+        values = Numbers.of({name: frame[name] for name in self._robot.seen})
         now = self._clock.monotonic()
         age = max(now - received, 0.0)
-        self._looked_at, self._looked_when = truth, now
+        self._last_truth, self._last_frame_at = truth, now
         self._cycle += 1
         self._hidden = [name for name, value in values.items() if not np.isfinite(value).all()]
         self._frames.put(
@@ -90,11 +90,11 @@ class VisionService:
         )
 
     def status(self) -> Status:
-        """What is seen, in a word."""
+        """Return the state of the camera, with the signals that are out of sight."""
         loops = {"camera": self._loop.statistics()}
         text = self._loop.trouble
-        if self._clock.monotonic() - self._looked_when > 2.0 / RATE + 0.5:
-            text = "There is nothing to look at: no truth comes from the simulator. Is `gemuco simulate` running?"
+        if self._clock.monotonic() - self._last_frame_at > 2.0 / RATE + 0.5:
+            text = "No truth arrives from the simulator. Is `gemuco simulate` running?"
         elif self._hidden and not text:
             text = f"Out of sight: {', '.join(self._hidden)}."
         return Status(
@@ -123,28 +123,28 @@ def run_vision(
     connect: Iterable[str] = (),
     stop: threading.Event | None = None,
 ) -> None:
-    """Play the camera of a simulated robot until SIGTERM, SIGINT or `stop`.
+    """Run the camera of a simulated robot until SIGTERM, SIGINT or `stop`.
 
     Args:
         robot: The robot file.
-        variant: One of the simulator's variants; the designer's if None.
-        seed: Chooses among the robots of a variant, and the camera's noise: the one given to `gemuco simulate`.
+        variant: One of the simulator's variants; None for the designer's.
+        seed: Chooses among the robots of a variant, and the camera's noise; as for `gemuco simulate`.
         connect: Endpoints, such as a router's, and role files.
         stop: Ends the service in place of the signals.
 
     Raises:
-        ConfigError: The robot has nothing that a camera sees, no simulator, or no such variant.
-        AlreadyRunning: Somebody looks at the robot already.
-        ServiceError: No session.
+        ConfigError: The robot has no vision signal, no simulator, or no such variant.
+        AlreadyRunning: The robot has a camera already.
+        ServiceError: No session opens.
     """
     if not robot.seen:
-        raise ConfigError(f"Robot '{robot.robot}' has no signal with `source: vision`, so there is nothing to look at.")
+        raise ConfigError(f"Robot '{robot.robot}' has no signal with `source: vision`, so it needs no camera.")
     variant = variant_of(robot, variant)
     camera = simulator_of(robot).vision(robot, variant, seed)
     signals = {
         name: {"unit": robot.signals[name].unit, "elements": robot.signals[name].elements} for name in robot.seen
     }
-    told_apart = {"variant": variant, "seed": seed, "rate": RATE, "signals": signals}
-    with until_told(stop) as told, Service(robot.robot, "vision", connect, lambda: told_apart) as service:
+    identity = {"variant": variant, "seed": seed, "rate": RATE, "signals": signals}
+    with until_told(stop) as end, Service(robot.robot, "vision", connect, lambda: identity) as service:
         log.info("The camera of robot '%s' runs (%s, seed %d)", robot.robot, variant, seed)
-        VisionService(robot, camera, service, variant).run(told)
+        VisionService(robot, camera, service, variant).run(end)

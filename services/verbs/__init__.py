@@ -1,1 +1,1 @@
-"""The words of the command line, by what they are about."""
+"""The verbs of the command line, by subject."""

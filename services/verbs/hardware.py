@@ -1,4 +1,4 @@
-"""Verbs of the command line for who stands before the hardware: scan, doctor, calibrate, can dump."""
+"""The verbs for work on the hardware: scan, doctor, calibrate, can dump."""
 
 import math
 from pathlib import Path
@@ -8,27 +8,25 @@ import typer
 
 from services.verbs.verb import Connect, RobotFile, load, speaks_plainly
 
-calibrate = typer.Typer(no_args_is_help=True, help="Measure zero, direction and gain of a device; keep them with it.")
-can = typer.Typer(no_args_is_help=True, help="Look at CAN buses.")
+calibrate = typer.Typer(no_args_is_help=True, help="Measure and store zero, direction and gain of a device.")
+can = typer.Typer(no_args_is_help=True, help="Show CAN buses.")
 
 MaybeRobot = Annotated[
-    str | None, typer.Argument(metavar="[ROBOT]", help="A robot file, or the name of one; or else an interface.")
+    str | None, typer.Argument(metavar="[ROBOT]", help="A robot file, or the name of one. Otherwise give an interface.")
 ]
 Interface = Annotated[
-    str | None, typer.Option(help="In place of a robot: an interface of python-can, such as socketcan.")
+    str | None, typer.Option(help="Instead of a robot: an interface of python-can, such as socketcan.")
 ]
-Channel = Annotated[str | None, typer.Option(help="Its channel, such as can0.")]
-Bitrate = Annotated[int, typer.Option(min=10_000, help="Its bit rate [bit/s].")]
-Device = Annotated[str, typer.Argument(metavar="DEVICE", help="A device, or the element that it measures.")]
-Seconds = Annotated[float, typer.Option(min=0.1, max=60.0, help="How long to average at each point [s].")]
-Noise = Annotated[
-    float | None, typer.Option(min=0.0, help="Largest standard deviation of what stands still [the signal's unit].")
-]
+Channel = Annotated[str | None, typer.Option(help="Channel of the interface, such as can0.")]
+Bitrate = Annotated[int, typer.Option(min=10_000, help="Bit rate of the channel [bit/s].")]
+Device = Annotated[str, typer.Argument(metavar="DEVICE", help="A device, or an element that it measures.")]
+Seconds = Annotated[float, typer.Option(min=0.1, max=60.0, help="Averaging time at each point [s].")]
+Noise = Annotated[float | None, typer.Option(min=0.0, help="Largest standard deviation at rest [the signal's unit].")]
 Yes = Annotated[bool, typer.Option("--yes", help="Measure the first point at once, and store without asking.")]
 
 
 def register(app: typer.Typer) -> None:
-    """Put these verbs on the command line."""
+    """Add the verbs to the command line."""
     app.command()(scan)
     app.command()(doctor)
     app.add_typer(calibrate, name="calibrate")
@@ -41,16 +39,18 @@ def scan(
     interface: Interface = None,
     channel: Channel = None,
     bitrate: Bitrate = 1_000_000,
-    seconds: Annotated[float, typer.Option(min=0.1, max=60.0, help="How long to listen first [s].")] = 1.5,
-    passive: Annotated[bool, typer.Option("--passive", help="Only listen; send nothing.")] = False,
+    seconds: Annotated[
+        float, typer.Option(min=0.1, max=60.0, help="Listening time before the first request [s].")
+    ] = 1.5,
+    passive: Annotated[bool, typer.Option("--passive", help="Only listen, send nothing.")] = False,
     mit: Annotated[
         bool,
-        typer.Option("--mit", help="Also look for MIT drives, by ending their motor mode: a joint that hangs falls."),
+        typer.Option("--mit", help="Also search for MIT drives. This ends their motor mode: a hanging joint falls."),
     ] = False,
 ) -> int:
-    """Find out who is on a bus: node ids, device types, vendors, serial numbers, beside the robot file if given.
+    """List the nodes of a bus: ids, device types, vendors, serial numbers. Compare them with the robot file if given.
 
-    Listens first, then asks nodes who they are, unless a master is at work there. Enables nothing.
+    Listens first, then reads the identity of each node, unless a master is active on the bus. Enables no motor.
     """
     from services.hardware.scan import run_scan
 
@@ -60,9 +60,10 @@ def scan(
 
 @speaks_plainly
 def doctor(robot: RobotFile, connect: Connect = None) -> int:
-    """Look at everything that a robot needs, one line each, with what to do: buses, nodes, clocks, role files, network.
+    """Check buses, nodes, clocks, role files and network of a robot: one line per check, with its remedy.
 
-    Asks the HAL if it runs, or else opens the buses itself with the motors off. Exit code 1 if anything is bad.
+    Reads the status of the HAL if it runs, otherwise opens the buses with the motors off. Exit code 1 if anything is
+    bad.
     """
     from services.hardware.doctor import run_doctor
 
@@ -76,21 +77,19 @@ def joint(
     device: Device,
     at: Annotated[
         list[float] | None,
-        typer.Option(
-            "--at", help="A position that you will put it to [rad or m]; again for another. Asks if not given."
-        ),
+        typer.Option("--at", help="A known position that you will set [rad or m]; repeat for more. Asks if not given."),
     ] = None,
     seconds: Seconds = 1.0,
     noise: Noise = None,
     yes: Yes = False,
 ) -> int:
-    """Zero of a joint or wire at one known position; also its direction at two, with a check of its scale.
+    """Measure the zero of a joint or wire at one known position; at two, also its direction, and check its scale.
 
     The HAL must not run. The motors stay off: move the joint by hand.
     """
-    from services.hardware.calibrate import Wanted, calibrate_joint
+    from services.hardware.calibrate import CalibrationOptions, calibrate_joint
 
-    return calibrate_joint(load(robot), device, Wanted(tuple(at or ()), seconds, noise, yes))
+    return calibrate_joint(load(robot), device, CalibrationOptions(tuple(at or ()), seconds, noise, yes))
 
 
 @calibrate.command()
@@ -100,22 +99,24 @@ def cell(
     device: Device,
     weight: Annotated[
         list[float] | None,
-        typer.Option("--weight", help="A weight that you will hang on it; again for another. Asks if not given."),
+        typer.Option("--weight", help="A known weight that you will attach; repeat for more. Asks if not given."),
     ] = None,
     unit: Annotated[
-        str | None, typer.Option(help="Of the weights: N, or the signal's own; kg for a force if not given.")
+        str | None,
+        typer.Option(help="Unit of the weights: kg, or the unit of the signal; kg for a force if not given."),
     ] = None,
     seconds: Seconds = 1.0,
     noise: Noise = None,
     yes: Yes = False,
 ) -> int:
-    """Tare of a load cell with one known weight (0 for none); also its gain with two or more.
+    """Measure the zero of a load cell with one known weight (0 for none); with two or more, also its gain.
 
-    The HAL must not run. Without --weight you are asked, in the signal's unit.
+    The HAL must not run. Without --weight it asks for values in the signal's unit.
     """
-    from services.hardware.calibrate import Wanted, calibrate_cell
+    from services.hardware.calibrate import CalibrationOptions, calibrate_cell
 
-    return calibrate_cell(load(robot), device, unit, Wanted(tuple(weight or ()), seconds, noise, yes))
+    options = CalibrationOptions(tuple(weight or ()), seconds, noise, yes)
+    return calibrate_cell(load(robot), device, unit, options)
 
 
 @can.command()
@@ -127,28 +128,28 @@ def dump(
     bitrate: Bitrate = 1_000_000,
     bus: Annotated[str | None, typer.Option(help="Only this bus of the robot.")] = None,
     node: Annotated[int | None, typer.Option(min=0, help="Only frames of this node.")] = None,
-    count: Annotated[int | None, typer.Option(min=1, help="So many frames.")] = None,
-    seconds: Annotated[float, typer.Option(min=0.1, help="So long [s]; until Ctrl-C if not given.")] = math.inf,
+    count: Annotated[int | None, typer.Option(min=1, help="Number of frames; no limit if not given.")] = None,
+    seconds: Annotated[float, typer.Option(min=0.1, help="Duration [s]; until Ctrl-C if not given.")] = math.inf,
     summary: Annotated[
         bool, typer.Option("--summary", help="One line per identifier, with its rate, at the end.")
     ] = False,
 ) -> int:
     """Show the frames of a bus in words: SYNC, NMT, heartbeats, emergencies, SDO, PDO, DBC and MIT frames.
 
-    Sends nothing, and may run beside a HAL.
+    Sends nothing, and may run while a HAL runs.
     """
-    from services.hardware.dump import Wanted, run_dump
+    from services.hardware.dump import DumpOptions, run_dump
 
     config, buses = _buses(robot, interface, channel, bitrate)
     if bus is not None:
         if bus not in buses:
             raise typer.BadParameter(f"There is no bus '{bus}'. Known: {', '.join(buses)}.")
         buses = {bus: buses[bus]}
-    return run_dump(buses, config, Wanted(node, count, seconds, summary))
+    return run_dump(buses, config, DumpOptions(node, count, seconds, summary))
 
 
 def _buses(robot: str | None, interface: str | None, channel: str | None, bitrate: int) -> tuple[Any, dict[str, Any]]:
-    """The robot file, if one was given, and its buses, or the one that was named."""
+    """Return the robot file and its buses; without a robot, None and the bus of the interface."""
     from hal.config import BusConfig
     from services.errors import BadArguments
 

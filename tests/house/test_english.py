@@ -42,7 +42,6 @@ NOT_YET = {
     "hal/wire",
     "services/cli.py",
     "services/errors.py",
-    "services/hardware",
     "services/health.py",
     "services/model",
     "services/process",

@@ -192,4 +192,4 @@ def test_a_hal_whose_cycle_is_stuck_stops_its_drives_and_ends_when_told(robot: s
         assert not thread.is_alive()
     assert wires.health().state is DeviceState.CLOSED
     wires.never.set()
-    assert body.fault_text == "Emergency stop: The HAL was told to end."
+    assert body.fault_text == "Emergency stop: The HAL ends."

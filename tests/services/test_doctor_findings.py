@@ -43,7 +43,7 @@ def test_a_hal_that_is_well() -> None:
         ({"fault": "The elbow is stuck."}, "fault", Verdict.BAD, "stuck"),
         ({"buses": {"can0": {**BUS, "state": "passive", "text": "Check wiring."}}}, "bus can0", Verdict.BAD, "wiring"),
         ({"buses": {"can0": {**BUS, "state": "warning", "text": "Hm."}}}, "bus can0", Verdict.WARNING, "Hm."),
-        ({"buses": {"can0": {**BUS, "unknown": ["node 33"]}}}, "strangers can0", Verdict.WARNING, "node 33"),
+        ({"buses": {"can0": {**BUS, "unknown": ["node 33"]}}}, "unknown nodes can0", Verdict.WARNING, "node 33"),
         ({"devices": {"elbow": {**DEVICE, "state": "silent", "text": "Gone."}}}, "node elbow", Verdict.BAD, "Gone."),
         ({"devices": {"elbow": {**DEVICE, "text": "Warm."}}}, "node elbow", Verdict.WARNING, "Warm."),
         ({"incomplete": 100}, "cycles", Verdict.WARNING, "90.0% of 1000 cycles"),
@@ -74,7 +74,7 @@ def test_every_check_of_this_machine_says_something() -> None:
     assert all(finding.text for finding in found)
 
 
-def test_role_files_are_told_with_their_end(tmp_path: Path) -> None:
+def test_role_files_are_checked_for_their_expiry(tmp_path: Path) -> None:
     folder, home = tmp_path / "keys", placed("127.0.0.1")
     init(folder, InstallationPlan(routers=["127.0.0.1"], robots={"a": home}, days=400))
     viewer = folder / "viewer.json"

@@ -125,11 +125,11 @@ def test_scan_of_an_interface_needs_no_robot(stage: Stage) -> None:
     assert "encoder (406)" in told.output
 
 
-def test_scan_asks_nobody_while_the_hal_runs(stage: Stage) -> None:
+def test_scan_sends_no_requests_while_the_hal_runs(stage: Stage) -> None:
     wire = can.Bus(interface="virtual", channel=stage.config.buses["can0"].channel)
     with instead_of(stage.config.robot, "hal"):
         told = stage.gemuco("scan", "--seconds", "0.2", "--mit")
-    assert "The HAL of this robot runs: nobody is asked" in told.output
+    assert "The HAL of this robot runs. The scan sends no requests" in told.output
     assert wire.recv(0.0) is None
     wire.shutdown()
 
@@ -197,7 +197,7 @@ def test_doctor_asks_a_hal_that_runs(stage: Stage) -> None:
     finally:
         stop.set()
         hal.join()
-    assert "Runs, mode 'off'; it is asked, and the buses are left alone." in told.output
+    assert "Runs, mode 'off'. It reports its state; the buses are not opened here." in told.output
     assert "All 3 answer" in told.output
     assert refused.exit_code == 1
     assert "already has a 'hal' service" in refused.output
@@ -218,7 +218,7 @@ def test_a_cell_is_calibrated_with_weights(stage: Stage, monkeypatch: pytest.Mon
     assert "calibration              1 devices" in stage.gemuco("doctor").output
 
 
-def test_a_weight_is_told_in_kilograms(stage: Stage) -> None:
+def test_a_weight_is_given_in_kilograms(stage: Stage) -> None:
     stage.set("muscle_tension.biceps", 10.0)
     assert stage.calibrate("cell", "biceps_cell", "--weight", "2", "--yes").exit_code == 0
     assert stage.stored("biceps_cell")["zero"] == pytest.approx(9.6133)  # 2 kg are 19.6133 N
@@ -239,7 +239,7 @@ def test_a_calibration_is_asked_for_and_may_be_dropped(stage: Stage, monkeypatch
     monkeypatch.setattr(typer, "confirm", lambda *_, **__: False)
     told = stage.calibrate("joint", "elbow_encoder")
     assert told.exit_code == 1
-    assert "'much' is no number" in told.output and "Not stored." in told.output
+    assert "'much' is not a number" in told.output and "Not stored." in told.output
     assert not list(stage.path.parent.glob("*.calibration.yaml"))
 
 
@@ -248,9 +248,9 @@ def test_what_makes_no_calibration_is_refused(stage: Stage, monkeypatch: pytest.
     same = stage.calibrate("cell", "biceps_cell", "--weight", "0", "--weight", "1", "--yes")
     assert "The cell read the same" in same.output
     unit = stage.calibrate("cell", "biceps_cell", "--weight", "0", "--unit", "stone", "--yes")
-    assert "are told in kg or N" in unit.output
+    assert "are given in kg or N" in unit.output
     nothing = stage.calibrate("joint", "elbow_encoder")
-    assert "Nothing was told" in nothing.output
+    assert "No known value was given" in nothing.output
     assert {same.exit_code, unit.exit_code, nothing.exit_code} == {1}
 
 

@@ -117,7 +117,7 @@ def test_a_camera_with_nothing_to_look_at_is_silent_and_says_so(robot: str) -> N
         while reader.wait(0.3) is not None:
             pass
         assert client.vision() is None
-        eventually(lambda: "nothing to look at" in getattr(client.status("vision", timeout=2.0), "text", ""))
+        eventually(lambda: "No truth arrives" in getattr(client.status("vision", timeout=2.0), "text", ""))
         truth.pause.clear()
         assert client.vision(timeout=5.0) is not None
 
