@@ -1,8 +1,8 @@
-"""DBC files: messages and signals found by name, and compiled to what is fast enough for a cycle.
+"""DBC files: messages and signals by name, compiled so that a cycle can read and write them fast.
 
 A message whose signals lie on whole bytes is read by `struct`, one with whole numbers elsewhere by shift and mask, any
-other, such as a multiplexed one, by cantools (studies/bus/dbc.py). What is called raw is the number in the frame,
-before the file's factor and offset.
+other, such as a multiplexed one, by cantools (studies/bus/dbc.py). A raw value is the number in the frame, before the
+file's factor and offset.
 """
 
 import difflib
@@ -20,18 +20,18 @@ from cantools.database.can.signal import Signal
 from hal.errors import ConfigError
 
 Value = float | str
-"""A number in the unit of the DBC file, or the name that it gives to a raw value (VAL_)."""
+"""A number in the unit of the DBC file, or the file's name of a raw value (VAL_)."""
 Read = Callable[[bytes | bytearray], tuple[float, ...] | None]
 Unpack = Callable[[bytes | bytearray], tuple[int, ...]]
 LISTED = 40
-"""So many names are listed in an error."""
+"""An error lists at most this number of names."""
 
 _INTEGERS = {8: "b", 16: "h", 32: "i", 64: "q"}
 _FLOATS = {16: "e", 32: "f", 64: "d"}
 
 
 class Dbc:
-    """A DBC file; every name that it does not have is a `ConfigError` with the names that it has."""
+    """A DBC file. An unknown name is a `ConfigError` that lists the known ones."""
 
     def __init__(self, path: Path, database: Database) -> None:
         self.path = path
@@ -39,51 +39,51 @@ class Dbc:
         self._messages = {message.name: message for message in self.messages}
 
     def message(self, name: str) -> Message:
-        """A message.
+        """Return a message.
 
         Raises:
-            ConfigError: There is none of that name.
+            ConfigError: There is no message of that name.
         """
         if name not in self._messages:
-            raise ConfigError(f"DBC file '{self.path}' has no message '{name}'. {_near(name, self._messages)}")
+            raise ConfigError(f"DBC file '{self.path}' has no message '{name}'. {_suggest(name, self._messages)}")
         return self._messages[name]
 
     def signal(self, name: str) -> tuple[Message, Signal]:
-        """A signal and the message that carries it, from `Message.Signal`.
+        """Return the message and the signal of `Message.Signal`.
 
         Raises:
-            ConfigError: The name is of another form, or there is no such message or signal.
+            ConfigError: The name has another form, or there is no such message or signal.
         """
         message_name, dot, signal_name = name.partition(".")
         if not dot:
-            raise ConfigError(f"'{name}' is not of the form `Message.Signal`, with names of '{self.path}'.")
+            raise ConfigError(f"'{name}' does not have the form `Message.Signal`, with names of '{self.path}'.")
         message = self.message(message_name)
         return message, self.signal_of(message, signal_name)
 
     def signal_of(self, message: Message, name: str) -> Signal:
-        """A signal of a message.
+        """Return a signal of a message.
 
         Raises:
-            ConfigError: The message has none of that name.
+            ConfigError: The message has no signal of that name.
         """
         signals = {signal.name: signal for signal in message.signals}
         if name not in signals:
             raise ConfigError(
-                f"Message '{message.name}' of DBC file '{self.path}' has no signal '{name}'. {_near(name, signals)}"
+                f"Message '{message.name}' of DBC file '{self.path}' has no signal '{name}'. {_suggest(name, signals)}"
             )
         return signals[name]
 
     def raw(self, signal: Signal, value: Value) -> float:
-        """The raw value of what is asked for; whole for a signal that is no float.
+        """Return the raw value of `value`; a whole number unless the signal is a float.
 
         Raises:
-            ConfigError: The file does not name such a value, or it does not fit into the signal.
+            ConfigError: The file has no value of that name, or the value does not fit into the signal.
         """
         if isinstance(value, str):
             named = {str(choice): raw for raw, choice in (signal.choices or {}).items()}
             if value not in named:
                 raise ConfigError(
-                    f"Signal '{signal.name}' of '{self.path}' has no value '{value}'. {_near(value, named)}"
+                    f"Signal '{signal.name}' of '{self.path}' has no value '{value}'. {_suggest(value, named)}"
                 )
             return named[value]
         raw = (value - signal.offset) / signal.scale
@@ -106,14 +106,14 @@ def load(path: Path) -> Dbc:
         raise ConfigError(f"There is no DBC file '{path}'. The path is relative to the folder of the robot file.")
     try:
         database = cantools.database.load_file(path, database_format="dbc")
-    except Exception as error:  # cantools passes on whatever its parser meets
+    except Exception as error:  # cantools passes on every exception of its parser
         raise ConfigError(f"'{path}' is not a DBC file that cantools can read: {error}.") from error
     assert isinstance(database, Database)
     return Dbc(path, database)
 
 
 def describe(signal: Signal, raw: float, is_bits: bool = False) -> str:
-    """A raw value in the file's words, in lower case; of a bit field the names of all bits that are set."""
+    """Return the file's name of a raw value, in lower case; for a bit field the names of all bits that are set."""
     choices = {value: str(choice).replace("_", " ").lower() for value, choice in (signal.choices or {}).items()}
     if raw in choices or not is_bits:
         return choices.get(int(raw), f"{raw:g}") if math.isfinite(raw) else "unknown"
@@ -122,7 +122,7 @@ def describe(signal: Signal, raw: float, is_bits: bool = False) -> str:
 
 
 def raw_bounds(signal: Signal) -> tuple[float, float]:
-    """Smallest and largest raw value that a signal can hold and the file allows."""
+    """Return the smallest and the largest raw value that the signal can hold and the file allows."""
     low, high = -math.inf, math.inf
     if not signal.is_float:
         low, high = (
@@ -137,20 +137,20 @@ def raw_bounds(signal: Signal) -> tuple[float, float]:
 
 
 class Reader:
-    """Takes some signals out of a message's data.
+    """Reads signals from a message's data.
 
     Attributes:
         message: The message.
-        names: The signals, in the order in which `read` gives them.
+        names: The signals, in the order in which `read` returns them.
         size: Data bytes of the message.
         is_compiled: Whether it is read without cantools.
-        read: Data of `size` bytes -> raw values, NaN where a multiplexed message does not carry a signal now; None if
-            it carries something that the file does not have.
+        read: Data of `size` bytes -> raw values; NaN for a signal on another page of a multiplexed message; None if
+            cantools cannot decode the data by the file.
     """
 
     def __init__(self, message: Message, names: Iterable[str]) -> None:
-        wanted = set(names)
-        signals = sorted((s for s in message.signals if s.name in wanted), key=_first_byte)
+        selection = set(names)
+        signals = sorted((s for s in message.signals if s.name in selection), key=_first_byte)
         self.message = message
         self.names = tuple(signal.name for signal in signals)
         self.size = message.length
@@ -161,22 +161,22 @@ class Reader:
 
     def _decode(self, data: bytes | bytearray) -> tuple[float, ...] | None:
         try:
-            found: Any = self.message.decode(bytes(data), decode_choices=False, scaling=False)
+            values: Any = self.message.decode(bytes(data), decode_choices=False, scaling=False)
         except cantools.Error:
             return None
-        return tuple(found.get(name, math.nan) for name in self.names)
+        return tuple(values.get(name, math.nan) for name in self.names)
 
 
 class Writer:
-    """Makes a message's data: signals that stay as they are, and one that changes from cycle to cycle.
+    """Makes a message's data: constant signals, and one that changes from cycle to cycle.
 
     Attributes:
-        data: The data, with the raw value last written.
-        bounds: Smallest and largest raw value of the signal that changes.
+        data: The data, with the newest raw value.
+        bounds: Smallest and largest raw value of the varying signal.
     """
 
     def __init__(self, dbc: Dbc, message: Message, values: Mapping[str, Value], varying: str | None = None) -> None:
-        """Signals without a value get the file's start value, or else a raw 0.
+        """Give signals without a value the file's start value, or else raw 0.
 
         Raises:
             ConfigError: The message does not have such a signal or value.
@@ -205,17 +205,17 @@ class Writer:
             ) from None
 
     def write(self, raw: float) -> None:
-        """Put a raw value into the signal that changes, as near as it can hold it."""
+        """Write a raw value, limited to its bounds, into the varying signal."""
         low, high = self.bounds
-        held = min(max(raw, low), high)
+        raw = min(max(raw, low), high)
         if self._is_whole:
-            held = round(held)
+            raw = round(raw)
         if self._packed is not None:
-            layout, place = self._packed
-            layout.pack_into(self.data, place, held)
+            layout, first_byte = self._packed
+            layout.pack_into(self.data, first_byte, raw)
             return
         assert self._varying is not None
-        self._raws[self._varying] = held
+        self._raws[self._varying] = raw
         self.data[:] = self._encode()
 
     def _encode(self) -> bytearray:
@@ -225,7 +225,7 @@ class Writer:
 
 
 def _layout(message: Message, signals: Sequence[Signal]) -> struct.Struct | None:
-    """The layout of some signals of a message, or None if it cannot be told to `struct`."""
+    """Return the layout of signals of a message, or None if `struct` cannot express it."""
     order = {_order(signal) for signal in signals if signal.length > 8} or {"<"}
     if len(order) > 1:
         return None
@@ -240,7 +240,9 @@ def _layout(message: Message, signals: Sequence[Signal]) -> struct.Struct | None
 
 
 def _shifts(message: Message, signals: Sequence[Signal]) -> Read | None:
-    """Reads whole numbers anywhere in a message; None if not all are whole, plain, and of one byte order."""
+    """Return a reader of whole numbers anywhere in a message; None if a signal is a float or multiplexed, or byte
+    orders differ.
+    """
     orders = {signal.byte_order for signal in signals}
     if len(orders) != 1 or any(signal.is_float or signal.multiplexer_ids is not None for signal in signals):
         return None
@@ -255,14 +257,14 @@ def _shifts(message: Message, signals: Sequence[Signal]) -> Read | None:
         bits = f"words[{number}] >> {shift} & {(1 << signal.length) - 1}"
         sign = 1 << signal.length - 1
         parts.append(f"({bits} ^ {sign}) - {sign}" if signal.is_signed else bits)
-    # Written out as one expression of numbers, which takes half the time of a loop over them.
+    # One compiled expression takes half the time of a loop over the signals.
     parts[0] = parts[0].replace("words", "(words := unpack(data))", 1)
     read: Read = eval(f"lambda data: ({', '.join(parts)},)", {"unpack": unpack})
     return read
 
 
 def _span(signal: Signal) -> tuple[int, int]:
-    """First bit and end of a signal, counted in the order in which its bits follow one another in the frame."""
+    """Return first bit and end of a signal, counted in the order of its bits in the frame."""
     if signal.byte_order == "little_endian":
         return signal.start, signal.start + signal.length
     first = 8 * _first_byte(signal) + 7 - signal.start % 8  # the start bit is the highest of its byte order
@@ -270,7 +272,7 @@ def _span(signal: Signal) -> tuple[int, int]:
 
 
 def _words(length: int, order: str, spans: Sequence[tuple[int, int]]) -> tuple[list[tuple[int, int]], Unpack]:
-    """First byte and size of the words to take a frame as, so that no span is cut, and what takes it so."""
+    """Return first byte and size of words that cut no span, and a function that unpacks a frame into them."""
     words, start = [], 0
     for size in (8, 4, 2, 1):
         while length - start >= size:
@@ -283,7 +285,7 @@ def _words(length: int, order: str, spans: Sequence[tuple[int, int]]) -> tuple[l
 
 
 def _code(signal: Signal) -> str | None:
-    """What `struct` calls such a signal; None if it does not begin and end with a byte, or has no such length."""
+    """Return the signal's format character of `struct`; None if it is not on whole bytes or has another length."""
     if signal.start % 8 != (0 if signal.byte_order == "little_endian" else 7):
         return None
     if signal.is_float:
@@ -297,12 +299,12 @@ def _order(signal: Signal) -> str:
 
 
 def _first_byte(signal: Signal) -> int:
-    """The byte in which a signal begins: DBC counts the start bit of both byte orders upwards from byte 0."""
+    """Return the byte in which a signal begins: DBC counts start bits of both byte orders upwards from byte 0."""
     return signal.start // 8
 
 
-def _near(name: str, known: Iterable[str]) -> str:
+def _suggest(name: str, known: Iterable[str]) -> str:
     names = sorted(known)
-    close = difflib.get_close_matches(name, names, 3)
+    matches = difflib.get_close_matches(name, names, 3)
     listed = ", ".join(names[:LISTED]) + (f" and {len(names) - LISTED} more" if len(names) > LISTED else "")
-    return (f"Did you mean {' or '.join(close)}? " if close else "") + f"It has: {listed or 'none'}."
+    return (f"Did you mean {' or '.join(matches)}? " if matches else "") + f"It has: {listed or 'none'}."

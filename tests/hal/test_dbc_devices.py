@@ -161,17 +161,17 @@ def test_states_that_the_robot_file_does_not_name_are_faults(place):
         ({"state": {"signal": "Status.Mode", "ready": ["OFF"], "enabled": ["OFF"]}}, "has two meanings"),
         ({"command": {**SERVO["command"], "signal": "Angl"}}, "no signal 'Angl'. Did you mean Angle"),
         ({"command": {**SERVO["command"], "quantity": "effort"}}, "'effort' is not measured"),
-        ({"cyclic": [SERVO["enable"][0]]}, "drop the `until`"),
+        ({"cyclic": [SERVO["enable"][0]]}, "remove its `until`"),
         ({"enable": [{"frame": {"id": 1}, "send": "Go"}]}, "either `send` or `frame`"),
         ({"enable": [{"frame": {"id": 1, "data": [256]}}]}, "enable.0.frame.data"),
         ({"enable": [{"until": {"signal": "Go.Mode", "equals": "AN"}}]}, "no value 'AN'"),
-        ({"tare": [SERVO["enable"][0]]}, "waits for nothing"),
+        ({"tare": [SERVO["enable"][0]]}, "cannot wait"),
         ({"quantities": {"position": {"signal": "Angle.Angle", "scale": 0}}}, "a factor must not be 0"),
-        ({"periods": {"Status": 0.05}}, "does not say how often 'Angle' is sent"),
-        ({"periods": {"Angle": 0.01}}, "does not say how often 'Status' is sent"),
+        ({"periods": {"Status": 0.05}}, "does not have the period of 'Angle'"),
+        ({"periods": {"Angle": 0.01}}, "does not have the period of 'Status'"),
     ],
 )
-def test_settings_that_do_not_fit_are_told(place, changes, sentence):
+def test_settings_that_do_not_fit_are_refused(place, changes, sentence):
     with pytest.raises((ConfigError, ValueError), match=sentence):
         DbcServo(place("position"), settings(ServoSettings, SERVO, **changes))
 
@@ -189,7 +189,7 @@ def steps(inbox, *given):
 
 
 def hear(inbox, *raws):
-    inbox.letters["Status"].raws = tuple(raws)
+    inbox.messages["Status"].raws = tuple(raws)
 
 
 def test_raw_frames(inbox):
@@ -240,7 +240,7 @@ def test_a_step_that_is_not_confirmed_is_sent_again_and_then_given_up(inbox):
     failed = Run("test", compiled, 200.0)
     while not failed.is_over:
         failed.advance(lambda frame: True)
-    assert failed.failure == "after Go ON it does not say Status.Mode ON or BUSY, but off"
+    assert failed.failure == "after Go ON it does not report Status.Mode ON or BUSY, but off"
 
 
 def test_a_step_that_is_not_needed_is_left_out(inbox):

@@ -362,7 +362,7 @@ def test_what_the_doctor_sees(bench):
     assert found["message 'Heartbeat'"].is_good
     axis(bench)._periods[axis(bench)._heartbeat] = 0.3
     bench.while_time_passes(lambda: found.update({check.what: check for check in axis_device.inspect()}))
-    assert "every 0.3 s, and `periods` says 0.1 s" in found["message 'Heartbeat'"].text
+    assert "every 0.3 s, but `periods` has 0.1 s" in found["message 'Heartbeat'"].text
 
 
 @pytest.mark.parametrize(
@@ -379,15 +379,15 @@ def test_what_the_doctor_sees(bench):
         ),
         ({"periods": {"Get_Velocity": 0.1}}, "no message 'Get_Velocity'"),
         ({"watchdog": None}, "a DBC file has no watchdog"),
-        ({"watchdog": {"timeout": 0.1, "fed_by": ["Heartbeat"]}}, "none is sent in every cycle"),
+        ({"watchdog": {"timeout": 0.1, "fed_by": ["Heartbeat"]}}, "none of them is sent in every cycle"),
         ({"watchdog": {"timeout": 0.01, "fed_by": ["Set_Input_Pos"]}}, "less than 3 cycles"),
-        ({"silent_after": 0.015}, "silent_after is 0.015 s, and 'Get_Encoder_Estimates' comes every 0.01 s"),
+        ({"silent_after": 0.015}, "silent_after is 0.015 s, but 'Get_Encoder_Estimates' comes every 0.01 s"),
         ({"dbc": "dbc/odrive.dbc"}, "There is no DBC file"),
         ({"dbc": "eds/servo_drive.eds"}, "not a DBC file"),
         ({"gear": 0.0}, "gear"),
         ({"mode": "torque"}, "mode"),
         ({"enable": []}, "enable"),
-        ({"damping": 1.0}, "damping needs an effort to be commanded"),
+        ({"damping": 1.0}, "damping needs an effort command"),
         ({"reset": [{"send": "Clear_Errors", "until": {"signal": "Heartbeat.Axis_Error"}}]}, "either `equals`"),
         ({"reset": [{}]}, "a step needs `send`"),
         ({"error": {"signal": "Heartbeat.Axis_Error", "good": False}}, "put the name in quotes"),
@@ -408,7 +408,7 @@ def test_a_servo_may_go_without_a_watchdog_if_the_robot_file_says_so():
 def test_a_node_id_beyond_the_identifiers_is_refused():
     body = description()
     body["devices"]["elbow_axis"]["node"] = 64
-    with pytest.raises(ConfigError, match=r"node id 64 makes identifier 8\w\wh of .* Node ids end at 63"):
+    with pytest.raises(ConfigError, match=r"node id 64 gives .* the identifier 8\w\wh.* largest node id is 63"):
         open_robot(RobotConfig.model_validate(body))
     body["devices"]["elbow_axis"]["node"] = 63
     with pytest.raises(ConfigError, match="63 is that of axes which have none yet"):

@@ -142,7 +142,7 @@ def test_a_page_that_does_not_carry_a_signal_is_no_value(mixed):
     [
         (lambda file: file.message("Mixd"), "has no message 'Mixd'. Did you mean Mixed"),
         (lambda file: file.signal("Mixed.Larg"), "has no signal 'Larg'. It has: Big, Flag, Little, Real"),
-        (lambda file: file.signal("Mixed"), "not of the form `Message.Signal`"),
+        (lambda file: file.signal("Mixed"), "does not have the form `Message.Signal`"),
         (lambda file: file.raw(file.signal("Bounded.Mode")[1], "RUNS"), "Did you mean RUN"),
         (lambda file: file.raw(file.signal("Bounded.Mode")[1], 256), "256 does not fit into signal 'Mode'"),
         (lambda file: dbc.Writer(file, file.message("Bounded"), {"Mod": 1}), "Did you mean Mode"),

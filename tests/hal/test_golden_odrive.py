@@ -134,7 +134,7 @@ def test_the_way_out_of_motion_and_of_faults():
 
 
 def test_who_is_asked_for():
-    asked = axis()._asking[0].frame
+    asked = axis()._identity_request[0].frame
     assert (asked.arbitration_id, asked.is_remote_frame, asked.is_extended_id) == (0x7E6, True, False)
 
 

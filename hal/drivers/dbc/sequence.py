@@ -1,4 +1,4 @@
-"""Messages received, conditions on their signals, and steps that are sent one after the other without waiting."""
+"""Received messages, conditions on their signals, and steps that are sent cycle by cycle without blocking."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -13,26 +13,27 @@ from hal.errors import ConfigError
 from hal.protocols.dbc import Dbc, Reader, Writer, describe
 
 TOLERANCE = 1e-6
-"""Relative difference within which two numbers that are no whole ones count as equal."""
+"""Two values that are not whole numbers are equal within this relative difference."""
 
 Raws = tuple[float, ...]
 
 
 @dataclass(slots=True)
-class Letter:
-    """A message that is listened to.
+class InputMessage:
+    """A message that the driver receives.
 
     Attributes:
-        message: The message.
-        wanted: Its signals that somebody asks for.
-        reader: Takes them out of a frame.
-        raws: What came last, in the order of `reader.names`; empty before the first. Another tuple for each frame.
-        received: When that was, monotonic [s].
-        count: How many came since its pace was looked at.
+        definition: The message in the DBC file.
+        names: Names of the signals in use.
+        reader: Reads these signals from a frame.
+        raws: Newest raw values in the order of `reader.names`; empty before the first frame. Each frame makes a new
+            tuple.
+        received: Monotonic time of the newest frame [s].
+        count: Frames since the last check of the sending rate.
     """
 
-    message: Message
-    wanted: set[str] = field(default_factory=set)
+    definition: Message
+    names: set[str] = field(default_factory=set)
     reader: Reader | None = None
     raws: Raws = ()
     received: float = -math.inf
@@ -40,102 +41,105 @@ class Letter:
 
 
 @dataclass(slots=True)
-class Seen:
-    """A signal that is listened to."""
+class InputSignal:
+    """A signal that the driver receives."""
 
-    letter: Letter
-    signal: Signal
-    place: int = -1
-    """In `letter.raws`."""
+    message: InputMessage
+    definition: Signal
+    index: int = -1
+    """Index in `message.raws`."""
 
     @property
     def raw(self) -> float:
-        """What it said last, as in the frame; NaN if nothing yet."""
-        raws = self.letter.raws
-        return raws[self.place] if raws else math.nan
+        """Newest raw value; NaN before the first frame."""
+        raws = self.message.raws
+        return raws[self.index] if raws else math.nan
 
-    def words(self, is_bits: bool = False) -> str:
-        """What it said last, in the DBC file's words."""
-        return describe(self.signal, self.raw, is_bits)
+    def describe(self, is_bits: bool = False) -> str:
+        """Return the newest value as the DBC file names it."""
+        return describe(self.definition, self.raw, is_bits)
 
 
 @dataclass(slots=True)
 class Condition:
-    """What a signal is waited to say."""
+    """A condition on the value of a signal."""
 
-    seen: Seen
+    signal: InputSignal
     holds: Callable[[float], bool]
     text: str
 
+    @property
     def newest(self) -> Raws:
-        """What there is now, to tell later whether something newer has come."""
-        return self.seen.letter.raws
+        """Newest raw values of the message, by which `is_met` recognises a later frame."""
+        return self.signal.message.raws
 
     def is_met(self, since: Raws | None = None) -> bool:
-        """Whether it says so, in a frame that came after `since` was taken."""
-        raws = self.seen.letter.raws
-        return bool(raws) and raws is not since and self.holds(raws[self.seen.place])
+        """Return whether the condition holds, in a frame later than the one of `since`."""
+        raws = self.newest
+        return bool(raws) and raws is not since and self.holds(raws[self.signal.index])
 
 
 class Inbox:
-    """All that is listened to; signals are asked for first, then `seal` makes the readers."""
+    """All messages that the driver receives. Request the signals first; then `seal` makes the readers."""
 
     def __init__(self, dbc: Dbc) -> None:
         self.dbc = dbc
-        self.letters: dict[str, Letter] = {}
-        self._seen: list[Seen] = []
+        self.messages: dict[str, InputMessage] = {}
+        self._signals: list[InputSignal] = []
 
-    def letter(self, message: str) -> Letter:
-        """Listen to a message.
+    def message(self, name: str) -> InputMessage:
+        """Receive a message.
 
         Raises:
             ConfigError: There is no such message.
         """
-        return self.letters.setdefault(message, Letter(self.dbc.message(message)))
+        return self.messages.setdefault(name, InputMessage(self.dbc.message(name)))
 
-    def signal(self, name: str) -> Seen:
-        """Listen to `Message.Signal`.
+    def signal(self, name: str) -> InputSignal:
+        """Receive `Message.Signal`.
 
         Raises:
             ConfigError: There is no such signal.
         """
-        message, signal = self.dbc.signal(name)
-        seen = Seen(self.letter(message.name), signal)
-        seen.letter.wanted.add(signal.name)
-        self._seen.append(seen)
-        return seen
+        message, definition = self.dbc.signal(name)
+        signal = InputSignal(self.message(message.name), definition)
+        signal.message.names.add(definition.name)
+        self._signals.append(signal)
+        return signal
 
     def condition(self, config: ConditionConfig) -> Condition:
-        """Listen to what a condition is about.
+        """Receive the signal of a condition.
 
         Raises:
             ConfigError: There is no such signal or value.
         """
-        seen = self.signal(config.signal)
-        signal = seen.signal
+        signal = self.signal(config.signal)
+        definition = signal.definition
         if config.below is not None:
             bound = config.below
             return Condition(
-                seen, lambda raw: abs(raw * signal.scale + signal.offset) < bound, f"{config.signal} below {bound:g}"
+                signal,
+                lambda raw: abs(raw * definition.scale + definition.offset) < bound,
+                f"{config.signal} below {bound:g}",
             )
         values = config.one_of if config.equals is None else (config.equals,)
-        raws = [self.dbc.raw(signal, value) for value in values]
-        told = f"{config.signal} {' or '.join(f'{v:g}' if isinstance(v, float) else v for v in values)}"
-        if signal.is_float:
-            return Condition(seen, lambda raw: any(math.isclose(raw, one, rel_tol=TOLERANCE) for one in raws), told)
-        return Condition(seen, frozenset(raws).__contains__, told)
+        raws = [self.dbc.raw(definition, value) for value in values]
+        text = f"{config.signal} {' or '.join(f'{v:g}' if isinstance(v, float) else v for v in values)}"
+        if definition.is_float:
+            return Condition(signal, lambda raw: any(math.isclose(raw, one, rel_tol=TOLERANCE) for one in raws), text)
+        return Condition(signal, frozenset(raws).__contains__, text)
 
     def seal(self) -> None:
-        """Make the readers; nothing can be asked for after this."""
-        for letter in self.letters.values():
-            letter.reader = Reader(letter.message, letter.wanted)
-        for seen in self._seen:
-            assert seen.letter.reader is not None
-            seen.place = seen.letter.reader.names.index(seen.signal.name)
+        """Make the readers; no further signals can be requested."""
+        for message in self.messages.values():
+            message.reader = Reader(message.definition, message.names)
+        for signal in self._signals:
+            assert signal.message.reader is not None
+            signal.index = signal.message.reader.names.index(signal.definition.name)
 
 
 RESEND = 0.2
-"""A step that is not confirmed is sent again after so long [s]: the frame may be lost."""
+"""An unconfirmed step is sent again after this time [s], because the frame may be lost."""
 
 STANDARD, EXTENDED = 0x7FF, 0x1FFFFFFF
 """Largest identifiers of 11 and of 29 bits."""
@@ -145,12 +149,12 @@ Send = Callable[[can.Message], bool]
 
 @dataclass(frozen=True, slots=True)
 class Address:
-    """Which identifiers a node has.
+    """The identifiers of a node.
 
     Attributes:
         node: Its node id.
-        offset: What it adds to the identifiers of the DBC file per node id.
-        extended: Whether identifiers have 29 bits; None: as the file says.
+        offset: Added to the identifiers of the DBC file per node id.
+        extended: Whether identifiers have 29 bits; None: as in the DBC file.
     """
 
     node: int
@@ -158,32 +162,32 @@ class Address:
     extended: bool | None
 
     def identifier(self, base: int, extended: bool, what: str) -> tuple[int, bool]:
-        """Identifier on the bus, and whether it has 29 bits.
+        """Return the identifier on the bus, and whether it has 29 bits.
 
         Raises:
-            ConfigError: It has too many.
+            ConfigError: The identifier is too large.
         """
         extended = extended if self.extended is None else self.extended
         identifier = base + self.node * self.offset
         largest = EXTENDED if extended else STANDARD
         if identifier > largest:
             raise ConfigError(
-                f"node id {self.node} makes identifier {identifier:X}h of {what}, and the largest is {largest:X}h. "
-                f"Node ids end at {max(largest - base, 0) // max(self.offset, 1)}."
+                f"node id {self.node} gives {what} the identifier {identifier:X}h, above the largest, {largest:X}h. "
+                f"The largest node id is {max(largest - base, 0) // max(self.offset, 1)}."
             )
         return identifier, extended
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """What a step of the robot file has become.
+    """A compiled step of the robot file.
 
     Attributes:
-        frame: What is sent; None if it only waits.
-        until: What is waited for; None if nothing.
-        unless: The step is left out if this is so already.
-        cycles: How many cycles that may take.
-        text: What is sent, for a person.
+        frame: Frame to send; None if the step only waits.
+        until: Condition that ends the step; None if it ends at once.
+        unless: The step is skipped if this condition holds.
+        cycles: Most cycles until the condition must hold.
+        text: Description of the frame for messages.
     """
 
     frame: can.Message | None
@@ -194,7 +198,7 @@ class Step:
 
 
 def message_of(dbc: Dbc, address: Address, name: str, data: bytearray) -> can.Message:
-    """The frame of a DBC message, to carry `data`.
+    """Return the frame of a DBC message with `data`.
 
     Raises:
         ConfigError: There is no such message, or its identifier does not fit.
@@ -205,10 +209,10 @@ def message_of(dbc: Dbc, address: Address, name: str, data: bytearray) -> can.Me
 
 
 def compile_steps(steps: Sequence[StepConfig], inbox: Inbox, address: Address, rate: float) -> tuple[Step, ...]:
-    """Steps of the robot file made ready to be sent at `rate` cycles per second.
+    """Compile steps of the robot file for `rate` cycles per second.
 
     Raises:
-        ConfigError: They name what the DBC file does not have.
+        ConfigError: A name in them is not in the DBC file.
     """
     compiled = []
     for step in steps:
@@ -239,48 +243,48 @@ def _raw(config: FrameConfig, address: Address) -> can.Message:
 
 
 class Run:
-    """One run of some steps; `advance` is called in every cycle until `is_over`."""
+    """One run of a sequence of steps. Call `advance` in every cycle until `is_over`."""
 
     def __init__(self, name: str, steps: Sequence[Step], rate: float, goes_on: bool = False) -> None:
         """Begin with the first step.
 
         Args:
-            name: Of the sequence, for a person.
-            steps: What is sent.
+            name: Name of the sequence in messages.
+            steps: The steps.
             rate: Cycles per second [Hz].
-            goes_on: A step that is not confirmed in time does not end the run, as when stopping.
+            goes_on: Whether the run continues after a step that is not confirmed in time, as in a stop.
         """
         self.name = name
         self.failure = ""
-        """Why it ended before its end; empty if it did not."""
+        """Reason why the run failed; empty if it did not."""
         self._steps = tuple(steps)
         self._resend = max(1, round(RESEND * rate))
         self._goes_on = goes_on
-        self._place = 0
+        self._index = 0
         self._waited = -1
         self._since: Raws = ()
 
     @property
     def is_over(self) -> bool:
-        """Whether nothing is left to do."""
-        return self._place >= len(self._steps) or bool(self.failure)
+        """Whether the run has ended."""
+        return self._index >= len(self._steps) or bool(self.failure)
 
     @property
     def has_sent_last(self) -> bool:
         """Whether the last step has been sent."""
-        return self._place >= len(self._steps) or (self._place == len(self._steps) - 1 and self._waited >= 0)
+        return self._index >= len(self._steps) or (self._index == len(self._steps) - 1 and self._waited >= 0)
 
     def advance(self, send: Send) -> None:
-        """One cycle: send the next step, or see whether the one that was sent is confirmed."""
+        """Send the next step, or check whether the sent one is confirmed; once per cycle."""
         if self.is_over:
             return
-        step = self._steps[self._place]
+        step = self._steps[self._index]
         self._waited += 1
         if self._waited == 0:
             if step.unless is not None and step.unless.is_met():
                 self._next()
                 return
-            self._since = step.until.newest() if step.until else ()
+            self._since = step.until.newest if step.until else ()
             if step.frame is not None:
                 send(step.frame)
             if step.until is None:
@@ -293,11 +297,11 @@ class Run:
             if self._goes_on:
                 self._next()
             else:
-                said = step.until.seen.words() if step.until.newest() else "nothing"
-                self.failure = f"after {step.text} it does not say {step.until.text}, but {said}"
+                value = step.until.signal.describe() if step.until.newest else "nothing"
+                self.failure = f"after {step.text} it does not report {step.until.text}, but {value}"
         elif step.frame is not None and self._waited % self._resend == 0:
             send(step.frame)
 
     def _next(self) -> None:
-        self._place += 1
+        self._index += 1
         self._waited = -1

@@ -1,4 +1,4 @@
-"""A servo with a DBC file: what a DBC does not say (states, sequences, watchdog) is said by the robot file."""
+"""A servo with a DBC file. The robot file adds what a DBC file cannot contain: states, sequences and the watchdog."""
 
 import logging
 import time
@@ -6,11 +6,12 @@ from collections.abc import Callable
 from typing import ClassVar
 
 import numpy as np
+from typing_extensions import override
 
 from hal.device import UNDER_POWER, Check, DeviceState
 from hal.drivers.can_device import Place
 from hal.drivers.dbc.sensor import FRAME_BYTES, POLL, DbcNode
-from hal.drivers.dbc.sequence import Letter, Raws, Run, Step, message_of
+from hal.drivers.dbc.sequence import InputMessage, Raws, Run, Step, message_of
 from hal.drivers.dbc.settings import DbcSettings, QuantityConfig, ServoSettings, Value
 from hal.errors import ConfigError, DeviceSilent
 from hal.protocols.dbc import Writer
@@ -18,30 +19,30 @@ from hal.protocols.dbc import Writer
 log = logging.getLogger(__name__)
 
 FED_CYCLES = 3
-"""A watchdog that runs out within fewer cycles would stop the servo at the first late one."""
+"""A watchdog with a timeout of fewer cycles would stop the servo at the first late cycle."""
 ENABLE, DISABLE, QUICK_STOP, RESET = "enabling", "disabling", "quick stop", "reset"
-"""Names of the sequences, as a person reads them."""
+"""Names of the sequences in messages."""
 BOOTING = "booting"
 BOOT_TIME = 2.0
-"""How long [s] a servo may take to start up while it is opened."""
+"""`open` waits at most this time [s] for a servo that starts up."""
 
 
 class DbcServo(DbcNode):
-    """One servo. It is enabled only by `enable`, and stays disabled once it dropped out by itself."""
+    """One servo. Only `enable` enables it; a servo that leaves its enabled state by itself stays disabled."""
 
     Settings: ClassVar[type[ServoSettings]] = ServoSettings
     COUNTERS: ClassVar[tuple[str, ...]] = (*DbcNode.COUNTERS, "watchdog_expired")
-    doubts_in_error = False
+    is_masked_by_error = False
     _settings: ServoSettings
 
     @classmethod
+    @override
     def commanded(cls, settings: ServoSettings) -> str:
-        """See `CanDevice.commanded`."""
         return settings.command.quantity
 
     @classmethod
+    @override
     def traffic(cls, settings: DbcSettings, rate: float) -> tuple[tuple[int, float, bool], ...]:
-        """See `CanDevice.traffic`."""
         assert isinstance(settings, ServoSettings)
         sent = (FRAME_BYTES, rate, bool(settings.extended))
         return (*super().traffic(settings, rate), *(sent for _ in (settings.command, *settings.cyclic)))
@@ -49,22 +50,23 @@ class DbcServo(DbcNode):
     def __init__(self, place: Place, settings: ServoSettings) -> None:
         self._is_wanted = False
         self._was_reached = False
-        self._ran_out = False
+        self._stopped_by_watchdog = False
         self._is_booting = False
         self._has_expired = False
-        self._was_on = False
-        self._dropped = ""
+        self._was_enabled = False
+        self._drop_text = ""
         self._hold = 0.0
         super().__init__(place, settings)
         self._activity = Run("nothing", (), place.rate)
         self._slot = self._slots[settings.command.quantity]
 
+    @override
     def _prepare(self, settings: DbcSettings) -> None:
         super()._prepare(settings)
         assert isinstance(settings, ServoSettings)
         state = settings.state
         self._state = self._inbox.signal(state.signal)
-        self._period_of(self._state.letter)
+        self._period_of(self._state.message)
         self._reason = self._inbox.signal(state.reason) if state.reason else None
         self._meaning: dict[float, DeviceState | str] = {}
         meanings: tuple[tuple[DeviceState | str, tuple[Value, ...]], ...] = (
@@ -76,7 +78,7 @@ class DbcServo(DbcNode):
         )
         for meaning, values in meanings:
             for value in values:
-                raw = self._inbox.dbc.raw(self._state.signal, value)
+                raw = self._inbox.dbc.raw(self._state.definition, value)
                 if self._meaning.setdefault(raw, meaning) != meaning:
                     raise ConfigError(f"the value {value} of {state.signal} has two meanings in `state`.")
         self._sequences = {
@@ -106,12 +108,12 @@ class DbcServo(DbcNode):
         self._is_position = command.quantity == "position"
         self.can_damp = settings.damping is not None
         if self.can_damp and "velocity" not in self._slots:
-            raise ConfigError("damping needs the velocity, which `elements` does not name.")
+            raise ConfigError("damping needs the velocity, which is not in `elements`.")
 
     def _prepare_watchdog(self, settings: ServoSettings) -> None:
         watchdog = settings.watchdog
         self._no_watchdog = "" if watchdog else f"{self._place} goes on with its last set-point when the host dies."
-        self._configuring: tuple[Step, ...] = self._steps(watchdog.configure) if watchdog else ()
+        self._watchdog_steps: tuple[Step, ...] = self._steps(watchdog.configure) if watchdog else ()
         self._expired = self._inbox.condition(watchdog.expired) if watchdog and watchdog.expired else None
         if watchdog is None:
             return
@@ -123,28 +125,30 @@ class DbcServo(DbcNode):
                 f"{self._rate:g} Hz: the servo would stop at the first late cycle."
             )
 
-    def _note(self, letter: Letter) -> Callable[[Raws], None] | None:
-        if letter is self._state.letter:
+    @override
+    def _observer(self, message: InputMessage) -> Callable[[Raws], None] | None:
+        if message is self._state.message:
             return self._on_state
-        return self._on_watchdog if self._expired and letter is self._expired.seen.letter else None
+        return self._on_watchdog if self._expired and message is self._expired.signal.message else None
 
     def _on_state(self, raws: Raws) -> None:
-        if self._expired and self._expired.seen.letter is self._state.letter:
+        if self._expired and self._expired.signal.message is self._state.message:
             self._on_watchdog(raws)
         is_booting = self._meaning.get(self._state.raw) == BOOTING
         if is_booting and not self._is_booting:
             self._counters["boots"] += 1
             self._lose(f"{self._place} rebooted.")
         self._is_booting = is_booting
-        self._was_on = self._is_enabled
+        self._was_enabled = self._is_enabled
 
     def _on_watchdog(self, raws: Raws) -> None:
         has_expired = self._expired is not None and self._expired.is_met()
         if has_expired and not self._has_expired:
             self._counters["watchdog_expired"] += 1
-            self._ran_out = self._is_wanted or self._was_on
+            self._stopped_by_watchdog = self._is_wanted or self._was_enabled
         self._has_expired = has_expired
 
+    @override
     def _lose(self, text: str) -> None:
         super()._lose(text)
         self._is_wanted = False
@@ -153,6 +157,7 @@ class DbcServo(DbcNode):
     def _is_enabled(self) -> bool:
         return self._meaning.get(self._state.raw) is DeviceState.ENABLED
 
+    @override
     def _identify(self) -> str:
         identity = super()._identify()
         deadline = time.monotonic() + BOOT_TIME
@@ -162,92 +167,98 @@ class DbcServo(DbcNode):
             time.sleep(POLL)
         return identity
 
+    @override
     def _commission(self) -> None:
         self._is_wanted = False
         self._activity = Run("nothing", (), self._rate)
-        if not self._state.letter.raws:
-            self._comes(self._state.letter)
+        if not self._state.message.raws:
+            self._comes(self._state.message)
         if self._is_enabled:
             self._run(DISABLE, self._sequences[DISABLE])
         super()._commission()
-        self._run("watchdog", self._configuring)
-        if self._is_rested:
-            log.warning("%s: its watchdog ran out before it was opened; that is reset", self._place)
+        self._run("watchdog", self._watchdog_steps)
+        if self._expired_disabled:
+            log.warning("%s: its watchdog ran out before it was opened; it is reset", self._place)
             self._run(RESET, self._sequences[RESET], goes_on=True)
 
+    @override
     def _release(self) -> None:
         if self.is_heard:
             self._run(DISABLE, self._sequences[DISABLE], goes_on=True)
 
     @property
-    def _is_rested(self) -> bool:
-        """Whether the watchdog ran out while nobody wanted the servo to move: nobody fed it, and it stopped nothing."""
-        return self._has_expired and not self._ran_out
+    def _expired_disabled(self) -> bool:
+        """Whether the watchdog ran out while the servo was disabled, where it was not fed and stopped no motion."""
+        return self._has_expired and not self._stopped_by_watchdog
 
+    @override
     def _fault(self) -> str:
         if text := super()._fault():
             return text
-        if self._is_rested:
+        if self._expired_disabled:
             return ""
         if text := self._error_text():
             return text
         if self._meaning.get(self._state.raw, DeviceState.FAULT) is DeviceState.FAULT:
-            return f"{self._place} is in its state '{self._state.words()}' ({self._settings.state.signal})."
+            return f"{self._place} is in its state '{self._state.describe()}' ({self._settings.state.signal})."
         return ""
 
+    @override
     def _drives(self) -> bool:
         return self._meaning.get(self._state.raw) in UNDER_POWER
 
-    def _standing(self) -> tuple[DeviceState, str]:
+    @override
+    def _state_and_text(self) -> tuple[DeviceState, str]:
         meaning = self._meaning.get(self._state.raw)
         if meaning is DeviceState.ENABLED:
             return DeviceState.ENABLED, ""
         if meaning is DeviceState.HOMING:
-            return DeviceState.HOMING, f"{self._place} is in its state '{self._state.words()}'."
-        return DeviceState.READY, self._dropped or self._no_watchdog
+            return DeviceState.HOMING, f"{self._place} is in its state '{self._state.describe()}'."
+        return DeviceState.READY, self._drop_text or self._no_watchdog
 
+    @override
     def enable(self) -> None:
-        """See `Device.enable`."""
-        self._is_wanted, self._was_reached, self._dropped = True, False, ""
+        self._is_wanted, self._was_reached, self._drop_text = True, False, ""
         first = self._sequences[RESET] if self._has_expired else ()
         self._activity = Run(ENABLE, (*first, *self._sequences[ENABLE]), self._rate)
 
+    @override
     def disable(self) -> None:
-        """See `Device.disable`; a quick stop that is under way goes on."""
         self._is_wanted = False
         if not self._is_stopping:
             self._begin(DISABLE)
 
+    @override
     def quick_stop(self) -> None:
-        """See `Device.quick_stop`; its first frame goes out at once, for the cycle may be stuck."""
         self._is_wanted = False
         if not self._is_stopping:
             self._begin(QUICK_STOP)
-            self._activity.advance(self._bus.send)
+            self._activity.advance(self._bus.send)  # at once, because the cycle may be stuck
 
     @property
     def _is_stopping(self) -> bool:
         return self._activity.name == QUICK_STOP and not self._activity.is_over
 
+    @override
     def reset(self) -> None:
-        """See `Device.reset`."""
-        self._ran_out = False
-        self._dropped = ""
+        self._stopped_by_watchdog = False
+        self._drop_text = ""
         self._begin(RESET)
 
     def _begin(self, name: str) -> None:
         self._activity = Run(name, self._sequences[name], self._rate, goes_on=True)
 
+    @override
     def apply(self, values: np.ndarray) -> None:
-        """See `Device.apply`; until the servo is enabled its target is where it is, or nothing."""
         self._follow(float(values[0]))
 
+    @override
     def damp(self) -> None:
-        """See `Device.damp`; the effort is against the velocity, and none while that is not known."""
         velocity = float(self._values[self._slots["velocity"]])
         self._follow(-(self._settings.damping or 0.0) * velocity if np.isfinite(velocity) else 0.0)
 
     def _follow(self, target: float) -> None:
+        """Send the set-point [SI]; until the servo is enabled, send one that does not move it, and enable it."""
         if not self._is_wanted:
             self.idle()
             return
@@ -265,14 +276,14 @@ class DbcServo(DbcNode):
         self._send(self._hold)
         activity.advance(self._bus.send)
 
+    @override
     def idle(self) -> None:
-        """See `Device.idle`; the servo is led to a state without power."""
         if not self.is_commissioned:
             return
         activity = self._activity
         if self._is_enabled if activity.is_over else activity.name == ENABLE:
             self._begin(DISABLE)
-        elif activity.is_over and self._is_rested:
+        elif activity.is_over and self._expired_disabled:
             self._begin(RESET)
         if self._settings.command.while_disabled:
             self._send(self._rest)
@@ -281,23 +292,23 @@ class DbcServo(DbcNode):
         self._activity.advance(self._bus.send)
 
     def _drop(self, failure: str) -> None:
-        """The servo is not enabled, or not any more, though it was to be."""
+        """Disable a servo that cannot be enabled, or that left its enabled state by itself."""
         self._is_wanted = False
-        reason = f", {self._reason.words()}" if self._reason else ""
-        said = f"'{self._state.words()}'{reason}"
+        reason = f", {self._reason.describe()}" if self._reason else ""
+        state = f"'{self._state.describe()}'{reason}"
         if failure:
-            self._dropped = f"{self._place} cannot be enabled: {failure}; its state is {said}."
+            self._drop_text = f"{self._place} cannot be enabled: {failure}; its state is {state}."
         else:
-            self._dropped = f"{self._place} left its enabled state by itself and is {said}."
+            self._drop_text = f"{self._place} left its enabled state by itself and is {state}."
         self._begin(DISABLE)
 
     @property
     def _rest(self) -> float:
-        """A set-point [SI] that does not move it: where it is, or no velocity, or no effort."""
+        """Set-point [SI] that does not move the servo: its position, or zero velocity or effort."""
         return float(self._values[self._slot]) if self._is_position else 0.0
 
     def _send(self, value: float) -> None:
-        """Send the set-point [SI]; not to a servo that is not heard, whose own watchdog may then run out."""
+        """Send the set-point [SI], unless the servo is silent: then its own watchdog is allowed to run out."""
         if self.is_commissioned and self.is_heard and np.isfinite(value):
             self._writer.write((value - self._offset) / self._scale)
             self._bus.send(self._frame)
@@ -308,17 +319,20 @@ class DbcServo(DbcNode):
             if step.frame is not None:
                 self._bus.send(step.frame)
 
+    @override
     def inspect(self) -> tuple[Check, ...]:
-        """See `Device.inspect`; the watchdog is proven only by having been seen to run out."""
         return (*super().inspect(), self._check_watchdog())
 
     def _check_watchdog(self) -> Check:
+        """Return whether the watchdog works; its only proof is that it ran out before."""
         watchdog = self._settings.watchdog
         if watchdog is None:
             return Check("watchdog", False, "There is none: it goes on with its last set-point when the host dies.")
         if self._counters["watchdog_expired"]:
-            return Check("watchdog", True, f"It was seen to run out; {watchdog.timeout:g} s are stated.")
+            return Check(
+                "watchdog", True, f"It has run out before; its timeout in the robot file: {watchdog.timeout:g} s."
+            )
         if self._expired is None:
-            return Check("watchdog", True, f"{watchdog.timeout:g} s by the robot file, which nothing here can check.")
-        text = f"It was not seen to run out. Is it switched on in the device, with {watchdog.timeout:g} s?"
+            return Check("watchdog", True, f"{watchdog.timeout:g} s by the robot file; this cannot be checked.")
+        text = f"It has not run out yet. Is it switched on in the device, with {watchdog.timeout:g} s?"
         return Check("watchdog", False, text)
