@@ -198,13 +198,13 @@ def test_who_streams_without_a_lease_commands_until_a_second_after(hal: Hal, ann
 @pytest.mark.parametrize("verb", ["enable", "reset", "home", "tare", "lease"])
 def test_what_may_move_the_robot_is_not_done_late(hal: Hal, anna: Client, verb: str) -> None:
     """As a link does that was cut: it delivers later what had been asked."""
-    run, cycle = anna.seen()
+    run, cycle = anna._link.seen()
     key = keys.verb(anna.robot, "hal", verb)
-    asked = replace(anna.caller, hal_boot=run, cycle=cycle)
-    eventually(lambda: anna.seen()[1] - cycle > 1.1 * hal.config.rates.hal)
+    asked = replace(anna._link.caller, hal_boot=run, cycle=cycle)
+    eventually(lambda: anna._link.seen()[1] - cycle > 1.1 * hal.config.rates.hal)
     for caller, says in (
         (asked, "s old when the question came|there was no cycle"),
-        (anna.caller, "does not say which sample of the HAL its sender saw"),
+        (anna._link.caller, "does not say which sample of the HAL its sender saw"),
         (replace(asked, hal_boot=run + 1), "another run of the HAL"),
     ):
         with pytest.raises(TooLate, match=says):

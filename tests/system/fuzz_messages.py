@@ -36,7 +36,7 @@ from hal.robot import Robot  # noqa: E402
 from services.client import Client  # noqa: E402
 from services.errors import ServiceError, WrongVersion  # noqa: E402
 from services.hardware.hal_service import HalService  # noqa: E402
-from services.model import gemuco_service  # noqa: E402
+from services.model import serve  # noqa: E402
 from services.process.router import run_router  # noqa: E402
 from services.process.service import Service  # noqa: E402
 from services.recording.recorder import run_recorder  # noqa: E402
@@ -232,7 +232,7 @@ class Stage:
             self.hal = HalService(self._config, robot, stack.enter_context(Service(self.robot, "hal", where)))
             stack.callback(self._end)  # before the HAL's session is closed
             self._start("hal", lambda: self.hal.run(self.told))
-            self._start("model", lambda: gemuco_service.serve(self._config, self._model, where, self.told))
+            self._start("model", lambda: serve.serve(self._config, self._model, where, self.told))
             self._start("recorder", lambda: run_recorder(self.robot, self._folder / "fuzz.mcap", where, self.told))
             self.client = stack.enter_context(Client(self.robot, where, name="who looks on"))
             self.holder = stack.enter_context(Client(self.robot, where, name="who holds"))
@@ -483,7 +483,7 @@ def campaign(stage: Stage, count: int, pace: float) -> dict[str, Any]:
         "model_rejected": stage.facts("model").get("rejected"),
         "top_rejected": stage.fleet.rejected,
         "top_strange": stage.fleet.strange,
-        "readers_rejected": sum(reader.rejected for reader in stage.client._readers.values()),
+        "readers_rejected": sum(reader.rejected for reader in stage.client._link._readers.values()),
         "warnings": len(stage.logged),
     }
 

@@ -122,7 +122,7 @@ def test_the_image_holds_what_is_named_and_no_secrets() -> None:
 def test_a_robots_services_need_nothing_of_what_its_image_lacks() -> None:
     """What the small image's processes import, with the large packages out of reach."""
     modules = (
-        "hardware.hal_service", "model.gemuco_service", "recording.recorder", "process.router", "verbs.network",
+        "hardware.hal_service", "model.serve", "recording.recorder", "process.router", "verbs.network",
         "verbs.recording", "verbs.ask", "health",
     )  # fmt: skip
     code = "\n".join(
