@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from services.verbs import deploy, hardware, network, page, recording
-from services.verbs.verb import Connect, RobotFile, load, robot_name, robot_path, speaks_plainly
+from services.verbs import deployment, hardware, page, recording
+from services.verbs.verb import Connect, RobotFile, load, report_errors, robot_name, robot_path
 
 app = typer.Typer(
     name="gemuco",
@@ -53,7 +53,7 @@ def main(
 
 
 @app.command()
-@speaks_plainly
+@report_errors
 def simulate(
     robot: RobotFile,
     variant: Variant = None,
@@ -73,7 +73,7 @@ def simulate(
 
 
 @app.command()
-@speaks_plainly
+@report_errors
 def hal(robot: RobotFile, connect: Connect = None) -> int:
     """Read the hardware and move it: samples out, limited commands in, until Ctrl-C.
 
@@ -85,7 +85,7 @@ def hal(robot: RobotFile, connect: Connect = None) -> int:
 
 
 @app.command()
-@speaks_plainly
+@report_errors
 def vision(robot: RobotFile, variant: Variant = None, seed: Seed = 0, connect: Connect = None) -> None:
     """Play the camera of a simulated robot: looks at the simulator's truth, publishes what it sees, until Ctrl-C.
 
@@ -97,7 +97,7 @@ def vision(robot: RobotFile, variant: Variant = None, seed: Seed = 0, connect: C
 
 
 @app.command()
-@speaks_plainly
+@report_errors
 def serve(
     robot: RobotFile,
     model: Annotated[Path | None, typer.Option(help="The trained model; runs/<robot>/model if not given.")] = None,
@@ -112,7 +112,7 @@ def serve(
 
 
 @app.command()
-@speaks_plainly
+@report_errors
 def collect(
     robot: RobotFile,
     variant: Variant = None,
@@ -152,7 +152,7 @@ def collect(
 
 
 @app.command()
-@speaks_plainly
+@report_errors
 def train(
     robot: Annotated[
         str, typer.Argument(metavar="ROBOT", help="A robot file, its name, or a description of measured data.")
@@ -186,7 +186,7 @@ def train(
 
 
 @app.command(context_settings={"ignore_unknown_options": True})  # a target may be negative
-@speaks_plainly
+@report_errors
 def query(
     robot: RobotFile,
     verb: Annotated[str, typer.Argument(help="What to ask: estimate, engage, target, adapt, describe, fault, ...")],
@@ -223,7 +223,7 @@ def query(
 
 
 @app.command()
-@speaks_plainly
+@report_errors
 def estop(
     robot: RobotFile,
     reason: Annotated[str, typer.Option(help="Told as the cause of the fault.")] = "gemuco estop",
@@ -234,13 +234,13 @@ def estop(
     Prints what each drive did. Exit code 1 and a loud line if one did not stop or nobody answered: then cut the power.
     This is no safety-rated emergency stop.
     """
-    from services.verbs.estop import estop_robot
+    from services.verbs.ask import estop_robot
 
     return estop_robot(robot_name(robot), reason, connect or ())
 
 
 @app.command()
-@speaks_plainly
+@report_errors
 def top(
     robot: Annotated[
         str | None, typer.Argument(metavar="[ROBOT]", help="A robot file, or the name of one; all robots if not given.")
@@ -262,7 +262,7 @@ def top(
 
 
 @app.command()
-@speaks_plainly
+@report_errors
 def demo(
     robot: RobotFile = "musashi_arm",
     seed: Annotated[int, typer.Option(help="Which of the actual robots to simulate.")] = 1,
@@ -280,7 +280,7 @@ def demo(
 
 
 @app.command()
-@speaks_plainly
+@report_errors
 def reproduce(
     robot: Annotated[str, typer.Argument(metavar="ROBOT", help="Whose experiments: pr2, musashi or kxr.")],
     seeds: Annotated[int, typer.Option(min=1, help="How many runs, each with its own seed.")] = 5,
@@ -303,7 +303,7 @@ def reproduce(
     typer.echo(f"Figures and tables are in {out / robot}.")
 
 
-for verbs in (hardware, network, recording, page, deploy):
+for verbs in (hardware, deployment, recording, page):
     verbs.register(app)
 
 

@@ -1,4 +1,4 @@
-"""`gemuco query`: one question to a running robot, answered as text."""
+"""`gemuco query` and `gemuco estop`: one request to a running robot, with a reply as text."""
 
 import json
 import time
@@ -9,10 +9,10 @@ import numpy as np
 import typer
 
 from services.client import SLOW_TIMEOUT, Client
-from services.errors import NoAnswer, RemoteError, ServiceError
+from services.errors import BadArguments, NoAnswer, RemoteError
 from services.wire import keys
 
-PLAIN = {
+WITHOUT_WORDS = {
     "enable": "hal",
     "disable": "hal",
     "stop": "hal",
@@ -22,6 +22,7 @@ PLAIN = {
     "rollback": "model",
     "normal": "model",
 }
+"""These verbs take no arguments; the value is their service."""
 VERBS = (
     "estimate",
     "anomaly",
@@ -34,55 +35,52 @@ VERBS = (
     "home",
     "tare",
     "holder",
-    *PLAIN,
+    *WITHOUT_WORDS,
 )
-WATCH_EVERY = 1.0
+WATCH_PERIOD = 1.0
+"""`query --watch` prints an estimate once per period [s]."""
 CONNECTS_WITHIN = 0.5
-"""Time [s] that connections to running services take at most."""
-
-
-class BadQuestion(ServiceError):
-    """The command line asks something that cannot be asked."""
+"""A new client connects to running services within this time [s]."""
 
 
 def ask_robot(
     robot: str, verb: str, words: Sequence[str], hide: Sequence[str], watch: bool, connect: Iterable[str]
 ) -> int:
-    """Ask, print the answer, return the exit code.
+    """Send a request, print the reply, return the exit code.
 
     Raises:
-        BadQuestion: An unknown verb, or words that the verb does not take.
-        NoAnswer: Nobody answers, or nobody who may, or not in time.
+        BadArguments: The verb is unknown, or does not take these words.
+        NoAnswer: No permitted service answers in time.
     """
     if verb not in VERBS:
-        raise BadQuestion(f"'{verb}' is not something to ask. Known: {', '.join(VERBS)}.")
+        raise BadArguments(f"'{verb}' is not a verb of query. Known: {', '.join(VERBS)}.")
     with Client(robot, connect) as client:
         if verb == "estimate":
             signal = _one(verb, words, "a signal, such as joint_position")
             if watch:
                 return _watch(client, signal, hide)
-            typer.echo(line_of(_estimate(client, signal, hide)))
+            typer.echo(estimate_line(_estimate(client, signal, hide)))
             return 0
         for key, value in _answer(client, verb, words, hide).items():
             typer.echo(f"{key}: {value if isinstance(value, str) else json.dumps(value)}")
     return 0
 
 
-def line_of(answer: dict[str, Any]) -> str:
-    """An estimate in one line: elements with values, and where they come from."""
-    unit, std = answer["unit"], np.asarray(answer["std"], float)
+def estimate_line(reply: dict[str, Any]) -> str:
+    """Format an estimate as one line: elements with values, and their source."""
+    start, std = f"{reply['signal']} [{reply['unit']}]", np.asarray(reply["std"], float)
     values = "  ".join(
-        f"{name} {value:+.3f}{'*' if guessed else ''}"
-        for name, value, guessed in zip(answer["elements"], answer["values"], answer["estimated"], strict=True)
+        f"{name} {value:+.3f}{'*' if estimated else ''}"
+        for name, value, estimated in zip(reply["elements"], reply["values"], reply["estimated"], strict=True)
     )
-    if answer["method"] == "measured":
-        return f"{answer['signal']} [{unit}]  {values}  measured"
-    if answer["method"] == "none":
-        return f"{answer['signal']} [{unit}]  {values}  neither measured nor estimable"
-    spread = float(np.sqrt(np.mean(std[np.asarray(answer["estimated"], bool)] ** 2)))
-    source = answer["mask"].replace("+", ", ") or "single elements"
-    error = f"{spread:.3f} {unit}" if np.isfinite(spread) else "unknown"
-    return f"{answer['signal']} [{unit}]  {values}  * estimated from {source}, expected error {error}"
+    if reply["method"] == "measured":
+        return f"{start}  {values}  measured"
+    if reply["method"] == "none":
+        return f"{start}  {values}  neither measured nor estimable"
+    spread = float(np.sqrt(np.mean(std[np.asarray(reply["estimated"], bool)] ** 2)))
+    source = reply["mask"].replace("+", ", ") or "single elements"
+    error = f"{spread:.3f} {reply['unit']}" if np.isfinite(spread) else "unknown"
+    return f"{start}  {values}  * estimated from {source}, expected error {error}"
 
 
 def _estimate(client: Client, signal: str, hide: Sequence[str]) -> dict[str, Any]:
@@ -90,35 +88,35 @@ def _estimate(client: Client, signal: str, hide: Sequence[str]) -> dict[str, Any
 
 
 def _watch(client: Client, signal: str, hide: Sequence[str]) -> int:
-    """Print an estimate each second, through whatever happens to the service, until Ctrl-C."""
+    """Print an estimate each second until Ctrl-C, also across restarts of the service."""
     while True:
         try:
-            typer.echo(line_of(_estimate(client, signal, hide)))
+            typer.echo(estimate_line(_estimate(client, signal, hide)))
         except NoAnswer as error:
             typer.echo(str(error))
-        time.sleep(WATCH_EVERY)
+        time.sleep(WATCH_PERIOD)
 
 
 def _answer(client: Client, verb: str, words: Sequence[str], hide: Sequence[str]) -> dict[str, Any]:
     if verb in ("target", "control"):
         if len(words) < 2:
-            raise BadQuestion(f"'{verb}' needs a signal and a value per element: {verb} joint_position 0 0 0 -0.6 0")
+            raise BadArguments(f"'{verb}' needs a signal and one value per element: {verb} joint_position 0 0 0 -0.6 0")
         values = _numbers(verb, words[1:], "after the signal")
         if verb == "control":
             return client.control({words[0]: values})
         return client.ask("model", "target", {"signal": words[0], "values": values})
     if verb == "simulate":
         if not words:
-            raise BadQuestion("'simulate' needs a command, a value per element of the commanded signal.")
+            raise BadArguments("'simulate' needs a command: one value per element of the commanded signal.")
         return client.simulate([_numbers(verb, words, "only")])
     if verb == "adapt":
         switch = _one(verb, words, "on or off")
         if switch not in ("on", "off"):
-            raise BadQuestion(f"'adapt' takes on or off, not '{switch}'.")
+            raise BadArguments(f"'adapt' takes on or off, not '{switch}'.")
         return client.adapt(switch == "on")
     if verb == "fault":
         if not words:
-            raise BadQuestion("'fault' needs to be told what to break: fault muscle_cut biceps")
+            raise BadArguments("'fault' needs a fault of the simulator: fault muscle_cut biceps")
         return _fault(client, " ".join(words))
     if verb == "home":
         return client.home(_one(verb, words, "the name of a drive"))
@@ -127,41 +125,41 @@ def _answer(client: Client, verb: str, words: Sequence[str], hide: Sequence[str]
     if verb == "describe":
         service = words[0] if words else ""
         if service not in ("", *keys.SERVICES):
-            raise BadQuestion(f"'{service}' is not a service. Known services: {', '.join(keys.SERVICES)}.")
+            raise BadArguments(f"'{service}' is not a service. Known services: {', '.join(keys.SERVICES)}.")
         return client.describe(service)
     if words:
-        raise BadQuestion(f"'{verb}' takes nothing more, but got '{' '.join(words)}'.")
+        raise BadArguments(f"'{verb}' takes no further words, but got '{' '.join(words)}'.")
     if verb == "holder":
-        held = client.holder()
-        return {"holder": held.name or "nobody", "left": round(held.left, 1)}
+        holder = client.holder()
+        return {"holder": holder.name or "none", "left": round(holder.left, 1)}
     if verb == "anomaly":
         return client.ask("model", "anomaly", {"hide": list(hide)}, SLOW_TIMEOUT)
-    return client.ask(PLAIN[verb], verb)
+    return client.ask(WITHOUT_WORDS[verb], verb)
 
 
 def _numbers(verb: str, words: Sequence[str], where: str) -> list[float]:
     try:
         return [float(word) for word in words]
     except ValueError:
-        raise BadQuestion(f"'{verb}' takes numbers {where}, not '{' '.join(words)}'.") from None
+        raise BadArguments(f"'{verb}' takes numbers {where}, not '{' '.join(words)}'.") from None
 
 
 def _fault(client: Client, text: str) -> dict[str, Any]:
-    """Break what the camera's process plays, or else the simulator, which may know the same name and not be watched."""
-    told = ""
+    """Send a fault to the camera's process if it runs and knows the fault; otherwise to the simulator."""
+    refusal = ""
     if _is_alive(client, "vision"):
         try:
             return client.fault(text, "vision")
         except (RemoteError, NoAnswer) as error:
-            told = str(error)
+            refusal = str(error)
     try:
         return client.fault(text)
     except RemoteError as error:
-        raise RemoteError(f"{error} {told}".rstrip()) from None
+        raise RemoteError(f"{error} {refusal}".rstrip()) from None
 
 
 def _is_alive(client: Client, service: str) -> bool:
-    """Whether a service runs; a client that was just opened is not connected at once."""
+    """Whether a service runs; wait until a new client has connected."""
     deadline = time.monotonic() + CONNECTS_WITHIN
     while service not in client.alive():
         if time.monotonic() > deadline:
@@ -172,5 +170,29 @@ def _is_alive(client: Client, service: str) -> bool:
 
 def _one(verb: str, words: Sequence[str], what: str) -> str:
     if len(words) != 1:
-        raise BadQuestion(f"'{verb}' needs {what}, and nothing else; it got {len(words)} words.")
+        raise BadArguments(f"'{verb}' needs {what}, and nothing else, but got {len(words)} words.")
     return words[0]
+
+
+def estop_robot(robot: str, reason: str, connect: Iterable[str]) -> int:
+    """Request the emergency stop and print one line per drive; return 0 only if every drive stopped."""
+    try:
+        with Client(robot, connect) as client:
+            reply = client.estop(reason)
+    except Exception as error:  # any failure must be loud
+        typer.echo(f"gemuco: {error}", err=True)
+        return _alarm(f"NO ANSWER of '{robot}': drives may still move. CUT THE POWER.")
+    for drive in reply["devices"]:
+        typer.echo(f"{drive['device']}: {drive['text']}", err=not drive["stopped"])
+    if reply["text"]:
+        typer.echo(f"gemuco: {reply['text']}", err=True)
+    if not reply["complete"]:
+        failed = ", ".join(drive["device"] for drive in reply["devices"] if not drive["stopped"])
+        return _alarm(f"NOT STOPPED: {failed}. CUT THE POWER.")
+    typer.echo(f"All {len(reply['devices'])} drives stopped. To end the fault: `gemuco query {robot} reset`.")
+    return 0
+
+
+def _alarm(text: str) -> int:
+    typer.secho(f"\a*** {text} ***", err=True, fg=typer.colors.WHITE, bg=typer.colors.RED, bold=True)
+    return 1

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from services.verbs.verb import Connect, RobotFile, load, speaks_plainly
+from services.verbs.verb import Connect, RobotFile, load, report_errors
 
 calibrate = typer.Typer(no_args_is_help=True, help="Measure and store zero, direction and gain of a device.")
 can = typer.Typer(no_args_is_help=True, help="Show CAN buses.")
@@ -33,7 +33,7 @@ def register(app: typer.Typer) -> None:
     app.add_typer(can, name="can")
 
 
-@speaks_plainly
+@report_errors
 def scan(
     robot: MaybeRobot = None,
     interface: Interface = None,
@@ -58,7 +58,7 @@ def scan(
     return run_scan(buses, config, seconds, not passive, mit)
 
 
-@speaks_plainly
+@report_errors
 def doctor(robot: RobotFile, connect: Connect = None) -> int:
     """Check buses, nodes, clocks, role files and network of a robot: one line per check, with its remedy.
 
@@ -71,7 +71,7 @@ def doctor(robot: RobotFile, connect: Connect = None) -> int:
 
 
 @calibrate.command()
-@speaks_plainly
+@report_errors
 def joint(
     robot: RobotFile,
     device: Device,
@@ -93,7 +93,7 @@ def joint(
 
 
 @calibrate.command()
-@speaks_plainly
+@report_errors
 def cell(
     robot: RobotFile,
     device: Device,
@@ -120,7 +120,7 @@ def cell(
 
 
 @can.command()
-@speaks_plainly
+@report_errors
 def dump(
     robot: MaybeRobot = None,
     interface: Interface = None,

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from services.verbs.verb import Connect, RobotFile, robot_name, robot_path, speaks_plainly
+from services.verbs.verb import Connect, RobotFile, report_errors, robot_name, robot_path
 
 
 def register(app: typer.Typer) -> None:
@@ -13,7 +13,7 @@ def register(app: typer.Typer) -> None:
     app.command()(view)
 
 
-@speaks_plainly
+@report_errors
 def view(
     robot: RobotFile,
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page; 0 for any.")] = 8090,

@@ -1,11 +1,11 @@
-"""The verbs of recordings: write them down, play them back, hand them on."""
+"""The verbs of recordings: record, replay, export."""
 
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from services.verbs.verb import Connect, RobotFile, load, robot_name, robot_path, speaks_plainly
+from services.verbs.verb import Connect, RobotFile, load, report_errors, robot_name, robot_path
 
 Files = Annotated[list[Path], typer.Argument(metavar="FILE...", help="Recordings (.mcap) of one robot, in any order.")]
 
@@ -17,24 +17,29 @@ def register(app: typer.Typer) -> None:
     app.command()(export)
 
 
-@speaks_plainly
+@report_errors
 def record(
     robot: RobotFile,
     out: Annotated[
-        Path, typer.Argument(metavar="FILE", help="The file to write, such as walk.mcap; none is ever replaced.")
+        Path,
+        typer.Argument(
+            metavar="FILE", help="The file to write, such as walk.mcap. An existing file is never replaced."
+        ),
     ],
     max_size: Annotated[
-        float | None, typer.Option(min=0.1, metavar="MB", help="Begin a new file when one has this size.")
+        float | None, typer.Option(min=0.1, metavar="MB", help="Begin a new file at this size.")
     ] = None,
     max_seconds: Annotated[
-        float | None, typer.Option(min=1, max=3600, metavar="S", help="Begin a new file when one covers this long.")
+        float | None, typer.Option(min=1, max=3600, metavar="S", help="Begin a new file after this time.")
     ] = None,
-    condition: Annotated[str, typer.Option(help="How the body is meanwhile, such as its tool; train uses it.")] = "",
+    condition: Annotated[
+        str, typer.Option(help="Condition of the body during the recording, such as its tool; train uses it.")
+    ] = "",
     connect: Connect = None,
 ) -> int:
-    """Write down all that a robot's services publish, as MCAP, until Ctrl-C.
+    """Record all messages of a robot's services as MCAP until Ctrl-C.
 
-    Foxglove opens the files. A new one begins every hour (walk.mcap, walk-000002.mcap, ...); with --max-size or
+    Foxglove opens the files. A new file begins every hour (walk.mcap, walk-000002.mcap, ...); with --max-size or
     --max-seconds they are walk-000001.mcap, walk-000002.mcap, ...
     """
     from services.recording.recorder import run_recorder
@@ -46,40 +51,40 @@ def record(
     )
 
 
-@speaks_plainly
+@report_errors
 def replay(
     files: Files,
-    robot: Annotated[str | None, typer.Option(help="Play as this robot; as the recorded one if not given.")] = None,
+    robot: Annotated[str | None, typer.Option(help="Name to play as; that of the recorded robot if not given.")] = None,
     speed: Annotated[
         float,
-        typer.Option(min=0, help="Times the recorded speed; 0 plays what is asked for with the verb hal/do/step."),
+        typer.Option(min=0, help="Multiple of the recorded speed; 0 plays on request of the verb hal/do/step."),
     ] = 1.0,
-    model: Annotated[bool, typer.Option("--model", help="Play what the model published too, in its place.")] = False,
+    model: Annotated[bool, typer.Option("--model", help="Also play the messages of the model, in its place.")] = False,
     connect: Connect = None,
 ) -> int:
-    """Play recordings in place of a robot's HAL and camera; serve, top and view work on it as on the robot.
+    """Play recordings in place of a robot's HAL and camera; serve, top and view work as with the robot.
 
-    Samples say that they are a replay, commands are not played, and what would move motors is refused.
+    Samples are marked as a replay. Commands are not played, and verbs that would move motors are refused.
     """
     from services.recording.replay import run_replay
 
     return run_replay(files, None if robot is None else robot_name(robot), speed, model, connect or ())
 
 
-@speaks_plainly
+@report_errors
 def export(
     files: Files,
-    out: Annotated[Path, typer.Option(metavar="FOLDER", help="Where the tables go; one per key.")],
+    out: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder for the tables.")],
     form: Annotated[str, typer.Option("--format", help="csv or parquet.")] = "csv",
 ) -> None:
-    """Write recordings as tables: one per key, a column per element with its unit, a row per message."""
+    """Write recordings as tables: one per key, with a column per element and its unit, and a row per message."""
     from services.recording.export import run_export
 
     run_export(files, out, form)
 
 
 def _signals(robot: str) -> Any:
-    """The signals of a robot whose file is here; None where only its HAL can tell them."""
+    """Return the signals of a robot file; None if there is no file, so that the HAL has to be queried."""
     from hal.errors import ConfigError
     from services.recording.schema import Catalogue
 

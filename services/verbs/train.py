@@ -1,4 +1,4 @@
-"""`gemuco train`: from recorded data to a saved model, with what a person should know on the screen."""
+"""`gemuco train`: train a model from recorded data, show its errors, save it."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,14 +23,14 @@ def run_training(
 
     Args:
         file: A robot file, or a description of measured data.
-        data: Collected samples, recordings, or the folder of the measured files; where they usually lie if not given.
-        out: Where to save; runs/<robot>/model if not given.
-        base: A model to fine-tune; learned from nothing if not given.
-        seed: Of all that is random.
-        condition: How the body was in recordings; as they tell if not given.
+        data: Collected samples, recordings, or the folder of the measured files; their usual place if empty.
+        out: Folder for the model; runs/<robot>/model if not given.
+        base: A model to fine-tune; None trains a new one.
+        seed: Seed of all random numbers.
+        condition: Condition of the body in recordings; if not given, as recorded.
 
     Raises:
-        SchemaError: Data, model or settings are not what is needed.
+        SchemaError: Data, model or settings do not fit.
         RecordingError: A recording cannot be read.
     """
     known = None if base is None else checkpoint.load(base)
@@ -44,42 +44,40 @@ def run_training(
     folder = out or artifacts.model_folder(name)
     drafts = trainer.drafts_of(folder)
 
-    def train(tell: Progress) -> TrainingResult:
+    def train(progress: Progress) -> TrainingResult:
         if not measured.is_description(file):
-            return trainer.train(robot, dataset, seed, tell, drafts, known)
+            return trainer.train(robot, dataset, seed, progress, drafts, known)
         if known is not None:
-            return trainer.tune(known, described.model, dataset, seed, tell, drafts, recording=name)
-        return trainer.learn(described.model, dataset, seed, tell, drafts, recording=name)
+            return trainer.tune(known, described.model, dataset, seed, progress, drafts, recording=name)
+        return trainer.learn(described.model, dataset, seed, progress, drafts, recording=name)
 
     if drafts.exists():
-        typer.echo(f"A training of {folder} was interrupted; it goes on if data and settings are the same.")
+        typer.echo(f"A training of {folder} was interrupted. It continues if data and settings are the same.")
     try:
-        with show.progress("training") as tell:
-            trained = train(tell)
+        with show.progress("training") as progress:
+            result = train(progress)
     except KeyboardInterrupt:
-        typer.echo("Interrupted. The same command goes on from here.", err=True)
+        typer.echo("Interrupted. The same command continues from here.", err=True)
         raise
-    trainer.show(trained, show.console())
-    trainer.save(trained, folder)
-    typer.echo(f"Saved in {folder}, with pictures of how it came about.")
+    trainer.show(result, show.console())
+    trainer.save(result, folder)
+    typer.echo(f"Saved in {folder}, with plots of the training.")
 
 
 def _data(robot: RobotConfig, data: Sequence[Path], condition: str | None) -> Dataset:
-    """What was collected, or what recordings hold."""
+    """Return the collected samples, or those of recordings."""
     if not any(is_recording(path) for path in data):
         if condition is not None:
-            raise DatasetError(
-                "Only recordings (.mcap) need to be told their condition; collected samples have theirs."
-            )
+            raise DatasetError("--condition is for recordings (.mcap) only; collected samples have their conditions.")
         return Dataset.load(_only(data) or artifacts.data_path(robot.robot))
     if not all(is_recording(path) for path in data):
         raise DatasetError("Train from recordings (.mcap) or from collected samples (.npz), not from both at once.")
-    found = select(robot, data, condition)
-    typer.echo(found.sentence())
-    return found.dataset
+    selection = select(robot, data, condition)
+    typer.echo(selection.sentence())
+    return selection.dataset
 
 
 def _only(data: Sequence[Path]) -> Path | None:
     if len(data) > 1:
-        raise DatasetError(f"Only recordings (.mcap) can be several; {data[0]} and {data[1]} are not.")
+        raise DatasetError(f"Only recordings (.mcap) can be several files; {data[0]} and {data[1]} are not.")
     return data[0] if data else None

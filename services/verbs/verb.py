@@ -1,4 +1,4 @@
-"""What every verb of the command line has: a robot, a plain sentence when something is wrong, an exit code."""
+"""Parts of all verbs of the command line: robot argument, error messages, exit codes."""
 
 import os
 from collections.abc import Callable
@@ -15,20 +15,20 @@ Connect = Annotated[
         "--connect",
         metavar="WHERE",
         envvar="GEMUCO_CONNECT",
-        help="Where the rest of the robot is: an endpoint (tcp/192.168.0.5:7447), or a role file of `security init`.",
+        help="Endpoint of the robot's other services (tcp/192.168.0.5:7447), or a role file of `security init`.",
     ),
 ]
 
 OURS = ("gemuco", "hal", "services", "simulators")
-"""A module of these that is missing is a mistake of ours; others may have been left out, as of a small image."""
+"""These packages are always installed; others may be missing, as in the small image."""
 
 
-def speaks_plainly(verb: Callable[..., Any]) -> Callable[..., Any]:
-    """Make what we raise on purpose one sentence on stderr: exit code 2 for a wrong robot file, 1 for the rest."""
+def report_errors(verb: Callable[..., Any]) -> Callable[..., Any]:
+    """Print an expected error as one sentence on stderr; exit with 2 for a wrong robot file, with 1 otherwise."""
 
     @wraps(verb)
-    def plain(*arguments: Any, **options: Any) -> Any:
-        # numpy reads this when it is first imported: one thread is faster on layers this small.
+    def reporting(*arguments: Any, **options: Any) -> Any:
+        # numpy reads this at its first import: one thread is faster for such small layers.
         for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
             os.environ.setdefault(name, "1")
         from gemuco.errors import SchemaError
@@ -46,29 +46,29 @@ def speaks_plainly(verb: Callable[..., Any]) -> Callable[..., Any]:
         except ModuleNotFoundError as error:
             if (error.name or "").partition(".")[0] in OURS:
                 raise
-            typer.echo(f"gemuco: this needs the package '{error.name}', which is not installed here.", err=True)
+            typer.echo(f"gemuco: this verb needs the package '{error.name}', which is not installed here.", err=True)
             raise typer.Exit(1) from None
         except KeyboardInterrupt:
             raise typer.Exit(130) from None
         raise typer.Exit(code or 0)
 
-    return plain
+    return reporting
 
 
 def robot_path(text: str) -> Path:
-    """The robot file that is named by its path or by the robot's name."""
+    """Find a robot file by its path or by the name of the robot."""
     from services.model.artifacts import robot_file
 
     return robot_file(text)
 
 
 def load(text: str) -> Any:
-    """The robot file, read."""
+    """Read a robot file."""
     from hal.config import load_robot
 
     return load_robot(robot_path(text))
 
 
 def robot_name(text: str) -> str:
-    """The robot's name; a client needs no robot file."""
+    """Return the name of a robot; a client needs no robot file."""
     return str(load(text).robot) if Path(text).suffix in (".yaml", ".yml") else text

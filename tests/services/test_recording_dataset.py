@@ -147,8 +147,8 @@ def test_train_takes_recordings_and_tells_what_it_cannot_take(
     assert (tmp_path / "model").is_dir()
     for data, condition, said in (
         ([files[0], tmp_path / "data.npz"], None, "not from both at once"),
-        ([tmp_path / "a.npz", tmp_path / "b.npz"], None, "can be several"),
-        ([tmp_path / "a.npz"], "heavy", "need to be told their condition"),
+        ([tmp_path / "a.npz", tmp_path / "b.npz"], None, "can be several files"),
+        ([tmp_path / "a.npz"], "heavy", "is for recordings"),
     ):
         with pytest.raises(DatasetError, match=said):
             run_training(file, data, tmp_path / "model", None, 0, condition)

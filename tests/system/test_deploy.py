@@ -13,7 +13,7 @@ import typer
 import yaml
 
 from services.hardware.hal_service import AT_REST_WITHIN
-from services.verbs.verb import speaks_plainly
+from services.verbs.verb import report_errors
 from services.wire import keys
 
 ROOT = Path(__file__).parents[2]
@@ -122,7 +122,7 @@ def test_the_image_holds_what_is_named_and_no_secrets() -> None:
 def test_a_robots_services_need_nothing_of_what_its_image_lacks() -> None:
     """What the small image's processes import, with the large packages out of reach."""
     modules = (
-        "hardware.hal_service", "model.serve", "recording.recorder", "process.router", "verbs.network",
+        "hardware.hal_service", "model.serve", "recording.recorder", "process.router", "verbs.deployment",
         "verbs.recording", "verbs.ask", "health",
     )  # fmt: skip
     code = "\n".join(
@@ -142,11 +142,11 @@ def test_what_the_small_image_lacks_is_told_in_a_sentence(
 ) -> None:
     monkeypatch.setitem(sys.modules, "torch", None)
     with pytest.raises(typer.Exit) as ended:
-        speaks_plainly(lambda: __import__("torch"))()
+        report_errors(lambda: __import__("torch"))()
     assert ended.value.exit_code == 1
     assert "needs the package 'torch'" in capsys.readouterr().err
     with pytest.raises(ModuleNotFoundError):
-        speaks_plainly(lambda: __import__("services.no_such_file"))()
+        report_errors(lambda: __import__("services.no_such_file"))()
 
 
 def requirements(*words: str) -> subprocess.CompletedProcess[str]:

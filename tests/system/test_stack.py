@@ -56,7 +56,7 @@ def test_what_cannot_be_is_refused_in_one_sentence(stack: Stack) -> None:
         stack.client.ask("model", "target", {"signal": "joint_position", "values": [0, 0, 0, 9, 0]})
     for words, sentence in (
         (("estimate", "elbow"), "Signal 'elbow' is not in the schema. Known signals: joint_position"),
-        (("dance",), "'dance' is not something to ask. Known: estimate, "),
+        (("dance",), "'dance' is not a verb of query. Known: estimate, "),
         (("fault", "coffee"), "'coffee' is not a part that can break"),
     ):
         answer = ask(stack, *words)
