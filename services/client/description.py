@@ -5,8 +5,8 @@ from typing import Any
 
 from services.client.link import Link
 from services.errors import NotAllowed, ServiceError, ServiceUnavailable
-from services.wire.absence import instead, starter
 from services.wire.messages import VERSION
+from services.wire.query import describe_presence, starter
 
 DESCRIBING = ("hal", "model")
 """These services describe the robot: the HAL its hardware and limits, the model its signals and masks."""
@@ -27,7 +27,9 @@ def of(link: Link, timeout: float) -> dict[str, Any]:
     while not {*DESCRIBING} <= (alive := link.alive()) and time.monotonic() - begun < min(timeout, CONNECTS_WITHIN):
         time.sleep(0.02)
     if not alive:
-        raise ServiceUnavailable(f"Robot '{link.robot}' has no service now.{instead(link.session, link.robot)}")
+        raise ServiceUnavailable(
+            f"Robot '{link.robot}' has no service now.{describe_presence(link.session, link.robot)}"
+        )
     described: dict[str, dict[str, Any]] = {}
     missing = {name: f"there is no '{name}' service. Is {starter(name)} running?" for name in DESCRIBING}
     for service in sorted(alive):

@@ -15,11 +15,11 @@ from services.client.live import Presence
 from services.command.client_lease import NEEDS_LEASE, ClientLease
 from services.errors import NoAnswer, NotAllowed, ServiceError, ServiceUnavailable, TooSlow, WrongVersion
 from services.wire import keys, query
-from services.wire.absence import instead, starter
 from services.wire.caller import Caller, own_name
-from services.wire.member import Member, told_by
+from services.wire.member import Member, member_in
 from services.wire.messages import Message, Sample
-from services.wire.session import CLIENT, close_session, new_boot, opened, settings
+from services.wire.query import describe_presence, starter
+from services.wire.session import CLIENT, close_session, new_boot, open_with, settings
 from services.wire.streams import Publisher, Reader
 
 M = TypeVar("M", bound=Message)
@@ -67,8 +67,8 @@ class Link:
             ServiceError: No session could be opened.
         """
         configuration = settings(self.robot, CLIENT, self._connect)
-        self.member = told_by(configuration)
-        self._session = opened(configuration, f"a client of robot '{self.robot}'")
+        self.member = member_in(configuration)
+        self._session = open_with(configuration, f"a client of robot '{self.robot}'")
 
     def close(self) -> None:
         """End the session and its threads; a thread that waits gets an error. Safe to call twice."""
@@ -155,7 +155,7 @@ class Link:
         with self._making:
             if key not in self._readers:
                 _, service, noun = keys.parse(key)
-                if not self.member.may_hear(self.robot, f"{service}/{noun}"):
+                if not self.member.may_subscribe(self.robot, f"{service}/{noun}"):
                     raise NotAllowed(f"The role '{self.member.role}' may not read {key}.")
                 arrived = self.changed if noun == "status" else None
                 self._readers[key] = Reader(self.session, key, record, arrived=arrived)
@@ -170,7 +170,7 @@ class Link:
         with self._making:
             if key not in self._publishers:
                 _, service, noun = keys.parse(key)
-                if not self.member.may_say(self.robot, f"{service}/{noun}"):
+                if not self.member.may_publish(self.robot, f"{service}/{noun}"):
                     raise NotAllowed(f"The role '{self.member.role}' may not publish {key}.")
                 self._publishers[key] = Publisher(self.session, key, record, self.boot)
             return self._publishers[key]
@@ -207,7 +207,7 @@ class Link:
             )
         return ServiceUnavailable(
             f"No '{noun}' of the '{service}' service of robot '{self.robot}' came within {waited:.1f} s. "
-            f"Is {starter(service)} running?{instead(self.session, self.robot)}{unread}"
+            f"Is {starter(service)} running?{describe_presence(self.session, self.robot)}{unread}"
         )
 
     def no_health(self, readers: Iterable[Reader[Any]], waited: float) -> NoAnswer:
@@ -217,5 +217,5 @@ class Link:
         for reader in readers:
             if text := reader.other_version(waited + LATELY):
                 return WrongVersion(f"{text} Update the older of both programs.")
-        others = instead(self._session, self.robot)
+        others = describe_presence(self._session, self.robot)
         return ServiceUnavailable(f"Nothing was heard of robot '{self.robot}' for {waited:.1f} s.{others}")

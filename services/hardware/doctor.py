@@ -22,8 +22,7 @@ from services.hardware import host_checks
 from services.model.artifacts import robot_file
 from services.process.lock import instead_of
 from services.wire import keys
-from services.wire.connect import role_file, sorted_out
-from services.wire.entering import ending, expiry, exposed
+from services.wire.connect import certificate_end, expiry_warning, exposure_warning, role_file, split_connect
 from services.wire.messages import Status
 from services.wire.session import port
 
@@ -140,16 +139,16 @@ def _bus(name: str, bus: dict[str, Any]) -> Iterator[Finding]:
 def role_files(connect: Iterable[str]) -> Iterator[Finding]:
     """Check that the certificates in these role files are valid, and that only their owner can read the files."""
     try:
-        for file in sorted_out(connect)[1]:
+        for file in split_connect(connect)[1]:
             configuration = role_file(file)
-            until = ending(configuration)
+            until = certificate_end(configuration)
             if until is None:
                 yield warning("role file", f"'{file}' holds no certificate.")
-            elif text := expiry(configuration):
+            elif text := expiry_warning(configuration):
                 yield (bad if until <= datetime.now(UTC) else warning)("role file", text)
             else:
                 yield ok("role file", f"The certificate in '{file}' is valid until {until:%Y-%m-%d}.")
-            if text := exposed(file):
+            if text := exposure_warning(file):
                 yield bad("role file", text)
     except (ServiceError, OSError) as error:
         yield bad("role file", str(error))

@@ -22,7 +22,7 @@ from services.process import realtime
 from services.process.loop import Loop
 from services.process.service import Service, until_told
 from services.wire import keys, messages
-from services.wire.caller import ASKING, Caller
+from services.wire.caller import CURRENT_CALLER, Caller
 from services.wire.messages import Status
 from services.wire.plain_text import plain
 
@@ -82,7 +82,7 @@ class HalService:
         verb("stop", lambda _: self._do(lambda: robot.stop("A client asked to stop.")), always=True)
         verb("estop", self._estop, always=True)
         verb("lease", self._take_lease, self._cycles.check)
-        verb("release", lambda _: self._lease.give_back(ASKING.get()))
+        verb("release", lambda _: self._lease.give_back(CURRENT_CALLER.get()))
 
     def run(self, stop: threading.Event) -> None:
         """Commission the devices, cycle the robot until `stop` is set, and release the drives."""
@@ -156,7 +156,7 @@ class HalService:
 
     def _enable(self) -> dict[str, str]:
         """Enable the robot. A service that asks on behalf of the lease holder may then command for it."""
-        reply, caller = self._do(self._robot.enable), ASKING.get()
+        reply, caller = self._do(self._robot.enable), CURRENT_CALLER.get()
         if caller.through:
             self._lease.delegate(caller)
         return reply
@@ -165,7 +165,7 @@ class HalService:
         """Give the caller the lease, or renew it."""
         if not {"seconds"} <= set(arguments) <= {"seconds", "number"}:
             raise BadArguments("lease takes {seconds}; a renewal takes {seconds, number} with the number of the lease.")
-        caller = ASKING.get()
+        caller = CURRENT_CALLER.get()
         if "number" in arguments:
             tenure = self._lease.renew(caller, arguments["seconds"], arguments["number"])
         else:

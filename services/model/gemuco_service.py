@@ -29,7 +29,7 @@ from services.process.one_core import OneCore
 from services.process.realtime import freeze, prepare_thread, promote_rest
 from services.process.service import Service
 from services.wire import keys, query
-from services.wire.caller import ASKING
+from services.wire.caller import CURRENT_CALLER
 from services.wire.history import HistoryRing
 from services.wire.messages import Anomaly, Applied, Command, Estimates, Holder, Sample, Status, Target, Update
 from services.wire.streams import Reader
@@ -164,7 +164,7 @@ class GemucoService:
 
     def enable_hal(self) -> dict[str, Any]:
         """Ask the HAL to enable the drives, on behalf of whoever asks."""
-        caller = ASKING.get()
+        caller = CURRENT_CALLER.get()
         key = keys.verb(self.robot.robot, "hal", "enable")
         answer = query.ask(self.service.session, key, caller=lambda: self.permission.on_behalf(caller))
         self.permission.begin(caller)

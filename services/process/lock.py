@@ -12,7 +12,7 @@ import zenoh
 from services.errors import AlreadyRunning, NoAnswer, ServiceError
 from services.runtime import runtime_folder
 from services.wire import keys, query
-from services.wire.session import address, close_session, opened, settings
+from services.wire.session import address, close_session, open_with, settings
 
 log = logging.getLogger(__name__)
 
@@ -89,7 +89,7 @@ class ServiceLock:
         found |= {"mode": "client", "listen": {"endpoints": [], "exit_on_failure": True}}
         found["connect"] |= {"endpoints": places, "timeout_ms": ROUTER_WITHIN_MS, "exit_on_failure": True}
         try:
-            session = opened(found, f"a look for other '{self.service}' services of robot '{self.robot}'")
+            session = open_with(found, f"a look for other '{self.service}' services of robot '{self.robot}'")
         except ServiceError as error:
             log.info("Nobody could be asked whether robot '%s' is unique: %s", self.robot, error)
             return

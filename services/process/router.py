@@ -13,9 +13,9 @@ from services.health import ROUTER
 from services.process.heartbeat import Heartbeat
 from services.process.loop import Loop
 from services.process.service import until_told
-from services.wire.connect import checked_endpoint, laid_over, sorted_out
-from services.wire.doorbell import ring
-from services.wire.session import ROUTER_PORT, close_session, opened, plain_settings
+from services.wire.connect import checked_endpoint, split_connect, with_role_files
+from services.wire.probe import check_answers
+from services.wire.session import ROUTER_PORT, close_session, common_settings, open_with
 
 log = logging.getLogger(__name__)
 
@@ -36,7 +36,7 @@ def router_settings(listen: Iterable[str] = (), connect: Iterable[str] = ()) -> 
     Raises:
         ServiceError: A role file cannot be read, or an endpoint is malformed.
     """
-    endpoints, files = sorted_out(connect)
+    endpoints, files = split_connect(connect)
     own = {
         "mode": "router",
         "listen": {"endpoints": list(LISTEN), "exit_on_failure": True},
@@ -46,9 +46,9 @@ def router_settings(listen: Iterable[str] = (), connect: Iterable[str] = ()) -> 
             "exit_on_failure": False,
             "retry": {"period_init_ms": 50, "period_max_ms": 500, "period_increase_factor": 2},
         },
-        **plain_settings(),
+        **common_settings(),
     }
-    found = laid_over(own, files, endpoints)
+    found = with_role_files(own, files, endpoints)
     if chosen := [checked_endpoint(one) for one in listen]:
         found["listen"]["endpoints"] = chosen
     return found
@@ -67,9 +67,9 @@ def run_router(listen: Iterable[str] = (), connect: Iterable[str] = (), stop: th
     """
     configuration = router_settings(listen, connect)
     with until_told(stop) as told:
-        session = opened(configuration, WHO)
+        session = open_with(configuration, WHO)
         print(f"Router listens on {', '.join(configuration['listen']['endpoints'])}.", flush=True)
-        door = Loop("door", RING_RATE, lambda: ring(configuration["listen"]["endpoints"]))
+        door = Loop("door", RING_RATE, lambda: check_answers(configuration["listen"]["endpoints"]))
         door.start()
         try:
             with Heartbeat(ROUTER, "", [door]):

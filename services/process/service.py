@@ -73,7 +73,7 @@ class Service:
         self._connect = tuple(connect)
         self.describe = describe
         self._lock = ServiceLock(robot, name)
-        self._asked = query.UnderWay()
+        self._asked = query.PendingQueries()
         self._statuses = _Statuses()
         self._watched: list[Turning] = [self._statuses]
 

@@ -15,8 +15,7 @@ import zenoh
 from services.errors import ServiceError
 from services.security.plan import InstallationPlan
 from services.wire import keys
-from services.wire.connect import merged, role_file
-from services.wire.entering import usable
+from services.wire.connect import merge, role_file, with_password_file
 from services.wire.roles import ROUTER
 
 Weaken = Callable[[str, dict[str, Any]], None]
@@ -140,7 +139,7 @@ class CheckSessions:
         Raises:
             zenoh.ZError: The session is refused.
         """
-        with usable(merged(configuration, {"transport": PATIENT})) as taken:
+        with with_password_file(merge(configuration, {"transport": PATIENT})) as taken:
             session = zenoh.open(zenoh.Config.from_json5(json.dumps(taken)))
         self._sessions.append(session)
         return session

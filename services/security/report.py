@@ -8,8 +8,7 @@ import typer
 
 from services.security.init import CA_KEY, Changes
 from services.security.plan import FILE, InstallationPlan
-from services.wire.connect import role_file
-from services.wire.entering import WARN_BEFORE, ending
+from services.wire.connect import WARN_BEFORE, certificate_end, role_file
 from services.wire.roles import PEOPLE, ROUTER
 
 VERBS = {"simulator": "simulate", "hal": "hal", "vision": "vision", "model": "serve", "recorder": "record"}
@@ -60,6 +59,6 @@ def _destinations(folder: Path, plan: InstallationPlan) -> Iterable[str]:
 
 def _expiring(folder: Path, plan: InstallationPlan) -> Iterable[str]:
     for name in plan.members():
-        until = ending(role_file(folder / f"{name}.json"))
+        until = certificate_end(role_file(folder / f"{name}.json"))
         if until is not None and until - datetime.now(UTC) < WARN_BEFORE:
             yield f"{name}.json ends on {until:%Y-%m-%d}: remove it and run this again to renew it."

@@ -12,10 +12,10 @@ from services.errors import ServiceError
 from services.security import access
 from services.security.authority import Identity, decoded, encoded
 from services.security.plan import LINKS, LISTENING, InstallationPlan, dialled, listened
-from services.wire.connect import merged, role_file
+from services.wire.connect import merge, role_file
 from services.wire.member import Member
 from services.wire.roles import ROLES, ROUTER
-from services.wire.session import plain_settings, port
+from services.wire.session import common_settings, port
 
 ROUTER_SESSIONS = 256
 SERVICE_SESSIONS = 32
@@ -70,7 +70,7 @@ def configuration(plan: InstallationPlan, name: str, known: Mapping[str, Secrets
             "auth": {"usrpwd": {"user": name, "password": known[name].password}},
         },
     }
-    return merged(merged(plain_settings(), common), own)
+    return merge(merge(common_settings(), common), own)
 
 
 def write(path: Path, content: str, mode: int = 0o600) -> None:

@@ -17,7 +17,7 @@ from services.runtime import services_here
 from services.wire import keys
 from services.wire.member import member_of
 from services.wire.messages import Holder, Message, MessageError, Status
-from services.wire.session import CLIENT, close_session, endpoint, opened, settings
+from services.wire.session import CLIENT, close_session, endpoint, open_with, settings
 from services.wire.streams import received_message
 
 M = TypeVar("M", bound=Message)
@@ -240,7 +240,7 @@ class FleetWatch:
         found = settings("", CLIENT, self._connect)
         if not self._connect:
             found["connect"]["endpoints"] = [endpoint(robot, service) for robot, service in self._here]
-        self._session = session = opened(found, WHO)
+        self._session = session = open_with(found, WHO)
         for robot in _robots(self._connect):
             self._held += [
                 session.liveliness().declare_subscriber(keys.alive(robot, "*"), self._see, history=True),

@@ -1,1 +1,1 @@
-"""What travels: keys, records, streams, questions and sessions; no robot, no model."""
+"""Communication: keys, records, streams, queries and sessions; no robot, no model."""

@@ -1,4 +1,4 @@
-"""Who asks: a name for people, a number for programs, and the sample it has seen, carried beside every question."""
+"""The caller of a verb: a name for people, a number for programs, and the newest sample that it has seen."""
 
 import getpass
 import os
@@ -13,13 +13,13 @@ LONGEST_NAME = 80
 
 @dataclass(frozen=True, slots=True)
 class Caller:
-    """Who asks a verb or commands.
+    """The sender of a query or a command. A field that it did not send is empty or 0.
 
     Attributes:
-        name: For people, such as `anna@workstation (pid 4711)`; empty if the caller does not tell.
-        boot: The caller's `boot`, as in its messages; 0 if it does not tell.
+        name: For people, such as `anna@workstation (pid 4711)`.
+        boot: The caller's `boot`, as in its messages.
         through: `boot` of the service that asks on the caller's behalf; 0 if the caller asks itself.
-        hal_boot: `Sample.boot` of the newest sample that whoever asks had seen then; 0 if it does not tell.
+        hal_boot: `Sample.boot` of the newest sample that the caller had seen.
         cycle: `Sample.cycle` of that sample.
     """
 
@@ -30,11 +30,11 @@ class Caller:
     cycle: int = 0
 
     def __str__(self) -> str:
-        return self.name or (f"client {self.boot}" if self.boot else "somebody who does not tell a name")
+        return self.name or (f"client {self.boot}" if self.boot else "a client without a name")
 
 
 def own_name() -> str:
-    """The name of this process: user, host and pid."""
+    """Return the name of this process: user, host and pid."""
     try:
         user = getpass.getuser()
     except (KeyError, OSError):  # a container's user has no entry
@@ -43,5 +43,5 @@ def own_name() -> str:
 
 
 UNKNOWN = Caller()
-ASKING: ContextVar[Caller] = ContextVar("asking", default=UNKNOWN)
-"""Who asks the verb that is being answered in this thread."""
+CURRENT_CALLER: ContextVar[Caller] = ContextVar("current_caller", default=UNKNOWN)
+"""This is the caller of the verb that the current thread is answering."""

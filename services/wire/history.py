@@ -1,8 +1,8 @@
-"""The last minute of every estimate: a ring in the model service, and what a client gets of it.
+"""The last minute of all estimates: a ring in the model service, and the pages of it that a client reads.
 
-Memory is taken once, for `WINDOW` seconds at the estimation rate, and no more than `MOST_BYTES`: 2.9 MB for the 25
-elements of the shipped arm at 200 Hz. A tick writes one row into it and waits for nobody; who reads copies rows out,
-and drops those that were overwritten meanwhile.
+Memory is allocated once, for `WINDOW` seconds at the estimation rate, but at most `MOST_BYTES`: 2.9 MB for the 25
+elements of the shipped arm at 200 Hz. A tick writes one row without a lock. A reader copies rows, and drops those that
+were overwritten meanwhile.
 """
 
 import time
@@ -17,15 +17,15 @@ from services.errors import BadArguments, ServiceUnavailable, TooSlow
 from services.wire.messages import Estimates
 
 WINDOW = 60.0
-"""How long [s] estimates are kept."""
+"""Estimates are kept for this time [s]."""
 MOST_BYTES = 1 << 24
-"""A robot with more signals, or a higher rate, keeps less than a minute."""
+"""The ring has at most this size; with very many signals or a high rate it holds less than a minute."""
 PAGE_BYTES = 1 << 19
-"""How much one answer holds at most: half of what a message may."""
+"""A page has at most this size, half of that of a message."""
 PAGE_EVERY = 0.025
-"""Pause [s] from one question for a page to the next; a router passes on no more than some fifty questions a second."""
+"""Queries for pages are this far apart [s]; a router passes on about 50 queries per second."""
 PAGE_WITHIN = 1.0
-"""How long [s] to wait for one page before asking for it again."""
+"""A page that does not come within this time [s] is asked for again."""
 
 Signals = Mapping[str, int]
 """Signal -> number of elements."""
@@ -34,10 +34,10 @@ Signals = Mapping[str, int]
 class HistoryRing:
     """Rows of estimates, numbered from 0 at the start of the service.
 
-    One thread adds; any other may read at the same time.
+    One thread adds rows; others may read at the same time.
 
     Args:
-        signals: What a row holds.
+        signals: Signals of a row.
         rate: Rows per second [Hz].
     """
 
@@ -53,11 +53,11 @@ class HistoryRing:
         self._elements = Elements.of(signals)
         self._places = self._elements.places
         self._begun = self._done = 0
-        """Rows whose writing began, and ended; equal but for a moment."""
+        """These count the rows whose writing began, and ended; they differ only while a row is written."""
 
     @property
     def nbytes(self) -> int:
-        """Memory [bytes] that the rows take, for good."""
+        """Memory of the rows [bytes]."""
         return self._values.nbytes + self._estimated.nbytes + self._stamps.nbytes + self._arrived.nbytes
 
     @property
@@ -78,15 +78,15 @@ class HistoryRing:
         self._done = self._begun
 
     def since(self, moment: float) -> int:
-        """Number of the first row that was written at monotonic time `moment` [s] or later."""
+        """Return the number of the first row that was written at monotonic time `moment` [s] or later."""
         numbers = np.arange(max(0, self._begun - self.capacity), self._done)
         return int(numbers[0] + np.searchsorted(self._arrived[numbers % self.capacity], moment)) if len(numbers) else 0
 
     def page(self, begin: int, end: int, signals: Iterable[str]) -> dict[str, Any]:
-        """Rows from `begin`, as many as one answer holds, before `end`; what is there no more is left out.
+        """Return the rows from `begin` to before `end` that fit into one page, without those that were overwritten.
 
         Returns:
-            `begin`, `end`: which rows these are; `stamp_ns`, `values`, `estimated`: binaries of little-endian int64,
+            `begin`, `end`: numbers of the rows; `stamp_ns`, `values`, `estimated`: binaries of little-endian int64,
             float64 and bytes, the last two by signal and row after row.
         """
         names = list(signals)
@@ -107,22 +107,22 @@ class HistoryRing:
         }
 
     def answer(self, arguments: Mapping[str, Any], boot: int, now: float) -> dict[str, Any]:
-        """The verb `history`: the last `seconds`, or rows from `begin` to `end`, of some signals or all.
+        """Answer the verb `history`: the last `seconds`, or rows from `begin` to `end`, of some signals or all.
 
         Args:
             arguments: `seconds`, or `begin` and `end`; `signals`.
-            boot: Of the service, so that a reader notices when the rows are numbered anew.
+            boot: `boot` of the service, so that a reader notices a restart, which numbers the rows anew.
             now: Monotonic time [s].
 
         Returns:
-            The first page, and `last`: up to which row to ask on.
+            The first page, and `last`: the row after the last one to ask for.
 
         Raises:
-            BadArguments: Something else was asked.
+            BadArguments: An argument is malformed or missing.
         """
         names = arguments.get("signals") or list(self.signals)
         if not isinstance(names, list) or not all(isinstance(name, str) and name in self.signals for name in names):
-            raise BadArguments(f"'signals' must be names out of: {', '.join(self.signals)}.")
+            raise BadArguments(f"'signals' must be a list of these names: {', '.join(self.signals)}.")
         begin, end, seconds = arguments.get("begin"), arguments.get("end"), arguments.get("seconds")
         if seconds is not None:
             if not isinstance(seconds, int | float) or isinstance(seconds, bool) or not 0 < seconds < np.inf:
@@ -142,13 +142,13 @@ class HistoryRing:
 
 @dataclass(frozen=True, slots=True)
 class History:
-    """What was estimated of late, one row per estimate that was published.
+    """Recent estimates, one row per published message.
 
     Attributes:
         stamp_ns: The model service's wall clock [ns since 1970], shape (rows,).
         values: Signal -> measured values, with estimates where an element was not measured [unit], shape (rows, n);
             NaN where neither was possible.
-        estimated: Signal -> which of them were estimated, shape (rows, n).
+        estimated: Signal -> whether each value was estimated, shape (rows, n).
     """
 
     stamp_ns: np.ndarray
@@ -157,7 +157,7 @@ class History:
 
     @property
     def seconds(self) -> np.ndarray:
-        """Time of each row before the newest one [s], shape (rows,): all of them 0 or less."""
+        """Time of each row relative to the newest one [s], shape (rows,); 0 or negative."""
         return (self.stamp_ns - self.stamp_ns[-1]) * 1e-9 if len(self.stamp_ns) else np.zeros(0)
 
 
@@ -167,37 +167,38 @@ def fetch(
     """Ask for all pages and join them.
 
     Args:
-        ask: Asks `history` with these arguments within a time [s].
-        seconds: How far back [s].
-        signals: Which; all if empty.
-        timeout: Deadline [s] of everything.
+        ask: Queries `history` with these arguments and a timeout [s].
+        seconds: Length of the history [s].
+        signals: Names of signals; all if empty.
+        timeout: Deadline [s] for all pages.
 
     Raises:
         TooSlow: Not all pages came in time.
-        ServiceUnavailable: Nobody is there, or the service was started anew meanwhile.
+        ServiceUnavailable: The service is absent, or was restarted meanwhile.
     """
-    begun = time.monotonic()
-    asked: dict[str, Any] = {"seconds": float(seconds), "signals": list(signals)}
+    deadline = time.monotonic() + timeout
+    request: dict[str, Any] = {"seconds": float(seconds), "signals": list(signals)}
     pages: list[dict[str, Any]] = []
     while True:
-        left = begun + timeout - time.monotonic()
+        sent = time.monotonic()
+        left = deadline - sent
         if left <= 0:
             raise TooSlow(
-                f"The history of {seconds:g} s did not come within {timeout:g} s. Ask for less, or for longer."
+                f"The history of {seconds:g} s did not come within {timeout:g} s. Ask for less, or with a longer "
+                "timeout."
             )
-        sent = time.monotonic()
         try:
-            page = ask(asked, min(left, PAGE_WITHIN))
+            page = ask(request, min(left, PAGE_WITHIN))
         except TooSlow:
             if left > PAGE_WITHIN:
                 continue
             raise
         if pages and page["boot"] != pages[0]["boot"]:
-            raise ServiceUnavailable("The model service was started anew while its history was read. Ask again.")
+            raise ServiceUnavailable("The model service was restarted while its history was read. Ask again.")
         pages.append(page)
         if page["end"] >= page["last"] or page["end"] == page["begin"]:
             return _joined(pages)
-        asked = {"begin": page["end"], "end": page["last"], "signals": list(page["elements"])}
+        request = {"begin": page["end"], "end": page["last"], "signals": list(page["elements"])}
         time.sleep(max(0.0, sent + PAGE_EVERY - time.monotonic()))
 
 

@@ -1,81 +1,81 @@
-"""The key space, whole. Nouns are published, verbs are queried; docs/keys.md says it in words."""
+"""The whole key space. Nouns are published, verbs are queried; docs/keys.md describes them."""
 
 ROOT = "gemuco"
 SERVICES = ("simulator", "hal", "vision", "model", "recorder")
 
 
 def robot_key(robot: str, *parts: str) -> str:
-    """`gemuco/<robot>/<parts...>`."""
+    """Return `gemuco/<robot>/<parts...>`."""
     return "/".join((ROOT, robot, *parts))
 
 
 def sample(robot: str) -> str:
-    """Published by hal every cycle: `messages.Sample`, what was measured."""
+    """Return the key that hal publishes every cycle: `messages.Sample`, the measured values."""
     return robot_key(robot, "hal", "sample")
 
 
 def applied(robot: str) -> str:
-    """Published by hal every cycle: `messages.Applied`, what was really sent to the drives."""
+    """Return the key that hal publishes every cycle: `messages.Applied`, the set-points sent to the drives."""
     return robot_key(robot, "hal", "applied")
 
 
 def vision(robot: str) -> str:
-    """Published by whatever looks at the robot, at its own rate: `messages.Sample` of what it sees."""
+    """Return the key that a camera's process publishes at its own rate: `messages.Sample`."""
     return robot_key(robot, "vision", "sample")
 
 
 def command(robot: str) -> str:
-    """Put by whoever commands: `messages.Command`, what is desired."""
+    """Return the key that the commanding client publishes: `messages.Command`, the desired values."""
     return robot_key(robot, "hal", "command")
 
 
 def holder(robot: str) -> str:
-    """Published by hal once a second and when it changes: `messages.Holder`, who commands."""
+    """Return the key that hal publishes once a second and on a change: `messages.Holder`, the lease holder."""
     return robot_key(robot, "hal", "holder")
 
 
 def estimate(robot: str) -> str:
-    """Published by model at the estimation rate: `messages.Estimates`."""
+    """Return the key that model publishes at the estimation rate: `messages.Estimates`."""
     return robot_key(robot, "model", "estimate")
 
 
 def anomaly(robot: str) -> str:
-    """Published by model at the anomaly rate: `messages.Anomaly`."""
+    """Return the key that model publishes at the anomaly rate: `messages.Anomaly`."""
     return robot_key(robot, "model", "anomaly")
 
 
 def update(robot: str) -> str:
-    """Published by model at the update rate: `messages.Update`."""
+    """Return the key that model publishes at the update rate: `messages.Update`."""
     return robot_key(robot, "model", "update")
 
 
 def target(robot: str) -> str:
-    """Put by whoever directs the controller: `messages.Target`."""
+    """Return the key that the client of the controller publishes: `messages.Target`."""
     return robot_key(robot, "model", "target")
 
 
 def truth(robot: str) -> str:
-    """Published by a simulator only: `messages.Sample` whose source is `truth`."""
+    """Return the key that only a simulator publishes: `messages.Sample` whose source is `truth`."""
     return robot_key(robot, "simulator", "truth")
 
 
 def status(robot: str, service: str) -> str:
-    """Published by every service once a second: `messages.Status`."""
+    """Return the key that every service publishes once a second: `messages.Status`."""
     return robot_key(robot, service, "status")
 
 
 def verb(robot: str, service: str, name: str) -> str:
-    """Queried: a verb of a service (`hal/do/enable`, `model/do/estimate`, `simulator/do/fault`)."""
+    """Return the key of a verb, which is queried (`hal/do/enable`, `model/do/estimate`, `simulator/do/fault`)."""
     return robot_key(robot, service, "do", name)
 
 
 def alive(robot: str, service: str) -> str:
-    """Liveliness token of a service."""
+    """Return the key of a service's liveliness token."""
     return robot_key(robot, service, "alive")
 
 
 def everything(robot: str) -> str:
-    """Key expression of all that a robot's services publish."""
+    """Return the key expression that covers every key of a robot."""
     return robot_key(robot, "**")
 
 

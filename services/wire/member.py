@@ -1,20 +1,20 @@
-"""Who one is, as one's role file says: what the client and the page ask before they ask the robot."""
+"""The role that a role file grants; the client and the page check it before they ask the robot."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from services.errors import ServiceError
-from services.wire.connect import role_file, sorted_out
+from services.wire.connect import role_file, split_connect
 from services.wire.roles import ROLES
 
 ALL = "*"
-"""In the place of a robot's name: every robot there is or will be."""
+"""In place of a robot's name this means every robot, future ones included."""
 
 
 @dataclass(frozen=True, slots=True)
 class Member:
-    """A role, and the robots that it is for; no role means that there is no security, and everything is allowed.
+    """A role and its robots. Without a role there is no security, and everything is allowed.
 
     Attributes:
         role: `operator`; empty without a role file.
@@ -32,40 +32,40 @@ class Member:
         """Whether it may ask a service's verb."""
         return not self.role or (self.is_for(robot) and self.role in ROLES and ROLES[self.role].may_ask(service, verb))
 
-    def may_say(self, robot: str, noun: str) -> bool:
+    def may_publish(self, robot: str, noun: str) -> bool:
         """Whether it may publish, such as `hal/command`."""
-        return not self.role or (self.is_for(robot) and self.role in ROLES and ROLES[self.role].may_say(noun))
+        return not self.role or (self.is_for(robot) and self.role in ROLES and ROLES[self.role].may_publish(noun))
 
-    def may_hear(self, robot: str, noun: str) -> bool:
+    def may_subscribe(self, robot: str, noun: str) -> bool:
         """Whether it may subscribe, such as to `model/estimate`."""
-        return not self.role or (self.is_for(robot) and self.role in ROLES and ROLES[self.role].may_hear(noun))
+        return not self.role or (self.is_for(robot) and self.role in ROLES and ROLES[self.role].may_subscribe(noun))
 
 
 def member_of(connect: Iterable[str]) -> Member:
-    """Who the role file among these is for.
+    """Return the member of the first role file in `connect` that names a role.
 
     Raises:
         ServiceError: It cannot be read.
     """
-    for file in sorted_out(connect)[1]:
-        if (found := told_by(role_file(file))).role:
-            return found
+    for file in split_connect(connect)[1]:
+        if (member := member_in(role_file(file))).role:
+            return member
     return Member()
 
 
-def told_by(configuration: Mapping[str, Any]) -> Member:
-    """Who a configuration is for.
+def member_in(configuration: Mapping[str, Any]) -> Member:
+    """Return the member that a configuration is for.
 
     Raises:
-        ServiceError: What it says of the role is no role.
+        ServiceError: Its metadata does not describe a role.
     """
-    told = (configuration.get("metadata") or {}).get("gemuco")
-    if told is None:
+    entry = (configuration.get("metadata") or {}).get("gemuco")
+    if entry is None:
         return Member()
     if (
-        not isinstance(told, Mapping)
-        or not isinstance(told.get("role"), str)
-        or not isinstance(told.get("robots"), list)
+        not isinstance(entry, Mapping)
+        or not isinstance(entry.get("role"), str)
+        or not isinstance(entry.get("robots"), list)
     ):
         raise ServiceError("The role file's metadata.gemuco must be {role: NAME, robots: [NAMES]}.")
-    return Member(told["role"], tuple(str(one) for one in told["robots"]))
+    return Member(entry["role"], tuple(str(robot) for robot in entry["robots"]))

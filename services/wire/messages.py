@@ -1,8 +1,8 @@
 """Typed records <-> msgpack, with type, version, stamp and sequence in each.
 
 On the wire a message is one msgpack map: `type`, `v`, `stamp_ns`, `seq`, `boot`, then the record's own fields. An array
-of numbers is a msgpack binary of little-endian float64; an array of truth values is a binary of one byte each. What is
-told of all signals is one array, in the order of the map `elements`, which says how many of them are whose.
+of numbers is a msgpack binary of little-endian float64; an array of truth values is a binary of one byte each. A field
+with values of all signals is one array. The map `elements` gives the order of the signals and the size of each.
 """
 
 from collections.abc import Callable
@@ -38,11 +38,11 @@ __all__ = [
 VERSION = 2
 MAX_BYTES = 1 << 20
 UNREADABLE = (msgspec.MsgspecError, UnicodeDecodeError, RecursionError)
-"""What msgspec raises of bytes that are not msgpack, or not what they should be."""
+"""msgspec raises these if bytes are not msgpack or not of the expected type."""
 
 
 class MessageError(ServiceError, ValueError):
-    """Bytes that are not the message they should be; the text says what is wrong."""
+    """Malformed bytes, or a message of another type."""
 
 
 class OtherVersion(MessageError):
@@ -57,7 +57,7 @@ Decode = Callable[[bytes], Any]
 
 
 def _packed(value: Any) -> Any:
-    """What msgpack has no word for, in its words."""
+    """Convert a value of numpy into a type of msgpack."""
     if isinstance(value, np.ndarray):
         return value.astype(_NUMBER, copy=False).tobytes()
     if isinstance(value, np.generic):
@@ -66,15 +66,15 @@ def _packed(value: Any) -> Any:
 
 
 def _read(_: Any, value: Any) -> np.ndarray:
-    """The array of which `_packed` made this."""
+    """Convert the binary that `_packed` made of an array back into the array."""
     if type(value) is not bytes or len(value) % 8:
         raise ValueError("Expected a binary of little-endian float64")
     return np.frombuffer(value, _NUMBER)
 
 
 _NUMBER = Numbers.DTYPE
-_packed_before: dict[Elements, msgspec.Raw] = {}
-"""Elements in their wire form, each packed once."""
+_packed_elements: dict[Elements, msgspec.Raw] = {}
+"""This cache holds elements in their wire form."""
 _to_bytes = msgspec.msgpack.Encoder(enc_hook=_packed).encode
 _readers: dict[type[Message], Decode] = {
     record: msgspec.msgpack.Decoder(record, dec_hook=_read).decode for record in RECORDS.values()
@@ -86,25 +86,25 @@ _read_any: Decode = msgspec.msgpack.Decoder(
 
 
 def encode(message: Message, **header: int) -> bytes:
-    """The wire form of a message; `header` replaces `seq` and `boot`, which the publisher knows."""
-    whole: Any = message
-    filled = whole.__copy__()  # `replace` would check it all again
-    force_setattr(filled, "v", VERSION)
+    """Return the wire form of a message; `header` replaces `seq` and `boot`, which the publisher knows."""
+    original: Any = message
+    copy = original.__copy__()  # `replace` would check all fields again
+    force_setattr(copy, "v", VERSION)
     for name in header:
-        force_setattr(filled, name, header[name])
-    if isinstance(filled, OfSignals):
-        _flatten(filled)
-    return _to_bytes(filled)
+        force_setattr(copy, name, header[name])
+    if isinstance(copy, OfSignals):
+        _flatten(copy)
+    return _to_bytes(copy)
 
 
 def _flatten(message: OfSignals) -> None:
-    """Put what the wire has in place of what it stands for; quicker than a hook of msgspec for each."""
+    """Replace elements and arrays by their wire form, which is quicker than a hook of msgspec for each."""
     elements = message.elements
-    packed = _packed_before.get(elements)
+    packed = _packed_elements.get(elements)
     if packed is None:
-        if len(_packed_before) >= KEPT:
-            _packed_before.clear()
-        packed = _packed_before[elements] = msgspec.Raw(_to_bytes(elements.counts))
+        if len(_packed_elements) >= KEPT:
+            _packed_elements.clear()
+        packed = _packed_elements[elements] = msgspec.Raw(_to_bytes(elements.counts))
     force_setattr(message, "elements", packed)
     for name, _, dtype, _ in message.parts:
         flat = getattr(message, name).flat
@@ -117,38 +117,38 @@ def decode(data: bytes, expected: type[M]) -> M:
     """Read a message of a known type.
 
     Raises:
-        MessageError: Too long, not msgpack, another type, a field missing or of a wrong kind.
-        OtherVersion: Of another version.
+        MessageError: It is too long, not msgpack or of another type, or a field is missing or malformed.
+        OtherVersion: It has another version.
     """
     message: M = _decoded(data, _readers[expected], expected.TYPE)
     return message
 
 
 def decode_any(data: bytes) -> Message:
-    """Read a message of whatever type it says it is.
+    """Read a message of any known type.
 
     Raises:
-        MessageError: As `decode`, or the type is not known.
+        MessageError: As `decode`, or the type is unknown.
     """
     message: Message = _decoded(data, _read_any, None)
     return message
 
 
-def _decoded(data: bytes, read: Decode, wanted: str | None) -> Any:
+def _decoded(data: bytes, read: Decode, expected: str | None) -> Any:
     if len(data) > MAX_BYTES:
-        raise MessageError(f"A {wanted or 'gemuco'} message of {len(data)} bytes is over the limit of {MAX_BYTES}.")
+        raise MessageError(f"A {expected or 'gemuco'} message of {len(data)} bytes is over the limit of {MAX_BYTES}.")
     try:
         message = read(data)
     except UNREADABLE as error:
-        raise _refusal(data, wanted, error) from None
+        raise _refusal(data, expected, error) from None
     if message.v != VERSION:
         raise _other_version(message.TYPE, message.v)
     return message
 
 
-def _refusal(data: bytes, wanted: str | None, error: Exception) -> MessageError:
-    """Why bytes could not be read: what is most wrong with them, and no other fault that follows from it."""
-    what = wanted or "gemuco"
+def _refusal(data: bytes, expected: str | None, error: Exception) -> MessageError:
+    """Return the error for bytes that could not be read: the first fault, without those that follow from it."""
+    what = expected or "gemuco"
     try:
         body = msgspec.msgpack.decode(data)
     except UNREADABLE as reason:
@@ -156,7 +156,7 @@ def _refusal(data: bytes, wanted: str | None, error: Exception) -> MessageError:
     if not isinstance(body, dict):
         return MessageError(f"Expected a {what} message, got {type(body).__name__}.")
     kind, version = body.get("type"), body.get("v")
-    if not isinstance(kind, str) or kind != (wanted or kind):
+    if not isinstance(kind, str) or kind != (expected or kind):
         return MessageError(f"Expected a {what} message, got {shown(kind)}.")
     if kind not in RECORDS:
         return MessageError(f"There is no message type {shown(kind)}. Known types: {', '.join(RECORDS)}.")

@@ -1,4 +1,4 @@
-"""What somebody else wrote, fit for a sentence, a log and a terminal."""
+"""Text of other processes, made safe for messages, logs and terminals."""
 
 from typing import Any
 
@@ -6,13 +6,13 @@ LONGEST = 300
 
 
 def plain(text: str, most: int = LONGEST) -> str:
-    """A text as one line of at most so many signs, without any that act on a terminal."""
-    seen = "".join(sign if sign.isprintable() else "?" for sign in text[: most + 1])
-    return seen if len(seen) <= most else f"{seen[: most - 3]}..."
+    """Return a text as one line of at most `most` characters, without control characters."""
+    printable = "".join(sign if sign.isprintable() else "?" for sign in text[: most + 1])
+    return printable if len(printable) <= most else f"{printable[: most - 3]}..."
 
 
 def shown(value: Any) -> str:
-    """A value that came over the network, short; of what may be nested without end only the type."""
+    """Format a received value briefly; of containers and other objects only the type."""
     if isinstance(value, str):
         return f"'{plain(value, 60)}'"
     if value is None or isinstance(value, bool | int | float):

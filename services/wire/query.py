@@ -1,7 +1,7 @@
-"""Verbs: a query with a msgpack map in, and a msgpack map out that holds the answer or the error.
+"""Verbs: a query carries a msgpack map of arguments, the reply a msgpack map with the result or the error.
 
-An exception of the handler travels as its class name and sentence, and comes back as the exception it was. Both ways
-an attachment tells the version of the wire format, and on the way there who asks; one that is missing is no error.
+An exception of the handler is sent as its class name and text, and raised as the same class by the client. An
+attachment of both holds the version of the wire format, and that of the query also the caller; it may be missing.
 """
 
 import logging
@@ -21,8 +21,7 @@ from gemuco.errors import SchemaError
 from hal.errors import HalError
 from services.errors import NoAnswer, RemoteError, ServiceError, ServiceUnavailable, TooSlow, WrongVersion
 from services.wire import keys
-from services.wire.absence import instead, starter
-from services.wire.caller import ASKING, LONGEST_NAME, UNKNOWN, Caller
+from services.wire.caller import CURRENT_CALLER, LONGEST_NAME, UNKNOWN, Caller
 from services.wire.messages import MAX_BYTES, UNREADABLE, VERSION, MessageError
 from services.wire.plain_text import plain, shown
 
@@ -31,22 +30,31 @@ log = logging.getLogger(__name__)
 Handler = Callable[[dict[str, Any]], Any]
 Guard = Callable[[Caller], None]
 RETRY_AFTER = 0.02
-"""Pause [s] before asking again when nobody was there: connections are made in the background."""
+"""A client waits this long [s] before it asks an absent service again: connections are made in the background."""
 APPEAR = 2.0
-"""How long [s] nobody may be there before the answer is that nobody is; a verb that computes may take longer."""
+"""A service that is absent for this long [s] is reported; a verb that computes may take longer to answer."""
 LONGEST_ERROR = 1000
-ASKERS = 64
-"""So many callers' attachments are kept, as they are on the wire and as they were read."""
-LONGEST_KEPT = 512
-"""Longer attachments [bytes], which no honest caller sends, are read each time."""
+CACHED_CALLERS = 64
+"""The attachments of this many callers are cached in both directions."""
+LONGEST_CACHED = 512
+"""Longer attachments [bytes], which no regular client sends, are not cached."""
 UNORDERED = (dict, set, frozenset)
-"""What may hold a set, or is one."""
+"""A value of these types is a set or may hold one."""
 LOG_EVERY = 1.0
 """A verb that keeps failing is logged this often [s]."""
+LOOK_WITHIN = 0.5
+"""A look for running services takes at most this long [s]."""
+STARTED_BY = {
+    "simulator": "gemuco simulate",
+    "hal": "gemuco hal",
+    "vision": "gemuco vision",
+    "model": "gemuco serve",
+    "recorder": "gemuco record",
+}
 
 
-class UnderWay:
-    """Counts the questions that are being answered, so that who ends can wait for the last answer to go out."""
+class PendingQueries:
+    """A count of the queries that are being answered. A service waits for zero before it closes its session."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
@@ -62,7 +70,7 @@ class UnderWay:
             self._changed.notify_all()
 
     def wait(self, within: float) -> bool:
-        """Wait so long [s] at most; whether none is left."""
+        """Wait at most `within` [s] for the last answer; return whether none is left."""
         with self._changed:
             return self._changed.wait_for(lambda: not self._count, within)
 
@@ -73,59 +81,59 @@ def serve_verb(
     handler: Handler,
     guard: Guard | None = None,
     always: bool = False,
-    under_way: UnderWay | None = None,
+    pending: PendingQueries | None = None,
 ) -> zenoh.Queryable:
     """Answer queries on a key until the session closes.
 
-    A question to several keys at once (`gemuco/arm/hal/do/*`) is refused: who only looks around must set nothing off.
+    A query to several keys at once (`gemuco/arm/hal/do/*`) is refused: a client that explores must not start anything.
 
     Args:
         session: An open session.
         key: From `keys.verb`.
         handler: Takes the arguments, returns what msgpack can carry (arrays become lists); its exceptions become
-            replies. Calls come one after another from a thread of zenoh, so long work belongs elsewhere. Who asks is in
-            `caller.ASKING` meanwhile.
-        guard: Takes the caller before that; what it raises is the answer.
-        always: Do it whoever asks however badly, with no arguments if those that came cannot be read; for stopping.
-        under_way: Counts the questions until they are answered.
+            replies. Calls come one after another from a thread of zenoh, so long work belongs elsewhere. The caller is
+            in `CURRENT_CALLER` meanwhile.
+        guard: Checks the caller first; its exceptions become replies.
+        always: Call the handler even if the query is malformed, then without arguments; for stopping.
+        pending: Counts the queries until they are answered.
     """
-    return session.declare_queryable(key, _Verb(key, handler, guard, always, under_way or UnderWay()).answer)
+    return session.declare_queryable(key, _Verb(key, handler, guard, always, pending or PendingQueries()).answer)
 
 
 class _Verb:
-    """Answers the questions to one key."""
+    """The handler of the queries to one key."""
 
-    def __init__(self, key: str, handler: Handler, guard: Guard | None, always: bool, under_way: UnderWay) -> None:
+    def __init__(self, key: str, handler: Handler, guard: Guard | None, always: bool, pending: PendingQueries) -> None:
         self._key, self._handler, self._guard, self._always = key, handler, guard, always
-        self._under_way = under_way
-        self._told = _pack({"v": VERSION})
+        self._pending = pending
+        self._attachment = _pack({"v": VERSION})
         self._logged_at = -math.inf
 
     def answer(self, query: zenoh.Query) -> None:
-        """Answer one question; raises nothing, for there is nobody above."""
+        """Answer one query; log every exception, because zenoh would ignore it."""
         try:
-            with self._under_way, query:
-                answer = self._done(query) if str(query.key_expr) == self._key else self._refusal_of_many(query)
-                query.reply(self._key, answer, attachment=self._told)
+            with self._pending, query:
+                answer = self._call(query) if str(query.key_expr) == self._key else self._refuse_several(query)
+                query.reply(self._key, answer, attachment=self._attachment)
         except Exception:  # the session closes
-            self._log("A question to %s was not answered", self._key)
+            self._log("A query to %s was not answered", self._key)
 
-    def _done(self, query: zenoh.Query) -> bytes:
+    def _call(self, query: zenoh.Query) -> bytes:
         token = None
         try:
             caller, arguments = self._read(query)
-            token = ASKING.set(caller)
+            token = CURRENT_CALLER.set(caller)
             if self._guard is not None:
                 self._guard(caller)
             return _pack({"ok": self._handler(arguments)})
         except (HalError, SchemaError, ServiceError, ValueError, LookupError) as error:
-            return _refused(error, str(error))
+            return _refusal(error, str(error))
         except Exception as error:
             self._log("Verb %s failed", self._key)
-            return _refused(error, f"The verb failed: {error}")
+            return _refusal(error, f"The verb failed: {error}")
         finally:
             if token is not None:
-                ASKING.reset(token)
+                CURRENT_CALLER.reset(token)
 
     def _read(self, query: zenoh.Query) -> tuple[Caller, dict[str, Any]]:
         caller, arguments = UNKNOWN, {}
@@ -137,55 +145,53 @@ class _Verb:
                 raise
         return caller, arguments
 
-    def _refusal_of_many(self, query: zenoh.Query) -> bytes:
-        return _refused(
+    def _refuse_several(self, query: zenoh.Query) -> bytes:
+        return _refusal(
             MessageError(), f"'{plain(str(query.key_expr))}' asks several verbs at once; ask '{self._key}' by its name."
         )
 
-    def _log(self, text: str, *about: object) -> None:
+    def _log(self, text: str, *arguments: object) -> None:
         now = time.monotonic()
         if now - self._logged_at >= LOG_EVERY:
             self._logged_at = now
-            log.exception(text, *about)
+            log.exception(text, *arguments)
 
 
-def _refused(error: Exception, text: str) -> bytes:
+def _refusal(error: Exception, text: str) -> bytes:
     return _pack({"error": type(error).__name__, "text": plain(text.replace("\n", " "), LONGEST_ERROR)})
 
 
 def _caller(key: str, attachment: zenoh.ZBytes | None) -> Caller:
-    """Who asks, as far as it tells.
+    """Read the caller of a query; `UNKNOWN` without an attachment.
 
     Raises:
-        WrongVersion: It speaks another version.
-        MessageError: The attachment is none.
+        WrongVersion: It uses another version of the wire format.
+        MessageError: The attachment is malformed.
     """
     if attachment is None:
         return UNKNOWN
-    told = attachment.to_bytes()
-    return _known_caller(key, told) if len(told) <= LONGEST_KEPT else _read_caller(key, told)
-
-
-@lru_cache(maxsize=ASKERS)
-def _known_caller(key: str, attachment: bytes) -> Caller:
-    """See `_caller`; most callers ask the same verb again and again."""
-    return _read_caller(key, attachment)
+    data = attachment.to_bytes()
+    return _cached_caller(key, data) if len(data) <= LONGEST_CACHED else _read_caller(key, data)
 
 
 def _read_caller(key: str, attachment: bytes) -> Caller:
-    told = _unpack(attachment, f"The attachment of a question to {key}")
-    _check_version(told, f"The question to {key}")
-    name = told.get("name", "")
-    numbers = {number: told.get(number, 0) for number in ("boot", "through", "hal_boot", "cycle")}
+    entries = _unpack(attachment, f"The attachment of a query to {key}")
+    _check_version(entries, f"The query to {key}")
+    name = entries.get("name", "")
+    numbers = {number: entries.get(number, 0) for number in ("boot", "through", "hal_boot", "cycle")}
     if not isinstance(name, str) or not all(type(value) is int for value in numbers.values()):
         raise MessageError(
-            f"The attachment of a question to {key} must hold a text `name`, and whole numbers {', '.join(numbers)}."
+            f"The attachment of a query to {key} must hold a text `name`, and whole numbers {', '.join(numbers)}."
         )
     return Caller(plain(name, LONGEST_NAME), **numbers)
 
 
-def _check_version(told: dict[str, Any], what: str) -> None:
-    version = told.get("v", VERSION)
+_cached_caller = lru_cache(maxsize=CACHED_CALLERS)(_read_caller)
+"""Most callers ask the same verb again and again, so their attachments are read once."""
+
+
+def _check_version(entries: dict[str, Any], what: str) -> None:
+    version = entries.get("v", VERSION)
     if type(version) is not int or version != VERSION:
         raise WrongVersion(
             f"{what} has version {shown(version)} of the wire format; this program speaks {VERSION}. Update the older."
@@ -216,24 +222,24 @@ def ask(
         key: From `keys.verb`.
         arguments: What the verb takes; arrays travel as lists.
         timeout: Deadline [s] for everything, the connection included.
-        caller: Who asks, or what tells who does, anew each time that nobody was there.
+        caller: The caller, or a function that returns it, called anew for each attempt.
 
     Returns:
         What the handler returned: a map, or `{"value": ...}` when it returned something else, or `{}`.
 
     Raises:
-        ServiceUnavailable: Nobody is there.
+        ServiceUnavailable: The service is absent.
         TooSlow: No answer within the deadline.
-        WrongVersion: One of both speaks another version.
-        ServiceError, HalError, SchemaError: What the service raised; `RemoteError` when the class is not known here.
+        WrongVersion: One side uses another version of the wire format.
+        ServiceError, HalError, SchemaError: The service raised it; `RemoteError` if the class is not known here.
     """
-    begun = time.monotonic()
-    deadline, appear = begun + timeout, begun + min(timeout, APPEAR)
+    start = time.monotonic()
+    deadline, appear = start + timeout, start + min(timeout, APPEAR)
     payload = _pack(dict(arguments or {}))
     late = False
     while (remaining := deadline - time.monotonic()) > 0:
-        told = _told(caller if isinstance(caller, Caller) else caller())
-        for reply in session.get(key, payload=payload, attachment=told, timeout=remaining):
+        attachment = _attachment(caller if isinstance(caller, Caller) else caller())
+        for reply in session.get(key, payload=payload, attachment=attachment, timeout=remaining):
             if reply.ok is not None:
                 return _result(key, reply.ok)
             late = True
@@ -241,22 +247,47 @@ def ask(
         if not late and time.monotonic() > appear:
             break
         time.sleep(max(0.0, min(RETRY_AFTER, deadline - time.monotonic())))
-    raise _unanswered(session, key, timeout if late else min(timeout, APPEAR), late)
+    raise _no_answer(session, key, timeout if late else min(timeout, APPEAR), late)
 
 
-@lru_cache(maxsize=ASKERS)
-def _told(caller: Caller) -> bytes:
-    """What a caller tells beside its question; what it does not know it does not tell."""
+@lru_cache(maxsize=CACHED_CALLERS)
+def _attachment(caller: Caller) -> bytes:
+    """Encode the version and the fields of the caller that are known."""
     return _pack({"v": VERSION} | {name: value for name, value in asdict(caller).items() if value})
 
 
-def alive(session: zenoh.Session, robot: str, timeout: float = 0.5) -> set[str]:
-    """Names of the robot's services that this session can see now."""
-    replies = session.liveliness().get(keys.alive(robot, "*"), timeout=timeout)
-    return {keys.parse(str(reply.ok.key_expr))[1] for reply in replies if reply.ok is not None}
+def alive(session: zenoh.Session, robot: str, timeout: float = LOOK_WITHIN) -> set[str]:
+    """Return the names of the robot's services that this session can see now."""
+    return _running(session, robot, timeout).get(robot, set())
 
 
-def _unanswered(session: zenoh.Session, key: str, timeout: float, late: bool) -> NoAnswer:
+def _running(session: zenoh.Session, robot: str = "*", timeout: float = LOOK_WITHIN) -> dict[str, set[str]]:
+    """Return robot -> names of its services that this session can see now."""
+    services: dict[str, set[str]] = {}
+    for reply in session.liveliness().get(keys.alive(robot, "*"), timeout=timeout):
+        if reply.ok is not None:
+            name, service, _ = keys.parse(str(reply.ok.key_expr))
+            services.setdefault(name, set()).add(service)
+    return services
+
+
+def starter(service: str) -> str:
+    """Return the command that starts a service, for a sentence."""
+    return f"`{STARTED_BY[service]}`" if service in STARTED_BY else f"the '{service}' service"
+
+
+def describe_presence(session: zenoh.Session, robot: str) -> str:
+    """Describe the services that are visible when the wanted one is not: a sentence that begins with a space."""
+    if not session.info.transports():
+        return " At the moment this program has no connection: no router, and no service of the robot."
+    if services := alive(session, robot):  # first alone: a role may not see other robots
+        return f" Of this robot there is: {', '.join(sorted(services))}."
+    if others := sorted(_running(session)):
+        return f" There is no robot '{robot}'; there is: {', '.join(others)}."
+    return " The router is there, and no robot."
+
+
+def _no_answer(session: zenoh.Session, key: str, timeout: float, late: bool) -> NoAnswer:
     robot, service, verb = keys.parse(key)
     verb = verb.removeprefix("do/")
     if late:
@@ -270,7 +301,7 @@ def _unanswered(session: zenoh.Session, key: str, timeout: float, late: bool) ->
         )
     return ServiceUnavailable(
         f"No '{service}' service of robot '{robot}' answered within {timeout:.3g} s. Is {starter(service)} running?"
-        f"{instead(session, robot)}"
+        f"{describe_presence(session, robot)}"
     )
 
 
@@ -301,7 +332,7 @@ def _pack(value: Any) -> bytes:
 
 
 def _ordered(value: Any) -> Any:
-    """With lists, sorted, in place of sets: msgspec would write them in any order."""
+    """Replace sets by sorted lists: msgspec would write sets in any order."""
     if isinstance(value, dict):
         return {key: _ordered(item) if isinstance(item, UNORDERED) else item for key, item in value.items()}
     return sorted(value) if isinstance(value, set | frozenset) else value

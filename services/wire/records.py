@@ -1,4 +1,4 @@
-"""What travels between the processes, as typed records; `services.wire.messages` puts them on the wire."""
+"""Typed records of all messages between the processes; `services.wire.messages` encodes and decodes them."""
 
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
@@ -22,19 +22,19 @@ if TYPE_CHECKING:
     WireElements = Elements
     WireNumbers = Numbers
     WireTruths = Truths
-else:  # the decoder leaves them as they came; `OfSignals` reads them, quicker than a hook of msgspec for each could
+else:  # the decoder leaves them as bytes; `OfSignals` reads them, which is quicker than a hook of msgspec for each
     WireElements = msgspec.Raw
     WireNumbers = WireTruths = bytes
 
 
 class Message(msgspec.Struct, frozen=True, kw_only=True, tag_field="type", tag=str.lower):
-    """What every message carries, beside its type, which is the name of its class in lower case.
+    """The fields of every message. Its type on the wire is the name of its class in lower case.
 
     Attributes:
-        v: Version of the wire format it came in.
+        v: Version of the wire format.
         stamp_ns: The sender's wall clock when the content was true [ns since 1970].
-        seq: Counts up by one per message of this key and sender; a gap is a loss.
-        boot: Random number of the sending process; another one means it was restarted.
+        seq: Number of the message of this key and sender; a gap is a loss.
+        boot: Random number of the sending process; it changes when the process restarts.
     """
 
     TYPE: ClassVar[str]
@@ -45,23 +45,23 @@ class Message(msgspec.Struct, frozen=True, kw_only=True, tag_field="type", tag=s
 
     @classmethod
     def of(cls, record: "hal.Sample | hal.Applied", **more: Any) -> Self:
-        """Make the message of a record of the HAL, whose fields have the same names; `more` are the others."""
+        """Make a message from a record of the HAL, whose fields have the same names, and from `more` fields."""
         return cls(**{name: getattr(record, name) for name in record.__slots__}, **more)
 
 
 class OfSignals(Message, frozen=True, kw_only=True):
-    """A message that tells several things of the same signals. One array per signal is taken too, and joined.
+    """A message with several fields for the same signals. A field is one array; a map of one per signal is joined.
 
     Attributes:
-        elements: Signal -> how many elements it has, in the order in which they lie in the arrays.
+        elements: Signal -> number of its elements, in the order of the arrays.
     """
 
     BY_ELEMENT: ClassVar[tuple[tuple[str, type[BySignal]], ...]] = ()
-    """Fields that have a value for each element."""
+    """These fields have a value for each element."""
     BY_SIGNAL: ClassVar[tuple[str, ...]] = ()
-    """Fields that have one for each signal."""
+    """These fields have a value for each signal."""
     parts: ClassVar[tuple[tuple[str, type[BySignal], np.dtype[Any], int], ...]] = ()
-    """`BY_ELEMENT`, how their numbers lie in memory, and how many bytes each has."""
+    """These are the `BY_ELEMENT` with the dtype and the bytes of one value."""
     elements: WireElements = NOTHING
 
     def __init_subclass__(cls, **_: Any) -> None:
@@ -77,8 +77,8 @@ class OfSignals(Message, frozen=True, kw_only=True):
                 raise ValueError(f"Expected the same signals in '{name}' as in 'elements'")
 
     def _read(self, counts: bytes) -> None:
-        """Make of what came from the wire what it stands for; nobody can write into the arrays."""
-        elements = _read_before.get(counts) or _read_elements(counts)
+        """Replace the fields in wire form by read-only arrays."""
+        elements = _known_elements.get(counts) or _read_elements(counts)
         force_setattr(self, "elements", elements)
         size = elements.size
         for name, kind, dtype, width in self.parts:
@@ -94,12 +94,12 @@ class OfSignals(Message, frozen=True, kw_only=True):
         """Make one array of a field that has one per signal."""
         elements = self.elements
         for name, kind in self.BY_ELEMENT:
-            found: BySignal | bytes = getattr(self, name)
-            if isinstance(found, bytes):
-                raise ValueError(f"Expected a map 'elements', which tells whose the elements in '{name}' are")
-            if type(found) is not kind or found.elements is not elements:
+            values: BySignal | bytes = getattr(self, name)
+            if isinstance(values, bytes):
+                raise ValueError(f"Expected a map 'elements' with the signals of '{name}'")
+            if type(values) is not kind or values.elements is not elements:
                 try:
-                    joined = kind.of(found, elements if elements.size else None)
+                    joined = kind.of(values, elements if elements.size else None)
                 except ValueError as error:
                     raise ValueError(f"{error} in '{name}'") from None
                 elements = joined.elements
@@ -107,20 +107,20 @@ class OfSignals(Message, frozen=True, kw_only=True):
                 force_setattr(self, "elements", elements)
 
 
-_read_before: dict[bytes, Elements] = {}
-"""Some elements by their bytes on the wire."""
+_known_elements: dict[bytes, Elements] = {}
+"""This cache holds elements by their wire form."""
 
 
 def _read_elements(wire: bytes) -> Elements:
     counts = msgspec.msgpack.decode(wire)
     if not isinstance(counts, dict):
         raise ValueError("Expected a map from signal to its number of elements in 'elements'")
-    found = Elements.of(counts)
-    if len(_read_before) >= KEPT:
-        _read_before.clear()
+    elements = Elements.of(counts)
+    if len(_known_elements) >= KEPT:
+        _known_elements.clear()
     if len(wire) <= LONGEST:
-        _read_before[wire] = found
-    return found
+        _known_elements[wire] = elements
+    return elements
 
 
 def _misfit(name: str, length: int, width: int, size: int) -> str:
@@ -154,14 +154,14 @@ class Sample(OfSignals, frozen=True, kw_only=True):
 
 
 class Command(Message, frozen=True, kw_only=True):
-    """What is desired of the drives.
+    """Desired values of the drives.
 
     Attributes:
         signal: The commanded signal.
         values: Desired values [its unit], shape (n,).
-        cycle: `Sample.cycle` that the command answers; the HAL takes the command's age from it, on its own clock.
+        cycle: `Sample.cycle` that the command answers; the HAL computes the command's age from it, on its own clock.
         hal_boot: `Sample.boot` of that sample.
-        name: Who commands, for people; only the first that begins a stream needs it.
+        name: Name of the client, for people; only the first command of a stream needs it.
     """
 
     TYPE: ClassVar[str] = "command"
@@ -173,13 +173,13 @@ class Command(Message, frozen=True, kw_only=True):
 
 
 class Holder(Message, frozen=True, kw_only=True):
-    """Who commands the robot.
+    """The holder of the lease, the client that commands the robot.
 
     Attributes:
-        name: For people; empty if nobody commands.
-        holder: `boot` of who commands; 0 if nobody does.
-        through: `boot` of the service that commands for the holder; 0 if it does so itself.
-        left: How long [s] the lease still runs.
+        name: Name for people; empty without a holder.
+        holder: `boot` of the holder; 0 without one.
+        through: `boot` of the service that commands for the holder; 0 if the holder does so itself.
+        left: Remaining time of the lease [s].
     """
 
     TYPE: ClassVar[str] = "holder"
@@ -190,15 +190,15 @@ class Holder(Message, frozen=True, kw_only=True):
 
 
 class Applied(Message, frozen=True, kw_only=True):
-    """What was really sent to the drives in a cycle.
+    """The set-points that were sent to the drives in a cycle.
 
     Attributes:
         cycle: The HAL's cycle number.
         mode: `off`, `enabling`, `hold`, `follow`, `homing`, `stopping` or `fault`.
         signal: The commanded signal.
-        desired: Newest accepted command [its unit], shape (n,); NaN if none is alive.
+        desired: Newest accepted command [its unit], shape (n,); NaN without a current one.
         values: Applied set-points [its unit], shape (n,); NaN while off.
-        limited_by: Which limits acted (`acceleration`, `effort`, `range`, `rate`, `tension`, `velocity`), sorted.
+        limited_by: Limits that acted (`acceleration`, `effort`, `range`, `rate`, `tension`, `velocity`), sorted.
         sender: `Command.boot` of the command that was followed; 0 if none.
     """
 
@@ -213,18 +213,18 @@ class Applied(Message, frozen=True, kw_only=True):
 
 
 class Estimates(OfSignals, frozen=True, kw_only=True):
-    """Every signal of the body, measured where it can be and estimated where it cannot.
+    """All signals of the body: measured values, and estimates of the elements that are not valid.
 
     Attributes:
-        cycle: `Sample.cycle` it was made from; -1 without a fresh sample.
+        cycle: `Sample.cycle` of its sample; -1 without a fresh sample.
         values: Signal -> measured values, with estimates in place of the elements that are not valid [unit];
             NaN where neither is possible.
-        estimated: Signal -> which elements were estimated, shape (n,).
+        estimated: Signal -> whether each element was estimated, shape (n,).
         std: Signal -> expected error of an estimate (1 sigma) [unit], shape (n,); 0 where measured, NaN where unknown.
         method: Signal -> `measured`, `mask`, `latent`, `input` or `none`.
         mask: Signal -> the signals it was estimated from, joined by `+`.
-        residual: Signal -> how badly the model explains what it was given, in standard deviations of the
-            training data (root mean square); 0 where measured.
+        residual: Signal -> error of the model on its own input (root mean square), in standard deviations of the
+            training data; 0 where measured.
     """
 
     TYPE: ClassVar[str] = "estimates"
@@ -242,17 +242,18 @@ class Estimates(OfSignals, frozen=True, kw_only=True):
 
 
 class Anomaly(OfSignals, frozen=True, kw_only=True):
-    """How unlike normal the body is.
+    """The deviation of the body from normal.
 
     Attributes:
-        cycle: `Sample.cycle` it was made from.
+        cycle: `Sample.cycle` of its sample.
         score: Mahalanobis distance (paper, II-K) of the prediction error; NaN without normal data.
         threshold: Score above which it counts as an anomaly.
-        is_anomaly: Score above threshold for as long as the robot file asks, and not for a change of environment.
-        blamed: `signal.element` that is most likely wrong over the samples above the threshold; below it, the one that
-            contributes most.
+        is_anomaly: Whether the score was above the threshold for as long as the robot file requires, and the cause is
+            not a change of environment.
+        blamed: `signal.element` that is most likely wrong in the samples above the threshold; below the threshold, the
+            one that contributes most.
         verdict: `normal`, `environment` (another condition of the body explains the samples above the threshold),
-            `anomaly` (none does), or empty while there is nothing to judge.
+            `anomaly` (no condition does), or empty before a verdict.
         contribution: Signal -> each element's part of score^2, shape (n,).
     """
 
@@ -268,17 +269,17 @@ class Anomaly(OfSignals, frozen=True, kw_only=True):
 
 
 class Update(Message, frozen=True, kw_only=True):
-    """What the online update does.
+    """The state of the online update.
 
     Attributes:
-        active: Whether it is engaged.
-        model_version: Counts up with every model that was swapped in.
-        window: Samples in the bounded window.
-        dropped: Oldest samples dropped so far.
+        active: Whether it is learning.
+        model_version: Number of the model in use; it grows with every swap.
+        window: Number of samples in the bounded window.
+        dropped: Number of samples dropped from it so far, oldest first.
         loss: Mean squared error over the window, in standard deviations of the training data.
         bias: The parametric bias p in use, shape (n,); empty without.
-        settled: Whether p is well known, so that W may follow.
-        rolled_back: How often W went back because it did worse on held-out samples.
+        settled: Whether p is well known, so that W may be updated.
+        rolled_back: Number of times W was restored because its error on held-out samples grew.
     """
 
     TYPE: ClassVar[str] = "update"
@@ -293,12 +294,12 @@ class Update(Message, frozen=True, kw_only=True):
 
 
 class Target(Message, frozen=True, kw_only=True):
-    """Where the controller shall bring the body.
+    """The target of the controller.
 
     Attributes:
         signal: Signal to reach, such as `joint_position`.
         values: Reference [its unit], shape (n,).
-        cycle: `Sample.cycle` of the newest sample that the sender had seen; a target older than a second is refused.
+        cycle: `Sample.cycle` of the newest sample that the sender had seen; a target older than 1 s is refused.
         hal_boot: `Sample.boot` of that sample.
     """
 
@@ -313,11 +314,11 @@ class Status(Message, frozen=True, kw_only=True):
     """Health of one service, once a second.
 
     Attributes:
-        service: Which service.
-        state: One word: `starting`, `ready`, `running`, `degraded`, `fault`, `stopping`.
-        text: One sentence for a person; empty when all is well.
+        service: Name of the service.
+        state: `starting`, `ready`, `running`, `degraded`, `fault`, `stopping`.
+        text: One sentence for the operator; empty when all is well.
         loops: Loop name -> rate_wanted, rate [Hz], late_p50, late_p99, late_max [s], ticks, skipped.
-        facts: Whatever else the service counts: devices, buses, controller, rejected messages.
+        facts: Other values of the service: devices, buses, controller, rejected messages.
     """
 
     TYPE: ClassVar[str] = "status"

@@ -1,4 +1,4 @@
-"""Who may do what, once and as data: the access control of every session and the checks of the client come from it.
+"""The rights of each role, as data: the access control of every session and the checks of the client come from it.
 
 Keys are those of docs/keys.md without `gemuco/<robot>/`; `*` stands for one part of a key, `**` for the rest.
 """
@@ -19,28 +19,28 @@ OPEN = (
     "simulator/truth",
     "*/status",
 )
-"""What everybody who is let in may see. What is commanded is not in it: that is for the robot and the recording."""
+"""Every role may subscribe to these. Commands are not among them: only the robot and the recorder read those."""
 READING = ("*/do/describe", "model/do/estimate", "model/do/anomaly", "model/do/history")
-"""Verbs that change nothing and compute little."""
+"""These verbs change nothing and compute little."""
 
 
 @dataclass(frozen=True, slots=True)
 class Role:
-    """What one role may do; whatever is not here is refused.
+    """The rights of one role; anything else is refused.
 
     Attributes:
         name: `hal`; in certificates and files with the robot's name behind it, `hal.musashi_arm`.
-        what: In words.
-        says: Keys that it publishes.
-        hears: Keys that it subscribes to; also what `alive` tokens it sees: all of its robots.
+        what: Description in words.
+        publishes: Keys that it publishes.
+        subscribes: Keys that it subscribes to. It sees the `alive` tokens of all its robots.
         asks: Verbs that it asks.
         is_service: Whether it is one of `keys.SERVICES`, and so answers verbs and is alive.
     """
 
     name: str
     what: str
-    says: tuple[str, ...] = ()
-    hears: tuple[str, ...] = ()
+    publishes: tuple[str, ...] = ()
+    subscribes: tuple[str, ...] = ()
     asks: tuple[str, ...] = ()
     is_service: bool = True
 
@@ -54,13 +54,13 @@ class Role:
         """Liveliness tokens that it may have."""
         return (f"{self.name}/alive",) if self.is_service else ()
 
-    def may_say(self, noun: str) -> bool:
+    def may_publish(self, noun: str) -> bool:
         """Whether it may publish `hal/command`."""
-        return _covers(self.says, noun)
+        return _covers(self.publishes, noun)
 
-    def may_hear(self, noun: str) -> bool:
+    def may_subscribe(self, noun: str) -> bool:
         """Whether it may subscribe to `model/estimate`."""
-        return _covers(self.hears, noun)
+        return _covers(self.subscribes, noun)
 
     def may_ask(self, service: str, verb: str) -> bool:
         """Whether it may ask a service's verb."""
@@ -68,10 +68,10 @@ class Role:
 
 
 def _service(
-    name: str, what: str, says: Iterable[str] = (), hears: Iterable[str] = (), asks: Iterable[str] = ()
+    name: str, what: str, publishes: Iterable[str] = (), subscribes: Iterable[str] = (), asks: Iterable[str] = ()
 ) -> Role:
-    """A service also tells its status, and asks another of its kind who that is before it starts beside it."""
-    return Role(name, what, (*says, f"{name}/status"), tuple(hears), (*asks, f"{name}/do/describe"))
+    """Make a service's role, which also publishes its status and asks a running service of its kind for `describe`."""
+    return Role(name, what, (*publishes, f"{name}/status"), tuple(subscribes), (*asks, f"{name}/do/describe"))
 
 
 ROUTER = "router"
@@ -89,7 +89,7 @@ ROLES = {
             [*OPEN, "model/target"],
             ["hal/do/*"],
         ),
-        _service("recorder", "writes everything down, and says nothing", hears=["**"], asks=["*/do/describe"]),
+        _service("recorder", "writes everything down, and says nothing", subscribes=["**"], asks=["*/do/describe"]),
         Role(
             "operator",
             "commands and asks anything",
@@ -98,18 +98,18 @@ ROLES = {
             tuple(f"{service}/do/*" for service in keys.SERVICES),
             is_service=False,
         ),
-        Role("viewer", "looks on", hears=OPEN, asks=READING, is_service=False),
+        Role("viewer", "looks on", subscribes=OPEN, asks=READING, is_service=False),
     )
 }
-"""All roles but the router, which passes on what the others may say and hear, and says nothing itself."""
+"""These are all roles but the router, which forwards the others' messages and publishes nothing itself."""
 
 RATES = {"hal/command": 1000.0, "model/target": 100.0}
-"""Messages per second that pass the router, by key; what is more is dropped."""
+"""The router passes this many messages per second by key, and drops the rest."""
 ASKED = 50.0
-"""Questions per second to each verb that computes; stop and the like are never limited."""
+"""The router passes this many queries per second to each verb of `COMPUTING`; stop and the like are never limited."""
 COMPUTING = ("describe", "estimate", "anomaly", "history", "control", "simulate")
 SIZES = {"hal/command": 8192, "model/target": 8192, "*/do/*": 1 << 18}
-"""Bytes that pass the router, by key."""
+"""The router passes messages up to this size [bytes], by key."""
 
 
 def _covers(patterns: Iterable[str], key: str) -> bool:
@@ -120,4 +120,4 @@ def _covers(patterns: Iterable[str], key: str) -> bool:
 def _includes(pattern: list[str], key: list[str]) -> bool:
     if pattern == ["**"]:
         return True
-    return len(pattern) == len(key) and all(one in ("*", part) for one, part in zip(pattern, key, strict=True))
+    return len(pattern) == len(key) and all(piece in ("*", part) for piece, part in zip(pattern, key, strict=True))

@@ -1,4 +1,4 @@
-"""Messages in and out: a publisher that numbers them, and a reader that keeps only the newest."""
+"""A publisher that numbers its messages, and a reader that keeps only the newest message."""
 
 import logging
 import math
@@ -17,16 +17,16 @@ log = logging.getLogger(__name__)
 
 
 def bind(session: zenoh.Session, key: str, record: type[Message]) -> zenoh.Publisher:
-    """A zenoh publisher for one type of message; it drops rather than blocks when a receiver is slow."""
+    """Declare a zenoh publisher for one type of message; it drops messages when a receiver is slow."""
     encoding = zenoh.Encoding("application/msgpack").with_schema(f"gemuco.{record.TYPE}.v{messages.VERSION}")
     return session.declare_publisher(key, encoding=encoding, congestion_control=zenoh.CongestionControl.DROP)
 
 
 def received_message(sample: zenoh.Sample, record: type[M]) -> M:
-    """The message of one type that came on a key.
+    """Decode a message of one type.
 
     Raises:
-        MessageError: It is none, or was put on many keys at once (`gemuco/arm/**`), which no honest sender does.
+        MessageError: It is malformed, or was put on many keys at once (`gemuco/arm/**`), which our programs never do.
     """
     if "*" in str(sample.key_expr):
         raise MessageError(f"A {record.TYPE} message was put on many keys at once: '{plain(str(sample.key_expr))}'.")
@@ -34,7 +34,7 @@ def received_message(sample: zenoh.Sample, record: type[M]) -> M:
 
 
 class Publisher(Generic[M]):
-    """Publishes messages of one type on one key, numbered, and marked with the process's `boot`."""
+    """A publisher of one type of message on one key. It numbers them and marks them with the process's `boot`."""
 
     def __init__(self, session: zenoh.Session, key: str, record: type[M], boot: int) -> None:
         self.boot = boot
@@ -48,34 +48,34 @@ class Publisher(Generic[M]):
 
     @property
     def has_listener(self) -> bool:
-        """Whether anybody subscribes to the key right now."""
-        status: Any = self._publisher.matching_status  # zenoh's stub says bool, which it is not: it is always true
+        """Whether the key has a subscriber right now."""
+        status: Any = self._publisher.matching_status  # zenoh's stub says bool; it is an object, which is always true
         return bool(status.matching)
 
 
 class Transit:
-    """How much longer than usual a message was on its way.
+    """The delay of messages beyond the shortest delay seen.
 
-    A process or a link that stood still for a moment gets what piled up meanwhile, and its time of arrival alone would
-    make that look fresh. How far the sender's wall clock is from our monotonic one is not known, but the least
-    difference stands for the shortest way; whatever a message has on top is delay. A link that becomes slower for good
-    therefore makes all late for long: nobody can tell that from old messages. Only a wall clock that is seen to go
-    back starts anew; set back during a silence, it looks like such a link.
+    After a pause of the process or the link, queued messages arrive together and would look fresh by their time of
+    arrival. The offset between the sender's wall clock and our monotonic clock is unknown, but the least difference
+    belongs to the shortest delay, and any excess over it is delay. If a link becomes slower permanently, all messages
+    count as late for a long time, because they look like old messages. A sender's clock that is seen to go back
+    restarts the estimate; a clock set back during a silence looks like a slower link.
     """
 
     DRIFT = 1e-3
-    """How fast [s/s] the least difference is forgotten: twice as fast as a clock is slewed, for clocks drift apart."""
+    """The least difference grows by this rate [s/s], twice the slew rate of a clock, because clocks drift apart."""
 
     def __init__(self) -> None:
         self._stamp_ns, self._now, self._least = 0, -math.inf, math.inf
 
     def delay(self, stamp_ns: int, now: float) -> float:
-        """Delay [s] of a message with this stamp (sender's wall clock [ns]) that arrives now (monotonic [s])."""
+        """Return the delay [s] of a message that arrives now (monotonic [s]); its stamp is the sender's clock [ns]."""
         if stamp_ns == 0:
             return 0.0
         difference = (round(now * 1e9) - stamp_ns) * 1e-9
-        forgotten = self._least if math.isinf(self._least) else self._least + self.DRIFT * (now - self._now)
-        self._least = difference if stamp_ns < self._stamp_ns else min(difference, forgotten)
+        drifted = self._least if math.isinf(self._least) else self._least + self.DRIFT * (now - self._now)
+        self._least = difference if stamp_ns < self._stamp_ns else min(difference, drifted)
         self._stamp_ns, self._now = stamp_ns, now
         return difference - self._least
 
@@ -85,8 +85,8 @@ class Arrival(NamedTuple, Generic[M]):
 
     Attributes:
         message: The message as it was sent.
-        received: Time of arrival, without its delay on the way [monotonic s of this process]; ages count from here, for
-            the clocks of two machines are never compared.
+        received: Time of arrival less its delay [monotonic s of this process]. Ages count from here, because the clocks
+            of two machines are never compared.
     """
 
     message: M
@@ -94,17 +94,17 @@ class Arrival(NamedTuple, Generic[M]):
 
 
 class Reader(Generic[M]):
-    """A subscriber that keeps the newest message of a key, and its time of arrival.
+    """A subscriber that keeps the newest message of a key and its time of arrival.
 
-    A thread takes messages from a ring of one, so a slow user never delays the session, and never reads old messages
-    one by one. Bytes that are not the message they should be are counted and dropped. Ends with the session.
+    A thread takes messages from a ring of one, so a slow user neither delays the session nor reads old messages one by
+    one. Malformed messages are counted and dropped. The thread ends with the session.
 
     Args:
         session: An open session.
-        key: What to subscribe to.
-        record: What comes there.
-        clock: What time it is.
-        arrived: What to notify of a message; readers that share one can be waited for together.
+        key: Key to subscribe to.
+        record: Type of its messages.
+        clock: Source of time.
+        arrived: Notified of each message; one wait can cover all readers that share it.
     """
 
     def __init__(
@@ -117,11 +117,11 @@ class Reader(Generic[M]):
     ) -> None:
         self.key = key
         self.rejected = 0
-        """Messages that were dropped because they could not be read."""
+        """This is the number of malformed messages, which were dropped."""
         self.rejected_text = ""
-        """Why the last one could not be read."""
+        """This is the error of the last of them."""
         self.has_ended = False
-        """Whether the session was closed."""
+        """This is True once the session was closed."""
         self.arrived = arrived or threading.Condition()
         self._record = record
         self._clock = clock or SystemClock()
@@ -132,20 +132,20 @@ class Reader(Generic[M]):
         self._thread.start()
 
     def get(self, max_age: float) -> M | None:
-        """The newest message if it arrived, or would have without delay, at most `max_age` [s] ago, else None."""
+        """Return the newest message if it is at most `max_age` [s] old, counted from `Arrival.received`, else None."""
         newest = self._newest
         if newest is None or self._clock.monotonic() - newest.received > max_age:
             return None
         return newest.message
 
     def last(self) -> Arrival[M] | None:
-        """Return the newest message, however old; None before the first."""
+        """Return the newest message of any age; None before the first."""
         return self._newest
 
     def other_version(self, max_age: float) -> str:
-        """What is wrong with the newest message if it is of another version and came at most `max_age` [s] ago."""
-        found = self._other_version
-        return "" if found is None or self._clock.monotonic() - found[0] > max_age else found[1]
+        """Return the error of a newest message of another version that came at most `max_age` [s] ago, else ""."""
+        newest = self._other_version
+        return "" if newest is None or self._clock.monotonic() - newest[0] > max_age else newest[1]
 
     def wait(self, timeout: float) -> M | None:
         """Wait for the next message to arrive; None if none does within `timeout` [s]."""
@@ -153,13 +153,13 @@ class Reader(Generic[M]):
         return None if arrival is None else arrival.message
 
     def newer(self, than: Arrival[M] | None, timeout: float | None) -> Arrival[M] | None:
-        """Wait until `last()` is another one than this; None if `timeout` [s] passes or the session ends first."""
+        """Wait until `last()` is not `than`; None if `timeout` [s] passes or the session ends first."""
         with self.arrived:
             self.arrived.wait_for(lambda: self._newest is not than or self.has_ended, timeout)
             return None if self._newest is than else self._newest
 
     def join(self, timeout: float) -> None:
-        """Wait until the thread has ended, after the session was closed, at most `timeout` [s]."""
+        """Wait at most `timeout` [s] for the thread to end after the session was closed."""
         self._thread.join(timeout)
 
     def _receive(self) -> None:
@@ -176,7 +176,7 @@ class Reader(Generic[M]):
             try:
                 message = received_message(sample, self._record)
                 received -= transit.delay(message.stamp_ns, received)
-            except Exception as error:  # whatever it is, the next message is to be read
+            except Exception as error:  # any error: the thread must go on to the next message
                 self.rejected += 1
                 self.rejected_text = str(error)
                 if isinstance(error, OtherVersion):

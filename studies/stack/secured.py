@@ -14,7 +14,7 @@ from services.process.router import router_settings
 from services.security.init import init, placed, planned
 from services.wire import keys
 from services.wire.query import serve_verb
-from services.wire.session import CLIENT, address, close_session, open_session, opened
+from services.wire.session import CLIENT, address, close_session, open_session, open_with
 
 ROBOT = "benchmark_secured"
 
@@ -23,7 +23,7 @@ def round_trips(
     hal: tuple[str, ...], client: tuple[str, ...], router: tuple[str, ...], count: int
 ) -> tuple[float, ...]:
     """Return median and p99 [ms] of a verb, and the processor time [ms] that client, router and HAL take for one."""
-    sessions = [opened(router_settings((), router) if router else router_settings(), "the router")]
+    sessions = [open_with(router_settings((), router) if router else router_settings(), "the router")]
     try:
         sessions += [open_session(ROBOT, "hal", hal), open_session(ROBOT, CLIENT, client)]
         key = keys.verb(ROBOT, "hal", "describe")

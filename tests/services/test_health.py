@@ -17,7 +17,7 @@ from services.process import heartbeat
 from services.process.heartbeat import Heartbeat
 from services.process.loop import Loop
 from services.process.supervisor import gemuco_command
-from services.wire import doorbell
+from services.wire import probe
 
 
 @pytest.fixture(autouse=True)
@@ -206,9 +206,9 @@ def test_the_check_loads_nothing_that_takes_long() -> None:
 
 
 def test_a_door_behind_which_nobody_reads_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doorbell, "PATIENCE", 0.2)
-    with socket.create_server(("127.0.0.1", 0)) as deaf, pytest.raises(ServiceError, match="Nobody answers"):
-        doorbell.ring([f"tcp/127.0.0.1:{deaf.getsockname()[1]}"])
-    with pytest.raises(ServiceError, match="Nobody answers"):
-        doorbell.ring([f"quic/127.0.0.1:{free_port()}"])
-    doorbell.ring(["unixsock-stream//tmp/no", "serial//dev/no"])
+    monkeypatch.setattr(probe, "PATIENCE", 0.2)
+    with socket.create_server(("127.0.0.1", 0)) as deaf, pytest.raises(ServiceError, match="No answer at"):
+        probe.check_answers([f"tcp/127.0.0.1:{deaf.getsockname()[1]}"])
+    with pytest.raises(ServiceError, match="No answer at"):
+        probe.check_answers([f"quic/127.0.0.1:{free_port()}"])
+    probe.check_answers(["unixsock-stream//tmp/no", "serial//dev/no"])

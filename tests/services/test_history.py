@@ -155,7 +155,7 @@ def test_wrong_arguments_are_refused(arguments: dict[str, Any]) -> None:
 def test_a_service_that_was_started_anew_is_told_and_a_slow_one_too(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(history, "PAGE_BYTES", 1000)
     ring, boots = filled(1000), iter(range(100))
-    with pytest.raises(ServiceUnavailable, match="started anew while its history was read"):
+    with pytest.raises(ServiceUnavailable, match="restarted while its history was read"):
         fetch(lambda arguments, left: ring.answer(arguments, next(boots), 10.0), 5.0, (), 10.0)
 
     def slow(arguments: dict[str, Any], left: float) -> dict[str, Any]:
@@ -177,5 +177,5 @@ def test_a_client_gets_the_history(client: Client) -> None:
     found = client.history(1.0, ["joint_position"], timeout=20.0)
     assert found.values["joint_position"].shape == (100, 2)
     assert found.values["joint_position"][-1].tolist() == [5999.0, 5999.1]
-    with pytest.raises(BadArguments, match="must be names out of: joint_position, muscle_length"):
+    with pytest.raises(BadArguments, match="must be a list of these names: joint_position, muscle_length"):
         client.history(1.0, ["elbow"], timeout=20.0)

@@ -115,7 +115,7 @@ def test_half_an_identity_opens_nothing(secured: Secured, tmp_path: Path, part: 
         with Client(secured.robot, str(path)) as client:
             assert client.sample(timeout=1.0) is None
         return
-    with pytest.raises(NotAllowed, match=r"somebody is at quic/127\.0\.0\.1:\d+, and does not let it in"):
+    with pytest.raises(NotAllowed, match=r"quic/127\.0\.0\.1:\d+ refused it"):
         Client(secured.robot, str(path)).__enter__()
 
 

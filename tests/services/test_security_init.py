@@ -9,7 +9,7 @@ import pytest
 
 from services.errors import NotAllowed, ServiceError
 from services.security.init import CA_KEY, init, placed, planned
-from services.wire.entering import expiry, exposed, usable
+from services.wire.connect import expiry_warning, exposure_warning, with_password_file
 from services.wire.session import address, settings
 
 
@@ -28,7 +28,7 @@ def test_secrets_are_for_their_owner_only(tmp_path: Path) -> None:
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
     for path in [folder / CA_KEY, *folder.glob("*.json")]:
         assert stat.S_IMODE(path.stat().st_mode) == (0o644 if path.name == "plan.json" else 0o600)
-        assert not exposed(path) or path.name == "plan.json"
+        assert not exposure_warning(path) or path.name == "plan.json"
 
 
 def test_a_file_that_others_may_read_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -91,13 +91,13 @@ def test_a_role_file_is_for_its_robot_and_service(tmp_path: Path) -> None:
 
 def test_an_ending_certificate_is_told(tmp_path: Path) -> None:
     soon, late = made(tmp_path / "soon", "a", days=10), made(tmp_path / "late", "a")
-    assert "ends on" in expiry(json.loads((soon / "viewer.json").read_text()))
-    assert not expiry(json.loads((late / "viewer.json").read_text()))
+    assert "ends on" in expiry_warning(json.loads((soon / "viewer.json").read_text()))
+    assert not expiry_warning(json.loads((late / "viewer.json").read_text()))
 
 
 def test_passwords_reach_zenoh_without_a_file_on_disk(tmp_path: Path) -> None:
     found = json.loads((made(tmp_path / "keys", "a") / "router.json").read_text())
-    with usable(found) as taken:
+    with with_password_file(found) as taken:
         login = taken["transport"]["auth"]["usrpwd"]
         assert "dictionary" not in login and login["dictionary_file"].startswith("/proc/self/fd/")
         lines = Path(login["dictionary_file"]).read_text().splitlines()

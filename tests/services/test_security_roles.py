@@ -6,7 +6,7 @@ import pytest
 
 from services.errors import ServiceError
 from services.wire import keys
-from services.wire.member import Member, member_of, told_by
+from services.wire.member import Member, member_in, member_of
 from services.wire.roles import OPEN, ROLES
 
 _NOUNS = [
@@ -23,36 +23,36 @@ def _rest(key: str) -> str:
 @pytest.mark.parametrize("name", _NOUNS)
 def test_every_noun_of_the_key_space_has_somebody_who_says_it_and_one_who_hears_it(name: str) -> None:
     noun = _rest(getattr(keys, name)("r"))
-    assert [role for role in ROLES.values() if role.may_say(noun)]
-    assert [role for role in ROLES.values() if role.may_hear(noun) and role.name != "recorder"]
+    assert [role for role in ROLES.values() if role.may_publish(noun)]
+    assert [role for role in ROLES.values() if role.may_subscribe(noun) and role.name != "recorder"]
 
 
 def test_every_service_has_a_role_that_tells_its_status() -> None:
     for service in keys.SERVICES:
         role = ROLES[service]
-        assert role.may_say(f"{service}/status") and role.alive == (f"{service}/alive",)
-        assert [other for other in keys.SERVICES if role.may_say(f"{other}/status")] == [service]
+        assert role.may_publish(f"{service}/status") and role.alive == (f"{service}/alive",)
+        assert [other for other in keys.SERVICES if role.may_publish(f"{other}/status")] == [service]
 
 
 def test_only_who_may_commands() -> None:
-    assert [name for name, role in ROLES.items() if role.may_say("hal/command")] == ["model", "operator"]
-    assert [name for name, role in ROLES.items() if role.may_say("model/target")] == ["operator"]
+    assert [name for name, role in ROLES.items() if role.may_publish("hal/command")] == ["model", "operator"]
+    assert [name for name, role in ROLES.items() if role.may_publish("model/target")] == ["operator"]
     assert [name for name, role in ROLES.items() if role.may_ask("hal", "enable")] == ["model", "operator"]
     assert [name for name, role in ROLES.items() if role.may_ask("model", "engage")] == ["operator"]
 
 
 def test_a_viewer_sees_and_says_nothing() -> None:
     viewer = ROLES["viewer"]
-    assert all(viewer.may_hear(noun) for noun in OPEN)
-    assert not viewer.says and not viewer.answers and not viewer.alive
-    assert not viewer.may_hear("hal/command") and not viewer.may_hear("**")
+    assert all(viewer.may_subscribe(noun) for noun in OPEN)
+    assert not viewer.publishes and not viewer.answers and not viewer.alive
+    assert not viewer.may_subscribe("hal/command") and not viewer.may_subscribe("**")
     for verb in ("enable", "stop", "estop", "lease", "reset", "tare", "home", "release"):
         assert not viewer.may_ask("hal", verb)
 
 
 def test_who_has_no_role_file_may_everything(tmp_path: Path) -> None:
     nobody = member_of(["tcp/127.0.0.1:1"])
-    assert nobody == Member() and nobody.may_ask("r", "hal", "enable") and nobody.may_say("r", "hal/command")
+    assert nobody == Member() and nobody.may_ask("r", "hal", "enable") and nobody.may_publish("r", "hal/command")
     file = tmp_path / "plain.json"
     file.write_text("{}")
     assert member_of([str(file)]) == Member()
@@ -63,9 +63,9 @@ def test_a_role_is_for_its_robots(tmp_path: Path) -> None:
     file.write_text('{"metadata": {"gemuco": {"role": "operator", "robots": ["a"]}}}')
     operator = member_of([str(file)])
     assert operator.may_ask("a", "hal", "enable") and not operator.may_ask("b", "hal", "enable")
-    assert operator.may_say("a", "hal/command") and not operator.may_hear("b", "hal/sample")
-    assert Member("viewer", ("*",)).may_hear("b", "hal/sample")
-    assert not Member("gardener", ("*",)).may_hear("b", "hal/sample")
+    assert operator.may_publish("a", "hal/command") and not operator.may_subscribe("b", "hal/sample")
+    assert Member("viewer", ("*",)).may_subscribe("b", "hal/sample")
+    assert not Member("gardener", ("*",)).may_subscribe("b", "hal/sample")
 
 
 @pytest.mark.parametrize("told", ['"viewer"', '{"role": 1, "robots": []}', '{"role": "viewer"}'])
@@ -77,7 +77,7 @@ def test_metadata_that_says_no_role_is_told(tmp_path: Path, told: str) -> None:
 
 
 def test_no_metadata_is_no_role() -> None:
-    assert told_by({}) == Member() and told_by({"metadata": {"other": 1}}) == Member()
+    assert member_in({}) == Member() and member_in({"metadata": {"other": 1}}) == Member()
 
 
 def test_the_documents_table_is_the_table() -> None:
@@ -85,6 +85,6 @@ def test_the_documents_table_is_the_table() -> None:
     for role in ROLES.values():
         row = next(line for line in text.splitlines() if line.startswith(f"| {role.name}: "))
         cells = row.split("|")[2:5]
-        for names, cell in zip((role.says, role.hears, role.asks), cells, strict=True):
+        for names, cell in zip((role.publishes, role.subscribes, role.asks), cells, strict=True):
             told = set(re.findall(r"`([^`]+)`", cell)) | (set(OPEN) if "*open*" in cell else set())
             assert told == set(names)

@@ -9,7 +9,16 @@ import pytest
 
 from services.errors import ServiceError
 from services.wire import keys
-from services.wire.session import LEASE_MS, address, close_session, endpoint, open_session, open_to_all, port, settings
+from services.wire.session import (
+    LEASE_MS,
+    address,
+    close_session,
+    endpoint,
+    open_session,
+    port,
+    settings,
+    unsecured_endpoints,
+)
 
 
 def test_ports_are_the_robots_own_and_below_the_ephemeral_range() -> None:
@@ -76,7 +85,7 @@ def test_a_bad_role_file_is_told(tmp_path: Path, text: str | None, says: str) ->
 )  # fmt: skip
 def test_what_listens_elsewhere_without_security_is_known(listen: str, mutual: bool, is_open: bool) -> None:
     link = {"link": {"tls": {"enable_mtls": mutual}}}
-    assert bool(open_to_all({"listen": {"endpoints": [listen]}, "transport": link})) is is_open
+    assert bool(unsecured_endpoints({"listen": {"endpoints": [listen]}, "transport": link})) is is_open
 
 
 def test_nothing_leaves_the_machine_by_default() -> None:
