@@ -80,7 +80,7 @@ def _note_mit(book: Book, node: int, settings: Any) -> None:
 
 
 def _asked(data: bytes, ranges: Ranges) -> str:
-    asked = mit.asked(data, ranges)
+    asked = mit.parse_command(data, ranges)
     if asked is None:
         return "malformed"
     if isinstance(asked, mit.Special):
@@ -98,7 +98,7 @@ def _answers(node: int, layout: Layout, ranges: Ranges, others: Explain | None) 
     def explain(data: bytes) -> tuple[int | None, str]:
         if (not data or data[0] & mask != node & mask) and others is not None:
             return others(data)
-        found = mit.answer(data, layout, ranges)
+        found = mit.parse_answer(data, layout, ranges)
         if found is None:
             return node, "malformed"
         if found.node != node & mask:

@@ -12,30 +12,31 @@ Sources, besides those of the motors (`hal.protocols.mit_motors`):
         unit of the timeout also in wiki.seeedstudio.com/damiao_series, "CAN Timeout".
 
 Numbers are fractions of a range -r..r (gains 0..r) in 16 or 12 bits: value = low + counts * span / (2^bits - 1). The
-firmware and all published hosts make counts by cutting off (`math_ops.c: float_to_uint` casts to int). We take the
-nearest, half a count downwards, which is never further off, gives 7FFFh and 7FFh for zero as they do, and gives back
-the very counts that a value was read from. (Page 51 of the CubeMars manual multiplies with 2^bits instead, by which
-the largest value would overflow to the smallest; its own way back divides by 2^bits - 1.)
+firmware and all published hosts truncate to counts (`math_ops.c: float_to_uint` casts to int). We round to the nearest
+count, half a count downwards. This is never less exact, gives 7FFFh and 7FFh for zero as truncation does, and
+reproduces the counts from which a value was read. (Page 51 of the CubeMars manual multiplies by 2^bits instead, which
+would overflow the largest value to the smallest; its inverse divides by 2^bits - 1.)
 """
 
 import math
 import struct
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
+from typing import NamedTuple
 
 NODES = 0x7FF
 """Largest id of a drive."""
 COMMAND_LAYOUT = struct.Struct(">Q")
 """Position 16, velocity 12, stiffness 12, damping 12, torque 12 bits, most significant first."""
 POSITION_TOP, TOP = 2**16 - 1, 2**12 - 1
-"""Largest counts of a position, and of everything else."""
+"""Largest counts of a position, and of all other values."""
 T_MOTOR_COLDEST = -40
-"""[degrees Celsius] at count 0 in an answer of T-Motor."""
+"""Temperature [degrees Celsius] at count 0 in an answer of T-Motor."""
 _PREFIX = b"\xff" * 7
 
 
 class Layout(StrEnum):
-    """Who packed an answer."""
+    """The layout of an answer, which depends on the maker."""
 
     MINI_CHEETAH = "mini_cheetah"
     """id, position, velocity, current; a seventh byte with the bus voltage in newer firmware."""
@@ -53,22 +54,22 @@ class Special(IntEnum):
     """Last byte of a frame whose other seven are FFh."""
 
     CLEAR = 0xFB
-    """Forget the fault; Damiao only."""
+    """Clear the fault; Damiao only."""
     ENTER = 0xFC
-    """Power on: follow the frames that come."""
+    """Power on and follow commands."""
     EXIT = 0xFD
-    """Power off; answered like any frame, so that a drive without power can be asked where it is."""
+    """Power off. It is answered like any frame, so a drive without power can be asked for its position."""
     ZERO = 0xFE
-    """The position now is zero."""
+    """Set the present position to zero."""
 
 
 class Register(IntEnum):
-    """Registers of Damiao drives that matter here."""
+    """Registers of Damiao drives that the driver uses."""
 
     MASTER_ID = 7
     NODE_ID = 8
     TIMEOUT = 9
-    """Without a frame for so long the drive powers off with error Dh; 0: never."""
+    """After this time without a frame the drive powers off with error Dh; 0: never."""
     MODE = 10
     SERIAL = 15
     POSITION_RANGE = 21
@@ -77,16 +78,16 @@ class Register(IntEnum):
 
 
 REGISTERS = 0x7FF
-"""Identifier under which registers of all Damiao drives are asked for."""
+"""Identifier of register requests to all Damiao drives."""
 TIMEOUT_UNIT = 50e-6
-"""[s] in register 9."""
+"""Unit of register 9 [s]."""
 MIT_MODE = 1
 """Value of register 10."""
 _READ, _WRITE = 0x33, 0x55
 _REGISTER_LAYOUT = struct.Struct("<HBB4s")
 
 ENABLED, DISABLED = 1, 0
-"""States in an answer of Damiao; what is above 1 is an error."""
+"""States in an answer of Damiao; a value above 1 is an error."""
 _T_MOTOR_ERRORS = {
     1: "the motor is too hot",
     2: "overcurrent",
@@ -108,14 +109,14 @@ _DAMIAO_ERRORS = {
 
 @dataclass(frozen=True, slots=True)
 class Ranges:
-    """What the largest counts mean; position, velocity and torque go from -range to range, gains from 0.
+    """Values at the largest counts. Position, velocity and torque range from -r to r, gains from 0 to r.
 
     Attributes:
-        position: [rad] at the motor's output.
-        velocity: [rad/s].
-        effort: [N m].
-        stiffness: kp [N m/rad].
-        damping: kd [N m s/rad].
+        position: Position of the motor's output [rad].
+        velocity: Velocity [rad/s].
+        effort: Torque [N m].
+        stiffness: Stiffness kp [N m/rad].
+        damping: Damping kd [N m s/rad].
     """
 
     position: float
@@ -125,16 +126,15 @@ class Ranges:
     damping: float = 5.0
 
 
-@dataclass(frozen=True, slots=True)
-class Command:
-    """What a drive is asked: torque = stiffness * (position - p) + damping * (velocity - v) + effort.
+class Command(NamedTuple):
+    """A command to a drive: torque = stiffness * (position - p) + damping * (velocity - v) + effort.
 
     Attributes:
-        position: [rad].
-        velocity: [rad/s].
-        stiffness: [N m/rad].
-        damping: [N m s/rad].
-        effort: [N m].
+        position: Position [rad].
+        velocity: Velocity [rad/s].
+        stiffness: Stiffness [N m/rad].
+        damping: Damping [N m s/rad].
+        effort: Torque [N m].
     """
 
     position: float
@@ -146,16 +146,16 @@ class Command:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What a drive tells.
+    """An answer of a drive.
 
     Attributes:
-        node: Its id; of Damiao only the lower four bits.
-        state: Damiao: 0 disabled, 1 enabled, above an error. Else the error; 0 if none, or if it does not tell.
-        position: [rad]; NaN at the ends of the range, where it may be anything beyond.
-        velocity: [rad/s]; NaN at the ends of the range.
-        effort: [N m]; NaN at the ends of the range.
-        temperature: Of the rotor [degrees Celsius]; NaN if it does not tell.
-        temperature_driver: Of the driver [degrees Celsius]; NaN if it does not tell.
+        node: Its id; for Damiao only the lower four bits.
+        state: Damiao: 0 disabled, 1 enabled, above 1 an error. Others: the error; 0 if none or not reported.
+        position: Position [rad]; NaN at the ends of the range, beyond which it cannot be measured.
+        velocity: Velocity [rad/s]; NaN at the ends of the range.
+        effort: Torque [N m]; NaN at the ends of the range.
+        temperature: Temperature of the rotor [degrees Celsius]; NaN if not reported.
+        temperature_driver: Temperature of the driver [degrees Celsius]; NaN if not reported.
     """
 
     node: int
@@ -169,11 +169,11 @@ class Answer:
 
 @dataclass(frozen=True, slots=True)
 class RegisterAnswer:
-    """A register of a Damiao drive as it was read or written.
+    """The answer to reading or writing a register of a Damiao drive.
 
     Attributes:
         node: The drive's id.
-        register: Which register; may be one that `Register` does not have.
+        register: Number of the register, which may be missing in `Register`.
         data: Its four bytes.
     """
 
@@ -183,34 +183,28 @@ class RegisterAnswer:
 
     @property
     def integer(self) -> int:
-        """The value of a register that holds an unsigned integer."""
+        """Value of a register that holds an unsigned integer."""
         return int.from_bytes(self.data, "little")
 
     @property
     def real(self) -> float:
-        """The value of a register that holds a float."""
+        """Value of a register that holds a float."""
         return float(struct.unpack("<f", self.data)[0])
 
 
 def to_counts(value: float, low: float, high: float, top: int) -> int:
-    """Nearest counts 0..top for a value, clipped to low..high; half a count goes down."""
+    """Return the nearest counts 0..top of a value, clipped to low..high; half a count is rounded down."""
     return math.ceil((min(max(value, low), high) - low) * top / (high - low) - 0.5)
 
 
 def special(code: Special) -> bytes:
-    """A frame that changes a drive's state."""
+    """Return the data of a frame that changes a drive's state."""
     return _PREFIX + bytes((code,))
 
 
-def command(asked: Command, ranges: Ranges) -> bytes:
-    """The frame that asks a drive."""
-    return COMMAND_LAYOUT.pack(
-        pack(asked.position, asked.velocity, asked.stiffness, asked.damping, asked.effort, ranges)
-    )
-
-
-def pack(position: float, velocity: float, stiffness: float, damping: float, effort: float, ranges: Ranges) -> int:
-    """The 64 bits of a command, without the record; see `Command`."""
+def pack(command: Command, ranges: Ranges) -> int:
+    """Return the 64 bits of a command, to be packed by `COMMAND_LAYOUT`."""
+    position, velocity, stiffness, damping, effort = command
     return (
         to_counts(position, -ranges.position, ranges.position, POSITION_TOP) << 48
         | to_counts(velocity, -ranges.velocity, ranges.velocity, TOP) << 36
@@ -220,8 +214,8 @@ def pack(position: float, velocity: float, stiffness: float, damping: float, eff
     )
 
 
-def asked(data: bytes | bytearray, ranges: Ranges) -> Command | Special | None:
-    """What a frame to a drive asks; None if it is not eight bytes long."""
+def parse_command(data: bytes | bytearray, ranges: Ranges) -> Command | Special | None:
+    """Parse a frame to a drive; None if it is not eight bytes long."""
     if len(data) != 8:
         return None
     if data[:7] == _PREFIX and data[7] in Special.__members__.values():
@@ -237,13 +231,13 @@ def asked(data: bytes | bytearray, ranges: Ranges) -> Command | Special | None:
 
 
 def counts(data: bytes | bytearray) -> tuple[int, int, int]:
-    """Counts of position, velocity and torque in an answer of any layout, whose length was checked."""
+    """Return the counts of position, velocity and torque in an answer of any layout; check its length before."""
     bits = int.from_bytes(data[1:6], "big")
     return bits >> 24, bits >> 12 & TOP, bits & TOP
 
 
-def answer(data: bytes | bytearray, layout: Layout, ranges: Ranges) -> Answer | None:
-    """What a drive tells; None if its length is wrong."""
+def parse_answer(data: bytes | bytearray, layout: Layout, ranges: Ranges) -> Answer | None:
+    """Parse an answer of a drive; None if its length is wrong."""
     if len(data) not in SIZES[layout]:
         return None
     position, velocity, effort = counts(data)
@@ -264,26 +258,26 @@ def _symmetric(count: int, end: float, top: int) -> float:
 
 
 def describe_error(state: int, layout: Layout) -> str:
-    """An error code in words."""
-    known = _DAMIAO_ERRORS if layout is Layout.DAMIAO else _T_MOTOR_ERRORS
-    return f"error {state:X}h, {known[state]}" if state in known else f"error {state:X}h, which is not documented"
+    """Return an error code in words."""
+    errors = _DAMIAO_ERRORS if layout is Layout.DAMIAO else _T_MOTOR_ERRORS
+    return f"error {state:X}h, {errors.get(state, 'which is not documented')}"
 
 
 def read_register(node: int, register: Register) -> bytes:
-    """The frame under `REGISTERS` that asks for a register."""
+    """Return the data of a frame under `REGISTERS` that reads a register."""
     return _REGISTER_LAYOUT.pack(node, _READ, register, bytes(4))
 
 
 def write_register(node: int, register: Register, value: int) -> bytes:
-    """The frame under `REGISTERS` that sets a register until power is lost."""
+    """Return the data of a frame under `REGISTERS` that sets a register until the drive loses power."""
     return _REGISTER_LAYOUT.pack(node, _WRITE, register, value.to_bytes(4, "little"))
 
 
-def register_answer(data: bytes | bytearray, node: int) -> RegisterAnswer | None:
-    """A register's value, if this frame from `node` is not an ordinary answer.
+def parse_register(data: bytes | bytearray, node: int) -> RegisterAnswer | None:
+    """Parse the answer to a register request; None for an ordinary answer of drive `node`.
 
-    Both share an identifier. An ordinary answer looks like this one only from a disabled drive within 0.4 % of the
-    lower end of its range.
+    Both have the same identifier. An ordinary answer can be mistaken for this one only if the drive is disabled and
+    within 0.4 % of the lower end of its range.
     """
     if len(data) != 8 or data[2] not in (_READ, _WRITE) or data[0] | data[1] << 8 != node:
         return None

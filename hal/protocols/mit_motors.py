@@ -1,8 +1,8 @@
-"""Ranges of motors in MIT mode: what the largest counts of their frames mean.
+"""Ranges of motors in MIT mode: the values at the largest counts of their frames.
 
-A wrong range is a wrong speed or torque that no frame tells. So every row names its source, and where sources disagree
-the note says which one was taken and why. Damiao drives are asked for their ranges when they are opened; the others
-cannot be asked: compare the row with the manual of your motor and its firmware, and override it in the robot file.
+A wrong range is a wrong speed or torque, and no frame shows it. So every row has its source, and a note where sources
+disagree. The driver reads the ranges of a Damiao drive on opening. Those of other drives cannot be read: compare the
+row with the manual of your motor and its firmware, and override it in the robot file.
 """
 
 from dataclasses import dataclass
@@ -31,10 +31,10 @@ class Motor:
     """A motor with its drive.
 
     Attributes:
-        ranges: Of its frames.
-        layout: Of its answers.
-        source: Where the ranges are from.
-        note: Where other sources say otherwise; empty if none was found.
+        ranges: Ranges of its frames.
+        layout: Layout of its answers.
+        source: Source of the ranges.
+        note: Other sources that disagree; empty if none is known.
     """
 
     ranges: Ranges
@@ -56,7 +56,7 @@ MOTORS: dict[str, Motor] = {
         Ranges(12.5, 65.0, 18.0),
         Layout.MINI_CHEETAH,
         MINI_CHEETAH,
-        "The firmware keeps its ranges in flash, and its torque is I_MAX * KT * GR of there: read them on its console.",
+        "The firmware keeps its ranges in flash; its torque is I_MAX * KT * GR from there: read them on its console.",
     ),
     "AK10-9": _t_motor(50.0, 65.0),
     "AK60-6": _t_motor(45.0, 15.0, f"50 rad/s in {_TMOTORCANCONTROL}; the maker's manual was taken."),
@@ -104,7 +104,7 @@ MOTORS: dict[str, Motor] = {
 
 
 def motor(name: str) -> Motor:
-    """A motor of the table.
+    """Return a motor of the table.
 
     Raises:
         ConfigError: It is not in the table.

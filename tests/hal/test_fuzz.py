@@ -42,9 +42,12 @@ PARSERS = {
     "cell status": lambda data: analog.describe_status(int.from_bytes(data[:1])),
     "encoder alarms": lambda data: cia406.describe_alarms(int.from_bytes(data[:2])),
     "error frame": lambda data: error_frame(int.from_bytes(data[:4]), data),
-    "MIT command": lambda data: mit.asked(data, RANGES),
-    "MIT register": lambda data: mit.register_answer(data, 5),
-    **{f"MIT answer of {layout}": lambda data, layout=layout: mit.answer(data, layout, RANGES) for layout in Layout},
+    "MIT command": lambda data: mit.parse_command(data, RANGES),
+    "MIT register": lambda data: mit.parse_register(data, 5),
+    **{
+        f"MIT answer of {layout}": lambda data, layout=layout: mit.parse_answer(data, layout, RANGES)
+        for layout in Layout
+    },
 }
 
 

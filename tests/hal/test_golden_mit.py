@@ -18,11 +18,15 @@ def hexed(data):
     return data.hex(" ").upper()
 
 
+def packed(command, ranges=AK80_9):
+    return hexed(mit.COMMAND_LAYOUT.pack(mit.pack(command, ranges)))
+
+
 @pytest.mark.parametrize("name", MOTORS)
 def test_zero_is_seven_ff(name):
     # (0 + r) * (2^n - 1) / 2r is 32767.5 and 2047.5; cut off or half a count down it is 7FFFh and 7FFh.
-    zero = mit.command(Command(0.0, 0.0, 0.0, 0.0, 0.0), MOTORS[name].ranges)
-    assert hexed(zero) == "7F FF 7F F0 00 00 07 FF"
+    zero = packed(Command(0.0, 0.0, 0.0, 0.0, 0.0), MOTORS[name].ranges)
+    assert zero == "7F FF 7F F0 00 00 07 FF"
 
 
 def test_special_frames():
@@ -36,23 +40,23 @@ def test_command_in_the_middle_of_everything():
     # position 1 rad: 13.5 * 65535 / 25 = 35388.9 -> 35389 = 8A3Dh; velocity -10: 40 * 4095 / 100 = 1638 = 666h
     # kp 100: 100 * 4095 / 500 = 819 = 333h; kd 1: 4095 / 5 = 819 = 333h; torque 9: 27 * 4095 / 36 = 3071.25 -> BFFh
     asked = Command(1.0, -10.0, 100.0, 1.0, 9.0)
-    assert hexed(mit.command(asked, AK80_9)) == "8A 3D 66 63 33 33 3B FF"
+    assert packed(asked) == "8A 3D 66 63 33 33 3B FF"
 
 
 def test_ends_of_every_field():
     top = Command(12.5, 50.0, 500.0, 5.0, 18.0)
-    assert hexed(mit.command(top, AK80_9)) == "FF FF FF FF FF FF FF FF"
+    assert packed(top) == "FF FF FF FF FF FF FF FF"
     bottom = Command(-12.5, -50.0, 0.0, 0.0, -18.0)
-    assert hexed(mit.command(bottom, AK80_9)) == "00 00 00 00 00 00 00 00"
+    assert packed(bottom) == "00 00 00 00 00 00 00 00"
 
 
 def test_what_does_not_fit_is_clipped_and_never_wraps():
     wild = Command(1e9, -1e9, 1e9, -1e9, 1e9)
-    assert hexed(mit.command(wild, AK80_9)) == "FF FF 00 0F FF 00 0F FF"
+    assert packed(wild) == "FF FF 00 0F FF 00 0F FF"
 
 
 def test_command_read_back():
-    read = mit.asked(bytes.fromhex("8A3D66633333 3BFF".replace(" ", "")), AK80_9)
+    read = mit.parse_command(bytes.fromhex("8A3D66633333 3BFF".replace(" ", "")), AK80_9)
     assert read == Command(
         pytest.approx(1.0, abs=25 / 65535),
         pytest.approx(-10.0),
@@ -60,8 +64,8 @@ def test_command_read_back():
         pytest.approx(1.0),
         pytest.approx(9.0, abs=36 / 4095),
     )
-    assert mit.asked(bytes.fromhex("FFFFFFFFFFFFFFFD"), AK80_9) is Special.EXIT
-    assert mit.asked(bytes.fromhex("FFFFFFFFFFFFFF"), AK80_9) is None
+    assert mit.parse_command(bytes.fromhex("FFFFFFFFFFFFFFFD"), AK80_9) is Special.EXIT
+    assert mit.parse_command(bytes.fromhex("FFFFFFFFFFFFFF"), AK80_9) is None
 
 
 def test_a_value_that_was_read_is_sent_back_as_the_same_counts():
@@ -74,7 +78,7 @@ def test_a_value_that_was_read_is_sent_back_as_the_same_counts():
 def test_answer_of_t_motor_with_temperature():
     # id 2; position 9000h = 36864: 36864 * 25 / 65535 - 12.5 = 1.5627; velocity 900h: 2304 * 100 / 4095 - 50 = 6.2637
     # torque 700h: 1792 * 36 / 4095 - 18 = -2.2462; temperature 46h = 70 - 40 = 30; error 2
-    answer = mit.answer(bytes.fromhex("0290009007004602"), Layout.T_MOTOR, AK80_9)
+    answer = mit.parse_answer(bytes.fromhex("0290009007004602"), Layout.T_MOTOR, AK80_9)
     assert answer == Answer(
         2,
         2,
@@ -89,16 +93,16 @@ def test_answer_of_t_motor_with_temperature():
 
 def test_answer_of_older_t_motor_and_of_mini_cheetah():
     short = bytes.fromhex("01 7FFF 7FF 7FF".replace(" ", ""))
-    answer = mit.answer(short, Layout.T_MOTOR, AK80_9)
+    answer = mit.parse_answer(short, Layout.T_MOTOR, AK80_9)
     assert (answer.node, answer.state) == (1, 0)
     assert answer.position == pytest.approx(-12.5 / 65535)  # half a count below zero: the firmware cuts off
     assert math.isnan(answer.temperature)
-    assert mit.answer(short + b"\x80", Layout.MINI_CHEETAH, AK80_9).position == answer.position
+    assert mit.parse_answer(short + b"\x80", Layout.MINI_CHEETAH, AK80_9).position == answer.position
 
 
 def test_answer_of_damiao():
     # D[0]: error Dh in the upper, id 5 in the lower four bits; driver 20h = 32, rotor 2Ah = 42 degrees
-    answer = mit.answer(bytes.fromhex("D5 4000 400 C00 20 2A".replace(" ", "")), Layout.DAMIAO, DM4310)
+    answer = mit.parse_answer(bytes.fromhex("D5 4000 400 C00 20 2A".replace(" ", "")), Layout.DAMIAO, DM4310)
     assert (answer.node, answer.state) == (5, 0xD)
     assert answer.position == pytest.approx(16384 * 25 / 65535 - 12.5)
     assert answer.velocity == pytest.approx(1024 * 60 / 4095 - 30)
@@ -109,7 +113,7 @@ def test_answer_of_damiao():
 
 @pytest.mark.parametrize("position", ["0000", "FFFF"])
 def test_a_value_at_the_end_of_its_range_is_not_known(position):
-    answer = mit.answer(bytes.fromhex(f"11 {position} 000 FFF 19 19".replace(" ", "")), Layout.DAMIAO, DM4310)
+    answer = mit.parse_answer(bytes.fromhex(f"11 {position} 000 FFF 19 19".replace(" ", "")), Layout.DAMIAO, DM4310)
     assert math.isnan(answer.position)
     assert math.isnan(answer.velocity)
     assert math.isnan(answer.effort)
@@ -118,7 +122,7 @@ def test_a_value_at_the_end_of_its_range_is_not_known(position):
 @pytest.mark.parametrize("layout", Layout)
 def test_answers_of_a_wrong_length(layout):
     for size in set(range(9)) - set(mit.SIZES[layout]):
-        assert mit.answer(bytes(size), layout, DM4310) is None
+        assert mit.parse_answer(bytes(size), layout, DM4310) is None
 
 
 def test_registers():
@@ -126,16 +130,16 @@ def test_registers():
     assert hexed(mit.read_register(5, Register.TIMEOUT)) == "05 00 33 09 00 00 00 00"
     assert hexed(mit.write_register(5, Register.TIMEOUT, 3000)) == "05 00 55 09 B8 0B 00 00"
     assert hexed(mit.write_register(0x123, Register.MODE, 1)) == "23 01 55 0A 01 00 00 00"
-    found = mit.register_answer(bytes.fromhex("0500330900000000"), 5)
+    found = mit.parse_register(bytes.fromhex("0500330900000000"), 5)
     assert (found.register, found.integer) == (Register.TIMEOUT, 0)
-    ranged = mit.register_answer(bytes.fromhex("0500331500004841"), 5)
+    ranged = mit.parse_register(bytes.fromhex("0500331500004841"), 5)
     assert (ranged.register, ranged.real) == (Register.POSITION_RANGE, 12.5)
 
 
 def test_an_ordinary_answer_is_no_register():
-    assert mit.register_answer(bytes.fromhex("0292557FF7FE1C1B"), 2) is None  # D[2] is 55h by chance
-    assert mit.register_answer(bytes.fromhex("1500331500004841"), 5) is None  # an enabled drive's
-    assert mit.register_answer(bytes.fromhex("050033090000"), 5) is None
+    assert mit.parse_register(bytes.fromhex("0292557FF7FE1C1B"), 2) is None  # D[2] is 55h by chance
+    assert mit.parse_register(bytes.fromhex("1500331500004841"), 5) is None  # an enabled drive's
+    assert mit.parse_register(bytes.fromhex("050033090000"), 5) is None
 
 
 def test_ranges_of_one_motor():

@@ -76,7 +76,7 @@ def test_a_forgotten_watchdog_is_found_before_there_is_power(bench):
     bench.cycle(2)
     bench.robot.enable()
     bench.until(lambda: bench.robot.mode == "fault", "refusal", 20)
-    assert "forgot its watchdog" in bench.robot.fault_text
+    assert "lost its watchdog setting" in bench.robot.fault_text
     assert not node(bench, "elbow").is_on
     bench.until(lambda: bench.states() == {"ready"}, "commissioned again")
     bench.robot.reset()

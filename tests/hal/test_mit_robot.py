@@ -59,7 +59,7 @@ def test_stiffness_grows_within_the_ramp(bench):
 def test_a_drive_that_remembers_a_command_is_not_moved_by_it():
     bench = mit_bench()
     bench.rig.step(0.0)
-    old = mit.command(mit.Command(-2.0, 0.0, 300.0, 1.0, 0.0), MOTORS["AK80-9"].ranges)
+    old = mit.COMMAND_LAYOUT.pack(mit.pack(mit.Command(-2.0, 0.0, 300.0, 1.0, 0.0), MOTORS["AK80-9"].ranges))
     for data in (mit.special(Special.ENTER), old):
         bench.wires["can0"].send(can.Message(arbitration_id=2, data=data, is_extended_id=False))
     bench.rig.step(0.0)

@@ -27,7 +27,6 @@ NOT_YET = {
     "hal/drivers/can_device.py",
     "hal/drivers/canopen",
     "hal/drivers/cia402",
-    "hal/drivers/mit",
     "hal/drivers/odrive.py",
     "hal/errors.py",
     "hal/finding",

@@ -1,6 +1,6 @@
 """A servo drive in MIT mode (T-Motor AK, Damiao DM, mini-cheetah) that turns a joint [rad] or winds a wire [m].
 
-It speaks only when spoken to: in every cycle it is sent a frame; without power that is a request to stay without.
+The drive only answers frames, so it is sent one in every cycle. Without power this frame is a request to stay so.
 """
 
 import contextlib
@@ -9,20 +9,21 @@ import threading
 
 import can
 import numpy as np
+from typing_extensions import override
 
 from hal.device import Check, DeviceState
 from hal.drivers.can_device import CanDevice, Place
-from hal.drivers.mit.law import Asked, Law
+from hal.drivers.mit.law import Law
 from hal.drivers.mit.registers import RegisterClient
 from hal.drivers.mit.settings import MitSettings
 from hal.errors import ConfigError, DeviceRefused, DeviceSilent
 from hal.protocols import mit
-from hal.protocols.mit import Layout, Register, Special
+from hal.protocols.mit import Command, Layout, Register, Special
 from hal.wire.bus import Bus, Handler
 
 
 class Replies:
-    """What listens to one identifier, under which each drive of one make says its id in the first byte."""
+    """The receiver of one identifier, under which each drive of one make sends its id in the first byte."""
 
     def __init__(self, bus: Bus, layout: Layout) -> None:
         self.layout = layout
@@ -32,10 +33,10 @@ class Replies:
 
     @classmethod
     def join(cls, place: Place, identifier: int, layout: Layout, handler: Handler) -> None:
-        """Have `handler` called with the answers of the drive at `place` under `identifier`.
+        """Call `handler` with the answers of the drive at `place` under `identifier`.
 
         Raises:
-            ConfigError: It can have no such id, or the answers of two devices could not be told apart.
+            ConfigError: The id is out of range, or the answers of two devices cannot be distinguished.
         """
         highest = 0xFF if layout is Layout.T_MOTOR else mit.NODES - 1
         if not 1 <= place.node <= highest:
@@ -48,13 +49,13 @@ class Replies:
         key = place.node & replies._mask
         if key in replies._handlers:
             raise ConfigError(
-                f"Two drives on bus '{bus.name}' answer under {identifier:03X}h with the id {key:X}h, and cannot be "
-                "told apart. Give one of them another `master_id` or node."
+                f"Two drives on bus '{bus.name}' answer under {identifier:03X}h with the id {key:X}h, so their answers "
+                "cannot be distinguished. Give one of them another `master_id` or node."
             )
         replies._handlers[key] = handler
 
     def __call__(self, data: bytearray, received: float) -> None:
-        """Pass a frame on; one of a drive that the robot file does not have is counted as unknown."""
+        """Pass a frame on; count it as unknown if the robot file does not have its drive."""
         handler = self._handlers.get(data[0] & self._mask) if data else None
         if handler is None:
             self._bus.counters["unknown"] += 1
@@ -63,41 +64,42 @@ class Replies:
 
 
 ANSWER_TIMEOUT = 0.05
-"""How long [s] an answer may take while the drive is opened."""
+"""While the drive is opened, a request is repeated after this time [s]."""
 TRIES = 4
 CONFIRMATIONS = 6
-"""After so many answers, one or two a cycle, a drive that does not tell its state is taken to have obeyed."""
+"""A drive that does not report its state counts as switched after this number of answers, one or two per cycle."""
 QUICK_STOP_TIME = 0.3
-"""For so long [s] a quick stop brakes before the power goes."""
+"""A quick stop brakes for this time [s] before it powers off."""
 CLEARING_CYCLES = 40
-"""For so many cycles a fault is tried to be cleared."""
+"""`reset` tries to clear a fault for this number of cycles."""
 QUANTITIES = ("position", "velocity", "effort", "temperature", "temperature_driver")
-_TELLS = {Layout.MINI_CHEETAH: 2, Layout.T_MOTOR: 4, Layout.DAMIAO: 5}
-"""How many of these are in an answer; the third of a mini-cheetah is a current or a torque, depending on its flash."""
+_REPORTED = {Layout.MINI_CHEETAH: 2, Layout.T_MOTOR: 4, Layout.DAMIAO: 5}
+"""An answer has this number of `QUANTITIES`. The third value of a mini-cheetah is not used, because the settings in its
+flash decide whether it is a current or a torque."""
 _POSITION_TOP, _TOP = mit.POSITION_TOP, mit.TOP
 
 
 class MitDrive(CanDevice):
-    """One drive. It is enabled only by `enable`, and stays disabled once it dropped out by itself."""
+    """One drive. Only `enable` enables it; a drive that powers off by itself stays disabled."""
 
     Settings = MitSettings
     COUNTERS = (*CanDevice.COUNTERS, "wrapped", "foreign")
     can_damp = True
 
     @classmethod
+    @override
     def quantities(cls, settings: MitSettings) -> tuple[str, ...]:
-        """See `CanDevice.quantities`; what is commanded comes first."""
-        known = QUANTITIES[: _TELLS[settings.actuator[0]]]
-        return (settings.mode, *(name for name in known if name != settings.mode))
+        reported = QUANTITIES[: _REPORTED[settings.actuator[0]]]
+        return (settings.mode, *(name for name in reported if name != settings.mode))
 
     @classmethod
+    @override
     def commanded(cls, settings: MitSettings) -> str:
-        """See `CanDevice.commanded`."""
         return settings.mode
 
     @classmethod
+    @override
     def traffic(cls, settings: MitSettings, rate: float) -> tuple[tuple[int, float], ...]:
-        """See `CanDevice.traffic`."""
         return ((mit.COMMAND_LAYOUT.size, rate), (max(mit.SIZES[settings.actuator[0]]), rate))
 
     def __init__(self, place: Place, settings: MitSettings) -> None:
@@ -112,13 +114,13 @@ class MitDrive(CanDevice):
         self._places = tuple((slot, QUANTITIES.index(quantity)) for quantity, slot in self._slots.items())
         self._registers = RegisterClient(place, settings.watch_time) if damiao else None
         self._heard = threading.Event()
-        self._asked: Special | None = None
+        self._request: Special | None = None
         self._confirmations = 0
         self._error = self._latched = 0
         self._counts: tuple[int, int, int] | None = None
         self._is_wrapped = False
         self._is_powered = self._is_wanted = self._was_reached = self._is_watched = self._is_neutral = False
-        self._dropped = ""
+        self._drop_text = ""
         self._braking = self._clearing = 0
         self._frame = can.Message(arbitration_id=node, is_extended_id=False, data=bytearray(mit.COMMAND_LAYOUT.size))
         self._specials = {
@@ -126,17 +128,18 @@ class MitDrive(CanDevice):
             for code in (Special.ENTER, Special.EXIT, Special.CLEAR)
         }
         Replies.join(place, self._reply_id, self._layout, self._on_reply)
-        if self._reply_id != node:  # nobody may answer under its id either: it would take the answer for a command
+        if self._reply_id != node:  # reserves the id: the drive would take an answer under it for a command
             place.bus.subscribe(node, self._on_foreign)
 
     def _on_foreign(self, data: bytearray, received: float) -> None:
-        """Somebody else sends frames to the drive."""
+        """Count a frame that another sender sent to the drive."""
         self._counters["foreign"] += 1
 
+    @override
     def _identify(self) -> str:
         if self._reply_id == 0 and self._bus.needs_sync:
             raise DeviceRefused(
-                f"{self._place} answers under identifier 0, which CANopen nodes on the same bus take for NMT commands. "
+                f"{self._place} answers under identifier 0, where CANopen nodes on the same bus expect NMT commands. "
                 "Give it another master id, or another bus."
             )
         self._rest()
@@ -147,7 +150,7 @@ class MitDrive(CanDevice):
         return f"mit:{self._bus.name}:{self.node}:{self._model}"
 
     def _knock(self) -> None:
-        """Ask to stay without power until there is an answer; may block.
+        """Request power off until the drive answers; may block.
 
         Raises:
             DeviceSilent: No answer.
@@ -161,30 +164,32 @@ class MitDrive(CanDevice):
             f"{self._place} does not answer under {self._reply_id:03X}h. Is it powered, are its id and master id right?"
         )
 
+    @override
     def _commission(self) -> None:
         self._is_wanted = False
         self._counts = None
         for _ in range(CONFIRMATIONS):
             self._knock()
         if self._is_powered:
-            raise DeviceRefused(f"{self._place} stays enabled when it is told to power off. Cut its power.")
+            raise DeviceRefused(f"{self._place} stays enabled after the command to power off. Cut its power.")
         if self._registers:
             self._registers.commission(self._ranges)
         self.missed = 0
 
+    @override
     def _release(self) -> None:
         self._rest()
-        with contextlib.suppress(DeviceSilent, DeviceRefused):  # nothing more can be done for it
+        with contextlib.suppress(DeviceSilent, DeviceRefused):
             for _ in range(CONFIRMATIONS):
                 self._knock()
             if self._registers and not self._is_powered:
                 self._registers.release()
 
     def _on_reply(self, data: bytearray, received: float) -> None:
-        if self._registers is not None and self._registers.wanted is not None:
-            found = mit.register_answer(data, self.node)
-            if found is not None:
-                self._registers.take(found)
+        if self._registers is not None and self._registers.pending is not None:
+            answer = mit.parse_register(data, self.node)
+            if answer is not None:
+                self._registers.take(answer)
                 return
         if len(data) not in self._sizes:
             self._counters["malformed"] += 1
@@ -200,19 +205,19 @@ class MitDrive(CanDevice):
             if self._confirmations:
                 self._confirmations -= 1
                 if not self._confirmations:
-                    self._is_powered = self._asked is Special.ENTER
+                    self._is_powered = self._request is Special.ENTER
         if self._error and not self._clearing:
             self._latched = self._error
         if not self._heard.is_set():
             self._heard.set()
         if self.is_commissioned:
             if self.missed > self._silent_cycles:
-                self._lose(f"{self._place} was silent and answers again, perhaps restarted. It is commissioned anew.")
+                self._lose(f"{self._place} was silent and answers again, perhaps restarted. It is commissioned again.")
             else:
                 self._store(mit.counts(data), rotor, driver, received)
 
     def _store(self, counts: tuple[int, int, int], rotor: float, driver: float, received: float) -> None:
-        """Bring the slots up to date; a value at the end of its range may be anything beyond, and is NaN."""
+        """Update the slots; a value at the end of its range is NaN, because it may lie beyond."""
         position, velocity, effort = counts
         before, self._counts = self._counts, counts
         if before is not None and abs(position - before[0]) > _POSITION_TOP // 2:
@@ -232,70 +237,74 @@ class MitDrive(CanDevice):
         self._received.fill(received)
         self._is_answered()
 
+    @override
     def _lose(self, text: str) -> None:
         super()._lose(text)
         self._is_wanted = False
 
+    @override
     def _fault(self) -> str:
         if self._is_wrapped:
             return (
-                f"{self._place} turned beyond {self._ranges.position:g} rad, where its position starts again at the "
-                "other end, so its place is not known. Turn it back, restart the drive, then reset."
+                f"{self._place} turned beyond {self._ranges.position:g} rad, where its measurement jumps to the other "
+                "end, so its position is unknown. Turn it back, restart the drive, then reset."
             )
         error = self._latched or self._error
         if not error:
             return ""
-        told = mit.describe_error(error, self._layout)
-        return f"{self._place} reports {told}. Reset it when the cause is gone; if it stays, cut its power once."
+        text = mit.describe_error(error, self._layout)
+        return f"{self._place} reports {text}. Reset it when the cause is gone; if it stays, cut its power once."
 
+    @override
     def _drives(self) -> bool:
         return self._is_powered
 
+    @override
     def _running(self) -> tuple[DeviceState, str]:
-        self._look_for_drop()
-        text = self._dropped
+        self._check_for_drop()
+        text = self._drop_text
         if not text and self._registers is None:
-            text = f"{self._place} has no watchdog: should the HAL die while it is enabled, it keeps to its last frame."
+            text = f"{self._place} has no watchdog: if the HAL dies while it is enabled, it follows its last frame."
         return DeviceState.ENABLED if self._is_powered else DeviceState.READY, text
 
+    @override
     def enable(self) -> None:
-        """See `Device.enable`; the stiffness grows from 0 within `ramp`, about the first set-point."""
         self._is_watched = self._is_neutral = self._was_reached = False
         self._braking = 0
-        self._dropped = ""
+        self._drop_text = ""
         self._law.restart()
         if self._registers:
-            self._registers.found = None
+            self._registers.answer = None
         self._is_wanted = True
 
+    @override
     def disable(self) -> None:
-        """See `Device.disable`."""
         self._is_wanted = False
         self._braking = 0
 
+    @override
     def quick_stop(self) -> None:
-        """See `Device.quick_stop`: damping alone for `QUICK_STOP_TIME`, then no power."""
         self._is_wanted = False
         self._braking = round(QUICK_STOP_TIME * self._place.rate) if self._is_powered else 0
 
+    @override
     def reset(self) -> None:
-        """See `Device.reset`."""
         self._latched = 0
         self._is_wrapped = False
         self._clearing = CLEARING_CYCLES
 
+    @override
     def apply(self, values: np.ndarray) -> None:
-        """See `Device.apply`; until the drive has power it is asked to power on, with no torque."""
         if self._may_move():
             self._command(self._law.set_point(float(values[0]), self._counts))
 
+    @override
     def damp(self) -> None:
-        """See `Device.damp`."""
         if self._may_move():
             self._command(self._law.braking())
 
+    @override
     def idle(self) -> None:
-        """See `Device.idle`; the drive is asked to stay without power, and answers where it is."""
         if not self.is_commissioned:
             return
         if self._is_powered and self._braking:
@@ -310,7 +319,7 @@ class MitDrive(CanDevice):
             self._ask(Special.EXIT)
 
     def _clear(self) -> None:
-        """Ask to forget a fault; T-Motor has no frame for that but to be entered, which here lasts two frames."""
+        """Request that a fault is cleared; for T-Motor by powering on for two frames, as it has no frame for this."""
         self._clearing -= 1
         if self._layout is Layout.DAMIAO:
             self._bus.send(self._specials[Special.CLEAR])
@@ -320,26 +329,26 @@ class MitDrive(CanDevice):
             self._ask(Special.EXIT)
 
     def _may_move(self) -> bool:
-        """Whether the drive has power and may be sent a set-point; if not, it was sent what it needs in this cycle."""
+        """Return whether the drive is enabled and takes a set-point; if not, send the frame of this cycle instead."""
         if self._latched or self._is_wrapped:
             self._is_wanted = False
-        self._look_for_drop()
+        self._check_for_drop()
         if not self._is_wanted or not self.is_commissioned:
             self.idle()
-        elif self._is_powered and self._asked is Special.ENTER:
+        elif self._is_powered and self._request is Special.ENTER:
             self._was_reached = True
             return True
         else:
             self._power_on()
         return False
 
-    def _look_for_drop(self) -> None:
+    def _check_for_drop(self) -> None:
         if self._is_wanted and self._was_reached and not self._is_powered:
             self._is_wanted = False
-            self._dropped = f"{self._place} powered off by itself. Was it restarted, was its supply interrupted?"
+            self._drop_text = f"{self._place} powered off by itself. Was it restarted, was its supply interrupted?"
 
     def _power_on(self) -> None:
-        """One step: look at its watchdog, take back what it was told before, then ask it for power without torque."""
+        """Do one step: read the watchdog, send a command without torque, then request power."""
         if self._registers and not self._is_watched:
             watching = self._registers.is_watching
             if watching is None:
@@ -347,7 +356,7 @@ class MitDrive(CanDevice):
                 self._rest()
                 return
             if not watching:
-                self._lose(f"{self._place} forgot its watchdog, so it was restarted, and waits to be commissioned.")
+                self._lose(f"{self._place} lost its watchdog setting, so it was restarted; it is commissioned again.")
                 return
             self._is_watched = True
         if self._is_neutral:
@@ -355,30 +364,31 @@ class MitDrive(CanDevice):
         self._rest()
 
     def _rest(self) -> None:
-        """No torque: the last frame before the power goes and the first after it came, as some follow their last again.
+        """Command no torque: in the last frame before power off and in the first one after power on, because some
+        drives follow the last command again when they power on.
 
-        Seen of T-Motor: github.com/dfki-ric-underactuated-lab/mini-cheetah-tmotor-python-can at 0ef9f89,
+        Source for T-Motor: github.com/dfki-ric-underactuated-lab/mini-cheetah-tmotor-python-can at 0ef9f89,
         src/motor_driver/canmotorlib.py, comments in `enable_motor` and `disable_motor`.
         """
         self._command(self._law.resting(self._counts))
         self._is_neutral = True
 
-    def _command(self, asked: Asked) -> None:
+    def _command(self, command: Command) -> None:
         self._is_neutral = False
-        mit.COMMAND_LAYOUT.pack_into(self._frame.data, 0, mit.pack(*asked, self._ranges))
+        mit.COMMAND_LAYOUT.pack_into(self._frame.data, 0, mit.pack(command, self._ranges))
         self._bus.send(self._frame)
 
     def _ask(self, code: Special) -> None:
-        if code is not self._asked:
-            self._asked, self._confirmations = code, CONFIRMATIONS
+        if code is not self._request:
+            self._request, self._confirmations = code, CONFIRMATIONS
         self._bus.send(self._specials[code])
 
+    @override
     def inspect(self) -> tuple[Check, ...]:
-        """See `Device.inspect`."""
         self._knock()
         if self._registers is not None:
             return self._registers.inspect(self._ranges)
         return (
-            Check("watchdog", False, "It has none that can be set or read over CAN. Have its power cut otherwise."),
+            Check("watchdog", False, "It has none that can be set or read over CAN. Cut its power by other means."),
             Check("ranges", True, "They cannot be read over CAN. Compare them with the manual of this firmware."),
         )

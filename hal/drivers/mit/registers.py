@@ -1,4 +1,4 @@
-"""Registers of a Damiao drive: its ranges, its mode, and the watchdog that is the only one such drives have."""
+"""Registers of a Damiao drive: ranges, mode and watchdog."""
 
 import math
 import threading
@@ -12,10 +12,10 @@ from hal.protocols import mit
 from hal.protocols.mit import Ranges, Register
 
 ANSWER_TIMEOUT = 0.05
-"""How long [s] a register may take to be answered."""
+"""A request is repeated after this time [s] without an answer."""
 TRIES = 4
 FEWEST_FRAMES = 3
-"""So many frames must fit into `watch_time`."""
+"""At least this number of frames must be sent within `watch_time`."""
 RANGES = (
     (Register.POSITION_RANGE, "position"),
     (Register.VELOCITY_RANGE, "velocity"),
@@ -24,45 +24,45 @@ RANGES = (
 
 
 class RegisterClient:
-    """Reads and writes registers of one Damiao drive; each answer is matched with its request."""
+    """A client that reads and writes registers of one Damiao drive and matches each answer with its request."""
 
     def __init__(self, place: Place, watch_time: float) -> None:
-        """Prepare for one drive, which is to power off after `watch_time` [s] without a frame.
+        """Prepare for one drive, which must power off after `watch_time` [s] without a frame.
 
         Raises:
-            ConfigError: One lost frame would make it power off.
+            ConfigError: `watch_time` is so short that a single lost frame would power it off.
         """
         frames = watch_time * place.rate
         if frames < FEWEST_FRAMES:
             raise ConfigError(
-                f"{place}: in watch_time {watch_time:g} s it gets {frames:.1f} frames at {place.rate:g} Hz, so that "
-                f"one lost frame would stop it. Give it time for {FEWEST_FRAMES}."
+                f"{place}: in watch_time {watch_time:g} s it gets {frames:.1f} frames at {place.rate:g} Hz, so one "
+                f"lost frame would stop it. Give it time for {FEWEST_FRAMES}."
             )
         self._node = place.node
         self._label = str(place)
         self._bus = place.bus
         self._timeout = round(watch_time / mit.TIMEOUT_UNIT)
         self._answered = threading.Event()
-        self.wanted: Register | None = None
-        """Asked for, and not answered yet."""
-        self.found: mit.RegisterAnswer | None = None
-        """The newest answer since something was asked for."""
+        self.pending: Register | None = None
+        """Register of the request that is not answered yet."""
+        self.answer: mit.RegisterAnswer | None = None
+        """Answer to the newest request."""
 
-    def take(self, found: mit.RegisterAnswer) -> None:
-        """An answer has come; called in the receive thread."""
-        if found.register == self.wanted:
-            self.found, self.wanted = found, None
+    def take(self, answer: mit.RegisterAnswer) -> None:
+        """Take an answer, in the receive thread."""
+        if answer.register == self.pending:
+            self.answer, self.pending = answer, None
             self._answered.set()
 
     def ask(self, register: Register, value: int | None = None) -> None:
-        """Ask to read a register, or to set it, without waiting."""
-        self.wanted, self.found = register, None
+        """Request to read a register, or to write it, without waiting."""
+        self.pending, self.answer = register, None
         node = self._node
         data = mit.read_register(node, register) if value is None else mit.write_register(node, register, value)
         self._bus.send(can.Message(arbitration_id=mit.REGISTERS, is_extended_id=False, data=data))
 
     def commission(self, ranges: Ranges) -> None:
-        """Check that the drive has these ranges; set its mode and its watchdog.
+        """Check the ranges of the drive; set its mode and its watchdog.
 
         Raises:
             DeviceSilent: No answer.
@@ -73,14 +73,14 @@ class RegisterClient:
             theirs, ours = self.read(register).real, getattr(ranges, name)
             if not math.isclose(theirs, ours, rel_tol=1e-3):
                 raise WrongDevice(
-                    f"{self._label} has a {name} range of {theirs:g}, and its motor in the robot file {ours:g}. "
-                    f"Is it another motor? If not, say `ranges: {{{name}: {theirs:g}}}`."
+                    f"{self._label} has a {name} range of {theirs:g}, but its motor in the robot file {ours:g}. "
+                    f"Is it another motor? If not, set `ranges: {{{name}: {theirs:g}}}`."
                 )
         self.write(Register.MODE, mit.MIT_MODE)
         self.write(Register.TIMEOUT, self._timeout)
 
     def release(self) -> None:
-        """Switch the watchdog off, when nobody is left to keep it from tripping.
+        """Switch the watchdog off, because no more frames will be sent.
 
         Raises:
             DeviceSilent: No answer.
@@ -90,12 +90,12 @@ class RegisterClient:
 
     @property
     def is_watching(self) -> bool | None:
-        """Whether the watchdog is as it was set, by the newest answer; None if there was none since it was asked."""
-        found = self.found
-        return None if found is None else found.register == Register.TIMEOUT and found.integer == self._timeout
+        """Whether the newest answer shows the watchdog as it was set; None before the answer to the newest request."""
+        answer = self.answer
+        return None if answer is None else answer.register == Register.TIMEOUT and answer.integer == self._timeout
 
     def inspect(self, ranges: Ranges) -> tuple[Check, ...]:
-        """What the registers say now.
+        """Read the registers and compare them with the settings.
 
         Raises:
             DeviceSilent: No answer.
@@ -112,7 +112,7 @@ class RegisterClient:
         return tuple(checks)
 
     def read(self, register: Register) -> mit.RegisterAnswer:
-        """A register's value.
+        """Read a register.
 
         Raises:
             DeviceSilent: No answer.
@@ -127,10 +127,10 @@ class RegisterClient:
             DeviceRefused: Another value is read back.
         """
         self._exchange(register, value)
-        found = self.read(register).integer
-        if found != value:
+        actual = self.read(register).integer
+        if actual != value:
             raise DeviceRefused(
-                f"{self._label}: register {register.name} reads back {found} after writing {value}. "
+                f"{self._label}: register {register.name} reads back {actual} after writing {value}. "
                 "Is it writable in this firmware?"
             )
 
@@ -138,9 +138,9 @@ class RegisterClient:
         for _ in range(TRIES):
             self._answered.clear()
             self.ask(register, value)
-            if self._answered.wait(ANSWER_TIMEOUT) and self.found is not None:
-                return self.found
-        self.wanted = None
+            if self._answered.wait(ANSWER_TIMEOUT) and self.answer is not None:
+                return self.answer
+        self.pending = None
         raise DeviceSilent(
-            f"{self._label} does not answer register {register.name}. Has its firmware registers, is it a Damiao drive?"
+            f"{self._label} does not answer register {register.name}. Is it a Damiao drive, has its firmware registers?"
         )

@@ -1,4 +1,4 @@
-"""What a robot file says of a drive in MIT mode."""
+"""Settings of a drive in MIT mode."""
 
 from typing import Annotated, Literal
 
@@ -14,41 +14,41 @@ NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
 class RangesSettings(Section):
-    """What is known better of a motor than by the table, or of one that is not in it."""
+    """Ranges that override the table, or those of a motor that is not in it."""
 
     position: Positive | None = None
     """Largest position of its frames [rad]."""
     velocity: Positive | None = None
-    """[rad/s]"""
+    """Largest velocity [rad/s]."""
     effort: Positive | None = None
-    """[N m]"""
+    """Largest torque [N m]."""
     stiffness: Positive | None = None
-    """[N m/rad]; 500 where neither this nor the table says otherwise."""
+    """Largest stiffness [N m/rad]; default 500."""
     damping: Positive | None = None
-    """[N m s/rad]; 5 likewise."""
+    """Largest damping [N m s/rad]; default 5."""
     layout: Layout | None = None
-    """Who packed its answers: `t_motor`, `damiao` or `mini_cheetah`."""
+    """Layout of its answers: `t_motor`, `damiao` or `mini_cheetah`."""
 
 
 class MitSettings(DeviceSettings):
     """Settings of a drive. Stiffness, damping and effort are those of the joint or wire, behind gear and spool."""
 
     motor: str
-    """As in the table of docs/devices.md, or any name if `ranges` is complete."""
+    """Name in the table of docs/devices.md, or any name if `ranges` is complete."""
     ranges: RangesSettings = RangesSettings()
-    """Takes precedence over the table, value by value."""
+    """Values that override those of the table."""
     master_id: Annotated[int, Field(ge=0, le=0x7FF)] | None = None
     """Identifier of its answers; absent: 0 for T-Motor and mini-cheetah, node + 16 for Damiao."""
     mode: Literal["position", "velocity", "effort"] = "position"
-    """What it is commanded by: stiffness and damping, damping alone, or neither."""
+    """Commanded quantity: position uses stiffness and damping, velocity only damping, effort neither."""
     stiffness: NotNegative = 0.0
-    """kp [N m/rad, or N/m with a spool]; needed with `mode: position`."""
+    """Stiffness kp [N m/rad, or N/m with a spool]; required with `mode: position`."""
     damping: Positive
-    """kd [N m s/rad, or N s/m]; also what a quick stop brakes with."""
+    """Damping kd [N m s/rad, or N s/m]; a quick stop brakes with it, too."""
     ramp: NotNegative = 0.5
-    """Time [s] in which the stiffness grows from 0 after being enabled."""
+    """Time [s] in which the stiffness grows from 0 after enabling."""
     gear: Positive = 1.0
-    """Turns of the motor's own output per turn of the joint or spool; its own gear is in its frames already."""
+    """Turns of the motor's output per turn of the joint or spool; the motor's frames include its built-in gear."""
     spool_radius: Positive | None = None
     """Radius of the spool [m]; without one the drive turns a joint."""
     direction: Literal[1, -1] = 1
@@ -56,11 +56,11 @@ class MitSettings(DeviceSettings):
     zero: Finite = 0.0
     """Value [rad or m] where the motor's angle is zero."""
     max_effort: Positive | None = None
-    """Largest effort [N m or N] that is asked for; absent: what the frame can carry."""
+    """Largest effort [N m or N] that is commanded; absent: the largest in a frame."""
     watch_time: Annotated[float, Field(ge=0.02, le=5.0)] = 0.15
-    """How long [s] a Damiao drive waits for a frame before it powers off by itself."""
+    """A Damiao drive powers off by itself after this time [s] without a frame."""
     allow_no_watchdog: bool = False
-    """Accept a drive that goes on with its last frame for ever when the HAL or the cable dies."""
+    """Accept a drive that follows its last frame for ever when the HAL or the cable dies."""
 
     @model_validator(mode="after")
     def _fits(self) -> "MitSettings":
@@ -69,13 +69,13 @@ class MitSettings(DeviceSettings):
         except ConfigError as error:
             raise ValueError(str(error)) from None
         if self.mode == "position" and not self.stiffness:
-            raise ValueError("with `mode: position` a `stiffness` above 0 is needed.")
+            raise ValueError("`mode: position` needs a `stiffness` above 0.")
         if layout is Layout.MINI_CHEETAH and self.mode == "effort":
-            raise ValueError("answers in the layout `mini_cheetah` carry no torque, so that `mode: effort` cannot be.")
+            raise ValueError("`mode: effort` is not possible: answers in the layout `mini_cheetah` carry no torque.")
         if layout is not Layout.DAMIAO and not self.allow_no_watchdog:
             raise ValueError(
                 f"motor '{self.motor}' has no watchdog that can be set or read over CAN: when the HAL or the cable "
-                "dies, it goes on with its last frame. If something else takes its power away then, say "
+                "dies, it follows its last frame. If another circuit then cuts its power, set "
                 "`allow_no_watchdog: true`."
             )
         scale = self.scale**2
@@ -84,7 +84,7 @@ class MitSettings(DeviceSettings):
             ("damping", self.damping, ranges.damping),
         ):
             if value * scale > most:
-                raise ValueError(f"{name} {value:g} is more than the motor's frames carry, {most / scale:g} at most.")
+                raise ValueError(f"{name} {value:g} is more than the motor's frames carry, at most {most / scale:g}.")
         return self
 
     @property
@@ -94,7 +94,7 @@ class MitSettings(DeviceSettings):
 
     @property
     def actuator(self) -> tuple[Layout, Ranges]:
-        """Layout and ranges of the motor, of the table with `ranges` over it.
+        """Layout and ranges of the motor: those of the table, overridden by `ranges`.
 
         Raises:
             ConfigError: The motor is not in the table, and `ranges` is not complete.
@@ -104,9 +104,9 @@ class MitSettings(DeviceSettings):
             return own.layout, Ranges(
                 own.position, own.velocity, own.effort, own.stiffness or 500.0, own.damping or 5.0
             )
-        known = mit_motors.motor(self.motor)
-        table = known.ranges
-        return own.layout or known.layout, Ranges(
+        motor = mit_motors.motor(self.motor)
+        table = motor.ranges
+        return own.layout or motor.layout, Ranges(
             own.position or table.position,
             own.velocity or table.velocity,
             own.effort or table.effort,
