@@ -1,4 +1,4 @@
-"""How to train."""
+"""Settings of a training."""
 
 from dataclasses import dataclass
 
@@ -8,23 +8,23 @@ from gemuco.layers import check_activation
 
 @dataclass(frozen=True, slots=True)
 class TrainConfig:
-    """How to train.
+    """Settings of a training.
 
     Attributes:
         hidden: Widths of the encoder's layers; the decoder mirrors them.
         latent: Length of z.
-        activation: What bends the layers: tanh, relu, sigmoid, elu or softplus.
+        activation: Activation of the hidden layers: tanh, relu, sigmoid, elu or softplus.
         bias_size: Length of p, one p per condition; 0 without parametric bias.
-        epochs: At most so many passes over the data.
+        epochs: Largest number of passes over the data.
         batch: Samples per step.
         rate: Peak of the one-cycle learning rate of W (Adam).
         bias_rate: Peak of the one-cycle learning rate of p.
-        held_out: Share of every condition's episodes (or time blocks) that only measures.
-        patience: Stop after so many epochs without a better held-out loss.
-        outliers: A measured signal is rejected while the model, which does not see it, misses it by more than so many
-            robust standard deviations of its misses. Infinite: nothing is rejected, and the loss is the plain square.
-        replay: Fine-tuning only: samples of the old training data per new sample.
-        seed: For the split, the first weights, the masks and the order of samples.
+        held_out: Share of every condition's episodes (or time blocks) that is held out of the training to measure it.
+        patience: The training stops after this many epochs without a better held-out loss.
+        outliers: A measured signal is rejected while the model, which does not see it, misses it by more than this
+            many robust standard deviations of its misses. Infinite: nothing is rejected, and the loss is the square.
+        replay: Fine-tuning only: number of old training samples per new sample.
+        seed: Seed of the split, the initial weights, the masks and the order of samples.
     """
 
     hidden: tuple[int, ...] = (200, 30)
@@ -49,7 +49,7 @@ class TrainConfig:
             whole_number(f"Training: {name}", getattr(self, name), least)
         for width in self.hidden:
             if width < 1:
-                raise SchemaError(f"Training: a hidden layer of {width} is none; leave it out or make it wider.")
+                raise SchemaError(f"Training: a hidden layer has width {width}; leave it out or make it wider.")
             whole_number("Training: the width of a hidden layer", width, 1)
         for name in ("rate", "bias_rate", "replay"):
             if not 0.0 <= getattr(self, name) < float("inf"):

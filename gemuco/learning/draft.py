@@ -1,4 +1,4 @@
-"""A training on disk, so that an interrupted one goes on: one safetensors file, nothing pickled."""
+"""File of an unfinished training, from which it is resumed: one safetensors file without pickle."""
 
 import hashlib
 import json
@@ -16,7 +16,7 @@ FORMAT = "gemuco.draft.2"
 
 
 def key_of(*parts: Any) -> str:
-    """Hash of all that a training depends on: arrays by their bytes, the rest by its text."""
+    """Return a hash of everything that a training depends on: arrays by their bytes, other parts by their text."""
     digest = hashlib.sha256()
     for part in parts:
         array = isinstance(part, np.ndarray)
@@ -26,18 +26,18 @@ def key_of(*parts: Any) -> str:
 
 
 class Draft:
-    """Where a training is kept as far as it is.
+    """File of the state of a training.
 
     Args:
-        path: The file; nothing is kept without one.
-        key: What the training depends on; a draft of another is ignored and overwritten.
+        path: The file; without one nothing is saved.
+        key: Hash of everything that the training depends on. A draft with another key is ignored and overwritten.
     """
 
     def __init__(self, path: str | Path | None, key: str) -> None:
         self.path, self.key = None if path is None else Path(path), key
 
     def load(self) -> tuple[dict[str, np.ndarray], dict[str, Any]] | None:
-        """Arrays and facts; None if there is no draft of this very training, or it is damaged."""
+        """Return arrays and facts, or None if there is no draft with this key or the draft is damaged."""
         if self.path is None or not self.path.exists():
             return None
         try:
@@ -52,7 +52,7 @@ class Draft:
         return (arrays, facts) if head.get("sha256") == _digest(arrays.items(), head["facts"]) else None
 
     def save(self, arrays: Mapping[str, np.ndarray], facts: Mapping[str, Any]) -> None:
-        """Replace what was kept, in one step: a process killed here leaves the draft before."""
+        """Replace the draft in one step: a process that is killed meanwhile leaves the previous draft."""
         if self.path is None:
             return
         text = json.dumps(dict(facts))

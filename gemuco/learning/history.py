@@ -1,21 +1,21 @@
-"""How a training went, for a plot and in sentences."""
+"""Record of a training."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True, slots=True)
 class History:
-    """How training went: losses [standard deviations squared] after every epoch, and what the data were like.
+    """Losses of every epoch [standard deviations squared], and facts about the training data.
 
     Attributes:
-        train: Loss on the training data while it was learned, one per epoch.
-        held_out: Loss on held-out data, one per epoch.
-        best_epoch: Whose weights were kept, counted from 0.
-        skipped: Training samples that no mask fits, or with nothing measured to learn from.
-        rejected: Measured signals of single training samples that were taken for outliers.
+        train: Loss on the training data during each epoch.
+        held_out: Loss on held-out data after each epoch.
+        best_epoch: Epoch whose weights were kept, counted from 0.
+        skipped: Number of training samples that no mask fits or that have no measured output.
+        rejected: Number of outliers: measured signals of single training samples that were rejected.
         dead: Elements (`signal.element`) that never varied in the training data or were never measured.
-        notes: What else a person should know, each a sentence that says what to do.
-        resumed: At which epoch an interrupted training went on; 0 if it ran in one piece.
+        notes: Remarks for the user, each one sentence that says what to do.
+        resumed: Epoch at which an interrupted training was resumed; 0 if it was not interrupted.
     """
 
     train: tuple[float, ...]
@@ -29,5 +29,5 @@ class History:
 
     @property
     def best(self) -> float:
-        """Held-out loss of the weights that were kept."""
+        """Held-out loss of the kept weights."""
         return self.held_out[self.best_epoch]

@@ -1,8 +1,7 @@
-"""The training loop (paper, II-D): W and every p together, each sample under a random feasible mask it allows.
+"""Training loop (paper, II-D): W and every p are learned together, each sample under a random mask that it allows.
 
-Each pass over the data is made ready in bulk: masks are drawn, inputs gathered and masked for all samples at once, so
-that a step is nothing but the network. Suspected outliers are looked for anew from time to time
-(`gemuco.learning.outliers`).
+The inputs of a whole pass over the data are prepared at once, so that a step computes only the network. Outliers are
+searched for repeatedly during the training (`gemuco.learning.outliers`).
 """
 
 import math
@@ -22,26 +21,26 @@ from gemuco.learning.material import Batch, Material
 from gemuco.optimiser import Optimiser
 
 Progress = Callable[[float, str], None]
-"""Called with the share that is done, 0 to 1, and one line of text."""
+"""This is called with the finished share, 0 to 1, and one line of text."""
 
 HUBER = (0.3, 1.0)
-"""Misses above this many standard deviations count in proportion and no longer squared, before outliers were looked for
-and after: what is not found out yet pulls at W like any large miss and not thirty times as hard. With 1 % of
-all values ten standard deviations off the PR2's tip is wrong by 141 mm with the plain square and by 14 mm so (8 mm on
-clean data; studies/accuracy/imperfect_data.py)."""
+"""Errors above this many standard deviations count linearly instead of squared, before and after the first search for
+outliers. This limits the effect of outliers that are not detected yet. With 1 % of all values ten standard deviations
+off, the error of the PR2's tip is 14 mm; with squared errors it is 141 mm, and on clean data 8 mm
+(studies/accuracy/imperfect_data.py)."""
 
-LOOKS = 16
-"""How often outliers are looked for during a training, beginning when a quarter of it is done."""
+SEARCHES = 16
+"""Outliers are searched for about this many times during a training, after the first quarter of the epochs."""
 
 DRAFTS = 40
-"""How often a training is written down."""
+"""A training is saved about this many times."""
 
 MOST_HELD = 4000
-"""Pairs of held-out sample and mask that are measured after every epoch, at most."""
+"""At most this many pairs of held-out sample and mask are measured after every epoch."""
 
 
 def one_cycle(share: float) -> float:
-    """Learning rate as a share of its peak when a share of the steps is done: up for a quarter, then down."""
+    """Return the learning rate as a share of its peak: it rises during the first quarter of the steps, then falls."""
     if share < 0.25:
         return 0.04 + 0.96 * 0.5 * (1.0 - math.cos(math.pi * share / 0.25))
     return 1e-4 + 0.5 * (1.0 + math.cos(math.pi * (share - 0.25) / 0.75))
@@ -49,14 +48,14 @@ def one_cycle(share: float) -> float:
 
 @dataclass(slots=True)
 class Course:
-    """How far a training is.
+    """Progress of a training.
 
     Attributes:
-        train: Loss while learning, one per epoch.
-        held_out: Held-out loss, one per epoch.
-        best_epoch: Epoch of the best held-out loss.
-        best: Its W, as compiled code has it, and p.
-        resumed: At which epoch it went on after an interruption.
+        train: Loss on the training data, one per epoch.
+        held_out: Loss on the held-out data, one per epoch.
+        best_epoch: Epoch of the lowest held-out loss.
+        best: W of this epoch in the layout of compiled code, and every p.
+        resumed: Epoch at which an interrupted training was resumed.
     """
 
     train: list[float] = field(default_factory=list)
@@ -67,28 +66,28 @@ class Course:
 
     @property
     def least(self) -> float:
-        """The best held-out loss."""
+        """Lowest held-out loss."""
         return self.held_out[self.best_epoch]
 
 
 class Learner:
-    """Network, every p, and the data, during one training.
+    """Network, every p and the data during one training.
 
     Args:
-        config: How.
-        weights: Where W starts.
-        biases: Where every p starts, shape (conditions, bias_size).
-        frozen: Which of them stay, shape (conditions,).
-        material: What is learned from.
-        held: What only measures.
+        config: Settings.
+        weights: Initial W.
+        biases: Initial p of every condition, shape (conditions, bias_size).
+        frozen: Whether the p of each condition stays as it is, shape (conditions,).
+        material: Training samples.
+        held: Held-out samples.
 
     Attributes:
-        biases: Every p as it is now, shape (conditions, bias_size).
-        chain: W as it is now.
-        moves: Which p are learned, shape (conditions, 1).
-        optimiser: What moves W.
-        bias_optimiser: What moves p.
-        measure: Held-out samples and the masks they are measured under.
+        biases: Current p of every condition, shape (conditions, bias_size).
+        chain: Current W.
+        is_learned: Whether the p of each condition is learned, shape (conditions, 1).
+        optimiser: Optimiser of W.
+        bias_optimiser: Optimiser of every p.
+        measurement: Held-out samples and the masks under which they are measured.
     """
 
     def __init__(
@@ -104,66 +103,67 @@ class Learner:
         self.task = material.task
         self.biases = np.array(biases, np.float32)
         self._start, self.chain = weights, pack(weights.whole)
-        self.moves = ~frozen[:, None]
+        self.is_learned = ~frozen[:, None]
         self.random = np.random.default_rng(config.seed)
         self.optimiser = Optimiser("adam", config.rate, len(self.chain.flat))
         self.bias_optimiser = Optimiser("adam", config.bias_rate, self.biases.size)
         self.course = Course()
-        self.measure = self.held.every(MOST_HELD)
+        self.measurement = self.held.every(MOST_HELD)
 
     @property
     def weights(self) -> Weights:
-        """W as it is now."""
+        """Current W."""
         return self._start.replaced(unpack(self.chain))
 
     def run(self, progress: Progress | None, title: str, draft: Draft) -> Course:
-        """Train to the end or until nothing gets better; leaves the best W and p in place."""
+        """Train until all epochs are done or the held-out loss stops falling; keep the best W and p."""
         self._restore(draft)
         while not self.is_done:
             self._epoch()
             if progress is not None:
                 progress(self.epoch / self.config.epochs, f"{title}: held-out loss {self.course.least:.4f}")
             if self.epoch % max(1, self.config.epochs // DRAFTS) == 0 or self.epoch == self.config.epochs:
-                draft.save(*self._written())
+                draft.save(*self._state())
         for name, numbers in self._numbers().items():
             numbers[...] = self.course.best[name]
-        self._look()
+        self._reject_outliers()
         return self.course
 
     @property
     def epoch(self) -> int:
-        """How many are done."""
+        """Number of finished epochs."""
         return len(self.course.train)
 
     @property
     def is_done(self) -> bool:
-        """Whether all epochs are done, or nothing got better for long."""
+        """Whether all epochs are done, or the held-out loss has not fallen for `patience` epochs."""
         return self.epoch >= self.config.epochs or self.epoch - self.course.best_epoch > self.config.patience
 
     def _epoch(self) -> None:
-        """Learn from every sample once, and measure on what is held out."""
+        """Learn from every sample once, and measure the loss on the held-out samples."""
         course, epoch, epochs = self.course, self.epoch, self.config.epochs
-        looks = range(epochs // 4, epochs, max(1, epochs // LOOKS))
-        if epoch in looks:
-            self._look(patient=epoch < epochs // 2)
-        course.train.append(self._pass(epoch, HUBER[epoch > looks.start]))
+        searches = range(epochs // 4, epochs, max(1, epochs // SEARCHES))
+        if epoch in searches:
+            self._reject_outliers(spare_rare=epoch < epochs // 2)
+        course.train.append(self._pass(epoch, HUBER[epoch > searches.start]))
         course.held_out.append(self._held_out())
         if epoch == 0 or course.held_out[-1] < course.least:
-            course.best_epoch, course.best = epoch, self._copy()
+            course.best_epoch = epoch
+            course.best = {name: numbers.copy() for name, numbers in self._numbers().items()}
 
-    def _pass(self, epoch: int, straight: float) -> float:
-        """One epoch; returns the mean loss of its steps."""
-        rows, chosen = self.material.draw(self.random, self.config.replay)
-        batches = list(self.material.cut(self.material.take(rows, chosen), self.config.batch))
+    def _pass(self, epoch: int, bend: float) -> float:
+        """Do all steps of an epoch and return their mean loss; see `HUBER` for `bend`."""
+        rows, masks = self.material.draw(self.random, self.config.replay)
+        batches = list(self.material.cut(self.material.take(rows, masks), self.config.batch))
         total = 0.0
         for index, batch in enumerate(batches):
-            total += self._step(batch, one_cycle((epoch + index / len(batches)) / self.config.epochs), straight)
+            total += self._step(batch, one_cycle((epoch + index / len(batches)) / self.config.epochs), bend)
         return total / len(batches)
 
-    def _step(self, batch: Batch, pace: float, straight: float) -> float:
-        """One step of Adam; returns the loss before it."""
-        missed, by_weights, by_input = gradients(
-            self.chain, self._inputs(batch), batch.wanted, self._straight(straight), True, self.biases.size > 0
+    def _step(self, batch: Batch, pace: float, bend: float) -> float:
+        """Do one step of Adam and return the loss before it."""
+        before, by_weights, by_input = gradients(
+            self.chain, self._inputs(batch), batch.target, self._bend(bend), True, self.biases.size > 0
         )
         self.optimiser.rate = pace * self.config.rate
         self.optimiser.move(self.chain.flat, by_weights)
@@ -171,44 +171,46 @@ class Learner:
             by_bias = np.zeros_like(self.biases)
             np.add.at(by_bias, batch.condition, by_input[:, -self.biases.shape[1] :])
             self.bias_optimiser.rate = pace * self.config.bias_rate
-            self.bias_optimiser.move(self.biases.reshape(-1), (by_bias * self.moves).reshape(-1))
-        return float(missed)
+            self.bias_optimiser.move(self.biases.reshape(-1), (by_bias * self.is_learned).reshape(-1))
+        return float(before)
 
     def _inputs(self, batch: Batch) -> np.ndarray:
-        return (
-            np.concatenate([batch.inputs, self.biases[batch.condition]], axis=1) if self.biases.size else batch.inputs
-        )
+        if not self.biases.size:
+            return batch.inputs
+        return np.concatenate([batch.inputs, self.biases[batch.condition]], axis=1)
 
-    def _straight(self, usual: float) -> np.float32:
-        """Misses above this many standard deviations count in proportion; none, where nothing is rejected either."""
-        return SQUARED if math.isinf(self.config.outliers) else np.float32(usual)
+    def _bend(self, bend: float) -> np.float32:
+        """Return where the loss changes from squared to linear; without outlier rejection it is squared everywhere."""
+        return SQUARED if math.isinf(self.config.outliers) else np.float32(bend)
 
     def _held_out(self) -> float:
-        rows, chosen = self.measure
+        rows, masks = self.measurement
         if not len(rows):
             return math.inf
-        batch = self.held.take(rows, chosen)
-        return float(loss(self.chain, self._inputs(batch), batch.wanted, self._straight(HUBER[1])))
+        batch = self.held.take(rows, masks)
+        return float(loss(self.chain, self._inputs(batch), batch.target, self._bend(HUBER[1])))
 
-    def _look(self, patient: bool = False) -> None:
-        """Suspect outliers anew, in what is learned and in what measures."""
+    def _reject_outliers(self, spare_rare: bool = False) -> None:
+        """Search the training samples and the held-out samples for outliers.
+
+        Args:
+            spare_rare: Keep samples in which several signals are far out together: they may be of a rare motion that
+                is not learned yet.
+        """
         weights, p, limit = self.weights, self.biases, self.config.outliers
         for part in (self.material, self.held):
-            found = outliers.find(part, weights, p[part.condition], limit)
-            if patient:  # several signals are far out together: perhaps a rare motion that is yet to be learned
-                found &= (part.far.sum(axis=1) < 2)[:, None]
-            part.hide(found)
-        self.measure = self.held.every(MOST_HELD)
+            suspects = outliers.find(part, weights, p[part.condition], limit)
+            if spare_rare:
+                suspects &= (part.far.sum(axis=1) < 2)[:, None]
+            part.hide(suspects)
+        self.measurement = self.held.every(MOST_HELD)
 
     def _numbers(self) -> dict[str, np.ndarray]:
-        """W and every p."""
+        """Return the arrays of W and of every p."""
         return {"weights": self.chain.flat, "biases": self.biases}
 
-    def _copy(self) -> dict[str, np.ndarray]:
-        return {name: numbers.copy() for name, numbers in self._numbers().items()}
-
-    def _written(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """All that the next epoch depends on: arrays and facts."""
+    def _state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Return the arrays and facts that the next epoch depends on."""
         arrays = {f"now.{name}": numbers for name, numbers in self._numbers().items()}
         arrays |= {f"best.{name}": numbers for name, numbers in self.course.best.items()}
         arrays |= {f"adam.weights.{name}": numbers for name, numbers in self.optimiser.state().items()}
@@ -224,11 +226,11 @@ class Learner:
         return arrays, facts
 
     def _restore(self, draft: Draft) -> None:
-        """Go on where an interrupted training was written down, if it was."""
-        found = draft.load()
-        if found is None:
+        """Restore the state of an interrupted training from its draft, if there is one."""
+        state = draft.load()
+        if state is None:
             return
-        arrays, facts = found
+        arrays, facts = state
         for name, numbers in self._numbers().items():
             numbers[...] = arrays[f"now.{name}"]
             self.course.best[name] = arrays[f"best.{name}"].copy()
@@ -238,7 +240,7 @@ class Learner:
             optimiser.time = facts["steps"]
         self.material.hide(arrays["suspected"])
         self.held.hide(arrays["held_suspected"])
-        self.measure = self.held.every(MOST_HELD)
+        self.measurement = self.held.every(MOST_HELD)
         self.random.bit_generator.state = facts["random"]
         self.course.train, self.course.held_out = facts["train"], facts["held_out"]
         self.course.best_epoch, self.course.resumed = facts["best_epoch"], len(facts["train"])

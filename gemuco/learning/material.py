@@ -1,4 +1,4 @@
-"""Samples made ready for the network: normalised, gaps filled and remembered, masks drawn for a whole pass at once."""
+"""Samples prepared for the network: normalised, with gaps filled, and with a mask drawn for each."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -10,29 +10,35 @@ from gemuco.scaler import CLIP, Scaler
 
 
 class Batch(NamedTuple):
-    """What one step learns from, a row per sample.
+    """Samples of one step.
 
     Attributes:
-        inputs: x_in under its mask, and m, shape (n, in_size + signals of x_in).
-        condition: Whose p goes with it, shape (n,).
-        wanted: x_out, NaN where it was not measured, shape (n, out_size).
+        inputs: x_in under the mask of each sample, and m, shape (n, in_size + signals of x_in).
+        condition: Index of the condition whose p belongs to each sample, shape (n,).
+        target: x_out, NaN where not measured, shape (n, out_size).
     """
 
     inputs: np.ndarray
     condition: np.ndarray
-    wanted: np.ndarray
+    target: np.ndarray
 
 
 class Material:
-    """Samples with what is known to be missing from them.
+    """Samples, their missing elements and their outliers.
 
     Args:
         task: Masks and signals.
-        rows: Samples [standard deviations], shape (samples, layout.size), NaN where nothing was measured.
-        condition: Whose p goes with every sample, shape (samples,).
-        scaler: What is usual, and which elements are dead. What is stuck or silent for ever says nothing, so its
-            absence hinders nothing: a mask needs only the living elements of its signals.
-        new: Samples from this one on are old ones, replayed lest they be forgotten; all are new if not given.
+        rows: Samples [standard deviations], shape (samples, layout.size), NaN where not measured.
+        condition: Index of the condition whose p belongs to each sample, shape (samples,).
+        scaler: Range of every element, and the dead elements. A mask does not need the dead elements of its signals.
+        new: Number of new samples; the samples behind them are old ones that are replayed. All are new if not given.
+
+    Attributes:
+        far: Whether a signal has an element far outside its usual range, shape (samples, signals).
+        granted: Whether an element is measured or not needed, shape (samples, layout.size).
+        suspected: Signals that are treated as not measured, shape (samples, signals).
+        allowed: Masks that each sample allows, shape (samples, masks).
+        usable: Indices of samples with an allowed mask and a measured output, shape (usable,).
     """
 
     def __init__(
@@ -55,49 +61,52 @@ class Material:
         self.hide(np.zeros((len(rows), len(task.layout.names)), bool))
 
     def hide(self, suspected: np.ndarray) -> None:
-        """Treat some signals as not measured, shape (samples, signals)."""
+        """Treat suspected signals, shape (samples, signals), as not measured."""
         self.suspected = suspected
         hidden = suspected[:, self.task.signal_of]
-        there = (self._measured & ~hidden)[:, self.task.out_index]
-        self._wanted = np.where(there, self._x_out, np.float32(np.nan))
+        is_target = (self._measured & ~hidden)[:, self.task.out_index]
+        self._target = np.where(is_target, self._x_out, np.float32(np.nan))
         self.allowed = self.task.allowed(self.granted & ~hidden)
-        self.usable = np.flatnonzero(self.allowed.any(axis=1) & there.any(axis=1))
+        self.usable = np.flatnonzero(self.allowed.any(axis=1) & is_target.any(axis=1))
 
     @property
     def skipped(self) -> int:
-        """New samples that no mask fits, or with nothing to learn from."""
+        """Number of new samples without an allowed mask or without a measured output."""
         return self.new - int((self.usable < self.new).sum())
 
     def draw(self, random: np.random.Generator, replay: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-        """One pass: every usable sample once, in random order, each under a random mask it allows: (rows, masks).
+        """Draw one pass over the data: every usable new sample once, in random order, under a random allowed mask.
 
         Args:
             random: Source of chance.
-            replay: As many of the old samples as this times the new ones.
+            replay: Number of old samples per new sample.
+
+        Returns:
+            Indices of the samples and of their masks, shape (n,).
         """
         new, old = self.usable[self.usable < self.new], self.usable[self.usable >= self.new]
         count = min(len(old), round(replay * len(new)))
         rows = random.permutation(np.concatenate([new, random.permutation(old)[:count]]))
-        chosen = random.integers(0, len(self.task.masks), len(rows))
-        wrong = np.flatnonzero(~self.allowed[rows, chosen])
+        masks = random.integers(0, len(self.task.masks), len(rows))
+        wrong = np.flatnonzero(~self.allowed[rows, masks])
         if len(wrong):
             dice = random.random((len(wrong), len(self.task.masks)), np.float32)
-            chosen[wrong] = np.where(self.allowed[rows[wrong]], dice, -1.0).argmax(axis=1)
-        return rows, chosen
+            masks[wrong] = np.where(self.allowed[rows[wrong]], dice, -1.0).argmax(axis=1)
+        return rows, masks
 
     def every(self, most: int) -> tuple[np.ndarray, np.ndarray]:
-        """Samples with every mask they allow, evenly thinned to `most` pairs: (rows, masks)."""
-        rows, chosen = np.nonzero(self.allowed[self.usable])
-        kept = np.linspace(0, len(rows) - 1, min(most, len(rows))).astype(int)
-        return self.usable[rows[kept]], chosen[kept]
+        """Return the indices of samples and masks of all allowed pairs, evenly thinned to at most `most` pairs."""
+        rows, masks = np.nonzero(self.allowed[self.usable])
+        thinned = np.linspace(0, len(rows) - 1, min(most, len(rows))).astype(int)
+        return self.usable[rows[thinned]], masks[thinned]
 
-    def take(self, rows: np.ndarray, chosen: np.ndarray) -> Batch:
-        """Samples under masks, ready for the network."""
-        inputs = np.concatenate([self._x_in[rows] * self.task.through[chosen], self.task.tails[chosen]], axis=1)
-        return Batch(inputs, self.condition[rows], self._wanted[rows])
+    def take(self, rows: np.ndarray, masks: np.ndarray) -> Batch:
+        """Return samples under masks, both by index, as the network needs them."""
+        inputs = np.concatenate([self._x_in[rows] * self.task.through[masks], self.task.tails[masks]], axis=1)
+        return Batch(inputs, self.condition[rows], self._target[rows])
 
     @staticmethod
     def cut(batch: Batch, size: int) -> Iterator[Batch]:
-        """A long batch in pieces."""
+        """Yield a batch in parts of at most `size` samples."""
         for start in range(0, len(batch.inputs), size):
             yield Batch(*(part[start : start + size] for part in batch))

@@ -1,4 +1,4 @@
-"""z = h_enc(x_in, m, p), x_out = h_dec(z); nothing else lives here."""
+"""The network as torch sees it: z = h_enc(x_in, m, p), x_out = h_dec(z)."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -31,14 +31,14 @@ def _linear(chain: nn.Sequential) -> list[nn.Linear]:
 
 
 class Network(nn.Module):
-    """Encoder and decoder, an activation between linear layers; the latent state and the output are linear.
+    """Encoder and decoder with an activation between linear layers; latent state and output are linear.
 
     Args:
         inputs: Length of x_in, m and p together.
         outputs: Length of x_out.
         hidden: Widths from the input to the latent state; the decoder mirrors them.
         latent: Length of z.
-        activation: Its name.
+        activation: Name of the activation.
     """
 
     def __init__(self, inputs: int, outputs: int, hidden: Sequence[int], latent: int, activation: str = "tanh") -> None:
@@ -48,16 +48,16 @@ class Network(nn.Module):
         self.decoder = _chain([latent, *reversed(hidden), outputs], activation)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Inputs (samples, inputs) -> x_out (samples, outputs)."""
+        """Return x_out, shape (samples, outputs), of inputs, shape (samples, inputs)."""
         return self.decoder(self.encoder(x))
 
     @property
     def linear(self) -> list[nn.Linear]:
-        """Every affine map, from the input to the output."""
+        """Linear layers from the input to the output."""
         return _linear(self.encoder) + _linear(self.decoder)
 
     def weights(self) -> Weights:
-        """A copy of W for the numpy kernels."""
+        """Copy W into numpy arrays."""
 
         def export(chain: nn.Sequential) -> Chain:
             linear = _linear(chain)

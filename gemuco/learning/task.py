@@ -1,4 +1,4 @@
-"""What a network is asked: which signals it is given, under which masks, and which it must tell."""
+"""Inputs, masks and outputs of a training, as arrays."""
 
 from dataclasses import dataclass, field
 
@@ -15,15 +15,15 @@ class Task:
 
     Attributes:
         layout: Every signal.
-        masks: What may be given.
-        x_out: Signals to tell, in the order of the layout.
-        x_in: The union of the masks, in the order of the layout.
-        in_index: Where the elements of x_in lie in the layout, shape (in_size,).
-        out_index: Where the elements of x_out lie in the layout, shape (out_size,).
+        masks: Feasible masks.
+        x_out: Signals to infer, in the order of the layout.
+        x_in: Union of the masks, in the order of the layout.
+        in_index: Indices of the elements of x_in in the layout, shape (in_size,).
+        out_index: Indices of the elements of x_out in the layout, shape (out_size,).
         signal_of: Index of the signal that each element of the layout belongs to, shape (layout.size,).
-        needs: Which signals of the layout a mask is made of, shape (masks, signals), float32.
-        tails: The m that the network sees, shape (masks, signals of x_in), float32.
-        through: Which elements of x_in a mask lets through, shape (masks, in_size), float32.
+        needs: 1 for the signals of the layout that a mask contains, else 0, shape (masks, signals), float32.
+        tails: m of every mask as the network receives it, shape (masks, signals of x_in), float32.
+        through: 1 for the elements of x_in that a mask lets through, else 0, shape (masks, in_size), float32.
     """
 
     layout: Layout
@@ -50,24 +50,28 @@ class Task:
         set_field(self, "through", np.repeat(self.tails, [layout.signal(name).size for name in x_in], axis=1))
 
     def any_of(self, elements: np.ndarray) -> np.ndarray:
-        """Of which signals any element is marked, shape (samples, signals); elements (samples, layout.size)."""
+        """Return whether any element of each signal is true, (samples, layout.size) -> (samples, signals)."""
         starts = np.searchsorted(self.signal_of, np.arange(len(self.layout.names)))
         return np.logical_or.reduceat(elements, starts, axis=1)
 
     def allowed(self, present: np.ndarray) -> np.ndarray:
-        """Which masks find all they need, shape (samples, masks), of what elements are there."""
-        lacking = self.any_of(~present).astype(np.float32)
-        return lacking @ self.needs.T < 0.5
+        """Return whether each mask has all its signals, shape (samples, masks).
 
-    def inputs(self, x: np.ndarray, chosen: int, bias: np.ndarray) -> np.ndarray:
-        """x_in, m and p under one mask, shape (samples, inputs), float32.
+        Args:
+            present: Whether each element is present, shape (samples, layout.size).
+        """
+        absent = self.any_of(~present).astype(np.float32)
+        return absent @ self.needs.T < 0.5
+
+    def inputs(self, x: np.ndarray, index: int, bias: np.ndarray) -> np.ndarray:
+        """Return x_in, m and p under one mask, shape (samples, inputs), float32.
 
         Args:
             x: Every signal [standard deviations], shape (samples, layout.size); NaN counts as the mean.
-            chosen: Index of the mask.
+            index: Index of the mask.
             bias: p of every sample, shape (samples, bias_size).
         """
-        through = self.through[chosen]
+        through = self.through[index]
         values = np.clip(np.nan_to_num(np.where(through > 0, x[:, self.in_index], 0.0)), -CLIP, CLIP)
-        tail = np.broadcast_to(self.tails[chosen], (len(x), len(self.x_in)))
+        tail = np.broadcast_to(self.tails[index], (len(x), len(self.x_in)))
         return np.concatenate([values, tail, bias], axis=1, dtype=np.float32)

@@ -1,4 +1,4 @@
-"""Training (paper, II-D): from episodes to a body schema, and from a schema to one that fits a few new episodes."""
+"""Training of a body schema from episodes (paper, II-D), and its fine-tuning on a few new episodes."""
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -22,7 +22,7 @@ from gemuco.scaler import Scaler
 from gemuco.schema import BodySchema
 
 ANCHORS = 1000
-"""A schema keeps at most this many samples of its training data."""
+"""A schema contains at most this many samples of its training data."""
 
 
 def fit(
@@ -43,16 +43,16 @@ def fit(
         masks: The feasible masks; their union is x_in.
         progress: Called after every epoch.
         x_out: Signals to infer; every signal if not given.
-        title: Begins the progress text.
-        resume: A file to keep the training in. If it holds this very training, interrupted, that goes on and ends
-            with the same result; if it is finished there, nothing is trained. The caller removes it.
+        title: First words of the progress text.
+        resume: A file in which the training is saved. If it contains the same training, interrupted, this is continued
+            with the same result; if it contains the finished training, nothing is trained. The caller removes it.
         units: Signal -> unit, of plain arrays.
 
     Returns:
-        The schema with its held-out errors and the statistics of the normal, and how training went.
+        The schema with its held-out errors and the statistics of its normal errors, and the record of the training.
 
     Raises:
-        NotEnoughData: Too few samples to hold some out, or none that fits a mask.
+        NotEnoughData: Too few samples to hold some out, or no sample that fits a mask.
         UnknownSignal: A mask or x_out names a signal that is not in the layout.
     """
     check_kind("The settings of a training", config, TrainConfig, "a TrainConfig")
@@ -64,24 +64,24 @@ def fit(
     outputs = layout.subset(layout.names if x_out is None else tuple(x_out)).names
     train_data, held_data = dataset.split(config.held_out, config.seed)
     scaler = Scaler.fit(layout, train_data.rows())
-    task, notes = _heard(dataset, checked, outputs)
+    task, notes = _task(dataset, checked, outputs)
     conditions = dataset.conditions
     material = _material(task, scaler, train_data, conditions)
     held = _material(task, scaler, held_data, conditions)
     frozen = np.full(len(conditions), len(conditions) == 1)
     if config.bias_size and frozen.all():
         notes.append(
-            f"All data are of one condition ('{conditions[0]}'), so the parametric bias has nothing to tell apart: p "
+            f"All data are of one condition ('{conditions[0]}'), so the parametric bias has nothing to distinguish: p "
             "stays 0 and has no effect. Collect other conditions, or set `bias: 0`."
         )
     torch.manual_seed(config.seed)
     size = len(task.in_index) + len(task.x_in) + config.bias_size
-    drawn = Network(size, len(task.out_index), config.hidden, config.latent, config.activation).weights()
-    _mute(drawn, task, scaler.dead, config.bias_size if frozen.all() else 0)
+    weights = Network(size, len(task.out_index), config.hidden, config.latent, config.activation).weights()
+    _mute(weights, task, scaler.dead, config.bias_size if frozen.all() else 0)
     biases = np.zeros((len(conditions), config.bias_size), np.float32)
-    learner = Learner(config, drawn, biases, frozen, material, held)
+    learner = Learner(config, weights, biases, frozen, material, held)
     learner.run(progress, title, Draft(resume, _key(config, task, dataset)))
-    schema = _assessed(_schema(learner, scaler, conditions), learner, conditions)
+    schema = _assess(_schema(learner, scaler, conditions), learner, conditions)
     return schema, _history(learner, scaler, notes)
 
 
@@ -93,46 +93,46 @@ def fine_tune(
     title: str = "fine-tuning",
     resume: str | Path | None = None,
 ) -> tuple[BodySchema, History]:
-    """Train a schema further on few samples of a body that is like the one it knows: simulation to real robot.
+    """Train a schema further on few samples of a similar body, such as a simulated and then the real robot.
 
-    W starts from the schema's, and so does the p of every condition it knows; others start from the p in use. The
-    scale stays. The schema's anchors are replayed under the p they had, which stays: what was known of postures that
-    the new samples do not show is kept, while the new conditions move away from the old ones. Shape and masks are the
-    schema's; `config` says the rest.
+    Training starts from the schema's W and from the p of every condition that the schema contains; the p of a new
+    condition starts from the p in use. Scale, network shape and masks stay. The schema's anchors are replayed under
+    their own p, which does not change: the schema does not forget postures that the new samples do not show.
 
     Args:
-        schema: What is known.
-        dataset: Episodes of the body as it is, with the signals of the schema.
-        config: How; `rate` is the peak, smaller than in training.
+        schema: The schema to start from.
+        dataset: Episodes of the present body, with the signals of the schema.
+        config: Settings; `rate` is the peak, smaller than in training.
         progress: Called after every epoch.
-        title: Begins the progress text.
+        title: First words of the progress text.
         resume: As in `fit`.
 
     Returns:
-        The schema under the p of all conditions, old and new, with errors and normal statistics of the new data.
+        The schema with the p of all conditions, old and new, and errors and normal statistics of the new data, and the
+        record of the training.
 
     Raises:
         DatasetError: A signal is missing, or has other elements or another unit.
-        NotEnoughData: Too few samples to hold some out, or none that fits a mask.
+        NotEnoughData: Too few samples to hold some out, or no sample that fits a mask.
     """
     dataset = dataset.with_layout(schema.layout)
     task = Task(schema.layout, schema.masks, schema.x_out)
     train_data, held_data = dataset.split(config.held_out, config.seed)
-    fresh = dataset.conditions
+    conditions = dataset.conditions
     old = list(schema.biases.values()) if len(schema.bias) else [schema.bias]
-    start = np.stack([*(schema.biases.get(c, schema.bias) for c in fresh), *old])
-    frozen = np.arange(len(start)) >= len(fresh)
-    material = _material(task, schema.scaler, train_data, fresh, schema)
-    held = _material(task, schema.scaler, held_data, fresh)
+    start = np.stack([*(schema.biases.get(c, schema.bias) for c in conditions), *old])
+    frozen = np.arange(len(start)) >= len(conditions)
+    material = _material(task, schema.scaler, train_data, conditions, schema)
+    held = _material(task, schema.scaler, held_data, conditions)
     key = _key(config, task, dataset, *schema.weights.arrays(), start, schema.anchors, schema.scaler.std)
     learner = Learner(config, schema.weights, start, frozen, material, held)
     learner.run(progress, title, Draft(resume, key))
-    tuned = _assessed(_schema(learner, schema.scaler, fresh, schema), learner, fresh)
-    return tuned, _history(learner, Scaler.fit(schema.layout, train_data.rows()), [])
+    result = _assess(_schema(learner, schema.scaler, conditions, schema), learner, conditions)
+    return result, _history(learner, Scaler.fit(schema.layout, train_data.rows()), [])
 
 
-def _heard(dataset: Dataset, masks: tuple[Mask, ...], x_out: tuple[str, ...]) -> tuple[Task, list[str]]:
-    """The task without signals that were never measured, and a sentence on each of those."""
+def _task(dataset: Dataset, masks: tuple[Mask, ...], x_out: tuple[str, ...]) -> tuple[Task, list[str]]:
+    """Return the task without signals that were never measured, and a remark on each of these."""
     layout, measured = dataset.layout, np.isfinite(dataset.rows()).any(axis=0)
     silent = [name for name in layout.names if not measured[layout.slice(name)].any()]
     notes = [
@@ -140,20 +140,20 @@ def _heard(dataset: Dataset, masks: tuple[Mask, ...], x_out: tuple[str, ...]) ->
         "or leave it out of the model's signals."
         for name in silent
     ]
-    left = tuple(m for m in masks if not m & set(silent))
+    usable = tuple(m for m in masks if not m & set(silent))
     outputs = tuple(name for name in x_out if name not in silent)
-    if not left or not outputs:
+    if not usable or not outputs:
         raise NotEnoughData(f"Nothing can be learned: {', '.join(silent)} was never measured; check what was recorded.")
-    return Task(layout, left, outputs), notes
+    return Task(layout, usable, outputs), notes
 
 
 def _material(
     task: Task, scaler: Scaler, data: Dataset, conditions: tuple[str, ...], before: BodySchema | None = None
 ) -> Material:
-    """The samples of a dataset, and behind them those that a schema brings along.
+    """Return the samples of a dataset, followed by the anchors of the previous schema.
 
     Raises:
-        NotEnoughData: None of the dataset's samples is of use.
+        NotEnoughData: No sample of the dataset can be used.
     """
     rows = scaler.normalise(data.rows())
     order = np.array([conditions.index(c) for c in data.conditions], int)
@@ -171,9 +171,9 @@ def _material(
 
 
 def _mute(weights: Weights, task: Task, dead: np.ndarray, unused: int) -> None:
-    """Let dead elements and an unused p have no effect, and a dead output be its mean.
+    """Set the weights of dead elements and of an unused p to zero; a dead output is then always its mean.
 
-    What enters with weight 0 and is always 0 gets no gradient, so it stays muted through all of the training.
+    These inputs are always 0, so their weights get no gradient and stay zero during the training.
     """
     first, last = weights.encoder[0], weights.decoder[-1]
     first.matrix[np.flatnonzero(np.isin(task.in_index, dead))] = 0.0
@@ -184,7 +184,7 @@ def _mute(weights: Weights, task: Task, dead: np.ndarray, unused: int) -> None:
 
 
 def _key(config: TrainConfig, task: Task, dataset: Dataset, *arrays: np.ndarray) -> str:
-    """What tells one training from another."""
+    """Return the key of a training for its draft."""
     masks = [label(m, task.layout.names) for m in task.masks]
     return key_of(config, task.layout, masks, task.x_out, dataset.conditions, dataset.rows(), *arrays)
 
@@ -192,18 +192,18 @@ def _key(config: TrainConfig, task: Task, dataset: Dataset, *arrays: np.ndarray)
 def _schema(
     learner: Learner, scaler: Scaler, conditions: tuple[str, ...], before: BodySchema | None = None
 ) -> BodySchema:
-    """What was learned, without errors and normal statistics."""
+    """Build the schema from the learned weights, without errors and normal statistics."""
     material, task = learner.material, learner.task
     learned = learner.biases[: len(conditions)].copy()
     known = {} if before is None else dict(before.biases)
     biases = {**known, **dict(zip(conditions, learned, strict=True))} if learned.shape[1] else {}
     rows = np.where(material.suspected[:, task.signal_of], np.nan, material.rows)[: material.new]
     complete = np.flatnonzero(np.isfinite(np.delete(rows, scaler.dead, axis=1)).all(axis=1))
-    chosen = complete[np.random.default_rng(learner.config.seed).permutation(len(complete))[:ANCHORS]]
-    anchors, names = np.nan_to_num(rows[chosen]), list(biases)
+    samples = complete[np.random.default_rng(learner.config.seed).permutation(len(complete))[:ANCHORS]]
+    anchors, names = np.nan_to_num(rows[samples]), list(biases)
     owners = np.array([names.index(c) for c in conditions] if biases else [], int)
-    owner = owners[material.condition[chosen]] if biases else np.zeros(0, int)
-    if before is not None and biases:  # what is known of conditions that the new data do not show
+    owner = owners[material.condition[samples]] if biases else np.zeros(0, int)
+    if before is not None and biases:  # anchors of conditions that the new data do not contain
         others = ~np.isin(before.anchor_conditions, owners)
         anchors = np.concatenate([anchors, before.anchors[others]])
         owner = np.concatenate([owner, before.anchor_conditions[others]])
@@ -221,8 +221,8 @@ def _schema(
     )
 
 
-def _assessed(schema: BodySchema, learner: Learner, conditions: tuple[str, ...]) -> BodySchema:
-    """The schema with errors and normal statistics of the held-out data, but for what was rejected there."""
+def _assess(schema: BodySchema, learner: Learner, conditions: tuple[str, ...]) -> BodySchema:
+    """Return the schema with errors and normal statistics of the held-out data without its outliers."""
     held = learner.held
     rows = schema.scaler.restore(np.where(held.suspected[:, held.task.signal_of], np.nan, held.rows))
     names = list(schema.biases)

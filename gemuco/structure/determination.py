@@ -1,7 +1,8 @@
 """Structure determination (paper, II-E): which signals can be inferred, and from which masks.
 
-Up to 10 signals all 2^n - 1 masks are measured; with more the border between too little and enough is searched for
-(`mask_search`). Either way a mask is feasible only if its own error was measured, on all rows, and is small enough.
+With up to 10 signals all 2^n - 1 masks are measured. With more, the border between masks that are enough and masks that
+are not is searched for (`mask_search`). A mask is feasible only if its own error was measured on all rows and is small
+enough.
 """
 
 from collections.abc import Iterable, Mapping
@@ -26,7 +27,7 @@ from gemuco.structure.mask_search import choose, find_border
 __all__ = ["Judge", "Structure", "Thresholds", "determine", "learn", "search", "select"]
 
 MOST_MASKS = 64
-"""A schema gets at most this many masks: each is trained, has its errors measured, and is tried in every estimate."""
+"""A schema has at most this many masks, because every mask costs time in training and in every estimate."""
 BUDGET = 20_000
 """The search measures about this many masks at most."""
 SHOWN = 40
@@ -43,9 +44,9 @@ class Structure:
         x_out: Outputs.
         masks: Feasible masks for the schema, the best first; at most `MOST_MASKS`.
         L_i: Signal -> error when inferred from all others; infinite if no held-out sample has it.
-        L_m: Mask -> error of x_out, of every mask that was measured.
-        thresholds: Errors below which something counts as inferable.
-        is_whole: Whether every mask was measured, or the search ended with nothing left to measure.
+        L_m: Mask -> error of x_out, for every mask that was measured.
+        thresholds: Largest errors of outputs and of feasible masks.
+        is_whole: Whether every mask was measured, or the search ended because nothing was left to measure.
     """
 
     layout: Layout
@@ -59,7 +60,7 @@ class Structure:
 
     @property
     def feasible(self) -> tuple[Mask, ...]:
-        """Every measured mask below the threshold, the best first."""
+        """Measured masks below the threshold, the best first."""
         return tuple(sorted((m for m in self.L_m if self.L_m[m] < self.thresholds.into), key=lambda m: self.L_m[m]))
 
     @property
@@ -69,13 +70,13 @@ class Structure:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """Facts that a reader of the tables may overlook, one sentence each."""
+        """Facts that the tables do not show, one sentence each."""
         sentences: list[str] = []
         for name in self.x_out:
             if all(name in m for m in self.masks):
                 sentences.append(
-                    f"'{name}' is an output, but no feasible mask does without it (threshold_in is lower than what it "
-                    "needs): where it is missing it is estimated by descent on z."
+                    f"'{name}' is an output, but every feasible mask contains it (without it no mask is below "
+                    "threshold_in): when it is missing it is estimated by descent on z."
                 )
         for name in self.layout.names:
             if name not in self.x_in and name not in self.x_out:
@@ -122,11 +123,11 @@ def determine(
     Args:
         data: Episodes of one body, as a dataset or as plain arrays; see `as_dataset`.
         config: Settings of the training; the defaults if not given.
-        thresholds: Errors below which something counts as inferable; the paper's if not given.
-        progress: Called with the share done, 0 to 1, and a line of text.
-        splits: Number of trainings, each with other episodes held out; errors are means over all. One is the paper's
-            way. Short recordings need more: their errors change many times over with the part that is held out.
-        drafts: A folder to keep trainings in, so that an interrupted one goes on; see `fit`.
+        thresholds: Largest errors of outputs and of feasible masks; those of the paper if not given.
+        progress: Called with the finished share, 0 to 1, and a line of text.
+        splits: Number of trainings, each with other episodes held out; errors are means over all. The paper uses one.
+            Short recordings need more, because their errors depend strongly on the held-out part.
+        drafts: A folder in which the trainings are saved, so that interrupted ones can be continued; see `fit`.
         units: Signal -> unit, of plain arrays.
 
     Raises:
@@ -165,7 +166,7 @@ def learn(
     x_out: Iterable[str] | None = None,
     units: Mapping[str, str] | None = None,
 ) -> BodySchema:
-    """Learn a body from data (paper, II-D and II-E); `fit` also returns how training went.
+    """Learn a body from data (paper, II-D and II-E); `fit` also returns the record of the training.
 
     Args:
         data: Episodes of one body, as a dataset or as plain arrays; see `as_dataset`.
@@ -183,7 +184,7 @@ def learn(
 
 
 def select(layout: Layout, judge: Judge, masks: np.ndarray, is_whole: bool, seed: int) -> Structure:
-    """Measure masks, shape (n, signals), and keep those that are feasible and serve best.
+    """Measure masks, shape (n, signals), and keep at most `MOST_MASKS` of those that are feasible.
 
     Raises:
         NotEnoughData: No mask is feasible.
@@ -216,7 +217,7 @@ def search(judge: Judge, seed: int) -> tuple[np.ndarray, bool]:
     """Search for masks that are enough.
 
     Returns:
-        These and the largest that are not, shape (n, signals), and whether the search came to an end.
+        These and the largest that are not enough, shape (n, signals), and whether the search was completed.
     """
     enough: list[np.ndarray] = []
 

@@ -1,4 +1,4 @@
-"""How well one network infers every signal from any mask, measured on held-out rows."""
+"""Errors of a network that infers every signal from any mask, measured on held-out rows."""
 
 import os
 from concurrent.futures import ThreadPoolExecutor
@@ -25,7 +25,7 @@ from gemuco.schema import BodySchema
 from gemuco.signals import Layout
 
 RARE = 0.05
-"""A signal with a larger share of suspected outliers has none: there the model is wrong, and all samples count."""
+"""If a larger share of a signal's samples are suspected outliers, the model is wrong and all its samples count."""
 LISTED = 10
 """With at most this many signals every mask is measured."""
 TRAINED = 2000
@@ -34,19 +34,19 @@ TRAINED = 2000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MaskErrors:
-    """A network that infers every signal from any mask, and rows to measure it on.
+    """A network that infers every signal from any mask, and the rows on which it is measured.
 
-    Errors are shares of variance: 1 is that of always guessing the mean. For elements that vary, this is the mean
-    squared error in standard deviations. An element that hardly moves (below the floor of its signal's scale) counts as
-    little as it moves, and one that never moves does not count, or dead channels would make a signal look well
+    Errors are shares of variance: the error of always guessing the mean is 1. For elements that vary, this is the mean
+    squared error in standard deviations. An element that hardly moves (below the floor of its signal's scale) counts
+    less, and an element that never moves does not count; otherwise dead channels would make a signal look well
     inferred.
 
     Attributes:
         layout: The signals.
-        chain: The network: all signals, a bit per signal and p in, all signals out.
+        chain: The network. Inputs: all signals, one bit per signal, and p. Outputs: all signals.
         x: Held-out rows [standard deviations], clipped, gaps filled by zero, shape (rows, size).
-        there: Which elements count: measured, and alive; shape (rows, size).
-        whole: Which signals are whole, shape (rows, signals).
+        counts: Whether an element is measured and not dead, shape (rows, size).
+        whole: Whether a signal is complete, shape (rows, signals).
         p: Parametric bias of every row, shape (rows, bias_size).
         liveliness: Variance of every element in the training data, at most 1 [standard deviations squared], (size,).
     """
@@ -54,16 +54,16 @@ class MaskErrors:
     layout: Layout
     chain: Chain
     x: np.ndarray
-    there: np.ndarray
+    counts: np.ndarray
     whole: np.ndarray
     p: np.ndarray
     liveliness: np.ndarray
 
     @classmethod
     def of_schema(cls, schema: BodySchema, train: Dataset, held: Dataset, limit: float) -> "MaskErrors":
-        """Return the errors of a schema whose inputs and outputs are all signals, on samples it was not trained on.
+        """Measure a schema, whose inputs and outputs are all signals, on held-out samples.
 
-        Each sample is judged under the p of its condition. Outliers (`TrainConfig.outliers`) do not count.
+        Each sample is measured under the p of its condition. Outliers (`TrainConfig.outliers`) do not count.
         """
         layout, scaler = schema.layout, schema.scaler
         x = scaler.normalise(held.rows())
@@ -74,27 +74,27 @@ class MaskErrors:
         material = Material(task, x, held.condition_of_rows(), scaler)
         wild = outliers.find(material, schema.weights, p, limit)
         wild[:, wild.mean(axis=0) > RARE] = False
-        there = np.isfinite(x) & ~wild[:, task.signal_of]
-        granted = there.copy()
-        granted[:, scaler.dead] = True  # a dead element hinders no mask
-        there[:, scaler.dead] = False
+        counts = np.isfinite(x) & ~wild[:, task.signal_of]
+        granted = counts.copy()
+        granted[:, scaler.dead] = True  # a mask does not need dead elements
+        counts[:, scaler.dead] = False
         whole = np.stack([granted[:, layout.slice(name)].all(axis=1) for name in layout.names], axis=1)
         known = scaler.normalise(train.rows())
         liveliness = np.zeros(layout.size)
         for element in np.setdiff1d(np.arange(layout.size), scaler.dead):
             liveliness[element] = min(1.0, float(np.nanvar(known[:, element])))
-        x = np.clip(np.where(there, x, 0.0), -CLIP, CLIP).astype(np.float32)
-        return cls(layout, schema.weights.whole, x, there, whole, p, liveliness)
+        x = np.clip(np.where(counts, x, 0.0), -CLIP, CLIP).astype(np.float32)
+        return cls(layout, schema.weights.whole, x, counts, whole, p, liveliness)
 
     def thinned(self, most: int) -> "MaskErrors":
-        """Return the same on at most `most` rows, evenly chosen."""
+        """Return a copy with at most `most` rows, evenly selected."""
         if len(self.x) <= most:
             return self
         return self.rows(np.linspace(0, len(self.x) - 1, most).astype(int))
 
-    def rows(self, chosen: np.ndarray) -> "MaskErrors":
-        """Return the same on these rows (indices), in this order."""
-        return replace(self, **{name: getattr(self, name)[chosen] for name in ("x", "there", "whole", "p")})
+    def rows(self, index: np.ndarray) -> "MaskErrors":
+        """Return a copy with the rows of these indices, in this order."""
+        return replace(self, **{name: getattr(self, name)[index] for name in ("x", "counts", "whole", "p")})
 
     def of(self, masks: np.ndarray) -> np.ndarray:
         """Measure masks on all cores.
@@ -104,42 +104,42 @@ class MaskErrors:
 
         Returns:
             Share of the variance of every signal that each mask leaves unexplained, shape (masks, signals), NaN where
-            no row has what it takes.
+            no row has all signals of the mask.
         """
         squared = self.squared(masks)
         usable = (~self.whole).astype(np.float32) @ masks.T.astype(np.float32) < 0.5  # (rows, masks)
-        count = usable.T.astype(np.float32) @ self.there.astype(np.float32)
-        measured = self.by_signal(np.where(count > 0, self.liveliness, 0.0))
-        missed = self.by_signal(squared / np.maximum(count, 1))
-        return np.where(measured > 0, missed / np.maximum(measured, 1e-12), np.nan)
+        count = usable.T.astype(np.float32) @ self.counts.astype(np.float32)
+        variance = self.by_signal(np.where(count > 0, self.liveliness, 0.0))
+        error = self.by_signal(squared / np.maximum(count, 1))
+        return np.where(variance > 0, error / np.maximum(variance, 1e-12), np.nan)
 
     def squared(self, masks: np.ndarray) -> np.ndarray:
         """Return the sum of squared errors of every element over the rows that count, shape (masks, size).
 
-        Each core measures a part of the masks, compiled code holds no interpreter lock.
+        Each core measures a part of the masks; compiled code holds no interpreter lock.
         """
         chain, cores = pack(self.chain), len(os.sched_getaffinity(0))
         inputs = np.concatenate([self.x, self.p], axis=1, dtype=np.float32)
-        rows = Rows(inputs, self.x, self.there.astype(np.float32), np.ascontiguousarray(self.whole))
+        rows = Rows(inputs, self.x, self.counts.astype(np.float32), np.ascontiguousarray(self.whole))
 
-        def part(some: np.ndarray) -> np.ndarray:
-            gates = np.repeat(some, self.sizes, axis=1).astype(np.float32)
-            return np.asarray(squared_errors(chain, rows, gates, some.astype(np.float32)))
+        def part(share: np.ndarray) -> np.ndarray:
+            gates = np.repeat(share, self.sizes, axis=1).astype(np.float32)
+            return np.asarray(squared_errors(chain, rows, gates, share.astype(np.float32)))
 
         with one_thread(), ThreadPoolExecutor(cores) as pool:
             return np.concatenate(list(pool.map(part, np.array_split(masks, cores))))
 
     def from_others(self) -> np.ndarray:
-        """Measure every signal as inferred from all others, shape (signals,); NaN if no row has what it takes."""
+        """Return the error of every signal inferred from all others, shape (signals,); NaN if no row allows it."""
         errors = self.of(~np.eye(len(self.layout.names), dtype=bool)).diagonal().copy()
         for index in np.flatnonzero(np.isnan(errors)).tolist():
             errors[index] = self._from_some(index)
         return errors
 
     def _from_some(self, signal: int) -> float:
-        """Measure a signal (by its index) that no row has together with all others; NaN if no row has it.
+        """Return the error of a signal (by its index) that no row contains together with all others.
 
-        Every row that has the signal is inferred from those of the others that it has.
+        In every row the signal is inferred from the others that are present. The error is NaN if no row has the signal.
         """
         others = np.arange(len(self.layout.names)) != signal
         span = self.layout.slice(self.layout.names[signal])
@@ -148,13 +148,13 @@ class MaskErrors:
         for index in np.flatnonzero(patterns.any(axis=1)):
             part = self.rows(np.flatnonzero(which.ravel() == index))
             total += part.squared(patterns[index : index + 1])[0]
-            count += part.there.sum(axis=0)
+            count += part.counts.sum(axis=0)
         known = self.liveliness[span] * (count[span] > 0)
         return float((total[span] / np.maximum(count[span], 1)).sum() / known.sum()) if known.any() else float("nan")
 
     @property
     def amounts(self) -> np.ndarray:
-        """Variance of each signal to explain, shape (signals,): the number of its elements, if all vary."""
+        """Variance of each signal, shape (signals,): the number of its elements if all vary."""
         return self.by_signal(self.liveliness)
 
     @property
@@ -163,7 +163,7 @@ class MaskErrors:
         return [signal.size for signal in self.layout.signals]
 
     def by_signal(self, elements: np.ndarray) -> np.ndarray:
-        """Return sums over the elements of every signal, shape (..., size) -> (..., signals)."""
+        """Return the sums over the elements of every signal, shape (..., size) -> (..., signals)."""
         return np.asarray(np.add.reduceat(elements, np.cumsum([0, *self.sizes[:-1]]), axis=-1))
 
 
@@ -174,7 +174,7 @@ def train_masks(
     progress: Progress | None = None,
     drafts: Path | None = None,
 ) -> tuple[MaskErrors, ...]:
-    """Train one network per split of the data under all masks, and return each with its held-out episodes.
+    """Train one network under all masks per split of the data, and return each with its held-out rows.
 
     Raises:
         NotEnoughData: A signal never varies or was never measured, or there are too few samples.
@@ -208,7 +208,7 @@ def _check_alive(train: Dataset) -> None:
 
 
 def _drawn_masks(names: tuple[str, ...], seed: int) -> tuple[Mask, ...]:
-    """Return all masks, or those that lack one signal and `TRAINED` random ones of all sizes."""
+    """Return all masks, or the masks that lack one signal and `TRAINED` random masks of all sizes."""
     if len(names) <= LISTED:
         return all_masks(names)
     random = np.random.default_rng(seed)

@@ -1,4 +1,4 @@
-"""Which masks have an error that is small enough, by a network that was trained under all of them."""
+"""Comparison of the errors of masks with the thresholds of the structure determination."""
 
 from dataclasses import dataclass
 
@@ -13,15 +13,15 @@ ROWS = 1000
 
 @dataclass(frozen=True, slots=True)
 class Thresholds:
-    """Errors below which something counts as inferable.
+    """Largest errors of outputs and of feasible masks.
 
     Attributes:
-        out: A signal whose L_i is below is an output (the paper's C^out).
-        into: A mask whose L_m is below is feasible (the paper's C^in).
-        measure: `mse` (mean squared error in standard deviations) or `rmse` (its root). The paper leaves it open; its
-            figures for the muscle-driven arm fit `mse`.
-        over: L_m over the `masked` outputs only, or over `all`. The paper's own figures need `masked`: what a network
-            is given it also gives back, and that would dilute the error of what it must infer.
+        out: A signal with L_i below this is an output (the paper's C^out).
+        into: A mask with L_m below this is feasible (the paper's C^in).
+        measure: `mse` (mean squared error in standard deviations) or `rmse` (its root). The paper does not say which;
+            its figures for the muscle-driven arm agree with `mse`.
+        over: L_m is the mean over the `masked` outputs only, or over `all`. The paper's figures need `masked`: a
+            network reproduces its inputs, and these would dilute the error of the inferred signals.
     """
 
     out: float = 0.15
@@ -50,11 +50,11 @@ class Judge:
     Args:
         names: The signals.
         errors: One per split of the data; errors are means over the splits.
-        thresholds: Which errors are small enough.
+        thresholds: Largest errors of outputs and of feasible masks.
 
     Attributes:
         L_i: Signal -> error when inferred from all others.
-        outputs: Which signals can be inferred, truth values, shape (signals,).
+        outputs: Whether each signal can be inferred, truth values, shape (signals,).
         measured: Number of masks measured so far.
     """
 
@@ -66,7 +66,7 @@ class Judge:
         self.outputs = np.array([self.L_i[name] < thresholds.out for name in names])
 
     def is_judged(self, masks: np.ndarray) -> np.ndarray:
-        """Whether a mask leaves any output to infer, shape (n,): the others are not judged (paper, II-E.3)."""
+        """Return whether each mask lacks an output, shape (n,); other masks are not judged (paper, II-E.3)."""
         return (self.outputs & ~masks).any(axis=1)
 
     def measure(self, masks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -87,6 +87,6 @@ class Judge:
         return self._measured(np.where(total > 0.0, mean, np.nan)), squared
 
     def _measured(self, squared: np.ndarray) -> np.ndarray:
-        """Return squared errors in the measure of the thresholds; infinite where there is none."""
+        """Return squared errors in the measure of the thresholds; infinite where there is no error."""
         is_plain = self.thresholds.measure == "mse"
         return np.where(np.isfinite(squared), squared if is_plain else np.sqrt(squared), np.inf)

@@ -1,14 +1,14 @@
-"""Feasible masks of many signals without measuring all 2^n - 1, and the choice of those that a schema keeps.
+"""Search for the feasible masks of many signals without measuring all 2^n - 1, and choice of those that a schema keeps.
 
-Whether a mask is enough hardly ever depends on more than this: a superset of a mask that is enough is enough, a subset
-of one that is not enough is not enough. So the border is sufficient: the smallest masks that are enough and the largest
-that are not. The search (after MARCO: Liffiton et al., Fast, flexible MUS enumeration, 2016) takes a mask about which
-the known border says nothing and measures it. If it is enough, signals are taken away while it stays so, else added
-while it stays too small. Each such walk ends on the border and needs n measurements; walks are taken many at a time, so
-that their masks are measured together.
+The search assumes that a superset of a mask that is enough is enough too, and that a subset of a mask that is not
+enough is not. Then the border describes all masks: the smallest masks that are enough and the largest that are not. The
+search (after MARCO: Liffiton et al., Fast, flexible MUS enumeration, 2016) measures a mask that the known border does
+not decide. If it is enough, signals are removed while it stays enough; otherwise signals are added while it stays too
+small. Each such walk ends on the border after n measurements. Many walks run together, so that their masks are measured
+together.
 
-The assumption only guides: every mask that is returned was measured itself. When the border is complete its masks are
-measured with one signal less and with two, for exceptions from which new walks begin.
+The assumption only guides the search: every returned mask was measured. When the border is complete, its masks are
+measured with one and with two signals less. New walks begin from each such mask that is enough against the assumption.
 """
 
 import heapq
@@ -18,13 +18,13 @@ from dataclasses import dataclass
 import numpy as np
 
 TOGETHER = 32
-"""Walks at a time."""
+"""This many walks run together."""
 DEPTH = 2
-"""Exceptions are looked for up to this many signals below the border."""
+"""Exceptions are searched for up to this many signals below the border."""
 SEEDS = 4000
 """The border counts as complete when it decides all of this many random masks."""
 SCENES = 1500
-"""Random sets of available signals on which masks are compared."""
+"""Masks are compared on this many random sets of available signals."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,10 +32,10 @@ class Border:
     """Result of the search.
 
     Attributes:
-        smallest: Masks that are enough and of which no signal can be spared, shape (n, signals).
-        largest: Masks that are not enough, to which no signal can be added, shape (n, signals).
+        smallest: Masks that are enough, and are not enough without any one of their signals, shape (n, signals).
+        largest: Masks that are not enough, and are enough with any one more signal, shape (n, signals).
         tried: Number of masks that were measured.
-        is_complete: Whether the search ended because nothing was left to measure, not for its budget.
+        is_complete: Whether the search ended because nothing was left to measure, and not because of its budget.
     """
 
     smallest: np.ndarray
@@ -45,7 +45,7 @@ class Border:
 
 
 class _Oracle:
-    """Memory of measured masks: line of truth values -> whether it is enough."""
+    """Memory of measured masks: the bytes of their truth values -> whether they are enough."""
 
     def __init__(self, is_enough: Callable[[np.ndarray], np.ndarray]) -> None:
         self._is_enough = is_enough
@@ -65,8 +65,8 @@ def find_border(is_enough: Callable[[np.ndarray], np.ndarray], signals: int, bud
     Args:
         is_enough: Masks (n, signals), truth values -> whether each is enough, shape (n,).
         signals: Number of signals.
-        budget: Number of masks to measure at most, roughly.
-        seed: Of the order of the walks.
+        budget: Approximate largest number of masks to measure.
+        seed: Seed of the order of the walks.
     """
     random = np.random.default_rng(seed)
     oracle = _Oracle(is_enough)
@@ -85,7 +85,7 @@ def find_border(is_enough: Callable[[np.ndarray], np.ndarray], signals: int, bud
 
 
 def _walk(masks: np.ndarray, oracle: _Oracle, random: np.random.Generator, enough: bool) -> np.ndarray:
-    """Take signals away while the masks stay enough, or add signals while they stay too small."""
+    """Remove signals while the masks stay enough, or add signals while they stay too small."""
     masks = masks.copy()
     orders = random.permuted(np.tile(np.arange(masks.shape[1]), (len(masks), 1)), axis=1)
     for step in range(masks.shape[1]):
@@ -112,7 +112,7 @@ def _unexplored(smallest: np.ndarray, largest: np.ndarray, signals: int, random:
 
 
 def _exceptions(smallest: np.ndarray, largest: np.ndarray, oracle: _Oracle) -> np.ndarray:
-    """Find masks up to `DEPTH` signals short of the border that are enough all the same, shape (n, signals)."""
+    """Find masks that are enough although they lack up to `DEPTH` signals of the border, shape (n, signals)."""
     short = np.concatenate([smallest, largest])
     for _ in range(DEPTH):
         lines, signals = np.nonzero(short)
@@ -129,12 +129,12 @@ def _exceptions(smallest: np.ndarray, largest: np.ndarray, oracle: _Oracle) -> n
 
 def _contains(masks: np.ndarray, parts: np.ndarray) -> np.ndarray:
     """Return whether each mask contains at least one of the parts, shape (masks,)."""
-    lacking = parts.astype(np.float32) @ (~masks).T.astype(np.float32)  # (parts, masks): signals of a part not there
+    lacking = parts.astype(np.float32) @ (~masks).T.astype(np.float32)  # (parts, masks): missing signals of the part
     return np.asarray((lacking < 0.5).any(axis=0)) if len(parts) else np.zeros(len(masks), bool)
 
 
 def _extremes(masks: np.ndarray) -> np.ndarray:
-    """Return the masks that contain no other of them."""
+    """Return the masks that contain no other mask of the array."""
     masks = np.unique(masks, axis=0)
     if not len(masks):
         return masks
@@ -145,30 +145,29 @@ def _extremes(masks: np.ndarray) -> np.ndarray:
 
 
 def choose(candidates: np.ndarray, errors: np.ndarray, outputs: np.ndarray, most: int, seed: int = 0) -> np.ndarray:
-    """Choose masks one after another, each the one that lowers the mean error over random scenes most.
+    """Choose masks one after another; each lowers the mean error over random scenes most.
 
-    If there is room, the masks of which no signal can be spared come first, so that every set of signals that is enough
-    is served.
+    If there is room, the smallest masks come first, so that every set of signals that is enough has a mask.
 
-    A scene is a set of available signals: all but one, or a random one with any share of the signals lost. Its error is
-    that of the outputs it lacks under the best chosen mask that it covers, and 1 (guess the mean) if it covers none.
+    A scene is a set of available signals: all but one, or a random set that lacks any share of the signals. Its error
+    is that of its missing outputs under the best chosen mask that it covers, and 1 (guess the mean) if it covers none.
 
     Args:
         candidates: Feasible masks, shape (n, signals), truth values.
         errors: Mean squared error of every signal under every mask [standard deviations squared], shape (n, signals).
-        outputs: Which signals are outputs, truth values, shape (signals,).
-        most: Number of masks to choose at most.
-        seed: Of the scenes.
+        outputs: Whether each signal is an output, shape (signals,).
+        most: Largest number of masks to choose.
+        seed: Seed of the scenes.
 
     Returns:
-        Indices of the chosen masks in the order of choice; fewer than `most` if more would serve no scene.
+        Indices of the chosen masks in the order of choice; fewer than `most` if more masks would improve no scene.
     """
     if len(candidates) <= most:
         return np.arange(len(candidates))
     scenes = _scenes(candidates.shape[1], seed)
     needed = (outputs & ~scenes).astype(np.float32)  # (scenes, signals)
     scenes, needed = scenes[needed.any(axis=1)], needed[needed.any(axis=1)]
-    # A mask without a measured error (NaN) does not serve; an error above 1 is worse than none.
+    # A mask without a measured error (NaN) is as bad as guessing the mean, and so is an error above 1.
     known = np.clip(np.nan_to_num(errors, nan=1.0), 0.0, 1.0).astype(np.float32)
     cost = known @ (needed / needed.sum(axis=1, keepdims=True)).T  # (candidates, scenes)
     cost[candidates.astype(np.float32) @ (~scenes).T.astype(np.float32) > 0.5] = 1.0

@@ -54,7 +54,7 @@ def test_says_what_is_wrong_with_thresholds(data):
 
 def test_an_output_that_no_mask_infers_is_remarked(data):
     found = determine(data, SHORT, Thresholds(out=1.0, into=0.15))
-    remark = next(r for r in found.remarks if r.startswith("'muscle_tension' is an output, but no feasible mask"))
+    remark = next(r for r in found.remarks if r.startswith("'muscle_tension' is an output, but every feasible mask"))
     assert remark in found.report()
 
 
@@ -159,7 +159,7 @@ def test_errors_of_masks_are_those_of_the_network(measured):
     found = errors.of(masks)
     for mask, line in zip(masks, found, strict=True):
         rows = errors.whole[:, mask].all(axis=1)
-        truth, there = errors.x[rows], errors.there[rows]
+        truth, there = errors.x[rows], errors.counts[rows]
         tail = np.broadcast_to(mask.astype(np.float32), (len(truth), len(mask)))
         given = np.repeat(mask, [signal.size for signal in layout.signals])
         told = run(errors.chain, np.concatenate([truth * given, tail, errors.p[rows]], axis=1))

@@ -13,8 +13,6 @@ ROOT = Path(__file__).parents[2]
 CODE = ("gemuco", "hal", "simulators", "services", "studies", "examples")
 NOT_YET = {
     "gemuco/compiled",
-    "gemuco/learning",
-    "gemuco/structure",
     "hal/actuators.py",
     "hal/by_signal.py",
     "hal/calibration",
