@@ -1,7 +1,7 @@
 """The hardware: buses, devices, limits and time. Knows nothing of learning or of the network.
 
-`from hal import open_robot` and the like is the front door. A name is imported from its room when it is first used, so
-that `import hal` loads neither numpy nor python-can.
+Users import from here (`from hal import open_robot`). A name is imported from its module on first use, so that
+`import hal` loads neither numpy nor python-can.
 """
 
 from importlib import import_module
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 else:
 
     def __getattr__(name: str) -> object:
-        """Import an exported name from its room."""
+        """Import an exported name from its module."""
         if name not in _ROOM_OF:
             raise AttributeError(f"module 'hal' has no attribute '{name}'")
         globals()[name] = value = getattr(import_module(_ROOM_OF[name]), name)

@@ -1,4 +1,4 @@
-"""What is told of every signal, in one array: a loop that reads or sends it has one array to handle, not one each."""
+"""Values of all signals in one array, so that a loop handles one array instead of one per signal."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar, Self
@@ -6,20 +6,21 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 KEPT = 256
-"""Sets of signals that are kept, so that equal ones are the same object; a robot has a handful."""
+"""At most this number of `Elements` is cached; a robot has a handful."""
 LONGEST = 1 << 14
-"""Letters of all names together; longer ones, which no robot has, are not kept."""
+"""Signals whose names have more characters in total are not cached; no robot has them."""
 
 
 class Elements:
-    """How many elements each signal has, and where they lie in an array of all of them.
+    """Number of elements of each signal, and their position in one array of all elements.
 
-    Equal ones are the same object as long as `KEPT` suffices: what is worked out for one serves the next message too.
+    `Elements.of` returns the same object for equal counts, up to `KEPT` of them, so that a caller can keep results by
+    object.
 
     Attributes:
-        counts: Signal -> how many elements, at least one.
-        places: Signal -> where they lie.
-        size: How many there are in all.
+        counts: Signal -> number of elements, at least 1.
+        places: Signal -> slice of the array.
+        size: Number of elements of all signals.
     """
 
     __slots__ = ("_hash", "counts", "places", "size")
@@ -49,20 +50,20 @@ class Elements:
 
     @classmethod
     def of(cls, counts: Mapping[str, float]) -> "Elements":
-        """The one with these counts.
+        """Return the cached object with these counts.
 
         Raises:
-            ValueError: They are no map from names to whole numbers above 0.
+            ValueError: The counts are not a map from names to whole numbers above 0.
         """
         try:
             return cls._known[(*counts, *counts.values())]
-        except (KeyError, TypeError):  # what cannot be a key is no number either
-            found = cls(counts) if counts else NOTHING
+        except (KeyError, TypeError):  # a count that cannot be hashed is not a number: the constructor refuses it
+            elements = cls(counts) if counts else NOTHING
         if len(cls._known) >= KEPT:
             cls._known.clear()
         if sum(map(len, counts)) <= LONGEST:
-            cls._known[(*counts, *counts.values())] = found
-        return found
+            cls._known[(*counts, *counts.values())] = elements
+        return elements
 
 
 NOTHING = Elements({})
@@ -70,36 +71,37 @@ NOTHING = Elements({})
 
 
 class BySignal(Mapping[str, np.ndarray]):
-    """Signal -> array, shape (n,): parts of one array.
+    """Map from signal to array of shape (n,), a view of one array.
 
     Attributes:
-        flat: The elements of all signals one behind the other, shape (size,).
-        elements: Which of them are whose.
+        flat: Elements of all signals, signal after signal, shape (size,).
+        elements: Position of each signal in `flat`.
     """
 
     __slots__ = ("elements", "flat")
     DTYPE: ClassVar[Any] = None
-    """Kind of the numbers; any if None."""
+    """Data type of `flat`; any type if None."""
 
     def __init__(self, flat: np.ndarray, elements: Elements) -> None:
         self.flat, self.elements = flat, elements
 
     @classmethod
     def of(cls, values: Mapping[str, Any], elements: Elements | None = None) -> Self:
-        """From one array per signal, in the order of `elements` if they are given.
+        """Join one array per signal, in the order of `elements` if they are given.
 
         Raises:
-            ValueError: The signals or their sizes are not those of `elements`.
+            ValueError: The signals or their sizes differ from `elements`.
         """
         if isinstance(values, BySignal) and (elements is None or values.elements is elements):
             return cls(np.asarray(values.flat, cls.DTYPE), values.elements)
         arrays = {name: np.atleast_1d(np.asarray(value, cls.DTYPE)) for name, value in values.items()}
         counts = {name: array.size for name, array in arrays.items()}
-        wanted = Elements.of(counts) if elements is None else elements
-        if counts != wanted.counts:
-            raise ValueError(f"Expected signals with so many elements: {wanted.counts}; these are {counts}")
-        parts = [arrays[name] for name in wanted.counts]
-        return cls(np.concatenate(parts) if parts else np.zeros(0, cls.DTYPE), wanted)
+        if elements is None:
+            elements = Elements.of(counts)
+        if counts != elements.counts:
+            raise ValueError(f"Expected signals with these numbers of elements: {elements.counts}; got {counts}")
+        parts = [arrays[name] for name in elements.counts]
+        return cls(np.concatenate(parts) if parts else np.zeros(0, cls.DTYPE), elements)
 
     def __getitem__(self, name: str) -> np.ndarray:
         return self.flat[self.elements.places[name]]
@@ -121,14 +123,14 @@ class BySignal(Mapping[str, np.ndarray]):
 
 
 class Numbers(BySignal):
-    """Of float64."""
+    """Map from signal to float64 array."""
 
     __slots__ = ()
     DTYPE = np.dtype("<f8")
 
 
 class Truths(BySignal):
-    """Of truth values."""
+    """Map from signal to bool array."""
 
     __slots__ = ()
     DTYPE = np.dtype("?")

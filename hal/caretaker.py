@@ -1,4 +1,4 @@
-"""Opens devices, opens them again when they come back, and runs what they were asked for; enables nothing."""
+"""Thread that opens devices, opens them again when they return, and runs their long requests. It enables no device."""
 
 import logging
 import threading
@@ -11,14 +11,14 @@ from hal.errors import HalError
 log = logging.getLogger(__name__)
 
 PASS_PERIOD = 0.05
-"""How often [s] the devices are looked at."""
+"""The devices are checked with this period [s]."""
 BACK_OFF = (0.2, 0.4)
-"""Pauses [s] between tries to open the same device; the last is repeated."""
+"""Attempts to open the same device have these pauses [s] between them; the last pause is repeated."""
 NEED_OPENING = (DeviceState.CLOSED, DeviceState.OPENING, DeviceState.SILENT)
 
 
 class Caretaker:
-    """Tries all devices at once, each in its own thread; one that does not answer delays no other."""
+    """Opener of all devices, each in its own thread: a device that does not answer delays no other."""
 
     def __init__(self, devices: Sequence[Device]) -> None:
         self._devices = tuple(devices)
@@ -26,24 +26,24 @@ class Caretaker:
         self._not_before = dict.fromkeys(self._devices, 0)
         self._seen = dict.fromkeys(self._devices, DeviceState.CLOSED)
         self._running: dict[Device, Future[None]] = {}
-        self._errands: set[Device] = set()
+        self._with_request: set[Device] = set()
         self._passes = 0
         self._stopping = threading.Event()
         self._pool: ThreadPoolExecutor | None = None
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
-        """Try every device once, then go on looking after them in a thread of its own."""
+        """Try to open every device once, then continue in a separate thread."""
         self._stopping.clear()
         self._pool = ThreadPoolExecutor(max(len(self._devices), 1), "commission")
-        self._look()
+        self._check()
         for future in list(self._running.values()):
             future.result()
         self._thread = threading.Thread(target=self._run, name="caretaker", daemon=True)
         self._thread.start()
 
     def stop(self) -> None:
-        """End the thread, wait for tries that are under way, and close every device."""
+        """End the thread, wait for running attempts, and close every device."""
         self._stopping.set()
         if self._thread:
             self._thread.join()
@@ -55,9 +55,9 @@ class Caretaker:
 
     def _run(self) -> None:
         while not self._stopping.wait(PASS_PERIOD):
-            self._look()
+            self._check()
 
-    def _look(self) -> None:
+    def _check(self) -> None:
         self._passes += 1
         for device in self._devices:
             running = self._running.get(device)
@@ -65,42 +65,42 @@ class Caretaker:
                 if not running.done():
                     continue
                 del self._running[device]
-                if device not in self._errands:  # one pause to give its first answer in, before it counts as silent
+                if device not in self._with_request:  # a pause for its first answer, before it counts as silent
                     self._not_before[device] = self._passes + self._pause(device)
-                self._errands.discard(device)
-            if device.errand is not None and self._pool:
-                self._errands.add(device)
-                self._running[device] = self._pool.submit(self._do, device)
+                self._with_request.discard(device)
+            if device.long_request is not None and self._pool:
+                self._with_request.add(device)
+                self._running[device] = self._pool.submit(self._execute, device)
                 continue
             state = device.health().state
             if state is not self._seen[device]:
                 self._seen[device] = state
-                if state is not DeviceState.SILENT:  # a node that boots need not wait for its turn
+                if state is not DeviceState.SILENT:  # a node that boots is opened without a pause
                     self._tries[device], self._not_before[device] = 0, 0
             if state in NEED_OPENING and self._passes >= self._not_before[device] and self._pool:
                 self._tries[device] += 1
                 self._running[device] = self._pool.submit(self._open, device)
 
     def _pause(self, device: Device) -> int:
-        """Passes between two tries."""
+        """Return the number of passes between two attempts."""
         return round(BACK_OFF[min(self._tries[device], len(BACK_OFF)) - 1] / PASS_PERIOD)
 
     @staticmethod
-    def _do(device: Device) -> None:
-        errand, device.errand = device.errand, None
+    def _execute(device: Device) -> None:
+        request, device.long_request = device.long_request, None
         try:
-            if errand is not None:
-                errand()
+            if request is not None:
+                request()
         except Exception:
-            log.exception("'%s' cannot do what it was asked for", device.name)
+            log.exception("A request to '%s' failed", device.name)
 
     @staticmethod
     def _open(device: Device) -> None:
         if device.health().state not in NEED_OPENING:
-            return  # it came back before its turn
+            return  # the device returned before this attempt
         try:
             device.open()
         except HalError as error:
-            log.debug("%s: %s", device.name, error)  # the device's health says it, and the next try comes
-        except Exception:  # a driver's mistake must not look like a device that is still being opened
+            log.debug("%s: %s", device.name, error)  # the device's health reports it, and the next attempt follows
+        except Exception:  # an error of a driver must not look like a device that is still opening
             log.exception("'%s' cannot be opened", device.name)

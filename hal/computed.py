@@ -1,4 +1,4 @@
-"""Signals that no device measures: what follows from another signal of the same sample."""
+"""Signals that no device measures: the HAL computes them from another signal of the same sample."""
 
 from collections.abc import Callable
 from functools import partial
@@ -11,18 +11,18 @@ from hal.config import RobotConfig
 from hal.errors import ConfigError
 
 LEAST_FORCE = 1.0
-"""Total force [N] below which a center of pressure is not told: it would be noise divided by nothing."""
+"""A center of pressure needs this total force [N]; below it the result would be noise."""
 
 
 def center_of_pressure(forces: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Where the ground pushes, which for a body at rest is below its center of gravity.
+    """Return the center of pressure on the ground; below the center of gravity if the body is at rest.
 
     Args:
-        forces: Of each load cell, upwards [N], shape (n,).
-        points: Where the cells are [m], shape (n, 2).
+        forces: Upward force on each load cell [N], shape (n,).
+        points: Positions of the cells [m], shape (n, 2).
 
     Returns:
-        Mean of the points weighted by force [m], shape (2,); NaN if the total force is too small to tell.
+        Mean of the points weighted by force [m], shape (2,); NaN if the total force is below `LEAST_FORCE`.
     """
     total = forces.sum()
     if not total > LEAST_FORCE:
@@ -31,10 +31,10 @@ def center_of_pressure(forces: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def function_of(config: RobotConfig, signal: str) -> Callable[[np.ndarray], np.ndarray]:
-    """What computes a signal [its unit], shape (n,), from the values of the signal it is computed from.
+    """Return the function that computes a signal [its unit], shape (n,), from the values of its input signal.
 
     Raises:
-        ConfigError: There is no such function, or what it returns does not fit the signal.
+        ConfigError: The function does not exist, or its result does not fit the signal.
     """
     computed = config.signals[signal].computed
     if computed is None:

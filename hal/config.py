@@ -1,4 +1,4 @@
-"""robots/*.yaml -> typed models. An unknown key is an error that lists the known ones."""
+"""Typed models of a robot file (robots/*.yaml). An unknown key is an error that lists the known keys."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -12,22 +12,22 @@ from hal.errors import ConfigError
 
 
 class Section(BaseModel):
-    """A part of the robot file: frozen, and without room for a misspelt key."""
+    """A part of the robot file: frozen, unknown keys are errors."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Rate = Annotated[float, Field(gt=0, le=10_000, allow_inf_nan=False)]
-"""Ticks per second [Hz], and no more than a loop in Python could ever do."""
+"""A rate [Hz] is at most what a loop in Python can reach."""
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
 def per_element(value: float | tuple[float, ...] | None, size: int, where: str, default: float = np.nan) -> np.ndarray:
-    """One value per element, shape (size,), of one for all or one for each; `default` where nothing is stated.
+    """Return one value per element, shape (size,), from one value for all or one for each; `default` for None.
 
     Raises:
-        ValueError: Another number of values.
+        ValueError: The number of values is not `size`.
     """
     array = np.asarray(default if value is None else value, float)
     if array.ndim and array.shape != (size,):
@@ -36,20 +36,20 @@ def per_element(value: float | tuple[float, ...] | None, size: int, where: str, 
 
 
 class RangeConfig(Section):
-    """Bounds of one signal, per element or one for all."""
+    """Range of one signal, per element or one for all."""
 
     low: Finite | tuple[Finite, ...] | None = None
     high: Finite | tuple[Finite, ...] | None = None
 
     def bounds(self, size: int, where: str) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest value, each of shape (size,); infinite where not stated.
+        """Return lowest and highest value, each of shape (size,); infinite where not stated.
 
         Args:
-            size: How many elements the signal has.
-            where: Named in what is raised.
+            size: Number of elements of the signal.
+            where: Place in the robot file, for error messages.
 
         Raises:
-            ValueError: Another number of values, or low is not below high.
+            ValueError: The number of values is not `size`, or low is not below high.
         """
         low = per_element(self.low, size, f"{where}.low", -np.inf)
         high = per_element(self.high, size, f"{where}.high", np.inf)
@@ -59,24 +59,24 @@ class RangeConfig(Section):
 
 
 class LimitConfig(RangeConfig):
-    """What of a signal is allowed, per element or one for all. For a command: what may be applied."""
+    """Limits of a measured or commanded signal, per element or one for all."""
 
     rate: Positive | tuple[Positive, ...] | None = None
-    """Largest change of a command [unit/s]: of a position its velocity, of a velocity its acceleration."""
+    """Largest change of a command [unit/s]: velocity if positions are commanded, acceleration if velocities are."""
     acceleration: Positive | tuple[Positive, ...] | None = None
     """Largest change of that rate [unit/s^2], for commanded positions."""
     soft_high: Positive | tuple[Positive, ...] | None = None
-    """Measured load above which the command is relaxed: tension of a muscle, effort of a drive in either direction."""
+    """Measured load above which the command is relaxed: muscle tension, or effort of a drive in both directions."""
     trip_low: Finite | tuple[Finite, ...] | None = None
     """Measured value below which the robot stops and disables, such as the tension of a slack muscle."""
     trip_high: Finite | tuple[Finite, ...] | None = None
     """Measured value above which the robot stops and disables."""
 
     def check(self, size: int, where: str, is_commanded: bool) -> None:
-        """Whether the limits of a signal of `size` elements fit each other.
+        """Check that the limits of a signal of `size` elements are consistent.
 
         Raises:
-            ValueError: They do not.
+            ValueError: They are not.
         """
         self.bounds(size, where)
         ladder = [
@@ -94,50 +94,50 @@ class LimitConfig(RangeConfig):
 
     @property
     def is_watched(self) -> bool:
-        """Whether the HAL has to see the signal."""
+        """Whether the HAL must measure the signal."""
         return any(value is not None for value in (self.soft_high, self.trip_low, self.trip_high))
 
 
 class CommandConfig(Section):
-    """Which signal is commanded, how long a command lives, and what happens when none comes."""
+    """Commanded signal, lifetime of a command, and behaviour without commands."""
 
     signal: str
     time_to_live: Annotated[float, Field(gt=0, le=10)] = 0.1
-    """Age [s] of a command beyond which it is not followed any more."""
+    """A command is followed up to this age [s]."""
     hold: Annotated[float, Field(ge=0)] = 1.0
-    """How long [s] the last applied command is held before the robot stops; how long a stop holds or damps."""
+    """The last applied command is held for this time [s] before the robot stops; a stop holds or damps as long."""
 
 
 class StopConfig(Section):
-    """What the robot does when it is asked to stop, or when no command comes any more."""
+    """Behaviour of the robot when it is asked to stop, or when commands end."""
 
     behaviour: Literal["hold", "damp", "park", "off"] = "hold"
-    """`hold` its place for `command.hold` and let go; `damp` its motion for as long and let go; `park`: move slowly to
-    a safe posture and let go; `off`: let go at once."""
+    """The drives lose power after `command.hold` seconds in which they `hold` their position or `damp` their motion,
+    after a slow motion to a safe posture (`park`), or at once (`off`)."""
     park: tuple[Finite, ...] | None = None
-    """The safe posture [unit of the commanded signal]."""
+    """Safe posture [unit of the commanded signal]."""
     speed: Positive | None = None
-    """Highest speed on the way there [unit/s]."""
+    """Highest speed of the motion to the safe posture [unit/s]."""
 
     @model_validator(mode="after")
     def _says_where(self) -> "StopConfig":
         parks = self.behaviour == "park"
         if parks and (self.park is None or self.speed is None):
-            raise ValueError("to park, say where (`park`, a value per element) and how fast (`speed`).")
+            raise ValueError("the behaviour park needs a posture (`park`, a value per element) and a `speed`.")
         if not parks and (self.park is not None or self.speed is not None):
             raise ValueError(f"`park` and `speed` are for the behaviour park, not for '{self.behaviour}'.")
         return self
 
 
 class ComputedConfig(Section):
-    """How a signal follows from another one of the same sample."""
+    """Computation of a signal from another one of the same sample."""
 
     by: str
     """`module:name` of a function: (values, **settings) -> the signal's values."""
     inputs: str = Field(alias="from")
-    """The signal it is computed from."""
+    """Name of the input signal."""
     settings: dict[str, Any] = Field(default_factory=dict)
-    """Passed to the function; lists as arrays."""
+    """Arguments of the function; lists become arrays."""
 
 
 class SignalConfig(Section):
@@ -146,11 +146,11 @@ class SignalConfig(Section):
     unit: str
     elements: tuple[str, ...] = Field(min_length=1)
     stale_after: Positive = 0.02
-    """Age [s] beyond which an element is not valid any more."""
+    """An element is valid up to this age [s]."""
     source: Literal["hal", "vision"] = "hal"
-    """Who publishes it: the HAL, or a camera's process of its own."""
+    """Publisher of the signal: the HAL, or the process of a camera."""
     computed: ComputedConfig | None = None
-    """Given: no device measures it, the HAL computes it."""
+    """Computation by the HAL; None for a signal that devices measure."""
 
     @property
     def is_measured(self) -> bool:
@@ -159,41 +159,41 @@ class SignalConfig(Section):
 
     @property
     def size(self) -> int:
-        """How many elements the signal has."""
+        """Number of elements."""
         return len(self.elements)
 
 
 class BusConfig(Section):
-    """One CAN bus, as python-can names it."""
+    """One CAN bus, in the terms of python-can."""
 
     interface: str = "socketcan"
     channel: str
     bitrate: int = 1_000_000
     max_load: Annotated[float, Field(gt=0, le=0.8)] = 0.6
-    """Share of the bit rate that the cyclic frames may take; more is refused at start."""
+    """Largest share of the bit rate for the cyclic frames; the HAL does not start with more."""
     options: dict[str, Any] = Field(default_factory=dict)
-    """Passed to python-can as they are."""
+    """Arguments for python-can."""
 
 
 class KindConfig(Section):
-    """What several devices share: the driver's name and its settings."""
+    """Driver and settings that several devices share."""
 
     driver: str
     settings: dict[str, Any] = Field(default_factory=dict)
 
 
 class DeviceConfig(Section):
-    """One device on a bus: where it is, and which elements of which signals it measures or moves."""
+    """One device on a bus: its address, and the elements that it measures or moves."""
 
     kind: str
     bus: str
     node: Annotated[int, Field(ge=0, le=2047)]
     element: str | None = None
-    """`signal.element`, as in `muscle_length.biceps`, for the one quantity that it is there for."""
+    """`signal.element` of its main quantity, as in `muscle_length.biceps`."""
     elements: dict[str, str] = Field(default_factory=dict)
-    """In place of `element`: quantity of the driver -> `signal.element`, as in `velocity: joint_velocity.elbow`."""
+    """Quantity of the driver -> `signal.element`, as in `velocity: joint_velocity.elbow`; replaces `element`."""
     settings: dict[str, Any] = Field(default_factory=dict)
-    """Added to the kind's settings; a key given in both takes the device's value."""
+    """Settings that are added to those of the kind; a key in both takes the device's value."""
 
     @model_validator(mode="after")
     def _serves_something(self) -> "DeviceConfig":
@@ -203,7 +203,7 @@ class DeviceConfig(Section):
 
     @property
     def served(self) -> tuple[str, ...]:
-        """Every `signal.element` that it measures or moves."""
+        """Every `signal.element` that the device measures or moves."""
         return tuple(self.elements.values()) if self.element is None else (self.element,)
 
 
@@ -231,17 +231,17 @@ class RobotConfig(Section):
     kinds: dict[str, KindConfig] = Field(default_factory=dict)
     devices: dict[str, DeviceConfig] = Field(default_factory=dict)
     simulator: str | None = None
-    """`module:name` of what stands in for the hardware."""
+    """`module:name` of the simulator that replaces the hardware."""
     urdf: Path | None = None
-    """What the robot looks like, for the live page; relative to the robot file."""
+    """URDF file for the live page, relative to the robot file."""
     conditions: tuple[str, ...] = ()
-    """Ways the body is known to be, such as the tools it may hold; the first unless said otherwise."""
+    """Known conditions of the body, such as the tools that it may hold; the first is the default."""
     model: dict[str, Any] = Field(default_factory=dict)
-    """What the body schema service reads; it checks this section itself."""
+    """Settings of the body schema service, which checks this section itself."""
     collect: dict[str, Any] = Field(default_factory=dict)
-    """How random safe motion is made; the collector checks this section itself."""
+    """Settings of random safe motion; the collector checks this section itself."""
     folder: Path = Path()
-    """Where the robot file lies; paths inside it are relative to this folder."""
+    """Folder of the robot file; paths in the file are relative to it."""
 
     @model_validator(mode="after")
     def _names_fit(self) -> "RobotConfig":
@@ -274,7 +274,7 @@ class RobotConfig(Section):
             missing = [e for e in self.element_names(self.measured) if e not in elements]
             if missing:
                 raise ValueError(
-                    f"no device measures {', '.join(missing)}. Add one, drop the element, or say `source: vision`."
+                    f"no device measures {', '.join(missing)}. Add one, remove the element, or set `source: vision`."
                 )
         return self
 
@@ -326,21 +326,21 @@ class RobotConfig(Section):
 
     @property
     def seen(self) -> tuple[str, ...]:
-        """Names of the signals that a camera's process publishes."""
+        """Names of the signals that the process of a camera publishes."""
         return tuple(name for name, signal in self.signals.items() if signal.source == "vision")
 
     def element_names(self, signals: Iterable[str] | None = None) -> list[str]:
-        """`signal.element` of every value of some signals, or of all, in order."""
+        """Return `signal.element` of every element of the given signals, or of all, in order."""
         names = self.signals if signals is None else signals
         return [f"{name}.{element}" for name in names for element in self.signals[name].elements]
 
     def bounds(self, signal: str) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest value of a signal [its unit], each of shape (n,); infinite where not stated."""
+        """Return lowest and highest value of a signal [its unit], each of shape (n,); infinite where not stated."""
         limit = self.limits.get(signal, LimitConfig())
         return limit.bounds(self.signals[signal].size, f"limits.{signal}")
 
     def settings_of(self, device: str) -> dict[str, Any]:
-        """The kind's settings with the device's own on top."""
+        """Return the settings of the device's kind, replaced and extended by those of the device."""
         entry = self.devices[device]
         return {**self.kinds[entry.kind].settings, **entry.settings}
 
@@ -349,7 +349,7 @@ def load_robot(path: str | Path) -> RobotConfig:
     """Read a robot file.
 
     Raises:
-        ConfigError: The file is missing, is not YAML, or does not describe a robot.
+        ConfigError: The file is missing, not YAML, or does not describe a robot.
     """
     path = Path(path)
     try:
@@ -369,13 +369,12 @@ def load_robot(path: str | Path) -> RobotConfig:
 
 
 def _beside(path: Path) -> str:
-    beside = path.parent.glob("*.yaml") if path.parent.is_dir() else ()
-    found = sorted(str(other) for other in beside if "." not in other.stem)  # x.calibration.yaml is no robot file
-    return f"Robot files there: {', '.join(found)}." if found else f"Is '{path.parent}' the right folder?"
+    files = sorted(str(file) for file in path.parent.glob("*.yaml") if "." not in file.stem)  # no x.calibration.yaml
+    return f"Robot files there: {', '.join(files)}." if files else f"Is '{path.parent}' the right folder?"
 
 
 def explain(error: ValidationError, model: type[BaseModel]) -> str:
-    """One problem in one sentence: an unknown key, with the keys that are known there, or else the first."""
+    """Return one problem as a sentence: an unknown key with the known keys there, otherwise the first problem."""
     problems = error.errors()
     first = next((problem for problem in problems if problem["type"] == "extra_forbidden"), problems[0])
     where = ".".join(str(part) for part in first["loc"])
@@ -393,7 +392,7 @@ def _model_at(model: type[BaseModel], location: tuple[int | str, ...]) -> type[B
     for part in location:
         field = model.model_fields.get(str(part))
         if field is None:
-            continue  # a name inside a mapping, such as the device's
+            continue  # a key of a mapping, such as the name of a device
         inner = [field.annotation, *getattr(field.annotation, "__args__", ())]
         models = [kind for kind in inner if isinstance(kind, type) and issubclass(kind, BaseModel)]
         model = models[0] if models else model

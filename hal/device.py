@@ -1,7 +1,7 @@
 """The contract of a device: open, enable, read, apply, stop, close.
 
-A device serves one or more elements of the robot's signals (`muscle_length.biceps`), in SI units. A driver holds no
-safety code: limits, command age and watchdogs wrap every device alike (see `hal.robot`).
+A device serves one or more elements of the robot's signals (`muscle_length.biceps`), in SI units. A driver contains no
+safety code: `hal.robot` applies limits, command age and watchdogs to every device in the same way.
 """
 
 import abc
@@ -17,22 +17,22 @@ from hal.errors import CommandRefused
 
 
 class DeviceState(StrEnum):
-    """Where a device stands."""
+    """State of a device."""
 
     CLOSED = "closed"
     OPENING = "opening"
     READY = "ready"
-    """Answers and measures, does not move."""
+    """The device answers and measures, but does not move."""
     ENABLED = "enabled"
-    """Follows what is applied."""
+    """The device follows the applied set-points."""
     HOMING = "homing"
-    """Moves by itself to find its zero."""
+    """The device moves by itself to find its zero."""
     STOPPING = "stopping"
-    """Comes to rest by itself and lets go then; still under power."""
+    """The device comes to rest by itself and then disables; it still has power."""
     FAULT = "fault"
-    """Reports a fault of its own; leaves it only by `reset`."""
+    """The device reports a fault, which only `reset` ends."""
     SILENT = "silent"
-    """Was heard, and is not heard any more."""
+    """The device answered before and does not answer any more."""
 
 
 UNDER_POWER = (DeviceState.ENABLED, DeviceState.HOMING, DeviceState.STOPPING)
@@ -40,11 +40,11 @@ UNDER_POWER = (DeviceState.ENABLED, DeviceState.HOMING, DeviceState.STOPPING)
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """What a device last measured.
+    """Newest measurement of a device.
 
     Attributes:
-        values: One value per element of `Device.measures` [the signal's unit], shape (n,); NaN if never measured.
-        received: Monotonic time [s] at which each value arrived, shape (n,); -inf if never.
+        values: One value per element of `Device.measures` [the signal's unit], shape (n,); NaN before the first.
+        received: Monotonic time [s] at which each value arrived, shape (n,); -inf before the first.
     """
 
     values: np.ndarray
@@ -53,27 +53,27 @@ class Reading:
 
 @dataclass(slots=True)
 class DeviceHealth:
-    """What a device says of itself; for status messages, not for control."""
+    """Report of a device about itself; for status messages, not for control."""
 
     state: DeviceState = DeviceState.CLOSED
     text: str = ""
-    """One sentence a person can act on; empty when all is well."""
+    """Problem and remedy in one sentence for the operator; empty without a problem."""
     counters: dict[str, int] = field(default_factory=dict)
-    """Malformed frames, missed cycles, emergencies, reboots and the like, since opened."""
+    """Numbers of malformed frames, missed cycles, emergencies, reboots and so on since `open`."""
 
     def plain(self) -> dict[str, Any]:
-        """The same in plain values."""
+        """Return the report as plain values."""
         return {"state": self.state.value, "text": self.text, "counters": dict(self.counters)}
 
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One thing that was looked at, for a person who looks for what is wrong.
+    """Result of one check, for the operator.
 
     Attributes:
-        what: What was looked at, as in `PDO mapping`.
-        is_good: Whether it is as it should be.
-        text: What was found, and if it is not good, what to do.
+        what: Subject of the check, as in `PDO mapping`.
+        is_good: Whether the subject is as required.
+        text: Result, and the remedy if it is not good.
     """
 
     what: str
@@ -82,101 +82,100 @@ class Check:
 
 
 class Device(abc.ABC):
-    """One thing on the robot that measures or moves.
+    """A device of the robot that measures or moves.
 
-    No method but `open`, `close` and `inspect` may block longer than it takes to put a frame on the bus: the rest is
-    called from the cycle. `enable`, `disable`, `quick_stop`, `home`, `tare` and `reset` ask; `health` tells when it has
-    happened.
+    Only `open`, `close` and `inspect` may block longer than it takes to send a frame: all other methods are called
+    from the cycle. `enable`, `disable`, `quick_stop`, `home`, `tare` and `reset` only send a request; `health` reports
+    its result.
     """
 
     name: str
     identity: str = ""
-    """What tells this very device from all others of its kind, as `canopen:<vendor>-<product>-<serial>`; empty before
-    it was opened, or if it cannot tell."""
-    errand: Callable[[], None] | None = None
-    """What was asked for and takes longer than a cycle; whoever looks after the devices takes it and runs it."""
+    """Identity of this very device, as `canopen:<vendor>-<product>-<serial>`; empty before `open`, or if unknown."""
+    long_request: Callable[[], None] | None = None
+    """Request that takes longer than a cycle; the caretaker runs it in a thread."""
     can_damp: bool = False
-    """Whether `damp` does something."""
+    """Whether the device implements `damp`."""
     measures: tuple[str, ...] = ()
     """Elements that `read` returns, in order."""
     commands: tuple[str, ...] = ()
     """Elements that `apply` takes, in order; empty for a sensor."""
     command_quantity: str = "position"
-    """What `apply` takes: `position`, `velocity` or `effort`."""
+    """Quantity that `apply` takes: `position`, `velocity` or `effort`."""
     served: Mapping[str, str] = MappingProxyType({})
-    """Quantity (`position`, `velocity`, `effort`, ...) -> `signal.element`, for the elements whose nature it knows."""
+    """Quantity (`position`, `velocity`, `effort`, ...) -> `signal.element`, where the quantity is known."""
 
     @abc.abstractmethod
     def open(self) -> None:
         """Check that the right device answers, and configure it. May block for seconds.
 
         Raises:
-            DeviceSilent: Nothing answers.
-            WrongDevice: Something else answers.
-            DeviceRefused: It refuses its configuration.
+            DeviceSilent: No device answers.
+            WrongDevice: Another device answers.
+            DeviceRefused: The device refuses its configuration.
         """
 
     @abc.abstractmethod
     def read(self) -> Reading:
-        """The newest values and when they arrived; never blocks, never makes a value look newer than it is."""
+        """Return the newest values and their arrival times without blocking; no value may look newer than it is."""
 
     @abc.abstractmethod
     def health(self) -> DeviceHealth:
-        """State, a sentence and counters."""
+        """Return state, a sentence and counters."""
 
     @property
     def has_power(self) -> bool:
-        """Whether its motor has power, as far as it tells; a device in fault may have it still."""
+        """Whether the device reports that its motor has power; it may still have power in fault."""
         return self.health().state in UNDER_POWER
 
     @abc.abstractmethod
     def close(self) -> None:
-        """Disable and let go. Safe to call twice, and when the bus is gone."""
+        """Disable and release the device. Safe to call twice, and when the bus is gone."""
 
     def enable(self) -> None:
-        """Ask to follow commands, starting from where the device is."""
+        """Ask the device to follow commands, from its present position."""
 
     def disable(self) -> None:
-        """Ask to stop following and to be safe without power."""
+        """Ask the device to switch its motor off."""
 
     def quick_stop(self) -> None:
-        """Ask to come to rest as fast as the device itself can, and to be safe without power then."""
+        """Ask the device to come to rest as fast as it can, and then to switch its motor off."""
         self.disable()
 
     def home(self) -> None:
-        """Ask to find the zero, which moves the device; its state is `homing` until it has.
+        """Ask the device to find its zero, which moves it; its state is `homing` until then.
 
         Raises:
-            CommandRefused: It cannot, or not now.
+            CommandRefused: The device cannot find its zero, or not now.
         """
         raise CommandRefused(f"'{self.name}' has no homing of its own.")
 
     def tare(self) -> None:
-        """Ask to take what is measured now as zero.
+        """Ask the device to take the present measurement as zero.
 
         Raises:
-            CommandRefused: It cannot, or not now.
+            CommandRefused: The device cannot do this, or not now.
         """
         raise CommandRefused(f"'{self.name}' cannot be tared.")
 
     def reset(self) -> None:
-        """Ask to leave a fault; never enables."""
+        """Ask the device to leave a fault, without enabling it."""
 
     def apply(self, values: np.ndarray) -> None:
         """Send set-points [the signal's unit], shape (len(commands),), already limited by `Robot`."""
         raise NotImplementedError(f"{self.name} takes no commands")
 
     def damp(self) -> None:
-        """Called instead of `apply` in a cycle in which it shall resist motion without holding a place."""
+        """Resist motion without holding a position; called instead of `apply`."""
         raise NotImplementedError(f"{self.name} cannot damp")
 
     def inspect(self) -> tuple[Check, ...]:
-        """Read back what the device was told. May block; never called while the robot cycles.
+        """Read back the configuration of the device. May block; never called while the robot cycles.
 
         Raises:
-            DeviceSilent: It does not answer.
+            DeviceSilent: The device does not answer.
         """
         return ()
 
     def idle(self) -> None:
-        """Called instead of `apply` in every cycle that has no set-point; may keep a state machine going."""
+        """Continue the device's state machine; called instead of `apply` in every cycle without a set-point."""

@@ -1,4 +1,4 @@
-"""What can be wrong with hardware or with its description."""
+"""Errors of the hardware and of its description."""
 
 
 class HalError(Exception):
@@ -6,24 +6,24 @@ class HalError(Exception):
 
 
 class ConfigError(HalError):
-    """The robot file is wrong; the message says where, what was possible, and what to check."""
+    """An error in the robot file; the message names the place, the alternatives, and what to check."""
 
 
 class DeviceSilent(HalError):
-    """A device did not answer in time."""
+    """No answer of a device in time."""
 
 
 class DeviceRefused(HalError):
-    """A device answered, and refused or contradicted what was asked."""
+    """A refusal or contradiction in the answer of a device."""
 
 
 class WrongDevice(HalError):
-    """Another device than the robot file names answers at this address."""
+    """An answer from another device than the one that the robot file names at this address."""
 
 
 class BusGone(HalError):
-    """The bus interface vanished or its peer died."""
+    """A bus whose interface vanished or whose peer ended."""
 
 
 class CommandRefused(HalError):
-    """A command was not accepted; nothing moved because of it."""
+    """A command that was not accepted and moved nothing."""

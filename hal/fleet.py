@@ -1,4 +1,4 @@
-"""The buses and devices that a robot file names, built but not opened."""
+"""Construction of the buses and devices of a robot file; nothing is opened here."""
 
 import math
 from collections.abc import Mapping
@@ -19,16 +19,16 @@ from hal.wire.bus import Bus
 def build(
     config: RobotConfig, clock: BusClock, calibrations: Mapping[str, Calibration] | None = None
 ) -> tuple[list[Bus], list[Device]]:
-    """Make every bus and every device of a robot.
+    """Build every bus and every device of a robot.
 
     Args:
         config: The robot file.
-        clock: What the devices go by.
-        calibrations: Device -> what was measured of it; those that are stored beside the robot file if not given.
+        clock: Clock of the buses.
+        calibrations: Device -> calibration; None for the calibrations that are stored beside the robot file.
 
     Raises:
-        ConfigError: An unknown driver or interface, settings that do not fit, a bus that would carry too much, or a
-            stored calibration that is refused.
+        ConfigError: A driver or interface is unknown, settings do not fit, the load of a bus is too high, or a stored
+            calibration is refused.
     """
     if calibrations is None:
         calibrations = store.load(config)
@@ -48,29 +48,29 @@ def build(
 
 
 def _elements(driver: Any, settings: Any, entry: DeviceConfig, name: str) -> dict[str, str]:
-    """Quantity of the driver -> `signal.element`, in the driver's order.
+    """Return a map from quantity of the driver to `signal.element`, in the driver's order.
 
     Raises:
-        ConfigError: A quantity that the driver does not have, or not the one that it commands.
+        ConfigError: The driver does not have a quantity, or the commanded quantity is missing.
     """
     known = driver.quantities(settings)
-    wanted = entry.elements if entry.element is None else {known[0]: entry.element}
-    unknown = sorted(set(wanted) - set(known))
+    elements = entry.elements if entry.element is None else {known[0]: entry.element}
+    unknown = sorted(set(elements) - set(known))
     if unknown:
         raise ConfigError(
             f"Device '{name}' has no quantity {', '.join(unknown)}. With these settings it has {', '.join(known)}."
         )
     commanded = driver.commanded(settings)
-    if commanded is not None and commanded not in wanted:
+    if commanded is not None and commanded not in elements:
         raise ConfigError(
             f"Device '{name}' is commanded by its {commanded}, which `elements` does not name. "
             f"Add `{commanded}: signal.element`, or set another mode."
         )
-    return {quantity: wanted[quantity] for quantity in known if quantity in wanted}
+    return {quantity: elements[quantity] for quantity in known if quantity in elements}
 
 
 def _bounds(config: RobotConfig, element: str | None) -> tuple[float, float]:
-    """Lowest and highest set-point of a commanded element [its unit]; infinite where not stated."""
+    """Return lowest and highest set-point of a commanded element [its unit]; infinite where not stated."""
     if element is None:
         return -math.inf, math.inf
     signal, _, name = element.partition(".")

@@ -1,4 +1,4 @@
-"""What the robot is doing, and what may happen next."""
+"""The mode of the robot and its transitions."""
 
 from collections.abc import Callable
 from enum import StrEnum
@@ -9,40 +9,40 @@ from hal.device import Device, DeviceState
 from hal.errors import CommandRefused
 
 ENABLE_TIMEOUT = 2.0
-"""How long [s] all drives together may take to enable; a brake needs some 0.1 s."""
+"""All drives together may take this time [s] to enable; a brake needs about 0.1 s."""
 DISABLE_TIMEOUT = 1.0
-"""How long [s] they may take to let go, a quick stop included."""
+"""The drives may take this time [s] to disable, including a quick stop."""
 HOMING_TIMEOUT = 60.0
-"""How long [s] a device may look for its zero."""
+"""A device may take this time [s] to find its zero."""
 QUICK_STOPS = 5
-"""In so many cycles a quick stop is asked for: a frame may be lost."""
+"""A quick stop is repeated in this number of cycles, because a frame may be lost."""
 PARK_SETTLE = 0.3
-"""How long [s] the robot rests in its safe posture before it lets go."""
+"""The robot rests for this time [s] in its safe posture before its drives are disabled."""
 
 
 class Mode(StrEnum):
-    """What the robot is doing as a whole; the drives of a muscle arm must not be left to do different things."""
+    """Mode of the whole robot; the drives of a muscle arm must never be in different modes."""
 
     OFF = "off"
     ENABLING = "enabling"
     HOLD = "hold"
-    """Enabled; the set-point stays where it is. A velocity is 0, and so is an effort unless the drives damp."""
+    """The drives are enabled and a position set-point is constant. A velocity is 0; an effort is 0 or damped."""
     FOLLOW = "follow"
-    """Enabled; a command younger than its time to live is followed."""
+    """The drives are enabled and follow a command that is younger than its time to live."""
     HOMING = "homing"
-    """One device looks for its zero, all others are off."""
+    """One device finds its zero; all others are off."""
     STOPPING = "stopping"
-    """Does what the robot file's `stop` says, or waits for the drives to let go; takes no commands."""
+    """The robot performs the stop of the robot file, or waits until its drives are off; it takes no commands."""
     FAULT = "fault"
-    """Stopped and without power because something is wrong; left by `reset` only."""
+    """The robot is stopped and without power because of a problem; only `reset` ends this mode."""
 
 
 class Act(StrEnum):
-    """What the drives are to do in a cycle."""
+    """Action of the drives in a cycle."""
 
     IDLE = "idle"
     START = "start"
-    """Be enabled where they are."""
+    """The set-point is the present position of the robot, so that no drive jumps."""
     HOLD = "hold"
     FOLLOW = "follow"
     DAMP = "damp"
@@ -53,14 +53,14 @@ _STOPS = {"hold": Act.HOLD, "damp": Act.DAMP, "park": Act.PARK, "off": Act.IDLE}
 
 
 class ModeMachine:
-    """The mode, its deadlines, and the one sentence that says why there is a fault. Not thread safe."""
+    """The mode, its deadlines, and the cause of a fault in one sentence. Not thread safe."""
 
     def __init__(self, actuators: Actuators, config: RobotConfig) -> None:
         self._actuators = actuators
         self._hold = config.command.hold
         self._stop_act = _STOPS[config.stop.behaviour]
-        held = Act.DAMP if actuators.quantity == "effort" and self._stop_act is Act.DAMP else Act.HOLD
-        self._acts = {Mode.ENABLING: Act.START, Mode.HOLD: held, Mode.FOLLOW: Act.FOLLOW}
+        hold = Act.DAMP if actuators.quantity == "effort" and self._stop_act is Act.DAMP else Act.HOLD
+        self._acts = {Mode.ENABLING: Act.START, Mode.HOLD: hold, Mode.FOLLOW: Act.FOLLOW}
         self._park_time = _park_time(config)
         self._deadline = 0.0
         self._act = Act.IDLE
@@ -74,7 +74,7 @@ class ModeMachine:
 
     @property
     def act(self) -> Act:
-        """What the drives are to do in this cycle."""
+        """Action of the drives in this cycle."""
         return self._act if self.mode is Mode.STOPPING else self._acts.get(self.mode, Act.IDLE)
 
     @property
@@ -84,14 +84,14 @@ class ModeMachine:
 
     @property
     def takes_commands(self) -> bool:
-        """Whether a command may be given now."""
+        """Whether the robot takes commands now."""
         return self.mode is Mode.FOLLOW or self.mode is Mode.HOLD
 
     def enable(self, now: float) -> None:
-        """Ask all drives to start from where they are.
+        """Ask all drives to start from their present position.
 
         Raises:
-            CommandRefused: In fault, homing, stopping, or a drive is not ready.
+            CommandRefused: The robot is in fault, homing or stopping, or a drive is not ready.
         """
         if self.mode in (Mode.HOLD, Mode.FOLLOW, Mode.ENABLING):
             return
@@ -140,18 +140,18 @@ class ModeMachine:
             raise CommandRefused(f"The robot is in mode '{self.mode}'. Ask to {verb} when it is 'off'.")
 
     def disable(self, now: float) -> None:
-        """Let go at once; a device that homes stops first."""
+        """Disable the drives at once; a device that is homing stops first."""
         if self.mode in (Mode.OFF, Mode.FAULT):
             return
-        self._let_go(now, self._actuators.quick_stop if self.mode is Mode.HOMING else self._actuators.disable)
+        self._release(now, self._actuators.quick_stop if self.mode is Mode.HOMING else self._actuators.disable)
 
     def halt(self, now: float) -> None:
-        """Stop as fast as the drives can, and let go."""
+        """Stop as fast as the drives can, and disable them."""
         if self.mode not in (Mode.OFF, Mode.FAULT):
-            self._let_go(now, self._actuators.quick_stop)
+            self._release(now, self._actuators.quick_stop)
 
     def stop(self, now: float) -> None:
-        """Do what the robot file's `stop` says, then let go."""
+        """Perform the stop of the robot file, then disable the drives."""
         if self.mode in (Mode.HOLD, Mode.FOLLOW):
             self._begin_stop(now)
         elif self.mode in (Mode.ENABLING, Mode.HOMING):
@@ -159,23 +159,23 @@ class ModeMachine:
 
     def _begin_stop(self, now: float) -> None:
         if self._stop_act is Act.IDLE:
-            self._let_go(now, self._actuators.disable)
+            self._release(now, self._actuators.disable)
             return
         self.mode, self._act, self._parked_at = Mode.STOPPING, self._stop_act, None
         self._deadline = now + (self._park_time if self._stop_act is Act.PARK else self._hold)
 
-    def _let_go(self, now: float, act: Callable[[], None]) -> None:
+    def _release(self, now: float, request: Callable[[], None]) -> None:
         self.mode, self._act, self._deadline = Mode.STOPPING, Act.IDLE, now + DISABLE_TIMEOUT
-        act()
+        request()
 
     def fault(self, text: str) -> None:
-        """Stop everything as fast as the drives can, and stay so until `reset`; the first cause is the one told."""
+        """Stop as fast as the drives can, and stay in fault until `reset`; the first cause is reported."""
         if self.mode is not Mode.FAULT:
             self.mode, self.fault_text, self._quick_stops = Mode.FAULT, text, QUICK_STOPS
         self._actuators.quick_stop()
 
     def emergency(self, text: str) -> None:
-        """`fault` in any mode, also in `off` and `fault`, without asking the drives: whoever calls does."""
+        """Enter the fault from any mode, also from `off` and `fault`; the caller stops the drives."""
         if self._is_emergency:
             text = self.fault_text
         elif self.mode is Mode.FAULT:
@@ -184,24 +184,24 @@ class ModeMachine:
         self.mode, self.fault_text, self._quick_stops = Mode.FAULT, text, QUICK_STOPS
 
     def reset(self) -> None:
-        """Leave the fault; enables nothing.
+        """Leave the fault, without enabling a drive.
 
         Raises:
-            CommandRefused: The robot is enabled, or a drive does not let go.
+            CommandRefused: The robot is enabled, or a drive still has power.
         """
         if self.mode not in (Mode.OFF, Mode.FAULT):
             raise CommandRefused(f"The robot is in mode '{self.mode}', there is no fault to reset.")
         powered = [device.name for device in self._actuators.devices if device.has_power]
         if powered:
-            raise CommandRefused(f"Still enabled: {', '.join(powered)}. If they do not let go, cut the power.")
+            raise CommandRefused(f"Still enabled: {', '.join(powered)}. If they stay enabled, cut the power.")
         self.mode, self.fault_text, self._is_emergency = Mode.OFF, "", False
 
     def step(self, now: float, has_command: bool, is_parked: bool = False) -> None:
-        """Move on to the mode of this cycle.
+        """Enter the mode of this cycle.
 
         Args:
             now: Monotonic time [s].
-            has_command: Whether an accepted command is still alive.
+            has_command: Whether an accepted command is younger than its time to live.
             is_parked: Whether the set-point is the safe posture.
         """
         if self.mode is Mode.FAULT:
@@ -217,16 +217,16 @@ class ModeMachine:
             _STEPS[self.mode](self, now, states, has_command, is_parked)
 
     def _problem(self, states: list[DeviceState]) -> str:
-        """Why the group must stop, given the drives' states; empty if it need not."""
+        """Return the reason to stop all drives, given their states; empty without a reason."""
         if self.mode is Mode.OFF or self.mode is Mode.HOMING:
             for device, state in zip(self._actuators.devices, states, strict=True):
                 is_powered = state in _POWERED or (state is DeviceState.FAULT and device.has_power)
                 if is_powered and device is not self._homing:
-                    return f"'{device.name}' is {state}, which nobody asked for. {device.health().text}".rstrip()
+                    return f"'{device.name}' is {state} without a request. {device.health().text}".rstrip()
             return ""
-        fits = _FIT[self.mode] if self.act is not Act.IDLE else _LETTING_GO
+        allowed = _ALLOWED[self.mode] if self.act is not Act.IDLE else _ALLOWED_IDLE
         for device, state in zip(self._actuators.devices, states, strict=True):
-            if state not in fits:
+            if state not in allowed:
                 return f"'{device.name}' is {state} while the robot is in mode '{self.mode}'. {device.health().text}"
         return ""
 
@@ -234,7 +234,7 @@ class ModeMachine:
         if all(state is DeviceState.ENABLED for state in states):
             self.mode, self._deadline = Mode.HOLD, now + self._hold
         elif now > self._deadline:
-            late = self._actuators.named(states, DeviceState.ENABLED)
+            late = self._actuators.names_not_in(DeviceState.ENABLED, states)
             self.fault(f"Not enabled within {ENABLE_TIMEOUT:g} s: {late}. Is the motor supply on?")
 
     def _holding(self, now: float, states: list[DeviceState], has_command: bool, is_parked: bool) -> None:
@@ -242,7 +242,7 @@ class ModeMachine:
             self.mode = Mode.FOLLOW
         elif now > self._deadline:
             if self._stop_act is Act.HOLD:
-                self._let_go(now, self._actuators.disable)
+                self._release(now, self._actuators.disable)
             else:
                 self._begin_stop(now)
 
@@ -255,23 +255,23 @@ class ModeMachine:
             self._park(now, is_parked)
         elif self._act is not Act.IDLE:
             if now > self._deadline:
-                self._let_go(now, self._actuators.disable)
+                self._release(now, self._actuators.disable)
         elif all(state is DeviceState.READY for state in states):
             self.mode, self._homing = Mode.OFF, None
         elif now > self._deadline:
-            held = self._actuators.named(states, DeviceState.READY)
-            self.fault(f"Still enabled {DISABLE_TIMEOUT:g} s after being disabled: {held}. Cut the power.")
+            late = self._actuators.names_not_in(DeviceState.READY, states)
+            self.fault(f"Still enabled {DISABLE_TIMEOUT:g} s after being disabled: {late}. Cut the power.")
 
     def _park(self, now: float, is_parked: bool) -> None:
         if not is_parked:
             self._parked_at = None
             if now > self._deadline:
-                self.fault(f"The robot was not parked within {self._park_time:g} s. What holds it back?")
+                self.fault(f"The robot was not parked within {self._park_time:g} s. Is its motion blocked?")
             return
         if self._parked_at is None:
             self._parked_at = now
         if now >= self._parked_at + PARK_SETTLE:
-            self._let_go(now, self._actuators.disable)
+            self._release(now, self._actuators.disable)
 
     def _find_zero(self, now: float, states: list[DeviceState], has_command: bool, is_parked: bool) -> None:
         device = self._homing
@@ -286,12 +286,12 @@ class ModeMachine:
         elif health.state is not DeviceState.READY or self._homing_seen:
             self.fault(f"'{device.name}' is {health.state} without having found its zero. {health.text}".rstrip())
         elif now > self._deadline - HOMING_TIMEOUT + ENABLE_TIMEOUT:
-            self.fault(f"'{device.name}' has not begun to look for its zero. {health.text}".rstrip())
+            self.fault(f"'{device.name}' has not started its homing. {health.text}".rstrip())
 
 
 _POWERED = (DeviceState.ENABLED, DeviceState.HOMING)
-_LETTING_GO = (DeviceState.ENABLED, DeviceState.HOMING, DeviceState.STOPPING, DeviceState.READY)
-_FIT = {
+_ALLOWED_IDLE = (DeviceState.ENABLED, DeviceState.HOMING, DeviceState.STOPPING, DeviceState.READY)
+_ALLOWED = {
     Mode.ENABLING: (DeviceState.ENABLED, DeviceState.READY),
     Mode.HOLD: (DeviceState.ENABLED,),
     Mode.FOLLOW: (DeviceState.ENABLED,),
@@ -307,7 +307,7 @@ _STEPS: dict[Mode, Callable[[ModeMachine, float, list[DeviceState], bool, bool],
 
 
 def _park_time(config: RobotConfig) -> float:
-    """How long [s] parking may take: twice the longest way that the ranges allow, and 5 s."""
+    """Return the time limit [s] of parking: twice the time for the longest way within the ranges, and 5 s."""
     if config.stop.park is None or config.stop.speed is None:
         return 0.0
     low, high = config.bounds(config.command.signal)

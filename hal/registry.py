@@ -1,4 +1,4 @@
-"""Names in a robot file -> what they stand for, imported when asked for."""
+"""Objects that a robot file names (drivers, simulators, functions), imported on demand."""
 
 import importlib
 from collections.abc import Mapping
@@ -22,10 +22,10 @@ DRIVERS = {
 
 
 def load_object(name: str) -> Any:
-    """Import and return the object that `module:name` stands for.
+    """Import and return the object `module:name`.
 
     Raises:
-        ConfigError: The name is malformed, or there is no such module or no such object in it.
+        ConfigError: The name is malformed, or the module or the object does not exist.
     """
     module_name, colon, attribute = name.partition(":")
     if not (colon and module_name and attribute):
@@ -33,7 +33,7 @@ def load_object(name: str) -> Any:
     try:
         module = importlib.import_module(module_name)
     except ImportError as error:
-        raise ConfigError(f"'{name}' cannot be loaded: {error}. Is the package that has it installed?") from error
+        raise ConfigError(f"'{name}' cannot be loaded: {error}. Is its package installed?") from error
     try:
         return getattr(module, attribute)
     except AttributeError:
@@ -42,10 +42,10 @@ def load_object(name: str) -> Any:
 
 
 def driver(name: str) -> Any:
-    """The driver class behind a kind's `driver`: a known name, or `module:name` for one of your own.
+    """Return the driver class of a kind: a known name, or `module:name` of your own driver.
 
     Raises:
-        ConfigError: Unknown.
+        ConfigError: The driver is unknown.
     """
     if ":" in name:
         return load_object(name)
@@ -55,18 +55,18 @@ def driver(name: str) -> Any:
 
 
 def equipment(config: RobotConfig, device: str, measured: Mapping[str, Any] | None = None) -> tuple[Any, Any]:
-    """The driver class of a device, and its settings.
+    """Return the driver class of a device, and its settings.
 
     Args:
         config: The robot file.
         device: Name of the device.
-        measured: Settings from a calibration; they take precedence over those of the robot file.
+        measured: Settings from a calibration; they replace those of the robot file.
 
     Raises:
-        ConfigError: No such driver, an unknown key among the settings, or a value that does not fit.
+        ConfigError: The driver or a key of the settings is unknown, or a value does not fit.
     """
-    found = driver(config.kinds[config.devices[device].kind].driver)
+    kind = driver(config.kinds[config.devices[device].kind].driver)
     try:
-        return found, found.Settings.model_validate({**config.settings_of(device), **(measured or {})})
+        return kind, kind.Settings.model_validate({**config.settings_of(device), **(measured or {})})
     except ValidationError as error:
-        raise ConfigError(f"Settings of device '{device}': {explain(error, found.Settings)}") from None
+        raise ConfigError(f"Settings of device '{device}': {explain(error, kind.Settings)}") from None

@@ -1,4 +1,4 @@
-"""Named devices read and commanded together: one coherent sample per cycle, and one mode for all drives."""
+"""The robot: all devices read and commanded together, with one sample per cycle and one mode for all drives."""
 
 from collections.abc import Sequence
 from types import TracebackType
@@ -25,16 +25,16 @@ from hal.wire.bus import Bus
 __all__ = ["Applied", "Robot", "Sample", "open_robot"]
 
 ANSWER_SHARE = 0.6
-"""Part of the period that the cycle waits for the answers to its SYNC."""
+"""The cycle waits for this part of its period for the answers to its SYNC."""
 CLOSING_TIME = 1.5
-"""How long [s] `close` waits for the drives to come to rest and let go."""
+"""`close` waits at most this time [s] for the drives to come to rest and disable."""
 
 
 class Robot:
-    """A robot: its devices, its limits, and the turn of its cycle.
+    """A robot: its devices, its limits and its cycle.
 
-    Somebody calls `cycle` at `config.rates.hal`; the other methods may be called from any thread and only ask. Nothing
-    is enabled by itself, at no time.
+    The owner calls `cycle` at `config.rates.hal`. All other methods may be called from any thread and only send
+    requests. No drive is ever enabled without a call of `enable`.
     """
 
     def __init__(
@@ -45,11 +45,11 @@ class Robot:
         clock: Clock | None = None,
         source: str = "can",
     ) -> None:
-        """Put a robot together; nothing is opened yet.
+        """Combine the parts of a robot; nothing is opened yet.
 
         Raises:
-            ConfigError: The devices do not measure each element once, do not command each element once, or cannot do
-                what the limits and the stop behaviour need.
+            ConfigError: The devices do not measure each element once, do not command each element once, or do not
+                support the limits and the stop behaviour.
         """
         self.config = config
         self.period = 1.0 / config.rates.hal
@@ -92,19 +92,19 @@ class Robot:
 
     @property
     def fault_text(self) -> str:
-        """Why the robot is in fault; empty if it is not."""
+        """Cause of the fault; empty without a fault."""
         return self._modes.fault_text
 
     @property
     def clock(self) -> Clock:
-        """What the cycle goes by; whoever calls `cycle` sleeps on it."""
+        """Clock of the cycle; the caller of `cycle` sleeps on it."""
         return self._clock
 
     def open(self) -> None:
-        """Open the buses and commission every node, all at once; blocks until each was tried.
+        """Open the buses and commission all nodes in parallel; block until each was tried once.
 
-        A node on a bus that does not answer is told by `health` and tried again until it does. Without buses, what a
-        device's `open` raises is passed on.
+        `health` reports a node that does not answer, and further attempts follow until it does. Without buses, an error
+        of a device's `open` is raised.
         """
         if self._is_open:
             return
@@ -118,7 +118,7 @@ class Robot:
             device.open()
 
     def close(self) -> None:
-        """Stop the drives as fast as they can, and give everything back. Safe to call twice."""
+        """Stop the drives as fast as they can, and close devices and buses. Safe to call twice."""
         if not self._is_open:
             return
         self._is_open = False
@@ -128,7 +128,7 @@ class Robot:
         if is_free:
             self._settle()
         else:
-            self.estop("The HAL ends while its cycle is stuck.")
+            self.estop("The HAL ends while its cycle is blocked.")
         if self._caretaker:
             self._caretaker.stop()
         else:
@@ -138,7 +138,7 @@ class Robot:
             bus.close()
 
     def _settle(self) -> None:
-        """Cycle until no drive has power, or it is clear that one does not let go."""
+        """Cycle until no drive has power, at most for `CLOSING_TIME`."""
         due = self._clock.monotonic()
         for _ in range(round(CLOSING_TIME / self.period)):
             self.cycle()
@@ -149,11 +149,11 @@ class Robot:
                 self._clock.sleep_until(due)
 
     def enable(self) -> None:
-        """Ask the drives to hold where the robot is; `mode` becomes `hold` when all do.
+        """Ask the drives to hold the present position; `mode` becomes `hold` when all drives are enabled.
 
         Raises:
-            CommandRefused: In fault or stopping, a drive is not ready, its position is not known, or the limits exclude
-                where the robot is.
+            CommandRefused: The robot is in fault or stopping, a drive is not ready, its position is unknown, or the
+                present position is outside of the limits.
         """
         with self._turns.question():
             if self._modes.mode is Mode.OFF:
@@ -163,55 +163,55 @@ class Robot:
             self._modes.enable(self._clock.monotonic())
 
     def home(self, device: str) -> None:
-        """Ask one device to find its zero, which moves it; the robot's mode is `homing` until it has.
+        """Ask one device to find its zero, which moves it; the robot's mode is `homing` until then.
 
         Raises:
-            CommandRefused: The robot is not off, there is no such device, or it is not ready or has no homing.
+            CommandRefused: The robot is not off, or the device is unknown, not ready or has no homing.
         """
         with self._turns.question():
             self._modes.home(find(device, self._actuators.devices), self._clock.monotonic())
 
     def tare(self, device: str) -> None:
-        """Ask one sensor to take what it measures as zero; its health tells what came of it.
+        """Ask one sensor to take its present measurement as zero; its health reports the result.
 
         Raises:
-            CommandRefused: The robot is not off, there is no such device, or it has no tare.
+            CommandRefused: The robot is not off, or the device is unknown or has no tare.
         """
         with self._turns.question():
             self._modes.tare(find(device, self._devices))
 
     def disable(self) -> None:
-        """Let go at once."""
+        """Disable the drives at once."""
         with self._turns.question():
             self._modes.disable(self._clock.monotonic())
 
     def stop(self, reason: str) -> None:
-        """Take no more commands, do what the robot file's `stop` says, and let go."""
+        """Take no more commands, perform the stop of the robot file, and disable the drives."""
         with self._turns.question():
             self._stop_reason = reason
             self._modes.stop(self._clock.monotonic())
 
     def estop(self, reason: str) -> Emergency:
-        """Stop every drive as fast as it can, whatever the robot is doing, and stay in fault until `reset`.
+        """Stop every drive as fast as it can, in every mode, and stay in fault until `reset`.
 
-        Works in every mode, from several threads at once, and when the cycle is stuck. Blocks until every drive has
-        said that it is without power, about a second at most. This is no safety-rated emergency stop.
+        Several threads may call this at once, also while the cycle is blocked. It blocks until every drive reports that
+        it has no power, for about a second at most. This is not a safety-rated emergency stop.
 
         Args:
-            reason: Told as the cause of the fault.
+            reason: Cause of the fault, for messages.
 
         Returns:
-            What every drive did, and whether all of them stopped.
+            Reaction of every drive, and whether all of them stopped.
         """
         text = f"Emergency stop: {reason}"
         self._emergency.latch(text)
         with self._turns.within(self._emergency.LOCK_TIMEOUT):
             self._modes.emergency(text)
-            asked = self._emergency.ask()
-        return self._emergency.watch(asked, lambda: self._number)
+            requests = self._emergency.ask()
+        return self._emergency.watch(requests, lambda: self._number)
 
     def reset(self) -> None:
-        """Leave the fault, here and in the drives; enables nothing.
+        """Leave the fault, here and in the drives, without enabling a drive.
 
         Raises:
             CommandRefused: The robot is enabled.
@@ -223,14 +223,15 @@ class Robot:
                 device.reset()
 
     def command(self, desired: np.ndarray, cycle: int) -> None:
-        """Ask for set-points; the newest wins, and lives `command.time_to_live` from the cycle that it answers.
+        """Set the desired set-points; they replace earlier ones and expire `command.time_to_live` after their cycle.
 
         Args:
             desired: Set-points [unit of the commanded signal], shape (n,).
             cycle: Number of the sample from which they were computed.
 
         Raises:
-            CommandRefused: A wrong size, not finite, the robot is not enabled, the cycle unknown or too long ago.
+            CommandRefused: The size is wrong, a value is not finite, the robot is not enabled, or the cycle is unknown
+                or too old.
         """
         signal = self.config.command.signal
         desired = checked(desired, signal, self.config.signals[signal].elements)
@@ -244,9 +245,9 @@ class Robot:
             self._desired = (desired, expires)
 
     def cycle(self) -> tuple[Sample, Applied]:
-        """One whole turn: limits, set-points, SYNC on all buses, the answers, the sample.
+        """Run one cycle: limits, set-points, SYNC on all buses, answers, sample.
 
-        What a driver raises is a fault of the robot, and passed on.
+        An error of a driver puts the robot in fault and is raised again.
         """
         try:
             return self._cycle()
@@ -276,7 +277,7 @@ class Robot:
         return Sample(self._number, stamp, self.source, complete, values, age, valid), applied
 
     def _act(self, now: float, stamp: int) -> Applied:
-        """Move on to this cycle's mode and send its set-points."""
+        """Enter the mode of this cycle and send its set-points."""
         modes, limiter = self._modes, self._limiter
         problem = self._cycle_watchdog.problem(now) or self._bus_problem() or limiter.trip(self._measured)
         problem = problem or (self._start.moved(self._measured) if modes.mode is Mode.ENABLING else "")
@@ -301,7 +302,7 @@ class Robot:
         )
 
     def _move(self, act: Act, desired: tuple[np.ndarray, float] | None) -> list[str]:
-        """Take the set-point one step on and send it; which limits acted."""
+        """Advance the set-point by one step, send it, and return the limits that acted."""
         limiter, actuators = self._limiter, self._actuators
         limited: list[str] = []
         if act is Act.IDLE:
@@ -311,7 +312,7 @@ class Robot:
             limiter.start(self._measured)
             actuators.damp()
             return limited
-        if act is Act.START:  # the set-point is where the robot is, so that nothing jumps
+        if act is Act.START:  # the set-point is the present position, so that no drive jumps
             limiter.start(self._start.believed())
         elif act is Act.PARK:
             limited = limiter.step(self._park, self._measured, is_parking=True)
@@ -321,12 +322,12 @@ class Robot:
         return limited
 
     def _bus_problem(self) -> str:
-        """What made a bus unusable since the cycle before; asked in every cycle, for it is told once."""
+        """Return the problem that made a bus unusable; every bus reports it once, so ask all of them in every cycle."""
         troubles = [(bus.name, bus.trouble()) for bus in self._buses]
         return next((f"Bus '{name}' {trouble}" for name, trouble in troubles if trouble), "")
 
     def health(self) -> dict[str, Any]:
-        """Mode, buses and devices in plain values: for status messages, not for control."""
+        """Return mode, buses and devices as plain values, for status messages and not for control."""
         return {
             "mode": self.mode,
             "fault": self.fault_text,
@@ -340,10 +341,10 @@ class Robot:
 
 
 def open_robot(config: RobotConfig, clock: BusClock | None = None) -> Robot:
-    """Build the buses and drivers that a robot file names; nothing is opened yet.
+    """Build the buses and drivers of a robot file; nothing is opened yet.
 
     Raises:
-        ConfigError: An unknown driver or interface, settings that do not fit, or a bus that would carry too much.
+        ConfigError: A driver or interface is unknown, settings do not fit, or the load of a bus is too high.
     """
     buses, devices = build(config, clock := clock or SystemClock())
     simulated = bool(config.buses) and all(bus.interface in ("hub", "virtual") for bus in config.buses.values())

@@ -1,4 +1,4 @@
-"""What the robot hands out each cycle: what was measured, and what was really sent."""
+"""Results of a cycle: the measured sample and the applied set-points."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -22,8 +22,8 @@ class Sample:
         source: `can` or `simulated`.
         complete: Whether every device answered in this cycle.
         values: Signal -> values [the signal's unit], shape (n,); NaN where not valid.
-        age: Signal -> age of each value [s], shape (n,); inf if never measured.
-        valid: Signal -> whether each value may be used, shape (n,).
+        age: Signal -> age of each value [s], shape (n,); inf before the first measurement.
+        valid: Signal -> whether each value is fresh and finite, shape (n,).
     """
 
     cycle: int
@@ -37,16 +37,16 @@ class Sample:
 
 @dataclass(frozen=True, slots=True)
 class Applied:
-    """What was really sent to the drives in a cycle.
+    """Set-points that were sent to the drives in a cycle, after all limits.
 
     Attributes:
         cycle: Number of the cycle, from 1.
         stamp_ns: Wall clock at the SYNC of the cycle [ns since 1970].
         mode: `off`, `enabling`, `hold`, `follow`, `homing`, `stopping` or `fault`.
         signal: The commanded signal.
-        desired: Newest accepted command [its unit], shape (n,); NaN if none is alive.
-        values: Applied set-points [its unit], shape (n,); NaN while nothing is applied.
-        limited_by: Which limits acted (`acceleration`, `effort`, `range`, `rate`, `tension`, `velocity`), sorted.
+        desired: Newest accepted command [its unit], shape (n,); NaN without a command.
+        values: Applied set-points [its unit], shape (n,); NaN if none were sent.
+        limited_by: Active limits (`acceleration`, `effort`, `range`, `rate`, `tension`, `velocity`), sorted.
     """
 
     cycle: int
@@ -60,7 +60,7 @@ class Applied:
 
 @dataclass(frozen=True, slots=True)
 class _Computed:
-    """A signal that is computed: how, from which elements, where it belongs, and until what age [s]."""
+    """A computed signal: function, input elements, own elements, and highest age [s]."""
 
     function: Callable[[np.ndarray], np.ndarray]
     inputs: slice
@@ -69,22 +69,21 @@ class _Computed:
 
     @property
     def size(self) -> int:
-        """How many elements it has."""
+        """Number of elements."""
         return self.place.stop - self.place.start
 
 
 class Assembler:
-    """Gathers the readings of all devices into the signals of the robot file, without a loop over elements."""
+    """Assembler of the readings of all devices into the signals of the robot file, without a loop over elements."""
 
     def __init__(self, config: RobotConfig, devices: Sequence[Device]) -> None:
-        """Work out where each device's values go.
+        """Compute the place of each device's values in the sample.
 
-        Signals that a camera's process publishes are served only where a device measures them, as a simulator without
-        a bus does.
+        The sample has the signals of a camera only if a device measures them, as a simulator without a bus does.
 
         Raises:
-            ConfigError: The devices measure an element twice, not at all, or one that the robot does not have; or a
-                signal cannot be computed.
+            ConfigError: The devices measure an element twice, not at all, or measure an unknown element; or a signal
+                cannot be computed.
         """
         measured = [element for device in devices for element in device.measures]
         seen = [name for name in config.seen if any(e in measured for e in config.element_names([name]))]
@@ -103,8 +102,8 @@ class Assembler:
         self._stale_after = np.repeat(
             [config.signals[name].stale_after for name in direct], [config.signals[name].size for name in direct]
         )
-        has = [name for name, signal in config.signals.items() if name in direct or signal.computed is not None]
-        self._elements = Elements.of({name: config.signals[name].size for name in has})
+        signals = [name for name, signal in config.signals.items() if name in direct or signal.computed is not None]
+        self._elements = Elements.of({name: config.signals[name].size for name in signals})
         places = self._elements.places
         self._direct = np.concatenate([np.r_[places[name]] for name in direct] or [np.zeros(0, int)])
         self._computed = [
@@ -115,18 +114,18 @@ class Assembler:
 
     @property
     def signals(self) -> tuple[str, ...]:
-        """Signals that a sample has, in the order of the robot file."""
+        """Signals of a sample, in the order of the robot file."""
         return tuple(self._elements.counts)
 
     @property
     def nothing(self) -> Numbers:
-        """Values of every signal as long as nothing was measured."""
+        """NaN for every signal: the values before the first measurement."""
         return Numbers(np.full(self._elements.size, np.nan), self._elements)
 
     def assemble(self, now: float) -> tuple[Numbers, Numbers, Truths]:
-        """Values, ages [s] and validity of every signal at monotonic time `now` [s], in fresh arrays."""
+        """Return values, ages [s] and validity of every signal at monotonic time `now` [s], in new arrays."""
         readings = [device.read() for device in self._devices]
-        # The times first: a value that arrives in between then looks older than it is, never newer.
+        # Times before values: a value that arrives in between looks older than it is, never newer.
         received = np.concatenate([reading.received for reading in readings])
         values = np.concatenate([reading.values for reading in readings])
         if not self._is_in_order:
@@ -139,20 +138,23 @@ class Assembler:
         return Numbers(values, self._elements), Numbers(age, self._elements), Truths(valid, self._elements)
 
     def _with_computed(self, values: np.ndarray, age: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, ...]:
-        """With what is computed put between what was measured."""
+        """Return values, ages [s] and validity of all signals, measured and computed, in the order of a sample."""
         size, direct = self._elements.size, self._direct
         all_values, all_ages, all_valid = np.empty(size), np.empty(size), np.zeros(size, bool)
         all_values[direct], all_ages[direct], all_valid[direct] = values, age, valid
-        for one in self._computed:
-            into = one.place
-            all_values[into], all_ages[into], all_valid[into] = _compute(
-                one, all_values[one.inputs], all_ages[one.inputs]
+        for part in self._computed:
+            place = part.place
+            all_values[place], all_ages[place], all_valid[place] = _compute(
+                part, all_values[part.inputs], all_ages[part.inputs]
             )
         return all_values, all_ages, all_valid
 
 
 def _compute(part: _Computed, values: np.ndarray, age: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Values, ages [s] and validity of a computed signal: valid only if every input is, and as old as the oldest."""
+    """Return values, ages [s] and validity of a computed signal, which is as old as its oldest input.
+
+    It is valid only if every input is valid.
+    """
     oldest = max(age.tolist())
     ages = np.full(part.size, oldest)
     if oldest > part.stale_after or not np.isfinite(values).all():

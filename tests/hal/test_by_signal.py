@@ -31,7 +31,7 @@ def test_arrays_of_each_signal_are_joined_in_the_order_that_is_asked_for() -> No
 
 @pytest.mark.parametrize("parts", [{}, {"joint_position": [1, 2]}, COUNTS | {"joint_position": [1, 2, 3]}])
 def test_other_signals_are_refused(parts: dict[str, object]) -> None:
-    with pytest.raises(ValueError, match="so many elements"):
+    with pytest.raises(ValueError, match="these numbers of elements"):
         Numbers.of(parts, Elements.of(COUNTS))
 
 

@@ -159,7 +159,7 @@ def test_every_measured_element_needs_a_device_and_no_other_may_have_one():
     }
     drive = {"kind": "drive", "bus": "can0", "node": 1, "element": "joint_position.hip"}
     assert len(feet(devices=devices | {"hip_drive": drive}).devices) == 5
-    with pytest.raises(ValueError, match=r"no device measures joint_position.hip. Add one, drop the element, or say"):
+    with pytest.raises(ValueError, match=r"no device measures joint_position.hip. Add one, remove the element, or set"):
         feet(devices=devices)
     camera = drive | {"element": "tool_tip_pixel.u", "node": 2}
     with pytest.raises(ValueError, match=r"'tool_tip_pixel.u', which a device cannot measure"):

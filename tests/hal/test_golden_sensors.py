@@ -139,7 +139,7 @@ def test_four_channels_have_a_status_each():
 def test_a_tare_is_the_signature_zero():
     with cell({**CELL, "6124:1": "00 00 C0 BF"}) as (device, puppet):
         device.tare()
-        device.errand()
+        device.long_request()
         assert "23 25 61 01 7A 65 72 6F" in puppet.requests
         assert device.health().counters["tared"] == 1
 

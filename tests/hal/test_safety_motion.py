@@ -154,9 +154,9 @@ def test_a_robot_that_would_trip_is_not_enabled():
 @pytest.mark.parametrize(
     ("quantity", "stop", "told"),
     [
-        ("effort", {"behaviour": "hold"}, "with effort commands say damp or off"),
-        ("effort", {"behaviour": "park", "park": [0, 0], "speed": 1}, "with effort commands say damp or off"),
-        ("velocity", {"behaviour": "park", "park": [0, 0], "speed": 1}, "with velocity commands say damp or off"),
+        ("effort", {"behaviour": "hold"}, "with effort commands use damp or off"),
+        ("effort", {"behaviour": "park", "park": [0, 0], "speed": 1}, "with effort commands use damp or off"),
+        ("velocity", {"behaviour": "park", "park": [0, 0], "speed": 1}, "with velocity commands use damp or off"),
         ("position", {"behaviour": "damp"}, "shoulder_drive, elbow_drive cannot damp"),
     ],
 )

@@ -216,7 +216,7 @@ def test_a_drive_that_is_enabled_without_being_asked_is_a_fault():
     bench.joints[1].state = DeviceState.ENABLED
     bench.cycle()
     assert bench.robot.mode == "fault"
-    assert "'elbow_drive' is enabled, which nobody asked for" in bench.robot.fault_text
+    assert "'elbow_drive' is enabled without a request" in bench.robot.fault_text
 
 
 def test_a_fault_is_not_reset_while_a_drive_keeps_its_power():

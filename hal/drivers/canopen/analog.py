@@ -395,7 +395,7 @@ class Cia404Cell(AnalogNode):
         if not self.is_commissioned:
             raise CommandRefused(f"{self._place} cannot be tared: {self._trouble[1]}")
         self._tare_text = "being tared"
-        self.errand = self._tare
+        self.long_request = self._tare
 
     def _tare(self) -> None:
         """Have every channel take what it measures as zero, and remember what it takes to do so again."""
