@@ -38,9 +38,16 @@ BO_ 257 Status: 2 Node
 BO_ 258 Angle: 4 Node
  SG_ Angle : 7|32@0- (0.01,0) [0|0] "deg" Host
 
+BO_ 259 Load: 4 Node
+ SG_ Force : 0|16@1- (0.5,-10) [0|0] "" Host
+ SG_ Heat : 16|8@1+ (1,-40) [0|0] "degC" Host
+
 BO_ 512 Go: 6 Host
  SG_ Mode : 0|8@1+ (1,0) [0|0] "" Node
  SG_ Angle : 15|32@0- (0.01,0) [-9000|9000] "deg" Node
+
+BO_ 513 Push: 2 Host
+ SG_ Torque : 0|16@1- (0.25,-20) [-8000|8000] "" Node
 
 VAL_ 257 Mode 0 "OFF" 1 "ON" 2 "BUSY" ;
 VAL_ 512 Mode 0 "OFF" 1 "ON" ;
@@ -114,6 +121,54 @@ def test_an_error_in_another_message_makes_values_doubtful(place):
     hear(bytearray.fromhex("00 28 23 00 00 00 00 00"), 1.1)
     assert math.isnan(device.read().values[0])
     assert "reports 5 (Status.Fault)" in device.health().text
+
+
+def test_gain_zero_and_direction_are_those_of_the_main_quantity(place):
+    """Force: raw 100 is 40 of the file's units, 0.2 * 40 + 3 = 11, 4 * 11 - 7 = 37; heat: raw 65 is 25."""
+    cell = {
+        "node_offset": 4,
+        "periods": {"Load": 0.01},
+        "quantities": {
+            "force": {"signal": "Load.Force", "scale": 0.2, "offset": 3.0},
+            "temperature": {"signal": "Load.Heat", "scale": 2.0, "offset": -1.0},
+        },
+    }
+    device = DbcNode(place("force", "temperature"), settings(DbcSettings, cell, gain=4.0, zero=-7.0))
+    device.is_commissioned = True
+    device._bus.subscriber(259 + 8)(bytearray.fromhex("64 00 41 00"), 1.0)
+    assert device.read().values == pytest.approx([37.0, 2 * 25.0 - 1.0])
+    encoder = {**SENSOR, "quantities": {"velocity": {"signal": "Motion.Speed", "scale": 2.0, "offset": 3.0}}}
+    encoder["quantities"]["position"] = {"signal": "Motion.Angle", "scale": 0.5, "offset": 5.0}
+    device = DbcNode(place("velocity", "position", node=3), settings(DbcSettings, encoder, direction=-1, zero=100.0))
+    device.is_commissioned = True
+    hear = device._bus.subscriber(256 + 12)
+    device._bus.subscriber(257 + 12)(bytearray.fromhex("00 00"), 1.0)
+    hear(bytearray.fromhex("00 28 23 00 00 00 00 00"), 1.0)  # 90
+    hear(bytearray.fromhex("01 64 00 00 00 00 00 00"), 1.0)  # 10
+    assert device.read().values == pytest.approx([-(2.0 * 10.0 + 3.0), 100.0 - (0.5 * 90.0 + 5.0)])
+
+
+@pytest.mark.parametrize(
+    ("command", "value", "data"),
+    [
+        # measured: effort = 0.2 * (raw / 2 - 10) + 3; commanded in the same way: raw = 4 * (torque + 20)
+        ({}, 11.0, "F0 00"),  # torque 40: raw 240
+        ({}, 3.0, "50 00"),  # torque 0: raw 80
+        ({"scale": -2.0}, 11.0, "40 00"),  # (11 - 3) / -2 = -4: raw 64
+        ({"offset": 1.0}, 11.0, "18 01"),  # torque 50: raw 280
+        ({"scale": 0.5, "offset": -1.0}, 0.0, "58 00"),  # torque 2: raw 88
+    ],
+)
+def test_set_points_with_a_scale_and_an_offset_of_their_own(place, command, value, data):
+    servo = {
+        **SERVO,
+        "periods": {"Load": 0.01, "Status": 0.05},
+        "quantities": {"effort": {"signal": "Load.Force", "scale": 0.2, "offset": 3.0}},
+        "command": {"quantity": "effort", "send": "Push", "signal": "Torque", **command},
+    }
+    device = DbcServo(place("effort"), settings(ServoSettings, servo))
+    device._writer.write((value - device._offset) / device._scale)
+    assert device._frame.data == bytes.fromhex(data)
 
 
 def test_a_servo_that_answers_in_the_cycle_is_waited_for(place):

@@ -327,3 +327,27 @@ def test_velocity_units(code, per_turn, counts_per_second):
 )
 def test_interpolation_periods(rate, value, index):
     assert cia402.interpolation(1 / rate) == (value, index)
+
+
+def test_no_set_point_goes_to_a_drive_before_it_is_commissioned_and_has_reported_where_it_is(wire):
+    """A target of 0 counts, sent before the position is known, would move the joint to its zero when it is enabled."""
+    bench = wire.bench.open()
+    bench.cycle(3)
+    drive = bench.drive
+    wire.frames()
+    drive.idle()
+    assert [data for _, data in wire.frames(0x205)] == ["00 00 00 00 00 00"]
+    drive.is_commissioned = False
+    drive.idle()
+    assert wire.frames(0x205) == []
+    drive.is_commissioned = True
+    for missing in ({"_statusword": -1}, {"_counts": None}):
+        before = {name: getattr(drive, name) for name in missing}
+        for name, value in missing.items():
+            setattr(drive, name, value)
+        drive.idle()
+        assert wire.frames(0x205) == []
+        for name, value in before.items():
+            setattr(drive, name, value)
+    drive.idle()
+    assert len(wire.frames(0x205)) == 1

@@ -1,0 +1,142 @@
+"""Run the mutation probe.
+
+    python -m studies.mutation [--count 300] [--seed 1] [--within hal/drivers/dbc] [--controls 20] [--calls FILE]
+
+Every place has the same chance to be drawn, and at each place one change is drawn. The tests run once to record the
+calls of each test (`--calls` reads an older record). A mutant inside a function then meets the tests that call it; a
+mutant elsewhere, or in a function that no test calls, meets those that call its module or a module that imports it. The
+fastest tests of all files come first, until one fails or `BUDGET` is spent. Controls are the same runs without a
+change: a control that fails shows how often a mutant counts as killed by chance. Everything runs in copies of the tree;
+the results are written to runs/mutation.
+"""
+
+import argparse
+import ast
+import difflib
+import json
+import os
+import queue
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from itertools import chain, islice, zip_longest
+from pathlib import Path
+
+from studies.mutation.mutants import ROOT, Mutant, draw
+
+TESTS = ["tests/hal", *(f"tests/services/test_{name}.py" for name in ("command_intake", "lease", "permission"))]
+BUDGET = 40.0
+"""The tests of one mutant take at most this time [s] when they pass."""
+TIMEOUT = 200.0
+"""A mutant whose tests take longer [s] is killed: a test does not end."""
+Calls = dict[str, tuple[float, list[str]]]
+
+
+def copy_tree(place: Path) -> Path:
+    """Copy what git lists and return the copy."""
+    names = subprocess.check_output(["git", "ls-files", "-co", "--exclude-standard"], cwd=ROOT, text=True).split("\n")
+    for name in filter(None, names):
+        (place / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / name, place / name)
+    return place
+
+
+def pytest(tree: Path, *words: str, timeout: float | None = None, **environment: str) -> tuple[int, str]:
+    """Run pytest in a copy and return its exit code, -1 after the timeout, and its output."""
+    command = ["nice", "-n", "19", sys.executable, "-B", "-m", "pytest", "-q", "-p", "no:cacheprovider", *words]
+    variables = {**os.environ, "PYTHONPATH": str(tree), **environment}
+    try:
+        run = subprocess.run(command, cwd=tree, env=variables, timeout=timeout, capture_output=True, text=True)
+    except subprocess.TimeoutExpired:
+        return -1, "timeout"
+    return run.returncode, run.stdout
+
+
+@cache
+def importers(path: str) -> frozenset[str]:
+    """Return a file and the files that import it."""
+    module = path.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
+    parent, _, name = module.rpartition(".")
+    files = {path}
+    for file in chain(*((ROOT / package).rglob("*.py") for package in ("hal", "services", "simulators"))):
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.ImportFrom) and (
+                node.module == module or (node.module == parent and name in {alias.name for alias in node.names})
+            ):
+                files.add(str(file.relative_to(ROOT)))
+    return frozenset(files)
+
+
+def tests_of(mutant: Mutant, calls: Calls) -> Iterator[str]:
+    """Yield the tests of a mutant, in the order in which they run."""
+    key, files = f"{mutant.path}:{mutant.function}", importers(mutant.path)
+    names = [name for name, (_, keys) in calls.items() if key in keys]
+    if not names:
+        names = [name for name, (_, keys) in calls.items() if any(key.split(":")[0] in files for key in keys)]
+    rows = defaultdict(list)
+    for name in sorted(names, key=lambda name: calls[name][0]):
+        rows[name.split("::")[0]].append(name)
+    left = BUDGET
+    for name in filter(None, chain(*zip_longest(*rows.values()))):
+        left -= calls[name][0]
+        if left > 0:
+            yield name
+
+
+def probe(mutant: Mutant, trees: queue.Queue[Path], calls: Calls) -> dict[str, object]:
+    """Run the tests of a mutant in a free copy of the tree."""
+    tree, names = trees.get(), list(tests_of(mutant, calls))
+    original = (tree / mutant.path).read_text()
+    code = mutant.apply(original) or original
+    (tree / mutant.path).write_text(code)
+    (tree / "names.txt").write_text("\n".join(names))
+    status, output = pytest(tree, "-x", "--timeout=20", "@names.txt", timeout=TIMEOUT) if names else (0, "no tests")
+    (tree / mutant.path).write_text(original)
+    trees.put(tree)
+    outcome = {0: "survived", -1: "timeout"}.get(status, "killed")
+    lines = difflib.unified_diff(original.splitlines(), code.splitlines(), lineterm="", n=0)
+    diff = [line for line in lines if line[:1] in "+-" and line[:3] not in ("---", "+++")]
+    tail = output.strip().split("\n")[-3:]
+    print(f"{outcome:9} {mutant.path}:{mutant.line} {mutant.function} {mutant.operator}", flush=True)
+    return {**mutant._asdict(), "outcome": outcome, "tests": len(names), "diff": diff, "output": tail}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Run the mutation probe.")
+    parser.add_argument("--count", type=int, default=300)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--within", default="")
+    parser.add_argument("--controls", type=int, default=20)
+    parser.add_argument("--calls", type=Path, default=None)
+    options = parser.parse_args()
+    folder = ROOT / "runs" / "mutation"
+    folder.mkdir(parents=True, exist_ok=True)
+    mutants = list(islice(draw(options.seed, options.within), options.count))
+    controls = [mutant._replace(operator="") for mutant in mutants[: options.controls]]
+    with tempfile.TemporaryDirectory() as place, ThreadPoolExecutor(2) as pool:
+        trees: queue.Queue[Path] = queue.Queue()
+        for name in ("one", "two"):
+            trees.put(copy_tree(Path(place) / name))
+        calls = options.calls or folder / "calls.json"
+        if options.calls is None:
+            plugin = ("-p", "studies.mutation.calls", "-m", "not long", *TESTS)
+            print(pytest(trees.queue[0], *plugin, CALLS=str(calls))[1].strip().split("\n")[-1], flush=True)
+        record = json.loads(calls.read_text())
+        results = list(pool.map(lambda mutant: probe(mutant, trees, record), [*mutants, *controls]))
+    (folder / f"seed{options.seed}.json").write_text(json.dumps(results, indent=1))
+    for result in results:
+        if result["outcome"] == "survived" and result["operator"]:
+            print("{path}:{line} {function} {operator}, {tests} tests".format(**result), *result["diff"], "", sep="\n")
+    counts = Counter(result["outcome"] for result in results if result["operator"])
+    failed = sum(result["outcome"] != "survived" for result in results if not result["operator"])
+    share = 1 - counts["survived"] / len(mutants)
+    print(f"{len(mutants)} mutants: {dict(counts)}, {share:.1%} noticed; {failed} of {len(controls)} controls failed")
+
+
+if __name__ == "__main__":
+    main()
