@@ -1,7 +1,7 @@
 """The objects that a servo drive gets before it is used, in the drive's units: values by arithmetic done by hand.
 
-The joint has 4096 counts per motor turn, a gear of 50 and its zero at -0.2 rad: 204 800 counts per turn of the joint, so
-32 594.93 counts per radian. The wire has a spool of 10 mm: 3 259 493 counts per metre.
+The joint has 4096 counts per motor turn, a gear of 50 and its zero at -0.2 rad: 204 800 counts per turn of the joint,
+so 32 594.93 counts per radian. The wire has a spool of 10 mm: 3 259 493 counts per metre.
 """
 
 import math

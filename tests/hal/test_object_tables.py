@@ -275,7 +275,7 @@ CODES = {
 
 
 def test_every_emergency_code_in_words():
-    for code in range(0, 0x10000):
+    for code in range(0x10000):
         high = code >> 8
         family = FAMILIES.get(high) or FAMILIES.get(high & 0xF0, "unknown family")
         exact = f": {CODES[code]}" if code in CODES else ""
