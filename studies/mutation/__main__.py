@@ -26,6 +26,7 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from itertools import chain, islice, zip_longest
 from pathlib import Path
+from typing import Any
 
 from studies.mutation.mutants import ROOT, Mutant, draw
 
@@ -88,7 +89,7 @@ def tests_of(mutant: Mutant, calls: Calls) -> Iterator[str]:
             yield name
 
 
-def probe(mutant: Mutant, trees: queue.Queue[Path], calls: Calls) -> dict[str, object]:
+def probe(mutant: Mutant, trees: queue.Queue[Path], calls: Calls) -> dict[str, Any]:
     """Run the tests of a mutant in a free copy of the tree."""
     tree, names = trees.get(), list(tests_of(mutant, calls))
     original = (tree / mutant.path).read_text()
