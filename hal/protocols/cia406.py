@@ -1,7 +1,7 @@
-"""Absolute encoders: position, speed, alarms and warnings, and what one turn is.
+"""Absolute encoders: position, speed, alarms, warnings, and counts per turn.
 
 Source: CiA 406, version 3.2: 6000h to 6004h, 6030h, 6031h, 6501h to 6506h. The preset 6003h is never written: the zero
-is the robot file's, so that an encoder that forgets its preset does not move the joint's zero.
+is in the robot file, so an encoder that loses its preset does not move the joint's zero.
 """
 
 from hal.protocols.cia301 import Mapped
@@ -10,12 +10,12 @@ PROFILE = 406
 
 OPERATING_PARAMETERS = Mapped(0x6000, 0, 16)
 SCALING_ON = 1 << 2
-"""Bit of 6000h: the position counts in the units of 6001h and 6002h, else in those of 6501h and 6502h."""
+"""This bit of 6000h selects the units of 6001h and 6002h for the position, else those of 6501h and 6502h."""
 UNITS_PER_TURN = Mapped(0x6001, 0, 32)
 TOTAL_UNITS = Mapped(0x6002, 0, 32)
 POSITION = Mapped(0x6004, 0, 32)
 SPEED = Mapped(0x6030, 1, 16, "signed")
-"""Position units per second, unless 6031h says otherwise."""
+"""Its unit is position units per second, unless 6031h defines another."""
 SPEED_MULTIPLIER = Mapped(0x6031, 3, 16)
 SPEED_DIVIDER = Mapped(0x6031, 4, 16)
 PHYSICAL_PER_TURN = Mapped(0x6501, 0, 32)
@@ -37,16 +37,16 @@ _WARNINGS = (
 
 
 def describe_alarms(alarms: int) -> str:
-    """Alarm bits (6503h) in words; empty if there is none. With any of them the position is not to be used."""
+    """Return alarm bits (6503h) in words; empty if there is none. With any alarm the position is invalid."""
     return _describe(alarms, _ALARMS, "alarms")
 
 
 def describe_warnings(warnings: int) -> str:
-    """Warning bits (6505h) in words; empty if there is none. The position is still good."""
+    """Return warning bits (6505h) in words; empty if there is none. The position is still valid."""
     return _describe(warnings, _WARNINGS, "warnings")
 
 
 def _describe(bits: int, names: tuple[tuple[int, str], ...], rest: str) -> str:
-    known = [text for bit, text in names if bits & bit]
+    words = [text for bit, text in names if bits & bit]
     other = bits & ~sum(bit for bit, _ in names)
-    return ", ".join([*known, f"{rest} {other:04X}h"] if other else known)
+    return ", ".join([*words, f"{rest} {other:04X}h"] if other else words)

@@ -401,7 +401,7 @@ def test_a_data_sheet_that_lacks_something_is_told_before_anything_is_opened(tmp
 
 
 def test_another_devices_data_sheet_is_told():
-    assert "is of device profile 404, not 402" in refused(sheet=ROBOTS / "eds" / "load_cell.eds")
+    assert "has device profile 404, not 402" in refused(sheet=ROBOTS / "eds" / "load_cell.eds")
 
 
 @pytest.mark.parametrize(
@@ -415,15 +415,15 @@ def test_another_devices_data_sheet_is_told():
         ({"temperature": {"object": "hot", "type": "int16"}}, "'hot' is not an object such as 6064h or 2200h:1."),
         ({"temperature": {"object": "2200h:1", "scale": 0}}, "a scale of 0 makes every temperature the same."),
         ({"mode": "jog"}, "mode: Input should be 'profile_position', 'csp', 'csv' or 'cst'"),
-        ({"node": 0}, "has a node id that CANopen does not have. It is 1 to 127."),
-        ({"node": 128}, "has a node id that CANopen does not have. It is 1 to 127."),
+        ({"node": 0}, "a CANopen node id is 1 to 127."),
+        ({"node": 128}, "a CANopen node id is 1 to 127."),
         (
             {"pdo": {**FIXED, "sends": FIXED["sends"][:0]}},
             "needs to send 6041h:0 (16 bit), 6064h:0 (32 bit); its setting",
         ),
         (
             {"pdo": {**FIXED, "sends": [{**FIXED["sends"][0], "transmission": 2}]}},
-            "of pdo.sends none has transmission 1, so that nothing answers a cycle.",
+            "no PDO in pdo.sends has transmission 1, so no PDO answers a cycle.",
         ),
         (
             {"pdo": {**FIXED, "receives": [{"number": 1, "objects": ["6040h uint16", "607Ah int32", "6072h uint16"]}]}},

@@ -1,4 +1,4 @@
-"""CANopen nodes in general, and sensors of CiA 401, CiA 404 and CiA 406."""
+"""CANopen nodes, and sensors of CiA 401, CiA 404 and CiA 406."""
 
 from hal.drivers.canopen.analog import Cia401Input, Cia404Cell
 from hal.drivers.canopen.cia406 import Cia406Encoder

@@ -8,18 +8,19 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field
+from typing_extensions import override
 
 from hal.commissioning.pdo_map import Pdo, PdoMap, lay_out
 from hal.config import Finite, Positive
 from hal.device import DeviceState
 from hal.drivers.can_device import Place
-from hal.drivers.canopen.node import HEARTBEAT, CanopenNode, NodeSettings, Taker, data_sheet
+from hal.drivers.canopen.node import HEARTBEAT, CanopenNode, NodeSettings, PdoHandler, data_sheet
 from hal.errors import CommandRefused, ConfigError, DeviceRefused, HalError
 from hal.protocols import analog, cia301
 from hal.protocols.cia301 import Mapped
 
 
-def _differ(values: tuple[int, ...]) -> tuple[int, ...]:
+def _refuse_duplicates(values: tuple[int, ...]) -> tuple[int, ...]:
     if len(set(values)) < len(values):
         raise ValueError(f"{', '.join(map(str, values))} names a channel twice")
     return values
@@ -29,26 +30,27 @@ ChannelNumber = Annotated[int, Field(ge=1, le=254)]
 
 
 class AnalogSettings(NodeSettings):
-    """Settings of a device with measuring channels: value = zero + gain * what the device says."""
+    """Settings of a device with measuring channels: value = zero + gain * number of the device."""
 
     measures: Literal["force", "torque", "pressure"] = "force"
-    """What the channels measure [N, N m or Pa]; also the name of the quantity."""
-    channels: Annotated[tuple[ChannelNumber, ...], Field(min_length=1), AfterValidator(_differ)] = (1,)
-    """Sub-indices that are used. The quantity of one is called `force`, those of several `force_1`, `force_2`..."""
+    """Measured quantity [N, N m or Pa]."""
+    channels: Annotated[tuple[ChannelNumber, ...], Field(min_length=1), AfterValidator(_refuse_duplicates)] = (1,)
+    """Sub-indices of the channels in use. A single quantity is named `force`, several are named `force_1`,
+    `force_2`..."""
     value: str | None = None
-    """Object and type in place of the preset's, as `7130h int16`; the sub-index is the channel unless it is given."""
+    """Object and type that replace the preset's, as `7130h int16`; default sub-index: the channel."""
     status: str | None = None
-    """Object and type that tells whether the value is good, in place of the preset's, as `2120h:0 uint16`; the
-    sub-index is the channel unless it is given."""
+    """Object and type of the status of a value that replace the preset's, as `2120h:0 uint16`; default sub-index: the
+    channel."""
     bad_status: Annotated[int, Field(ge=1)] = 0xFFFF_FFFF
-    """Bits of the status that make a value bad."""
+    """Bits of the status that make a value invalid."""
     gain: Finite | tuple[Finite, ...] | None = None
-    """SI units per unit of the device, one number or one per channel; negative if pulling reads negative. It must be
-    given where the device tells raw counts; else 1."""
+    """SI units per unit of the device, one number or one per channel; negative if pulling reads negative. Required for
+    a device that sends raw counts; else 1."""
     zero: Finite | tuple[Finite, ...] = 0.0
     """Added [SI unit], one number or one per channel."""
     frozen_after: Positive | None = None
-    """A value that stays the same to the last bit for so long [s] is not believed; only for a cell whose last bit is
+    """A value becomes invalid after this time [s] without a change of any bit; only for a cell whose last bit is
     noise."""
 
 
@@ -58,18 +60,18 @@ class Channel:
 
     Attributes:
         number: Its sub-index.
-        quantity: As the robot file names it.
-        value: What is mapped.
-        status: What tells whether the value is good; None if nothing does.
-        slot: Where in `read` its value goes.
+        quantity: Name of its quantity in the robot file.
+        value: Object of the value.
+        status: Object of the status; None without one.
+        slot: Index of its value in `read`.
         zero: Added [SI unit].
-        gain: As set.
-        scale: SI units per number of the device; not known before it was read from there.
-        bounds: Numbers at or beyond which the value is an overload.
-        bad: Status bits now that make the value bad.
-        number_now: What the device said last.
-        changed: When that was another number [monotonic s].
-        trouble: Why the value now is not to be used; empty if it is.
+        gain: Gain of the settings.
+        scale: SI units per number of the device; NaN before it was read from the device.
+        bounds: A number at or beyond one of these is an overload.
+        bad: Present status bits that make the value invalid.
+        number_now: Newest number of the device.
+        changed: Time of its last change [monotonic s].
+        trouble: Reason why the present value is invalid; empty if it is valid.
     """
 
     number: int
@@ -88,41 +90,41 @@ class Channel:
 
 
 class AnalogNode(CanopenNode):
-    """Channels whose values answer every SYNC. A value that the device does not vouch for is NaN."""
+    """Channels whose values answer every SYNC. An invalid value is NaN."""
 
     Settings = AnalogSettings
 
     @classmethod
+    @override
     def quantities(cls, settings: Any) -> tuple[str, ...]:
-        """See `CanDevice.quantities`."""
         if len(settings.channels) == 1:
             return (settings.measures,)
         return tuple(f"{settings.measures}_{number}" for number in settings.channels)
 
     @classmethod
+    @override
     def traffic(cls, settings: Any, rate: float) -> tuple[tuple[int, float], ...]:
-        """See `CanDevice.traffic`."""
         return cls.traffic_of(settings, rate, cls.quantities(settings))
 
     @classmethod
+    @override
     def traffic_of(cls, settings: Any, rate: float, quantities: tuple[str, ...]) -> tuple[tuple[int, float], ...]:
-        """See `CanDevice.traffic_of`."""
         channels = zip(settings.channels, cls.quantities(settings), strict=True)
         objects = [cls._objects(settings, number) for number, quantity in channels if quantity in quantities]
         return (*_map(objects).frames(rate), HEARTBEAT)
 
     @classmethod
     def _objects(cls, settings: Any, channel: int) -> tuple[Mapped, Mapped | None]:
-        """Value and status of a channel."""
+        """Return the objects of value and status of a channel."""
         raise NotImplementedError
 
     def __init__(self, place: Place, settings: AnalogSettings, profile: int) -> None:
-        """Prepare; what is not read by the robot file is not mapped.
+        """Map the channels that the robot file uses.
 
         Raises:
-            ConfigError: An object, a gain or a zero that makes no sense.
+            ConfigError: An object, a gain or a zero is not valid.
         """
-        used = [
+        entries = [
             (slot, position, number)
             for position, (number, quantity) in enumerate(
                 zip(settings.channels, self.quantities(settings), strict=True)
@@ -130,13 +132,13 @@ class AnalogNode(CanopenNode):
             for slot, name in enumerate(place.elements)
             if name == quantity
         ]
-        self._channels = [self._channel(place, settings, *entry) for entry in used]
+        self._channels = [self._channel(place, settings, *entry) for entry in entries]
         self._settings = settings
         super().__init__(place, settings, profile, _map([(c.value, c.status) for c in self._channels]))
 
     def _channel(self, place: Place, settings: AnalogSettings, slot: int, position: int, number: int) -> Channel:
         value, status = self._objects(settings, number)
-        if status is not None and settings.status is None:  # a device may do without one
+        if status is not None and settings.status is None:  # the preset's status is optional
             entry = data_sheet(place.folder / settings.eds).get_variable(status.index, status.subindex)
             status = status if entry is not None and entry.pdo_mappable else None
         gain = _of(settings.gain, settings, position, f"{place}: gain")
@@ -148,7 +150,7 @@ class AnalogNode(CanopenNode):
         return Channel(number, quantity, value, status, slot, zero or 0.0, gain or 1.0, bounds)
 
     def _bounds(self, settings: Any, value: Mapped) -> tuple[float, float]:
-        """Numbers at or beyond which a value is an overload: the ends of its type."""
+        """Return the ends of the value's type; a number at or beyond one of them is an overload."""
         if value.kind == "float":
             return -math.inf, math.inf
         if value.kind == "unsigned":
@@ -156,7 +158,8 @@ class AnalogNode(CanopenNode):
         half = 1 << value.bits - 1
         return -half, half - 1
 
-    def _taker(self, pdo: Pdo) -> Taker:
+    @override
+    def _pdo_handler(self, pdo: Pdo) -> PdoHandler:
         places = {item: place for place, item in enumerate(pdo.objects)}
         statuses = [(places[c.status], c) for c in self._channels if c.status in places]
         values = [(places[c.value], c) for c in self._channels if c.value in places]
@@ -171,7 +174,7 @@ class AnalogNode(CanopenNode):
         return take
 
     def _measure(self, channel: Channel, number: float, received: float) -> None:
-        """Keep a value, or NaN if the device, an emergency, its range or its stillness says that it is none."""
+        """Keep a value, or NaN if its status, its range, a frozen number or an emergency makes it invalid."""
         low, high = channel.bounds
         if number != channel.number_now:
             channel.number_now, channel.changed = number, received
@@ -191,43 +194,44 @@ class AnalogNode(CanopenNode):
         self._keep(channel.slot, math.nan, received)
 
     def _describe(self, bad: int) -> str:
-        """Bad status bits in words."""
+        """Return status bits in words."""
         return f"status {bad:X}h"
 
     def _troubles(self) -> list[str]:
-        """What is wrong though the device answers and reports no fault."""
+        """Return the troubles of a device that answers and reports no fault."""
         return [f"{channel.quantity}: {channel.trouble}" for channel in self._channels if channel.trouble]
 
+    @override
     def _running(self) -> tuple[DeviceState, str]:
         troubles = self._troubles()
         return DeviceState.READY, f"{self._place}: {'; '.join(troubles)}." if troubles else ""
 
 
 def parse(text: str, channel: int, what: str) -> Mapped:
-    """The object of a channel that a person writes as `7130h int16` or, with its sub-index, `2120h:0 uint16`.
+    """Parse the object of a channel, as `7130h int16` or, with its sub-index, `2120h:0 uint16`.
 
     Raises:
-        ConfigError: It is none.
+        ConfigError: The text has another form.
     """
-    place, _, kind = text.strip().partition(" ")
+    entry, _, kind = text.strip().partition(" ")
     try:
-        found = cia301.mapped(place, kind.strip())
+        item = cia301.mapped(entry, kind.strip())
     except ValueError as error:
         raise ConfigError(f"{what} '{text}': {error} Write an object and its type: 7130h int16.") from None
-    return found if ":" in place else Mapped(found.index, channel, found.bits, found.kind)
+    return item if ":" in entry else Mapped(item.index, channel, item.bits, item.kind)
 
 
-def _of(given: float | tuple[float, ...] | None, settings: AnalogSettings, position: int, what: str) -> float | None:
-    """The number of one channel, where one was given for all or one for each."""
-    if not isinstance(given, tuple):
-        return given
-    if len(given) != len(settings.channels):
-        raise ConfigError(f"{what} has {len(given)} numbers for {len(settings.channels)} channels.")
-    return given[position]
+def _of(value: float | tuple[float, ...] | None, settings: AnalogSettings, position: int, what: str) -> float | None:
+    """Return the setting of one channel: one number for all channels, or one for each."""
+    if not isinstance(value, tuple):
+        return value
+    if len(value) != len(settings.channels):
+        raise ConfigError(f"{what} has {len(value)} numbers for {len(settings.channels)} channels.")
+    return value[position]
 
 
 def _map(channels: Sequence[tuple[Mapped, Mapped | None]]) -> PdoMap:
-    """A channel's value and its own status in one PDO; a status that is all channels' in the first."""
+    """Map a channel's value and its own status to one PDO; a status common to all channels to the first PDO."""
     statuses = [status for _, status in channels]
     shared = statuses[0] if statuses and len(channels) > 1 and len(set(statuses)) == 1 else None
     groups = [(value,) if status in (None, shared) else (value, status) for value, status in channels]
@@ -241,20 +245,21 @@ INPUT_PRESETS = dict(analog.INPUTS) | {
 
 
 class InputSettings(AnalogSettings):
-    """Settings of analogue inputs; `gain` must be given, SI units per count (or per unit of the float object)."""
+    """Settings of analogue inputs; `gain` is required: SI units per count (or per unit of the float object)."""
 
     preset: Literal["int16", "int32", "float32", "zc_sg"] = "int16"
-    """Which object is the value: 6401h as `int16`, 6402h as `int32`, 6403h as `float32`; or a family of converters."""
+    """Object of the value: 6401h as `int16`, 6402h as `int32`, 6403h as `float32`; or a family of converters."""
     resolution: Annotated[int, Field(ge=2, le=32)] | None = None
-    """Bits of the converter, whose ends count as overload; absent: as many as the object has."""
+    """Bits of the converter, the ends of whose range are overload; absent: the bits of the object."""
 
 
 class Cia401Input(AnalogNode):
-    """Analogue inputs. The device has no unit and no tare: both are the calibration's."""
+    """Analogue inputs. The device has no unit and no tare; gain and zero replace them."""
 
     Settings = InputSettings
 
     @classmethod
+    @override
     def _objects(cls, settings: InputSettings, channel: int) -> tuple[Mapped, Mapped | None]:
         item = INPUT_PRESETS[settings.preset]
         value = Mapped(item.index, channel, item.bits, item.kind)
@@ -264,9 +269,10 @@ class Cia401Input(AnalogNode):
 
     def __init__(self, place: Place, settings: InputSettings) -> None:
         if settings.gain is None:
-            raise ConfigError(f"{place} tells counts. Give `gain`, the {settings.measures} of one count in SI units.")
+            raise ConfigError(f"{place} sends counts. Give `gain`, the {settings.measures} of one count in SI units.")
         super().__init__(place, settings, analog.INPUT_PROFILE)
 
+    @override
     def _bounds(self, settings: Any, value: Mapped) -> tuple[float, float]:
         low, high = super()._bounds(settings, value)
         bits = settings.resolution
@@ -274,10 +280,12 @@ class Cia401Input(AnalogNode):
             return low, high
         return low, high >> value.bits - bits << value.bits - bits
 
+    @override
     def _calibrate(self) -> None:
         for channel in self._channels:
             channel.scale = 1.0
 
+    @override
     def _writes(self) -> tuple[tuple[Mapped, int], ...]:
         enable = analog.INTERRUPT_ENABLE
         return ((enable, 1),) if self._sdo.has(enable.index) else ()
@@ -286,16 +294,16 @@ class Cia401Input(AnalogNode):
 log = logging.getLogger(__name__)
 
 COUNTS = "counts"
-"""In place of a unit: the device tells raw counts, and `gain` says what one of them is."""
+"""This unit stands for raw counts; `gain` is the value of one count."""
 
 
 @dataclass(frozen=True, slots=True)
 class Preset:
-    """What is known of an amplifier, under a name for the robot file.
+    """Properties of an amplifier that a robot file selects by a name.
 
     Attributes:
-        form: Which of the objects it offers is the value.
-        unit: What its numbers are; None: it says so itself (6131h).
+        form: Form of its measured value.
+        unit: Unit of its numbers; None: read from the device (6131h).
     """
 
     form: analog.Form
@@ -303,7 +311,7 @@ class Preset:
 
 
 CELL_PRESETS = {name: Preset(form, None if form.has_unit else COUNTS) for name, form in analog.FORMS.items()} | {
-    # Baumer StrainLink DSRT, manual V3.05, 6.3: 7130h, 6132h, 6150h, 6125h; it tells strain, which gain makes a force.
+    # Baumer StrainLink DSRT, manual V3.05, 6.3: 7130h, 6132h, 6150h, 6125h; it sends strain, which `gain` converts.
     "strain_link": Preset(analog.FORMS["int16"], COUNTS),
 }
 PresetName = Literal["float32", "int16", "int32", "counts16", "counts32", "strain_link"]
@@ -313,21 +321,22 @@ class CellSettings(AnalogSettings):
     """Settings of a load cell; by default unit and decimal digits are read from the device."""
 
     preset: PresetName = "int32"
-    """Which object is the value: 6130h as `float32`, 7130h as `int16`, 9130h as `int32`, or before any scaling 7100h as
+    """Object of the value: 6130h as `float32`, 7130h as `int16`, 9130h as `int32`, or before any scaling 7100h as
     `counts16`, 9100h as `counts32`; or a family of amplifiers."""
     unit: str | None = None
-    """What the device's numbers are, in place of what it says in 6131h: `N`, `kN`, `kg`, `N m`, `bar`, ... `counts`."""
+    """Unit of the device's numbers, in place of that in 6131h: `N`, `kN`, `kg`, `N m`, `bar`, ... `counts`."""
     digits: int | None = None
-    """Decimal digits of a whole number, in place of what the device says in 6132h."""
+    """Decimal digits of a whole number, in place of those in 6132h."""
 
 
 class Cia404Cell(AnalogNode):
-    """Channels of a measuring amplifier; a tare that the device forgets when it reboots is given back to it."""
+    """Channels of a measuring amplifier. A tare that the device loses when it reboots is restored."""
 
     Settings = CellSettings
     COUNTERS = (*AnalogNode.COUNTERS, "tared")
 
     @classmethod
+    @override
     def _objects(cls, settings: CellSettings, channel: int) -> tuple[Mapped, Mapped | None]:
         form = CELL_PRESETS[settings.preset].form
         value, status = (
@@ -349,22 +358,23 @@ class Cia404Cell(AnalogNode):
         super().__init__(place, settings, analog.CELL_PROFILE)
 
     def _known_unit(self, place: Place, settings: CellSettings) -> float | None:
-        """SI units per unit of the device, if the robot file or the preset says so.
+        """Return the SI units per unit of the device; None if the unit is only known to the device.
 
         Raises:
-            ConfigError: Another quantity's unit, none at all, or counts without a gain.
+            ConfigError: The unit is unknown or of another quantity, or counts have no gain.
         """
         if self._unit is None:
             return None
         if self._unit == COUNTS:
             if settings.gain is None:
-                raise ConfigError(f"{place} tells counts. Give `gain`, the {settings.measures} of one count, SI units.")
+                raise ConfigError(f"{place} sends counts. Give `gain`, the {settings.measures} of one count, SI units.")
             return 1.0
-        known = [name for name, unit in analog.UNITS.items() if unit.quantity == settings.measures]
-        if self._unit not in known:
-            raise ConfigError(f"{place}: '{self._unit}' is no unit of {settings.measures}. Known: {', '.join(known)}.")
+        units = [name for name, unit in analog.UNITS.items() if unit.quantity == settings.measures]
+        if self._unit not in units:
+            raise ConfigError(f"{place}: '{self._unit}' is no unit of {settings.measures}. Known: {', '.join(units)}.")
         return analog.UNITS[self._unit].scale
 
+    @override
     def _calibrate(self) -> None:
         for channel in self._channels:
             channel.scale = self._unit_scale(channel) * 10.0 ** -self._digits(channel)
@@ -390,15 +400,15 @@ class Cia404Cell(AnalogNode):
             return 0
         return self._sdo.read(analog.DIGITS, channel.number)
 
+    @override
     def tare(self) -> None:
-        """See `Device.tare`; `health` tells what came of it, and counts it as `tared`."""
         if not self.is_commissioned:
             raise CommandRefused(f"{self._place} cannot be tared: {self._trouble[1]}")
         self._tare_text = "being tared"
         self.long_request = self._tare
 
     def _tare(self) -> None:
-        """Have every channel take what it measures as zero, and remember what it takes to do so again."""
+        """Tare every channel, and keep the offsets to restore them after a reboot."""
         try:
             for channel in self._channels:
                 self._sdo.write(analog.AUTOZERO, channel.number, analog.ZERO, 4)
@@ -412,14 +422,16 @@ class Cia404Cell(AnalogNode):
         log.info("%s is tared", self._place)
 
     def _offset(self, number: int) -> int:
-        """What the tare has set, as the bits of a REAL32."""
+        """Return the offset that the tare has set, as the bits of a REAL32."""
         bits = self._sdo.read(analog.OFFSET, number)
         if not math.isfinite(struct.unpack("<f", bits.to_bytes(4, "little"))[0]):
-            raise DeviceRefused(f"{self._place} says after the tare that its offset (6124h:{number}) is no number.")
+            raise DeviceRefused(f"{self._place} reports an offset (6124h:{number}) after the tare that is no number.")
         return bits
 
+    @override
     def _describe(self, bad: int) -> str:
         return analog.describe_status(bad) if self._cell.status is None else super()._describe(bad)
 
+    @override
     def _troubles(self) -> list[str]:
         return [*super()._troubles(), *([self._tare_text] if self._tare_text else [])]

@@ -1,13 +1,15 @@
-"""An absolute encoder on a joint: position [rad], and velocity [rad/s] where it tells that."""
+"""An absolute encoder on a joint: position [rad], and velocity [rad/s] if the encoder measures it."""
 
 import math
 from typing import Any, Literal
+
+from typing_extensions import override
 
 from hal.commissioning.pdo_map import Pdo, PdoMap, lay_out
 from hal.config import Finite, Positive
 from hal.device import DeviceState
 from hal.drivers.can_device import Place
-from hal.drivers.canopen.node import HEARTBEAT, CanopenNode, NodeSettings, Taker, data_sheet
+from hal.drivers.canopen.node import HEARTBEAT, CanopenNode, NodeSettings, PdoHandler, data_sheet
 from hal.errors import DeviceRefused
 from hal.protocols import cia406
 from hal.protocols.cia301 import PDO_SIZE, Mapped
@@ -19,14 +21,14 @@ class EncoderSettings(NodeSettings):
     """Settings of an encoder."""
 
     counts_per_turn: Positive | None = None
-    """Counts per turn of the joint; absent: per turn of the encoder, as the device says."""
+    """Counts per turn of the joint; absent: those per turn of the encoder, read from the device."""
     direction: Literal[1, -1] = 1
     """1 if counts grow with the angle, else -1."""
     zero: Finite = 0.0
     """Angle at zero counts [rad]."""
     around: Finite | None = None
-    """The angle is told within half the encoder's range of this one [rad], wherever its counts begin again; absent:
-    from `zero` on."""
+    """Center of the reported angles [rad], which extend by half the encoder's range to each side; absent: they start at
+    `zero`."""
 
 
 class Cia406Encoder(CanopenNode):
@@ -35,14 +37,14 @@ class Cia406Encoder(CanopenNode):
     Settings = EncoderSettings
 
     @classmethod
+    @override
     def quantities(cls, settings: EncoderSettings) -> tuple[str, ...]:
-        """See `CanDevice.quantities`."""
         return ("position", "velocity")
 
     @classmethod
+    @override
     def traffic(cls, settings: EncoderSettings, rate: float) -> tuple[tuple[int, float], ...]:
-        """See `CanDevice.traffic`; position and alarms, and room for speed or warnings."""
-        return ((PDO_SIZE, rate), HEARTBEAT)
+        return ((PDO_SIZE, rate), HEARTBEAT)  # position, alarms, and speed or warnings
 
     def __init__(self, place: Place, settings: EncoderSettings) -> None:
         self._scale = self._range = self._speed_scale = math.nan
@@ -50,16 +52,16 @@ class Cia406Encoder(CanopenNode):
         self._is_outside = False
         self._settings = settings
         sheet = data_sheet(place.folder / settings.eds)
-        wanted = [cia406.POSITION]
+        objects = [cia406.POSITION]
         extra = cia406.SPEED if "velocity" in place.elements else cia406.WARNINGS
         for item in (cia406.ALARMS, extra):
             entry = sheet.get_variable(item.index, item.subindex)
             if item is cia406.SPEED or (entry is not None and entry.pdo_mappable):
-                wanted.append(item)
-        super().__init__(place, settings, cia406.PROFILE, PdoMap(sends=lay_out(wanted)))
+                objects.append(item)
+        super().__init__(place, settings, cia406.PROFILE, PdoMap(sends=lay_out(objects)))
 
+    @override
     def _calibrate(self) -> None:
-        """Read what one turn is, and after how many counts they begin again."""
         scaled = self._optional(cia406.OPERATING_PARAMETERS) & cia406.SCALING_ON
         if scaled:
             per_turn, total = self._optional(cia406.UNITS_PER_TURN), self._optional(cia406.TOTAL_UNITS)
@@ -68,9 +70,9 @@ class Cia406Encoder(CanopenNode):
             total = per_turn * self._optional(cia406.PHYSICAL_TURNS)
         counts = self._settings.counts_per_turn or per_turn
         if not counts:
-            raise DeviceRefused(f"{self._place} does not say what one turn is (6001h, 6501h). Give counts_per_turn.")
+            raise DeviceRefused(f"{self._place} does not report counts per turn (6001h, 6501h). Give counts_per_turn.")
         if not total and self._settings.around is not None:
-            raise DeviceRefused(f"{self._place} does not say how many turns it tells apart (6502h). Drop `around`.")
+            raise DeviceRefused(f"{self._place} does not report its number of turns (6502h). Remove `around`.")
         size = 2.0 * math.pi / counts
         self._scale = self._settings.direction * size
         self._range = total * size or math.inf
@@ -78,10 +80,11 @@ class Cia406Encoder(CanopenNode):
         self._speed_scale = self._scale * (self._optional(cia406.SPEED_DIVIDER) or 1) / multiplier
 
     def _optional(self, item: Mapped) -> int:
-        """The value of an object; 0 if the data sheet does not have it."""
+        """Return the value of an object; 0 if the data sheet does not have it."""
         return self._sdo.read(item.index, item.subindex) if self._sdo.has(item.index, item.subindex) else 0
 
-    def _taker(self, pdo: Pdo) -> Taker:
+    @override
+    def _pdo_handler(self, pdo: Pdo) -> PdoHandler:
         places = {item: place for place, item in enumerate(pdo.objects)}
         position, speed = places.get(cia406.POSITION), places.get(cia406.SPEED)
         alarms, warnings = places.get(cia406.ALARMS), places.get(cia406.WARNINGS)
@@ -96,14 +99,14 @@ class Cia406Encoder(CanopenNode):
             if position is not None and angle_slot is not None:
                 self._keep(angle_slot, self._angle(objects[position]) if good else math.nan, received)
             if speed is not None and speed_slot is not None:
-                found = objects[speed]
-                inside = good and -_SPEED_END < found < _SPEED_END
-                self._keep(speed_slot, self._speed_scale * found if inside else math.nan, received)
+                counts = objects[speed]
+                inside = good and -_SPEED_END < counts < _SPEED_END
+                self._keep(speed_slot, self._speed_scale * counts if inside else math.nan, received)
 
         return take
 
     def _angle(self, counts: int) -> float:
-        """Angle of the joint [rad]; NaN for counts that the encoder cannot have."""
+        """Return the angle of the joint [rad]; NaN for counts beyond the encoder's range."""
         settings, whole = self._settings, self._range
         self._is_outside = counts * abs(self._scale) >= whole
         if self._is_outside:
@@ -113,6 +116,7 @@ class Cia406Encoder(CanopenNode):
             return angle
         return settings.around + (angle - settings.around + 0.5 * whole) % whole - 0.5 * whole
 
+    @override
     def _running(self) -> tuple[DeviceState, str]:
         text = ""
         if self._alarms:

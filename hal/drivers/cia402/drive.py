@@ -12,7 +12,7 @@ from hal.commissioning.pdo_map import Pdo, describe
 from hal.commissioning.sdo_client import SdoClient
 from hal.device import Check, DeviceState
 from hal.drivers.can_device import Place
-from hal.drivers.canopen.node import HEARTBEAT, CanopenNode, Taker, data_sheet
+from hal.drivers.canopen.node import HEARTBEAT, CanopenNode, PdoHandler, data_sheet
 from hal.drivers.cia402.modes import HomingRun, SetPointHandshake
 from hal.drivers.cia402.settings import MODES, OBJECTS, TARGETS, DriveSettings, DriveUnits, drive_units
 from hal.drivers.cia402.writes import Write, check_objects, drive_writes
@@ -226,7 +226,7 @@ class Cia402Drive(CanopenNode):
         assert self._units is not None
         return drive_writes(self._settings, self._units, self._place.bounds, 1.0 / self._place.rate, self._sheet)
 
-    def _taker(self, pdo: Pdo) -> Taker:
+    def _pdo_handler(self, pdo: Pdo) -> PdoHandler:
         places = {item: place for place, item in enumerate(pdo.objects)}
         status, counts, velocity, mode = (
             places.get(item, -1) for item in (cia402.STATUSWORD, cia402.POSITION, cia402.VELOCITY, cia402.MODE_DISPLAY)
