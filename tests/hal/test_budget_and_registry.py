@@ -112,6 +112,4 @@ def test_a_quantity_that_a_driver_does_not_have_is_told():
 
 
 def test_a_node_id_that_canopen_does_not_have_is_told():
-    assert "'biceps_drive' (node 200 on can0): a CANopen node id is 1 to 127" in refused(
-        devices=devices(node=200)
-    )
+    assert "'biceps_drive' (node 200 on can0): a CANopen node id is 1 to 127" in refused(devices=devices(node=200))
