@@ -2,36 +2,30 @@
 
 from pathlib import Path
 
-import matplotlib
 import numpy as np
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 
 from hal.config import RobotConfig
 from services.demo.story import MUSCLE, SILENT_ELEMENT, Marks
 from services.demo.timeline import Timeline
+from services.learning.plots import picture
 
 GREY, RED, GREEN, BLUE = "0.45", "tab:red", "tab:green", "tab:blue"
 
 
 def plot(robot: RobotConfig, timeline: Timeline, marks: Marks, path: Path) -> None:
     """Draw the whole story into a PNG."""
-    figure, axes = plt.subplots(4, 1, figsize=(13, 13), sharex=True, layout="constrained")
-    figure.suptitle(f"{robot.robot}: a minute with a lost sensor, an online update and a cut muscle")
-    _silent_joint(axes[0], robot, timeline, marks)
-    _hidden_error(axes[1], timeline, marks)
-    _anomaly(axes[2], timeline, marks)
-    _command(axes[3], robot, timeline)
-    for axis in axes:
-        _stages(axis, marks)
-    for stage in marks.stages:
-        axes[0].text(stage.start, 1.02, stage.name, transform=axes[0].get_xaxis_transform(), color=GREY, fontsize=9)
-    axes[-1].set_xlabel("time [s]")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    title = f"{robot.robot}: a minute with a lost sensor, an online update and a cut muscle"
+    with picture(path, title, rows=4, figsize=(13, 13), sharex=True) as axes:
+        _silent_joint(axes[0], robot, timeline, marks)
+        _hidden_error(axes[1], timeline, marks)
+        _anomaly(axes[2], timeline, marks)
+        _command(axes[3], robot, timeline)
+        for axis in axes:
+            _stages(axis, marks)
+        for stage in marks.stages:
+            axes[0].text(stage.start, 1.02, stage.name, transform=axes[0].get_xaxis_transform(), color=GREY, fontsize=9)
+        axes[-1].set_xlabel("time [s]")
 
 
 def _stages(axis: Axes, marks: Marks) -> None:

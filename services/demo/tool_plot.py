@@ -2,11 +2,7 @@
 
 from pathlib import Path
 
-import matplotlib
 import numpy as np
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 
 from gemuco.adaption.recognise import Prior
@@ -14,36 +10,29 @@ from gemuco.schema import BodySchema
 from hal.config import RobotConfig
 from services.demo.timeline import Timeline
 from services.demo.tool_story import ToolMarks
+from services.learning.plots import picture
 
 GREY, RED, GREEN, BLUE = "0.45", "tab:red", "tab:green", "tab:blue"
 
 
 def plot(robot: RobotConfig, signal: str, schema: BodySchema, timeline: Timeline, marks: ToolMarks, path: Path) -> None:
     """Draw the whole story of a signal into a PNG."""
-    figure, axes = plt.subplots(5, 1, figsize=(13, 15), sharex=True, layout="constrained")
     old, new = marks.conditions
-    figure.suptitle(f"{robot.robot}: a covered camera, and {new} put into the hand in place of {old}")
-    _tip(axes[0], robot.signals[signal].elements, timeline, marks)
-    _miss(axes[1], timeline, marks)
-    _hidden_error(axes[2], timeline)
-    _bias(axes[3], schema, timeline, marks)
-    _anomaly(axes[4], timeline)
-    for axis in axes:
-        _stages(axis, marks)
-    for index, stage in enumerate(marks.stages):
-        axes[0].text(
-            stage.start,
-            1.02 + 0.06 * (index % 2),
-            stage.name,
-            transform=axes[0].get_xaxis_transform(),
-            color=GREY,
-            fontsize=9,
-        )
-    axes[0].set_ylabel(f"{signal} [{robot.signals[signal].unit}]")
-    axes[-1].set_xlabel("time [s]")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    title = f"{robot.robot}: a covered camera, and {new} put into the hand in place of {old}"
+    with picture(path, title, rows=5, figsize=(13, 15), sharex=True) as axes:
+        _tip(axes[0], robot.signals[signal].elements, timeline, marks)
+        _miss(axes[1], timeline, marks)
+        _hidden_error(axes[2], timeline)
+        _bias(axes[3], schema, timeline, marks)
+        _anomaly(axes[4], timeline)
+        for axis in axes:
+            _stages(axis, marks)
+        at = axes[0].get_xaxis_transform()
+        for index, stage in enumerate(marks.stages):
+            height = 1.02 + 0.06 * (index % 2)
+            axes[0].text(stage.start, height, stage.name, transform=at, color=GREY, fontsize=9)
+        axes[0].set_ylabel(f"{signal} [{robot.signals[signal].unit}]")
+        axes[-1].set_xlabel("time [s]")
 
 
 def _stages(axis: Axes, marks: ToolMarks) -> None:

@@ -10,12 +10,12 @@ import numpy as np
 
 from hal.by_signal import Numbers, Truths
 from hal.config import RobotConfig
-from services.hardware.stand_in import condition_of, simulator_of, variant_of
+from services.hardware.stand_in import condition_of, fault_verb, simulator_of, variant_of
 from services.process import realtime
 from services.process.loop import Loop
 from services.process.service import Service, until_told
 from services.wire import keys, messages
-from services.wire.messages import MessageError, Status
+from services.wire.messages import Status
 
 log = logging.getLogger(__name__)
 
@@ -72,7 +72,7 @@ class SimulatorService:
         self._truth = service.publisher(keys.truth(robot), messages.Sample)
         self._loop = Loop("truth", TRUTH_RATE, self.tick, priority=PRIORITY)
         service.watch(self._loop)
-        service.verb("fault", self._fault)
+        service.verb("fault", fault_verb(rig.fault, "muscle_cut biceps"))
 
     def run(self, stop: threading.Event) -> int:
         """Run the rig until `stop` is set or the rig fails; return the exit code."""
@@ -105,14 +105,6 @@ class SimulatorService:
                 valid=Truths(np.ones(len(values.flat), bool), values.elements),
             )
         )
-
-    def _fault(self, arguments: dict[str, Any]) -> dict[str, str]:
-        text = arguments.get("text")
-        if not isinstance(text, str) or not text.strip():
-            raise MessageError("The verb 'fault' takes {text: what to break}, as in 'muscle_cut biceps'.")
-        done = self._rig.fault(text)
-        log.info("%s", done)
-        return {"text": done}
 
     def _status(self, stop: threading.Event) -> Status:
         failure = self._rig.failure

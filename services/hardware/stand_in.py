@@ -1,6 +1,7 @@
 """The simulator that a robot file names, and the interface that services use."""
 
-from collections.abc import Mapping
+import logging
+from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 import numpy as np
@@ -9,6 +10,9 @@ from hal import registry
 from hal.config import RobotConfig
 from hal.errors import ConfigError
 from hal.robot import Robot
+from services.wire.messages import MessageError
+
+log = logging.getLogger(__name__)
 
 
 class Camera(Protocol):
@@ -91,3 +95,17 @@ def condition_of(robot: RobotConfig, condition: str | None) -> str | None:
         names = ", ".join(known) or "none"
         raise ConfigError(f"Robot '{robot.robot}' has no condition '{condition}'. Known conditions: {names}.")
     return condition
+
+
+def fault_verb(apply: Callable[[str], str], example: str) -> Callable[[dict[str, Any]], dict[str, str]]:
+    """Return the handler of the verb `fault`, which applies a fault and replies with a sentence about it."""
+
+    def handle(arguments: dict[str, Any]) -> dict[str, str]:
+        text = arguments.get("text")
+        if not isinstance(text, str) or not text.strip():
+            raise MessageError(f"The verb 'fault' takes {{text: what to break}}, as in '{example}'.")
+        sentence = apply(text.strip())
+        log.info("%s", sentence)
+        return {"text": sentence}
+
+    return handle

@@ -7,7 +7,6 @@ import logging
 import threading
 import time
 from collections.abc import Iterable
-from typing import Any
 
 import numpy as np
 
@@ -15,11 +14,11 @@ from hal.by_signal import Numbers, Truths
 from hal.clock import SystemClock
 from hal.config import RobotConfig
 from hal.errors import ConfigError
-from services.hardware.stand_in import Camera, simulator_of, variant_of
+from services.hardware.stand_in import Camera, fault_verb, simulator_of, variant_of
 from services.process.loop import Loop
 from services.process.service import Service, until_told
 from services.wire import keys, messages
-from services.wire.messages import MessageError, Status
+from services.wire.messages import Status
 
 log = logging.getLogger(__name__)
 
@@ -52,7 +51,7 @@ class VisionService:
         self._cycle = 0
         self._hidden: list[str] = []
         service.watch(self._loop)
-        service.verb("fault", self._fault)
+        service.verb("fault", fault_verb(self._fault, "camera_covered"))
 
     def run(self, stop: threading.Event) -> None:
         """Publish frames until `stop` is set."""
@@ -106,14 +105,9 @@ class VisionService:
             facts={"variant": self._variant, "frames": self._cycle, "rejected": self._truth.rejected},
         )
 
-    def _fault(self, arguments: dict[str, Any]) -> dict[str, str]:
-        text = arguments.get("text")
-        if not isinstance(text, str) or not text.strip():
-            raise MessageError("The verb 'fault' takes {text: what to break}, as in 'camera_covered'.")
+    def _fault(self, text: str) -> str:
         with self._lock:
-            done = self._camera.fault(text.strip())
-        log.info("%s", done)
-        return {"text": done}
+            return self._camera.fault(text)
 
 
 def run_vision(

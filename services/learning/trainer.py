@@ -168,13 +168,13 @@ def fits(robot: RobotConfig, folder: Path) -> bool:
 
 def save(trained: TrainingResult, folder: Path) -> None:
     """Write the model with pictures of its structure and training, and remove its drafts."""
-    from services.learning import structure_plot, training_plot
+    from services.learning.plots import plot_history, plot_structure
 
     checkpoint.save(trained.schema, folder)
     with writing("The pictures", folder):
         if trained.structure is not None:
-            structure_plot.plot(trained.structure, folder / "structure.png")
-        training_plot.plot(trained.history, f"{trained.samples} samples", folder / "training.png")
+            plot_structure(trained.structure, folder / "structure.png")
+        plot_history(trained.history, f"{trained.samples} samples", folder / "training.png")
     shutil.rmtree(drafts_of(folder), ignore_errors=True)
 
 

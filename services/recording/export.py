@@ -50,7 +50,7 @@ class CsvTable:
 
     def write(self, rows: list[list[Any]]) -> None:
         """Add rows."""
-        self._writer.writerows([["" if x is None else x for x in row] for row in rows])
+        self._writer.writerows(rows)
 
     def close(self) -> None:
         """Finish the file."""

@@ -36,9 +36,7 @@ class RecordingFile:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.messages = 0
-        """Number of messages that are safe in the file."""
-        self._pending = 0
+        self._has_messages, self._is_empty = False, True
         self._schemas: dict[tuple[str, str, bytes], int] = {}
         self._channels: dict[tuple[str, str, int], int] = {}
         self._stream = _CommittedStream(path)
@@ -67,7 +65,7 @@ class RecordingFile:
     def add(self, channel: int, received_ns: int, stamp_ns: int, seq: int, data: bytes) -> None:
         """Add a message; it is safe after the next `commit`."""
         self._writer.add_message(channel, received_ns, data, stamp_ns, seq & 0xFFFFFFFF)
-        self._pending += 1
+        self._has_messages = True
 
     def add_facts(self, name: str, facts: Mapping[str, str]) -> None:
         """Add facts about the whole recording, as MCAP metadata."""
@@ -80,9 +78,7 @@ class RecordingFile:
             OSError: They could not be written; the file stays as it was after the last commit.
         """
         self._writer.flush()
-        self._stream.commit()
-        self.messages += self._pending
-        self._pending = 0
+        self._commit()
 
     def finish(self) -> None:
         """Write the waiting messages and the index, and close.
@@ -92,22 +88,19 @@ class RecordingFile:
         """
         try:
             self._writer.finish()
-            self._stream.commit()
-            self.messages += self._pending
-            self._pending = 0
+            self._commit()
         finally:
             self._stream.close()
 
-    def abandon(self) -> int:
-        """Close after a `commit` that failed; a file without a message is removed.
-
-        Returns:
-            Number of messages that were not written.
-        """
+    def abandon(self) -> None:
+        """Close after a `commit` that failed; a file without a message is removed."""
         self._stream.close()
-        if self.messages == 0:
+        if self._is_empty:
             self.path.unlink(missing_ok=True)
-        return self._pending
+
+    def _commit(self) -> None:
+        self._stream.commit()
+        self._is_empty = not self._has_messages
 
 
 class _CommittedStream:
@@ -175,23 +168,16 @@ class _CommittedStream:
                 return
 
 
-def numbered(path: Path, number: int) -> Path:
-    """Return `walk-000007.mcap` for `walk.mcap` and 7, so that names sort in the order of writing."""
-    return path.with_name(f"{path.stem}-{number:0{DIGITS}d}{path.suffix}")
-
-
 def next_path(path: Path, is_one_of_many: bool) -> Path:
     """Return the next file of a recording: the path itself, or a numbered one if there may be many or it exists.
 
-    Numbers continue from the highest existing one, so a killed recorder can be started again with the same arguments.
+    The seventh file of `walk.mcap` is `walk-000007.mcap`, so that names sort in the order of writing. Numbers continue
+    from the highest existing one, so a killed recorder can be started again with the same arguments.
     """
     if not is_one_of_many and not path.exists():
         return path
     shape = re.compile(re.escape(path.stem) + rf"-(\d{{{DIGITS},}})" + re.escape(path.suffix))
-    numbers = [int(match[1]) for other in _siblings(path) if (match := shape.fullmatch(other.name))]
+    numbers = [int(match[1]) for other in path.parent.glob("*") if (match := shape.fullmatch(other.name))]
     least = 0 if is_one_of_many else 1  # the path itself is the first
-    return numbered(path, max(numbers, default=least) + 1)
-
-
-def _siblings(path: Path) -> list[Path]:
-    return list(path.parent.iterdir()) if path.parent.is_dir() else []
+    number = max(numbers, default=least) + 1
+    return path.with_name(f"{path.stem}-{number:0{DIGITS}d}{path.suffix}")

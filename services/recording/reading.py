@@ -5,6 +5,7 @@ import json
 import logging
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,6 @@ from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader, breakup_chunk
 
 from services.errors import RecordingError
-from services.recording.losses import LOG
 from services.recording.schema import Catalogue, Form
 from services.recording.writer import FACTS, FORMAT, LOSSES, ROBOT
 from services.wire.messages import RECORDS, MessageError
@@ -125,42 +125,19 @@ def read(paths: Paths, only: Iterable[str] = ()) -> Iterator[Recorded]:
         RecordingError: As `facts_of`.
     """
     keys = frozenset(only)
-    later = facts_of(paths)[::-1]
-    heap: list[tuple[int, int, Recorded, Iterator[Recorded]]] = []
-    number = 0
-    while later or heap:
-        # Files are opened when their time has come: a long recording has more files than a process may open.
-        while later and (not heap or later[-1].begin_ns <= heap[0][0]):
-            messages = _messages(later.pop().path, keys)
-            number += 1
-            if (first := next(messages, None)) is not None:
-                heapq.heappush(heap, (first.received_ns, number, first, messages))
-        if not heap:
-            continue
-        _, index, recorded, rest = heap[0]
-        following = next(rest, None)
-        if following is None:
-            heapq.heappop(heap)
-        else:
-            heapq.heapreplace(heap, (following.received_ns, index, following, rest))
-        yield recorded
+    for _, recorded in heapq.merge(*(_timed(file, keys) for file in facts_of(paths)), key=itemgetter(0)):
+        if recorded is not None:
+            yield recorded
 
 
-def log_lines(path: str | Path) -> Iterator[dict[str, Any]]:
-    """Yield the lines of a file's log: services that came and went, losses and their times.
+def _timed(file: FileFacts, only: frozenset[str]) -> Iterator[tuple[int, Recorded | None]]:
+    """Yield arrival [ns] and message of a file, after an entry without a message.
 
-    Raises:
-        RecordingError: As `facts_of`.
+    The file is opened after that entry, at its time: a long recording has more files than a process may open.
     """
-    channels: set[int] = set()
-    logs: set[int] = set()
-    for record in _records(Path(path)):
-        if isinstance(record, Schema) and record.name == LOG:
-            logs.add(record.id)
-        elif isinstance(record, Channel) and record.schema_id in logs:
-            channels.add(record.id)
-        elif isinstance(record, McapMessage) and record.channel_id in channels:
-            yield json.loads(record.data)
+    yield file.begin_ns, None
+    for recorded in _messages(file.path, only):
+        yield recorded.received_ns, recorded
 
 
 def _listed(paths: Paths) -> list[Path]:

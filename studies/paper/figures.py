@@ -1,30 +1,18 @@
 """Kinds of figures that the experiments share, drawn into PNG files."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 
-import matplotlib
 import numpy as np
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 
-DPI = 110
+from services.learning import plots
 
 
-@contextmanager
-def picture(path: Path, title: str, columns: int = 1, rows: int = 1) -> Iterator[list[Axes]]:
-    """Yield axes to draw on, row by row; write the PNG when the block ends."""
-    figure, grid = plt.subplots(rows, columns, figsize=(6.4 * columns, 4.6 * rows), layout="constrained", squeeze=False)
-    try:
-        figure.suptitle(title)
-        yield list(grid.flat)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=DPI)
-    finally:
-        plt.close(figure)
+def picture(path: Path, title: str, columns: int = 1, rows: int = 1) -> AbstractContextManager[list[Axes]]:
+    """Return a context of axes to draw on, of equal size; the PNG is written at its end."""
+    return plots.picture(path, title, rows, columns, figsize=(6.4 * columns, 4.6 * rows))
 
 
 def bias_map(axis: Axes, biases: Mapping[str, np.ndarray], paths: Mapping[str, np.ndarray] | None = None) -> None:

@@ -17,12 +17,14 @@ import pytest
 import zenoh
 from any_message import ARM, a_message
 from mcap.reader import make_reader
+from mcap.records import Channel
+from mcap.records import Message as McapMessage
 
 from services.errors import RecordingError
 from services.process.service import Service
 from services.recording import recorder
 from services.recording.losses import LOG, MOST_KEYS, OTHERS, Losses
-from services.recording.reading import facts_of, log_lines, losses, read
+from services.recording.reading import _records, facts_of, losses, read
 from services.recording.recorder import EntryQueue, Recorder, run_recorder
 from services.recording.writer import UNREADABLE, Limits, RecordingWriter
 from services.wire import keys, messages
@@ -33,6 +35,17 @@ from services.wire.streams import Publisher
 
 def _update(version: int) -> Update:
     return Update(stamp_ns=version + 1, active=True, model_version=version, window=0, dropped=0, loss=0.0)
+
+
+def log_lines(path: Path) -> list[dict[str, Any]]:
+    """Return the lines of the log in a file that may still be written."""
+    records = list(_records(path))
+    logs = {record.id for record in records if isinstance(record, Channel) and record.topic.endswith("/recorder/log")}
+    return [
+        msgspec.json.decode(record.data)
+        for record in records
+        if isinstance(record, McapMessage) and record.channel_id in logs
+    ]
 
 
 def _eventually(happened: Callable[[], Any], within: float = 30.0) -> None:

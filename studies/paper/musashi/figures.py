@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from hal.config import RobotConfig
-from services.learning.structure_plot import plot as plot_structure
+from services.learning.plots import plot_structure
 from studies.paper.figures import bars, picture, score_over_time
 from studies.paper.musashi import simulation
 from studies.paper.musashi.control import OURS

@@ -1,6 +1,9 @@
-"""Picture of the tables of structure determination."""
+"""Pictures of structure determination and of a training, and the PNG file that every picture is drawn into."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -9,24 +12,48 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 
+from gemuco.learning.history import History
 from gemuco.structure.determination import Structure
 
+DPI = 110
 GOOD, BAD = "tab:green", "0.6"
 
 
-def plot(structure: Structure, path: Path) -> None:
+@contextmanager
+def picture(path: Path, title: str = "", rows: int = 1, columns: int = 1, **options: Any) -> Iterator[list[Axes]]:
+    """Yield axes to draw on, row by row; write the PNG when the block ends. Options are those of `plt.subplots`."""
+    figure, grid = plt.subplots(rows, columns, layout="constrained", squeeze=False, **options)
+    try:
+        if title:
+            figure.suptitle(title)
+        yield list(grid.flat)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path, dpi=DPI)
+    finally:
+        plt.close(figure)
+
+
+def plot_history(history: History, title: str, path: Path) -> None:
+    """Draw the learning curve into a PNG."""
+    with picture(path, figsize=(8, 4.5)) as (axis,):
+        axis.semilogy(history.train, color="tab:blue", label="training data, while learned")
+        axis.semilogy(history.held_out, color="tab:orange", label="held-out data")
+        axis.axvline(history.best_epoch, color="0.6", linestyle=":", label=f"kept: {history.best:.4g} held out")
+        if history.resumed:
+            axis.axvline(history.resumed, color="0.8", label="went on after an interruption")
+        axis.set_title(title)
+        axis.set_xlabel("epoch")
+        axis.set_ylabel("loss [standard deviations squared]")
+        axis.legend()
+
+
+def plot_structure(structure: Structure, path: Path) -> None:
     """Draw L_i and L_m against their thresholds into a PNG."""
     masks = list(structure.listed)
     heights = [len(structure.L_i) + 2, len(masks) + 2]
-    figure, (upper, lower) = plt.subplots(
-        2, 1, figsize=(10, 1.6 + 0.27 * sum(heights)), height_ratios=heights, layout="constrained"
-    )
-    upper_title = "L_i: each signal inferred from all others; an output if below the line"
-    _outputs(upper, structure, upper_title)
-    _masks(lower, structure, masks)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    with picture(path, rows=2, figsize=(10, 1.6 + 0.27 * sum(heights)), height_ratios=heights) as (upper, lower):
+        _outputs(upper, structure, "L_i: each signal inferred from all others; an output if below the line")
+        _masks(lower, structure, masks)
 
 
 def _outputs(axis: Axes, structure: Structure, title: str) -> None:
