@@ -128,7 +128,7 @@ class Robot:
         if is_free:
             self._settle()
         else:
-            self.estop("The HAL ends while its cycle is blocked.")
+            self.estop("The HAL ends while its cycle is stuck.")
         if self._caretaker:
             self._caretaker.stop()
         else:
@@ -194,7 +194,7 @@ class Robot:
     def estop(self, reason: str) -> Emergency:
         """Stop every drive as fast as it can, in every mode, and stay in fault until `reset`.
 
-        Several threads may call this at once, also while the cycle is blocked. It blocks until every drive reports that
+        Several threads may call this at once, also while the cycle is stuck. It blocks until every drive reports that
         it has no power, for about a second at most. This is not a safety-rated emergency stop.
 
         Args:

@@ -1,1 +1,1 @@
-"""One CAN bus: opening it, its state, what goes out, what comes in and when it came, and whether it all fits."""
+"""One CAN bus: interface, state, sending, receiving, time of arrival and load."""

@@ -1,7 +1,8 @@
-"""Whether the frames of a cycle fit on the bus, before anything is sent.
+"""Load of a bus, computed from the robot file before a frame is sent.
 
-Source: classic CAN (ISO 11898-1): with an 11-bit identifier 44 bits beside the data, with a 29-bit one 64, of which 34
-or 54 and the data may be stuffed once in four after the first, and 3 bits of space between frames.
+Source: classic CAN (ISO 11898-1). A frame has 44 bits beside the data with an 11-bit identifier, 64 with a 29-bit
+identifier. In 34 or 54 of these bits and in the data, every fourth bit after the first may be followed by a stuff bit.
+The space between frames has 3 bits.
 """
 
 from dataclasses import dataclass
@@ -11,26 +12,27 @@ from hal.config import RobotConfig
 from hal.errors import ConfigError
 
 OWN_HEARTBEAT_RATE = 50.0
-"""Of the HAL [Hz]; a drive stops after 0.15 s without one, of which a machine under load may sleep most."""
+"""The HAL sends its heartbeat at this rate [Hz]. A drive stops after 0.15 s without one, and a machine under load may
+sleep for most of this time."""
 
 
 def frame_bits(size: int, is_extended: bool = False) -> int:
-    """Longest a classic frame with `size` data bytes can be on the wire [bit], stuffing and space included."""
+    """Return the longest length of a classic frame with `size` data bytes [bit], with stuff bits and space."""
     stuffed = (54 if is_extended else 34) + 8 * size
     return 13 + stuffed + (stuffed - 1) // 4
 
 
 @dataclass(frozen=True, slots=True)
 class BusBudget:
-    """What the cyclic frames take of one bus.
+    """Load of one bus by cyclic frames.
 
     Attributes:
         bus: Name in the robot file.
-        frames: Frames per cycle, the SYNC included if there is one.
-        bits: Their longest length together [bit].
-        beside: What heartbeats and whatever else has a rate of its own add [bit/s].
+        frames: Number of frames per cycle, including a SYNC.
+        bits: Sum of the longest lengths of these frames [bit].
+        beside: Load by heartbeats and other frames with a rate of their own [bit/s].
         rate: Cycles per second [Hz].
-        bitrate: Of the bus [bit/s].
+        bitrate: Bit rate of the bus [bit/s].
     """
 
     bus: str
@@ -42,7 +44,7 @@ class BusBudget:
 
     @property
     def load(self) -> float:
-        """Share of the bit rate, 0 to 1 and beyond."""
+        """Share of the bit rate; may exceed 1."""
         return (self.bits * self.rate + self.beside) / self.bitrate
 
     def __str__(self) -> str:
@@ -53,7 +55,7 @@ class BusBudget:
 
 
 def budgets(config: RobotConfig) -> list[BusBudget]:
-    """The budget of every bus of a robot."""
+    """Return the budget of every bus of a robot."""
     return [_budget(config, name) for name in config.buses]
 
 
@@ -67,8 +69,8 @@ def _budget(config: RobotConfig, bus: str) -> BusBudget:
             continue
         driver, settings = registry.equipment(config, device)
         has_sync |= driver.NEEDS_SYNC
-        wanted = tuple(entry.elements) or driver.quantities(settings)[:1]
-        for size, times, *extended in driver.traffic_of(settings, rate, wanted):
+        quantities = tuple(entry.elements) or driver.quantities(settings)[:1]
+        for size, times, *extended in driver.traffic_of(settings, rate, quantities):
             bits = frame_bits(size, any(extended))
             if times == rate:
                 cyclic.append(bits)
@@ -81,10 +83,10 @@ def _budget(config: RobotConfig, bus: str) -> BusBudget:
 
 
 def check(config: RobotConfig) -> None:
-    """Refuse a robot whose frames do not fit.
+    """Check that the load of every bus is allowed.
 
     Raises:
-        ConfigError: A bus would carry more than its `max_load`; the message has the arithmetic.
+        ConfigError: The load of a bus exceeds its `max_load`; the message shows the calculation.
     """
     for budget in budgets(config):
         allowed = config.buses[budget.bus].max_load

@@ -1,7 +1,7 @@
-"""One CAN bus: a receive thread that lives on, whatever happens to the interface.
+"""One CAN bus, with a receive thread that survives every failure of the interface.
 
-python-can's Notifier is not used: its thread ends at the first exception. canopen's network is fed from here and only
-commissions; the cycle is `begin`, `send`, `sync`, the handlers and `wait`.
+The thread of python-can's Notifier ends at the first exception, so it is not used. The network of canopen gets its
+frames from here and is only used for commissioning. A cycle is `begin`, `send`, `sync`, the handlers and `wait`.
 """
 
 import logging
@@ -30,33 +30,33 @@ __all__ = ["OWN_NODE", "PATIENCE", "Answers", "Bus", "BusState", "Handler"]
 log = logging.getLogger(__name__)
 
 OWN_HEARTBEAT_PERIOD = 1.0 / OWN_HEARTBEAT_RATE
-"""[s]; the drives stop when it fails for their consumer heartbeat time."""
+"""The HAL sends its heartbeat with this period [s]; drives stop after their consumer heartbeat time without one."""
 SILENCE = 1.0
-"""No frame for so long [s] means that the interface may be another one by now: it is opened again."""
+"""The interface is opened again after this time [s] without a frame, because it may have been replaced."""
 BACK_OFF = (0.05, 0.5)
-"""First and longest pause [s] between tries to open; the first again once a frame was heard."""
+"""Attempts to open have these first and longest pauses [s]; the first again after a received frame."""
 RECEIVE_TIMEOUT = 0.1
 MISSES_FORGIVEN = 4
-"""A node that missed so many cycles in a row is not waited for any more, until it is heard."""
+"""A cycle does not wait for a node that missed this number of cycles in sequence, until it answers again."""
 _FRAMES = ("received", "sent", "send_failures", "unknown", "ignored", "babbled", "broken_handlers", "error_frames")
 COUNTERS = (*_FRAMES, "opened", "failures")
-TOLD_STRANGERS = 8
+MAX_STRANGERS = 8
 ECHOING = ("udp_multicast",)
-"""Interfaces that return to us what we send."""
+"""These interfaces return sent frames to the sender."""
 
 
 class Answers(Protocol):
     """A device that answers once in every cycle, or sends by itself."""
 
     missed: int
-    """Cycles in a row without its answer."""
+    """Number of cycles since its last answer."""
     patience: int
-    """Cycles within which it answers. It is waited for if that is 1; more for a device that goes by its own clock."""
+    """Number of cycles within which it answers; the cycle waits if this is 1. More for a device with its own clock."""
     is_commissioned: bool
 
 
 class _Network:
-    """What canopen takes for a python-can bus: it can send, and never raises."""
+    """Replacement of a python-can bus for canopen; it sends and never raises."""
 
     def __init__(self, sender: Sender) -> None:
         self._sender = sender
@@ -66,10 +66,10 @@ class _Network:
 
 
 class Bus:
-    """A CAN bus that is always there, though at times nobody answers."""
+    """A CAN bus that stays usable as an object while its interface fails and returns."""
 
     def __init__(self, name: str, config: BusConfig, clock: BusClock) -> None:
-        """Prepare; `open` opens.
+        """Prepare; nothing is opened yet.
 
         Raises:
             ConfigError: python-can does not know the interface.
@@ -82,7 +82,7 @@ class Bus:
         self.name = name
         self.counters = dict.fromkeys(COUNTERS, 0)
         self.needs_sync = False
-        """Whether there are CANopen nodes, which wait for the SYNC and for the HAL's heartbeat."""
+        """Whether the bus has CANopen nodes, which need the SYNC and the HAL's heartbeat."""
         self._config = config
         self._clock = clock
         self._watch = BusWatch(self._changed)
@@ -110,25 +110,25 @@ class Bus:
 
     @property
     def state(self) -> BusState:
-        """What the bus can do for us."""
+        """State of the bus."""
         return self._watch.state
 
     @property
     def text(self) -> str:
-        """One sentence a person can act on; empty when all is well."""
+        """Problem and remedy in one sentence for the operator; empty without a problem."""
         return self._watch.text
 
     @property
     def is_receiving(self) -> bool:
-        """Whether the receive thread is alive and came back from the interface lately, frames or none."""
+        """Whether the receive thread is alive and returned from the interface recently, with or without a frame."""
         thread = self._thread
         return thread is not None and thread.is_alive() and self._thread_watch.is_turning
 
     def subscribe(self, identifier: int, handler: Handler, extended: bool = False) -> None:
-        """Have `handler` called with every data frame of an identifier; one handler each.
+        """Call `handler` with every data frame of an identifier from now on; an identifier has one handler.
 
         Raises:
-            ConfigError: It is taken, or out of range.
+            ConfigError: The identifier has a handler, or is out of range.
         """
         self._receiver.routes.add(identifier, handler, extended)
         interface = self._can
@@ -136,7 +136,7 @@ class Bus:
             self._kernel.filter(interface, self._receiver.routes)
 
     def subscriber(self, identifier: int) -> Handler | None:
-        """Who is called with the frames of an identifier, so that drives which answer under one can share it."""
+        """Return the handler of an identifier, so that drives which answer under the same one can share it."""
         route = self._receiver.routes.of.get(identifier)
         return route.handler if route else None
 
@@ -145,14 +145,14 @@ class Bus:
         self._nodes.append(node)
 
     def answered(self, node: Answers) -> None:
-        """A device's answer of this cycle has come; called in the receive thread."""
+        """Note the answer of a device in this cycle; called in the receive thread."""
         waiting = self._waiting
         waiting.discard(node)
         if not waiting:
             self._answered.set()
 
     def open(self) -> None:
-        """Start receiving; returns when the interface was tried once, also if that failed."""
+        """Start receiving, and return after the first attempt to open the interface, also if it failed."""
         self._closing.clear()
         self._tried.clear()
         self._thread_watch.start()
@@ -161,23 +161,23 @@ class Bus:
         self._tried.wait(5.0)
 
     def close(self) -> None:
-        """Stop receiving and let go of the interface. Safe to call twice."""
+        """Stop receiving and close the interface. Safe to call twice."""
         self._closing.set()
         if self._thread:
             self._thread.join()
             self._thread = None
 
     def send(self, message: can.Message, patience: float = 0.0) -> bool:
-        """Put a frame on the bus; whether the interface took it. Never raises.
+        """Send a frame, and return whether the interface took it. Never raises.
 
         Args:
-            message: The frame. If it is not taken it is dropped: the next cycle has a newer one.
-            patience: How long [s] it may wait for room; 0 in the cycle, whose frames may together wait for 2 ms.
+            message: The frame. It is dropped if the interface does not take it: the next cycle sends a newer one.
+            patience: Longest wait [s] for space in the interface; 0 in the cycle, whose frames share 2 ms.
         """
         return self._sender.send(message, patience)
 
     def begin(self) -> None:
-        """Begin a cycle, before anything is sent: some devices answer their set-point, others the SYNC."""
+        """Begin a cycle, before the first frame: some devices answer their set-point, others the SYNC."""
         self._sender.begin()
         self._waiting = {n for n in self._nodes if n.patience == 1 and n.is_commissioned and n.missed < MISSES_FORGIVEN}
         self._answered.clear()
@@ -185,7 +185,7 @@ class Bus:
             self._watch.lost("Its receive thread hangs. Is the adapter still plugged in?")
 
     def sync(self, now: float) -> None:
-        """Send the SYNC, and now and then the HAL's own heartbeat, if anybody waits for them."""
+        """Send the SYNC, and the HAL's heartbeat when it is due, if the bus has CANopen nodes."""
         if not self.needs_sync:
             return
         self._sender.send(self._sync)
@@ -194,25 +194,25 @@ class Bus:
             self._sender.send(self._heartbeat)
 
     def wait(self, deadline: float) -> bool:
-        """Wait until every device has answered, or the deadline [monotonic s]; whether every node has."""
+        """Wait for the answers of all devices until the deadline [monotonic s], and return whether all answered."""
         waiting = self._waiting
         while waiting and self._clock.wait(self._answered, deadline):
             self._answered.clear()
         complete = not waiting
         for node in self._nodes:
-            # The receive thread sets it to 0 at an answer, so that it never looks fresher than it is.
+            # The receive thread sets `missed` to 0 at an answer, so that it never looks fresher than it is.
             node.missed += 1
             complete &= node.missed <= node.patience
         return complete
 
     def trouble(self) -> str:
-        """What made the bus unusable now, or at some time since this was asked last; empty if nothing did."""
+        """Return the problem that made the bus unusable now or since the last call; empty without one."""
         watch = self._watch
         losses, self._losses = self._losses, watch.losses
         return watch.lost_by if watch.state in UNUSABLE or watch.losses != losses else ""
 
     def health(self) -> dict[str, Any]:
-        """State, a sentence, share of the bit rate that is used, counters, and whose clock stamps the frames."""
+        """Return state, problem, load as a share of the bit rate, counters, and the clock that stamps frames."""
         return {
             "state": self.state.value,
             "text": self.text,
@@ -220,7 +220,7 @@ class Bus:
             "is_receiving": self.is_receiving,
             "stamps": STAMPED.get(self._config.interface, "arrival"),
             "error_counters": self._watch.error_counters,
-            "unknown": self._receiver.strangers()[:TOLD_STRANGERS],
+            "unknown": self._receiver.strangers()[:MAX_STRANGERS],
             "counters": {**self.counters, **self._frame_clock.counters},
         }
 
@@ -232,11 +232,11 @@ class Bus:
                 interface = self._new_interface()
                 self._tried.set()
                 self._receive(interface)
-            except BaseException as error:  # an interface plugin may raise anything, and this thread must live on
+            except BaseException as error:  # an interface plugin may raise anything, and this thread must survive
                 self.counters["failures"] += 1
                 self._watch.lost(f"{type(error).__name__}: {error} Trying again.")
                 log.debug("bus %s", self.name, exc_info=True)
-            self._let_go()
+            self._close_interface()
             self._tried.set()
             pause = BACK_OFF[0] if self.counters["received"] > received else min(2 * pause, BACK_OFF[1])
             self._closing.wait(pause)
@@ -250,22 +250,22 @@ class Bus:
         set_buffers(interface)
         self._kernel = Kernel(config.interface, config.channel)
         self._kernel.filter(interface, self._receiver.routes)
-        self._watch.opened("Open, but nothing was heard yet. Is a node powered, is the bus terminated?")
+        self._watch.opened("Open, but no frame was received yet. Is a node powered, is the bus terminated?")
         self._sender.use(interface)
         self.counters["opened"] += 1
         return interface
 
-    def _let_go(self) -> None:
+    def _close_interface(self) -> None:
         self._sender.use(None)
         interface, self._can = self._can, None
         if interface is not None:
             try:
                 interface.shutdown()
-            except Exception:  # a dead adapter may refuse even to close
+            except Exception:  # closing a dead adapter may fail too
                 log.debug("bus %s does not close", self.name, exc_info=True)
 
     def _receive(self, interface: can.BusABC) -> None:
-        """Handle frames until the bus is closed, silent, or not able to send."""
+        """Handle frames until the bus is closed, silent, or cannot send."""
         receiver, sender, monotonic = self._receiver, self._sender, self._clock.monotonic
         opened = now = monotonic()
         while not self._closing.is_set():
@@ -273,26 +273,26 @@ class Bus:
             now = monotonic()
             if message is not None:
                 receiver.handle(message, now)
-            if now >= receiver.stock_due:
+            if now >= receiver.statistics_due:
                 receiver.has_master = self.needs_sync and self._config.interface not in ECHOING
-                receiver.take_stock(now, sender.bits, self._kernel.received())
+                receiver.update_statistics(now, sender.bits, self._kernel.received())
             if sender.problem:
                 raise ConnectionError(sender.problem)
             if message is not None:
                 continue
             silent = now - max(receiver.heard, opened)
             if silent > SILENCE:
-                raise ConnectionError(f"Nothing was heard for {silent:.1f} s. Is a node powered?")
-            self._closing.wait(0.001)  # some interfaces return at once when their peer is dead
+                raise ConnectionError(f"No frame was received for {silent:.1f} s. Is a node powered?")
+            self._closing.wait(0.001)  # some interfaces return at once if their peer is dead
 
     def _next(self, interface: can.BusABC, before: float) -> can.Message | None:
-        """The next frame, or None after a while; `before` is when the last one was read [s]."""
+        """Return the next frame, or None after `RECEIVE_TIMEOUT`; `before` is the time of the last reading [s]."""
         arrival = self._arrival
-        asked = 0.0 if arrival.since is None else time.monotonic()
+        start = 0.0 if arrival.since is None else time.monotonic()
         message = interface.recv(RECEIVE_TIMEOUT)
         if self._thread_watch.turn():
             arrival.since = before
-        elif asked and (message is None or time.monotonic() - asked > WAITED):
+        elif start and (message is None or time.monotonic() - start > WAITED):
             arrival.since = None
         return message
 

@@ -1,4 +1,4 @@
-"""What the kernel can be asked for a CAN interface: room, filters, and how many frames there were."""
+"""Kernel settings of a CAN interface: buffers, filters and frame counter."""
 
 import os
 import socket
@@ -11,11 +11,11 @@ from hal.wire.routes import Routes
 from hal.wire.send import PAUSE, PAUSES
 
 IN_FLIGHT = 64
-"""Frames that a socket may have taken and not yet sent: these cannot be taken back."""
+"""A socket may hold at most this number of unsent frames, because they cannot be withdrawn."""
 FRAME_MEMORY = 768
-"""What Linux counts for one frame in a socket's buffer [byte]."""
+"""Linux counts this memory for one frame in the buffer of a socket [byte]."""
 RECEIVE_MEMORY = 4 << 20
-"""For frames that wait to be read [byte]: 5000, half a second of a full bus; the kernel may grant less."""
+"""The receive buffer has this size [byte]: 5000 frames, half a second of a full bus; the kernel may grant less."""
 NETWORK = Path("/sys/class/net")
 
 _SO_RCVBUFFORCE = 33
@@ -23,9 +23,9 @@ _TIMEVAL = struct.Struct("@ll")
 
 
 def set_buffers(interface: can.BusABC) -> None:
-    """Give an interface's socket, if it has one, much room for what is received and little for what is sent.
+    """Set a large receive buffer and a small send buffer, if the interface has a socket.
 
-    A TCP socket that takes nothing gives up after the pauses of one cycle.
+    A TCP socket with a full buffer fails after the pauses of one cycle.
     """
     try:
         handle = os.dup(interface.fileno())
@@ -33,7 +33,7 @@ def set_buffers(interface: can.BusABC) -> None:
         return
     try:
         link = socket.socket(fileno=handle)
-    except OSError:  # a serial line, for one
+    except OSError:  # such as a serial line
         os.close(handle)
         return
     with link:
@@ -47,18 +47,18 @@ def set_buffers(interface: can.BusABC) -> None:
 
 
 class Kernel:
-    """The Linux kernel's view of one interface; of an interface that is not its own it knows nothing.
+    """Filters and frame counter of a SocketCAN interface; without effect for other interfaces.
 
-    What it keeps away on our behalf loads the bus all the same, so those frames are counted by the difference.
+    Filtered frames load the bus too: they are the difference of the kernel's count and the received frames.
     """
 
     def __init__(self, interface: str, channel: str, network: Path = NETWORK) -> None:
         """Prepare.
 
         Args:
-            interface: python-can's name of the kind.
-            channel: Of the interface.
-            network: Where Linux tells of its interfaces.
+            interface: Kind of the interface, as named by python-can.
+            channel: Channel of the interface.
+            network: Folder in which Linux describes its interfaces.
         """
         self._filters = interface == "socketcan"
         folder = network / channel
@@ -66,12 +66,12 @@ class Kernel:
         self._count = folder / "statistics" / "rx_packets" if self._filters and (folder / "device").exists() else None
 
     def filter(self, interface: can.BusABC, routes: Routes) -> None:
-        """Keep away what nobody wants; python-can's own filters would cost more than they save."""
+        """Filter frames without a subscriber in the kernel; filters of python-can cost more than they save."""
         if self._filters:
             interface.set_filters(routes.filters())  # type: ignore[arg-type]
 
     def received(self) -> int | None:
-        """Frames that the interface ever received; None if nobody counts them."""
+        """Return the number of frames that the interface received since boot; None if they are not counted."""
         if self._count is None:
             return None
         try:

@@ -1,4 +1,4 @@
-"""SYNC and the HAL's heartbeat while nobody cycles, so that drives which watch for them do not report a lost master."""
+"""SYNC and heartbeat of the HAL without a cycle, so that drives which expect them do not report a lost master."""
 
 import threading
 from collections.abc import Iterator, Sequence
@@ -9,16 +9,16 @@ from hal.wire.budget import OWN_HEARTBEAT_RATE
 from hal.wire.bus import Bus
 
 PATIENCE = 0.01
-"""How long [s] to wait for the nodes' answers, so that those of one SYNC are not taken for a second node's."""
+"""Nodes have this time [s] to answer a SYNC; an answer after the next SYNC would look like that of a second node."""
 
 
 @contextmanager
 def pulse(buses: Sequence[Bus]) -> Iterator[threading.Lock]:
-    """Keep the nodes of some open buses awake for as long as the context lasts; hold the lock to cycle oneself."""
-    lock, over, clock = threading.Lock(), threading.Event(), SystemClock()
+    """Send SYNC and heartbeat on open buses while the context lasts; hold the yielded lock to run own cycles."""
+    lock, stopping, clock = threading.Lock(), threading.Event(), SystemClock()
 
     def beat() -> None:
-        while not over.wait(1.0 / OWN_HEARTBEAT_RATE):
+        while not stopping.wait(1.0 / OWN_HEARTBEAT_RATE):
             with lock:
                 start = clock.monotonic()
                 for bus in buses:
@@ -32,5 +32,5 @@ def pulse(buses: Sequence[Bus]) -> Iterator[threading.Lock]:
     try:
         yield lock
     finally:
-        over.set()
+        stopping.set()
         thread.join()

@@ -1,4 +1,4 @@
-"""What becomes of a frame that was received: counted, timed, handed to whoever wants it."""
+"""Handling of received frames: count, time of arrival, call of the subscriber, statistics."""
 
 import logging
 import math
@@ -15,11 +15,11 @@ from hal.wire.state import BusState, BusWatch
 log = logging.getLogger(__name__)
 
 OWN_NODE = 127
-"""Node id under which the HAL sends its own heartbeat."""
-STOCK_PERIOD = 1.0
-"""How often [s] load and strangers are looked at."""
+"""The HAL sends its own heartbeat under this node id."""
+STATISTICS_PERIOD = 1.0
+"""Load and strangers are evaluated with this period [s]."""
 HIGH_LOAD = 0.8
-"""Share of the bit rate above which frames wait long for one another."""
+"""Above this share of the bit rate frames wait long for each other."""
 
 _BITS = tuple(frame_bits(size) for size in range(9))
 _BITS_EXTENDED = tuple(frame_bits(size, is_extended=True) for size in range(9))
@@ -28,7 +28,7 @@ _NODES = range(cia301.HEARTBEAT + 1, cia301.HEARTBEAT + OWN_NODE)
 
 
 class Receiver:
-    """Handles the frames of one bus, all in its receive thread."""
+    """Receiver of the frames of one bus; runs in its receive thread."""
 
     def __init__(
         self, name: str, bitrate: int, watch: BusWatch, counters: dict[str, int], frame_clock: FrameClock | ArrivalClock
@@ -36,31 +36,31 @@ class Receiver:
         """Prepare.
 
         Args:
-            name: Of the bus.
-            bitrate: Of the bus [bit/s].
-            watch: Is told what is seen.
-            counters: Counted in place.
-            frame_clock: What to make of the stamps of frames.
+            name: Name of the bus.
+            bitrate: Bit rate of the bus [bit/s].
+            watch: State of the bus, updated here.
+            counters: Counters, updated in place.
+            frame_clock: Clock that converts the stamps of frames.
         """
         self.routes = Routes(name)
         self.heard = -math.inf
-        """When the last frame of another node was read [monotonic s]."""
+        """Monotonic time at which the last frame of another node was read [s]."""
         self.load = 0.0
-        """Share of the bit rate that frames took when stock was taken last, both ways and stuffed at worst."""
+        """Share of the bit rate in the last statistics period, in both directions, with the most stuff bits."""
         self.has_master = False
-        """Whether we are the ones who send the SYNC, and nobody else should."""
-        self.stock_due = -math.inf
+        """Whether the HAL sends the SYNC, so that no other node may."""
+        self.statistics_due = -math.inf
         self._name = name
         self._bitrate = bitrate
         self._watch = watch
         self._counters = counters
         self._frame_clock = frame_clock
         self._bits = 0
-        self._stock: tuple[float, int, int | None] = (0.0, 0, None)
+        self._last: tuple[float, int, int | None] = (0.0, 0, None)
         self._logged = -math.inf
 
     def handle(self, message: can.Message, now: float) -> None:
-        """Take in one frame, read at monotonic time `now` [s]. Never raises."""
+        """Handle one frame that was read at monotonic time `now` [s]. Never raises."""
         if message.is_error_frame:
             self._on_error_frame(message, now)
             return
@@ -96,40 +96,40 @@ class Receiver:
         else:
             try:
                 route.handler(data, received)
-            except BaseException as error:  # whatever a frame does to its handler, the next frame must be handled
+            except BaseException as error:  # after any error of a handler the next frame must be handled
                 self._on_broken_handler(identifier, error, now)
 
-    def take_stock(self, now: float, sent_bits: int, passed_kernel: int | None = None) -> None:
-        """Work out the load, and complain of what should not be on the bus.
+    def update_statistics(self, now: float, sent_bits: int, kernel_count: int | None = None) -> None:
+        """Compute the load, and warn of frames that should not be on the bus.
 
         Args:
             now: Monotonic time [s].
-            sent_bits: Longest length of all frames that we ever sent [bit].
-            passed_kernel: Frames that the kernel ever received, those included that it kept away; None: not known.
+            sent_bits: Longest length of all frames that the HAL ever sent [bit].
+            kernel_count: Frames that the kernel ever received, including filtered ones; None if unknown.
         """
-        self.stock_due = now + STOCK_PERIOD
-        since, before, unseen_before = self._stock
-        unseen = None if passed_kernel is None else passed_kernel - self._counters["received"]
+        self.statistics_due = now + STATISTICS_PERIOD
+        since, bits_before, unseen_before = self._last
+        unseen = None if kernel_count is None else kernel_count - self._counters["received"]
         bits = self._bits + sent_bits
-        self._stock = (now, bits, unseen)
+        self._last = (now, bits, unseen)
         passed = now - since
-        if not 0 < passed < 10 * STOCK_PERIOD:
+        if not 0 < passed < 10 * STATISTICS_PERIOD:
             return
-        kept_away = 0 if unseen is None or unseen_before is None else max(unseen - unseen_before, 0)
-        self.load = (bits - before + kept_away * _BITS[8]) / (passed * self._bitrate)
-        complaint = ""
+        filtered = 0 if unseen is None or unseen_before is None else max(unseen - unseen_before, 0)
+        self.load = (bits - bits_before + filtered * _BITS[8]) / (passed * self._bitrate)
+        warning = ""
         if self.load > HIGH_LOAD:
-            complaint = f"The bus is loaded to {self.load:.0%}. Is a node sending more than it was told to?"
+            warning = f"The bus is loaded to {self.load:.0%}. Does a node send more than configured?"
         for key in self.routes.strangers() if self.has_master else ():
             if key in _OURS:
-                complaint = f"Somebody else sends our {name_of(key)}. Is another master or another HAL on this bus?"
+                warning = f"Another node sends our {name_of(key)}. Is another master or another HAL on this bus?"
         for name, rate in self.routes.babblers(passed):
-            complaint = f"{name.capitalize()} babbles: {rate:.0f} frames/s. What is beyond the limit is not handled."
-        if complaint:
-            self._watch.worry(complaint, now)
+            warning = f"{name.capitalize()} babbles: {rate:.0f} frames/s. Frames above the limit are not handled."
+        if warning:
+            self._watch.worry(warning, now)
 
     def strangers(self) -> list[str]:
-        """Who is on the bus and not wanted, in words."""
+        """Return in words the received nodes and identifiers that have no subscriber."""
         return [
             f"node {key - cia301.HEARTBEAT}" if key in _NODES and self.has_master else name_of(key)
             for key in self.routes.strangers()
@@ -141,8 +141,8 @@ class Receiver:
 
     def _on_broken_handler(self, identifier: int, error: BaseException, now: float) -> None:
         self._counters["broken_handlers"] += 1
-        told = f"{name_of(identifier)} on bus {self._name}: {type(error).__name__}: {error}"
-        self._watch.worry(f"The handler of {told}. Please report it.", now)
-        if now - self._logged > STOCK_PERIOD:
+        text = f"{name_of(identifier)} on bus {self._name}: {type(error).__name__}: {error}"
+        self._watch.worry(f"Error in the handler of {text}. Please report it.", now)
+        if now - self._logged > STATISTICS_PERIOD:
             self._logged = now
-            log.error("handler of %s", told, exc_info=error)
+            log.error("handler of %s", text, exc_info=error)

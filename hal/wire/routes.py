@@ -1,32 +1,33 @@
-"""Who wants which identifier, and how often it comes."""
+"""Subscribers by identifier, and the rate of each identifier."""
 
 from collections.abc import Callable
 
 from hal.errors import ConfigError
 
 Handler = Callable[[bytearray, float], None]
-"""Called in the receive thread with a frame's data and its monotonic time of arrival [s]; must not block."""
+"""A handler is called in the receive thread with a frame's data and its monotonic time of arrival [s], and must not
+block."""
 
 EXTENDED = 1 << 31
-"""Marks a 29-bit identifier among the 11-bit ones."""
+"""This bit marks a 29-bit identifier."""
 BABBLE = 4000.0
-"""Frames of one identifier per second [1/s] beyond which the rest is not handled: more than any cycle asks for, half
-of what a full bus of 1 Mbit/s carries."""
+"""An identifier may have this number of frames per second [1/s], and more are not handled. No cycle needs as many; a
+full bus of 1 Mbit/s carries twice as many."""
 WINDOW = 0.05
-"""Over so long [s] the rate is taken."""
+"""The rate is measured over this time [s]."""
 STRANGERS = 256
-"""So many identifiers that nobody wants are told apart."""
+"""At most this number of identifiers without a subscriber is counted separately."""
 FORGOTTEN = 10
-"""A stranger that was not heard while stock was taken so many times is gone."""
+"""A stranger is forgotten after this number of statistics periods without a frame."""
 LISTENED = ((0x000, 0x7FF), (0x080, 0x780), (0x700, 0x780))
-"""Identifiers and masks that are let in though nobody wants them: NMT of another master, SYNC and emergencies,
-heartbeats and boot-ups of nodes that the robot file does not name."""
+"""These identifiers and masks pass the filters without a subscriber: NMT of another master, SYNC and emergencies,
+heartbeats and boot-ups of nodes that are not in the robot file."""
 
 _WINDOW_FRAMES = round(BABBLE * WINDOW)
 
 
 class Route:
-    """What happens with the frames of one identifier."""
+    """Handler and frame count of one identifier."""
 
     __slots__ = ("counted", "handler", "limit", "quiet", "seen")
 
@@ -39,20 +40,20 @@ class Route:
 
 
 class Routes:
-    """Identifier -> route, for those that are wanted and for strangers."""
+    """Map from identifier to route, for subscribed identifiers and for strangers (identifiers without subscriber)."""
 
     def __init__(self, bus: str) -> None:
         self.of: dict[int, Route] = {}
-        """By identifier, with `EXTENDED` added to 29-bit ones."""
+        """Routes by identifier; a 29-bit identifier has the bit `EXTENDED`."""
         self.window_end = 0.0
         self._bus = bus
         self._strangers = 0
 
     def add(self, identifier: int, handler: Handler, extended: bool) -> None:
-        """Have frames handled.
+        """Set the handler of an identifier.
 
         Raises:
-            ConfigError: They are already, or there is no such identifier.
+            ConfigError: The identifier has a handler, or is out of range.
         """
         last = 0x1FFFFFFF if extended else 0x7FF
         if not 0 <= identifier <= last:
@@ -65,7 +66,7 @@ class Routes:
         self.of[key] = Route(handler)
 
     def stranger(self, key: int) -> Route | None:
-        """Note an identifier that nobody wants; None if there are too many."""
+        """Add an identifier without a subscriber and return its route; None if there are too many."""
         if self._strangers >= STRANGERS:
             return None
         self._strangers += 1
@@ -73,36 +74,36 @@ class Routes:
         return route
 
     def open_window(self, now: float) -> None:
-        """Let every identifier have its frames of the next window, which begins `now` [s]."""
+        """Begin a new window at `now` [s], in which every identifier may again have `BABBLE * WINDOW` frames."""
         self.window_end = now + WINDOW
         for route in list(self.of.values()):
             route.limit = route.seen + _WINDOW_FRAMES
 
     def babblers(self, passed: float) -> list[tuple[str, float]]:
-        """Identifiers over the allowed rate, and their rates [1/s], in the `passed` time [s] since asked last.
+        """Return the identifiers above the allowed rate and their rates [1/s], over the `passed` time [s] since last.
 
-        Strangers that fell silent are forgotten.
+        Strangers without frames for long are forgotten.
         """
-        found = []
+        babblers = []
         for key, route in list(self.of.items()):
             rate = (route.seen - route.counted) / passed
             route.counted = route.seen
             if rate > BABBLE:
-                found.append((name_of(key), rate))
+                babblers.append((name_of(key), rate))
             if route.handler is None:
                 route.quiet = 0 if rate else route.quiet + 1
                 if route.quiet >= FORGOTTEN:
                     del self.of[key]
                     self._strangers -= 1
-        return found
+        return babblers
 
     def strangers(self) -> list[int]:
-        """Identifiers, marked with `EXTENDED`, that were heard and that nobody wants."""
+        """Return received identifiers without a subscriber; a 29-bit identifier has the bit `EXTENDED`."""
         return sorted(key for key, route in list(self.of.items()) if route.handler is None)
 
     def filters(self) -> list[dict[str, int | bool]]:
-        """What python-can shall let in: what is wanted, and what tells of strangers."""
-        listened: list[dict[str, int | bool]] = [
+        """Return python-can filters that pass subscribed identifiers and `LISTENED`."""
+        filters: list[dict[str, int | bool]] = [
             {"can_id": identifier, "can_mask": mask, "extended": False} for identifier, mask in LISTENED
         ]
         for key, route in list(self.of.items()):
@@ -112,10 +113,10 @@ class Routes:
             identifier = key & ~EXTENDED
             if extended or not any(identifier & mask == listened_id for listened_id, mask in LISTENED):
                 mask = 0x1FFFFFFF if extended else 0x7FF
-                listened.append({"can_id": identifier, "can_mask": mask, "extended": extended})
-        return listened
+                filters.append({"can_id": identifier, "can_mask": mask, "extended": extended})
+        return filters
 
 
 def name_of(key: int) -> str:
-    """An identifier in words, as `identifier 181h`."""
+    """Return an identifier in words, as `identifier 181h`."""
     return f"identifier {key & ~EXTENDED:0{8 if key & EXTENDED else 3}X}h"

@@ -1,8 +1,8 @@
-"""Putting frames on a bus: at once or not at all.
+"""Sending frames on a bus without a queue.
 
-The HAL keeps no queue. A set-point that the interface does not take in its cycle is dropped, and the one of the next
-cycle replaces it, so that no old command goes out late, however long the bus was away. What is asked once (NMT, SDO) is
-given longer, outside of the cycle, and asked again by whoever misses the answer.
+A set-point that the interface does not take in its cycle is dropped, and that of the next cycle replaces it. So no old
+command is sent late, however long the bus was gone. Single requests (NMT, SDO) have more time outside of the cycle, and
+their senders repeat them without an answer.
 """
 
 import errno
@@ -15,18 +15,18 @@ import can
 from hal.wire.budget import frame_bits
 
 PAUSE = 0.0002
-"""Between two tries to have a full interface take a frame [s]; a frame at 1 Mbit/s needs about 0.1 ms."""
+"""A full interface is tried again after this time [s]; a frame at 1 Mbit/s needs about 0.1 ms."""
 PAUSES = 10
-"""All frames of a cycle together may wait for so many pauses: 2 ms, whatever the interface does."""
+"""All frames of a cycle together may wait for this number of pauses: 2 ms."""
 TURN = 0.02
-"""All frames of a cycle together may wait so long [s] while another thread hands over a frame; that is one system call,
+"""All frames of a cycle together may wait this long [s] for another thread that sends a frame. That is one system call,
 but on a busy machine with one CPU a thread may be interrupted in it."""
 PATIENCE = 0.05
-"""What is asked once may wait so long [s], and not in the cycle."""
+"""A single request outside of the cycle may wait this long [s]."""
 FAILED_SENDS = 3
-"""So many frames of one identifier in a row, and the interface is opened again."""
+"""The interface is opened again after this number of failures of one identifier in sequence."""
 STUCK = 1.0
-"""An interface that keeps a frame for so long [s] has hung; less, and the machine may have been busy."""
+"""An interface that does not return from sending for this time [s] is blocked; a busy machine needs less."""
 
 _BITS = tuple(frame_bits(size) for size in range(9))
 _FULL = (None, errno.ENOBUFS, errno.EAGAIN)
@@ -34,51 +34,51 @@ _BUSY = can.CanOperationError("the interface is still busy with another frame", 
 
 
 class Sender:
-    """Sends for all threads; never raises, never blocks the cycle beyond its pauses."""
+    """Sender for all threads; never raises, and never blocks the cycle longer than its pauses."""
 
     def __init__(self, counters: dict[str, int], failed: Callable[[str], None]) -> None:
-        """Prepare; `counters` has `sent` and `send_failures`, `failed` is told why a frame could not be sent."""
+        """Prepare; `counters` has `sent` and `send_failures`, `failed` is called with the reason of a failure."""
         self.bits = 0
-        """Longest length of all frames that were sent [bit]."""
+        """Sum of the longest lengths of all sent frames [bit]."""
         self.is_barred = False
-        """Nothing is sent while the controller is off the bus."""
+        """Whether the controller is off the bus, so that no frame is sent."""
         self._counters = counters
         self._failed = failed
         self._interface: can.BusABC | None = None
         self._lock = threading.Lock()
         self._pauses = PAUSES
         self._turn = TURN
-        self._in_a_row: dict[int, int] = {}
-        self._given_up = ""
+        self._failures: dict[int, int] = {}
+        self._failure = ""
         self._since: float | None = None
 
     def use(self, interface: can.BusABC | None) -> None:
-        """Send through a fresh interface from now on, or through none; what failed before is forgotten."""
+        """Send through a new interface, or through none, and forget earlier failures."""
         self._interface = interface
-        self._in_a_row.clear()
-        self._given_up = ""
+        self._failures.clear()
+        self._failure = ""
         self._since = None
 
     def begin(self) -> None:
-        """A cycle begins, and may wait again."""
+        """Begin a cycle, which has all its pauses again."""
         self._pauses, self._turn = PAUSES, TURN
 
     @property
     def problem(self) -> str:
-        """Why the interface must be opened again; empty if it need not."""
+        """Reason to open the interface again; empty without a reason."""
         since = self._since
         if since is not None and time.monotonic() - since > STUCK:
-            return f"The interface has not come back from sending a frame for {STUCK:g} s."
-        return self._given_up
+            return f"The interface has not returned from sending a frame for {STUCK:g} s."
+        return self._failure
 
     def send(self, message: can.Message, patience: float = 0.0) -> bool:
-        """Put a frame on the bus; whether the interface took it.
+        """Send a frame, and return whether the interface took it.
 
         Args:
             message: The frame.
-            patience: How long [s] it may wait for room beside the cycle's own pauses; 0 in the cycle.
+            patience: Longest wait [s] for space in the interface, outside of the cycle; 0 in the cycle.
         """
-        if self._interface is None or self.is_barred or self._given_up:
+        if self._interface is None or self.is_barred or self._failure:
             self._counters["send_failures"] += 1
             return False
         size = len(message.data)
@@ -100,14 +100,14 @@ class Sender:
         if error is not None:
             self._note(message, error)
             return False
-        if self._in_a_row:
-            self._in_a_row.pop(message.arbitration_id, None)
+        if self._failures:
+            self._failures.pop(message.arbitration_id, None)
         self._counters["sent"] += 1
         self.bits += _BITS[size]
         return True
 
     def _try(self, message: can.Message, patience: float) -> Exception | None:
-        """What came of handing a frame to the interface, after waiting for another thread that does so."""
+        """Pass a frame to the interface as soon as no other thread uses it, and return an error."""
         if not self._lock.acquire(blocking=False) and not self._wait(patience):
             return _BUSY
         try:
@@ -124,7 +124,7 @@ class Sender:
         return None
 
     def _wait(self, patience: float) -> bool:
-        """Wait for the interface while another thread uses it; whether it is ours now."""
+        """Wait for the interface while another thread uses it, and return whether this thread has it now."""
         if patience:
             return self._lock.acquire(timeout=patience)
         start = time.monotonic()
@@ -135,17 +135,17 @@ class Sender:
     def _note(self, message: can.Message, error: Exception) -> None:
         identifier = message.arbitration_id
         self._counters["send_failures"] += 1
-        if error is _BUSY:  # one that does not come back is a problem of its own, and told as such
+        if error is _BUSY:  # `problem` reports an interface that stays busy
             return
-        failed = self._in_a_row[identifier] = self._in_a_row.get(identifier, 0) + 1
+        failures = self._failures[identifier] = self._failures.get(identifier, 0) + 1
         text = f"Frame {identifier:03X}h could not be sent: {error}."
-        if failed >= FAILED_SENDS:
-            self._given_up = text
+        if failures >= FAILED_SENDS:
+            self._failure = text
         self._failed(text)
 
 
 def _is_full(error: Exception) -> bool:
-    """Whether an interface has no room just now, rather than being broken."""
+    """Whether an interface has no space now, but works."""
     if isinstance(error, can.CanOperationError):
         return error.error_code in _FULL
     return isinstance(error, BlockingIOError)

@@ -1,50 +1,49 @@
-"""When a frame was received, on the monotonic clock that every age and deadline goes by."""
+"""Time of arrival of a frame on the monotonic clock, which all ages and deadlines use."""
 
 import math
 
 from hal.clock import BusClock
 
 STAMPED = {"socketcan": "kernel", "udp_multicast": "kernel", "hub": "sender"}
-"""Interfaces whose frames bear wall-clock time of this machine, and whose clock that is; all others bear some time or
-other, and what counts is when the frame was read."""
+"""The frames of these interfaces are stamped with the wall clock of this machine, by the kernel or by the sender. For
+all others the time of reading counts."""
 PLAUSIBLE = 0.005
-"""A frame that seems to have waited longer [s] has, or the wall clock was set: it is looked at again."""
+"""A frame that seems older than this [s] waited, or the wall clock was set: the offset is measured again."""
 STEP = 0.001
-"""A wall clock that moved by more than this [s] between two looks was set,"""
+"""The wall clock was set if it moved by more than this [s] and `SLEW` between two measurements."""
 SLEW = 0.001
-"""beside what it may be slewed [s/s]; Linux does at most half of that."""
+"""The wall clock may be slewed at this rate [s/s]; Linux uses at most half of it."""
 EARLY = 0.0002
-"""What clocks that are not read at the same instant may differ [s]."""
+"""Clocks that are not read at the same instant may differ by this time [s]."""
 DOUBT = 0.1
-"""For so long [s] after the wall clock was set, frames stamped before may still be read."""
-LOOK_EVERY = 0.1
-"""How often [s] the offset between the clocks is measured,"""
-LOOK_AGAIN = 0.002
-"""and how soon at the earliest when a stamp is doubted: where reading a clock is slow, not for every frame."""
+"""Frames with stamps of the old wall clock may arrive for this time [s] after it was set."""
+MEASURE_EVERY = 0.1
+"""The offset between the clocks is measured with this period [s]."""
+MEASURE_AGAIN = 0.002
+"""A doubtful stamp causes a new measurement after this time [s] at the earliest, as reading a clock may be slow."""
 _READ_WITHIN = 5e-5
 _READ_BADLY = 5e-4
 _READS = 4
 
 
 WAITED = 0.0005
-"""An interface that takes so long [s] to hand over a frame had none waiting."""
+"""An interface that needs this time [s] to return a frame had no frame waiting."""
 
 
 class ArrivalClock:
-    """For stamps that are worth nothing: a frame came when it was read.
+    """Clock for interfaces without usable stamps: the arrival of a frame is the time of reading.
 
-    Frames that were read after this process was frozen may have come at any time since; they are told as old as they
-    can be.
+    Frames that are read after this process was frozen get the earliest possible time of arrival.
     """
 
     def __init__(self) -> None:
         self.counters = {"waited": 0}
-        """Frames that lay in the interface while this process was frozen."""
+        """Number of frames that waited in the interface while this process was frozen."""
         self.since: float | None = None
-        """Frames that are read now may have come since then [monotonic s]; None: they come as they are read."""
+        """Monotonic time [s] since which the frames that are read now may have waited; None if they did not wait."""
 
     def received(self, stamp: float, now: float) -> float:
-        """See `FrameClock.received`."""
+        """Return `now`, or `since` for a frame that waited."""
         if self.since is None:
             return now
         self.counters["waited"] += 1
@@ -52,37 +51,37 @@ class ArrivalClock:
 
 
 class FrameClock:
-    """Turns wall-clock stamps into monotonic times.
+    """Clock that converts wall-clock stamps to monotonic times.
 
-    A frame that waited while this process was frozen is told as old as it is. A wall clock that is set makes no frame
-    newer or older: the offset before and the one after are both tried. A stamp that fits neither is not believed.
+    A frame that waited while this process was frozen gets its true age. Setting the wall clock makes no frame newer or
+    older: the offsets before and after are both tried. A stamp that fits neither is ignored.
     """
 
     def __init__(self, clock: BusClock) -> None:
         self.counters = {"waited": 0, "clock_steps": 0, "bad_stamps": 0}
-        """Frames that lay in the interface for long, times that the wall clock was set, stamps in the future."""
+        """Number of frames that waited for long, of steps of the wall clock, and of stamps in the future."""
         self._clock = clock
         self._offset = self._before = self._measure(None)
         self._set_at = -DOUBT
-        self._look_at = clock.monotonic() + LOOK_EVERY
+        self._measure_at = clock.monotonic() + MEASURE_EVERY
 
     def received(self, stamp: float, now: float) -> float:
-        """Monotonic time [s] at which a frame came, never after `now`.
+        """Return the monotonic time of arrival of a frame [s], never after `now`.
 
         Args:
-            stamp: Wall-clock time that the frame bears [s since 1970].
+            stamp: Wall-clock stamp of the frame [s since 1970].
             now: Monotonic time at which it was read [s].
         """
-        if now >= self._look_at:
-            self._look(now)
+        if now >= self._measure_at:
+            self._update(now)
         received = stamp - self._offset
         if now - PLAUSIBLE < received <= now:
             return received
         return self._doubtful(stamp, now)
 
     def _doubtful(self, stamp: float, now: float) -> float:
-        if now - (self._look_at - LOOK_EVERY) >= LOOK_AGAIN:
-            self._look(now)
+        if now - (self._measure_at - MEASURE_EVERY) >= MEASURE_AGAIN:
+            self._update(now)
         received = stamp - self._offset
         if now - self._set_at < DOUBT:
             other = stamp - self._before
@@ -95,21 +94,21 @@ class FrameClock:
             self.counters["waited"] += 1
         return min(received, now)
 
-    def _look(self, now: float) -> None:
-        """Measure the offset; notice when the wall clock was set."""
-        passed = now - self._look_at + LOOK_EVERY
-        self._look_at = now + LOOK_EVERY
-        found = self._measure(self._offset)
-        if abs(found - self._offset) > STEP + SLEW * passed:
+    def _update(self, now: float) -> None:
+        """Measure the offset, and detect a step of the wall clock."""
+        passed = now - self._measure_at + MEASURE_EVERY
+        self._measure_at = now + MEASURE_EVERY
+        offset = self._measure(self._offset)
+        if abs(offset - self._offset) > STEP + SLEW * passed:
             self.counters["clock_steps"] += 1
             self._before, self._set_at = self._offset, now
-        self._offset = found
+        self._offset = offset
 
     def _measure(self, otherwise: float | None) -> float:
-        """Wall-clock minus monotonic time [s], by the quickest of a few readings.
+        """Return wall-clock minus monotonic time [s], from the fastest of a few readings.
 
         Args:
-            otherwise: What to answer if this thread is interrupted in all of them; None: the best of them all the same.
+            otherwise: Result if this thread is interrupted in all readings; None for the fastest reading.
         """
         clock = self._clock
         offset, best = 0.0, math.inf

@@ -1,6 +1,6 @@
-"""What can be said of a bus: a state machine that is told what was seen and knows neither interface nor clock.
+"""State machine of a bus, without access to interface or clock.
 
-Receive thread and cycle both tell it; whoever only looks at the state needs no lock.
+Receive thread and cycle both report events to it. Reading the state needs no lock.
 """
 
 import threading
@@ -11,21 +11,21 @@ from enum import StrEnum
 from hal.protocols.error_frames import Controller, ErrorFrame
 
 WORRY = 1.0
-"""Something that went wrong once is over when it did not happen again for so long [s]."""
+"""A problem is over if it did not occur again for this time [s]."""
 RECOVERY = 5.0
-"""A controller that was in trouble has recovered when frames came for so long [s] without a word of it: some drivers
-report the way down only."""
+"""A controller has recovered if frames arrived for this time [s] without a new error, because some drivers do not
+report recovery."""
 
 
 class BusState(StrEnum):
-    """What a bus can do for us, worst last."""
+    """State of a bus, worst last."""
 
     OK = "ok"
     WARNING = "warning"
     PASSIVE = "passive"
     BUS_OFF = "bus-off"
     GONE = "gone"
-    """Not open, or nothing was heard since it was opened."""
+    """The bus is not open, or no frame was received since it was opened."""
 
 
 UNUSABLE = (BusState.BUS_OFF, BusState.GONE)
@@ -40,23 +40,23 @@ _STATE_OF = {
 class BusWatch:
     """The state of one bus.
 
-    An interface that could be opened proves nothing: a bus is there once a frame was heard. A bus that was unusable for
-    an instant, between two looks at `state`, is found by `losses`.
+    An open interface does not prove that the bus works: it is present after the first received frame. `losses` also
+    counts a loss that begins and ends between two readings of `state`.
     """
 
     def __init__(self, changed: Callable[[BusState, str], None] = lambda state, text: None) -> None:
-        """Start out gone; `changed` is called with every new state and its text."""
+        """Start in state GONE; `changed` is called with every new state and its text."""
         self.state = BusState.GONE
         self.text = "Not opened yet."
         self.losses = 0
-        """How often it became unusable."""
+        """Number of times that the bus became unusable."""
         self.lost_by = ""
-        """Why it became unusable last."""
+        """Cause of the last loss."""
         self.error_counters: tuple[int, int] | None = None
-        """Transmit and receive error counters that the controller last told."""
+        """Newest transmit and receive error counters of the controller."""
         self._changed = changed
         self._lock = threading.RLock()
-        self._is_there = False
+        self._is_present = False
         self._controller = Controller.ACTIVE
         self._controller_text = ""
         self._controller_at = 0.0
@@ -65,23 +65,23 @@ class BusWatch:
         self._gone = self.text
 
     def opened(self, text: str) -> None:
-        """The interface was opened, which says nothing of the bus yet; `text` says what to wait for."""
+        """Report that the interface was opened; the bus stays GONE with `text` until a frame arrives."""
         with self._lock:
             self.error_counters = None
             self.lost(text)
 
     def lost(self, text: str) -> None:
-        """The interface failed, was closed, or nothing was heard for too long."""
+        """Report that the interface failed, was closed, or received no frame for too long."""
         with self._lock:
-            self._is_there = False
+            self._is_present = False
             self._controller, self._worry = Controller.ACTIVE, ""
             self._gone = text
             self._settle()
 
     def heard(self, now: float) -> None:
-        """A frame of another node has come at `now` [s]; need not be told while the state is ok."""
+        """Report a frame of another node at `now` [s]; not necessary in state OK."""
         with self._lock:
-            self._is_there = True
+            self._is_present = True
             if self._controller is Controller.OFF or now - self._controller_at > RECOVERY:
                 self._controller = Controller.ACTIVE  # a controller that is off the bus hears nothing
             if now - self._worry_at > WORRY:
@@ -89,7 +89,7 @@ class BusWatch:
             self._settle()
 
     def error(self, frame: ErrorFrame, now: float) -> None:
-        """An error frame has come at `now` [s]."""
+        """Report an error frame at `now` [s]."""
         with self._lock:
             if frame.counters is not None:
                 self.error_counters = frame.counters
@@ -100,14 +100,14 @@ class BusWatch:
             self._settle()
 
     def worry(self, text: str, now: float) -> None:
-        """Something is not as it should be, though frames come and go."""
+        """Report a problem at `now` [s] that does not stop the bus."""
         with self._lock:
             self._worry, self._worry_at = text, now
             self._settle()
 
     def _settle(self) -> None:
         before = self.state
-        if not self._is_there and self._controller is not Controller.OFF:
+        if not self._is_present and self._controller is not Controller.OFF:
             self.state, self.text = BusState.GONE, self._worry or self._gone
         elif self._controller is not Controller.ACTIVE:
             self.state, self.text = _STATE_OF[self._controller], self._controller_text
@@ -123,15 +123,15 @@ class BusWatch:
 
 
 FROZEN = 0.25
-"""A receive thread that turns after so long [s] did not come to run: two and a half times what it waits for frames."""
+"""A receive thread with a turn longer than this [s] was frozen; it waits 0.4 of this time for a frame."""
 HANGS = 1.0
-"""One that has not turned for so long [s] hangs,"""
+"""A receive thread hangs if it has no turn for this time [s] and for `HUNG_CYCLES` cycles."""
 HUNG_CYCLES = 3
-"""provided that the cycle went on meanwhile: a process that was frozen as a whole has no thread that hangs."""
+"""A receive thread only hangs if more cycles than this ran without its turn: the process may have been frozen."""
 
 
 class ThreadWatch:
-    """Goes by the machine's own clock: whether threads run is no matter of simulated time."""
+    """Monitor of the receive thread, on the machine's own clock, because threads do not run in simulated time."""
 
     def __init__(self) -> None:
         self._turned = time.monotonic()
@@ -139,21 +139,21 @@ class ThreadWatch:
         self._cycles = 0
 
     def start(self) -> None:
-        """The thread starts now."""
+        """Start the time of the first turn."""
         self._turned = time.monotonic()
 
     def turn(self) -> bool:
-        """Called by the thread in every turn; whether it was frozen before."""
+        """Note a turn of the thread, and return whether the thread was frozen before it."""
         before, self._turned = self._turned, time.monotonic()
         return self._turned - before > FROZEN
 
     @property
     def is_turning(self) -> bool:
-        """Whether the thread turned lately."""
+        """Whether the last turn is recent."""
         return time.monotonic() - self._turned < HANGS
 
     def hangs(self) -> bool:
-        """Asked once per cycle: whether the thread has not turned for long, though the cycle has."""
+        """Return whether the thread has no turn although the cycle continues; call once per cycle."""
         self._cycles = 0 if self._turned != self._seen else self._cycles + 1
         self._seen = self._turned
         return self._cycles > HUNG_CYCLES and not self.is_turning

@@ -11,7 +11,7 @@ from hal.config import BusConfig
 from hal.errors import ConfigError
 from hal.wire.bus import Bus
 from hal.wire.kernel import Kernel
-from hal.wire.receive import STOCK_PERIOD
+from hal.wire.receive import STATISTICS_PERIOD
 from hal.wire.routes import BABBLE, STRANGERS, WINDOW, Routes
 
 ALLOWED = round(BABBLE * WINDOW)
@@ -101,7 +101,7 @@ def test_a_babbling_node_is_cut_off_and_told_and_the_others_are_not(bus):
     heard = {0x181: 0, 0x182: 0}
     for identifier in heard:
         bus.subscribe(identifier, lambda data, received, key=identifier: heard.update({key: heard[key] + 1}))
-    windows = round(STOCK_PERIOD / WINDOW)
+    windows = round(STATISTICS_PERIOD / WINDOW)
     for _ in range(windows):
         for _ in range(1000):
             bus.receive(frame())
@@ -111,26 +111,26 @@ def test_a_babbling_node_is_cut_off_and_told_and_the_others_are_not(bus):
     assert heard[0x182] == windows + 1
     assert heard[0x181] == windows * ALLOWED
     assert bus.counters["babbled"] == windows * (1000 - ALLOWED)
-    bus._receiver._stock = (bus._clock.monotonic() - STOCK_PERIOD, 0, None)
-    bus._receiver.take_stock(bus._clock.monotonic(), 0)
+    bus._receiver._last = (bus._clock.monotonic() - STATISTICS_PERIOD, 0, None)
+    bus._receiver.update_statistics(bus._clock.monotonic(), 0)
     assert bus.state == "warning"
-    assert bus.text == "Identifier 181h babbles: 20000 frames/s. What is beyond the limit is not handled."
+    assert bus.text == "Identifier 181h babbles: 20000 frames/s. Frames above the limit are not handled."
 
 
 def test_a_stranger_that_babbles_is_told_too(bus):
     for _ in range(20_000):
         bus.receive(frame(0x001))
-    bus._receiver._stock = (bus._clock.monotonic() - STOCK_PERIOD, 0, None)
-    bus._receiver.take_stock(bus._clock.monotonic(), 0)
+    bus._receiver._last = (bus._clock.monotonic() - STATISTICS_PERIOD, 0, None)
+    bus._receiver.update_statistics(bus._clock.monotonic(), 0)
     assert "Identifier 001h babbles: 20000 frames/s" in bus.text
 
 
 def test_a_bus_that_is_nearly_full_is_told(bus):
-    bus._receiver.take_stock(bus._clock.monotonic(), 0)
+    bus._receiver.update_statistics(bus._clock.monotonic(), 0)
     for _ in range(7000):
         bus.receive(frame())
-    bus._clock.advance(STOCK_PERIOD)
-    bus._receiver.take_stock(bus._clock.monotonic(), 0)
+    bus._clock.advance(STATISTICS_PERIOD)
+    bus._receiver.update_statistics(bus._clock.monotonic(), 0)
     assert bus.health()["load"] == pytest.approx(0.945)
     assert bus.state == "warning"
     assert bus.text.startswith("The bus is loaded to 94%.") or bus.text.startswith("Identifier 181h babbles")
@@ -143,12 +143,12 @@ def test_frames_that_the_kernel_keeps_away_load_the_bus_all_the_same(bus, tmp_pa
     kernel = Kernel("socketcan", "can0", tmp_path)
     assert kernel.received() is None
     count.write_text("1000\n")
-    bus._receiver.take_stock(bus._clock.monotonic(), 0, kernel.received())
+    bus._receiver.update_statistics(bus._clock.monotonic(), 0, kernel.received())
     for _ in range(1000):
         bus.receive(frame())
     count.write_text("8000\n")
-    bus._clock.advance(STOCK_PERIOD)
-    bus._receiver.take_stock(bus._clock.monotonic(), 0, kernel.received())
+    bus._clock.advance(STATISTICS_PERIOD)
+    bus._receiver.update_statistics(bus._clock.monotonic(), 0, kernel.received())
     assert bus.health()["load"] == pytest.approx(7000 * 135e-6)
     assert bus.text.startswith("The bus is loaded to 94%.")
     assert Kernel("hub", "can0", tmp_path).received() is None
@@ -164,21 +164,21 @@ def test_nodes_that_the_robot_file_does_not_name_are_told_until_they_are_gone(bu
     assert bus.health()["unknown"] == ["identifier 1A5h", "node 37"]
     assert bus.counters["unknown"] == 2
     for _ in range(12):
-        bus._clock.advance(STOCK_PERIOD)
-        bus._receiver.take_stock(bus._clock.monotonic(), 0)
+        bus._clock.advance(STATISTICS_PERIOD)
+        bus._receiver.update_statistics(bus._clock.monotonic(), 0)
     assert bus.health()["unknown"] == []
 
 
 @pytest.mark.parametrize("identifier", [0x080, 0x77F])
 def test_another_master_on_the_bus_is_told(bus, identifier):
     bus._receiver.has_master = True
-    bus._receiver.take_stock(bus._clock.monotonic(), 0)
+    bus._receiver.update_statistics(bus._clock.monotonic(), 0)
     bus.receive(frame(identifier, b""))
-    bus._clock.advance(STOCK_PERIOD)
-    bus._receiver.take_stock(bus._clock.monotonic(), 0)
+    bus._clock.advance(STATISTICS_PERIOD)
+    bus._receiver.update_statistics(bus._clock.monotonic(), 0)
     assert (
         bus.text
-        == f"Somebody else sends our identifier {identifier:03X}h. Is another master or another HAL on this bus?"
+        == f"Another node sends our identifier {identifier:03X}h. Is another master or another HAL on this bus?"
     )
 
 

@@ -21,7 +21,6 @@ NOT_YET = {
     "hal/finding",
     "hal/protocols",
     "hal/safety",
-    "hal/wire",
     "services/cli.py",
     "services/errors.py",
     "services/health.py",
