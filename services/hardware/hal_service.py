@@ -20,7 +20,7 @@ from services.command.lease import Lease
 from services.errors import BadArguments
 from services.process import realtime
 from services.process.loop import Loop
-from services.process.service import Service, until_told
+from services.process.service import Service, until_stopped
 from services.wire import keys, messages
 from services.wire.caller import CURRENT_CALLER, Caller
 from services.wire.messages import Status
@@ -253,7 +253,7 @@ def run_hal(config: RobotConfig, connect: Iterable[str] = (), stop: threading.Ev
     """
     realtime.prepare_process()
     robot = open_robot(config)
-    with until_told(stop) as end, Service(config.robot, "hal", connect, lambda: _describe(config)) as service:
+    with until_stopped(stop) as end, Service(config.robot, "hal", connect, lambda: _describe(config)) as service:
         log.info("HAL of robot '%s' runs (boot %d)", config.robot, service.boot)
         HalService(config, robot, service).run(end)
     return 0

@@ -13,7 +13,7 @@ from hal.config import RobotConfig
 from services.hardware.stand_in import condition_of, fault_verb, simulator_of, variant_of
 from services.process import realtime
 from services.process.loop import Loop
-from services.process.service import Service, until_told
+from services.process.service import Service, until_stopped
 from services.wire import keys, messages
 from services.wire.messages import Status
 
@@ -157,7 +157,7 @@ def run_simulator(
         "variants": list(simulator.variants),
         "conditions": list(simulator.conditions),
     }
-    with until_told(stop) as end, Service(config.robot, "simulator", connect, lambda: identity) as service:
+    with until_stopped(stop) as end, Service(config.robot, "simulator", connect, lambda: identity) as service:
         log.info("Simulator of robot '%s' runs (%s, seed %d)", config.robot, variant, seed)
         rig = simulator.rig(config, variant, seed, condition)
         return SimulatorService(config.robot, rig, service, variant).run(end)

@@ -16,7 +16,7 @@ from hal.config import RobotConfig
 from hal.errors import ConfigError
 from services.hardware.stand_in import Camera, fault_verb, simulator_of, variant_of
 from services.process.loop import Loop
-from services.process.service import Service, until_told
+from services.process.service import Service, until_stopped
 from services.wire import keys, messages
 from services.wire.messages import Status
 
@@ -139,6 +139,6 @@ def run_vision(
         name: {"unit": robot.signals[name].unit, "elements": robot.signals[name].elements} for name in robot.seen
     }
     identity = {"variant": variant, "seed": seed, "rate": RATE, "signals": signals}
-    with until_told(stop) as end, Service(robot.robot, "vision", connect, lambda: identity) as service:
+    with until_stopped(stop) as end, Service(robot.robot, "vision", connect, lambda: identity) as service:
         log.info("The camera of robot '%s' runs (%s, seed %d)", robot.robot, variant, seed)
         VisionService(robot, camera, service, variant).run(end)

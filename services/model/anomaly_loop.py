@@ -1,4 +1,4 @@
-"""The anomaly loop: how unlike normal the body is, whether its environment changed, and which element is wrong."""
+"""The anomaly loop: the deviation of the body from normal, a change of its environment, and the wrong element."""
 
 import math
 from collections import deque
@@ -14,20 +14,20 @@ from services.model.estimation import Freshness, in_order
 from services.wire.messages import Anomaly
 
 ODD = 10
-"""Newest samples above the threshold that a verdict is made from."""
+"""A verdict is made from at most this many of the newest samples above the threshold."""
 JUDGE_EVERY = 0.3
-"""Time [s] between two verdicts; one costs as much as some hundred scores."""
-VERDICTS = 10.0
-"""How often [Hz] it is looked whether a verdict is due."""
+"""Verdicts are at least this far apart [s]; one costs as much as about 100 scores."""
+VERDICT_RATE = 10.0
+"""The loop of the verdicts runs at this rate [Hz]."""
 PATIENCE = 1.0
-"""An anomaly that nobody came to judge within this time [s] is told without a verdict."""
+"""An anomaly without a verdict after this time [s] is published without one."""
 
 
 class AnomalyWatch:
-    """Makes one `Anomaly` per tick; an anomaly is one only after it has lasted.
+    """The source of one `Anomaly` per tick. A high score counts as an anomaly only after some time.
 
-    While scores are above the threshold the samples are kept, and a verdict is made from all of them now and then: by
-    `judge`, which is slow and belongs into a loop of its own.
+    While scores are above the threshold, the samples are kept, and `judge` makes verdicts from them. It is slow and
+    has a loop of its own.
     """
 
     def __init__(
@@ -38,7 +38,7 @@ class AnomalyWatch:
         publish: Callable[[Anomaly], None],
         clock: Clock,
     ) -> None:
-        """`after` is how long [s] the score must stay above its threshold."""
+        """Prepare; `after` is the time [s] that the score must stay above its threshold."""
         self._freshness, self._schema, self._after, self._publish, self._clock = (
             freshness,
             schema,
@@ -51,20 +51,20 @@ class AnomalyWatch:
         self._last_cycle = -1
         self._scored: tuple[BodySchema, Numbers, Deviation, str] | None = None
         self._judged: tuple[float, float, Verdict] | None = None
-        """When the scores that were judged rose above the threshold, when the verdict was made, and the verdict."""
+        """This holds the time at which the judged scores rose above the threshold, that of the verdict, and it."""
         self.latest: Anomaly | None = None
 
     def tick(self) -> None:
-        """Score the newest sample; NaN, and nobody is blamed, without a fresh one or without normal data."""
+        """Score the newest sample; NaN and no blame without a fresh sample or without normal data."""
         fresh, values = self._freshness.take()
         schema, known = self._schema(), self._scored
         if known is None or known[0] is not schema or known[1] is not values:  # a sample is scored once
-            score = deviation_of(schema, in_order(schema, values).flat)
-            known = self._scored = schema, values, score, score.largest(schema)
-        found = known[2]
+            deviation = deviation_of(schema, in_order(schema, values).flat)
+            known = self._scored = schema, values, deviation, deviation.largest(schema)
+        deviation = known[2]
         now = self._clock.monotonic()
         cycle = -1 if fresh is None else fresh.message.cycle
-        if found.distance > found.threshold:
+        if deviation.distance > deviation.threshold:
             self._above_since = min(self._above_since, now)
             if cycle != self._last_cycle or not self._odd:
                 self._odd.append(values)
@@ -72,37 +72,37 @@ class AnomalyWatch:
             self._above_since = math.inf
             self._odd.clear()
         self._last_cycle = cycle
-        self._tell(schema, found, known[3], cycle, now)
+        self._report(schema, deviation, known[3], cycle, now)
 
     def judge(self) -> None:
-        """Make a verdict if one is due: the score has been above the threshold for long enough, and the last is old."""
+        """Make a verdict if the score has been above the threshold for long enough and the last verdict is old."""
         since, now = self._above_since, self._clock.monotonic()
         is_judged = self._judged is not None and self._judged[0] == since and now - self._judged[1] < JUDGE_EVERY
         if now - since >= self._after and not is_judged:
             self._judged = since, now, judge(self._schema(), list(self._odd))
 
     def summary(self) -> dict[str, Any]:
-        """What the last tick found, without the parts of each signal; empty before the first."""
+        """Return the result of the last tick without the contributions; empty before the first."""
         latest = self.latest
         if latest is None:
             return {}
         return {name: getattr(latest, name) for name in ("score", "threshold", "is_anomaly", "verdict", "blamed")}
 
-    def _tell(self, schema: BodySchema, found: Deviation, largest: str, cycle: int, now: float) -> None:
+    def _report(self, schema: BodySchema, deviation: Deviation, largest: str, cycle: int, now: float) -> None:
         known = self._judged
         verdict = known[2] if known is not None and known[0] == self._above_since else None
-        kind = "normal" if found.distance <= found.threshold else "" if verdict is None else verdict.kind
+        kind = "normal" if deviation.distance <= deviation.threshold else "" if verdict is None else verdict.kind
         has_lasted = now - self._above_since >= self._after + (PATIENCE if verdict is None else 0.0)
-        elements = Elements.of({one.name: one.size for one in schema.out_layout.signals})
+        elements = Elements.of({signal.name: signal.size for signal in schema.out_layout.signals})
         self.latest = Anomaly(
             stamp_ns=self._clock.now_ns(),
             cycle=cycle,
-            score=found.distance,
-            threshold=found.threshold,
+            score=deviation.distance,
+            threshold=deviation.threshold,
             is_anomaly=has_lasted and kind != "environment",
             blamed=verdict.blamed if verdict is not None and verdict.blamed else largest,
             elements=elements,
-            contribution=Numbers(found.contribution, elements),
+            contribution=Numbers(deviation.contribution, elements),
             verdict=kind,
         )
         self._publish(self.latest)

@@ -1,4 +1,4 @@
-"""Where a robot's data, model and recordings lie, and whether a model was made for a robot file."""
+"""Paths of a robot's data and model, and the fingerprint that links a model to a robot file."""
 
 import hashlib
 import json
@@ -13,17 +13,17 @@ ROBOTS = Path("robots")
 
 
 def data_path(robot: str) -> Path:
-    """Collected episodes."""
+    """Return the path of the collected episodes."""
     return RUNS / robot / "data.npz"
 
 
 def model_folder(robot: str) -> Path:
-    """The trained body schema."""
+    """Return the folder of the trained body schema."""
     return RUNS / robot / "model"
 
 
 def fingerprint(robot: RobotConfig) -> str:
-    """Hash of what a model depends on: the signals, and how the robot file wants data collected and it trained."""
+    """Hash the parts of the robot file that a model depends on: signals, conditions, collection and training."""
     model = model_config(robot)
     content = {
         "signals": {name: list(robot.signals[name].elements) for name in model.signals or robot.signals},
@@ -35,10 +35,10 @@ def fingerprint(robot: RobotConfig) -> str:
 
 
 def robot_file(text: str) -> Path:
-    """A robot file from its path or from the robot's name (`musashi_arm`).
+    """Return the path of a robot file, given its path or the robot's name (`musashi_arm`).
 
     Raises:
-        ConfigError: There is neither.
+        ConfigError: There is no such file.
     """
     path = Path(text)
     if path.suffix in (".yaml", ".yml") or path.exists():

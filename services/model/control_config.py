@@ -1,4 +1,4 @@
-"""The `control` and `simulation` parts of a robot file's model section, and what they make of a model."""
+"""The `control` and `simulation` parts of a robot file's model section, and their controller and simulator."""
 
 from typing import Annotated, Literal, Self
 
@@ -23,24 +23,24 @@ KINDS: dict[str, tuple[str, ...]] = {
     "hold": ("value",),
     "torque_balance": ("weight", "position", "tension", "length", "at"),
 }
-"""Term -> the keys it takes beside its own."""
+"""This maps each term to the keys that it takes beside its own."""
 
 
 class TermConfig(Section):
-    """One wish: one key of a kind with the signal it is about, and what that kind takes."""
+    """One term of the loss: the key of its kind with a signal, and the options of that kind."""
 
     match: str | None = None
-    """Reach the reference of a signal, or `value`; through `matrix` if there is one."""
+    """This term reaches the reference of a signal, or `value`; through `matrix` if given."""
     stay_near: str | None = None
-    """Keep a signal near a reference, near `value`, or near where it is."""
+    """This term keeps a signal near a reference, near `value`, or near its present value."""
     stay_small: str | None = None
-    """Keep a signal near its physical zero."""
+    """This term keeps a signal near its physical zero."""
     hold: str | None = None
-    """Force a signal to a reference or to `value` (.nan: this element is free)."""
+    """This constraint forces a signal to a reference or to `value` (.nan: this element is free)."""
     torque_balance: str | None = None
-    """`module:name` of the joint torque [N m] that the muscles must supply at a posture [rad]."""
+    """This is `module:name` of the joint torque [N m] that the muscles must supply at a posture [rad]."""
     weight: Weight | None = None
-    """Loss per standard deviation (per SI unit with `unit: si`), and per N m of torque."""
+    """The weight is the loss per standard deviation (per SI unit with `unit: si`), or per N m of torque."""
     value: tuple[float, ...] | None = None
     matrix: tuple[tuple[Finite, ...], ...] | None = None
     unit: Literal["std", "si"] | None = None
@@ -48,7 +48,7 @@ class TermConfig(Section):
     tension: str | None = None
     length: str | None = None
     at: Literal["reference", "predicted"] | None = None
-    """Whether torque is balanced at the reference posture or at the predicted one."""
+    """Torque is balanced at this posture."""
 
     @model_validator(mode="after")
     def _one_kind(self) -> Self:
@@ -63,51 +63,51 @@ class TermConfig(Section):
 
     @property
     def signals(self) -> tuple[str, ...]:
-        """The signals it names."""
+        """Names of its signals."""
         names = (self.match, self.stay_near, self.stay_small, self.hold, self.position, self.tension, self.length)
         return tuple(name for name in names if name is not None)
 
     def term(self) -> Term | Hold:
-        """What it means.
+        """Make the term.
 
         Raises:
-            SchemaError: The numbers make no sense together.
+            SchemaError: Its numbers do not fit together.
         """
         kind = next(kind for kind in KINDS if getattr(self, kind) is not None)
         options = {name: getattr(self, name) for name in KINDS[kind] if getattr(self, name) is not None}
         if kind == "torque_balance":
             return TorqueBalance(registry.load_object(str(self.torque_balance)), **options)
-        made: type[Match | StayNear | StaySmall | Hold]
-        made = {"match": Match, "stay_near": StayNear, "stay_small": StaySmall, "hold": Hold}[kind]
-        return made(getattr(self, kind), **options)
+        term: type[Match | StayNear | StaySmall | Hold]
+        term = {"match": Match, "stay_near": StayNear, "stay_small": StaySmall, "hold": Hold}[kind]
+        return term(getattr(self, kind), **options)
 
 
 class ControlConfig(Section):
-    """What the controller reaches, and what else it minds (paper, II-I and III)."""
+    """The target signal and the loss of the controller (paper, II-I and III)."""
 
     target: str
-    """The signal that targets are given for."""
+    """Targets are values of this signal."""
     route: Route = "auto"
     """`auto` is the paper's rule; see `gemuco.controller`."""
     mask: tuple[str, ...] | None = None
-    """With route mask or input: the signals the network is given."""
+    """With route mask or input, the network is given these signals."""
     terms: tuple[TermConfig, ...] = ()
-    """To match the target if none is named."""
+    """Without terms, the loss is to match the target."""
     speed: Positive = 1.0
-    """Speed [unit/s] at which the reference moves from where the body is to the target."""
+    """The reference moves from the present posture to the target at this speed [unit/s]."""
 
 
 class SimulationConfig(Section):
-    """What state a command brings about (paper, II-J)."""
+    """The simulation of the state that a command leads to (paper, II-J)."""
 
     route: Route = "auto"
     mask: tuple[str, ...] | None = None
     terms: tuple[TermConfig, ...] = ()
-    """Constraints; to match the command is added if none is about it."""
+    """These are constraints; one that matches the command is added if they do not contain it."""
 
 
 def terms_of(config: ControlConfig | SimulationConfig) -> tuple[Term | Hold, ...]:
-    """The section's terms; a controller's are at least to match its target."""
+    """Return the section's terms; a controller without terms matches its target."""
     if isinstance(config, ControlConfig) and not config.terms:
         return (Match(config.target),)
     return tuple(term.term() for term in config.terms)
@@ -119,10 +119,10 @@ def controller_of(
     config: ControlConfig,
     search: DescentConfig | NewtonConfig | None = None,
 ) -> Controller:
-    """The robot file's controller, which stays inside the limits of the commanded signal.
+    """Make the robot file's controller, which stays inside the limits of the commanded signal.
 
     Raises:
-        SchemaError: This model cannot control; the text says what it lacks.
+        SchemaError: This model cannot control; the text names what is missing.
     """
     signal = robot.command.signal
     limits = {signal: robot.bounds(signal)}
@@ -130,10 +130,10 @@ def controller_of(
 
 
 def simulator_of(schema: BodySchema, robot: RobotConfig, config: SimulationConfig) -> Simulator:
-    """The robot file's simulator.
+    """Make the robot file's simulator.
 
     Raises:
-        SchemaError: This model cannot simulate; the text says what it lacks.
+        SchemaError: This model cannot simulate; the text names what is missing.
     """
     return Simulator(schema, terms_of(config), robot.command.signal, config.route, mask=_mask(config))
 
@@ -143,7 +143,7 @@ def _mask(config: ControlConfig | SimulationConfig) -> frozenset[str] | None:
 
 
 def named_signals(config: ControlConfig | SimulationConfig) -> list[tuple[str, str]]:
-    """(key, signal) of every signal that the section names, for a look at whether it exists."""
-    found = [("target", config.target)] if isinstance(config, ControlConfig) else []
-    found += [("mask", name) for name in config.mask or ()]
-    return found + [(f"terms.{index}", name) for index, term in enumerate(config.terms) for name in term.signals]
+    """Return (key, signal) for every signal that the section names."""
+    names = [("target", config.target)] if isinstance(config, ControlConfig) else []
+    names += [("mask", name) for name in config.mask or ()]
+    return names + [(f"terms.{index}", name) for index, term in enumerate(config.terms) for name in term.signals]

@@ -1,4 +1,4 @@
-"""The control loop: targets in, commands out, nothing without being engaged and nothing on an old sample."""
+"""The control loop: targets in, commands out. It commands only while engaged and on a fresh sample."""
 
 import math
 import threading
@@ -17,26 +17,26 @@ from services.wire.plain_text import shown
 from services.wire.streams import Arrival
 
 BUMP = 0.3
-"""Time constant [s] in which the first command's distance from where the servos are fades out."""
+"""The difference between the first command and the measured value decays with this time constant [s]."""
 LONGEST_STEP = 0.1
-"""A tick that comes later than this [s] moves the reference no further than one that comes in time."""
+"""A late tick moves the reference at most as far as this time [s] allows."""
 LIVE_MODES = ("hold", "follow")
 DEAD_MODES = ("off", "homing", "stopping", "fault")
 
 
 class Solver(Protocol):
-    """Something that finds the command [its unit], shape (n,), that brings about a target."""
+    """A solver for the command that reaches a target."""
 
     def __call__(self, target: Mapping[str, np.ndarray], now: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Solve for signal -> reference, starting from signal -> value now."""
+        """Return the command [its unit], shape (n,), for signal -> reference, starting from signal -> value now."""
         ...
 
 
 def check_target(robot: RobotConfig, config: ControlConfig, target: Target) -> np.ndarray:
-    """The reference [unit of the target signal], shape (n,).
+    """Return the reference of a valid target [unit of its signal], shape (n,).
 
     Raises:
-        TargetRefused: Not the signal that is controlled, a wrong size, not a number, or outside of the limits.
+        TargetRefused: It has another signal, a wrong size, a value that is not a number, or is outside of the limits.
     """
     if target.signal not in robot.signals:
         raise TargetRefused(f"Target signal {shown(target.signal)} is not a signal. Known: {', '.join(robot.signals)}.")
@@ -58,7 +58,7 @@ def check_target(robot: RobotConfig, config: ControlConfig, target: Target) -> n
 
 
 class Control:
-    """Moves a reference towards the target, solves for the command, and sends it while that is safe."""
+    """The controller: it moves a reference towards the target, solves for the command, and sends it while safe."""
 
     def __init__(
         self,
@@ -71,12 +71,12 @@ class Control:
         send: Callable[[Command], None],
         clock: Clock,
     ) -> None:
-        """`newest` and `applied` return what the HAL said last."""
+        """Prepare; `newest` and `applied` return the newest messages of the HAL."""
         self._robot, self._config, self._clock = robot, config, clock
         self._newest, self._applied, self._estimation = newest, applied, estimation
         self._solver, self._send = solver, send
         self._lock = threading.Lock()
-        self._led_in_at = -math.inf
+        self._bump_begins = -math.inf
         self._ticked_at = -math.inf
         self._was_live = False
         self._reference: np.ndarray | None = None
@@ -87,24 +87,24 @@ class Control:
         self.counters = {"sent": 0, "waited": 0, "refused_targets": 0}
 
     def set_target(self, target: Target) -> None:
-        """Where to go from now on.
+        """Set a new target.
 
         Raises:
-            TargetRefused: It cannot be reached safely; the target before stays.
+            TargetRefused: The target is not valid; the one before stays.
         """
         values = check_target(self._robot, self._config, target)
         with self._lock:
             self._target, self.text = values, ""
 
     def try_target(self, target: Target, check: Callable[[Target], None] = lambda _: None) -> None:
-        """Take a published target, whose sender waits for no answer; a refusal is counted, and reported by `facts`.
+        """Set a published target, whose sender gets no answer; `facts` reports and counts refusals.
 
         Args:
-            target: The target as it was published.
+            target: The published target.
             check: Raises `CommandHeld` or `TooLate` if it must not be followed.
 
         Raises:
-            TargetRefused, CommandHeld, TooLate: The refusal.
+            TargetRefused, CommandHeld, TooLate: It is refused.
         """
         try:
             check(target)
@@ -115,13 +115,13 @@ class Control:
             raise
 
     def engage(self, enable: Callable[[], Any]) -> None:
-        """Take over from where the body is, and ask the HAL to enable.
+        """Start from the present posture, and ask the HAL to enable.
 
         Raises:
             NotEngaged: There is no fresh sample, or the posture can neither be measured nor estimated.
         """
         if self._fresh() is None:
-            raise NotEngaged("No fresh sample comes from the HAL, so there is nothing to start from. Is it running?")
+            raise NotEngaged("No fresh sample comes from the HAL, so the posture is unknown. Is it running?")
         posture = self._posture()
         if posture is None:
             raise NotEngaged(f"'{self._config.target}' can neither be measured nor estimated, so nothing is engaged.")
@@ -132,19 +132,19 @@ class Control:
             self._ticked_at = self._clock.monotonic()
             self.engaged, self.text = True, ""
 
-    def disengage(self, why: str = "") -> None:
-        """Send nothing any more; the HAL then holds, and disables."""
+    def disengage(self, reason: str = "") -> None:
+        """Stop commanding; the HAL then holds, and disables."""
         with self._lock:
-            self.engaged, self.text = False, why
+            self.engaged, self.text = False, reason
             self._target = self._reference = None
 
     def tick(self) -> None:
-        """Send one command, if engaged, on a fresh sample, and the drives follow."""
+        """Send one command if engaged, on a fresh sample, and in a mode in which the drives follow."""
         if not self.engaged:
             return
         fresh, mode = self._fresh(), self._mode()
         if self._was_live and mode in DEAD_MODES:
-            self.disengage(f"The HAL went to '{mode}', so the controller let go. Engage it again when that is mended.")
+            self.disengage(f"The HAL went to '{mode}', so the controller disengaged. Engage it again after repair.")
             return
         if fresh is None or mode not in LIVE_MODES or self._estimation.latest is None:
             self.counters["waited"] += 1
@@ -163,7 +163,7 @@ class Control:
             self.counters["sent"] += 1
 
     def facts(self) -> dict[str, Any]:
-        """For the status message."""
+        """Return the state for the status message."""
         with self._lock:
             target = [] if self._target is None else self._target.tolist()
             reference = [] if self._reference is None else self._reference.tolist()
@@ -193,16 +193,16 @@ class Control:
         step = self._config.speed * min(now - self._ticked_at, LONGEST_STEP)
         self._ticked_at = now
         if self._reference is not None and self._target is not None:
-            way = self._target - self._reference
-            longest = float(np.abs(way).max())
-            self._reference = self._target if longest <= step else self._reference + way * (step / longest)
+            distance = self._target - self._reference
+            longest = float(np.abs(distance).max())
+            self._reference = self._target if longest <= step else self._reference + distance * (step / longest)
         return self._reference
 
     def _command(self, reference: np.ndarray, now: Mapping[str, np.ndarray]) -> np.ndarray:
-        """The solved command, led in from where the servos stand when the controller took over."""
-        solved = self._solver({self._config.target: reference}, now)
+        """Solve for the command, and blend it in from the measured values at the first tick."""
+        solution = self._solver({self._config.target: reference}, now)
         measured = now[self._robot.command.signal]
         if self._bump is None:
-            self._bump = np.where(np.isfinite(measured), measured - solved, 0.0)
-            self._led_in_at = self._clock.monotonic()
-        return solved + self._bump * math.exp(-(self._clock.monotonic() - self._led_in_at) / BUMP)
+            self._bump = np.where(np.isfinite(measured), measured - solution, 0.0)
+            self._bump_begins = self._clock.monotonic()
+        return solution + self._bump * math.exp(-(self._clock.monotonic() - self._bump_begins) / BUMP)

@@ -1,4 +1,4 @@
-"""The estimation loop: stale is masked, estimated, and marked as estimated."""
+"""The estimation loop: stale values are masked, estimated, and marked as estimated."""
 
 import math
 from bisect import bisect_left
@@ -18,15 +18,15 @@ from services.wire.messages import Estimates, Sample
 from services.wire.streams import Arrival
 
 Newest = Callable[[], Arrival[Sample] | None]
-"""Returns the last sample that arrived, however old."""
+"""A function of this type returns the newest sample, of any age."""
 
 
 class Freshness:
-    """What of the newest samples, the HAL's and the camera's, may be used now.
+    """The usable values of the newest samples of the HAL and the camera; stale and invalid elements are masked.
 
-    A value may be as old as its signal's `stale_after` when it is published, and the sample may wait as long again on
-    its way and here, since that happens on a busy machine. With the default of 20 ms a silent sensor is noticed within
-    40 ms. Each signal is taken from the process that the robot file says is its source, and from no other.
+    A value may be as old as its signal's `stale_after` when it is published, and the sample may be delayed by the same
+    time, as happens on a busy machine. With the default of 20 ms a silent sensor is noticed within 40 ms. Each signal
+    is taken only from the process that the robot file gives as its source.
     """
 
     def __init__(
@@ -41,10 +41,10 @@ class Freshness:
 
         Args:
             robot: The robot file.
-            newest: Returns the last sample of the HAL, however old.
-            clock: Of this process.
-            seen: Returns the last sample of the camera's process, however old.
-            names: The model's signals in its own order; in the robot file's if not given.
+            newest: Returns the newest sample of the HAL, of any age.
+            clock: Source of time.
+            seen: Returns the newest sample of the camera's process, of any age.
+            names: The model's signals in its own order; by default in that of the robot file.
         """
         self.elements = Elements.of({name: robot.signals[name].size for name in names or layout_of(robot).names})
         self._hal = _Source(robot, self.elements, "hal")
@@ -52,43 +52,43 @@ class Freshness:
         self._newest, self._seen, self._clock = newest, seen, clock
         nothing = _unwritable(np.full(self.elements.size, np.nan))
         self._nothing = nothing, False
-        self._told: tuple[np.ndarray, np.ndarray, Numbers] = nothing, nothing, Numbers(nothing, self.elements)
+        self._joined: tuple[np.ndarray, np.ndarray, Numbers] = nothing, nothing, Numbers(nothing, self.elements)
 
     def take(self) -> tuple[Arrival[Sample] | None, Numbers]:
-        """The HAL's newest sample, and all usable values [unit], shapes (n,); NaN where invalid or stale by now.
+        """Return the HAL's newest sample, and all usable values [unit], shapes (n,); NaN where invalid or stale.
 
-        The sample is None if nothing of it is usable; what the camera sees may be usable then. Nobody may write into
-        the arrays: they are the same, in the same object, until another sample comes or something becomes stale. Any
-        thread may ask.
+        The sample is None if no value of it is usable; values of the camera may be usable then. The arrays are
+        read-only: the same object is returned until another sample comes or a value becomes stale. Any thread may call
+        this.
         """
         now, fresh = self._clock.monotonic(), self._newest()
         measured, is_there = self._nothing if fresh is None else self._hal.usable(fresh, now)
         seen = self._nothing[0]
         if self._vision is not None and self._seen is not None and (shot := self._seen()) is not None:
             seen, _ = self._vision.usable(shot, now)
-        told = self._told
-        if told[0] is not measured or told[1] is not seen:
+        joined = self._joined
+        if joined[0] is not measured or joined[1] is not seen:
             both = measured if seen is self._nothing[0] else np.where(np.isnan(measured), seen, measured)
-            told = self._told = measured, seen, Numbers(_unwritable(both), self.elements)
-        return (fresh if is_there else None), told[2]
+            joined = self._joined = measured, seen, Numbers(_unwritable(both), self.elements)
+        return (fresh if is_there else None), joined[2]
 
 
 class _Source:
-    """What may be used of the samples of one process."""
+    """The usable values of the samples of one process."""
 
     def __init__(self, robot: RobotConfig, elements: Elements, source: str) -> None:
         self._elements, self._names = elements, [n for n in elements.counts if robot.signals[n].source == source]
         stale = [np.full(count, robot.signals[name].stale_after) for name, count in elements.counts.items()]
         self._stale_after = np.concatenate(stale)
         self._limits = sorted({robot.signals[name].stale_after for name in self._names})
-        """After these times [s] of waiting some of it becomes stale."""
+        """Values become stale after these times [s]."""
         self._layout: tuple[Elements, tuple[np.ndarray, np.ndarray]] | None = None
         self._read: tuple[Sample, np.ndarray, bool] | None = None
-        """The sample that was read last, what of it could be used when it was published, and whether anything could."""
+        """This holds the last sample, its usable values when it was published, and whether there was any."""
         self._kept: tuple[np.ndarray, int, np.ndarray, bool] | None = None
 
     def usable(self, fresh: Arrival[Sample], now: float) -> tuple[np.ndarray, bool]:
-        """Every element of the model [unit], shape (size,), NaN where it must not be used now; and whether any may."""
+        """Return all elements of the model [unit], shape (size,), NaN where not usable; and whether any is usable."""
         read, kept = self._read, self._kept
         if read is None or read[0] is not fresh.message:
             read = self._read = fresh.message, *self._published(fresh.message)
@@ -98,22 +98,22 @@ class _Source:
             return published, is_any
         if kept is None or kept[0] is not published or kept[1] != passed:
             left = self._limits[passed] if passed < len(self._limits) else math.inf
-            found = _unwritable(np.where(self._stale_after >= left, published, np.nan))
-            kept = self._kept = published, passed, found, bool(np.isfinite(found).any())
+            values = _unwritable(np.where(self._stale_after >= left, published, np.nan))
+            kept = self._kept = published, passed, values, bool(np.isfinite(values).any())
         return kept[2], kept[3]
 
     def _published(self, sample: Sample) -> tuple[np.ndarray, bool]:
-        """What could be used when a sample was published, and whether anything could."""
+        """Return the values that were usable when the sample was published, and whether there was any."""
         layout = self._layout
         if layout is None or layout[0] is not sample.elements:
             layout = self._layout = sample.elements, self._places(sample.elements)
-        found = np.empty(self._elements.size)
+        row = np.empty(self._elements.size)
         values, valid, age = sample.values.flat, sample.valid.flat, sample.age.flat
-        is_any = usable(values, valid, age, *layout[1], self._stale_after, found)
-        return _unwritable(found), is_any
+        is_any = usable(values, valid, age, *layout[1], self._stale_after, row)
+        return _unwritable(row), is_any
 
     def _places(self, theirs: Elements) -> tuple[np.ndarray, np.ndarray]:
-        """Where the model's elements lie in a sample, and where here; a signal of another size is as good as silent."""
+        """Return the indices of the model's elements in a sample, and here; a signal of another size is ignored."""
         names = [name for name in self._names if theirs.counts.get(name) == self._elements.counts[name]]
         of, to = ([np.r_[all_of.places[name]] for name in names] for all_of in (theirs, self._elements))
         nowhere = np.zeros(0, int)
@@ -126,16 +126,16 @@ def _unwritable(array: np.ndarray) -> np.ndarray:
 
 
 def in_order(schema: BodySchema, values: Numbers) -> Numbers:
-    """The same values in the order of the schema's layout, which may be another one than the robot file's."""
+    """Return the values in the order of the schema's layout, which may differ from that of the robot file."""
     if tuple(values.elements.counts) == schema.layout.names:
         return values
-    found = Numbers.of(values, Elements.of({one.name: one.size for one in schema.layout.signals}))
-    _unwritable(found.flat)
-    return found
+    ordered = Numbers.of(values, Elements.of({signal.name: signal.size for signal in schema.layout.signals}))
+    _unwritable(ordered.flat)
+    return ordered
 
 
 class Estimation:
-    """Makes one `Estimates` per tick from the newest sample."""
+    """The source of one `Estimates` per tick, from the newest sample."""
 
     def __init__(
         self,
@@ -144,35 +144,35 @@ class Estimation:
         publish: Callable[[Estimates], None],
         clock: Clock,
     ) -> None:
-        """`schema` returns the body schema in use at the moment."""
+        """Prepare; `schema` returns the body schema in use."""
         self._freshness, self._schema, self._publish, self._clock = freshness, schema, publish, clock
-        self._told: tuple[BodySchema, Numbers] | None = None
-        """The schema and the values that `latest` was made from."""
+        self._source: tuple[BodySchema, Numbers] | None = None
+        """This holds the schema and the values of `latest`."""
         self._newest: Sample | None = None
         self._waited: float | None = None
         self.latest: Estimates | None = None
 
     def tick(self) -> None:
-        """Publish what is measured, and estimates in place of what is not; nothing is computed twice."""
+        """Publish measured values, and estimates of the others; equal input is computed once."""
         now = self._clock.monotonic()
         fresh, values = self._freshness.take()
         self._waited = None if fresh is None or fresh.message is self._newest else now - fresh.received
         self._newest = None if fresh is None else fresh.message
         schema, stamp_ns = self._schema(), self._clock.now_ns()
         cycle = -1 if fresh is None else fresh.message.cycle
-        told = self._told
-        if self.latest is not None and told is not None and told[0] is schema and told[1] is values:
+        source = self._source
+        if self.latest is not None and source is not None and source[0] is schema and source[1] is values:
             self.latest = replace(self.latest, stamp_ns=stamp_ns, cycle=cycle)
         else:
-            self.latest, self._told = _estimates(schema, in_order(schema, values), stamp_ns, cycle), (schema, values)
+            self.latest, self._source = _estimates(schema, in_order(schema, values), stamp_ns, cycle), (schema, values)
         self._publish(self.latest)
 
     def waited(self) -> float | None:
-        """How long [s] the HAL's sample had waited when the last tick began; None if it was not a new one."""
+        """Return the waiting time [s] of the HAL's sample at the start of the last tick; None if it was not new."""
         return self._waited
 
     def counts(self) -> dict[str, int]:
-        """How many signals were `measured`, `estimated` and `none` of both in the last tick."""
+        """Count the signals that were `measured`, `estimated`, or neither (`none`) in the last tick."""
         methods = list(self.latest.method.values()) if self.latest is not None else []
         measured, none = methods.count("measured"), methods.count("none")
         return {"measured": measured, "estimated": len(methods) - measured - none, "none": none}

@@ -17,7 +17,7 @@ from hal.clock import SystemClock
 from hal.config import RobotConfig
 from services.command.intake import Intake
 from services.command.permission import Permission
-from services.model.anomaly_loop import VERDICTS, AnomalyWatch
+from services.model.anomaly_loop import VERDICT_RATE, AnomalyWatch
 from services.model.control_config import ControlConfig, controller_of
 from services.model.control_loop import Control
 from services.model.estimation import Estimation, Freshness
@@ -37,32 +37,31 @@ from services.wire.streams import Reader
 log = logging.getLogger(__name__)
 
 SEARCH = NewtonConfig(iterations=12)
-"""Each tick goes on where the last one ended, so few steps suffice."""
+"""Few steps suffice, because each tick starts from the last solution."""
 SHARE = 0.5
-"""Part of its period that a solve may take; then the best command found so far is sent, and counted as late."""
+"""A solve may take this share of its period; then the best command so far is sent, and counted as late."""
 SETTLED = 1e-3
-"""A solve that moves the command by less than this share of its range (of 1 where it has none) has found it; it stays
-until the reference or the model is another."""
+"""A solve that moves the command by less than this share of its range (of 1 without a range) has converged. The command
+then stays until the reference or the model changes."""
 NETWORK_PRIORITY = 45
 STATUS_PRIORITY = 10
-"""A status takes a millisecond, once a second: a loop may not wait for it."""
+"""The status is less urgent than any loop that keeps time: it takes 1 ms, once a second."""
 PRIORITIES = {"estimation": 40, "control": 35, "anomaly": 30, "update": 10, "verdict": 10}
-"""SCHED_FIFO where the system allows it; learning and judging are lowest but not without, or they would hold the
-interpreter up."""
+"""These are SCHED_FIFO priorities, where the system allows it. Learning and verdicts have the lowest ones, but not
+none: they would hold the interpreter lock while other processes run."""
 OFFSETS = {"estimation": 0.8e-3, "anomaly": 1.4e-3, "control": 1.9e-3, "update": 7.4e-3, "verdict": 29.4e-3}
-"""When they begin [s] after the multiples of their periods, so that at usual rates no two begin at once, none with the
-HAL, which begins at those multiples, and learning when a solve for a command, which takes a millisecond or two, has
-ended."""
+"""Each loop begins this time [s] after the multiples of its period. At usual rates no two begin together, none begins
+with the HAL, which begins at those multiples, and learning begins after a solve, which takes 1 to 2 ms."""
 
 
 class ModelSolver:
-    """The controller of whichever model is in use."""
+    """The controller of the model in use."""
 
     def __init__(self, living: LivingModel, robot: RobotConfig, config: ControlConfig) -> None:
         """Prepare for the robot file's control section.
 
         Raises:
-            SchemaError: This model cannot control; the text says what it lacks.
+            SchemaError: This model cannot control; the text names what is missing.
         """
         schema = living.schema
         self._living = living
@@ -73,25 +72,25 @@ class ModelSolver:
         self._reference = np.zeros(0)
         low, high = robot.bounds(robot.command.signal)
         self._range = np.where(np.isfinite(high - low), high - low, 1.0)
-        self._is_found = False
+        self._has_converged = False
         self._command = np.full(len(low), np.nan)
         self._target = config.target
         self._within = SHARE / robot.rates.control
         self.late = 0
-        """Solves that ran out of time."""
+        """This is the number of solves that ran out of time."""
 
     def __call__(self, target: Mapping[str, np.ndarray], now: Mapping[str, np.ndarray]) -> np.ndarray:
-        """The command [its unit], shape (n,), that brings about a target."""
+        """Return the command [its unit], shape (n,), that reaches a target."""
         schema, reference = self._living.schema, target[self._target]
         is_swapped = self._controller.schema is not schema
         if is_swapped:
             self._controller.swap(schema)
         if is_swapped or not np.array_equal(reference, self._reference):
-            self._reference, self._is_found, self._command = reference, False, np.full_like(self._command, np.nan)
-        if not self._is_found:
+            self._reference, self._has_converged, self._command = reference, False, np.full_like(self._command, np.nan)
+        if not self._has_converged:
             solution = self._controller.solve(target, now, self._within)
             moved = np.abs(solution.command - self._command) / self._range
-            self._is_found = not solution.is_late and bool((moved < SETTLED).all())
+            self._has_converged = not solution.is_late and bool((moved < SETTLED).all())
             self._command = solution.command
             self.late += solution.is_late
         return self._command
@@ -101,7 +100,7 @@ class GemucoService:
     """The four loops of one robot, bound to its session."""
 
     def __init__(self, robot: RobotConfig, schema: BodySchema, service: Service) -> None:
-        """Subscribe, publish and prepare; nothing ticks yet."""
+        """Subscribe, publish and prepare; the loops do not run yet."""
         self.robot, self.config, self.service = robot, model_config(robot), service
         self.clock = SystemClock()
         self.living = LivingModel(schema)
@@ -119,9 +118,9 @@ class GemucoService:
         self.freshness = Freshness(
             robot, self._samples.last, self.clock, None if self._seen is None else self._seen.last, schema.layout.names
         )
-        self.history = HistoryRing({one.name: one.size for one in schema.layout.signals}, robot.rates.estimation)
+        self.history = HistoryRing({s.name: s.size for s in schema.layout.signals}, robot.rates.estimation)
         self._estimates = service.publisher(keys.estimate(robot.robot), Estimates)
-        self.estimation = Estimation(self.freshness, self._schema, self._tell, self.clock)
+        self.estimation = Estimation(self.freshness, self._schema, self._publish, self.clock)
         self.anomaly = AnomalyWatch(
             self.freshness,
             self._schema,
@@ -148,7 +147,7 @@ class GemucoService:
     def _make_loops(self) -> list[Loop]:
         rates, estimation, anomaly = self.robot.rates, self.estimation, self.anomaly
         times = max(rates.estimation, rates.hal) / min(rates.estimation, rates.hal)
-        # Of rates that do not divide each other samples come at every moment of a period: there is nothing to keep to.
+        # If the rates do not divide each other, samples come at varying phases, and the loop cannot follow them.
         waited = estimation.waited if times.is_integer() else None
 
         def loop(name: str, rate: float, tick: Callable[[], None], **options: Any) -> Loop:
@@ -159,11 +158,11 @@ class GemucoService:
             loop("control", rates.control, self._control_tick),
             loop("anomaly", rates.anomaly, anomaly.tick),
             loop("update", rates.update, self.update.tick),
-            loop("verdict", VERDICTS, anomaly.judge),
+            loop("verdict", VERDICT_RATE, anomaly.judge),
         ]
 
     def enable_hal(self) -> dict[str, Any]:
-        """Ask the HAL to enable the drives, on behalf of whoever asks."""
+        """Ask the HAL to enable the drives, on behalf of the caller."""
         caller = CURRENT_CALLER.get()
         key = keys.verb(self.robot.robot, "hal", "enable")
         answer = query.ask(self.service.session, key, caller=lambda: self.permission.on_behalf(caller))
@@ -171,7 +170,7 @@ class GemucoService:
         return answer
 
     def status(self) -> Status:
-        """State and counters of this second."""
+        """Return the state and the counters."""
         fresh, values = self.freshness.take()
         missing = [name for name, value in values.items() if not np.isfinite(value).all()]
         loops = {loop.name: loop.statistics() for loop in self.loops}
@@ -206,7 +205,7 @@ class GemucoService:
         )
 
     def run(self, stop: threading.Event) -> None:
-        """Serve until told to stop."""
+        """Run the loops until `stop` is set."""
         freeze()
         for loop in self.loops:
             loop.start()
@@ -220,20 +219,20 @@ class GemucoService:
                 loop.stop()
 
     def _each_second(self) -> Status:
-        """The status, and a look at where to run."""
+        """Return the status, and let `OneCore` choose the core."""
         status = self.status()
         self._core.look(any(loop.is_slow for loop in self.loops))
         return status
 
     def _blind(self) -> str:
-        """What to check when nothing comes from the camera's process; empty when something does."""
+        """Return a hint if no fresh sample comes from the camera's process, else an empty text."""
         seen = None if self._seen is None else self._seen.last()
         longest = max((self.robot.signals[name].stale_after for name in self.robot.seen), default=0.0)
         if not self.robot.seen or (seen is not None and self.clock.monotonic() - seen.received <= longest):
             return ""
         return " No camera publishes. Is `gemuco vision` running?"
 
-    def _tell(self, estimates: Estimates) -> None:
+    def _publish(self, estimates: Estimates) -> None:
         self._estimates.put(estimates)
         self.history.add(estimates, self.clock.monotonic())
 
@@ -241,7 +240,7 @@ class GemucoService:
         return self.living.schema
 
     def _others_keep_time(self) -> bool:
-        """Whether learning takes nothing from the loops that keep time: the update is the first to give way."""
+        """Whether all loops of higher priority keep their rate; if not, the update does not learn."""
         return not any(loop.is_slow for loop in self.loops if PRIORITIES[loop.name] > PRIORITIES["update"])
 
     def _learner(self, schema: BodySchema) -> adapt.Updater:
@@ -249,7 +248,7 @@ class GemucoService:
         return adapt.Updater(schema, adapt.UpdateConfig(**config.model_dump(exclude={"interval"})))
 
     def _make_control(self, config: ModelConfig) -> tuple[Control | None, str]:
-        """The controller, or why there is none."""
+        """Make the controller; without one, return the reason."""
         if config.control is None:
             return None, f"The robot file of '{self.robot.robot}' has no model.control section."
         try:
@@ -276,8 +275,8 @@ class GemucoService:
         if self.control is None:
             return
         self._targets.take()
-        if self.control.engaged and (why := self.permission.ended()):
-            self.control.disengage(why)
+        if self.control.engaged and (reason := self.permission.ended()):
+            self.control.disengage(reason)
         self.control.tick()
 
     def _follow(self, target: Target) -> None:

@@ -1,4 +1,4 @@
-"""The body schema in use: read by four loops at any time, replaced whole by one."""
+"""The body schema in use: four loops read it at any time, and one replaces it."""
 
 import threading
 from pathlib import Path
@@ -12,17 +12,16 @@ from services.model.model_config import model_config
 
 
 def layout_of(robot: RobotConfig) -> Layout:
-    """The signals that the robot file gives the model, all of them unless it names some."""
-    names = model_config(robot).signals or tuple(robot.signals)
-    chosen = ((name, robot.signals[name]) for name in names)
-    return Layout(tuple(Signal(name, signal.size, signal.unit, signal.elements) for name, signal in chosen))
+    """Return the model's signals: those that the robot file names, by default all."""
+    signals = [(name, robot.signals[name]) for name in model_config(robot).signals or robot.signals]
+    return Layout(tuple(Signal(name, signal.size, signal.unit, signal.elements) for name, signal in signals))
 
 
 def load_model(robot: RobotConfig, folder: Path) -> BodySchema:
-    """The trained schema of a robot.
+    """Load the trained schema of a robot.
 
     Raises:
-        CheckpointError: There is none, it is damaged, or it is of another body than the robot file describes.
+        CheckpointError: It is missing or damaged, or it is of another body than the robot file describes.
     """
     if not folder.exists():
         raise CheckpointError(f"There is no model in '{folder}'. Make one with `gemuco collect` and `gemuco train`.")
@@ -37,7 +36,7 @@ def load_model(robot: RobotConfig, folder: Path) -> BodySchema:
 
 
 class LivingModel:
-    """Holds the schema in use and the one before adaption began; a reader sees one or the other, never a mixture."""
+    """The schema in use and the one before adaption began. A reader sees one of them, never a mixture."""
 
     def __init__(self, schema: BodySchema) -> None:
         self._lock = threading.Lock()
@@ -52,7 +51,7 @@ class LivingModel:
 
     @property
     def before(self) -> BodySchema | None:
-        """The schema before adaption began; None if it never did."""
+        """The schema before adaption began; None before that."""
         return self._before
 
     def keep(self) -> None:
@@ -61,16 +60,15 @@ class LivingModel:
             self._before = self._before or self._schema
 
     def swap(self, schema: BodySchema) -> int:
-        """Use another schema from now on; returns its version."""
-        # Here and not in the next ticks of the loops that keep time.
-        schema.prepare(self._schema)
+        """Replace the schema; return the new version."""
+        schema.prepare(self._schema)  # here, so that the other loops need no time for it
         with self._lock:
             self._schema = schema
             self.version += 1
             return self.version
 
     def rollback(self) -> int:
-        """Back to the schema before adaption began; returns the version."""
+        """Restore the schema before adaption began; return the version."""
         with self._lock:
             if self._before is not None:
                 self._schema, self._before = self._before, None

@@ -1,4 +1,4 @@
-"""The `model` and `collect` sections of a robot file, checked here because only the services read them."""
+"""The `model` and `collect` sections of a robot file, which only the services read."""
 
 from typing import Annotated, Literal, TypeVar
 
@@ -11,7 +11,7 @@ from services.model.control_config import ControlConfig, SimulationConfig, named
 
 Count = Annotated[int, Field(ge=1)]
 DEFAULT = TrainConfig()
-"""The defaults of training are those of the library."""
+"""These defaults of training are those of the library."""
 
 
 class NetworkConfig(Section):
@@ -21,43 +21,43 @@ class NetworkConfig(Section):
     latent: Count = DEFAULT.latent
     activation: Literal["tanh", "relu", "sigmoid", "elu", "softplus"] = "tanh"
     bias: Annotated[int, Field(ge=0)] = DEFAULT.bias_size
-    """Length of the parametric bias p, one p per condition; 0 without."""
+    """This is the length of the parametric bias p, one p per condition; 0 without p."""
 
 
 Threshold = Annotated[float, Field(gt=0, le=1)]
 
 
 class StructureConfig(Section):
-    """Thresholds of the paper, II-E: normalised error on held-out data; 1 is that of always guessing the mean."""
+    """The thresholds of the paper, II-E: normalised error on held-out data; 1 is the error of guessing the mean."""
 
     threshold_out: Threshold = 0.15
     """A signal that the others explain better than this becomes an output."""
     threshold_in: Threshold = 0.15
     """A mask that explains the outputs better than this is feasible."""
     measure: Literal["mse", "rmse"] = "mse"
-    """What is compared with them: the mean squared error, or its root."""
+    """The thresholds apply to the mean squared error or to its root."""
     over: Literal["masked", "all"] = "masked"
-    """Outputs that a mask is judged by: those it does not give, or all."""
+    """A mask is judged by the outputs that it does not contain, or by all."""
     splits: Count = 1
-    """How often to train and measure, each time with other episodes held out."""
+    """The network is trained and measured this many times, each time with other episodes held out."""
     epochs: Count = 80
 
 
 class TrainingConfig(Section):
-    """How the network is fitted once its structure is known."""
+    """The training of the network after structure determination."""
 
     epochs: Count = DEFAULT.epochs
     batch: Count = DEFAULT.batch
     rate: Positive = DEFAULT.rate
-    """Peak learning rate of the one-cycle schedule."""
+    """This is the peak learning rate of the one-cycle schedule."""
     bias_rate: Positive = DEFAULT.bias_rate
-    """Peak learning rate of p."""
+    """This is the peak learning rate of p."""
     held_out: Annotated[float, Field(gt=0, lt=1)] = DEFAULT.held_out
-    """Share of every condition's data that only measures."""
+    """This share of every condition's data is held out from training and measures the loss."""
     patience: Count | None = DEFAULT.patience
-    """Training stops after this many epochs without a better held-out loss; `null`: it goes on to the end."""
+    """Training stops after this many epochs without a better held-out loss; with `null` it runs all epochs."""
     outliers: Positive = DEFAULT.outliers
-    """Reject a measured signal that the others contradict by so many robust standard deviations; `.inf`: none."""
+    """A measured signal is rejected if the others contradict it by this many robust standard deviations."""
 
 
 class UpdateConfig(Section):
@@ -67,41 +67,41 @@ class UpdateConfig(Section):
     """Without parametric bias, W alone is updated."""
     bias_method: Literal["ekf", "gauss_newton", "gradient"] = "ekf"
     window: Count = 6000
-    """Samples kept; the oldest is dropped."""
+    """The window keeps this many samples; the oldest is dropped."""
     minimum: Count = 10
-    """Samples before the first gradient step."""
+    """The first gradient step needs this many samples."""
     interval: Positive = 0.1
-    """Least time [s] between two samples of the window, so that it spans some motion."""
+    """Samples of the window are at least this far apart [s], so that it spans some motion."""
     steps: Count = 3
-    """Gradient steps per tick of the update loop."""
+    """Each tick of the update loop makes this many gradient steps."""
     rate: Positive = 1e-4
-    """Learning rate of W."""
+    """This is the learning rate of W."""
     bias_rate: Positive = 0.02
-    """Learning rate of p, by gradient."""
+    """This is the learning rate of p, if it is updated by gradient."""
     optimiser: Literal["adam", "sgd"] = "adam"
     replay: Annotated[int, Field(ge=0)] = 300
-    """As how many samples of the window the training data counts."""
+    """This is the weight of the training data, in window samples."""
     held_out: Annotated[int, Field(ge=0)] = 5
-    """Every so many-th sample only judges W; 0 none."""
+    """One of this many samples is held out to judge W; 0 holds out none."""
 
 
 class AnomalyConfig(Section):
-    """When an unlikely prediction error counts as an anomaly."""
+    """The condition under which an unlikely prediction error counts as an anomaly."""
 
     after: Annotated[float, Field(ge=0)] = 0.05
-    """How long [s] the score must stay above its threshold."""
+    """The score must stay above its threshold for this time [s]."""
 
 
 class ModelConfig(Section):
     """The whole `model` section."""
 
     signals: tuple[str, ...] = ()
-    """The signals that are the body schema's x; all of the robot's if none is named."""
+    """These signals are the body schema's x; by default all signals of the robot."""
     network: NetworkConfig = NetworkConfig()
     structure: StructureConfig = StructureConfig()
     training: TrainingConfig = TrainingConfig()
     control: ControlConfig | None = None
-    """Absent: the robot is observed and never commanded."""
+    """Without this section the robot is observed and never commanded."""
     simulation: SimulationConfig = SimulationConfig()
     update: UpdateConfig = UpdateConfig()
     anomaly: AnomalyConfig = AnomalyConfig()
@@ -111,33 +111,33 @@ class CollectConfig(Section):
     """The whole `collect` section: a motion of the robot's own, or random postures within limits and constraints."""
 
     motion: str | None = None
-    """`module:name` of the random safe motion: (config, seed) -> (command, duration [s]) without end. Absent: random
-    postures within the limits of the commanded signal, and smooth moves from one to the next."""
+    """This is `module:name` of the random safe motion: (config, seed) -> endless (command, duration [s]). Without it
+    the robot moves smoothly between random postures within the limits of the commanded signal."""
     speed: Positive = 1.0
-    """Highest speed of a commanded element on the way [its unit per second]."""
+    """A commanded element moves at most at this speed [its unit per second]."""
     hold: Annotated[float, Field(ge=0)] = 0.3
-    """Rest in every posture [s]."""
+    """The robot rests in every posture for this time [s]."""
     forecast: str | None = None
-    """`module:name` of the designer's model: (config, condition, commands of shape (n, k)) -> signal -> (n, m)."""
+    """This is `module:name` of the designer's model: (config, condition, commands (n, k)) -> signal -> (n, m)."""
     constraints: dict[str, RangeConfig] = Field(default_factory=dict)
-    """Signal -> range within which the forecast of every posture, and of the way there, must lie."""
+    """The forecast of every posture, and of the motion to it, must lie within this range of each signal."""
     states: str | None = None
-    """`module:name` of random states of the designer's geometry, added to what is collected from the designer's
+    """This is `module:name` of random states of the designer's geometry, which are added to the data of the designer's
     variant: (config, count, seed) -> signal -> array (count, n)."""
     states_share: Annotated[float, Field(gt=0, le=1)] = 0.5
-    """How many of them per recorded sample."""
+    """This many of them are added per recorded sample."""
     samples: Count = 10_000
     rate: Positive = 20.0
-    """Samples per second of the robot's time."""
+    """Samples are recorded at this rate [Hz] of the robot's time."""
     settle: Annotated[float, Field(ge=0)] = 0.0
-    """Seconds after the start that are not recorded."""
+    """This time [s] after the start is not recorded."""
 
 
 def model_config(robot: RobotConfig) -> ModelConfig:
-    """The checked `model` section.
+    """Return the checked `model` section.
 
     Raises:
-        ConfigError: An unknown key, a value out of range, or a signal the robot does not have.
+        ConfigError: It has an unknown key, a value out of range, or an unknown signal.
     """
     model = _section(robot, "model", ModelConfig)
     wrong = [name for name in model.signals if name not in robot.signals]
@@ -145,22 +145,21 @@ def model_config(robot: RobotConfig) -> ModelConfig:
     if wrong:
         known = ", ".join(robot.signals)
         raise ConfigError(
-            f"Robot '{robot.robot}': model.signals names '{wrong[0]}', which is no signal or there twice. "
-            f"Known: {known}."
+            f"Robot '{robot.robot}': model.signals names '{wrong[0]}', which is unknown or named twice. Known: {known}."
         )
     for section in ("control", "simulation"):
         part = getattr(model, section)
         for key, signal in [] if part is None else named_signals(part):
-            if signal not in (there := model.signals or tuple(robot.signals)):
+            if signal not in (known_signals := model.signals or tuple(robot.signals)):
                 raise ConfigError(
                     f"Robot '{robot.robot}': model.{section}.{key} '{signal}' is not a signal of the model. "
-                    f"Known: {', '.join(there)}."
+                    f"Known: {', '.join(known_signals)}."
                 )
     return model
 
 
 def collect_config(robot: RobotConfig) -> CollectConfig:
-    """The checked `collect` section.
+    """Return the checked `collect` section.
 
     Raises:
         ConfigError: It is missing or wrong.
@@ -168,11 +167,11 @@ def collect_config(robot: RobotConfig) -> CollectConfig:
     collect = _section(robot, "collect", CollectConfig)
     where = f"Robot '{robot.robot}', section 'collect'"
     if not robot.collect:
-        raise ConfigError(f"Robot '{robot.robot}' has no 'collect' section, so how it may be moved is not known.")
+        raise ConfigError(f"Robot '{robot.robot}' has no 'collect' section, so its safe motion is unknown.")
     if collect.motion is not None and collect.model_fields_set & {"speed", "hold", "forecast", "constraints"}:
-        raise ConfigError(f"{where}: 'motion' moves as it likes; speed, hold, forecast and constraints are without it.")
+        raise ConfigError(f"{where}: with 'motion', speed, hold, forecast and constraints have no effect. Remove them.")
     if collect.constraints and collect.forecast is None:
-        raise ConfigError(f"{where}: 'constraints' need a 'forecast' of what they constrain.")
+        raise ConfigError(f"{where}: 'constraints' need a 'forecast'.")
     for name, allowed in collect.constraints.items():
         if name not in robot.signals:
             raise ConfigError(f"{where}: constraints.{name} is not a signal. Known: {', '.join(robot.signals)}.")

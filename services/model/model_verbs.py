@@ -1,4 +1,4 @@
-"""What the model service can be asked for, by anybody on the network."""
+"""The verbs of the model service."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -20,17 +20,17 @@ from services.wire.plain_text import shown
 from services.wire.query import Guard, Handler
 
 MOST_STEPS = 200
-"""Commands that one question may simulate; a step takes some ten milliseconds."""
+"""A query may simulate at most this many commands; a step takes about 10 ms."""
 
 
 class ModelVerbs:
-    """Handlers of `gemuco/<robot>/model/do/...`; each takes and returns a map."""
+    """The handlers of `gemuco/<robot>/model/do/...`; each takes and returns a map."""
 
     def __init__(self, service: GemucoService) -> None:
         self._service = service
 
     def handlers(self) -> dict[str, Handler]:
-        """Verb -> handler; `describe` comes with every service."""
+        """Return verb -> handler; `describe` comes with every service."""
         return {
             "estimate": self.estimate,
             "control": self.solve,
@@ -46,7 +46,7 @@ class ModelVerbs:
         }
 
     def serve(self, service: Service) -> None:
-        """Answer all of them; what changes what the robot does only for who commands, letting go for everybody."""
+        """Answer all verbs. A verb that changes the motion needs permission; `disengage` is open to every client."""
         permission = self._service.permission
         guards: dict[str, Guard] = dict.fromkeys(("adapt", "rollback", "normal"), self._may_change)
         guards |= {"engage": permission.may_move, "target": permission.may_move}
@@ -55,12 +55,12 @@ class ModelVerbs:
         service.describe = self.describe
 
     def _may_change(self, caller: Caller) -> None:
-        """Raise unless the caller may change the model; another model moves the robot while one is engaged."""
+        """Raise unless the caller may change the model; while engaged, a new model moves the robot."""
         control, permission = self._service.control, self._service.permission
         (permission.may_move if control is not None and control.engaged else permission.check)(caller)
 
     def describe(self) -> dict[str, Any]:
-        """What the model is about."""
+        """Return the model's signals, conditions, masks, rates and version."""
         schema, robot, control = self._service.living.schema, self._service.robot, self._service.config.control
         return {
             "signals": {s.name: {"unit": s.unit, "elements": list(s.elements)} for s in schema.layout.signals},
@@ -76,7 +76,7 @@ class ModelVerbs:
         }
 
     def estimate(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Estimate one signal or all, from the newest sample or from given values, some of them hidden."""
+        """Estimate one signal or all from the newest sample or from given values, without the hidden signals."""
         _only(arguments, "signal", "values", "hide")
         schema = self._service.living.schema
         if not isinstance(arguments.get("signal", ""), str):
@@ -89,37 +89,37 @@ class ModelVerbs:
         return {"signals": _estimates(schema, values)} | facts
 
     def solve(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """The command that the robot file's loss finds for a target; nothing is sent, nothing moves."""
+        """Return the command for a target by the robot file's loss; the robot does not move."""
         _only(arguments, "target", "values")
         service, schema = self._service, self._service.living.schema
         if service.config.control is None:
             raise NotEngaged(service.no_control)
         target = _signals(arguments.get("target"), "target")
         now, cycle = self._values({"values": arguments.get("values")})
-        found = controller_of(schema, service.robot, service.config.control).solve(target, now)
+        solution = controller_of(schema, service.robot, service.config.control).solve(target, now)
         signal = schema.layout.signal(service.robot.command.signal)
         return {
             "signal": signal.name,
             "unit": signal.unit,
             "elements": list(signal.elements),
-            "values": found.command,
-            "predicted": found.predicted,
-            "loss": found.loss,
-            "residual": found.residual,
-            "route": found.route,
-            "mask": label(found.mask, schema.layout.names),
+            "values": solution.command,
+            "predicted": solution.predicted,
+            "loss": solution.loss,
+            "residual": solution.residual,
+            "route": solution.route,
+            "mask": label(solution.mask, schema.layout.names),
             "cycle": cycle,
             "model_version": service.living.version,
         }
 
     def simulate(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """The states that commands bring about one after the other, under the robot file's constraints."""
+        """Return the states that successive commands lead to, under the robot file's constraints."""
         _only(arguments, "commands", "given", "values")
         service, schema = self._service, self._service.living.schema
         commands = arguments.get("commands")
         if not isinstance(commands, list) or not 1 <= len(commands) <= MOST_STEPS:
-            what = service.robot.command.signal
-            raise BadArguments(f"'commands' must be a list of 1 to {MOST_STEPS} commands of '{what}'.")
+            signal = service.robot.command.signal
+            raise BadArguments(f"'commands' must be a list of 1 to {MOST_STEPS} commands of '{signal}'.")
         given = _signals(arguments.get("given") or {}, "given")
         now, _ = self._values({"values": arguments.get("values")})
         simulator = simulator_of(schema, service.robot, service.config.simulation)
@@ -134,41 +134,41 @@ class ModelVerbs:
         }
 
     def anomaly(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """How unlike normal the newest sample is, or given values, some of them hidden."""
+        """Score the newest sample or given values, without the hidden signals."""
         _only(arguments, "values", "hide")
         values, cycle = self._values(arguments)
-        found = score(self._service.living.schema, values)
+        anomaly = score(self._service.living.schema, values)
         return {
-            "score": found.score,
-            "threshold": found.threshold,
-            "is_anomaly": found.is_anomaly,
-            "blamed": found.blamed,
-            "contribution": found.contribution,
+            "score": anomaly.score,
+            "threshold": anomaly.threshold,
+            "is_anomaly": anomaly.is_anomaly,
+            "blamed": anomaly.blamed,
+            "contribution": anomaly.contribution,
             "cycle": cycle,
             "model_version": self._service.living.version,
         }
 
     def history(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """What was estimated in the last seconds, page by page."""
+        """Return a page of the estimates of the last seconds."""
         _only(arguments, "seconds", "signals", "begin", "end")
         service = self._service
         return service.history.answer(arguments, service.service.boot, service.clock.monotonic())
 
     def engage(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Take over from where the body is, and ask the HAL to enable."""
+        """Engage the controller at the present posture, and ask the HAL to enable."""
         _only(arguments)
         control = self._control()
         control.engage(self._service.enable_hal)
         return control.facts()
 
     def disengage(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Send nothing any more; the HAL then holds, and disables."""
+        """Stop commanding; the HAL then holds, and disables."""
         control = self._control()
         control.disengage()
         return control.facts()
 
     def target(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Set a target, and hear of it if it is refused."""
+        """Set a target; a refusal is the reply."""
         _only(arguments, "signal", "values")
         control = self._control()
         values = _numbers(arguments.get("values"), "values")
@@ -184,12 +184,12 @@ class ModelVerbs:
         return {"active": self._service.update.is_active, "model_version": self._service.living.version}
 
     def rollback(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Stop the update and go back to the model before it began."""
+        """Stop the update and restore the model before it began."""
         _only(arguments)
         return {"active": False, "model_version": self._service.update.rollback()}
 
     def normal(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Learn anew what is normal, from the samples since the model last changed."""
+        """Learn what is normal from the samples since the model last changed."""
         _only(arguments)
         samples = self._service.update.learn_normal()
         normal = self._service.living.schema.normal
@@ -201,7 +201,7 @@ class ModelVerbs:
         return self._service.control
 
     def _values(self, arguments: Mapping[str, Any]) -> tuple[dict[str, np.ndarray], int]:
-        """What to judge by, without what is hidden, and its cycle; -1 when it was given or nothing is fresh."""
+        """Return the values without the hidden ones, and their cycle; -1 if they were given or nothing is fresh."""
         given, cycle = arguments.get("values"), -1
         if given is None:
             fresh, newest = self._service.freshness.take()

@@ -1,4 +1,4 @@
-"""`gemuco serve`: the process of the body schema service."""
+"""The process of the body schema service (`gemuco serve`)."""
 
 import logging
 import threading
@@ -12,12 +12,12 @@ from services.model.gemuco_service import GemucoService
 from services.model.living_model import load_model
 from services.model.model_verbs import ModelVerbs
 from services.process.realtime import prepare_process
-from services.process.service import Service, until_told
+from services.process.service import Service, until_stopped
 
 log = logging.getLogger(__name__)
 
 PATIENCE = 3.0
-"""Compiling is reported at this interval [s]; loading code that was compiled before takes less."""
+"""Compiling is reported at this interval [s]; loading stored code takes less."""
 
 
 def serve(robot: RobotConfig, folder: Path, connect: Iterable[str] = (), stop: threading.Event | None = None) -> None:
@@ -27,7 +27,7 @@ def serve(robot: RobotConfig, folder: Path, connect: Iterable[str] = (), stop: t
         robot: The robot file.
         folder: Folder of the trained model.
         connect: Endpoints, such as a router's, and role files.
-        stop: An event that ends it; signals are then not handled.
+        stop: Event that ends the service; signals are then not handled.
 
     Raises:
         CheckpointError: The folder holds no model, or a model of another body.
@@ -36,7 +36,7 @@ def serve(robot: RobotConfig, folder: Path, connect: Iterable[str] = (), stop: t
     prepare_process()
     schema = load_model(robot, folder)
     make_ready()
-    with until_told(stop) as stopped, Service(robot.robot, "model", connect) as service:
+    with until_stopped(stop) as stopped, Service(robot.robot, "model", connect) as service:
         model = GemucoService(robot, schema, service)
         ModelVerbs(model).serve(service)
         model.run(stopped)

@@ -1,4 +1,4 @@
-"""The update loop: p and W learn online from a bounded window, and every model they make is swapped in whole."""
+"""The update loop: it learns p and W online from a bounded window, and replaces the whole model after each step."""
 
 import math
 import threading
@@ -20,8 +20,8 @@ from services.model.model_config import UpdateConfig
 from services.wire.messages import Update
 
 SPREAD = 0.1
-"""A sample joins the learner's window when some element moved this far since the last [standard deviations]: a robot
-that rests would fill it with one posture."""
+"""A sample joins the learner's window when an element moved this far since the last one [standard deviations]. A robot
+at rest would otherwise fill the window with one posture."""
 
 
 Values = Mapping[str, np.ndarray]
@@ -29,24 +29,24 @@ Values = Mapping[str, np.ndarray]
 
 
 class Learner(Protocol):
-    """An updater of p and W with a window of its own (`gemuco.adaption.update.Updater`)."""
+    """An updater of p and W with its own window (`gemuco.adaption.update.Updater`)."""
 
     schema: BodySchema
 
     def add(self, values: Mapping[str, np.ndarray]) -> Any:
-        """Take one complete sample [unit]."""
+        """Add one complete sample [unit]."""
         ...
 
     def step(self) -> Any:
-        """Learn a little; the result is `gemuco.adaption.update.UpdateResult`."""
+        """Make some learning steps; return a `gemuco.adaption.update.UpdateResult`."""
         ...
 
 
 class OnlineUpdate:
-    """Gathers samples while the robot moves; while active, learns from them and swaps the model.
+    """The online update: it collects samples while the robot moves; while active, it learns and replaces the model.
 
-    Samples since the model last changed are kept apart: what is normal is learned from those, because the errors a
-    model makes on what it was fitted to say nothing of its errors elsewhere.
+    Samples since the last change of the model are kept apart. Normal errors are learned from these, because the errors
+    on samples that the model was fitted to do not represent its errors on others.
     """
 
     def __init__(
@@ -60,14 +60,21 @@ class OnlineUpdate:
         clock: Clock,
         may_learn: Callable[[], bool] = lambda: True,
     ) -> None:
-        """`learner` makes an updater that starts from a schema, with an empty window.
+        """Prepare.
 
-        `is_engaged` tells whether the robot is being moved; a robot at rest is of interest only then. While `may_learn`
-        says no, samples are taken and nothing is learned from them.
+        Args:
+            freshness: Source of samples.
+            living: The model in use.
+            config: The `update` section of the robot file.
+            learner: Makes an updater that starts from a schema, with an empty window.
+            is_engaged: Whether the controller moves the robot; samples at rest count only then.
+            publish: Publishes the state.
+            clock: Source of time.
+            may_learn: Whether learning is allowed in this tick; if not, samples are only collected.
         """
         self._may_learn = may_learn
         self.waited = 0
-        """Ticks in which it might not learn."""
+        """This is the number of ticks in which learning was not allowed."""
         self._freshness, self._living, self._config = freshness, living, config
         self._is_engaged = is_engaged
         self._make_learner, self._publish, self._clock = learner, publish, clock
@@ -77,7 +84,7 @@ class OnlineUpdate:
         self._last: np.ndarray | None = None
         self._awaits_first = False
         self._taken_at = -math.inf
-        self._told = Update(active=False, model_version=0, window=0, dropped=0, loss=math.nan)
+        self._state = Update(active=False, model_version=0, window=0, dropped=0, loss=math.nan)
 
     @property
     def is_active(self) -> bool:
@@ -85,36 +92,36 @@ class OnlineUpdate:
         return self._learner is not None
 
     def adapt(self, active: bool) -> None:
-        """Start from the model in use, or stop; the model stays as it is then."""
+        """Start from the model in use, or stop and keep the model."""
         with self._lock:
             if active and self._learner is None:
                 self._living.keep()
                 self._learner = self._make_learner(self._living.schema)
-                # One sample may tell what p is, and the robot may rest when it is asked to learn.
+                # One sample may determine p, even of a robot at rest.
                 self._awaits_first = len(self._living.schema.bias) > 0
             elif not active:
                 self._learner, self._awaits_first = None, False
                 self._since_change.clear()
 
     def rollback(self) -> int:
-        """Stop, and go back to the model before adaption began; returns the model's version."""
+        """Stop, and restore the model before adaption began; return the model's version."""
         with self._lock:
             self._learner, self._awaits_first = None, False
             self._since_change.clear()
             return self._living.rollback()
 
     def learn_normal(self) -> int:
-        """Learn what errors are normal from the samples since the model last changed; returns how many.
+        """Learn the normal errors from the samples since the model last changed; return the number of samples.
 
         Raises:
-            NotEnoughData: The robot moved too little since.
+            NotEnoughData: The robot moved too little.
         """
         with self._lock:
             samples = list(self._since_change)
             schema = self._living.schema
             try:
                 if not samples:
-                    raise NotEnoughData("No whole sample of the moving robot came since the model last changed.")
+                    raise NotEnoughData("No complete sample of the moving robot came since the model last changed.")
                 rows = {name: np.stack([sample[name] for sample in samples]) for name in samples[0]}
                 normal = Normal.fit(predict_error(schema, rows), schema.scaler.std[schema.out_index])
             except NotEnoughData as error:
@@ -123,37 +130,37 @@ class OnlineUpdate:
             return len(samples)
 
     def tick(self) -> None:
-        """Take the newest sample if the robot moves or is engaged, and learn if active."""
+        """Add the newest sample if the robot moves or is engaged, and learn if active."""
         with self._lock:
             sample, moved = self._newest()
-            if sample is not None and _is_whole(sample) and (moved or self._is_engaged()):
+            if sample is not None and _is_complete(sample) and (moved or self._is_engaged()):
                 self._since_change.append(sample)
             if self._learner is not None and not self._may_learn():
                 self.waited += 1
                 if moved and sample is not None:
                     self._learner.add(sample)
-                told = replace(self._told, stamp_ns=self._clock.now_ns(), active=True)
+                self._state = replace(self._state, stamp_ns=self._clock.now_ns(), active=True)
             elif self._learner is None:
-                told = Update(
+                self._state = Update(
                     stamp_ns=self._clock.now_ns(),
                     active=False,
                     model_version=self._living.version,
                     window=len(self._since_change),
                     dropped=0,
-                    loss=self._told.loss,
+                    loss=self._state.loss,
                     bias=np.asarray(self._living.schema.bias, float),
-                    rolled_back=self._told.rolled_back,
+                    rolled_back=self._state.rolled_back,
                 )
             else:
-                told = self._learn(self._learner, sample if moved else None)
-            self._told = told
-        self._publish(told)
+                self._state = self._learn(self._learner, sample if moved else None)
+            state = self._state
+        self._publish(state)
 
     def _newest(self) -> tuple[Values | None, bool]:
-        """The newest sample, and whether it is far and late enough to be learned from.
+        """Return the newest sample, and whether it is far enough in motion and time from the last to be learned from.
 
-        A sample that lacks something still tells p, from whatever is left. Where there is no p it is not taken: W would
-        drift where nothing is measured, and no other condition's data hold it.
+        An incomplete sample still determines p. A model without p does not use it: W would drift in the signals that
+        are not measured, and no data of another condition hold it.
         """
         fresh, values = self._freshness.take()
         if fresh is None:
@@ -164,9 +171,9 @@ class OnlineUpdate:
         now = self._clock.monotonic()
         if now - self._taken_at < 0.9 * self._config.interval:
             return values, False
-        away = np.full(1, math.inf) if self._last is None else np.abs(row - self._last)
-        far = not np.isfinite(away).any() or float(np.nanmax(away)) >= SPREAD
-        if not far and not self._awaits_first:
+        distance = np.full(1, math.inf) if self._last is None else np.abs(row - self._last)
+        is_far = not np.isfinite(distance).any() or float(np.nanmax(distance)) >= SPREAD
+        if not is_far and not self._awaits_first:
             return values, False
         moved = self._last is not None or self._awaits_first
         self._awaits_first, self._last, self._taken_at = False, row, now
@@ -192,5 +199,5 @@ class OnlineUpdate:
         )
 
 
-def _is_whole(sample: Mapping[str, np.ndarray]) -> bool:
+def _is_complete(sample: Mapping[str, np.ndarray]) -> bool:
     return all(np.isfinite(value).all() for value in sample.values())

@@ -12,7 +12,7 @@ from typing import Any
 from services.health import ROUTER
 from services.process.heartbeat import Heartbeat
 from services.process.loop import Loop
-from services.process.service import until_told
+from services.process.service import until_stopped
 from services.wire.connect import checked_endpoint, split_connect, with_role_files
 from services.wire.probe import check_answers
 from services.wire.session import ROUTER_PORT, close_session, common_settings, open_with
@@ -66,7 +66,7 @@ def run_router(listen: Iterable[str] = (), connect: Iterable[str] = (), stop: th
         ServiceError: A port is taken, an endpoint is malformed, or a role file cannot be read.
     """
     configuration = router_settings(listen, connect)
-    with until_told(stop) as told:
+    with until_stopped(stop) as told:
         session = open_with(configuration, WHO)
         print(f"Router listens on {', '.join(configuration['listen']['endpoints'])}.", flush=True)
         door = Loop("door", RING_RATE, lambda: check_answers(configuration["listen"]["endpoints"]))

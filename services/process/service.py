@@ -156,7 +156,7 @@ def next_status(now: float) -> float:
 
 
 @contextmanager
-def until_told(stop: threading.Event | None = None) -> Iterator[threading.Event]:
+def until_stopped(stop: threading.Event | None = None) -> Iterator[threading.Event]:
     """An event that SIGTERM and SIGINT set; the handlers before are put back at the end.
 
     Args:

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple, Self
 import zenoh
 
 from services.errors import RecordingError, ServiceError
-from services.process.service import Service, until_told
+from services.process.service import Service, until_stopped
 from services.recording.losses import INFO, WARNING
 from services.recording.schema import Catalogue
 from services.recording.writer import Limits, RecordingWriter
@@ -300,7 +300,7 @@ def run_recorder(
         raise RecordingError(f"A recording's name ends in .mcap, unlike '{path}'.")
     began = time.monotonic()
     with (
-        until_told(stop) as stopped,
+        until_stopped(stop) as stopped,
         Service(robot, "recorder", connect) as service,
         recording(service.session, robot, path, catalogue, condition, limits) as recorder,
     ):

@@ -17,7 +17,7 @@ from msgspec.structs import replace
 
 from hal.errors import CommandRefused
 from services.errors import BadArguments, RecordingError
-from services.process.service import Service, until_told
+from services.process.service import Service, until_stopped
 from services.recording.reading import FileFacts, Paths, Recorded, facts_of, one_robot, read
 from services.recording.writer import CARRIED
 from services.wire import keys
@@ -295,7 +295,7 @@ def run_replay(
     if not held:
         raise RecordingError(f"There is nothing of robot '{recorded}' to play: no {', '.join(playable[:3])}.")
     names = ["hal", *sorted({noun.partition("/")[0] for noun in map(_noun, held)} - {"hal"})]
-    with until_told(stop) as stopped, contextlib.ExitStack() as stack:
+    with until_stopped(stop) as stopped, contextlib.ExitStack() as stack:
         services = {
             name: stack.enter_context(Service(robot or recorded, name, connect, lambda: _describe(files)))
             for name in names

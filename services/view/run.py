@@ -7,7 +7,7 @@ from pathlib import Path
 import typer
 
 from services.model import artifacts
-from services.process.service import until_told
+from services.process.service import until_stopped
 from services.view.controls import Controls
 from services.view.page import Page, serve_page
 from services.view.role import is_loopback, why_read_only
@@ -35,7 +35,7 @@ def view(
     connect = tuple(connect)
     read_only = why_read_only(member_of(connect), robot, host)
     watch = Watch(robot, connect)
-    with until_told(stop) as end:
+    with until_stopped(stop) as end:
         site = open_site(host, port, f"gemuco view {robot}")
         try:
             page = Page(site, robot, watch.look, Controls(lambda: watch.client, read_only), urdf, taught_path(robot))

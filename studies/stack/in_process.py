@@ -24,7 +24,7 @@ from hal.robot import Robot
 from services.hardware.hal_service import HalService
 from services.model.serve import serve
 from services.process.realtime import prepare_process
-from services.process.service import Service, until_told
+from services.process.service import Service, until_stopped
 from services.wire import keys
 from simulators.direct import DirectDevice
 from simulators.world import World
@@ -71,7 +71,7 @@ def main(file: Path, model: Path | None, seed: int, endpoint: str) -> None:
     config, connect = load_robot(file), (endpoint,) if endpoint else ()
     is_wild = threading.Event()
     signal.signal(signal.SIGUSR1, lambda *_: is_wild.set())
-    with until_told() as end, Service(config.robot, "hal", connect) as service:
+    with until_stopped() as end, Service(config.robot, "hal", connect) as service:
         hal = HalService(config, in_process(config, seed), service)
         if model is None:
             hal.run(end)

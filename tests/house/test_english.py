@@ -24,7 +24,6 @@ NOT_YET = {
     "services/cli.py",
     "services/errors.py",
     "services/health.py",
-    "services/model",
     "services/process",
     "services/runtime.py",
     "services/show.py",

@@ -116,7 +116,7 @@ def test_a_start_outside_of_the_constraints_may_come_in_but_go_no_further_out() 
         ({"constraints": {"gravity": {"low": 0}}}, ConfigError, "constraints.gravity is not a signal"),
         ({"constraints": {"tool_tip_position": {"low": [0, 0, 0]}}}, ConfigError, "has 3 values, the signal has 2"),
         ({"constraints": {"foot_force": {"low": 1.0}}}, ConfigError, "collect.constraints need foot_force of shape"),
-        ({"motion": "small_hand:move"}, ConfigError, "'motion' moves as it likes"),
+        ({"motion": "small_hand:move"}, ConfigError, "with 'motion', speed, hold"),
         ({"sped": 1.0}, ConfigError, "unknown key 'sped'"),
     ],
 )
