@@ -72,7 +72,7 @@ def test_a_short_or_long_frame_is_counted_and_not_used(joint):
 
 
 @pytest.mark.parametrize(
-    ("statusword", "told"), [(0x0050, "is led from its own panel"), (0x02D0, "warns (bit 7"), (0x0250, "")]
+    ("statusword", "told"), [(0x0050, "is controlled from its own panel"), (0x02D0, "warns (bit 7"), (0x0250, "")]
 )
 def test_bits_of_the_statusword_that_a_person_should_know(joint, statusword, told):
     bench = joint("csp", quantities=("position",)).open()
@@ -392,7 +392,7 @@ def without(tmp_path, *indices):
         ("6065", {"following_error": 0.1}, "needs object 6065h:0 for following_error"),
         ("6081", {"mode": "profile_position", "profile": {"velocity": 1}}, "6081h:0 for profile.velocity"),
         ("6076", {"mode": "cst", "quantities": ("effort",)}, "6076h:0 for the rated torque (or the setting rated_to"),
-        ("1016", {}, "has no object 1016h by its data sheet, so that it would go on when the HAL is gone"),
+        ("1016", {}, "has no object 1016h by its data sheet, so it would go on moving when the HAL is gone"),
         ("1802", {"quantities": ("position", "velocity", "temperature")}, "would need TPDO3 to send 2200h:1 (16 bit)"),
     ],
 )
@@ -457,11 +457,11 @@ def test_a_drive_without_a_watchdog_is_used_only_on_demand_and_told(joint, tmp_p
     bench = joint("csp", quantities=("position",), eds=str(sheet), allow_no_watchdog=True).open()
     bench.cycle(3)
     assert bench.device("elbow")["state"] == "ready"
-    assert "does not notice when the HAL is gone (no 1016h)" in text(bench)
+    assert "does not detect the loss of the HAL (no 1016h)" in text(bench)
     assert bench.objects[0x1016, 1] == 0
     bad = [check for check in inspected(bench) if not check.is_good]
     assert [check.what for check in bad] == ["watchdog"]
-    assert "when the HAL is gone (no 1016h). Let something else cut its power." in bad[0].text
+    assert "the loss of the HAL (no 1016h). Cut its power by other means." in bad[0].text
 
 
 def test_a_drive_that_was_never_opened_can_be_inspected(joint):
@@ -477,6 +477,6 @@ def test_a_drive_that_was_never_opened_can_be_inspected(joint):
 
 def test_a_velocity_unit_that_is_not_known_is_told(joint):
     bench = joint("csv", hardware={"velocity_unit": 0x00410300}).open()
-    assert "has velocities in unit 00410300h (60A9h), which is not known here. Give velocity_unit: counts/s" in text(
+    assert "has velocities in the unknown unit 00410300h (60A9h). Give velocity_unit: counts/s" in text(
         bench
     )

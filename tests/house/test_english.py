@@ -16,7 +16,6 @@ NOT_YET = {
     "hal/calibration",
     "hal/commissioning",
     "hal/drivers/can_device.py",
-    "hal/drivers/cia402",
     "hal/drivers/odrive.py",
     "hal/finding",
     "hal/protocols",

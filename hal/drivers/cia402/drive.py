@@ -6,6 +6,7 @@ from typing import Any
 
 import can
 import numpy as np
+from typing_extensions import override
 
 from hal.commissioning.node import cob_id
 from hal.commissioning.pdo_map import Pdo, describe
@@ -22,35 +23,35 @@ from hal.protocols.cia301 import Mapped
 from hal.protocols.cia402 import Mode, State, VelocityUnit
 from hal.wire.bus import Bus
 
-UNWATCHED = "{} does not notice when the HAL is gone (no 1016h)."
+UNWATCHED = "{} does not detect the loss of the HAL (no 1016h)."
 
 
 def drive_checks(sdo: SdoClient, mode: Mode, is_watched: bool, label: str) -> Iterator[Check]:
-    """Ask the drive for its mode; what its data sheet lacks is told as well.
+    """Check the mode of the drive, and yield failed checks for objects that its data sheet lacks.
 
     Args:
-        sdo: Asks the drive.
-        mode: The mode that it should be in.
-        is_watched: Whether it notices when the HAL is gone.
-        label: The drive, in words.
+        sdo: Client of the drive.
+        mode: The expected mode.
+        is_watched: Whether the drive detects the loss of the HAL.
+        label: Name of the drive in messages.
 
     Raises:
         DeviceSilent: It does not answer.
     """
     if not is_watched:
-        yield Check("watchdog", False, f"{UNWATCHED.format(label)} Let something else cut its power.")
+        yield Check("watchdog", False, f"{UNWATCHED.format(label)} Cut its power by other means.")
     if not sdo.has(cia402.ABORT_CONNECTION.index):
-        text = "There is no object 6007h. Look up in its manual what the drive does when the heartbeat fails."
+        text = "There is no object 6007h. Check in the manual how the drive reacts when the heartbeat fails."
         yield Check("abort option", False, text)
     if sdo.has(cia402.MODE_DISPLAY.index):
-        shown = sdo.read_signed(cia402.MODE_DISPLAY.index, 0, cia402.MODE_DISPLAY.bits)
-        text = f"The drive is in mode {cia402.describe_mode(shown)}."
-        is_good = shown == mode
-        yield Check("mode", is_good, text if is_good else f"{text} Open it again, or look at its display.")
+        actual = sdo.read_signed(cia402.MODE_DISPLAY.index, 0, cia402.MODE_DISPLAY.bits)
+        text = f"The drive is in mode {cia402.describe_mode(actual)}."
+        is_good = actual == mode
+        yield Check("mode", is_good, text if is_good else f"{text} Open it again, or check its display.")
 
 
 class CommandFrames:
-    """Controlword, mode and target, in the RPDOs that carry them."""
+    """The RPDOs with controlword, mode and target."""
 
     def __init__(self, pdos: Sequence[Pdo], node: int, target: Mapped, label: str) -> None:
         """Prepare the frames.
@@ -58,11 +59,11 @@ class CommandFrames:
         Args:
             pdos: The RPDOs.
             node: Node id.
-            target: The object that takes the set-point.
-            label: Named in what is raised.
+            target: The object of the set-point.
+            label: Name of the drive in messages.
 
         Raises:
-            ConfigError: They carry an object that nobody here has a value for.
+            ConfigError: They carry an object without a value here.
         """
         known = (cia402.CONTROLWORD, cia402.MODE_OF_OPERATION, target)
         unknown = [item for pdo in pdos for item in pdo.objects if item not in known]
@@ -79,14 +80,14 @@ class CommandFrames:
             self._frames.append((message, pdo.layout, places))
 
     def send(self, bus: Bus, word: int, mode: int, target: int) -> None:
-        """Put them on the bus; for the cycle's thread, which fills the same frames again and again."""
+        """Send them from the cycle's thread, which reuses the same frames."""
         values = (word, mode, target)
         for message, layout, places in self._frames:
             layout.pack_into(message.data, 0, *[values[place] for place in places])
             bus.send(message)
 
-    def send_anew(self, bus: Bus, word: int, mode: int, target: int) -> None:
-        """Put them on the bus from any thread, in frames that no other thread fills meanwhile."""
+    def send_new(self, bus: Bus, word: int, mode: int, target: int) -> None:
+        """Send them from any thread, in new frames."""
         values = (word, mode, target)
         for message, layout, places in self._frames:
             data = layout.pack(*[values[place] for place in places])
@@ -94,44 +95,44 @@ class CommandFrames:
 
 
 RESET_CYCLES = 200
-"""For so many cycles a fault reset is tried,"""
+"""A fault reset is tried for this number of cycles."""
 RESET_PERIOD = 4
-"""as a rising edge in every fourth."""
+"""A fault reset has one rising edge in this number of cycles."""
 STOPPING = 0.8
-"""How long [s] a quick stop, or slowing down, may take before the power is taken off."""
+"""After this time [s] for a quick stop, or for slowing down, the drive is powered off."""
 RAMPED = (Mode.PROFILE_POSITION, Mode.CYCLIC_SYNCHRONOUS_VELOCITY)
-"""Modes in which a drive that is let go may be moving, and slows down first."""
+"""In these modes a drive may move when it is disabled, so it slows down first."""
 ANSWER_TIME = 1.0
-"""How long [s] a drive may take to acknowledge a set-point."""
+"""`health` warns if a drive takes longer than this time [s] to acknowledge a set-point."""
 
 
 class Cia402Drive(CanopenNode):
-    """One drive. It is enabled only by `enable`, and stays disabled once it dropped out by itself."""
+    """One drive. Only `enable` enables it; a drive that leaves 'operation enabled' by itself stays disabled."""
 
     Settings = DriveSettings
     COUNTERS = (*CanopenNode.COUNTERS, "homed")
     MAY_RECEIVE = (cia402.MODE_OF_OPERATION,)
 
     @classmethod
+    @override
     def quantities(cls, settings: DriveSettings) -> tuple[str, ...]:
-        """See `CanDevice.quantities`."""
         return settings.quantities
 
     @classmethod
+    @override
     def commanded(cls, settings: DriveSettings) -> str:
-        """See `CanDevice.commanded`."""
         return settings.commanded
 
     @classmethod
+    @override
     def traffic(cls, settings: DriveSettings, rate: float) -> tuple[tuple[int, float], ...]:
-        """See `CanDevice.traffic`."""
         return cls.traffic_of(settings, rate, settings.quantities)
 
     @classmethod
+    @override
     def traffic_of(
         cls, settings: DriveSettings, rate: float, quantities: tuple[str, ...]
     ) -> tuple[tuple[int, float], ...]:
-        """See `CanDevice.traffic_of`."""
         pdos = settings.pdo.map("pdo") if settings.pdo else settings.pdos(quantities)
         return (*pdos.frames(rate), HEARTBEAT)
 
@@ -141,9 +142,9 @@ class Cia402Drive(CanopenNode):
         self._units: DriveUnits | None = None
         self._state = State.NOT_READY
         self._statusword = -1
-        """The newest; negative until one has come."""
+        """The newest statusword; -1 before the first."""
         self._counts: int | None = None
-        self._shown_mode = 0
+        self._actual_mode = 0
         self._velocity = math.nan
         count = len(place.elements)
         self._zeros, self._scales = np.zeros(count).tolist(), np.full(count, math.nan).tolist()
@@ -156,34 +157,37 @@ class Cia402Drive(CanopenNode):
         self._homing: HomingRun | None = None
         self._is_wanted = False
         self._was_reached = False
-        self._told = ""
-        self._resetting = self._letting_go = self._slowing = 0
+        self._text = ""
+        self._resetting = self._quick_stopping = self._slowing = 0
         self._stopping_cycles = round(STOPPING * place.rate)
         target = TARGETS[settings.commanded]
         self._frames = CommandFrames(self._pdos.receives, place.node, target, str(place))
 
+    @override
     def _watch_time(self) -> float:
         return self._settings.watch_time if self._is_watched else 0.0
 
+    @override
     def _before_commissioning(self) -> None:
         self._forget()
         self._sdo.write(cia402.CONTROLWORD.index, 0, cia402.DISABLE_VOLTAGE, 2)
 
+    @override
     def _calibrate(self) -> None:
         self._check_modes()
         settings = self._settings
         units = self._units = drive_units(settings, self._velocity_unit(), self._rated_torque())
         line = units.position
-        found = {
+        lines = {
             "position": (line.zero, line.scale),
             "velocity": (0.0, units.velocity),
             "effort": (0.0, units.effort),
             "following_error": (0.0, line.scale),
         }
         if settings.temperature:
-            found["temperature"] = (settings.temperature.zero, settings.temperature.scale)
+            lines["temperature"] = (settings.temperature.zero, settings.temperature.scale)
         for quantity, slot in self._slots.items():
-            self._zeros[slot], self._scales[slot] = found[quantity]
+            self._zeros[slot], self._scales[slot] = lines[quantity]
 
     def _check_modes(self) -> None:
         if not self._sdo.has(cia402.SUPPORTED_MODES.index):
@@ -206,26 +210,28 @@ class Cia402Drive(CanopenNode):
             if code:
                 known = ", ".join(cia402.VELOCITY_UNITS)
                 raise DeviceRefused(
-                    f"{self._place} has velocities in unit {code:08X}h (60A9h), which is not known here. "
+                    f"{self._place} has velocities in the unknown unit {code:08X}h (60A9h). "
                     f"Give velocity_unit: {known}."
                 )
         return cia402.VELOCITY_UNITS[name or "counts/s"]
 
     def _rated_torque(self) -> float:
-        """[N m]; NaN if nobody asks for it."""
+        """Return the rated torque [N m]; NaN if effort is not measured."""
         if self._settings.rated_torque is not None:
             return self._settings.rated_torque
         if "effort" not in self._slots:
             return math.nan
-        found = self._sdo.read(cia402.RATED_TORQUE.index, 0) * 1e-3
-        if not found:
-            raise DeviceRefused(f"{self._place} says that its rated torque is 0 (6076h). Give rated_torque.")
-        return found
+        torque = self._sdo.read(cia402.RATED_TORQUE.index, 0) * 1e-3
+        if not torque:
+            raise DeviceRefused(f"{self._place} reports a rated torque of 0 (6076h). Give rated_torque.")
+        return torque
 
+    @override
     def _writes(self) -> tuple[Write, ...]:
         assert self._units is not None
         return drive_writes(self._settings, self._units, self._place.bounds, 1.0 / self._place.rate, self._sheet)
 
+    @override
     def _pdo_handler(self, pdo: Pdo) -> PdoHandler:
         places = {item: place for place, item in enumerate(pdo.objects)}
         status, counts, velocity, mode = (
@@ -233,7 +239,7 @@ class Cia402Drive(CanopenNode):
         )
         objects = OBJECTS | ({"temperature": self._settings.temperature.mapped} if self._settings.temperature else {})
         kept = [(places[objects[q]], slot) for q, slot in self._slots.items() if objects[q] in places]
-        zeros, scales, found, times = self._zeros, self._scales, self._values, self._received
+        zeros, scales, measured, times = self._zeros, self._scales, self._values, self._received
 
         def take(values: tuple[Any, ...], received: float) -> None:
             if status >= 0:
@@ -244,123 +250,120 @@ class Cia402Drive(CanopenNode):
             if velocity >= 0:
                 self._velocity = values[velocity]
             if mode >= 0:
-                self._shown_mode = values[mode]
+                self._actual_mode = values[mode]
             for place, slot in kept:
-                found[slot] = zeros[slot] + scales[slot] * values[place]
+                measured[slot] = zeros[slot] + scales[slot] * values[place]
                 times[slot] = received
 
         return take
 
+    @override
     def _lose(self, text: str) -> None:
         super()._lose(text)
         self._forget()
 
     def _forget(self) -> None:
-        """Nothing that was asked before holds any more."""
+        """Drop the state of the drive and all requests."""
         self._state, self._statusword, self._counts = State.NOT_READY, -1, None
-        self._is_wanted, self._letting_go, self._slowing, self._homing = False, 0, 0, None
+        self._is_wanted, self._quick_stopping, self._slowing, self._homing = False, 0, 0, None
 
+    @override
     def _drives(self) -> bool:
         return self._state in (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_REACTION)
 
+    @override
     def _running(self) -> tuple[DeviceState, str]:
         state, homing = self._state, self._homing
         if state is State.FAULT or state is State.FAULT_REACTION:
-            return DeviceState.FAULT, f"{self._place} is in its state '{state}'. Look at its display, then reset."
+            return DeviceState.FAULT, f"{self._place} is in its state '{state}'. Check its display, then reset."
         if homing is not None:
             return DeviceState.HOMING, f"{self._place} is {homing.phase}."
         if state is State.OPERATION_ENABLED:
             return DeviceState.ENABLED, self._warning()
         if state is State.QUICK_STOP_ACTIVE:
-            return DeviceState.STOPPING, self._told or f"{self._place} comes to rest by a quick stop."
-        return DeviceState.READY, self._told or self._warning()
+            return DeviceState.STOPPING, self._text or f"{self._place} comes to rest by a quick stop."
+        return DeviceState.READY, self._text or self._warning()
 
     def _warning(self) -> str:
         if self._handshake.waited > ANSWER_TIME * self._place.rate:
             return f"{self._place} does not acknowledge set-points (bit 12 of its statusword)."
         if self._statusword >= 0 and not self._statusword & cia402.REMOTE:
-            return f"{self._place} is led from its own panel and takes no commands (bit 9 of its statusword)."
+            return f"{self._place} is controlled from its own panel and takes no commands (bit 9 of its statusword)."
         if self._statusword >= 0 and self._statusword & cia402.WARNING:
-            return f"{self._place} warns (bit 7 of its statusword). Look at its display."
+            return f"{self._place} warns (bit 7 of its statusword). Check its display."
         return "" if self._is_watched else UNWATCHED.format(self._place)
 
+    @override
     def enable(self) -> None:
-        """See `Device.enable`."""
-        self._is_wanted, self._was_reached, self._told, self._letting_go = True, False, "", 0
+        self._is_wanted, self._was_reached, self._text, self._quick_stopping = True, False, "", 0
 
+    @override
     def disable(self) -> None:
-        """See `Device.disable`."""
         if self._is_wanted and self._mode in RAMPED:
             self._slowing = self._stopping_cycles
         self._is_wanted = False
         if (homing := self._homing) is not None:
             homing.give_up("was stopped")
 
+    @override
     def quick_stop(self) -> None:
-        """See `Device.quick_stop`; the word goes out at once, and in every cycle until the drive stands."""
         self.disable()
         if self._state in (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE):
-            self._letting_go = self._stopping_cycles
-            self._frames.send_anew(self._bus, cia402.QUICK_STOP, self._homing_mode(), self._rest())
+            self._quick_stopping = self._stopping_cycles  # the command goes out now, and then in every cycle
+            self._frames.send_new(self._bus, cia402.QUICK_STOP, self._homing_mode(), self._rest())
 
+    @override
     def home(self) -> None:
-        """See `Device.home`.
-
-        Raises:
-            CommandRefused: There are no settings for it, or the drive is not ready.
-        """
         if self._settings.homing is None:
             raise CommandRefused(f"'{self.name}' has no setting `homing` in the robot file.")
         health = self.health()
         if health.state is not DeviceState.READY:
             raise CommandRefused(f"'{self.name}' is {health.state}, not ready, so it cannot be homed. {health.text}")
-        self._told = ""
+        self._text = ""
         self._homing = HomingRun(self._mode, round(self._settings.homing.timeout * self._place.rate))
 
+    @override
     def reset(self) -> None:
-        """See `Device.reset`."""
         super().reset()
-        self._told = ""
+        self._text = ""
         self._resetting = RESET_CYCLES
 
+    @override
     def apply(self, values: np.ndarray) -> None:
-        """See `Device.apply`; until the drive is enabled a velocity or torque is 0.
-
-        A position is what `Robot` asks for from the beginning, which looks whether it can be believed: a single wrong
-        frame of ours or of another node must not become the place to start from.
-        """
+        # Before the drive is enabled its target is 0 for a velocity or torque. For a position it is already the value
+        # that `Robot` has checked, so that a single wrong frame cannot become the position to start from.
         units = self._units
         if units is None:
             return
         convert = {"position": units.counts, "velocity": units.speed, "effort": units.torque}[self.command_quantity]
         target = convert(float(values[0]))
-        if not self._is_followed(target if self.command_quantity == "position" else 0):
+        if not self._leads_to_enabled(target if self.command_quantity == "position" else 0):
             return
         bits = 0
         if self._mode is Mode.PROFILE_POSITION:
             bits, target = self._handshake.step(target, self._statusword)
         self._send(cia402.ENABLE_OPERATION | bits, target, self._mode)
 
+    @override
     def damp(self) -> None:
-        """See `Device.damp`; the effort is against the velocity, and none while that is not known."""
-        if not self._is_followed(self._rest()) or self._units is None or self._settings.damping is None:
+        if not self._leads_to_enabled(self._rest()) or self._units is None or self._settings.damping is None:
             return
         effort = -self._settings.damping * self._velocity * self._units.velocity
         self._send(cia402.ENABLE_OPERATION, self._units.torque(effort) if effort == effort else 0, self._mode)
 
+    @override
     def idle(self) -> None:
-        """See `Device.idle`; the drive is led to a state without power, out of a fault, or to its zero, if asked."""
         state = self._state
-        if self._letting_go:
-            self._letting_go -= 1
+        if self._quick_stopping:
+            self._quick_stopping -= 1
             if state in (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE):
-                word = cia402.QUICK_STOP if self._letting_go else cia402.DISABLE_VOLTAGE
+                word = cia402.QUICK_STOP if self._quick_stopping else cia402.DISABLE_VOLTAGE
                 self._send(word, self._rest(), self._homing_mode())
                 return
-            self._letting_go = 0
+            self._quick_stopping = 0
         homing = self._homing
         if homing is not None:
-            word, mode = homing.step(state, self._statusword, self._shown_mode)
+            word, mode = homing.step(state, self._statusword, self._actual_mode)
             self._send(word, self._rest(), mode)
             if homing.is_over:
                 self._end_homing(homing)
@@ -373,23 +376,25 @@ class Cia402Drive(CanopenNode):
             self._resetting = self._resetting - 1 if state in (State.FAULT, State.FAULT_REACTION) else 0
         self._send(word, self._rest(), self._mode)
 
+    @override
     def inspect(self) -> tuple[Check, ...]:
-        """See `Device.inspect`."""
-        if self._units is None:  # never opened, but asked
+        if self._units is None:  # not opened yet
             self._calibrate()
-        own = drive_checks(self._sdo, self._mode, self._is_watched, str(self._place))
-        return (*super().inspect(), *own)
+        checks = drive_checks(self._sdo, self._mode, self._is_watched, str(self._place))
+        return (*super().inspect(), *checks)
 
-    def _is_followed(self, rest: int) -> bool:
-        """Whether the drive takes set-points; if not, it is led there, or let go when it has dropped out by itself.
+    def _leads_to_enabled(self, rest: int) -> bool:
+        """Return whether the drive takes set-points; if not, send the command of this cycle instead.
+
+        It leads the drive towards 'operation enabled', or disables it if it left that state by itself.
 
         Args:
-            rest: The target that moves nothing, as far as can be known.
+            rest: Target that does not move the drive.
         """
         state = self._state
         if self._is_wanted and self._was_reached and state is not State.OPERATION_ENABLED:
             self._is_wanted = False
-            self._told = f"{self._place} left 'operation enabled' by itself and is '{state}'."
+            self._text = f"{self._place} left 'operation enabled' by itself and is '{state}'."
         if not self._is_wanted:
             self.idle()
             return False
@@ -403,7 +408,7 @@ class Cia402Drive(CanopenNode):
 
     def _end_homing(self, homing: HomingRun) -> None:
         self._homing = None
-        self._told = f"{self._place}: homing {homing.problem}." if homing.problem else ""
+        self._text = f"{self._place}: homing {homing.problem}." if homing.problem else ""
         if not homing.problem:
             self._counters["homed"] += 1
 
@@ -411,11 +416,11 @@ class Cia402Drive(CanopenNode):
         return self._mode if self._homing is None else Mode.HOMING
 
     def _rest(self) -> int:
-        """The target that moves nothing: where the drive is, no velocity, no torque."""
+        """Return a target that does not move the drive: its position, or zero velocity or torque."""
         return (self._counts or 0) if self.command_quantity == "position" else 0
 
     def _send(self, word: int, target: int, mode: Mode) -> None:
-        """Put the command on the bus, if the drive has told where it is since it was commissioned."""
-        has_told = self._statusword >= 0 and (self._counts is not None or self.command_quantity != "position")
-        if self.is_commissioned and has_told:
+        """Send the command, if the drive has reported its state and position since it was commissioned."""
+        has_reported = self._statusword >= 0 and (self._counts is not None or self.command_quantity != "position")
+        if self.is_commissioned and has_reported:
             self._frames.send(self._bus, word, mode, target)

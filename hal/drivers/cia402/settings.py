@@ -1,4 +1,4 @@
-"""What a robot file says of a servo drive, and what follows from it: quantities, PDOs and units."""
+"""Settings of a servo drive, with the quantities, PDOs and units that follow from them."""
 
 import math
 from dataclasses import dataclass
@@ -20,37 +20,37 @@ MODES = {
     "csv": Mode.CYCLIC_SYNCHRONOUS_VELOCITY,
     "cst": Mode.CYCLIC_SYNCHRONOUS_TORQUE,
 }
-"""Modes as a robot file names them."""
+"""Modes by their names in a robot file."""
 COMMANDED = {"profile_position": "position", "csp": "position", "csv": "velocity", "cst": "effort"}
 TARGETS = {
     "position": cia402.TARGET_POSITION,
     "velocity": cia402.TARGET_VELOCITY,
     "effort": cia402.TARGET_TORQUE,
 }
-"""Commanded quantity -> the object that takes it."""
+"""Commanded quantity -> object of its set-point."""
 OBJECTS = {
     "position": cia402.POSITION,
     "effort": cia402.TORQUE,
     "velocity": cia402.VELOCITY,
     "following_error": cia402.FOLLOWING_ERROR,
 }
-"""Measured quantity -> the object that has it, in the order in which they are mapped."""
+"""Measured quantity -> its object, in the order of the mapping."""
 
 
 class TemperatureSettings(Section):
-    """Where a drive has a temperature; the standard has no object for it."""
+    """The object of a drive's temperature; the standard defines none."""
 
     object: str
-    """As in `2200h:1`."""
+    """Index and sub-index, as in `2200h:1`."""
     type: str = "int16"
     scale: Finite = 0.1
     """Degrees Celsius per count."""
     zero: Finite = 0.0
     """Degrees Celsius at zero counts; -273.15 for a drive that counts kelvins."""
     every: Annotated[int, Field(ge=1, le=240)] = 20
-    """Sent with every n-th SYNC."""
+    """The drive sends it with every n-th SYNC."""
     event_time: Positive | None = None
-    """Given: sent every so many seconds, whatever the SYNC."""
+    """Period [s] in which the drive sends it, in place of `every`."""
 
     @model_validator(mode="after")
     def _is_object(self) -> "TemperatureSettings":
@@ -61,37 +61,37 @@ class TemperatureSettings(Section):
 
     @property
     def mapped(self) -> Mapped:
-        """The object."""
+        """Object of the temperature."""
         return cia301.mapped(self.object, self.type)
 
 
 class ProfileSettings(Section):
-    """How a drive moves in profile position mode; what is absent is left as it is in the drive."""
+    """The motion profile of profile position mode; an absent value stays as it is in the drive."""
 
     velocity: Positive | None = None
-    """[rad/s or m/s], object 6081h."""
+    """Velocity [rad/s or m/s], object 6081h."""
     acceleration: Positive | None = None
-    """[rad/s2 or m/s2], object 6083h."""
+    """Acceleration [rad/s2 or m/s2], object 6083h."""
     deceleration: Positive | None = None
-    """[rad/s2 or m/s2], object 6084h."""
+    """Deceleration [rad/s2 or m/s2], object 6084h."""
 
 
 class HomingSettings(Section):
-    """How a drive finds its zero by itself."""
+    """The drive's own search for its zero."""
 
     method: Annotated[int, Field(ge=-128, le=127)]
-    """Object 6098h: 17 and 18 negative and positive limit switch, 33 and 34 next index pulse, 37 where it is."""
+    """Object 6098h: 17 and 18 negative and positive limit switch, 33 and 34 next index pulse, 37 present position."""
     speed: Positive
-    """Of the search for the switch [rad/s or m/s], object 6099h:1."""
+    """Speed of the search for the switch [rad/s or m/s], object 6099h:1."""
     slow_speed: Positive
-    """Of the search for the edge or the index [rad/s or m/s], object 6099h:2."""
+    """Speed of the search for the edge or the index [rad/s or m/s], object 6099h:2."""
     acceleration: Positive | None = None
-    """[rad/s2 or m/s2], object 609Ah."""
+    """Acceleration [rad/s2 or m/s2], object 609Ah."""
     offset: Finite = 0.0
-    """From the home position to the zero position, with the drive's direction [rad or m], object 607Ch; `zero` is the
-    value at the zero position."""
+    """Distance from the home position to the zero position, in the drive's direction [rad or m], object 607Ch; `zero`
+    is the value at the zero position."""
     timeout: Positive = 60.0
-    """After so long [s] it is given up."""
+    """Homing fails after this time [s]."""
 
 
 class DriveSettings(NodeSettings):
@@ -110,27 +110,27 @@ class DriveSettings(NodeSettings):
     zero: Finite = 0.0
     """Value at zero counts [m or rad]."""
     velocity_unit: Literal["counts/s", "rps", "rpm", "0.1 rpm", "mrpm"] | None = None
-    """Of the drive's velocities, turns being the motor's; absent: what object 60A9h says, else counts/s."""
+    """Unit of the drive's velocities, in turns of the motor; absent: that of object 60A9h, else counts/s."""
     rated_torque: Positive | None = None
     """Motor rated torque [N m]; absent: object 6076h, by the standard (not every drive) in mN m."""
     max_torque: Annotated[int, Field(ge=0, le=10_000)] | None = None
-    """Written to object 6072h [thousandths of the rated torque]; absent: left as it is."""
+    """Value of object 6072h [thousandths of the rated torque]; absent: not changed."""
     max_velocity: Positive | None = None
-    """Written to objects 607Fh and 6080h [rad/s or m/s]; absent: left as they are."""
+    """Value of objects 607Fh and 6080h [rad/s or m/s]; absent: not changed."""
     following_error: Positive | None = None
-    """Beyond it the drive faults [rad or m], object 6065h; absent: left as it is."""
+    """The drive faults beyond this following error [rad or m], object 6065h; absent: not changed."""
     profile: ProfileSettings = ProfileSettings()
-    """For profile position mode."""
+    """Motion profile of profile position mode."""
     temperature: TemperatureSettings | None = None
-    """Where the drive has a temperature."""
+    """Object of the temperature; absent: the drive has none."""
     homing: HomingSettings | None = None
-    """How it finds its zero; absent: it need not or cannot."""
+    """Homing of the drive; absent: none."""
     damping: Positive | None = None
-    """For `damp` in the mode cst [N m s/rad or N s/m]."""
+    """Damping of `damp` in the mode cst [N m s/rad or N s/m]."""
     watch_time: Annotated[float, Field(ge=0.1, le=5.0)] = 0.15
-    """How long [s] the drive waits for the HAL's heartbeat before it stops by itself (object 1016h)."""
+    """The drive stops by itself after this time [s] without the HAL's heartbeat (object 1016h)."""
     allow_no_watchdog: bool = False
-    """Use a drive that cannot wait for the HAL's heartbeat, and goes on moving when the HAL is gone."""
+    """Accept a drive that cannot monitor the HAL's heartbeat and goes on moving when the HAL is gone."""
 
     @model_validator(mode="after")
     def _fits_the_mode(self) -> "DriveSettings":
@@ -142,17 +142,17 @@ class DriveSettings(NodeSettings):
 
     @property
     def commanded(self) -> str:
-        """The quantity that is commanded."""
+        """Commanded quantity."""
         return COMMANDED[self.mode]
 
     @property
     def quantities(self) -> tuple[str, ...]:
-        """What the drive can measure, the commanded quantity first."""
+        """Measured quantities, the commanded quantity first."""
         rest = (*OBJECTS, *(("temperature",) if self.temperature else ()))
         return (self.commanded, *(quantity for quantity in rest if quantity != self.commanded))
 
     def pdos(self, quantities: tuple[str, ...]) -> PdoMap:
-        """The PDOs that carry some quantities, and what the driver needs besides."""
+        """Return the PDOs of these quantities and of the objects that the driver needs."""
         needed = set(quantities)
         if self.commanded == "position":
             needed.add("position")  # to start from
@@ -183,15 +183,15 @@ LARGEST_TORQUE = 2**15 - 1
 
 @dataclass(frozen=True, slots=True)
 class DriveUnits:
-    """What a drive's numbers are worth.
+    """The units of a drive's numbers.
 
     Attributes:
         position: Counts -> [rad or m].
-        velocity: [rad/s or m/s] of one velocity unit; negative if counts grow the other way.
-        effort: [N m at the joint, or N at the wire] of a thousandth of the rated torque, in the direction in which the
-            position grows: motor torque times gear (over the radius); friction of the gear is not in it. Held by its
-            motor, a taut wire has a negative effort, since it would get longer. NaN if the rated torque is not known.
-        motor_turn: [rad or m] of one turn of the motor.
+        velocity: One velocity unit [rad/s or m/s]; negative if counts grow the other way.
+        effort: A thousandth of the rated torque [N m at the joint, or N at the wire], in the direction of growing
+            position: motor torque times gear (over the radius), without friction of the gear. A taut wire held by its
+            motor has a negative effort, because it pulls towards greater length. NaN if the rated torque is unknown.
+        motor_turn: One turn of the motor [rad or m].
     """
 
     position: Linear
@@ -200,29 +200,29 @@ class DriveUnits:
     motor_turn: float
 
     def counts(self, value: float) -> int:
-        """The nearest target position [counts] for a position [rad or m]."""
+        """Return the nearest target position [counts] of a position [rad or m]."""
         return _clip(self.position.to_counts(value), LARGEST_COUNT)
 
     def speed(self, value: float) -> int:
-        """The nearest target velocity [velocity units] for a velocity [rad/s or m/s]."""
+        """Return the nearest target velocity [velocity units] of a velocity [rad/s or m/s]."""
         return _clip(value / self.velocity, LARGEST_COUNT)
 
     def torque(self, value: float) -> int:
-        """The nearest target torque [thousandths of the rated one] for an effort [N m or N]."""
+        """Return the nearest target torque [thousandths of the rated torque] of an effort [N m or N]."""
         return _clip(value / self.effort, LARGEST_TORQUE)
 
     def size(self, value: float, per_unit: float) -> int:
-        """A bound, for an object without a sign: at least 1, at most what 31 bits hold."""
+        """Return a bound for an unsigned object: at least 1, at most 2^31 - 1."""
         return min(max(round(abs(value / per_unit)), 1), LARGEST_COUNT)
 
 
 def drive_units(settings: DriveSettings, unit: VelocityUnit, rated_torque: float) -> DriveUnits:
-    """The units of one drive.
+    """Return the units of one drive.
 
     Args:
         settings: Its settings.
-        unit: Of its velocities.
-        rated_torque: Of its motor [N m]; NaN if not known.
+        unit: Unit of its velocities.
+        rated_torque: Rated torque of its motor [N m]; NaN if unknown.
     """
     shape = (settings.counts_per_turn, settings.gear, settings.direction, settings.zero)
     radius = settings.spool_radius

@@ -1,4 +1,4 @@
-"""What a servo drive is told before it is used: its mode, its limits, and what it does when nobody leads it."""
+"""Objects that are written to a servo drive before its use: mode, limits, and the reaction to a lost connection."""
 
 import math
 from collections.abc import Iterator
@@ -14,30 +14,30 @@ Write = tuple[Mapped, int]
 
 ERROR_BEHAVIOUR = Mapped(cia301.ERROR_BEHAVIOUR, 1, 8)
 POSITION_MARGIN = 0.1
-"""The drive's own limits are wider than the robot file's by this part of the range: a drive that stands a little out of
-range must not jump into it when it is enabled, and one that stands further out is not enabled at all."""
+"""The drive's limits are wider than the robot file's by this part of the range: a drive slightly out of range must not
+jump into it when it is enabled. A drive further out of range is not enabled."""
 
 
-def check_objects(settings: DriveSettings, wants_effort: bool, sheet: canopen.ObjectDictionary, label: str) -> None:
-    """Refuse settings that need what the drive does not have.
+def check_objects(settings: DriveSettings, has_effort: bool, sheet: canopen.ObjectDictionary, label: str) -> None:
+    """Check that the drive has the objects that its settings need.
 
     Raises:
-        ConfigError: Names the object and the setting.
+        ConfigError: An object is missing; it names the object and the setting.
     """
-    for what, item in _needed(settings, wants_effort):
+    for what, item in _needed(settings, has_effort):
         if sheet.get_variable(item.index, item.subindex) is None:
             raise ConfigError(f"{label} needs object {item} for {what}; its data sheet has none. Is it the right file?")
     watchdog = sheet.get_variable(cia301.CONSUMER_HEARTBEAT, 1)
     if watchdog is None and not settings.allow_no_watchdog:
         raise ConfigError(
-            f"{label} has no object {cia301.CONSUMER_HEARTBEAT:04X}h by its data sheet, so that it would go on when "
+            f"{label} has no object {cia301.CONSUMER_HEARTBEAT:04X}h by its data sheet, so it would go on moving when "
             "the HAL is gone. Use another drive, or accept it with allow_no_watchdog: true."
         )
 
 
-def _needed(settings: DriveSettings, wants_effort: bool) -> Iterator[tuple[str, Mapped]]:
+def _needed(settings: DriveSettings, has_effort: bool) -> Iterator[tuple[str, Mapped]]:
     yield "its mode", cia402.MODE_OF_OPERATION
-    if wants_effort and settings.rated_torque is None:
+    if has_effort and settings.rated_torque is None:
         yield "the rated torque (or the setting rated_torque)", cia402.RATED_TORQUE
     if settings.max_torque is not None:
         yield "max_torque", cia402.MAX_TORQUE
@@ -69,14 +69,14 @@ def drive_writes(
     period: float,
     sheet: canopen.ObjectDictionary,
 ) -> tuple[Write, ...]:
-    """Objects and their values, in the order in which they are written.
+    """Return objects and their values, in the order in which they are written.
 
     Args:
         settings: The drive's settings.
-        units: What its numbers are worth.
-        bounds: Lowest and highest set-point by the robot file [its unit]; infinite where not stated.
-        period: Of the set-points [s], between which a drive interpolates.
-        sheet: Its data sheet; a limit or reaction that it has no object for is left to the HAL.
+        units: The drive's units.
+        bounds: Lowest and highest set-point of the robot file [unit of the commanded element]; infinite if not given.
+        period: Period of the set-points [s], between which a drive interpolates.
+        sheet: Its data sheet; a limit or reaction without an object there is not written.
     """
     value, index = cia402.interpolation(period)
     optional = (
@@ -96,7 +96,7 @@ def drive_writes(
 
 
 def _takes(sheet: canopen.ObjectDictionary, item: Mapped) -> bool:
-    """Whether the data sheet has an object that can be written."""
+    """Return whether the data sheet has the object and allows writing it."""
     entry = sheet.get_variable(item.index, item.subindex)
     return entry is not None and "w" in entry.access_type
 
