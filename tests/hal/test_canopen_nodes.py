@@ -477,6 +477,4 @@ def test_a_drive_that_was_never_opened_can_be_inspected(joint):
 
 def test_a_velocity_unit_that_is_not_known_is_told(joint):
     bench = joint("csv", hardware={"velocity_unit": 0x00410300}).open()
-    assert "has velocities in the unknown unit 00410300h (60A9h). Give velocity_unit: counts/s" in text(
-        bench
-    )
+    assert "has velocities in the unknown unit 00410300h (60A9h). Give velocity_unit: counts/s" in text(bench)
