@@ -1,4 +1,4 @@
-"""The command line: every verb of gemuco, each ending in a sentence when something is wrong."""
+"""The command line of gemuco: all verbs."""
 
 import sys
 from importlib import metadata
@@ -17,35 +17,33 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
     help="A body schema for robots, run as a real-time service.\n\n"
-    "A robot is a YAML file (robots/musashi_arm.yaml). Three processes run it: [bold]simulate[/] pretends to be the "
-    "hardware, [bold]hal[/] reads and moves the hardware, [bold]serve[/] thinks; [bold]vision[/] is a fourth where a "
-    "camera looks on. [bold]collect[/] and [bold]train[/] make the model that serve needs. [bold]demo[/] does all of "
-    "it in a minute.",
+    "A robot is a YAML file (robots/musashi_arm.yaml). Three processes run it: [bold]simulate[/] simulates the "
+    "hardware, [bold]hal[/] reads and moves it, [bold]serve[/] runs the model. A robot with a camera has a fourth, "
+    "[bold]vision[/]. [bold]collect[/] and [bold]train[/] make the model for serve. [bold]demo[/] shows all of this in "
+    "a minute.",
 )
 
-Seed = Annotated[int, typer.Option(help="Seed of all that is random.")]
+Seed = Annotated[int, typer.Option(help="Seed of all random numbers.")]
 Variant = Annotated[
     str | None,
-    typer.Option(
-        help="Which variant of the robot to simulate; the designer's model, which is the first, if not given."
-    ),
+    typer.Option(help="Variant of the robot to simulate; the first, which is the designer's model, if not given."),
 ]
 
 
-def _version(is_asked: bool) -> None:
-    if is_asked:
+def _version(is_given: bool) -> None:
+    if is_given:
         typer.echo(f"gemuco {metadata.version('gemuco')}")
         raise typer.Exit
 
 
 @app.callback()
 def main(
-    verbose: Annotated[
-        bool, typer.Option("--verbose", "-v", help="Log what happens, not only what goes wrong.")
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log events, not only warnings and errors.")] = False,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
     ] = False,
-    version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Tell it.")] = False,
 ) -> None:
-    """Begin logging on stderr; the verbs do the rest."""
+    """Set logging on stderr up."""
     import logging
 
     level = logging.INFO if verbose else logging.WARNING
@@ -59,13 +57,13 @@ def simulate(
     variant: Variant = None,
     seed: Seed = 0,
     condition: Annotated[
-        str | None, typer.Option(help="Condition of the body, such as its tool; the file's first if not given.")
+        str | None, typer.Option(help="Condition of the body, such as its tool; the first of the file if not given.")
     ] = None,
     connect: Connect = None,
 ) -> int:
-    """Pretend to be the hardware: simulated CANopen nodes on the robot file's buses, until Ctrl-C.
+    """Run simulated nodes on the robot file's buses until Ctrl-C.
 
-    Break things while it runs with `gemuco query ROBOT fault "muscle_cut biceps"`.
+    Apply faults while it runs with `gemuco query ROBOT fault "muscle_cut biceps"`.
     """
     from services.hardware.simulator_service import run_simulator
 
@@ -75,9 +73,9 @@ def simulate(
 @app.command()
 @report_errors
 def hal(robot: RobotFile, connect: Connect = None) -> int:
-    """Read the hardware and move it: samples out, limited commands in, until Ctrl-C.
+    """Read and move the hardware until Ctrl-C: publish samples, apply limited commands.
 
-    Starts with the motors off, and turns them on only when asked.
+    The motors are off at the start; a client enables them.
     """
     from services.hardware.hal_service import run_hal
 
@@ -87,9 +85,10 @@ def hal(robot: RobotFile, connect: Connect = None) -> int:
 @app.command()
 @report_errors
 def vision(robot: RobotFile, variant: Variant = None, seed: Seed = 0, connect: Connect = None) -> None:
-    """Play the camera of a simulated robot: looks at the simulator's truth, publishes what it sees, until Ctrl-C.
+    """Run the camera of a simulated robot until Ctrl-C: compute the vision signals from the simulator's truth.
 
-    A real robot's camera publishes on the same key instead. Cover it with `gemuco query ROBOT fault camera_covered`.
+    The camera of a real robot publishes on the same key instead. To cover the simulated one: `gemuco query ROBOT fault
+    camera_covered`.
     """
     from services.hardware.vision_service import run_vision
 
@@ -103,7 +102,7 @@ def serve(
     model: Annotated[Path | None, typer.Option(help="The trained model; runs/<robot>/model if not given.")] = None,
     connect: Connect = None,
 ) -> None:
-    """Run the model: estimation, control, anomaly detection and online update, until Ctrl-C."""
+    """Run the model until Ctrl-C: estimation, control, anomaly detection, online update."""
     from services.model import artifacts
     from services.model.serve import serve as run_model
 
@@ -119,35 +118,36 @@ def collect(
     seed: Seed = 0,
     condition: Annotated[
         list[str] | None,
-        typer.Option("--condition", help="Condition of the body to record; again for another; all if not given."),
+        typer.Option("--condition", help="Condition of the body to record; repeat for more; all if not given."),
     ] = None,
     samples: Annotated[
-        int | None, typer.Option(min=1, help="How many per condition; the robot file's number if not given.")
+        int | None, typer.Option(min=1, help="Samples per condition; the robot file's number if not given.")
     ] = None,
     postures: Annotated[
-        Path | None, typer.Option(metavar="CSV", help="Play these taught postures in place of random motion.")
+        Path | None, typer.Option(metavar="CSV", help="Play these taught postures instead of random motion.")
     ] = None,
     bus: Annotated[
-        bool, typer.Option("--bus", help="Move the robot that `gemuco hal` runs, in its own time; else no bus at all.")
+        bool,
+        typer.Option("--bus", help="Move the robot of a running `gemuco hal` in real time; otherwise no bus is used."),
     ] = False,
-    out: Annotated[Path | None, typer.Option(help="Where to write; runs/<robot>/data.npz if not given.")] = None,
+    out: Annotated[Path | None, typer.Option(help="The file to write; runs/<robot>/data.npz if not given.")] = None,
 ) -> None:
-    """Record random safe motion, or taught postures, to train from."""
+    """Record random safe motion or taught postures as training data."""
     from services.learning import collector
     from services.model import artifacts
     from services.show import progress
 
     config, request = load(robot), collector.Request(tuple(condition or ()), samples, postures)
-    with progress("collecting") as tell:
+    with progress("collecting") as report:
         if bus:
-            found = collector.collect_bus(config, seed, request, tell)
+            collection = collector.collect_bus(config, seed, request, report)
         else:
-            found = collector.collect_direct(config, variant, seed, request, tell)
+            collection = collector.collect_direct(config, variant, seed, request, report)
     path = out or artifacts.data_path(config.robot)
-    found.dataset.save(path)
+    collection.dataset.save(path)
     typer.echo(
-        f"{len(found.dataset)} samples in {path}: {found.robot_time:.0f} s of motion in {found.wall_time:.1f} s, "
-        f"{found.speed:.1f} times real time."
+        f"{len(collection.dataset)} samples in {path}: {collection.robot_time:.0f} s of motion in "
+        f"{collection.wall_time:.1f} s, {collection.speed:.1f} times real time."
     )
 
 
@@ -160,11 +160,11 @@ def train(
     data: Annotated[
         list[Path] | None,
         typer.Option(
-            help="Collected samples, runs/<robot>/data.npz if not given; or recordings (.mcap), again for another one. "
+            help="Collected samples, runs/<robot>/data.npz if not given; or recordings (.mcap), repeat for more. "
             "With a description of measured data the folder of its files; that of the description if not given."
         ),
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="Where to write; runs/<robot>/model if not given.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder of the model; runs/<robot>/model if not given.")] = None,
     base: Annotated[
         Path | None,
         typer.Option(
@@ -172,13 +172,13 @@ def train(
         ),
     ] = None,
     condition: Annotated[
-        str | None, typer.Option(help="How the body was in these recordings; as they tell if not given.")
+        str | None, typer.Option(help="Condition of the body in these recordings; as recorded if not given.")
     ] = None,
     seed: Seed = 0,
 ) -> None:
-    """Find out which signals explain which, train, and tell the errors in physical units.
+    """Determine the structure of the signals, train, and print the errors in physical units.
 
-    Interrupted (Ctrl-C, or killed), the same command goes on where it was.
+    After an interruption (Ctrl-C or kill) the same command continues.
     """
     from services.verbs.train import run_training
 
@@ -189,33 +189,33 @@ def train(
 @report_errors
 def query(
     robot: RobotFile,
-    verb: Annotated[str, typer.Argument(help="What to ask: estimate, engage, target, adapt, describe, fault, ...")],
-    words: Annotated[list[str] | None, typer.Argument(metavar="[WORDS]...", help="What the verb needs.")] = None,
+    verb: Annotated[str, typer.Argument(help="The verb: estimate, engage, target, adapt, describe, fault, ...")],
+    words: Annotated[list[str] | None, typer.Argument(metavar="[WORDS]...", help="Arguments of the verb.")] = None,
     hide: Annotated[
-        list[str] | None, typer.Option(help="estimate, anomaly: act as if this signal were not measured.")
+        list[str] | None, typer.Option(help="estimate, anomaly: compute as if this signal were not measured.")
     ] = None,
-    watch: Annotated[bool, typer.Option("--watch", help="estimate: go on once a second until Ctrl-C.")] = False,
+    watch: Annotated[bool, typer.Option("--watch", help="estimate: repeat once a second until Ctrl-C.")] = False,
     connect: Connect = None,
 ) -> int:
-    """Ask a running robot, from any process.
+    """Send a request to a running robot.
 
-    [bold]estimate SIGNAL[/] measured or estimated values    [bold]target SIGNAL V1 V2 ...[/] where to go
+    [bold]estimate SIGNAL[/] measured or estimated values    [bold]target SIGNAL V1 V2 ...[/] set a target
 
     [bold]engage[/], [bold]disengage[/] let the model move the robot or not    [bold]adapt on|off[/] online update
 
-    [bold]control SIGNAL V1 V2 ...[/] the command for a target    [bold]simulate V1 V2 ...[/] where a command leads
+    [bold]control SIGNAL V1 V2 ...[/] command for a target    [bold]simulate V1 V2 ...[/] state after a command
 
-    [bold]anomaly[/] how unlike normal    [bold]rollback[/] the model before the update
+    [bold]anomaly[/] anomaly score    [bold]rollback[/] restore the model before the update
 
-    [bold]normal[/] learn anew what is normal
+    [bold]normal[/] learn the statistics of normal errors again
 
-    [bold]enable[/], [bold]disable[/], [bold]stop[/], [bold]reset[/], [bold]home DRIVE[/] the HAL's motors
+    [bold]enable[/], [bold]disable[/], [bold]stop[/], [bold]reset[/], [bold]home DRIVE[/] motors of the HAL
 
-    [bold]tare SENSOR[/] what it measures now is zero, while the robot is off
+    [bold]tare SENSOR[/] make the present value zero, while the robot is off
 
-    [bold]describe[/] what the robot is    [bold]describe SERVICE[/] who a service is
+    [bold]describe[/] the robot    [bold]describe SERVICE[/] a service    [bold]holder[/] lease holder
 
-    [bold]fault TEXT[/] break something in the simulator
+    [bold]fault TEXT[/] apply a fault in the simulator
     """
     from services.verbs.ask import ask_robot
 
@@ -226,13 +226,13 @@ def query(
 @report_errors
 def estop(
     robot: RobotFile,
-    reason: Annotated[str, typer.Option(help="Told as the cause of the fault.")] = "gemuco estop",
+    reason: Annotated[str, typer.Option(help="Reported as the cause of the fault.")] = "gemuco estop",
     connect: Connect = None,
 ) -> int:
-    """Stop every drive of a running robot as fast as it can, from any process, whatever the robot does.
+    """Stop every drive of a running robot as fast as it can, in any state of the robot.
 
-    Prints what each drive did. Exit code 1 and a loud line if one did not stop or nobody answered: then cut the power.
-    This is no safety-rated emergency stop.
+    Prints the result of each drive. Exit code 1 and an alarm if one did not stop or the HAL did not answer: then cut
+    the power. This is not a safety-rated emergency stop.
     """
     from services.verbs.ask import estop_robot
 
@@ -248,9 +248,10 @@ def top(
     once: Annotated[bool, typer.Option("--once", help="Print once and exit.")] = False,
     connect: Connect = None,
 ) -> int:
-    """Watch all robots, trouble first, or one: rates, lateness, ages of signals, estimates, anomaly, motors.
+    """Watch all robots, faults first, or one: rates, lateness, ages of signals, estimates, anomaly, motors.
 
-    Without --connect those of this machine. With --once the exit code tells: 0 if all robots are well (one: is there).
+    Without --connect it shows the robots of this machine. With --once the exit code is 0 if all robots are well; for
+    one robot, if it is present.
     """
     if robot is None:
         from services.verbs.fleet_top import watch_fleet
@@ -265,14 +266,14 @@ def top(
 @report_errors
 def demo(
     robot: RobotFile = "musashi_arm",
-    seed: Annotated[int, typer.Option(help="Which of the actual robots to simulate.")] = 1,
-    out: Annotated[Path, typer.Option(help="Where the plot, the recording and the logs go.")] = Path("runs/demo"),
+    seed: Annotated[int, typer.Option(help="Seed of the simulated actual robot.")] = 1,
+    out: Annotated[Path, typer.Option(help="Folder for plot, recording and logs.")] = Path("runs/demo"),
 ) -> int:
-    """One minute with an arm that loses a sensor, learns its own body, and loses a muscle.
+    """Play one minute with a simulated arm: it loses a sensor, learns its own body, and loses a muscle.
 
-    A robot with tools and a camera loses its sight instead, is given another tool, and finds out which.
+    A robot with tools and a camera loses its sight instead, gets another tool, and recognises it.
 
-    Makes a model first if there is none; then starts simulated hardware, HAL and model as processes, and plays.
+    Makes a model first if there is none, and starts simulated hardware, HAL and model as processes.
     """
     from services.demo.demo import play
 
@@ -282,24 +283,22 @@ def demo(
 @app.command()
 @report_errors
 def reproduce(
-    robot: Annotated[str, typer.Argument(metavar="ROBOT", help="Whose experiments: pr2, musashi or kxr.")],
-    seeds: Annotated[int, typer.Option(min=1, help="How many runs, each with its own seed.")] = 5,
-    out: Annotated[Path, typer.Option(help="Where data, models, figures and tables go.")] = Path("runs/reproduce"),
-    fresh: Annotated[
-        bool, typer.Option("--fresh", help="Collect and train again, even what is there already.")
-    ] = False,
+    robot: Annotated[str, typer.Argument(metavar="ROBOT", help="Robot of the experiments: pr2, musashi or kxr.")],
+    seeds: Annotated[int, typer.Option(min=1, help="Number of runs, each with its own seed.")] = 5,
+    out: Annotated[Path, typer.Option(help="Folder for data, models, figures and tables.")] = Path("runs/reproduce"),
+    fresh: Annotated[bool, typer.Option("--fresh", help="Collect and train again, also where results exist.")] = False,
 ) -> None:
-    """Run the paper's experiments on a simulated robot and print its figures beside ours."""
+    """Run the paper's experiments on a simulated robot; print the paper's figures beside the measured ones."""
     from rich.console import Console
 
     from hal import registry
     from services.show import progress
 
-    run = registry.load_object("studies.paper:experiment")(robot)  # by name: studies stand above services
-    with progress(f"reproduce {robot}") as tell:
-        report = run(range(seeds), out / robot, tell, fresh)
-    report.save(out / robot)
-    Console().print(report.table())
+    run = registry.load_object("studies.paper:experiment")(robot)  # by name, because studies are above services
+    with progress(f"reproduce {robot}") as report:
+        results = run(range(seeds), out / robot, report, fresh)
+    results.save(out / robot)
+    Console().print(results.table())
     typer.echo(f"Figures and tables are in {out / robot}.")
 
 

@@ -1,8 +1,8 @@
 """Story of the demo: an arm moves, loses a sensor, learns its body, loses a muscle."""
 
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from statistics import mode
 
 import numpy as np
 
@@ -105,7 +105,7 @@ class Story:
         returned = self._actor.wait(lambda: not self._is_estimated(index), NOTICED_WITHIN)
         self.marks.silent = (start, end)
         error = np.abs(self._silent_error(index, start + delay, end))
-        source = _most_common(self._timeline.between("source", start + delay, end).tolist())
+        source = mode(self._timeline.between("source", start + delay, end).tolist() or [""])
         source = "method " + source.replace(" ", ", from ").replace("+", ", ")
         worst = float(np.nanmax(error)) if error.size else float("nan")
         mean = float(np.nanmean(error)) if error.size else float("nan")
@@ -152,7 +152,7 @@ class Story:
         for _ in range(CUT_POSES):
             self._go(self._pose(), LEARNING_TIME)
         early = [anomaly for at, anomaly in self._timeline.anomalies if start <= at < self.marks.alarm + 1.0]
-        element = _most_common([anomaly.blamed for anomaly in early])
+        element = mode([anomaly.blamed for anomaly in early] or [""])
         self.marks.blamed = self._blamed_muscle(early)
         end = self._timeline.now()
         after = float(np.nanmedian(self._timeline.between("score", self.marks.alarm, end)))
@@ -247,7 +247,3 @@ class Story:
 
 def _mean_norm(errors: list[np.ndarray]) -> float:
     return float(np.mean([np.linalg.norm(error) for error in errors]))
-
-
-def _most_common(words: list[str]) -> str:
-    return Counter(words).most_common(1)[0][0] if words else ""

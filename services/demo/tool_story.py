@@ -1,9 +1,9 @@
 """Story of a robot that holds tools: it moves, its camera is covered, its tool is changed, and it notices."""
 
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import cycle
+from statistics import mode
 
 import numpy as np
 
@@ -115,7 +115,7 @@ class ToolStory:
         marked = self._timeline.between("estimated", start + delay, end) > 0
         error = np.linalg.norm(value - truth, axis=1)
         mean = float(np.nanmean(error)) if np.isfinite(error).any() else float("nan")
-        source = _most_common(self._timeline.between("source", start + delay, end).tolist())
+        source = mode(self._timeline.between("source", start + delay, end).tolist() or [""])
         source = "method " + source.replace(" ", ", from ", 1).replace("+", ", ")
         figures = (
             f"marked as estimated after {1e3 * delay:.0f} ms, {source}",
@@ -226,7 +226,7 @@ class ToolStory:
     def _verdict(self, start: float) -> tuple[str, float]:
         """Return the most frequent verdict on the body since a time, and its share."""
         words = [word for word in self._timeline.between("verdict", start, np.inf).tolist() if word]
-        verdict = _most_common(words) or "none"
+        verdict = mode(words or ["none"])
         return verdict, words.count(verdict) / max(1, len(words))
 
     def _stage(self, name: str, start: float, figures: tuple[str, ...], observed: bool) -> Stage:
@@ -236,7 +236,3 @@ class ToolStory:
 def _seen(update: Update) -> int:
     """Return the number of samples since the update began; the window may have dropped some."""
     return update.window + update.dropped
-
-
-def _most_common(words: list[str]) -> str:
-    return Counter(words).most_common(1)[0][0] if words else ""

@@ -20,7 +20,6 @@ NOT_YET = {
     "hal/finding",
     "hal/protocols",
     "hal/safety",
-    "services/cli.py",
     "services/errors.py",
     "services/health.py",
     "services/process",
