@@ -1,1 +1,1 @@
-"""What runs in every tick, compiled: no interpreter, no GIL, no torch. `gemuco.layers` is the same in plain numpy."""
+"""Compiled code of every tick, without interpreter, GIL or torch. `gemuco.layers` has the same in plain numpy."""

@@ -1,4 +1,4 @@
-"""One sample for a bank of beliefs about p; see `gemuco.adaption.recognise.Kalman`, which says what it means."""
+"""Update of a bank of beliefs about p by one sample; `gemuco.adaption.recognise.Kalman` explains the method."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from gemuco.compiled.newton import cholesky, substitute
 
 @jit
 def invert(matrix, out):
-    """The inverse of a positive definite matrix (k, k) into `out`; returns the logarithm of its determinant."""
+    """Write the inverse of a positive definite matrix (k, k) into `out`; return the logarithm of its determinant."""
     size = len(matrix)
     lower, volume = matrix.copy(), 0.0
     cholesky(lower)
@@ -24,7 +24,7 @@ def invert(matrix, out):
 
 @jit
 def gained(slope, error, information, pull):
-    """S^T S into `information` (k, k) and S^T e into `pull` (k,), of one belief's slope S (n, k) and error e (n,)."""
+    """Write S^T S into `information` (k, k) and S^T e into `pull` (k,), for the slope S (n, k) and error e (n,)."""
     for i in range(slope.shape[1]):
         pull[i] = 0.0
         for n in range(len(slope)):
@@ -38,7 +38,7 @@ def gained(slope, error, information, pull):
 
 @jit
 def point_near(points, at, near):
-    """The first of some points that a p, shape (k,), differs from by no more than `near`; -1 if there is none."""
+    """Return the first point whose distance from a p, shape (k,), is at most `near`; -1 without such a point."""
     for i in range(len(points)):
         is_near = True
         for j in range(len(at)):
@@ -50,7 +50,7 @@ def point_near(points, at, near):
 
 @jit
 def best_point(raw):
-    """Which point the sample fits best, of errors of shape (points, n)."""
+    """Return the index of the point with the smallest errors; errors have shape (points, n)."""
     nearest, least = 0, np.inf
     for i in range(len(raw)):
         square = 0.0
@@ -63,47 +63,47 @@ def best_point(raw):
 
 @jit
 def linearise(predictor, row, mean, pairs, near, rules, error, slope, before, scale):
-    """Errors and derivatives of every belief where the sample moves it to, as if they had been taken at `mean`.
+    """Compute errors and derivatives of every belief at the p to which the sample moves it, converted to `mean`.
 
-    A belief takes the errors and derivatives of another one's point if that is near enough. The last belief knows
-    nothing: it is linearised first at that point of the others where the sample fits best. Known conditions stay where
-    they are, and a straight line is enough for what little their p is in doubt.
+    A belief shares the linearisation of another belief's point if that point is near enough. The last belief is the new
+    one without knowledge of p: it is first linearised at the point of the other beliefs that fits the sample best.
+    Known conditions do not move, and one linearisation is enough for their small uncertainty of p.
 
     Args:
         predictor: The network.
         row: The sample [standard deviations], shape (size,).
         mean: p of every belief, shape (beliefs, k).
         pairs: `through`, `tails`, `index` and `whiten` of `innovations`.
-        near: A p that differs from a point by no more than this, shape (k,), is linearised there.
-        rules: Numbers.
-        error: Is filled in, shape (beliefs, n).
-        slope: Is filled in, shape (beliefs, n, k).
+        near: Largest difference between a p and the point at which it is linearised, shape (k,).
+        rules: Constants.
+        error: Result, shape (beliefs, n).
+        slope: Result, shape (beliefs, n, k).
         before: Inverse covariance of every belief, shape (beliefs, k, k).
-        scale: Of the errors' variance.
+        scale: Factor of the errors' variance.
     """
     count, size = mean.shape
     width = error.shape[1]
     points, raw = np.empty((count * rules.passes, size)), np.empty((count * rules.passes, width))
     moved, done = np.empty((count * rules.passes, width, size)), 0
-    at, far, chosen = mean.copy(), np.ones(count, np.bool_), np.zeros(count, np.int64)
+    at, far, index = mean.copy(), np.ones(count, np.bool_), np.zeros(count, np.int64)
     information, pull = np.empty((size, size)), np.empty(size)
     for turn in range(rules.passes):
         fresh = done
         for h in range(count - (turn == 0)):
             if far[h]:
-                chosen[h] = point_near(points[:done], at[h], near)
-                if chosen[h] < 0:
-                    points[done], chosen[h] = at[h], done
+                index[h] = point_near(points[:done], at[h], near)
+                if index[h] < 0:
+                    points[done], index[h] = at[h], done
                     done += 1
         if done > fresh:
-            some = points[fresh:done].astype(np.float32)
-            raw[fresh:done], moved[fresh:done] = innovations(predictor, row.reshape(1, -1), some, *pairs)
+            biases = points[fresh:done].astype(np.float32)
+            raw[fresh:done], moved[fresh:done] = innovations(predictor, row.reshape(1, -1), biases, *pairs)
         if turn == 0:
-            chosen[count - 1] = best_point(raw[:done])
+            index[count - 1] = best_point(raw[:done])
         for h in range(count):
             if not far[h]:
                 continue
-            point = chosen[h]
+            point = index[h]
             for n in range(width):
                 error[h, n] = raw[point, n]
                 for j in range(size):
@@ -123,7 +123,7 @@ def linearise(predictor, row, mean, pairs, near, rules, error, slope, before, sc
 
 @jit
 def oddness(before, information, pull, error, scale):
-    """How badly a belief foretold the sample, and the logarithm of the determinant of what is known of p after it."""
+    """Return the squared, normalised prediction error of a belief, and the log determinant of the new information."""
     size = len(pull)
     known, step, odd, volume = np.empty((size, size)), pull.copy(), 0.0, 0.0
     add(before, information, 1.0 / scale, known)
@@ -139,22 +139,22 @@ def oddness(before, information, pull, error, scale):
 
 @jit
 def weigh(mean, covariance, weight, error, slope, before, volumes, log_volume, scale, rules):
-    """Weigh all beliefs by a linearised sample, and move those that are not of a known condition.
+    """Weigh all beliefs by a linearised sample, and update the p of beliefs that are not known conditions.
 
     Args:
         mean: p of every belief, shape (beliefs, k).
-        covariance: Of every p, shape (beliefs, k, k).
-        weight: Logarithm of how likely each is, shape (beliefs,).
-        error: Of every belief, shape (beliefs, n).
-        slope: Of every belief, shape (beliefs, n, k).
+        covariance: Covariance of every p, shape (beliefs, k, k).
+        weight: Log likelihood of every belief, shape (beliefs,).
+        error: Error of every belief, shape (beliefs, n).
+        slope: Derivatives of every belief, shape (beliefs, n, k).
         before: Inverse of the covariance, shape (beliefs, k, k).
         volumes: Logarithm of the determinant of the covariance, shape (beliefs,).
-        log_volume: Of the errors' covariance.
-        scale: Of the errors' variance.
-        rules: Numbers.
+        log_volume: Logarithm of the determinant of the errors' covariance.
+        scale: Factor of the errors' variance.
+        rules: Constants.
 
     Returns:
-        How odd the sample was for all of them, 1 if as usual. `mean`, `covariance` and `weight` are changed in place.
+        Mean oddness of the sample, 1 for a usual sample. `mean`, `covariance` and `weight` are changed in place.
     """
     count, size = mean.shape
     n, freedom = error.shape[1], rules.freedom
@@ -164,9 +164,9 @@ def weigh(mean, covariance, weight, error, slope, before, volumes, log_volume, s
         gained(slope[h], error[h], information, pull)
         odd, gain = oddness(before[h], information, pull, error[h], scale)
         trust = (freedom + n) / (freedom + odd)
-        foretold = np.exp(weight[h])
-        share += foretold
-        oddity += foretold * trust * odd
+        likelihood = np.exp(weight[h])
+        share += likelihood
+        oddity += likelihood * trust * odd
         volume = log_volume + n * np.log(scale) + volumes[h] + gain
         weight[h] -= 0.5 * volume + 0.5 * (freedom + n) * np.log1p(odd / freedom)
         if h >= rules.known:
@@ -184,22 +184,22 @@ def weigh(mean, covariance, weight, error, slope, before, volumes, log_volume, s
 
 @jit
 def see(predictor, row, beliefs, count, prior, pairs, log_volume, near, scale, rules):
-    """Weigh all beliefs by a sample, and move those that are not of a known condition.
+    """Weigh all beliefs by a sample, and update the p of beliefs that are not known conditions.
 
     Args:
         predictor: The network.
         row: The sample [standard deviations], shape (size,).
-        beliefs: Are changed in place.
-        count: How many there are.
-        prior: Mean, shape (k,), and covariance, shape (k, k), of the p of a body that is not known.
+        beliefs: The beliefs; they are changed in place.
+        count: Number of beliefs.
+        prior: Mean, shape (k,), and covariance, shape (k, k), of the p of an unknown body.
         pairs: `through`, `tails`, `index` and `whiten` of `innovations`.
         log_volume: Logarithm of the determinant of the errors' covariance.
         near: See `linearise`, shape (k,).
-        scale: Of the errors' variance.
-        rules: Numbers.
+        scale: Factor of the errors' variance.
+        rules: Constants.
 
     Returns:
-        How odd the sample was for all of them, 1 if as usual, and how many beliefs there are now.
+        Mean oddness of the sample, 1 for a usual sample, and the new number of beliefs.
     """
     begin_anew(beliefs, count, prior[0], prior[1], rules)
     count += 1

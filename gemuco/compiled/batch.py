@@ -1,4 +1,4 @@
-"""What a network learns from samples: each once under every mask that it allows."""
+"""Training batch of samples, each once under every mask that it allows."""
 
 import numpy as np
 
@@ -7,21 +7,21 @@ from gemuco.compiled.jit import jit
 
 @jit
 def under_masks(rows, biases, through, bits, predictor):
-    """Inputs and wanted outputs.
+    """Return the inputs and target outputs of every mask and every sample that has all elements of the mask.
 
     Args:
-        rows: Samples [standard deviations], shape (n, size), float32; NaN where nothing was measured.
-        biases: p of each, shape (n, bias_size).
+        rows: Samples [standard deviations], shape (n, size), float32; NaN where not measured.
+        biases: p of every sample, shape (n, bias_size).
         through: 1 for elements of x_in that a mask lets through, else 0, shape (masks, in_size).
         bits: m of every mask, shape (masks, x_in).
-        predictor: Where x_in and x_out lie, and how far inputs may be.
+        predictor: Positions of x_in and x_out in the layout, and the limit of inputs.
 
     Returns:
-        Mask after mask, the samples of which it lacks nothing: the network's inputs, shape (k, n_in); x_out, shape
-        (k, out_size); and which sample each is of, shape (k,).
+        Inputs of the network, shape (k, n_in); x_out, shape (k, out_size); and the index of the sample, shape (k,).
+        They are ordered by mask.
     """
     masks, count = through.shape
-    told, width = bits.shape[1], count + bits.shape[1] + biases.shape[1]
+    signals, width = bits.shape[1], count + bits.shape[1] + biases.shape[1]
     allowed = np.ones((masks, len(rows)), np.bool_)
     for mask in range(masks):
         for row in range(len(rows)):
@@ -31,8 +31,8 @@ def under_masks(rows, biases, through, bits, predictor):
                     break
     size = int(allowed.sum())
     inputs = np.zeros((size, width), np.float32)
-    wanted = np.empty((size, len(predictor.outputs)), np.float32)
-    whose = np.empty(size, np.int64)
+    targets = np.empty((size, len(predictor.outputs)), np.float32)
+    samples = np.empty(size, np.int64)
     clip, k = np.float32(predictor.clip), 0
     for mask in range(masks):
         for row in range(len(rows)):
@@ -40,12 +40,12 @@ def under_masks(rows, biases, through, bits, predictor):
                 for i in range(count):
                     if through[mask, i] > 0.0:
                         inputs[k, i] = min(max(rows[row, predictor.inputs[i]], -clip), clip)
-                for i in range(told):
+                for i in range(signals):
                     inputs[k, count + i] = bits[mask, i]
                 for i in range(biases.shape[1]):
-                    inputs[k, count + told + i] = biases[row, i]
+                    inputs[k, count + signals + i] = biases[row, i]
                 for i in range(len(predictor.outputs)):
-                    wanted[k, i] = rows[row, predictor.outputs[i]]
-                whose[k] = row
+                    targets[k, i] = rows[row, predictor.outputs[i]]
+                samples[k] = row
                 k += 1
-    return inputs, wanted, whose
+    return inputs, targets, samples

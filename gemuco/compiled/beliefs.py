@@ -1,4 +1,4 @@
-"""The beliefs about p, apart from samples; `gemuco.adaption.recognise.Kalman` says what they mean."""
+"""Beliefs about p, and their operations without samples; `gemuco.adaption.recognise.Kalman` explains the method."""
 
 from typing import NamedTuple
 
@@ -8,13 +8,13 @@ from gemuco.compiled.jit import jit
 
 
 class Beliefs(NamedTuple):
-    """Room for as many beliefs as there may be, and one more while a sample is looked at.
+    """Memory for the largest number of beliefs, and for one more during a sample.
 
     Attributes:
         mean: p of every belief, shape (room, k); the known conditions come first.
-        covariance: Of every p, shape (room, k, k).
-        weight: Logarithm of how likely each is, shape (room,).
-        age: Samples since which each is believed, shape (room,).
+        covariance: Covariance of every p, shape (room, k, k).
+        weight: Log likelihood of every belief, shape (room,).
+        age: Number of samples since the body change that each belief assumes, shape (room,).
     """
 
     mean: np.ndarray
@@ -24,16 +24,16 @@ class Beliefs(NamedTuple):
 
 
 class Rules(NamedTuple):
-    """Numbers that do not change; see the constants of `gemuco.adaption.recognise` for what they mean.
+    """Constants; those of `gemuco.adaption.recognise` explain them.
 
     Attributes:
-        known: How many of the beliefs are known conditions.
-        passes: How often a sample is linearised at most.
-        hazard: How often the body changes, per sample.
-        familiar: How often it then is a known condition.
-        drift: Variance of p's wandering per sample, as a share of the prior's.
-        freedom: Of the errors' t-distribution.
-        faintest: Logarithm of the smallest weight against the largest.
+        known: Number of beliefs that are known conditions.
+        passes: Largest number of linearisations per sample.
+        hazard: Probability of a body change per sample.
+        familiar: Probability that a changed body is a known condition.
+        drift: Variance of the drift of p per sample, as a share of the prior's variance.
+        freedom: Degrees of freedom of the errors' t-distribution.
+        faintest: Logarithm of the smallest weight relative to the largest.
     """
 
     known: int
@@ -47,7 +47,7 @@ class Rules(NamedTuple):
 
 @jit
 def add(one, other, share, out):
-    """The sum one + share * other into `out`, shapes (k, k)."""
+    """Write one + share * other into `out`, shapes (k, k)."""
     for i in range(len(one)):
         for j in range(len(one)):
             out[i, j] = one[i, j] + share * other[i, j]
@@ -55,14 +55,14 @@ def add(one, other, share, out):
 
 @jit
 def begin_anew(beliefs, count, mean, covariance, rules):
-    """The body may have changed just now, to a known condition or to a new one; everybody else is less sure.
+    """Account for a body change at this sample: add a new belief, and lower the certainty of the others.
 
     Args:
-        beliefs: Are changed in place; the new one comes behind the last.
-        count: How many there are.
-        mean: Of the prior, shape (k,).
-        covariance: Of the prior, shape (k, k).
-        rules: Numbers.
+        beliefs: The beliefs; they are changed in place, and the new one follows the last.
+        count: Number of beliefs.
+        mean: Mean of the prior, shape (k,).
+        covariance: Covariance of the prior, shape (k, k).
+        rules: Constants.
     """
     total = 0.0
     for h in range(count):
@@ -81,7 +81,7 @@ def begin_anew(beliefs, count, mean, covariance, rules):
 
 @jit
 def thin(beliefs, count, most, known):
-    """Too many filters: of two whose ages differ least in proportion the less likely goes; returns how many stay."""
+    """Remove beliefs until `most` remain: of the two with the most similar ages, the less likely. Return the count."""
     while count > most:
         order = np.arange(known, count)
         for i in range(1, len(order)):
@@ -105,7 +105,7 @@ def thin(beliefs, count, most, known):
 
 @jit
 def summary(beliefs, count):
-    """The mean over all beliefs, shape (k,), its covariance, which contains how far they are apart, and the age."""
+    """Return mean, shape (k,), and covariance, shape (k, k), over all beliefs, and the age of the likeliest belief."""
     size = beliefs.mean.shape[1]
     mean, covariance, away = np.zeros(size), np.zeros((size, size)), np.empty(size)
     total, likeliest = 0.0, 0
@@ -129,9 +129,9 @@ def summary(beliefs, count):
 
 @jit
 def is_below(covariance, limit):
-    """Whether a covariance is smaller than another one in every direction, shapes (k, k).
+    """Return whether a covariance is smaller than another one in every direction, shapes (k, k).
 
-    Then their difference is positive definite, and Cholesky's method finds no number that has no root.
+    This is so if their difference is positive definite, which a Cholesky decomposition shows.
     """
     size = len(covariance)
     lower = np.empty((size, size))

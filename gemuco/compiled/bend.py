@@ -1,7 +1,7 @@
-"""The activations of `gemuco.layers`, element by element, in place.
+"""Activations of `gemuco.layers`, element by element, in place.
 
-tanh is a quotient of polynomials that the compiler turns into vector instructions, five times as fast as the one of
-the C library: fitted here to a relative error of 1.2e-8 on [-8.5, 8.5], 3e-7 with float32's own rounding.
+tanh is a quotient of polynomials, which the compiler translates to vector instructions: five times as fast as that of
+the C library. Its relative error is 1.2e-8 on [-8.5, 8.5], and 3e-7 with the rounding of float32.
 """
 
 import math
@@ -12,7 +12,7 @@ from gemuco.compiled.jit import jit
 from gemuco.layers import LINEAR
 
 CODES = {LINEAR: 0, "tanh": 1, "sigmoid": 2, "relu": 3, "elu": 4, "softplus": 5}
-"""Activation -> its number in compiled code."""
+"""This is the number of each activation in compiled code."""
 
 FAR = np.float32(8.5)
 P1, P2 = np.float32(0.1341323107), np.float32(0.00353400805)
@@ -24,18 +24,18 @@ NONE, HALF, ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 
 @jit
 def tanh(x):
-    """One number's hyperbolic tangent."""
+    """Return the hyperbolic tangent of a number."""
     u = x * x
     above = x * (ONE + u * (P1 + u * (P2 + u * (P3 + u * P4))))
     below = ONE + u * (Q1 + u * (Q2 + u * (Q3 + u * Q4)))
     near = min(max(above / below, -ONE), ONE)
-    flat = ONE if x > NONE else (-ONE if x < NONE else x)  # far out no gradient is left; no number stays none
+    flat = ONE if x > NONE else (-ONE if x < NONE else x)  # NaN stays NaN
     return near if abs(x) < FAR else flat
 
 
 @jit
 def bend(values, offset, code):
-    """Add the offset, then the activation, in place; shapes (rows, n) and (n,)."""
+    """Add the offset and apply the activation in place; shapes (rows, n) and (n,)."""
     rows, width = values.shape
     for row in range(rows):
         line = values[row]
@@ -86,7 +86,7 @@ def slopes(values, out, code):
 
 @jit
 def bends(values, factor, out, code):
-    """Product of a factor and d2a/dx2 at values y = a(x) into `out`, shapes (1, n); see `Activation.bend`."""
+    """Write a factor times d2a/dx2 at values y = a(x) into `out`, shapes (1, n); see `Activation.bend`."""
     line = values[0]
     for i in range(len(line)):
         y = line[i]

@@ -1,9 +1,9 @@
-"""Matrix products for compiled code: of float32, and one of float64.
+"""Matrix products for compiled code: three of float32 and one of float64.
 
-numba itself calls the BLAS of scipy, whose wheels are a release behind that of numpy: on the few rows of a search it
-takes two to three times as long (4 x 200 times 200 x 200: 26 us against 10 us; `python -m studies.speed.solvers` shows
-what that makes of a search), and takes 17 MB of memory. So the one that the wheels of numpy bring along is used; with a
-numpy from elsewhere, scipy has to be there.
+They call the BLAS in the wheels of numpy. numba itself calls the BLAS of scipy, whose wheels are one release behind: on
+the few rows of a search it takes two to three times as long (4 x 200 times 200 x 200: 26 us instead of 10 us;
+`python -m studies.speed.solvers` measures the effect on a search), and it takes 17 MB of memory. It is used only with a
+numpy that is not a wheel of PyPI.
 """
 
 import ctypes
@@ -28,21 +28,21 @@ def _is_loaded(library: Path | None) -> bool:
     return True
 
 
-FOUND = _is_loaded(NUMPYS)
-if not FOUND and find_spec("scipy") is None:
+HAS_NUMPYS = _is_loaded(NUMPYS)
+if not HAS_NUMPYS and find_spec("scipy") is None:
     raise ImportError(
-        "This numpy has no BLAS that compiled code can call, for it is not a wheel of PyPI. "
+        "This numpy has no BLAS that compiled code can call, because it is not a wheel of PyPI. "
         "Install scipy beside it, or numpy by pip."
     )
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Have the whole process do each product on one thread meanwhile, for products that are done side by side.
+    """Limit BLAS to one thread in the whole process, for products that run in parallel.
 
-    Those of BLAS's own threads would wait for each other. Without numpy's BLAS nothing is changed.
+    Otherwise the threads of BLAS would wait for each other. Without numpy's BLAS nothing changes.
     """
-    if not FOUND:
+    if not HAS_NUMPYS:
         yield
         return
     library = ctypes.CDLL(str(NUMPYS))
@@ -63,11 +63,11 @@ _dgemm = types.ExternalFunction(
 )
 _sgemv = types.ExternalFunction("scipy_cblas_sgemv64_", types.void(_i, _i, _n, _n, _f, _p, _n, _p, _n, _f, _p, _n))
 
-if FOUND:
+if HAS_NUMPYS:
 
     @jit
     def times(a, b, out):
-        """The product a b into `out`, shapes (m, k), (k, n) and (m, n), rows one behind the other."""
+        """Write the product a b into `out`, shapes (m, k), (k, n) and (m, n), all in C order."""
         m, k, n = a.shape[0], a.shape[1], b.shape[1]
         if m == 1:
             _sgemv(_ROWS, _TURNED, k, n, 1.0, b.ctypes.data, n, a.ctypes.data, 1, 0.0, out.ctypes.data, 1)
@@ -77,7 +77,7 @@ if FOUND:
 
     @jit
     def times_turned(a, b, out):
-        """The product a b^T into `out`, shapes (m, k), (n, k) and (m, n)."""
+        """Write the product a b^T into `out`, shapes (m, k), (n, k) and (m, n)."""
         m, k, n = a.shape[0], a.shape[1], b.shape[0]
         if m == 1:
             _sgemv(_ROWS, _PLAIN, n, k, 1.0, b.ctypes.data, k, a.ctypes.data, 1, 0.0, out.ctypes.data, 1)
@@ -87,14 +87,14 @@ if FOUND:
 
     @jit
     def turned_times(a, b, out):
-        """The product a^T b into `out`, shapes (m, k), (m, n) and (k, n)."""
+        """Write the product a^T b into `out`, shapes (m, k), (m, n) and (k, n)."""
         m, k, n = a.shape[0], a.shape[1], b.shape[1]
         x, y, z = a.ctypes.data, b.ctypes.data, out.ctypes.data
         _sgemm(_ROWS, _TURNED, _PLAIN, k, n, m, 1.0, x, k, y, n, 0.0, z, n)
 
     @jit
     def times_turned_double(a, b, out):
-        """The product a b^T of float64 into `out`, shapes (m, k), (n, k) and (m, n)."""
+        """Write the product a b^T of float64 into `out`, shapes (m, k), (n, k) and (m, n)."""
         m, k, n = a.shape[0], a.shape[1], b.shape[0]
         x, y, z = a.ctypes.data, b.ctypes.data, out.ctypes.data
         _dgemm(_ROWS, _PLAIN, _TURNED, m, n, k, 1.0, x, k, y, k, 0.0, z, n)
@@ -103,20 +103,20 @@ else:
 
     @jit
     def times(a, b, out):
-        """The product a b into `out`, shapes (m, k), (k, n) and (m, n), rows one behind the other."""
+        """Write the product a b into `out`, shapes (m, k), (k, n) and (m, n), all in C order."""
         np.dot(a, b, out)
 
     @jit
     def times_turned(a, b, out):
-        """The product a b^T into `out`, shapes (m, k), (n, k) and (m, n)."""
+        """Write the product a b^T into `out`, shapes (m, k), (n, k) and (m, n)."""
         np.dot(a, b.T, out)
 
     @jit
     def turned_times(a, b, out):
-        """The product a^T b into `out`, shapes (m, k), (m, n) and (k, n)."""
+        """Write the product a^T b into `out`, shapes (m, k), (m, n) and (k, n)."""
         np.dot(a.T, b, out)
 
     @jit
     def times_turned_double(a, b, out):
-        """The product a b^T of float64 into `out`, shapes (m, k), (n, k) and (m, n)."""
+        """Write the product a b^T of float64 into `out`, shapes (m, k), (n, k) and (m, n)."""
         np.dot(a, b.T, out)

@@ -1,7 +1,7 @@
-"""A chain of layers as compiled code takes it, and its passes; `gemuco.layers` has the same in numpy, and says more.
+"""Chain of layers for compiled code, and its passes; `gemuco.layers` has the same in numpy with more explanation.
 
-Values of all layers lie one behind the other in one array, so that a pass allocates nothing per layer. Loops are
-written out and products go through two functions: the compiler takes seconds for every array expression.
+The values of all layers are in one array, one layer after another, so that a pass allocates no memory per layer. Loops
+are written out and all products call two functions, because compiling an array expression takes seconds.
 """
 
 from typing import NamedTuple
@@ -18,9 +18,9 @@ class Packed(NamedTuple):
     """A chain of layers.
 
     Attributes:
-        flat: Matrix (n_in, n_out) and offset (n_out,) of every layer, one behind the other, float32.
-        form: For every layer its width n_in, n_out, where its matrix begins in `flat`, the widths of all that lies
-            before its output, and its activation (`bend.CODES`), shape (layers, 5).
+        flat: Matrix (n_in, n_out) and offset (n_out,) of every layer, one after another, float32.
+        form: For every layer n_in, n_out, the position of its matrix in `flat`, the sum of all widths before its
+            output, and its activation (`bend.CODES`), shape (layers, 5).
     """
 
     flat: np.ndarray
@@ -31,7 +31,7 @@ WIDE, NARROW, PLACE, BEFORE, CODE = range(5)
 
 
 def pack(chain: Chain) -> Packed:
-    """Lay a chain out for compiled code."""
+    """Convert a chain for compiled code."""
     form, place, before = np.zeros((len(chain), 5), np.int64), 0, 0
     for index, layer in enumerate(chain):
         wide, narrow = layer.matrix.shape
@@ -46,60 +46,60 @@ def pack(chain: Chain) -> Packed:
 
 
 def turned(chain: Packed) -> np.ndarray:
-    """`Packed.flat` with every matrix transposed, shape (n_out, n_in): of a few rows products take half the time."""
-    found = chain.flat.copy()
+    """Return `Packed.flat` with every matrix transposed, which halves the time of products of few rows."""
+    flat = chain.flat.copy()
     for wide, narrow, place, *_ in chain.form:
         part = chain.flat[place : place + wide * narrow].reshape(wide, narrow)
-        found[place : place + wide * narrow].reshape(narrow, wide)[:] = part.T
-    return found
+        flat[place : place + wide * narrow].reshape(narrow, wide)[:] = part.T
+    return flat
 
 
 def unpack(chain: Packed) -> list[np.ndarray]:
-    """A copy of every matrix and offset, in the order of the layers."""
-    flat, found = chain.flat.copy(), []
+    """Copy every matrix and offset, in the order of the layers."""
+    flat, arrays = chain.flat.copy(), []
     for wide, narrow, place, *_ in chain.form:
         middle = place + wide * narrow
-        found += [flat[place:middle].reshape(wide, narrow), flat[middle : middle + narrow]]
-    return found
+        arrays += [flat[place:middle].reshape(wide, narrow), flat[middle : middle + narrow]]
+    return arrays
 
 
 @jit
 def matrix(chain, layer):
-    """Matrix W of a layer, shape (n_in, n_out)."""
+    """Return matrix W of a layer, shape (n_in, n_out)."""
     place, wide, narrow = chain.form[layer, PLACE], chain.form[layer, WIDE], chain.form[layer, NARROW]
     return chain.flat[place : place + wide * narrow].reshape(wide, narrow)
 
 
 @jit
 def offset(chain, layer):
-    """Offset b of a layer, shape (n_out,)."""
+    """Return offset b of a layer, shape (n_out,)."""
     place = chain.form[layer, PLACE] + chain.form[layer, WIDE] * chain.form[layer, NARROW]
     return chain.flat[place : place + chain.form[layer, NARROW]]
 
 
 @jit
 def space(chain, rows):
-    """Room for the values of all layers."""
+    """Allocate memory for the values of all layers."""
     last = len(chain.form) - 1
     return np.empty(rows * (chain.form[last, BEFORE] + chain.form[last, NARROW]), chain.flat.dtype)
 
 
 @jit
 def first(chain, values, rows):
-    """The input, shape (rows, n_in)."""
+    """Return the input, shape (rows, n_in)."""
     return values[: rows * chain.form[0, WIDE]].reshape(rows, chain.form[0, WIDE])
 
 
 @jit
 def after(chain, values, rows, layer):
-    """The value after a layer, shape (rows, n_out)."""
+    """Return the value after a layer, shape (rows, n_out)."""
     begin, width = rows * chain.form[layer, BEFORE], chain.form[layer, NARROW]
     return values[begin : begin + rows * width].reshape(rows, width)
 
 
 @jit
 def forward(chain, values, rows):
-    """Fill in the value after every layer, from the input that lies in front; returns the last, shape (rows, n_out)."""
+    """Compute the value after every layer from the input in `values`; return the last, shape (rows, n_out)."""
     value = first(chain, values, rows)
     for layer in range(len(chain.form)):
         result = after(chain, values, rows, layer)
@@ -111,21 +111,21 @@ def forward(chain, values, rows):
 
 @jit
 def alone(chain, values, rows, row):
-    """Values of all layers for one of the rows, as a pass of that row alone would leave them."""
-    found = space(chain, 1)
-    of, to = first(chain, values, rows), first(chain, found, 1)
+    """Copy the values of all layers for one row, in the layout of a pass with this row alone."""
+    copy = space(chain, 1)
+    of, to = first(chain, values, rows), first(chain, copy, 1)
     for i in range(to.shape[1]):
         to[0, i] = of[row, i]
     for layer in range(len(chain.form)):
-        of, to = after(chain, values, rows, layer), after(chain, found, 1, layer)
+        of, to = after(chain, values, rows, layer), after(chain, copy, 1, layer)
         for i in range(to.shape[1]):
             to[0, i] = of[row, i]
-    return found
+    return copy
 
 
 @jit
 def output(chain, line):
-    """The last value for a single input, shapes (n_in,) and (n_out,)."""
+    """Return the output, shape (n_out,), for a single input, shape (n_in,)."""
     values = space(chain, 1)
     inputs = first(chain, values, 1)[0]
     for i in range(len(inputs)):
@@ -135,14 +135,14 @@ def output(chain, line):
 
 @jit
 def pull(chain, values, rows, begin, gradient):
-    """Gradient with respect to the output -> with respect to the input, shapes (some, n).
+    """Return the gradient with respect to the input from that with respect to the output, shapes (some, n).
 
     Args:
         chain: The layers.
-        values: After `forward`.
-        rows: How many rows they are of.
-        begin: Which of them the first gradient is of; the others follow.
-        gradient: It is changed.
+        values: Values after `forward`.
+        rows: Number of rows of the values.
+        begin: Row of the first gradient; the others follow.
+        gradient: Gradient with respect to the output; it is changed.
     """
     some = len(gradient)
     for layer in range(len(chain.form) - 1, -1, -1):
@@ -157,7 +157,7 @@ def pull(chain, values, rows, begin, gradient):
 
 @jit
 def pull_all(chain, back, values, gradient):
-    """`pull` of every row, with the matrices as `turned` has them."""
+    """Do `pull` for all rows with the transposed matrices of `turned`."""
     rows = len(gradient)
     for layer in range(len(chain.form) - 1, -1, -1):
         place, wide, narrow = chain.form[layer, PLACE], chain.form[layer, WIDE], chain.form[layer, NARROW]
@@ -171,7 +171,7 @@ def pull_all(chain, back, values, gradient):
 
 @jit
 def push_all(chain, values, rows, row):
-    """Derivatives of one row's output by every number of its input, shape (n_in, n_out)."""
+    """Return the derivatives of one row's output by every element of its input, shape (n_in, n_out)."""
     begin = matrix(chain, 0).copy()
     if chain.form[0, CODE]:
         slopes(after(chain, values, rows, 0)[row : row + 1], begin, chain.form[0, CODE])
@@ -186,11 +186,11 @@ def push_all(chain, values, rows, row):
 
 @jit
 def mixed(chain, values, weights, tangents):
-    """How g = (dy/dx)^T w of a single row changes with x, seen along directions u_k; see `kernels.Curvature`.
+    """Return the derivatives of g = (dy/dx)^T w of a single row by x, along directions u_k.
 
     Args:
         chain: The layers.
-        values: Of one row, after `forward`.
+        values: Values of one row, after `forward`.
         weights: w, shape (1, n_out).
         tangents: u, shape (k, n_in).
 

@@ -1,4 +1,4 @@
-"""The paper's descent (II-G) in one call: many step sizes at once; see `gemuco.search.descent`, which says more."""
+"""The paper's descent (II-G) in one call, with many step sizes at once; `gemuco.search.descent` explains it."""
 
 import numpy as np
 
@@ -12,11 +12,11 @@ def descend(problem, starts, gamma_max, candidates, iterations):
     """Minimise a problem without `held` rows.
 
     Args:
-        problem: What.
-        starts: First points, shape (starts, n); the best of them is where it begins.
+        problem: The loss.
+        starts: First points, shape (starts, n); the descent begins at the best of them.
         gamma_max: Largest step size.
-        candidates: How many step sizes are tried at once; 1 is a constant step.
-        iterations: How many steps.
+        candidates: Number of step sizes that are tried at once; 1 is a constant step.
+        iterations: Number of steps.
 
     Returns:
         The best point, shape (n,), its loss, and the loss after every iteration, shape (iterations + 1,).
@@ -32,19 +32,19 @@ def descend(problem, starts, gamma_max, candidates, iterations):
     values, inner = space(problem.chain, len(points)), room(problem.balance, len(points))
     for iteration in range(iterations + 1):
         rows = differences(problem, points, values)
-        found, rest = losses(problem, rows, 0.0, inner)
-        chosen = np.argmin(found)
-        history[iteration] = found[chosen]
-        if found[chosen] < least:
-            least = found[chosen]
-            best = points[chosen].copy()
+        loss, rest = losses(problem, rows, 0.0, inner)
+        index = np.argmin(loss)
+        history[iteration] = loss[index]
+        if loss[index] < least:
+            least = loss[index]
+            best = points[index].copy()
         if iteration == iterations:
             break
-        if iteration > 0 and candidates > 1 and chosen == 0:
+        if iteration > 0 and candidates > 1 and index == 0:
             for i in range(candidates):
                 gammas[i] /= candidates - 1
-        slope = gradient(problem, values, rows, inner, rest, chosen)
-        origin = points[chosen].copy()
+        slope = gradient(problem, values, rows, inner, rest, index)
+        origin = points[index].copy()
         if iteration == 0:
             points = np.empty((candidates, size), points.dtype)
             values, inner = space(problem.chain, candidates), room(problem.balance, candidates)

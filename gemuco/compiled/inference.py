@@ -8,18 +8,18 @@ from gemuco.compiled.chain import Packed, first, forward, space
 from gemuco.compiled.jit import jit
 
 Parts = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]
-"""`Predictor.parts`"""
+"""This is the type of `Predictor.parts`."""
 
 
 class Predictor(NamedTuple):
-    """A network with what stands around it.
+    """A network, the positions of its inputs and outputs, and the scale of the signals.
 
     Attributes:
         chain: Encoder and decoder.
-        inputs: Where x_in lies in the layout, shape (in_size,).
-        outputs: Where x_out does, shape (out_size,).
+        inputs: Indices of x_in in the layout, shape (in_size,).
+        outputs: Indices of x_out in the layout, shape (out_size,).
         scale: Mean and standard deviation of every element [its unit], shape (2, size).
-        clip: Inputs further from the mean than this [standard deviations] are taken for this far.
+        clip: Largest distance of inputs from the mean [standard deviations]; larger ones are clipped to it.
     """
 
     chain: Packed
@@ -35,27 +35,27 @@ class Predictor(NamedTuple):
 
 
 @jit
-def infer(flat, form, inputs, outputs, scale, clip, joined, through, tail, wanted, found):
-    """What the network says of one sample.
+def infer(flat, form, inputs, outputs, scale, clip, joined, through, tail, requested, estimate):
+    """Predict one sample under a mask.
 
-    The predictor comes in its `parts`: Python hands arrays over in half the time that it needs for tuples of them.
+    The predictor is passed in `parts`, because Python passes arrays in half the time of tuples of arrays.
 
     Args:
         flat: See `Packed`.
         form: See `Packed`.
-        inputs: See `Predictor`, and so for the next three.
-        outputs: See there.
-        scale: See there.
-        clip: See there.
+        inputs: See `Predictor`.
+        outputs: See `Predictor`.
+        scale: See `Predictor`.
+        clip: See `Predictor`.
         joined: Every element of the layout [its unit], shape (size,); NaN where masked.
         through: 1 for elements of x_in that the mask lets through, else 0, shape (in_size,).
         tail: m and p, shape (masks + bias_size,).
-        wanted: Which elements are asked for, truth values, shape (size,).
-        found: What is told of those [its unit] is written into it, shape (size,); NaN for what is not in x_out.
+        requested: Whether each element is requested, truth values, shape (size,).
+        estimate: Result for the requested elements [its unit], shape (size,); NaN for elements that are not in x_out.
 
     Returns:
-        The root mean square of what was given minus what the network says of it [standard deviations], NaN if it says
-        nothing.
+        Root mean square of the difference between the sample and its prediction [standard deviations], NaN if no
+        element of x_out was given.
     """
     chain = Packed(flat, form)
     values = space(chain, 1)
@@ -69,18 +69,18 @@ def infer(flat, form, inputs, outputs, scale, clip, joined, through, tail, wante
             line[i] = min(max(x, -clip), clip)
     for i in range(len(tail)):
         line[count + i] = tail[i]
-    told = forward(chain, values, 1)[0]
-    for i in range(len(found)):
-        if wanted[i]:
-            found[i] = np.nan
+    prediction = forward(chain, values, 1)[0]
+    for i in range(len(estimate)):
+        if requested[i]:
+            estimate[i] = np.nan
     square, given = 0.0, 0
     for i in range(len(outputs)):
         element = outputs[i]
         mean, std = scale[0, element], scale[1, element]
-        if wanted[element]:
-            found[element] = told[i] * std + mean
+        if requested[element]:
+            estimate[element] = prediction[i] * std + mean
         if np.isfinite(joined[element]):
-            amiss = told[i] - (joined[element] - mean) / std
-            square += amiss * amiss
+            residual = prediction[i] - (joined[element] - mean) / std
+            square += residual * residual
             given += 1
     return np.sqrt(square / given) if given else np.nan

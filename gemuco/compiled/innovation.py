@@ -1,4 +1,4 @@
-"""Errors of everything that was predicted from other signals, and how p moves them (`gemuco.adaption.innovation`)."""
+"""Prediction errors under several masks, and their derivatives by p (`gemuco.adaption.innovation`)."""
 
 import numpy as np
 
@@ -10,16 +10,16 @@ from gemuco.compiled.jit import jit
 
 @jit
 def innovations(predictor, rows, biases, through, tails, index, whiten):
-    """Whitened errors of samples under several masks and p, and their derivatives: error(p + dp) = error - slope dp.
+    """Return the whitened errors of samples under several masks, and derivatives: error(p + dp) = error - slope dp.
 
     Args:
         predictor: The network (`inference.Predictor`).
         rows: Samples [standard deviations], shape (rows, size), or (1, size) for all p.
         biases: p of every row, shape (rows, bias_size).
         through: 1 for elements of x_in that each mask lets through, else 0, shape (masks, in_size).
-        tails: m of each mask, with any p behind it, shape (masks, x_in signals + bias_size).
-        index: Which errors: positions in the (masks, out_size) table, flattened, shape (n,).
-        whiten: Turns errors into independent ones of variance 1, shape (n, n).
+        tails: m of each mask, followed by any p, shape (masks, x_in signals + bias_size).
+        index: Positions of the errors in the flattened (masks, out_size) table, shape (n,).
+        whiten: Matrix that converts the errors to independent ones of variance 1, shape (n, n).
 
     Returns:
         Errors, shape (rows, n), and derivatives, shape (rows, n, bias_size).
@@ -27,34 +27,34 @@ def innovations(predictor, rows, biases, through, tails, index, whiten):
     count, size = biases.shape
     masks, outputs = len(through), len(predictor.outputs)
     batch = count * masks
-    told = values_and_tangents(predictor, rows, biases, through, tails)
+    prediction = values_and_tangents(predictor, rows, biases, through, tails)
     raw = np.empty((count * (1 + size), len(index)))
     for row in range(count):
         sample = rows[row if len(rows) > 1 else 0]
         for i in range(len(index)):
             line, element = row * masks + index[i] // outputs, index[i] % outputs
-            raw[row, i] = sample[predictor.outputs[element]] - told[line, element]
+            raw[row, i] = sample[predictor.outputs[element]] - prediction[line, element]
             for j in range(size):
-                raw[count + row * size + j, i] = told[(1 + j) * batch + line, element]
-    turned = np.empty_like(raw)
+                raw[count + row * size + j, i] = prediction[(1 + j) * batch + line, element]
+    white = np.empty_like(raw)
     if len(index):
-        times_turned_double(raw, whiten, turned)
-    found = np.empty((count, len(index), size))
+        times_turned_double(raw, whiten, white)
+    slope = np.empty((count, len(index), size))
     for row in range(count):
         for j in range(size):
             for i in range(len(index)):
-                found[row, i, j] = turned[count + row * size + j, i]
-    return turned[:count], found
+                slope[row, i, j] = white[count + row * size + j, i]
+    return white[:count], slope
 
 
 @jit
 def values_and_tangents(predictor, rows, biases, through, tails):
-    """The network's output for every row under every mask, and below how it moves with each element of p.
+    """Return the network's output for every row under every mask, followed by its derivatives by each element of p.
 
-    Both go through a layer in one product: a matrix is read once for all of them.
+    Both pass a layer in one product, so that each matrix is read once.
 
     Returns:
-        Shape ((1 + bias_size) * rows * masks, out_size).
+        Outputs and derivatives, shape ((1 + bias_size) * rows * masks, out_size).
     """
     chain, (count, size) = predictor.chain, biases.shape
     masks, wide = through.shape
@@ -73,20 +73,20 @@ def values_and_tangents(predictor, rows, biases, through, tails):
                 line[wide + i] = tails[m, i]
             for i in range(size):
                 line[wide + width - size + i] = biases[row, i]
-    told = np.empty(((1 + size) * batch, begin.shape[1]), begin.dtype)
-    times(inputs, begin, told[:batch])
+    value = np.empty(((1 + size) * batch, begin.shape[1]), begin.dtype)
+    times(inputs, begin, value[:batch])
     for j in range(size):
         for row in range(batch):
-            for i in range(told.shape[1]):
-                told[(1 + j) * batch + row, i] = begin[len(begin) - size + j, i]
+            for i in range(value.shape[1]):
+                value[(1 + j) * batch + row, i] = begin[len(begin) - size + j, i]
     for layer in range(len(chain.form)):
         if layer:
-            above = np.empty((len(told), chain.form[layer, NARROW]), told.dtype)
-            times(told, matrix(chain, layer), above)
-            told = above
+            above = np.empty((len(value), chain.form[layer, NARROW]), value.dtype)
+            times(value, matrix(chain, layer), above)
+            value = above
         code = chain.form[layer, CODE]
-        bend(told[:batch], offset(chain, layer), code)
+        bend(value[:batch], offset(chain, layer), code)
         if code:
             for j in range(size):
-                slopes(told[:batch], told[(1 + j) * batch : (2 + j) * batch], code)
-    return told
+                slopes(value[:batch], value[(1 + j) * batch : (2 + j) * batch], code)
+    return value

@@ -1,7 +1,7 @@
-"""How everything in this package is compiled: without the GIL, and kept on disk.
+"""Compiler of this package: without the GIL, and with a cache on disk.
 
-numba looks only at the file of the function itself to find out whether what it kept is still right, not at the
-functions that it calls. So what is kept lies in a folder named after all sources of this package together.
+numba checks only the file of a function to decide whether its cached code is still valid, and not the functions that it
+calls. Therefore the cache folder is named by a hash of all sources of this package.
 """
 
 import contextlib
@@ -21,15 +21,15 @@ MADV_DONTNEED = 4
 F = TypeVar("F", bound=Callable[..., object])
 
 FREE = {"nsz", "arcp", "contract", "reassoc"}
-"""Rounding may differ from the order in the source; what is not a number stays so."""
+"""Rounding may differ from the order in the source; NaN stays NaN."""
 CONFIG: Any = numba.config
 HERE = Path(__file__).parent
 
 
 def _numpys_blas() -> Path | None:
-    """The library that numpy's wheels bring along, if it is there and has the names that `blas` calls."""
+    """Return the BLAS library in numpy's wheel, if it exists and has the functions that `blas` calls."""
     for library in sorted((Path(np.__file__).parents[1] / "numpy.libs").glob("libscipy_openblas64_*.so")):
-        loaded = ctypes.CDLL(str(library))  # numpy has it open already
+        loaded = ctypes.CDLL(str(library))  # already open in numpy
         if all(hasattr(loaded, f"scipy_cblas_{name}64_") for name in ("sgemm", "sgemv", "dgemm")):
             return library
     return None
@@ -45,7 +45,7 @@ def _digest() -> str:
 
 
 def _is_own(folder: Path) -> bool:
-    """Whether this user, and nobody else, can put code there: what lies there will be run. Others may copy it."""
+    """Whether only this user can write code into the folder, because the code will be run. Others may read it."""
     try:
         folder.mkdir(mode=0o755, parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()
@@ -56,10 +56,10 @@ def _is_own(folder: Path) -> bool:
 
 
 def find_folder() -> Path | None:
-    """Where compiled code is kept: `$NUMBA_CACHE_DIR`, or beside the sources, or in the home or temporary directory.
+    """Find the folder of compiled code: `$NUMBA_CACHE_DIR`, beside the sources, or the home or temporary directory.
 
-    What lies beside sources that cannot be written, as in a read-only image, is copied to where it can be used. None
-    if nothing can be written anywhere: then it is compiled at every start.
+    Compiled code beside sources that are not writable, as in a read-only image, is copied to the folder. Return None if
+    no folder is writable; then everything is compiled at every start.
     """
     name = f"gemuco-{_digest()}"
     beside = HERE / "__pycache__" / name
@@ -71,7 +71,7 @@ def find_folder() -> Path | None:
     if folder is not None and folder != beside and beside.is_dir() and not any(folder.iterdir()):
         with contextlib.suppress(OSError), tempfile.TemporaryDirectory(dir=folder.parent) as staging:
             shutil.copytree(beside, Path(staging) / name)
-            (Path(staging) / name).rename(folder)  # whole, or not at all where another process was first
+            (Path(staging) / name).rename(folder)  # complete, or not at all if another process was faster
     return folder
 
 
@@ -90,12 +90,12 @@ def jit(function: F) -> F:
 
 
 def let_compiler_go() -> None:
-    """Give back the memory of the compiler's program, some 50 MB, when everything is compiled.
+    """Release the memory of the compiler's code, about 50 MB, after everything is compiled.
 
-    It is the read-only text of a library, which the kernel takes from its file again if something is compiled later.
+    It is the read-only text of a library; the kernel reads it from the file again if something is compiled later.
     """
     libc = ctypes.CDLL(None)
-    with contextlib.suppress(OSError):  # a system without /proc keeps it
+    with contextlib.suppress(OSError):  # a system without /proc
         for line in Path("/proc/self/maps").read_text().splitlines():
             place, rights, *_, name = line.split()
             if rights == "r-xp" and name.endswith("/libllvmlite.so"):

@@ -1,4 +1,4 @@
-"""One gradient step on W and p (paper, usages c and d); see `gemuco.adaption.relearn` and `gemuco.optimiser`."""
+"""Gradients of W and p (paper, usages c and d) and steps; see `gemuco.adaption.relearn` and `gemuco.optimiser`."""
 
 import numpy as np
 
@@ -10,27 +10,27 @@ from gemuco.compiled.jit import jit
 MOMENTUM = 0.9
 SQUARES = 0.999
 SQUARED = np.float32(np.inf)
-"""No miss is too large to count squared."""
+"""With this bend every error counts squared."""
 
 
 @jit
-def missed(told, wanted, straight, gradient):
-    """Mean loss of what was told, and its derivatives by that into `gradient`.
+def huber(prediction, target, bend, gradient):
+    """Return the mean loss of a prediction, and write its derivatives by the prediction into `gradient`.
 
     Args:
-        told: Shape (rows, n_out).
-        wanted: The same shape; NaN where nothing is known.
-        straight: Misses above this count in proportion and no longer squared (Huber); infinite: all are squared.
-        gradient: Shape (rows, n_out), or (0, 0) if nobody asks.
+        prediction: Outputs of the network, shape (rows, n_out).
+        target: Known outputs, shape (rows, n_out), NaN where not known.
+        bend: Errors above this count linearly instead of squared (Huber); infinite: all are squared.
+        gradient: Result, shape (rows, n_out), or (0, 0) if it is not needed.
     """
     total, count = 0.0, 0
-    for row in range(len(told)):
-        for i in range(told.shape[1]):
-            miss = told[row, i] - wanted[row, i]
-            known = np.isfinite(wanted[row, i])
-            bound = min(max(miss, -straight), straight) if known else np.float32(0.0)
+    for row in range(len(prediction)):
+        for i in range(prediction.shape[1]):
+            error = prediction[row, i] - target[row, i]
+            known = np.isfinite(target[row, i])
+            bound = min(max(error, -bend), bend) if known else np.float32(0.0)
             if known:
-                total += bound * (miss + miss - bound)
+                total += bound * (error + error - bound)
                 count += 1
             if len(gradient):
                 gradient[row, i] = bound
@@ -42,37 +42,37 @@ def missed(told, wanted, straight, gradient):
 
 
 @jit
-def loss(chain, inputs, wanted, straight):
-    """Mean loss of a batch; see `missed`."""
+def loss(chain, inputs, target, bend):
+    """Return the mean loss of a batch; see `huber`."""
     values = space(chain, len(inputs))
     first(chain, values, len(inputs))[:] = inputs
-    told = forward(chain, values, len(inputs))
-    return missed(told, wanted, straight, np.empty((0, 0), told.dtype))
+    prediction = forward(chain, values, len(inputs))
+    return huber(prediction, target, bend, np.empty((0, 0), prediction.dtype))
 
 
 @jit
-def gradients(chain, inputs, wanted, straight, by_weights, by_inputs):
-    """Mean loss of a batch, and its derivatives.
+def gradients(chain, inputs, target, bend, by_weights, by_inputs):
+    """Return the mean loss of a batch, and its derivatives.
 
     Args:
         chain: The network.
-        inputs: Shape (rows, n_in).
-        wanted: Shape (rows, n_out); NaN where nothing is known.
-        straight: See `missed`.
-        by_weights: Whether derivatives by W are wanted.
-        by_inputs: Whether derivatives by the inputs are.
+        inputs: Inputs, shape (rows, n_in).
+        target: Known outputs, shape (rows, n_out), NaN where not known.
+        bend: See `huber`.
+        by_weights: Whether derivatives by W are computed.
+        by_inputs: Whether derivatives by the inputs are computed.
 
     Returns:
-        The loss, its gradient by W in the order of `chain.flat`, and by the inputs, shape (rows, n_in); empty where
-        nobody wants it.
+        The loss, its gradient by W in the order of `chain.flat`, and its gradient by the inputs, shape (rows, n_in).
+        A gradient that is not computed is empty.
     """
     rows = len(inputs)
     values = space(chain, rows)
     first(chain, values, rows)[:] = inputs
-    told = forward(chain, values, rows)
-    gradient = np.empty_like(told)
-    total = missed(told, wanted, straight, gradient)
-    found = np.empty(len(chain.flat) if by_weights else 0, chain.flat.dtype)
+    prediction = forward(chain, values, rows)
+    gradient = np.empty_like(prediction)
+    total = huber(prediction, target, bend, gradient)
+    slope = np.empty(len(chain.flat) if by_weights else 0, chain.flat.dtype)
     for layer in range(len(chain.form) - 1, -1, -1):
         code = chain.form[layer, CODE]
         if code:
@@ -81,8 +81,8 @@ def gradients(chain, inputs, wanted, straight, by_weights, by_inputs):
         below = first(chain, values, rows) if layer == 0 else after(chain, values, rows, layer - 1)
         if by_weights:
             place = chain.form[layer, PLACE]
-            turned_times(below, gradient, found[place : place + wide * narrow].reshape(wide, narrow))
-            offsets = found[place + wide * narrow : place + (wide + 1) * narrow]
+            turned_times(below, gradient, slope[place : place + wide * narrow].reshape(wide, narrow))
+            offsets = slope[place + wide * narrow : place + (wide + 1) * narrow]
             offsets[:] = 0.0
             for row in range(rows):
                 for i in range(narrow):
@@ -91,12 +91,12 @@ def gradients(chain, inputs, wanted, straight, by_weights, by_inputs):
         if len(pulled):
             times_turned(gradient, matrix(chain, layer), pulled)
         gradient = pulled
-    return total, found, gradient
+    return total, slope, gradient
 
 
 @jit
 def adam(numbers, gradient, slow, square, rate, time):
-    """The `time`-th step of Adam in place, all shapes (n,)."""
+    """Do step number `time` of Adam in place, all shapes (n,)."""
     gain = rate * np.sqrt(1.0 - SQUARES**time) / (1.0 - MOMENTUM**time)
     fast, faster, step = np.float32(1.0 - MOMENTUM), np.float32(1.0 - SQUARES), np.float32(gain)
     for i in range(len(numbers)):
@@ -107,7 +107,7 @@ def adam(numbers, gradient, slow, square, rate, time):
 
 @jit
 def momentum(numbers, gradient, slow, rate):
-    """A step of descent with momentum in place, all shapes (n,)."""
+    """Do one step of descent with momentum in place, all shapes (n,)."""
     keep, step = np.float32(MOMENTUM), np.float32(rate)
     for i in range(len(numbers)):
         slow[i] = keep * slow[i] + gradient[i]

@@ -1,7 +1,7 @@
-"""Squared errors of one network under many masks, on the same rows; see `gemuco.structure.mask_errors`.
+"""Squared errors of one network under many masks on the same rows; see `gemuco.structure.mask_errors`.
 
-Elements that a mask withholds are left out of the rows and of the first layer's matrix, and the bits of the mask are
-added to the first layer's offset. Rows go in blocks whose values stay in the second-level cache.
+Elements that a mask removes are left out of the rows and of the first layer's matrix, and the bits of the mask are
+added to the first layer's offset. Rows are processed in blocks whose values stay in the second-level cache.
 """
 
 from typing import NamedTuple
@@ -14,7 +14,7 @@ from gemuco.compiled.chain import CODE, NARROW, matrix, offset
 from gemuco.compiled.jit import jit
 
 BLOCK = 256
-"""Smaller blocks give less efficient products, larger ones leave the cache."""
+"""A block has this many rows: smaller blocks give less efficient products, larger ones do not fit into the cache."""
 
 
 class Rows(NamedTuple):
@@ -42,7 +42,7 @@ class Buffers(NamedTuple):
         shift: The first layer's offset under the mask, shape (n_out,).
         inputs: Input values of a block, shape (BLOCK * (size + bias_size),).
         even: Values of every other layer, shape (BLOCK * widest,).
-        odd: Values of the layers between.
+        odd: Values of the other layers, shape (BLOCK * widest,).
     """
 
     columns: np.ndarray
@@ -71,7 +71,7 @@ def make_buffers(chain, columns):
 
 @jit
 def begin(chain, gate, bits, buffers):
-    """Set up the first layer under one mask: `columns`, `start` and `shift` of the buffers.
+    """Prepare the first layer under one mask: `columns`, `start` and `shift` of the buffers.
 
     Args:
         chain: The network: elements, bits and p in.
@@ -123,7 +123,7 @@ def predict(chain, rows, first, count, columns, buffers):
 
 @jit
 def has_signals(rows, row, bits):
-    """Whether a row has all signals of a mask."""
+    """Return whether a row has all signals of a mask."""
     has_all = True
     for i in range(len(bits)):
         has_all &= rows.whole[row, i] or bits[i] == 0.0

@@ -1,8 +1,8 @@
 """Gauss-Newton with damping (Levenberg, Marquardt) for sums of norms, with bounds and with rows that must be zero.
 
-A norm is no square, so each is weighed by its inverse (iteratively reweighted least squares): near the point
-w ||r|| = w r.r / (2 |r|) + w |r| / 2 touches it from above, and a step that lowers the squares lowers the loss. Several
-dampings are tried at once, and the loss itself says which of them was best.
+A norm is not a square, so each one is weighed by its inverse (iteratively reweighted least squares): w ||r|| is at most
+w r.r / (2 |r|) + w |r| / 2, with equality at the point, so a step that lowers the squares lowers the loss. Several
+dampings are tried at once, and the one with the lowest loss is used.
 """
 
 import numpy as np
@@ -13,21 +13,21 @@ from gemuco.compiled.jit import jit
 from gemuco.compiled.problem import differences, inside, jacobian, length, losses, muscle_slopes, room
 
 DAMPINGS = 4
-"""Dampings tried at once, each `APART` times the one before."""
+"""This many dampings are tried at once, each `APART` times the one before."""
 APART = 30.0
 FIRST = 1e-4
-"""Smallest damping of the first step, as a share of the curvature."""
+"""The smallest damping of the first step is this share of the curvature."""
 LEAST, MOST = 1e-9, 1e9
-"""Between them the damping moves; where even the largest lowers nothing, the search has ended."""
+"""The damping stays between these; when even the largest does not lower the loss, the search ends."""
 STRIDE = 1.0
-"""No number moves further than this in one step, inputs in standard deviations and z as it is: far from the data a
-network says anything."""
+"""An element moves at most this far in one step (inputs in standard deviations, z as it is), because the network is
+not reliable far from the data."""
 FLOOR = 1e-4
-"""A norm below this is weighed as if it were this large: at zero its weight would be infinite."""
+"""A norm below this is weighed as if it were this large, because at zero its weight would be infinite."""
 BREACH = 100.0
-"""Loss per unit of a row that must be zero and is not, while a step is judged."""
+"""While a step is judged, a row that must be zero adds this loss per unit of its value."""
 RETURNS = 10
-"""Newton steps to where the held rows are zero, at the end."""
+"""The search ends with this many Newton steps towards the point where the held rows are zero."""
 RIDGE = 1e-9
 
 _clock = types.ExternalFunction("clock_gettime", types.int32(types.int32, types.voidptr))
@@ -35,7 +35,7 @@ _clock = types.ExternalFunction("clock_gettime", types.int32(types.int32, types.
 
 @jit
 def monotonic():
-    """The clock of `time.monotonic` [s]."""
+    """Return the time of `time.monotonic` [s]."""
     now = np.empty(2, np.int64)
     _clock(1, now.ctypes.data)
     return now[0] + 1e-9 * now[1]
@@ -43,16 +43,16 @@ def monotonic():
 
 @jit
 def weighed(problem, rows, rest, inner, slopes, curvature, way):
-    """Curvature, shape (n, n), and gradient, shape (n,), of the squares that touch the loss at a point.
+    """Compute curvature, shape (n, n), and gradient, shape (n,), of the squares that replace the loss at a point.
 
     Args:
-        problem: What is minimised.
+        problem: The loss.
         rows: r at the point, shape (1, rows).
-        rest: What the muscles lack there [N m], shape (1, joints).
-        inner: Values of their network there.
-        slopes: Its derivatives, shape (n, rows).
-        curvature: Is filled in, its lower half.
-        way: Is filled in.
+        rest: Missing torque of the muscles there [N m], shape (1, joints).
+        inner: Values of the muscles' network there.
+        slopes: Derivatives of r, shape (n, rows).
+        curvature: Result, in its lower half.
+        way: Result, the gradient.
     """
     count = len(way)
     way[:] = 0.0
@@ -82,7 +82,7 @@ def weighed(problem, rows, rest, inner, slopes, curvature, way):
 
 @jit
 def add(curvature, way, slopes, rows, begin, end, share):
-    """The part of one norm, whose derivatives are some columns of `slopes`."""
+    """Add the part of one norm, whose derivatives are the columns `begin` to `end` of `slopes`."""
     for i in range(len(way)):
         for k in range(begin, end):
             way[i] += share * slopes[i, k] * rows[0, k]
@@ -95,9 +95,9 @@ def add(curvature, way, slopes, rows, begin, end, share):
 
 @jit
 def step(curvature, way, stuck, slopes, rows, held, damping):
-    """The step that lowers the damped squares most while it takes the held rows to zero, shape (n,).
+    """Return the step that lowers the damped squares most and takes the held rows to zero, shape (n,).
 
-    Stuck numbers do not move. The held rows come in by their Schur complement.
+    Stuck elements do not move. The held rows are included by their Schur complement.
     """
     count = len(way)
     system, move = np.zeros((count, count)), np.zeros(count)
@@ -117,7 +117,7 @@ def step(curvature, way, stuck, slopes, rows, held, damping):
     substitute(system, move)
     if held:
         first = len(rows) - held
-        aside, amiss = np.zeros((held, count)), np.empty(held)
+        aside, residual = np.zeros((held, count)), np.empty(held)
         for k in range(held):
             for i in range(count):
                 if not stuck[i]:
@@ -125,24 +125,24 @@ def step(curvature, way, stuck, slopes, rows, held, damping):
             substitute(system, aside[k])
         square = np.zeros((held, held))
         for k in range(held):
-            amiss[k] = rows[first + k]
+            residual[k] = rows[first + k]
             for i in range(count):
-                amiss[k] += slopes[i, first + k] * move[i]
+                residual[k] += slopes[i, first + k] * move[i]
                 for m in range(held):
                     square[k, m] += slopes[i, first + k] * aside[m, i]
         for k in range(held):
             square[k, k] += 1e-9 * (1.0 + square[k, k])
         cholesky(square)
-        substitute(square, amiss)
+        substitute(square, residual)
         for k in range(held):
             for i in range(count):
-                move[i] -= aside[k, i] * amiss[k]
+                move[i] -= aside[k, i] * residual[k]
     return move
 
 
 @jit
 def cholesky(matrix):
-    """L of L L^T in place of the lower half of a positive definite matrix."""
+    """Replace the lower half of a positive definite matrix by L of its decomposition L L^T."""
     for i in range(len(matrix)):
         for j in range(i + 1):
             total = matrix[i, j]
@@ -172,51 +172,51 @@ def substitute(lower, right):
 
 @jit
 def back(problem, point):
-    """Bring a point, shape (1, n), to where the held rows are zero, by Newton steps of least length, in place."""
+    """Move a point, shape (1, n), to where the held rows are zero by the shortest Newton steps, in place."""
     held, count = problem.held, point.shape[1]
     values = space(problem.chain, 1)
-    square, amiss = np.zeros((held, held)), np.zeros(held)
+    square, residual = np.zeros((held, held)), np.zeros(held)
     for _ in range(RETURNS):
         rows = differences(problem, point, values)
         slopes = jacobian(problem, values, 1, 0)
         begin = slopes.shape[1] - held
         for k in range(held):
-            amiss[k] = rows[0, begin + k]
+            residual[k] = rows[0, begin + k]
             for m in range(k + 1):
                 square[k, m] = 1e-6 if k == m else 0.0
                 for i in range(count):
                     square[k, m] += slopes[i, begin + k] * slopes[i, begin + m]
         cholesky(square)
-        substitute(square, amiss)
+        substitute(square, residual)
         for i in range(count):
             for k in range(held):
-                point[0, i] -= slopes[i, begin + k] * amiss[k]
+                point[0, i] -= slopes[i, begin + k] * residual[k]
         inside(problem, point)
 
 
 @jit
-def look(problem, points, values, inner):
-    """The best of several points: which, its loss, and what a step from there needs to know of it.
+def pick(problem, points, values, inner):
+    """Return the best of several points, and the values that a step from there needs.
 
     Args:
-        problem: What is minimised.
-        points: Shape (points, n); they are moved into the bounds.
-        values: Room for the network's values at all of them.
-        inner: `room` for those of the muscles' network.
+        problem: The loss.
+        points: Points, shape (points, n); they are moved into the bounds.
+        values: Memory for the network's values at all points.
+        inner: Memory for the values of the muscles' network (`room`).
 
     Returns:
-        Which, its loss, its rows, shape (1, rows), what its muscles lack, shape (1, joints), and the values of both
-        networks there.
+        Index of the point, its loss, its rows, shape (1, rows), the missing torque of its muscles [N m], shape
+        (1, joints), and the values of both networks there.
     """
     inside(problem, points)
     rows, count = differences(problem, points, values), len(points)
-    found, rest = losses(problem, rows, BREACH, inner)
-    best = np.argmin(found)
+    loss, rest = losses(problem, rows, BREACH, inner)
+    best = np.argmin(loss)
     one = alone(problem.chain, values, count, best)
     other = inner[:0]
     if problem.balance.weight > 0.0:
         other = alone(problem.balance.chain, inner, count, best)
-    return best, found[best], rows[best : best + 1].copy(), rest[best : best + 1].copy(), one, other
+    return best, loss[best], rows[best : best + 1].copy(), rest[best : best + 1].copy(), one, other
 
 
 @jit
@@ -224,18 +224,18 @@ def search(problem, starts, iterations, tolerance, until):
     """Minimise a problem.
 
     Args:
-        problem: What.
-        starts: First points, shape (starts, n); the best of them is where it begins.
-        iterations: At most so many steps.
-        tolerance: It ends when two steps in a row lower the loss by less than this share of it.
-        until: It ends when `monotonic` is later than this [s].
+        problem: The loss.
+        starts: First points, shape (starts, n); the search begins at the best of them.
+        iterations: Largest number of steps.
+        tolerance: The search ends when two consecutive steps lower the loss by less than this share of it.
+        until: The search ends when `monotonic` is later than this [s].
 
     Returns:
-        The best point, shape (n,), its loss without what held rows cost, the loss after every iteration, shape
-        (done + 1,), and whether time was up before the end.
+        The best point, shape (n,), its loss without the part of the held rows, the loss after every iteration, shape
+        (done + 1,), and whether the time limit ended the search.
     """
     size, points = starts.shape[1], starts.copy()
-    first = look(problem, points, space(problem.chain, len(points)), room(problem.balance, len(points)))
+    first = pick(problem, points, space(problem.chain, len(points)), room(problem.balance, len(points)))
     chosen, loss, rows, rest, values, inner = first
     point = points[chosen : chosen + 1].copy()
     history = np.empty(iterations + 1)
@@ -262,7 +262,7 @@ def search(problem, starts, iterations, tolerance, until):
                     stride = max(stride, abs(move[i]) / STRIDE)
                 for i in range(size):
                     tried[k, i] = point[0, i] + move[i] / stride
-            chosen, least, its_rows, its_rest, its_values, its_inner = look(problem, tried, outer, within)
+            chosen, least, its_rows, its_rest, its_values, its_inner = pick(problem, tried, outer, within)
             is_better = least < loss
             if is_better:
                 small = small + 1 if loss - least < tolerance * abs(loss) else 0

@@ -1,11 +1,11 @@
-"""What a search minimises, as compiled code takes it: sums of norms of differences that a network predicts.
+"""Loss of a search for compiled code: a sum of norms of differences that a network predicts.
 
-The terms of a loss are linear in what is predicted, so the network is folded together with them: its first layer takes
-nothing but what moves, its last gives the differences themselves, r(p) = D p + c + net(p). What is left is
+The terms of a loss are linear in the prediction, so they are merged with the network: the inputs of its first layer are
+only the searched numbers p, and the outputs of its last layer are the differences, r(p) = D p + c + net(p). The loss is
 
     loss(p) = sum_k weight_k ||r_k(p)|| + weight ||torque + K (theta - theta_0) + G(theta, f)^T f||
 
-with r_k blocks of r; f and, in simulation, theta are further rows of r, and so is what must be zero.
+with blocks r_k of r. Further rows of r are f, in simulation theta, and the values that must be zero.
 """
 
 from typing import NamedTuple
@@ -20,15 +20,15 @@ TINY = 1e-9
 
 
 class Balance(NamedTuple):
-    """The torque balance of muscles (`gemuco.search.torque`); nothing where `weight` is 0.
+    """Torque balance of muscles (`gemuco.search.torque`); unused if `weight` is 0.
 
     Attributes:
-        chain: From posture and tension, one behind the other, to muscle length.
-        back: Its matrices, `chain.turned`.
+        chain: Network from posture, followed by tension, to muscle length.
+        back: Transposed matrices of the network, see `chain.turned`.
         joints: For every joint: theta's standard deviation [rad], tau_ext at theta_0 [N m], theta_0 [standard
             deviations], and the stiffness K [N m per standard deviation], shape (joints, 3 + joints).
         lines: For every muscle: f's standard deviation and mean [N], l's standard deviation [m], shape (muscles, 3).
-        rows: Where f and theta begin among the rows of r; -1 for theta that is given: it is theta_0.
+        rows: First row of f and of theta in r; -1 if theta is given and equals theta_0.
         weight: Loss per N m.
     """
 
@@ -41,21 +41,21 @@ class Balance(NamedTuple):
 
 
 STD, TORQUE, POSTURE, STIFFNESS = range(4)
-"""Columns of `Balance.joints`."""
+"""These are the columns of `Balance.joints`."""
 F_STD, F_MEAN, L_STD = range(3)
-"""Columns of `Balance.lines`."""
+"""These are the columns of `Balance.lines`."""
 
 
 class Problem(NamedTuple):
     """A loss of n numbers p.
 
     Attributes:
-        chain: net, n in and rows out.
-        direct: D and, as its last row, c, shape (n + 1, rows).
+        chain: The network net(p), from n inputs to the rows of r.
+        direct: D with c as its last row, shape (n + 1, rows).
         ends: Borders of the blocks, shape (blocks + 1,), beginning with 0.
-        weights: Of the blocks, shape (blocks,).
+        weights: Weights of the blocks, shape (blocks,).
         balance: Torque balance.
-        held: As many rows at the end must be zero.
+        held: Number of rows at the end that must be zero.
         bounds: Lowest and highest p, shape (2, n).
     """
 
@@ -78,35 +78,35 @@ def inside(problem, points):
 
 @jit
 def differences(problem, points, values):
-    """The rows r at points, shape (points, rows); the network's values stay in `values`."""
+    """Return the rows r at points, shape (points, rows), and keep the network's values in `values`."""
     count, size = points.shape
     inputs = first(problem.chain, values, count)
     for row in range(count):
         for i in range(size):
             inputs[row, i] = points[row, i]
-    told = forward(problem.chain, values, count)
-    rows = np.empty_like(told)
+    prediction = forward(problem.chain, values, count)
+    rows = np.empty_like(prediction)
     times(inputs, problem.direct[:size], rows)
     for row in range(count):
         for i in range(rows.shape[1]):
-            rows[row, i] += told[row, i] + problem.direct[size, i]
+            rows[row, i] += prediction[row, i] + problem.direct[size, i]
     return rows
 
 
 @jit
 def room(balance, count):
-    """Room for the values of the muscles' network at so many points; none without a balance."""
+    """Allocate memory for the values of the muscles' network at `count` points; it is empty without a balance."""
     return space(balance.chain, count) if balance.weight > 0.0 else np.empty(0, balance.lines.dtype)
 
 
 @jit
 def muscles(balance, rows, values):
-    """What the muscles lack [N m], shape (points, joints).
+    """Return the missing torque of the muscles [N m], shape (points, joints).
 
     Args:
         balance: Torque balance.
         rows: r at points, shape (points, rows).
-        values: Room for the values of their network, which are left there.
+        values: Memory for the values of the muscles' network, which stay there.
     """
     count, joints, lines = len(rows), len(balance.joints), len(balance.lines)
     inputs = first(balance.chain, values, count)
@@ -131,23 +131,23 @@ def muscles(balance, rows, values):
 
 @jit
 def force(balance, inputs):
-    """Tension f times the scale of l [N m per standard deviation of l], shape (points, muscles)."""
+    """Return tension f times the scale of l [N m per standard deviation of l], shape (points, muscles)."""
     joints, lines = len(balance.joints), len(balance.lines)
-    found = np.empty((len(inputs), lines), inputs.dtype)
+    scaled = np.empty((len(inputs), lines), inputs.dtype)
     for row in range(len(inputs)):
         for i in range(lines):
             newton = inputs[row, joints + i] * balance.lines[i, F_STD] + balance.lines[i, F_MEAN]
-            found[row, i] = newton * balance.lines[i, L_STD]
-    return found
+            scaled[row, i] = newton * balance.lines[i, L_STD]
+    return scaled
 
 
 @jit
 def muscle_slopes(balance, values, ways):
-    """How what they lack at one point changes with f and theta, seen along directions of torque.
+    """Return the derivatives of the missing torque at one point by f and theta, along directions of torque.
 
     Args:
         balance: Torque balance.
-        values: What `muscles` left of that point (`chain.alone`).
+        values: Values of `muscles` at this point (`chain.alone`).
         ways: Directions, shape (k, joints).
 
     Returns:
@@ -161,22 +161,22 @@ def muscle_slopes(balance, values, ways):
         for i in range(joints):
             tangents[k, i] = ways[k, i] / balance.joints[i, STD]
     pushed, bent = mixed(balance.chain, values, force(balance, inputs), tangents)
-    found = np.zeros((lines + joints, count), inputs.dtype)
+    slopes = np.zeros((lines + joints, count), inputs.dtype)
     for k in range(count):
         for j in range(lines):
             scale = balance.lines[j, F_STD] * balance.lines[j, L_STD]
-            found[j, k] = scale * pushed[k, j] + bent[k, joints + j]
+            slopes[j, k] = scale * pushed[k, j] + bent[k, joints + j]
         if balance.rows[1] >= 0:
             for j in range(joints):
-                found[lines + j, k] = bent[k, j]
+                slopes[lines + j, k] = bent[k, j]
                 for i in range(joints):
-                    found[lines + j, k] += ways[k, i] * balance.joints[i, STIFFNESS + j]
-    return found
+                    slopes[lines + j, k] += ways[k, i] * balance.joints[i, STIFFNESS + j]
+    return slopes
 
 
 @jit
 def length(values, begin, end):
-    """Norm of a part of a line."""
+    """Return the norm of a part of a row."""
     square = 0.0
     for i in range(begin, end):
         square += values[i] * values[i]
@@ -185,39 +185,39 @@ def length(values, begin, end):
 
 @jit
 def losses(problem, rows, breach, inner):
-    """Loss of every point, shape (points,), and what its muscles lack [N m], shape (points, joints).
+    """Return the loss of every point, shape (points,), and the missing torque there [N m], shape (points, joints).
 
     Args:
-        problem: What is minimised.
+        problem: The loss.
         rows: r at points, shape (points, rows).
-        breach: What a row that must be zero and is not costs per unit.
-        inner: `room` for the values of the muscles' network, which are left there.
+        breach: Loss per unit of a row that must be zero.
+        inner: Memory for the values of the muscles' network (`room`), which stay there.
     """
     count, width = rows.shape
-    found, rest = np.zeros(count), np.empty((count, 0), rows.dtype)
+    loss, rest = np.zeros(count), np.empty((count, 0), rows.dtype)
     for row in range(count):
         for block in range(len(problem.weights)):
-            found[row] += problem.weights[block] * length(rows[row], problem.ends[block], problem.ends[block + 1])
+            loss[row] += problem.weights[block] * length(rows[row], problem.ends[block], problem.ends[block + 1])
         for i in range(width - problem.held, width):
-            found[row] += breach * abs(rows[row, i])
+            loss[row] += breach * abs(rows[row, i])
     if problem.balance.weight > 0.0:
         rest = muscles(problem.balance, rows, inner)
         for row in range(count):
-            found[row] += problem.balance.weight * length(rest[row], 0, rest.shape[1])
-    return found, rest
+            loss[row] += problem.balance.weight * length(rest[row], 0, rest.shape[1])
+    return loss, rest
 
 
 @jit
 def gradient(problem, values, rows, inner, rest, row):
-    """Gradient of the loss at one of the points by p, shape (1, n); `held` rows aside.
+    """Return the gradient of the loss by p at one point, shape (1, n), without the `held` rows.
 
     Args:
-        problem: What is minimised.
-        values: What `differences` left.
-        rows: What it returned.
-        inner: What `losses` left.
-        rest: What the muscles lack, of `losses`.
-        row: Which point.
+        problem: The loss.
+        values: Values of the network after `differences`.
+        rows: Result of `differences`.
+        inner: Values of the muscles' network after `losses`.
+        rest: Missing torque, from `losses`.
+        row: Index of the point.
     """
     count, width = rows.shape
     size = len(problem.direct) - 1
@@ -238,21 +238,21 @@ def gradient(problem, values, rows, inner, rest, row):
         if balance.rows[1] >= 0:
             for j in range(joints):
                 back[0, balance.rows[1] + j] += slope[lines + j, 0]
-    found = np.zeros((1, size), rows.dtype)
+    total = np.zeros((1, size), rows.dtype)
     for i in range(size):
         for j in range(width):
-            found[0, i] += problem.direct[i, j] * back[0, j]
+            total[0, i] += problem.direct[i, j] * back[0, j]
     pulled = pull(problem.chain, values, count, row, back)
     for i in range(size):
-        found[0, i] += pulled[0, i]
-    return found
+        total[0, i] += pulled[0, i]
+    return total
 
 
 @jit
 def jacobian(problem, values, count, row):
-    """Derivatives of r at one of the points by p, shape (n, rows)."""
-    found = push_all(problem.chain, values, count, row)
-    for i in range(found.shape[0]):
-        for j in range(found.shape[1]):
-            found[i, j] += problem.direct[i, j]
-    return found
+    """Return the derivatives of r by p at one point, shape (n, rows)."""
+    slopes = push_all(problem.chain, values, count, row)
+    for i in range(slopes.shape[0]):
+        for j in range(slopes.shape[1]):
+            slopes[i, j] += problem.direct[i, j]
+    return slopes

@@ -1,4 +1,4 @@
-"""How unlike normal one sample is (paper, II-K): its prediction errors, and their Mahalanobis distance."""
+"""Anomaly score of one sample (paper, II-K): its prediction errors and their Mahalanobis distance."""
 
 from typing import NamedTuple
 
@@ -9,12 +9,12 @@ from gemuco.compiled.jit import jit
 
 
 class Judges(NamedTuple):
-    """By which mask each element of x_out is judged.
+    """Masks by which the elements of x_out are judged.
 
     Attributes:
         through: 1 for elements of x_in that a mask lets through, else 0, shape (masks, in_size).
         tails: m and p of every mask, shape (masks, x_in + bias_size).
-        mask: Which of the masks judges an element, shape (out_size,).
+        mask: Index of the mask that judges each element, shape (out_size,).
     """
 
     through: np.ndarray
@@ -24,11 +24,11 @@ class Judges(NamedTuple):
 
 @jit
 def errors(predictor, judges, joined):
-    """Measured minus predicted [unit], shape (out_size,); NaN where one of them is not to be had.
+    """Return measured minus predicted [unit], shape (out_size,); NaN where one of them is missing.
 
     Args:
         predictor: The network.
-        judges: Which mask predicts what.
+        judges: Mask of every element.
         joined: Every element of the layout [its unit], shape (size,); NaN where not measured.
     """
     rows, count = judges.through.shape
@@ -47,28 +47,28 @@ def errors(predictor, judges, joined):
                     complete[row] = False
         for i in range(judges.tails.shape[1]):
             inputs[row, count + i] = judges.tails[row, i]
-    told = forward(predictor.chain, values, rows)
-    found = np.full(len(judges.mask), np.nan)
+    prediction = forward(predictor.chain, values, rows)
+    error = np.full(len(judges.mask), np.nan)
     for i in range(len(judges.mask)):
         element, row = predictor.outputs[i], judges.mask[i]
         if complete[row]:
-            found[i] = joined[element] - told[row, i] * predictor.scale[1, element] - predictor.scale[0, element]
-    return found
+            error[i] = joined[element] - prediction[row, i] * predictor.scale[1, element] - predictor.scale[0, element]
+    return error
 
 
 @jit
 def distance(error, mean, index, precision):
-    """Mahalanobis distance of the elements `index` of an error, and what each of them adds to its square.
+    """Return the Mahalanobis distance of the elements `index` of an error, and their contributions to its square.
 
     Args:
-        error: Shape (out_size,).
+        error: Measured minus predicted, shape (out_size,).
         mean: Mean error of a healthy body, shape (out_size,).
-        index: Which elements are judged, shape (n,).
-        precision: Inverse covariance of those, shape (n, n).
+        index: Indices of the judged elements, shape (n,).
+        precision: Inverse covariance of the judged elements, shape (n, n).
 
     Returns:
-        The distance; and by how much its square drops without an element, (P e)_i^2 / P_ii, shape (out_size,), NaN
-        for those that are not judged.
+        The distance; and by how much its square falls without each element, (P e)_i^2 / P_ii, shape (out_size,), NaN
+        for elements that are not judged.
     """
     contribution = np.full(len(error), np.nan)
     total = 0.0
@@ -83,5 +83,5 @@ def distance(error, mean, index, precision):
 
 @jit
 def deviation(predictor, judges, joined, mean, index, precision):
-    """`distance` of the `errors` of a sample; see both."""
+    """Return the `distance` of the `errors` of a sample."""
     return distance(errors(predictor, judges, joined), mean, index, precision)

@@ -1,4 +1,4 @@
-"""What of a sample may be used, element by element."""
+"""Mask of the stale and invalid elements of a sample."""
 
 import numpy as np
 
@@ -6,27 +6,27 @@ from gemuco.compiled.jit import jit
 
 
 @jit
-def usable(values, valid, age, of, to, stale_after, found):
-    """Take what is valid and not too old.
+def usable(values, valid, age, of, to, stale_after, result):
+    """Copy the elements of a sample that are valid and not stale.
 
     Args:
-        values: Of the sample [unit of each element], shape (n,).
-        valid: Whether they may be used, shape (n,).
-        age: How old they were when the sample was published [s], shape (n,).
-        of: Which of them are taken, shape (k,).
-        to: Where each of these goes, shape (k,).
-        stale_after: How old each may be there [s], shape (size,).
-        found: Is filled in, NaN for all that may not be used, shape (size,).
+        values: Values of the sample [unit of each element], shape (n,).
+        valid: Whether each value is valid, shape (n,).
+        age: Age of each value when the sample was published [s], shape (n,).
+        of: Indices of the values to copy, shape (k,).
+        to: Index of each of these in the result, shape (k,).
+        stale_after: Largest age of each element of the result [s], shape (size,).
+        result: Result, NaN for stale and invalid elements, shape (size,).
 
     Returns:
-        Whether anything may be used.
+        Whether any element is usable.
     """
     is_any = False
-    for i in range(len(found)):
-        found[i] = np.nan
+    for i in range(len(result)):
+        result[i] = np.nan
     for k in range(len(of)):
         i, j = of[k], to[k]
         if valid[i] and age[i] <= stale_after[j]:
-            found[j] = values[i]
+            result[j] = values[i]
             is_any = is_any or np.isfinite(values[i])
     return is_any

@@ -49,7 +49,7 @@ class TrainConfig:
             whole_number(f"Training: {name}", getattr(self, name), least)
         for width in self.hidden:
             if width < 1:
-                raise SchemaError(f"Training: a hidden layer has width {width}; leave it out or make it wider.")
+                raise SchemaError(f"Training: a hidden layer of {width} is impossible; leave it out or make it wider.")
             whole_number("Training: the width of a hidden layer", width, 1)
         for name in ("rate", "bias_rate", "replay"):
             if not 0.0 <= getattr(self, name) < float("inf"):

@@ -12,7 +12,6 @@ import pytest
 ROOT = Path(__file__).parents[2]
 CODE = ("gemuco", "hal", "simulators", "services", "studies", "examples")
 NOT_YET = {
-    "gemuco/compiled",
     "hal/calibration",
     "hal/commissioning",
     "hal/drivers/can_device.py",
