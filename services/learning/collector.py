@@ -1,7 +1,7 @@
 """Recording of safe motion: random or taught, condition by condition, without a bus or on a running robot."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,6 +18,7 @@ from services.learning.playground import BusPlayground, CollectionStopped, Direc
 from services.learning.postures import load_postures, taught
 from services.model.living_model import layout_of
 from services.model.model_config import CollectConfig, collect_config
+from services.show import Progress
 
 EPISODE = 10.0
 """An episode has this length [s of the robot's time]; held-out data are whole episodes."""
@@ -27,8 +28,6 @@ STARVED = 30.0
 """Collecting is given up after this robot time [s] without a usable sample."""
 BUS = "bus"
 """Data recorded on a bus get this condition if the robot file has no conditions and none was given."""
-
-Progress = Callable[[float, str], None]
 
 
 @dataclass(frozen=True, slots=True)

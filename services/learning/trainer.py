@@ -2,7 +2,6 @@
 
 import shutil
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,12 +20,11 @@ from hal.config import RobotConfig
 from services.model.artifacts import fingerprint
 from services.model.living_model import layout_of
 from services.model.model_config import ModelConfig, model_config
+from services.show import Progress
 
 if TYPE_CHECKING:
     from gemuco.learning.train import TrainConfig
     from gemuco.structure.determination import Structure
-
-Progress = Callable[[float, str], None]
 
 GENTLER = 1.0 / 3.0
 """The peak learning rate of fine-tuning is this share of the robot file's."""

@@ -69,7 +69,6 @@ class TimedSchedule:
         self._begun_ns = time.time_ns()
         self._last_ns: int | None = None
         self._elapsed = 0.0
-        self._cut_ns = 0
 
     def wait(self, received_ns: int) -> bool:
         """Wait until a message of this arrival is due; return False if the replay was stopped."""

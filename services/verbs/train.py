@@ -11,7 +11,7 @@ from gemuco.errors import DatasetError
 from hal.config import RobotConfig, load_robot
 from services import show
 from services.learning import measured, trainer
-from services.learning.trainer import Progress, TrainingResult
+from services.learning.trainer import TrainingResult
 from services.model import artifacts
 from services.recording.dataset import is_recording, select
 
@@ -44,7 +44,7 @@ def run_training(
     folder = out or artifacts.model_folder(name)
     drafts = trainer.drafts_of(folder)
 
-    def train(progress: Progress) -> TrainingResult:
+    def train(progress: show.Progress) -> TrainingResult:
         if not measured.is_description(file):
             return trainer.train(robot, dataset, seed, progress, drafts, known)
         if known is not None:

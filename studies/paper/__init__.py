@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Protocol
 
 from services.errors import BadArguments
-from services.show import Tell
+from services.show import Progress
 from studies.paper.report import Report
 
 EXPERIMENTS = ("pr2", "musashi", "kxr")
@@ -15,7 +15,7 @@ EXPERIMENTS = ("pr2", "musashi", "kxr")
 class Experiment(Protocol):
     """The function `reproduce` of each robot's module `experiment`."""
 
-    def __call__(self, seeds: Sequence[int], folder: Path, progress: Tell, fresh: bool) -> Report:
+    def __call__(self, seeds: Sequence[int], folder: Path, progress: Progress, fresh: bool) -> Report:
         """Run every experiment of one robot.
 
         Args:

@@ -16,7 +16,7 @@ from joblib.externals.loky.process_executor import TerminatedWorkerError
 from hal.config import RobotConfig
 from services.errors import ServiceError
 from services.model.artifacts import fingerprint
-from services.show import Tell
+from services.show import Progress
 
 Outcome = TypeVar("Outcome")
 Result = TypeVar("Result")
@@ -65,7 +65,7 @@ def open_run(robot: RobotConfig, folder: Path, seed: int, fresh: bool = False) -
     return Run(robot, seed, memory)
 
 
-Experiment = Callable[[Run, Tell], Outcome]
+Experiment = Callable[[Run, Progress], Outcome]
 """An experiment is a function of a module, so that another process can import it by its name."""
 
 
@@ -73,7 +73,7 @@ def each_seed(
     robot: RobotConfig,
     seeds: Sequence[int],
     folder: Path,
-    progress: Tell,
+    progress: Progress,
     fresh: bool,
     experiment: Experiment[Outcome],
 ) -> list[Outcome]:
@@ -106,7 +106,7 @@ def _of_seed(experiment: Experiment[Outcome], run: Run, reports: Queue[Any]) -> 
     return experiment(run, lambda done, text: reports.put((run.seed, done, text)))
 
 
-def _relay(reports: Queue[Any], count: int, progress: Tell) -> None:
+def _relay(reports: Queue[Any], count: int, progress: Progress) -> None:
     """Report the mean progress of all seeds until the queue yields None."""
     shares: dict[int, float] = {}
     while (report := reports.get()) is not None:
@@ -114,6 +114,6 @@ def _relay(reports: Queue[Any], count: int, progress: Tell) -> None:
         progress(sum(shares.values()) / count, f"seed {seed}: {text}")
 
 
-def between(report: Tell, first: float, last: float) -> Tell:
+def between(report: Progress, first: float, last: float) -> Progress:
     """Return a progress function for one part of the work, from the share `first` of the whole to `last`."""
     return lambda done, text: report(first + (last - first) * done, text)

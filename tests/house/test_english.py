@@ -23,7 +23,6 @@ NOT_YET = {
     "services/health.py",
     "services/process",
     "services/runtime.py",
-    "services/show.py",
     "services/verbs/fleet_top.py",
     "services/verbs/fleet_watch.py",
     "services/verbs/page.py",

@@ -13,7 +13,7 @@ from gemuco.signals import Layout, Signal
 from hal.config import load_robot
 from services.cli import app
 from services.errors import BadArguments
-from services.show import Tell
+from services.show import Progress
 from studies.paper import experiment, figures, runs
 from studies.paper.report import Report, Row
 from studies.paper.runs import Run, RunKilled, each_seed, open_run
@@ -98,7 +98,7 @@ def test_two_components_are_enough_for_a_p_of_one_number(tmp_path):
     assert (tmp_path / "one.png").exists()
 
 
-def _seed_and_process(run: Run, progress: Tell) -> tuple[int, int]:
+def _seed_and_process(run: Run, progress: Progress) -> tuple[int, int]:
     if run.robot.robot == "killed":
         os.kill(os.getpid(), signal.SIGKILL)
     progress(0.5, "counting")
@@ -107,7 +107,7 @@ def _seed_and_process(run: Run, progress: Tell) -> tuple[int, int]:
     return run.seed, os.getpid()
 
 
-def _each_seed(robot: str, seeds: list[int], folder: Path, progress: Tell) -> list[tuple[int, int]]:
+def _each_seed(robot: str, seeds: list[int], folder: Path, progress: Progress) -> list[tuple[int, int]]:
     config = load_robot(ROBOT).model_copy(update={"robot": robot})
     return each_seed(config, seeds, folder, progress, False, _seed_and_process)
 

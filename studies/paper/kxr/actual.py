@@ -13,7 +13,7 @@ from hal.config import RobotConfig
 from services.learning.trainer import train_config
 from services.model.living_model import layout_of
 from services.model.model_config import model_config
-from services.show import Tell
+from services.show import Progress
 from studies.paper.body import JOINTS
 from studies.paper.kxr.robot import Standing, inverse, random_targets, safe_postures, stiff
 from studies.paper.kxr.simulated import AFTER, FRESH, LEADS, TOOLS, UPDATES, control_of, leads, recognitions
@@ -56,7 +56,7 @@ class Actual:
     controlled: Mapping[str, Trial]
 
 
-def actual(run: Run, simulated: BodySchema, progress: Tell) -> Actual:
+def actual(run: Run, simulated: BodySchema, progress: Progress) -> Actual:
     """Collect on the actual robot, fine-tune the simulated model, and run every trial of one seed."""
     progress(0.0, "collecting on the actual robot")
     settings = {"grid": TAUGHT_GRID, "margin": TAUGHT_MARGIN, "random": RANDOM}
@@ -91,7 +91,7 @@ def _collect(run: Run) -> Dataset:
     return Dataset(layout, tuple(episodes))
 
 
-def _tune(run: Run, simulated: BodySchema, data: Dataset, progress: Tell) -> BodySchema:
+def _tune(run: Run, simulated: BodySchema, data: Dataset, progress: Progress) -> BodySchema:
     config = replace(train_config(model_config(run.robot), EPOCHS, run.seed), rate=RATE, replay=0.0)
     return fine_tune(simulated, data, config, lambda done, text: progress(0.1 + 0.7 * done, text))[0]
 

@@ -13,7 +13,7 @@ from services.learning.collector import collect_direct
 from services.learning.trainer import train
 from services.model.control_config import ControlConfig
 from services.model.model_config import model_config
-from services.show import Tell
+from services.show import Progress
 from studies.paper.body import JOINTS
 from studies.paper.kxr.robot import (
     CENTER,
@@ -84,7 +84,7 @@ class Simulated:
     limit: Trial
 
 
-def simulate(run: Run, progress: Tell) -> Simulated:
+def simulate(run: Run, progress: Progress) -> Simulated:
     """Collect, train, and run every trial of one seed."""
     robot, seed = run.robot, run.seed
     progress(0.0, "collecting")

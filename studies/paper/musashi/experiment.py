@@ -12,7 +12,7 @@ import numpy as np
 
 from hal.config import load_robot
 from services.model.artifacts import robot_file
-from services.show import Tell
+from services.show import Progress
 from studies.paper.musashi import control, figures, simulation
 from studies.paper.musashi.model import decay
 from studies.paper.musashi.motion import LENGTH, POSITION, TENSION
@@ -25,7 +25,7 @@ LOOSE = 0.30
 """The paper's second threshold of masks."""
 
 
-def reproduce(seeds: Sequence[int], folder: Path, progress: Tell, fresh: bool) -> Report:
+def reproduce(seeds: Sequence[int], folder: Path, progress: Progress, fresh: bool) -> Report:
     """Run all experiments; see `studies.paper.Experiment`."""
     robot = load_robot(robot_file("musashi_arm"))
     outcomes = each_seed(robot, seeds, folder, progress, fresh, run_seed)

@@ -9,7 +9,7 @@ from gemuco.dataset import Dataset
 from gemuco.schema import BodySchema
 from gemuco.structure.determination import Structure
 from services.learning.trainer import train
-from services.show import Tell
+from services.show import Progress
 from studies.paper.musashi import anomaly, control, model, simulation
 from studies.paper.musashi.motion import TENSION, record
 from studies.paper.runs import Run, between
@@ -69,7 +69,7 @@ class Outcome:
     forced: Mapping[str, Mapping[str, np.ndarray]]
 
 
-def run_seed(run: Run, progress: Tell) -> Outcome:
+def run_seed(run: Run, progress: Progress) -> Outcome:
     """Train, move the actual arm, learn from it, and judge the models before and after."""
     robot, seed = run.robot, run.seed
     progress(0.0, "drawing states of the geometric model")

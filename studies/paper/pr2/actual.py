@@ -15,7 +15,7 @@ from services.hardware.stand_in import simulator_of
 from services.learning.collector import Request, collect_direct
 from services.learning.trainer import train_config
 from services.model.model_config import collect_config, model_config
-from services.show import Tell
+from services.show import Progress
 from studies.paper.body import JOINTS
 from studies.paper.pr2.arm import TIP, Arm, Geometry, duster_motion
 from studies.paper.pr2.simulated import BELIEVED, ELEVATION, errors_by_grasp
@@ -55,7 +55,7 @@ class Actual:
     samples: int
 
 
-def actual(run: Run, simulated: BodySchema, progress: Tell) -> Actual:
+def actual(run: Run, simulated: BodySchema, progress: Progress) -> Actual:
     """Collect on the actual arm, fine-tune the simulated model, and run every trial of one seed."""
     progress(0.0, "collecting on the actual arm")
     count = round(COLLECTED * collect_config(run.robot).samples)
@@ -94,7 +94,7 @@ def split(data: Dataset, share: float) -> tuple[Dataset, Dataset]:
     return Dataset(data.layout, tuple(first)), Dataset(data.layout, tuple(last))
 
 
-def _tune(run: Run, simulated: BodySchema, learned: Dataset, progress: Tell) -> BodySchema:
+def _tune(run: Run, simulated: BodySchema, learned: Dataset, progress: Progress) -> BodySchema:
     model = model_config(run.robot)
     config = replace(train_config(model, round(EPOCHS * model.training.epochs), run.seed), rate=RATE, replay=0.0)
     schema, _ = fine_tune(simulated, learned, config, lambda done, text: progress(0.2 + 0.4 * done, text))

@@ -8,7 +8,7 @@ import numpy as np
 
 from hal.config import load_robot
 from services.model.artifacts import robot_file
-from services.show import Tell
+from services.show import Progress
 from studies.paper.body import JOINTS
 from studies.paper.pr2.actual import MODELS, Actual, actual
 from studies.paper.pr2.arm import TIP
@@ -33,12 +33,12 @@ class Outcome:
     actual: Actual
 
 
-def _of_seed(run: Run, progress: Tell) -> Outcome:
+def _of_seed(run: Run, progress: Progress) -> Outcome:
     simulated = simulate(run, between(progress, 0.0, 0.7))
     return Outcome(simulated, actual(run, simulated.schema, between(progress, 0.7, 1.0)))
 
 
-def reproduce(seeds: Sequence[int], folder: Path, progress: Tell, fresh: bool) -> Report:
+def reproduce(seeds: Sequence[int], folder: Path, progress: Progress, fresh: bool) -> Report:
     """Run both experiments; see `studies.paper.Experiment`."""
     robot = load_robot(robot_file(ROBOT))
     outcomes = each_seed(robot, seeds, folder, progress, fresh, _of_seed)

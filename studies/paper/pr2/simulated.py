@@ -12,7 +12,7 @@ from gemuco.schema import BodySchema
 from services.learning.collector import Request, collect_direct
 from services.learning.trainer import train
 from services.model.model_config import collect_config
-from services.show import Tell
+from services.show import Progress
 from studies.paper.pr2.arm import Arm, Geometry, duster_motion
 from studies.paper.pr2.trials import Trial, control_along, estimate_along, model_error
 from studies.paper.runs import Run, between
@@ -104,7 +104,7 @@ class Simulated:
         return self.schema.manifest[name]
 
 
-def simulate(run: Run, progress: Tell) -> Simulated:
+def simulate(run: Run, progress: Progress) -> Simulated:
     """Collect, train, and run every trial of one seed."""
     robot, seed = run.robot, run.seed
     progress(0.0, "collecting")
