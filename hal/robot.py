@@ -14,10 +14,10 @@ from hal.device import Device
 from hal.errors import CommandRefused
 from hal.fleet import build
 from hal.modes import Act, Mode, ModeMachine
+from hal.safety.cycle_lock import PATIENCE, CycleLock
 from hal.safety.emergency import Emergency, EmergencyStop
 from hal.safety.limiter import Limiter
 from hal.safety.start import Start
-from hal.safety.turns import PATIENCE, Turns
 from hal.safety.watchdog import CommandWatchdog, CycleWatchdog, checked
 from hal.sample import Applied, Assembler, Sample
 from hal.wire.bus import Bus
@@ -57,7 +57,7 @@ class Robot:
         self._devices = tuple(devices)
         self._buses = tuple(buses)
         self._clock: Clock = clock or SystemClock()
-        self._turns = Turns()
+        self._lock = CycleLock()
         self._assembler = Assembler(config, devices)
         self._actuators = Actuators(config, devices)
         self._limiter = Limiter(config, self.period, devices, self._actuators.quantity)
@@ -122,7 +122,7 @@ class Robot:
         if not self._is_open:
             return
         self._is_open = False
-        with self._turns.within(PATIENCE) as is_free:
+        with self._lock.within(PATIENCE) as is_free:
             if is_free:
                 self._modes.halt(self._clock.monotonic())
         if is_free:
@@ -155,11 +155,11 @@ class Robot:
             CommandRefused: The robot is in fault or stopping, a drive is not ready, its position is unknown, or the
                 present position is outside of the limits.
         """
-        with self._turns.question():
+        with self._lock.request():
             if self._modes.mode is Mode.OFF:
                 self._start.check(self._clock.monotonic(), self._limiter)
                 self._desired = None
-                self._limiter.start(self._start.believed())
+                self._limiter.start(self._start.median())
             self._modes.enable(self._clock.monotonic())
 
     def home(self, device: str) -> None:
@@ -168,7 +168,7 @@ class Robot:
         Raises:
             CommandRefused: The robot is not off, or the device is unknown, not ready or has no homing.
         """
-        with self._turns.question():
+        with self._lock.request():
             self._modes.home(find(device, self._actuators.devices), self._clock.monotonic())
 
     def tare(self, device: str) -> None:
@@ -177,17 +177,17 @@ class Robot:
         Raises:
             CommandRefused: The robot is not off, or the device is unknown or has no tare.
         """
-        with self._turns.question():
+        with self._lock.request():
             self._modes.tare(find(device, self._devices))
 
     def disable(self) -> None:
         """Disable the drives at once."""
-        with self._turns.question():
+        with self._lock.request():
             self._modes.disable(self._clock.monotonic())
 
     def stop(self, reason: str) -> None:
         """Take no more commands, perform the stop of the robot file, and disable the drives."""
-        with self._turns.question():
+        with self._lock.request():
             self._stop_reason = reason
             self._modes.stop(self._clock.monotonic())
 
@@ -205,9 +205,9 @@ class Robot:
         """
         text = f"Emergency stop: {reason}"
         self._emergency.latch(text)
-        with self._turns.within(self._emergency.LOCK_TIMEOUT):
+        with self._lock.within(self._emergency.LOCK_TIMEOUT):
             self._modes.emergency(text)
-            requests = self._emergency.ask()
+            requests = self._emergency.request()
         return self._emergency.watch(requests, lambda: self._number)
 
     def reset(self) -> None:
@@ -216,7 +216,7 @@ class Robot:
         Raises:
             CommandRefused: The robot is enabled.
         """
-        with self._turns.question():
+        with self._lock.request():
             self._modes.reset()
             self._emergency.unlatch()
             for device in self._devices:
@@ -235,7 +235,7 @@ class Robot:
         """
         signal = self.config.command.signal
         desired = checked(desired, signal, self.config.signals[signal].elements)
-        with self._turns.question():
+        with self._lock.request():
             expires = self._watchdog.expiry(cycle, self._clock.monotonic())
             if not self._modes.takes_commands:
                 raise CommandRefused(
@@ -252,14 +252,14 @@ class Robot:
         try:
             return self._cycle()
         except Exception as error:
-            with self._turns.cycle():
+            with self._lock.cycle():
                 self._modes.fault(f"The cycle failed: {type(error).__name__}: {error}")
             raise
 
     def _cycle(self) -> tuple[Sample, Applied]:
         for bus in self._buses:
             bus.begin()
-        with self._turns.cycle():
+        with self._lock.cycle():
             start = self._clock.monotonic()
             stamp = self._clock.now_ns()
             self._number += 1
@@ -313,7 +313,7 @@ class Robot:
             actuators.damp()
             return limited
         if act is Act.START:  # the set-point is the present position, so that no drive jumps
-            limiter.start(self._start.believed())
+            limiter.start(self._start.median())
         elif act is Act.PARK:
             limited = limiter.step(self._park, self._measured, is_parking=True)
         else:

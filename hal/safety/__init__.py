@@ -1,1 +1,1 @@
-"""One limit per class, and what happens when a limit is not enough: trips and the emergency stop."""
+"""Limits of commands, trips, watchdogs and the emergency stop."""

@@ -1,82 +1,54 @@
-"""The ends of the way for commands that are no positions: a velocity brakes in time, an effort fades out."""
-
-from dataclasses import dataclass
+"""Position and velocity ranges for velocity and effort commands: a velocity brakes in time, an effort fades out."""
 
 import numpy as np
+from typing_extensions import override
 
-from hal.safety.limit import Arrays, Turn, changed
+from hal.safety.feedback import MeasuredRange
+from hal.safety.limit import CycleState, Limit, changed
 
 RESPONSE = 0.02
-"""How long [s] a drive may lag behind its command."""
+"""A drive may lag behind its command by this time [s]."""
 CALM = 2.0
-"""How many times longer the last of the way takes than what is measured is old: with 1 the drive would swing about the
-end, as any loop does whose dead time is as long as its time constant."""
+"""The last part of the way takes this multiple of the age of the measurement. With 1 the drive would oscillate about
+the end, as any loop whose dead time equals its time constant."""
 FADE_BAND = 0.1
-"""Part of the range, at each end of it, within which an effort towards the end fades out."""
+"""An effort towards an end of the range fades out within this part of the range."""
 
 
-@dataclass(frozen=True, slots=True)
-class Way:
-    """A signal that says where, or how fast, the commanded elements are.
+class EndsOfVelocity(Limit):
+    """Limit of a velocity command, which brakes so that the position comes to rest inside its range.
 
-    Attributes:
-        signal: Its name.
-        elements: Names of its elements that belong to the commanded ones, k of them.
-        commanded: Their places in the commanded signal, shape (k,).
-        measured: Their places in this signal, shape (k,).
-        low: Lowest value allowed [unit of this signal], shape (k,); -inf where there is none.
-        high: Highest value allowed, shape (k,).
-    """
-
-    signal: str
-    elements: tuple[str, ...]
-    commanded: np.ndarray
-    measured: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-
-    def read(self, measured: Arrays) -> np.ndarray:
-        """What is measured now [unit of this signal], shape (k,)."""
-        return measured[self.signal][self.measured]
-
-    def unknown(self, measured: Arrays) -> list[str]:
-        """Names of the elements that are not measured now."""
-        return [name for name, value in zip(self.elements, self.read(measured).tolist(), strict=True) if value != value]
-
-
-class EndsOfVelocity:
-    """A velocity command is braked so that the position comes to rest inside of its range.
-
-    A velocity v that is seen `ahead` too late and is braked then goes on for `v * ahead + v^2 / (2 deceleration)`.
-    Solved for v, that is never braked harder than `deceleration`. Beyond an end only the way back is open. Where the
-    position is not known the command is 0: nobody can tell how far it would go.
+    A velocity v that starts to brake `ahead` too late continues for `v * ahead + v^2 / (2 deceleration)`. Solved for v,
+    this never needs more than `deceleration`. Beyond an end only the way back is allowed. Where the position is unknown
+    the command is 0.
     """
 
     name = "range"
     needs = "position"
 
-    def __init__(self, position: Way, deceleration: np.ndarray | None, ahead: float) -> None:
+    def __init__(self, position: MeasuredRange, deceleration: np.ndarray | None, ahead: float) -> None:
         """Prepare.
 
         Args:
-            position: Of the commanded elements.
-            deceleration: How fast the command may brake [unit of the command/s], shape (k,); at once if None.
-            ahead: How old [s] a position may be by the time at which the drive has followed a command.
+            position: Position of the commanded elements.
+            deceleration: Deceleration of the command [unit of the command/s], shape (k,); None for no limit.
+            ahead: Largest age [s] of a position at the time at which the drive has followed a command.
         """
-        self._position, self._deceleration = position, deceleration
+        self.feedback = self._position = position
+        self._deceleration = deceleration
         self._ahead = CALM * ahead
 
-    def limit(self, wanted: np.ndarray, turn: Turn) -> np.ndarray:
-        """See `Limit.limit`."""
-        way = self._position
-        position = way.read(turn.measured)
-        up, down = self._fastest(way.high - position), self._fastest(position - way.low)
-        mine = wanted[way.commanded]
-        bounded = np.where(np.isfinite(position), np.minimum(np.maximum(mine, -down), up), 0.0)
-        if (bounded == mine).all():
-            return wanted
-        limited = wanted.copy()
-        limited[way.commanded] = bounded
+    @override
+    def limit(self, desired: np.ndarray, state: CycleState) -> np.ndarray:
+        source = self._position
+        position = source.read(state.measured)
+        up, down = self._fastest(source.high - position), self._fastest(position - source.low)
+        own = desired[source.commanded]
+        bounded = np.where(np.isfinite(position), np.minimum(np.maximum(own, -down), up), 0.0)
+        if (bounded == own).all():
+            return desired
+        limited = desired.copy()
+        limited[source.commanded] = bounded
         return limited
 
     def _fastest(self, left: np.ndarray) -> np.ndarray:
@@ -85,37 +57,30 @@ class EndsOfVelocity:
             return left / self._ahead
         return self._deceleration * (np.sqrt(self._ahead**2 + 2.0 / self._deceleration * left) - self._ahead)
 
-    def blind(self, measured: Arrays) -> list[str]:
-        """See `Limit.blind`."""
-        return self._position.unknown(measured)
 
+class EndsOfEffort(Limit):
+    """Limit of an effort command, which fades out towards the end of the range of a position or velocity.
 
-class EndsOfEffort:
-    """An effort command fades out towards the end of the way, and towards the highest velocity; see `Trips` for beyond.
-
-    Towards the other side it acts in full. Where position or velocity is not known the command is 0.
+    In the other direction the effort is not limited. Where position or velocity is unknown the command is 0. Beyond the
+    range `Trips` stops the robot.
     """
 
-    def __init__(self, name: str, way: Way) -> None:
-        """`name` is told in `Applied.limited_by`; `way` are positions or velocities, and their bounds."""
+    def __init__(self, name: str, source: MeasuredRange) -> None:
+        """Prepare; `name` is reported in `Applied.limited_by`, `source` has positions or velocities."""
         self.name = name
         self.needs = "position" if name == "range" else name
-        self._way = way
-        span = way.high - way.low
-        scale = np.where(np.isfinite(span), span, np.maximum(np.abs(way.low), np.abs(way.high)))
+        self.feedback = self._source = source
+        span = source.high - source.low
+        scale = np.where(np.isfinite(span), span, np.maximum(np.abs(source.low), np.abs(source.high)))
         self._band = FADE_BAND * np.where(np.isfinite(scale), scale, 1.0)
 
-    def limit(self, wanted: np.ndarray, turn: Turn) -> np.ndarray:
-        """See `Limit.limit`."""
-        way = self._way
-        value = way.read(turn.measured)
-        mine = wanted[way.commanded]
-        left = np.where(mine > 0, way.high - value, value - way.low)
+    @override
+    def limit(self, desired: np.ndarray, state: CycleState) -> np.ndarray:
+        source = self._source
+        value = source.read(state.measured)
+        own = desired[source.commanded]
+        left = np.where(own > 0, source.high - value, value - source.low)
         share = np.minimum(np.maximum(left / self._band, 0.0), 1.0)
-        limited = wanted.copy()
-        limited[way.commanded] = np.where(np.isfinite(value), mine * share, 0.0)
-        return changed(limited, wanted)
-
-    def blind(self, measured: Arrays) -> list[str]:
-        """See `Limit.blind`."""
-        return self._way.unknown(measured)
+        limited = desired.copy()
+        limited[source.commanded] = np.where(np.isfinite(value), own * share, 0.0)
+        return changed(limited, desired)

@@ -1,23 +1,23 @@
 """Contract of a limit, and the limits that need no measurement: range, rate of change, and acceleration."""
 
-from collections.abc import Mapping
+import abc
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
+from typing_extensions import override
 
-Arrays = Mapping[str, np.ndarray]
+from hal.safety.feedback import Arrays, Feedback
 
 
 @dataclass(slots=True)
-class Turn:
-    """What is known when the set-point of a cycle is decided.
+class CycleState:
+    """State of the robot at the decision of a set-point.
 
     Attributes:
-        before: Set-point of the cycle before [unit of the commanded signal], shape (n,).
-        speed: How fast it changed then [unit/s], shape (n,).
-        measured: Signal -> newest valid values [its unit], shapes (m,); NaN where there is none.
-        is_commanded: Whether the set-point comes from outside; one that is merely held is not pulled into range.
+        before: Set-point of the last cycle [unit of the commanded signal], shape (n,).
+        speed: Speed of its change [unit/s], shape (n,).
+        measured: Signal -> newest valid values [its unit], shapes (m,); NaN where not valid.
+        is_commanded: Whether the set-point is commanded; a held set-point is not moved into the range.
     """
 
     before: np.ndarray
@@ -26,43 +26,45 @@ class Turn:
     is_commanded: bool = True
 
 
-class Limit(Protocol):
-    """One limit of a command. Limits are asked one after the other; the last has the last word."""
+class Limit(abc.ABC):
+    """One limit of a command. Limits are applied in sequence; a later limit has priority."""
 
     name: str
-    """As told in `Applied.limited_by`."""
-    needs: str
-    """What must be measured for it, in a word; empty if nothing."""
+    """Name in `Applied.limited_by`."""
+    needs: str = ""
+    """Quantity that must be measured; empty without one."""
+    feedback: Feedback | None = None
+    """Measured elements that the limit needs."""
 
-    def limit(self, wanted: np.ndarray, turn: Turn) -> np.ndarray:
-        """The set-point that may be applied [unit of the commanded signal], shape (n,).
+    @abc.abstractmethod
+    def limit(self, desired: np.ndarray, state: CycleState) -> np.ndarray:
+        """Return the set-point that may be applied [unit of the commanded signal], shape (n,).
 
         Returns:
-            `wanted` itself if it may be applied as it is, else a new array.
+            `desired` itself if it may be applied unchanged, otherwise a new array.
         """
-        ...
 
     def blind(self, measured: Arrays) -> list[str]:
-        """Elements for which a missing measurement keeps this limit from acting as it should."""
-        ...
+        """Return the elements whose measurement the limit needs and does not have."""
+        return self.feedback.unknown(measured) if self.feedback else []
 
 
-def changed(limited: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """`wanted` itself if both are the same, so that whoever asks sees at once that nothing was changed."""
-    return wanted if (limited == wanted).all() else limited
+def changed(limited: np.ndarray, desired: np.ndarray) -> np.ndarray:
+    """Return `desired` itself if both are equal, so that a caller can compare objects."""
+    return desired if (limited == desired).all() else limited
 
 
 def fastest(distance: np.ndarray, deceleration: np.ndarray | float, period: float) -> np.ndarray:
-    """Speed [unit/s] of this cycle from which a motion can come to rest within a distance.
+    """Return the speed [unit/s] of this cycle from which a motion can come to rest within a distance.
 
     In cycles of `period`, a motion that loses `deceleration * period` of speed per cycle and has n cycles left covers
     `distance = period * (n v - deceleration * period * n (n - 1) / 2)`; solved for v with the smallest whole n. The
-    last of these cycles ends exactly there.
+    last of these cycles ends exactly at the distance.
 
     Args:
-        distance: Way that is left [unit], shape (n,); 0 where it is negative.
-        deceleration: How fast it can brake [unit/s^2].
-        period: Of a cycle [s].
+        distance: Remaining way [unit], shape (n,); 0 where it is negative.
+        deceleration: Deceleration [unit/s^2].
+        period: Period of a cycle [s].
 
     Returns:
         Largest speeds [unit/s], shape (n,).
@@ -73,72 +75,58 @@ def fastest(distance: np.ndarray, deceleration: np.ndarray | float, period: floa
     return left / (cycles * period) + 0.5 * one * (cycles - 1.0)
 
 
-class Range:
-    """A command stays between the lowest and the highest value."""
+class Range(Limit):
+    """Lowest and highest value of a command."""
 
     name = "range"
-    needs = ""
 
     def __init__(self, low: np.ndarray, high: np.ndarray) -> None:
-        """Bounds [unit of the commanded signal], shapes (n,); infinite where there is none."""
+        """Set the bounds [unit of the commanded signal], shapes (n,); infinite for none."""
         self._low, self._high = low, high
 
-    def limit(self, wanted: np.ndarray, turn: Turn) -> np.ndarray:
-        """See `Limit.limit`."""
-        if not turn.is_commanded:
-            return wanted
-        return changed(np.minimum(np.maximum(wanted, self._low), self._high), wanted)
-
-    def blind(self, measured: Arrays) -> list[str]:
-        """See `Limit.blind`; it needs no measurement."""
-        return []
+    @override
+    def limit(self, desired: np.ndarray, state: CycleState) -> np.ndarray:
+        if not state.is_commanded:
+            return desired
+        return changed(np.minimum(np.maximum(desired, self._low), self._high), desired)
 
 
-class Rate:
-    """A set-point changes by at most so much per second: of a position that is a velocity, of a velocity a ramp."""
+class Rate(Limit):
+    """Largest change of a set-point per second: the velocity of a position, the ramp of a velocity."""
 
     name = "rate"
-    needs = ""
 
     def __init__(self, rate: np.ndarray | float, period: float) -> None:
-        """`rate` [unit/s], shape (n,) or one for all, for cycles of `period` [s]."""
+        """Set the `rate` [unit/s], shape (n,) or one for all, for cycles of `period` [s]."""
         self._step = rate * period
 
-    def limit(self, wanted: np.ndarray, turn: Turn) -> np.ndarray:
-        """See `Limit.limit`."""
-        way = wanted - turn.before
+    @override
+    def limit(self, desired: np.ndarray, state: CycleState) -> np.ndarray:
+        way = desired - state.before
         step = np.minimum(np.maximum(way, -self._step), self._step)
-        return wanted if (step == way).all() else turn.before + step
-
-    def blind(self, measured: Arrays) -> list[str]:
-        """See `Limit.blind`; it needs no measurement."""
-        return []
+        return desired if (step == way).all() else state.before + step
 
 
-class Acceleration:
-    """A position starts and stops on a ramp: it begins to brake in time to come to rest where it is to be.
+class Acceleration(Limit):
+    """Largest acceleration of a position: it brakes in time to come to rest at its target.
 
-    A set-point that turns back, or is held, brakes as fast as it may. As every speed it takes can be braked before the
-    place that was wanted, which is in range, it never leaves the range either.
+    A set-point that reverses, or is held, brakes at the largest deceleration. It can always brake before the target,
+    which is in range, so it does not leave the range.
     """
 
     name = "acceleration"
-    needs = ""
 
     def __init__(self, acceleration: np.ndarray | float, period: float) -> None:
-        """`acceleration` [unit/s^2], shape (n,) or one for all, for cycles of `period` [s]."""
+        """Set the `acceleration` [unit/s^2], shape (n,) or one for all, for cycles of `period` [s]."""
         self._acceleration, self._period = acceleration, period
         self._change = acceleration * period
 
-    def limit(self, wanted: np.ndarray, turn: Turn) -> np.ndarray:
-        """See `Limit.limit`; `Rate` comes after it, for from the far end of one step nobody sees how far it is."""
-        way = wanted - turn.before
+    @override
+    def limit(self, desired: np.ndarray, state: CycleState) -> np.ndarray:
+        """Return the next set-point; `Rate` must come after this limit, which needs the full distance to the target."""
+        way = desired - state.before
         speed = np.copysign(fastest(np.abs(way), self._acceleration, self._period), way)
-        speed = np.minimum(np.maximum(speed, turn.speed - self._change), turn.speed + self._change)
+        speed = np.minimum(np.maximum(speed, state.speed - self._change), state.speed + self._change)
         step = speed * self._period
         arrives = np.abs(step - way) <= 1e-9 * np.abs(way)
-        return wanted if arrives.all() else np.where(arrives, wanted, turn.before + step)
-
-    def blind(self, measured: Arrays) -> list[str]:
-        """See `Limit.blind`; it needs no measurement."""
-        return []
+        return desired if arrives.all() else np.where(arrives, desired, state.before + step)

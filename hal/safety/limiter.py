@@ -1,4 +1,4 @@
-"""All limits of a robot's command, one after the other: what a command may become before it is applied."""
+"""All limits of a robot's command, applied in sequence."""
 
 from collections.abc import Sequence
 
@@ -6,28 +6,29 @@ import numpy as np
 
 from hal.config import LimitConfig, RobotConfig, per_element
 from hal.device import Device
-from hal.safety import roles
+from hal.safety import feedback
 from hal.safety.ends import RESPONSE, EndsOfEffort, EndsOfVelocity
-from hal.safety.limit import Acceleration, Arrays, Limit, Range, Rate, Turn
-from hal.safety.soft_effort import Load, SoftEffort, SoftEffortOfEffort, SoftEffortOfVelocity
+from hal.safety.feedback import Arrays, Load
+from hal.safety.limit import Acceleration, CycleState, Limit, Range, Rate
+from hal.safety.soft_effort import SoftEffort, SoftEffortOfEffort, SoftEffortOfVelocity
 from hal.safety.trips import Trips
 
 
 class Limiter:
-    """Keeps the set-point, and moves it towards what is desired as far as every limit allows.
+    """Owner of the set-point, which moves towards the desired one as far as every limit allows.
 
-    Every new set-point is a step from the one before, so that no command, however it jumps, moves a drive faster than
-    the robot file says. A limit that depends on what is measured comes after those that do not, and wins.
+    Every new set-point is a step from the last one, so that no jump of a command moves a drive faster than the robot
+    file allows. Limits that need a measurement come after the others and have priority.
 
     Attributes:
-        set_point: Of the newest cycle [unit of the commanded signal], shape (n,).
+        set_point: Set-point of the newest cycle [unit of the commanded signal], shape (n,).
     """
 
     def __init__(self, config: RobotConfig, period: float, devices: Sequence[Device] = (), quantity: str = "position"):
         """Prepare the limits of `config` for cycles of `period` [s] and commands of a `quantity`.
 
         Raises:
-            ConfigError: A limit that cannot act.
+            ConfigError: A limit can have no effect.
         """
         self._config, self._period, self._quantity = config, period, quantity
         name = config.command.signal
@@ -36,15 +37,17 @@ class Limiter:
         limit = config.limits.get(name, LimitConfig())
         self._rate = None if limit.rate is None else per_element(limit.rate, self._size, name)
         self._acceleration = None if limit.acceleration is None else per_element(limit.acceleration, self._size, name)
-        nature = roles.natures(config, devices)
-        if quantity != "position":
-            roles.check_known(config, nature)
-        self._positions = [roles.own_way(config)] if quantity == "position" else roles.ways(config, nature, "position")
-        self._velocities = roles.ways(config, nature, "velocity")
+        quantity_of = feedback.quantities(config, devices)
+        if quantity == "position":
+            self._positions = [feedback.commanded_range(config)]
+        else:
+            feedback.check_known(config, quantity_of)
+            self._positions = feedback.measured_ranges(config, quantity_of, "position")
+        self._velocities = feedback.measured_ranges(config, quantity_of, "velocity")
         self._trips = Trips(config, self._positions)
         self._parking: list[Limit] = []
-        make = {"position": self._of_position, "velocity": self._of_velocity, "effort": self._of_effort}[quantity]
-        self._limits = make(roles.loads(config, nature, quantity))
+        limits_of = {"position": self._of_position, "velocity": self._of_velocity, "effort": self._of_effort}
+        self._limits = limits_of[quantity](feedback.loads(config, quantity_of, quantity))
         self.set_point = np.full(self._size, np.nan)
         self._speed = np.zeros(self._size)
 
@@ -72,9 +75,9 @@ class Limiter:
         limits += [SoftEffortOfVelocity(load, relief[load.commanded]) for load in loads]
         if self._rate is not None:
             limits.append(Rate(self._rate, self._period))
-        for way in self._positions:
-            braking = None if self._rate is None else self._rate[way.commanded]
-            limits.append(EndsOfVelocity(way, braking, self._ahead(way.signal)))
+        for position in self._positions:
+            braking = None if self._rate is None else self._rate[position.commanded]
+            limits.append(EndsOfVelocity(position, braking, self._ahead(position.signal)))
         return limits
 
     def _of_effort(self, loads: Sequence[Load]) -> list[Limit]:
@@ -82,16 +85,16 @@ class Limiter:
         if self._rate is not None:
             limits.append(Rate(self._rate, self._period))
         limits += [SoftEffortOfEffort(load) for load in loads]
-        limits += [EndsOfEffort("range", way) for way in self._positions]
-        limits += [EndsOfEffort("velocity", way) for way in self._velocities]
+        limits += [EndsOfEffort("range", position) for position in self._positions]
+        limits += [EndsOfEffort("velocity", velocity) for velocity in self._velocities]
         return limits
 
     def _ahead(self, signal: str) -> float:
-        """How old [s] a measurement may be by the time at which a drive has followed what was made of it."""
+        """Return the largest age [s] of a measurement at the time at which a drive has followed its command."""
         return self._config.signals[signal].stale_after + 2 * self._period + RESPONSE
 
     def start(self, measured: Arrays) -> np.ndarray:
-        """Begin where the robot is: at its position, or without velocity or effort. Shape (n,)."""
+        """Set and return the set-point, shape (n,): the measured position, or zero velocity or effort."""
         self._speed = np.zeros(self._size)
         if self._quantity == "position":
             value = measured[self._config.command.signal]
@@ -101,45 +104,45 @@ class Limiter:
         return self.set_point
 
     def step(self, desired: np.ndarray | None, measured: Arrays, is_parking: bool = False) -> list[str]:
-        """Take `set_point` one cycle further.
+        """Advance `set_point` by one cycle.
 
         Args:
-            desired: What is asked for [unit of the commanded signal], shape (n,); None: hold, which of a velocity or
-                effort is 0.
-            measured: The newest valid values; an element that is NaN limits nothing, or everything, as the limit says.
-            is_parking: Whether to move no faster than `stop.speed`.
+            desired: Desired set-point [unit of the commanded signal], shape (n,); None to hold the position, or for
+                zero velocity or effort.
+            measured: Newest valid values; each limit defines its behaviour where an element is NaN.
+            is_parking: Whether `stop.speed` limits the speed.
 
         Returns:
-            A sorted subset of `range`, `rate`, `acceleration`, `tension`, `effort`, `velocity`: which limits acted.
+            Limits that acted: a sorted subset of `range`, `rate`, `acceleration`, `tension`, `effort`, `velocity`.
         """
         before = self.set_point
-        wanted = desired
-        if wanted is None:
-            wanted = before if self._quantity == "position" else np.zeros(self._size)
-        turn = Turn(before, self._speed, measured, desired is not None)
-        acted = set()
+        set_point = desired
+        if set_point is None:
+            set_point = before if self._quantity == "position" else np.zeros(self._size)
+        state = CycleState(before, self._speed, measured, desired is not None)
+        active = set()
         for limit in self._parking if is_parking else self._limits:
-            limited = limit.limit(wanted, turn)
-            if limited is not wanted:
-                acted.add(limit.name)
-                wanted = limited
-        self._speed = (wanted - before) / self._period
-        self.set_point = wanted
-        return sorted(acted)
+            limited = limit.limit(set_point, state)
+            if limited is not set_point:
+                active.add(limit.name)
+                set_point = limited
+        self._speed = (set_point - before) / self._period
+        self.set_point = set_point
+        return sorted(active)
 
     def trip(self, measured: Arrays) -> str:
-        """Why the robot must stop, in a sentence; empty if it need not. Values that are not valid trip nothing."""
+        """Return the reason to stop the robot, as a sentence; empty without one. Invalid values are no reason."""
         return self._trips.trip(measured)
 
     def excluded(self, measured: Arrays) -> str:
-        """Why the robot must not be enabled where it is, in a sentence; empty if it may."""
+        """Return the reason not to enable the robot at its present position; empty without one."""
         return self._trips.excluded(measured)
 
     def blind(self, measured: Arrays) -> str:
-        """Which limits cannot act for want of a measurement, in a sentence; empty if all can."""
-        told = []
+        """Return the limits that cannot act because a measurement is missing, in sentences; empty if all can."""
+        texts = []
         for limit in self._limits:
             names = limit.blind(measured)
             if names:
-                told.append(f"The {limit.name} limit cannot act without a valid {limit.needs} of {', '.join(names)}.")
-        return " ".join(told)
+                texts.append(f"The {limit.name} limit cannot act without a valid {limit.needs} of {', '.join(names)}.")
+        return " ".join(texts)

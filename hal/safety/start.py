@@ -1,4 +1,4 @@
-"""Whether a robot may be enabled where it is."""
+"""Checks of the robot's position before and while its drives are enabled."""
 
 from collections import deque
 
@@ -6,52 +6,52 @@ import numpy as np
 
 from hal.config import RobotConfig
 from hal.errors import CommandRefused
-from hal.safety.limit import Arrays
+from hal.safety.feedback import Arrays
 from hal.safety.limiter import Limiter
 
 MEMORY = 0.25
-"""The robot may be enabled where all its drives were seen not longer ago [s]: a lost frame is no obstacle."""
+"""All drives must have been measured within this time [s] before enabling, so that a lost frame does not matter."""
 MOVED = 0.05
-"""Part of its range that an element may move while the drives are being enabled: brakes open, nothing pushes yet."""
+"""An element may move by this part of its range while the drives are enabled, because brakes open."""
 
 
 class Start:
-    """Remembers where the robot was when all of the commanded signal was last known.
+    """Start position: the last complete measurements of the commanded signal.
 
     Attributes:
-        known: Signal -> values of that cycle [its unit].
+        known: Signal -> values of the last complete cycle [its unit].
     """
 
     def __init__(self, config: RobotConfig, quantity: str) -> None:
-        """Know of nothing yet.
+        """Begin without measurements.
 
         Args:
             config: The robot file.
-            quantity: What the drives are commanded in; only positions have a place to start from.
+            quantity: Commanded quantity; only positions have a start position.
         """
         self.known: Arrays = {}
         self._recent: deque[np.ndarray] = deque(maxlen=3)
         self._signal = config.command.signal
         self._elements = config.signals[self._signal].elements
         self._seen = -np.inf
-        self._newest = self._asked = np.full(len(self._elements), np.nan)
+        self._newest = self._checked = np.full(len(self._elements), np.nan)
         low, high = config.bounds(self._signal)
         self._may_move = MOVED * (high - low) if quantity == "position" else np.full(len(self._elements), np.inf)
 
     def note(self, measured: Arrays, now: float) -> None:
-        """What the cycle at monotonic time `now` [s] measured."""
+        """Note the measurements of the cycle at monotonic time `now` [s]."""
         self._newest = measured[self._signal]
-        if now - self._seen > MEMORY:  # it may have been moved while nobody looked
+        if now - self._seen > MEMORY:  # the robot may have moved without measurements
             self._recent.clear()
         if np.isfinite(self._newest).all():
             self.known, self._seen = measured, now
             self._recent.append(self._newest)
 
     def check(self, now: float, limiter: Limiter) -> None:
-        """Look before anything is enabled.
+        """Check the position before a drive is enabled.
 
         Raises:
-            CommandRefused: A commanded element is not known, or the limits exclude where the robot is.
+            CommandRefused: A commanded element is unknown, or the position is outside of the limits.
         """
         if now - self._seen > MEMORY:
             unknown = [name for name, value in zip(self._elements, self._newest, strict=True) if not np.isfinite(value)]
@@ -62,20 +62,20 @@ class Start:
         excluded = limiter.excluded(self.known)
         if excluded:
             raise CommandRefused(excluded)
-        self._asked = self.believed()[self._signal]
+        self._checked = self.median()[self._signal]
 
-    def believed(self) -> Arrays:
-        """The middle one of the last three measurements of the commanded signal: one wrong one is not followed."""
+    def median(self) -> Arrays:
+        """Return the median of the last three measurements of the commanded signal, which ignores a single error."""
         return {self._signal: np.median(self._recent, axis=0)}
 
     def moved(self, measured: Arrays) -> str:
-        """What has moved further since `check` than can be while the drives are being enabled; empty if nothing has."""
-        wrong = np.flatnonzero(np.abs(measured[self._signal] - self._asked) > self._may_move)
+        """Return the element that moved too far since `check`, as a sentence; empty without one."""
+        wrong = np.flatnonzero(np.abs(measured[self._signal] - self._checked) > self._may_move)
         if not wrong.size:
             return ""
         index = int(wrong[0])
         return (
-            f"{self._signal}.{self._elements[index]} went from {self._asked[index]:.4g} to "
+            f"{self._signal}.{self._elements[index]} went from {self._checked[index]:.4g} to "
             f"{measured[self._signal][index]:.4g} while the drives were being enabled. Does it move by itself, or does "
-            "another node send in its name?"
+            "another node use its identifier?"
         )

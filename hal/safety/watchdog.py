@@ -1,4 +1,4 @@
-"""Who watches the clock: the age of a command, taken from the cycle whose sample it answers, and the cycle itself."""
+"""Watchdogs: the age of a command, measured from the cycle of its sample, and the time between two cycles."""
 
 import math
 from collections.abc import Sequence
@@ -9,10 +9,10 @@ from hal.errors import CommandRefused
 
 
 def checked(desired: np.ndarray, signal: str, elements: Sequence[str]) -> np.ndarray:
-    """A copy of a command of a signal [its unit], shape (n,).
+    """Return a copy of a command of a signal [its unit], shape (n,).
 
     Raises:
-        CommandRefused: A wrong size, or not finite.
+        CommandRefused: The size is wrong, or a value is not finite.
     """
     desired = np.array(desired, float)
     if desired.shape != (len(elements),):
@@ -25,7 +25,7 @@ def checked(desired: np.ndarray, signal: str, elements: Sequence[str]) -> np.nda
 
 
 class CommandWatchdog:
-    """Remembers when each recent cycle was, so that no clock is compared between two processes."""
+    """Times of the recent cycles, so that clocks of two processes are never compared."""
 
     def __init__(self, time_to_live: float, period: float) -> None:
         """Remember as many cycles of `period` [s] as fit into four times `time_to_live` [s], and at least 64."""
@@ -34,15 +34,15 @@ class CommandWatchdog:
         self._newest = 0
 
     def note(self, cycle: int, now: float) -> None:
-        """Cycle number `cycle` (one more than the one before) is happening at monotonic time `now` [s]."""
+        """Note that cycle number `cycle` (one more than the last) is at monotonic time `now` [s]."""
         self._times[cycle % len(self._times)] = now
         self._newest = cycle
 
     def expiry(self, cycle: int, now: float) -> float:
-        """Monotonic time [s] until which a command that answers `cycle` may be followed.
+        """Return the monotonic time [s] until which a command that answers `cycle` may be followed.
 
         Raises:
-            CommandRefused: No such cycle, or one too long ago.
+            CommandRefused: The cycle is unknown or too old.
         """
         newest = self._newest
         if not 0 < cycle <= newest:
@@ -52,27 +52,27 @@ class CommandWatchdog:
         oldest = newest - len(self._times) + 1
         age = math.inf if cycle < oldest else now - self._times[cycle % len(self._times)]
         if age > self.time_to_live:
-            told = f"{age * 1e3:.0f} ms" if math.isfinite(age) else f"{newest - cycle} cycles"
+            ago = f"{age * 1e3:.0f} ms" if math.isfinite(age) else f"{newest - cycle} cycles"
             raise CommandRefused(
-                f"The command answers cycle {cycle}, {told} ago; a command lives {self.time_to_live * 1e3:.0f} ms. "
+                f"The command answers cycle {cycle}, {ago} ago; a command lives {self.time_to_live * 1e3:.0f} ms. "
                 "Is the sender too slow, or reading old samples?"
             )
         return now - age + self.time_to_live
 
 
 LONGEST_GAP = 0.2
-"""A cycle of an enabled robot that comes so long [s] after the one before stops it: nobody looked after the robot
-meanwhile, and drives that miss the HAL's heartbeat for 0.15 s have stopped by themselves."""
+"""An enabled robot stops if two cycles are farther apart than this [s]: it was not supervised meanwhile, and drives
+without the HAL's heartbeat for 0.15 s have stopped by themselves."""
 
 
 class CycleWatchdog:
-    """Notices that the cycle itself did not turn: a frozen process, a machine that was suspended."""
+    """Detector of gaps between cycles: a frozen process or a suspended machine."""
 
     def __init__(self) -> None:
         self._before = math.inf
 
     def problem(self, now: float) -> str:
-        """A cycle begins at monotonic time `now` [s]: why the robot must stop, in a sentence; empty if it need not."""
+        """Note a cycle at monotonic time `now` [s] and return the reason to stop the robot; empty without one."""
         gap, self._before = now - self._before, now
         if gap <= LONGEST_GAP:
             return ""

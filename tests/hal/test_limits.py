@@ -186,8 +186,8 @@ def test_limits_that_contradict_each_other_are_refused_at_load(limits, told):
 @pytest.mark.parametrize(
     ("stop", "told"),
     [
-        ({"behaviour": "park"}, "say where"),
-        ({"behaviour": "park", "park": [0.3, 0.3]}, "how fast"),
+        ({"behaviour": "park"}, "needs a posture"),
+        ({"behaviour": "park", "park": [0.3, 0.3]}, "and a `speed`"),
         ({"behaviour": "park", "park": [0.3], "speed": 0.1}, "stop.park has 1 values, muscle_length has 2"),
         ({"behaviour": "park", "park": [0.3, 0.9], "speed": 0.1}, "triceps 0.9 is outside of its limits, 0.1 to 0.5"),
         ({"behaviour": "off", "speed": 0.1}, "are for the behaviour park, not for 'off'"),

@@ -5,9 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hal.safety.ends import EndsOfEffort, EndsOfVelocity, Way
-from hal.safety.limit import Acceleration, Range, Rate, Turn, fastest
-from hal.safety.soft_effort import Load, SoftEffort, SoftEffortOfEffort, SoftEffortOfVelocity
+from hal.safety.ends import EndsOfEffort, EndsOfVelocity
+from hal.safety.feedback import Load, MeasuredRange
+from hal.safety.limit import Acceleration, CycleState, Range, Rate, fastest
+from hal.safety.soft_effort import SoftEffort, SoftEffortOfEffort, SoftEffortOfVelocity
 
 PERIOD = 0.005
 LOW, HIGH = -1.0, 2.0
@@ -21,7 +22,7 @@ def along(limits, wanted, before, measured=None, period=PERIOD, commanded=True):
     before, speed, found = np.array([before]), np.zeros(1), []
     for wish in np.repeat(wanted, 5):
         value = np.array([wish])
-        turn = Turn(before, speed, measured or {}, commanded)
+        turn = CycleState(before, speed, measured or {}, commanded)
         for limit in limits:
             value = limit.limit(value, turn)
         speed, before = (value - before) / period, value
@@ -30,7 +31,7 @@ def along(limits, wanted, before, measured=None, period=PERIOD, commanded=True):
 
 
 def way(signal="p", low=LOW, high=HIGH):
-    return Way(signal, ("elbow",), ONE, ONE, np.array([low]), np.array([high]))
+    return MeasuredRange(signal, ("elbow",), ONE, ONE, np.array([low]), np.array([high]))
 
 
 def load(soft=100.0, hard=200.0, is_signed=False):
@@ -39,7 +40,7 @@ def load(soft=100.0, hard=200.0, is_signed=False):
 
 def one(limit, wanted, before=0.5, **measured):
     """What a limit makes of one wish."""
-    turn = Turn(np.array([before]), np.zeros(1), {name: np.array([value]) for name, value in measured.items()})
+    turn = CycleState(np.array([before]), np.zeros(1), {name: np.array([value]) for name, value in measured.items()})
     return float(limit.limit(np.array([wanted]), turn)[0])
 
 
@@ -97,7 +98,7 @@ def test_what_is_held_while_it_moves_comes_to_rest_on_the_ramp():
     ramp = Acceleration(1.0, PERIOD)
     before, speed, found = np.zeros(1), np.array([0.5]), []
     for _ in range(200):
-        value = ramp.limit(before, Turn(before, speed, {}, is_commanded=False))
+        value = ramp.limit(before, CycleState(before, speed, {}, is_commanded=False))
         speed, before = (value - before) / PERIOD, value
         found.append(float(speed[0]))
     np.testing.assert_allclose(found[:3], [0.495, 0.49, 0.485])
@@ -119,7 +120,7 @@ def test_a_velocity_command_is_braked_before_the_end_also_with_a_slow_drive(want
     for wish in np.repeat(wanted, 25):
         value = np.array([wish])
         for limit in limits:
-            value = limit.limit(value, Turn(before, np.zeros(1), {"p": np.array([position])}))
+            value = limit.limit(value, CycleState(before, np.zeros(1), {"p": np.array([position])}))
         before = value
         sent.append(float(value[0]))
         velocity += (sent[-1 - late] - velocity) * (1 - np.exp(-PERIOD / 0.015) if is_slow else 1.0)
@@ -207,8 +208,8 @@ def test_an_effort_command_settles_at_the_soft_limit(stiffness):
     limit, before, loads = SoftEffortOfEffort(load()), np.array([60.0 / stiffness]), []
     force = 60.0
     for _ in range(2000):
-        value = limit.limit(np.array([1000.0]), Turn(before, np.zeros(1), {"f": np.array([force])}))
-        value = Rate(20.0 / stiffness, PERIOD).limit(value, Turn(before, np.zeros(1), {}))
+        value = limit.limit(np.array([1000.0]), CycleState(before, np.zeros(1), {"f": np.array([force])}))
+        value = Rate(20.0 / stiffness, PERIOD).limit(value, CycleState(before, np.zeros(1), {}))
         force, before = stiffness * float(value[0]), value
         loads.append(force)
     assert max(loads) < 105.0

@@ -177,5 +177,5 @@ def test_a_range_of_nobody_knows_what_is_refused():
     bench = SafetyBench("velocity")
     for joint in bench.joints:
         joint.served = {}
-    with pytest.raises(ConfigError, match="no device says what shoulder, elbow is of the commanded joint_velocity"):
+    with pytest.raises(ConfigError, match="no device names the quantity of shoulder, elbow"):
         Robot(bench.config, bench.joints, clock=bench.clock)

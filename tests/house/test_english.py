@@ -18,7 +18,6 @@ NOT_YET = {
     "hal/drivers/odrive.py",
     "hal/finding",
     "hal/protocols",
-    "hal/safety",
     "services/errors.py",
     "services/health.py",
     "services/process",

@@ -1,4 +1,4 @@
-"""Whose turn it is with the robot's state: the cycle's, or that of somebody who asks."""
+"""Lock of the robot's state between the cycle and requests of other threads."""
 
 import threading
 from collections.abc import Iterator
@@ -7,36 +7,36 @@ from contextlib import contextmanager
 from hal.errors import CommandRefused
 
 PATIENCE = 0.5
-"""How long [s] a question waits for a cycle that does not end."""
+"""A request waits at most this time [s] for the end of a cycle."""
 
 
-class Turns:
-    """A lock that the cycle waits for, and that nobody else waits for without end."""
+class CycleLock:
+    """A lock for which the cycle waits without limit, and all other threads for a limited time."""
 
     def __init__(self) -> None:
         self._lock = threading.RLock()
 
     @contextmanager
     def cycle(self) -> Iterator[None]:
-        """The cycle's turn."""
+        """Hold the lock during a cycle."""
         with self._lock:
             yield
 
     @contextmanager
-    def question(self) -> Iterator[None]:
-        """The turn of somebody who asks, between two cycles.
+    def request(self) -> Iterator[None]:
+        """Hold the lock during a request, between two cycles.
 
         Raises:
-            CommandRefused: The cycle does not end.
+            CommandRefused: The cycle does not end within `PATIENCE`.
         """
         with self.within(PATIENCE) as is_free:
             if not is_free:
-                raise CommandRefused("The HAL's cycle is stuck, so it can be asked nothing but `gemuco estop`.")
+                raise CommandRefused("The HAL's cycle is stuck, so only `gemuco estop` is possible.")
             yield
 
     @contextmanager
     def within(self, patience: float) -> Iterator[bool]:
-        """A turn if the cycle ends within `patience` [s], or else none; which of both."""
+        """Hold the lock if the cycle ends within `patience` [s]; yield whether it did."""
         is_free = self._lock.acquire(timeout=patience)
         try:
             yield is_free
