@@ -1,4 +1,4 @@
-"""What every device on a bus has: a place, a slot per quantity, commissioning, silence and an identity."""
+"""A device on a bus: its place, a slot per quantity, commissioning, silence and identity."""
 
 import logging
 import math
@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
+from typing_extensions import override
 
 from hal.calibration.line import Calibration
 from hal.config import Positive, Section
@@ -20,27 +21,27 @@ log = logging.getLogger(__name__)
 
 
 class DeviceSettings(Section):
-    """Settings that every kind has."""
+    """Settings of every kind of device."""
 
     silent_after: Positive = 0.15
-    """How long [s] without its answer in a cycle until the device counts as silent; a silent drive stops the robot."""
+    """The device is silent after this time [s] without an answer in a cycle; a silent drive stops the robot."""
 
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where a device is, and what the robot wants of it.
+    """The place of a device on the robot and on its bus.
 
     Attributes:
         name: Name in the robot file.
-        elements: Quantity of the driver -> `signal.element`, for those quantities that the robot file names, in the
-            driver's order.
-        bus: The bus it is on.
+        elements: Quantity of the driver -> `signal.element`, for the quantities in the robot file, in the driver's
+            order.
+        bus: Its bus.
         node: Its node id.
         folder: Folder of the robot file.
         rate: Cycles per second [Hz].
-        calibration: What was measured of the device that shall be here; None if nothing was.
+        calibration: Calibration of the device that belongs here; None without one.
         bounds: Lowest and highest set-point by the robot file's limits [unit of the commanded element]; infinite where
-            not stated, and for a sensor.
+            not given, and for a sensor.
     """
 
     name: str
@@ -57,7 +58,7 @@ class Place:
 
 
 class CanDevice(Device):
-    """A device that answers once in every cycle; what its frames carry is the subclass's business.
+    """A device that answers once in every cycle. A subclass defines the content of its frames.
 
     Handlers run in the bus's receive thread and write single slots; the cycle reads them.
     """
@@ -66,23 +67,23 @@ class CanDevice(Device):
     COUNTERS: ClassVar[tuple[str, ...]] = ("malformed", "boots", "emergencies", "commissioned", "failed_openings")
 
     NEEDS_SYNC: ClassVar[bool] = False
-    """Whether it waits for the SYNC and the HAL's heartbeat, which are sent on its bus then."""
+    """Whether SYNC and the HAL's heartbeat must be sent on its bus."""
 
     @classmethod
     def quantities(cls, settings: Any) -> tuple[str, ...]:
-        """What a device with these settings can measure; the quantity it is there for comes first."""
+        """Return the quantities that a device with these settings measures, the main quantity first."""
         raise NotImplementedError
 
     @classmethod
     def commanded(cls, settings: Any) -> str | None:
-        """The quantity that `apply` sets (`position`, `velocity`, `effort`); None for a sensor."""
+        """Return the quantity that `apply` sets (`position`, `velocity`, `effort`); None for a sensor."""
         return None
 
     @classmethod
     def traffic(cls, settings: Any, rate: float) -> tuple[tuple[int, float] | tuple[int, float, bool], ...]:
-        """Data bytes and frames per second [Hz] of all that is sent because of it, at `rate` cycles per second.
+        """Return data bytes and frames per second [Hz] of its whole traffic, at `rate` cycles per second.
 
-        A third value says whether the identifier has 29 bits.
+        A third value is True if the identifier has 29 bits.
         """
         raise NotImplementedError
 
@@ -90,7 +91,7 @@ class CanDevice(Device):
     def traffic_of(
         cls, settings: Any, rate: float, quantities: tuple[str, ...]
     ) -> tuple[tuple[int, float] | tuple[int, float, bool], ...]:
-        """`traffic` of a device of which a robot file names only some quantities."""
+        """Return the `traffic` of a device if the robot file uses only these quantities."""
         return cls.traffic(settings, rate)
 
     def __init__(self, place: Place, settings: DeviceSettings) -> None:
@@ -115,43 +116,43 @@ class CanDevice(Device):
         self._counters = self._health.counters
         self._trouble: tuple[DeviceState, str] = (DeviceState.CLOSED, "Not opened yet.")
         self._opening = threading.Lock()
-        self._standing_lock = threading.Lock()
+        self._closing = threading.Lock()
         self._is_closed = True
         place.bus.needs_sync |= self.NEEDS_SYNC
         place.bus.expect(self)
 
     def _identify(self) -> str:
-        """Check that the right kind of device is there; its `identity`. Changes nothing in it."""
+        """Check the kind of the device and return its `identity`, without changing anything in it."""
         raise NotImplementedError
 
     def _commission(self) -> None:
-        """Make the device safe, configure it, and have it answer the cycles."""
+        """Make the device safe, configure it, and start its answers to the cycles."""
         raise NotImplementedError
 
     def _release(self) -> None:
-        """Leave the device without power and quiet; it may be silent by now."""
+        """Leave the device without power and quiet; it may be silent already."""
 
     def _fault(self) -> str:
-        """The fault that the device reports, in a sentence; empty if none."""
+        """Return the fault that the device reports, in a sentence; empty if none."""
         return ""
 
     def _drives(self) -> bool:
-        """Whether its motor has power by what came last, whatever else it reports."""
+        """Return whether its motor has power by its newest state, independent of faults."""
         return False
 
     @property
+    @override
     def has_power(self) -> bool:
-        """See `Device.has_power`; a fault that is reported beside the state says nothing of the power."""
         state = self.health().state
         return state in UNDER_POWER or (state is DeviceState.FAULT and self._drives())
 
     def _running(self) -> tuple[DeviceState, str]:
-        """State and sentence of a device that is commissioned, answers, and reports no fault."""
+        """Return state and sentence of a device that is commissioned, answers, and reports no fault."""
         return DeviceState.READY, ""
 
+    @override
     def open(self) -> None:
-        """See `Device.open`; a second call while one is under way returns at once."""
-        if not self._opening.acquire(blocking=False):
+        if not self._opening.acquire(blocking=False):  # another thread opens it
             return
         try:
             self._open()
@@ -183,23 +184,23 @@ class CanDevice(Device):
         calibration = self._place.calibration
         if calibration is not None and calibration.identity != self.identity:
             raise WrongDevice(
-                f"{self._place} is {self.identity or 'a device that does not tell who it is'}, its calibration is of "
+                f"{self._place} is {self.identity or 'a device without an identity'}, its calibration is of "
                 f"{calibration.identity}. Was it replaced? Calibrate it again."
             )
 
+    @override
     def read(self) -> Reading:
-        """See `Device.read`; the same two arrays each time, written as frames come."""
-        return self._reading
+        return self._reading  # handlers write its arrays
 
+    @override
     def health(self) -> DeviceHealth:
-        """See `Device.health`; the same record each time."""
         health = self._health
         if not self.is_commissioned:
             health.state, health.text = self._trouble
         elif self.missed > self._silent_cycles:
             health.state = DeviceState.SILENT
             health.text = f"{self._place} has not answered for {self.missed} cycles. Is it powered, is its cable in?"
-        elif self._opening.locked():  # it answers again, but what it was told may be forgotten and is being told anew
+        elif self._opening.locked():  # it answers again, but may have lost its configuration
             health.state, health.text = DeviceState.OPENING, "Being commissioned."
         elif fault := self._fault():
             health.state, health.text = DeviceState.FAULT, fault
@@ -207,10 +208,10 @@ class CanDevice(Device):
             health.state, health.text = self._running()
         return health
 
+    @override
     def close(self) -> None:
-        """See `Device.close`."""
         with self._opening:
-            with self._standing_lock:  # what still comes from the bus must not look like a device being opened
+            with self._closing:  # frames that still come must not set the state to opening
                 was_commissioned, self.is_commissioned = self.is_commissioned, False
                 self._is_closed, self._trouble = True, (DeviceState.CLOSED, "Closed.")
             if was_commissioned:
@@ -218,17 +219,17 @@ class CanDevice(Device):
 
     @property
     def is_heard(self) -> bool:
-        """Whether it answered lately enough not to count as silent."""
+        """Whether it is not silent."""
         return self.missed <= self._silent_cycles
 
-    def _is_answered(self) -> None:
-        """All that the device sends in a cycle has come."""
+    def _mark_answered(self) -> None:
+        """Note that all frames of the device in this cycle have come."""
         self.missed = 0
         self._bus.answered(self)
 
     def _lose(self, text: str) -> None:
-        """The device is not as we configured it any more."""
-        with self._standing_lock:
+        """Note that the device has lost its configuration."""
+        with self._closing:
             self.is_commissioned = False
             if not self._is_closed:
                 self._trouble = (DeviceState.OPENING, text)

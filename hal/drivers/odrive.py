@@ -1,7 +1,7 @@
-"""An ODrive axis over CANSimple: the settings of a servo with a DBC file, most of them written down here once.
+"""An ODrive axis over CANSimple: a servo with a DBC file, with defaults for most of its settings.
 
-Source: the maker's documentation (docs.odriverobotics.com, CAN Protocol and CAN Guide, firmware 0.6) and, for what
-feeds the watchdog, the public firmware 0.5 (Firmware/communication/can/can_simple.cpp: every frame for the axis does).
+Source: the maker's documentation (docs.odriverobotics.com, CAN Protocol and CAN Guide, firmware 0.6) and, for the
+watchdog, the public firmware 0.5 (Firmware/communication/can/can_simple.cpp: every frame to the axis feeds it).
 """
 
 import math
@@ -16,11 +16,11 @@ from hal.drivers.dbc.settings import ServoSettings
 from hal.errors import ConfigError
 
 COMMAND_BITS = 5
-"""An identifier is the node id before so many bits of the command."""
+"""The command takes this number of low bits of an identifier; the node id is above them."""
 BROADCAST = 63
-"""All axes hear this node id, and those without one of their own answer under it."""
+"""All axes receive frames to this node id, and axes without a node id answer under it."""
 STANDSTILL = 0.05
-"""Turns of the motor per second below which it counts as standing."""
+"""Below this speed [turns of the motor per second] a motor stands still."""
 
 _MODES: dict[str, dict[str, Any]] = {
     "position": {"control": "POSITION_CONTROL", "send": "Set_Input_Pos", "signal": "Input_Pos"},
@@ -30,8 +30,8 @@ _MODES: dict[str, dict[str, Any]] = {
 _IDLE = {"signal": "Heartbeat.Axis_State", "equals": "IDLE", "within": 0.5}
 
 
-def _state(wanted: str, until: dict[str, Any]) -> dict[str, Any]:
-    return {"send": "Set_Axis_State", "values": {"Axis_Requested_State": wanted}, "until": until}
+def _state(state: str, until: dict[str, Any]) -> dict[str, Any]:
+    return {"send": "Set_Axis_State", "values": {"Axis_Requested_State": state}, "until": until}
 
 
 def _control(mode: str) -> dict[str, Any]:
@@ -60,7 +60,7 @@ COMMON: dict[str, Any] = {
         "signals": ["Address.Serial_Number"],
     },
     "disable": [_state("IDLE", _IDLE)],
-    # To rest by the drive's own velocity control, then without power; an axis that does not say so is sent an Estop.
+    # Stop by the drive's own velocity control, then power off; an axis that does not confirm this is sent an Estop.
     "quick_stop": [
         _control("VELOCITY_CONTROL"),
         {
@@ -72,11 +72,11 @@ COMMON: dict[str, Any] = {
     ],
     "reset": [{"send": "Clear_Errors", "until": {"signal": "Heartbeat.Axis_Error", "equals": "NONE", "within": 0.5}}],
 }
-"""What holds for every axis in every mode."""
+"""These settings hold for every axis in every mode."""
 
 
 def profile(mode: str, gear: float, watchdog_timeout: float) -> dict[str, Any]:
-    """Settings of a servo with a DBC file for one axis.
+    """Return the settings of one axis as a servo with a DBC file.
 
     Args:
         mode: `position`, `velocity` or `effort`.
@@ -84,7 +84,7 @@ def profile(mode: str, gear: float, watchdog_timeout: float) -> dict[str, Any]:
         watchdog_timeout: axis.config.watchdog_timeout [s].
     """
     turn = 2.0 * math.pi / gear
-    chosen = _MODES[mode]
+    command = _MODES[mode]
     return {
         **COMMON,
         "quantities": {
@@ -96,16 +96,16 @@ def profile(mode: str, gear: float, watchdog_timeout: float) -> dict[str, Any]:
             "current": {"signal": "Get_Iq.Iq_Measured"},
             "voltage": {"signal": "Get_Bus_Voltage_Current.Bus_Voltage"},
         },
-        # Sent while disabled too: it feeds the watchdog, and the axis begins where it is.
+        # Also sent while disabled: it feeds the watchdog, and the axis starts from its present position.
         "command": {
             "quantity": mode,
-            "send": chosen["send"],
-            "signal": chosen["signal"],
+            "send": command["send"],
+            "signal": command["signal"],
             "scale": gear if mode == "effort" else turn,
             "while_disabled": True,
         },
         "enable": [
-            _control(chosen["control"]),
+            _control(command["control"]),
             _state(
                 "CLOSED_LOOP_CONTROL",
                 {"signal": "Heartbeat.Axis_State", "equals": "CLOSED_LOOP_CONTROL", "within": 1.0},
@@ -113,32 +113,31 @@ def profile(mode: str, gear: float, watchdog_timeout: float) -> dict[str, Any]:
         ],
         "watchdog": {
             "timeout": watchdog_timeout,
-            "fed_by": [chosen["send"]],
+            "fed_by": [command["send"]],
             "expired": {"signal": "Heartbeat.Axis_Error", "equals": "WATCHDOG_TIMER_EXPIRED"},
         },
     }
 
 
 class OdriveSettings(ServoSettings):
-    """Settings of an axis; any other setting of a servo with a DBC file has the profile's value if not given."""
+    """Settings of an axis. All other settings of a servo with a DBC file have defaults from `profile`."""
 
     mode: Literal["position", "velocity", "effort"] = "position"
-    """What is commanded."""
+    """Commanded quantity."""
     gear: Positive = 1.0
     """Motor turns per turn of the output."""
     watchdog_timeout: Annotated[float, Field(ge=0.05, le=5.0)] = 0.2
-    """What axis.config.watchdog_timeout is set to [s], with axis.config.enable_watchdog."""
+    """Value of axis.config.watchdog_timeout [s]; axis.config.enable_watchdog must be set."""
 
     @model_validator(mode="before")
     @classmethod
-    def _filled_in(cls, given: dict[str, Any]) -> dict[str, Any]:
-        mode, gear = given.get("mode", "position"), given.get("gear", 1.0)
+    def _fill_in(cls, settings: dict[str, Any]) -> dict[str, Any]:
+        mode, gear = settings.get("mode", "position"), settings.get("gear", 1.0)
         if mode not in _MODES or not isinstance(gear, int | float) or not gear > 0:
-            mode, gear = "position", 1.0  # the field's own check tells what is wrong with it
-        timeout = given.get("watchdog_timeout", 0.2)
-        filled = {**profile(mode, gear, timeout), **given}
-        filled["periods"] = {**COMMON["periods"], **given.get("periods", {})}
-        return filled
+            mode, gear = "position", 1.0  # the field's own check reports the error
+        timeout = settings.get("watchdog_timeout", 0.2)
+        periods = {**COMMON["periods"], **settings.get("periods", {})}
+        return {**profile(mode, gear, timeout), **settings, "periods": periods}
 
 
 class Odrive(DbcServo):
@@ -148,7 +147,5 @@ class Odrive(DbcServo):
 
     def __init__(self, place: Place, settings: OdriveSettings) -> None:
         if place.node == BROADCAST:
-            raise ConfigError(
-                f"Device {place}: node id {BROADCAST} is that of axes which have none yet; it is 0 to 62."
-            )
+            raise ConfigError(f"Device {place}: node id {BROADCAST} is for axes that have none yet; use 0 to 62.")
         super().__init__(place, settings)

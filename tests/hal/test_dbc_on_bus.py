@@ -411,5 +411,5 @@ def test_a_node_id_beyond_the_identifiers_is_refused():
     with pytest.raises(ConfigError, match=r"node id 64 gives .* the identifier 8\w\wh.* largest node id is 63"):
         open_robot(RobotConfig.model_validate(body))
     body["devices"]["elbow_axis"]["node"] = 63
-    with pytest.raises(ConfigError, match="63 is that of axes which have none yet"):
+    with pytest.raises(ConfigError, match="63 is for axes that have none yet"):
         open_robot(RobotConfig.model_validate(body))

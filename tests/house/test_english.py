@@ -14,8 +14,6 @@ CODE = ("gemuco", "hal", "simulators", "services", "studies", "examples")
 NOT_YET = {
     "hal/calibration",
     "hal/commissioning",
-    "hal/drivers/can_device.py",
-    "hal/drivers/odrive.py",
     "hal/finding",
     "hal/protocols",
     "services/errors.py",

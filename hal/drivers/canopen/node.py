@@ -215,7 +215,7 @@ class CanopenNode(CanDevice):
             self._lose(f"{self._place} goes on sending process data without a heartbeat. Does its firmware hang?")
             self._halt()
         else:
-            self._is_answered()
+            self._mark_answered()
 
     def _on_double(self) -> None:
         """Count a second answer to a SYNC, which may be a late one."""

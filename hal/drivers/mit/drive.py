@@ -235,7 +235,7 @@ class MitDrive(CanDevice):
         for slot, index in self._places:
             values[slot] = measured[index]
         self._received.fill(received)
-        self._is_answered()
+        self._mark_answered()
 
     @override
     def _lose(self, text: str) -> None:
