@@ -1,1 +1,1 @@
-"""What every process has: lock, session, loops in time, health, an end."""
+"""The parts of every service process: lock, session, loops, health, end."""

@@ -1,4 +1,4 @@
-"""Write once a second how far each loop of a service is, for `services.health` and for systemd."""
+"""Write the progress of a service's loops once a second, for `services.health` and for systemd."""
 
 import contextlib
 import json
@@ -17,12 +17,12 @@ log = logging.getLogger(__name__)
 EVERY = 1.0
 
 
-class Turning(Protocol):
-    """Something that completes one piece of work after the other, as `services.process.loop.Loop` does.
+class Activity(Protocol):
+    """A repeated piece of work, such as a `services.process.loop.Loop`.
 
     Attributes:
-        name: For people.
-        rate: About how often it completes one [Hz].
+        name: Name for people.
+        rate: Approximate rate [Hz].
     """
 
     name: str
@@ -30,37 +30,37 @@ class Turning(Protocol):
 
     @property
     def done(self) -> int:
-        """How many pieces of work were completed."""
+        """Number of completed pieces of work."""
         ...
 
     @property
     def error(self) -> str:
-        """Why none is being completed, if that is known; else empty."""
+        """Reason why none is completed, if known; else empty."""
         ...
 
 
 class Heartbeat:
-    """Writes once a second who this process is and when each of its loops was last seen to complete something.
+    """A context manager that writes once a second the identity of the process and the last progress of each loop.
 
-    A context manager; the file is there while it lasts, and after a kill. The thread only looks at numbers: what is
-    stuck cannot hold it up. Under systemd it also says `READY=1`, and `WATCHDOG=1` as long as all is well.
+    The file exists while the context lasts, and after a kill. The thread only reads numbers, so a stuck loop cannot
+    block it. Under systemd it also sends `READY=1`, and `WATCHDOG=1` while all loops progress.
 
     Args:
         service: The service's name.
         robot: The robot's name.
-        turning: What has to go on.
+        activities: The loops to watch.
     """
 
-    def __init__(self, service: str, robot: str, turning: Sequence[Turning]) -> None:
+    def __init__(self, service: str, robot: str, activities: Sequence[Activity]) -> None:
         self._path = heartbeat_path(service, robot)
-        self._turning = turning
+        self._activities = activities
         self._seen: dict[str, tuple[int, float]] = {}
         self._stop = threading.Event()
         self._failed = False
 
     def __enter__(self) -> Self:
         self._beat()
-        _tell_systemd("READY=1")
+        _notify_systemd("READY=1")
         self._thread = threading.Thread(target=self._run, name="heartbeat", daemon=True)
         self._thread.start()
         return self
@@ -68,39 +68,38 @@ class Heartbeat:
     def __exit__(self, *_: object) -> None:
         self._stop.set()
         self._thread.join()
-        _tell_systemd("STOPPING=1")
+        _notify_systemd("STOPPING=1")
         with contextlib.suppress(OSError):
             self._path.unlink()
 
     def _run(self) -> None:
         while not self._stop.wait(EVERY):
-            found = self._beat()
-            if not judge(found, time.monotonic()):
-                _tell_systemd("WATCHDOG=1")
+            if not judge(self._beat(), time.monotonic()):
+                _notify_systemd("WATCHDOG=1")
 
     def _beat(self) -> dict[str, Any]:
         now = time.monotonic()
-        for one in self._turning:
-            done = one.done
-            if one.name not in self._seen or done != self._seen[one.name][0]:
-                self._seen[one.name] = (done, now)
-        found = {
+        for activity in self._activities:
+            done = activity.done
+            if activity.name not in self._seen or done != self._seen[activity.name][0]:
+                self._seen[activity.name] = (done, now)
+        content = {
             "pid": os.getpid(),
             "space": pid_space(),
             "started": started(os.getpid()),
             "boot": this_boot(),
             "stamp": now,
             "loops": {
-                one.name: {"done": self._seen[one.name][0], "at": self._seen[one.name][1], "period": 1.0 / one.rate,
-                           "error": one.error}
-                for one in self._turning
+                a.name: {"done": self._seen[a.name][0], "at": self._seen[a.name][1], "period": 1.0 / a.rate,
+                         "error": a.error}
+                for a in self._activities
             },
         }  # fmt: skip
-        self._write(json.dumps(found))
-        return found
+        self._write(json.dumps(content))
+        return content
 
     def _write(self, text: str) -> None:
-        """Replace the file whole; a reader never sees half of one."""
+        """Replace the whole file at once, so that a reader never sees half of it."""
         try:
             part = self._path.with_suffix(f".{os.getpid()}.part")
             part.write_text(text)
@@ -112,12 +111,12 @@ class Heartbeat:
             self._failed = True
 
 
-def _tell_systemd(text: str) -> None:
-    """Send a word to the service manager, if it asked for one (sd_notify)."""
+def _notify_systemd(text: str) -> None:
+    """Send a notification to the service manager, if it asks for them (sd_notify)."""
     address = os.environ.get("NOTIFY_SOCKET", "")
     if not address:
         return
-    with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as told:
-        told.connect("\0" + address[1:] if address.startswith("@") else address)
-        told.setblocking(False)
-        told.send(text.encode())
+    with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as link:
+        link.connect("\0" + address[1:] if address.startswith("@") else address)
+        link.setblocking(False)
+        link.send(text.encode())

@@ -17,11 +17,11 @@ from services.wire.session import address, close_session, open_with, settings
 log = logging.getLogger(__name__)
 
 ROUTER_WITHIN_MS = 500
-"""How long a router may take to let in who looks; one that is not there must not keep a HAL from starting."""
+"""A router must answer within this time; an absent one must not keep a HAL from starting."""
 
 
 class ServiceLock:
-    """Held for as long as a service of a robot runs; the kernel frees it even after kill -9.
+    """The lock that a running service of a robot holds; the kernel releases it even after kill -9.
 
     Args:
         robot: The robot's name.
@@ -56,57 +56,58 @@ class ServiceLock:
         """Look for the same service elsewhere on the network. Call before declaring one's own token.
 
         Raises:
-            AlreadyRunning: It is alive; the message names its host and pid as far as it tells them.
+            AlreadyRunning: It is alive; the message names its host and pid if it answers.
         """
         if self.service not in query.alive(session, self.robot):
             return
         try:
-            who = query.ask(session, keys.verb(self.robot, self.service, "describe"), timeout=0.5)
+            other = self._describe_other(session)
         except ServiceError:
-            who = {}
-        raise AlreadyRunning(
-            self._sentence(f"process {who.get('pid', 'unknown')} on {who.get('host', 'another host')}")
-        )
+            other = "process unknown on another host"
+        raise AlreadyRunning(self._sentence(other))
 
     def check_router(self, connect: Iterable[str]) -> None:
         """Look for the same service of another machine that shares a router with this one. Call before opening.
 
         Services are peers, and a router does not show peers to each other; a client of it sees them all. A token
-        without anybody who answers is that of a process that has just died.
+        without an answer belongs to a process that has just died.
 
         Args:
             connect: Endpoints and role files.
 
         Raises:
-            AlreadyRunning: It is alive, and tells its host and pid.
+            AlreadyRunning: It is alive; the message names its host and pid.
         """
-        told = tuple(connect)
-        if not told:
+        items = tuple(connect)
+        if not items:
             return
-        found = settings(self.robot, self.service, told)
+        configuration = settings(self.robot, self.service, items)
         own = f"tcp/{address(self.robot)}:"
-        places = [one for one in found["connect"]["endpoints"] if not one.startswith(own)]
-        found |= {"mode": "client", "listen": {"endpoints": [], "exit_on_failure": True}}
-        found["connect"] |= {"endpoints": places, "timeout_ms": ROUTER_WITHIN_MS, "exit_on_failure": True}
+        places = [place for place in configuration["connect"]["endpoints"] if not place.startswith(own)]
+        configuration |= {"mode": "client", "listen": {"endpoints": [], "exit_on_failure": True}}
+        configuration["connect"] |= {"endpoints": places, "timeout_ms": ROUTER_WITHIN_MS, "exit_on_failure": True}
         try:
-            session = open_with(found, f"a look for other '{self.service}' services of robot '{self.robot}'")
+            session = open_with(configuration, f"a look for other '{self.service}' services of robot '{self.robot}'")
         except ServiceError as error:
-            log.info("Nobody could be asked whether robot '%s' is unique: %s", self.robot, error)
+            log.info("No router could be asked whether robot '%s' is unique: %s", self.robot, error)
             return
         try:
             if self.service in query.alive(session, self.robot):
-                who = query.ask(session, keys.verb(self.robot, self.service, "describe"), timeout=0.5)
-                raise AlreadyRunning(self._sentence(f"process {who.get('pid')} on {who.get('host')}"))
+                raise AlreadyRunning(self._sentence(self._describe_other(session)))
         except NoAnswer as error:
-            log.info("A token of robot '%s' is there, and nobody with it: %s", self.robot, error)
+            log.info("A token of robot '%s' exists, but no service answers: %s", self.robot, error)
         finally:
             close_session(session)
 
     def release(self) -> None:
-        """Give the lock back. Safe to call twice."""
+        """Release the lock. Safe to call twice."""
         if self._file is not None:
             self._file.close()
             self._file = None
+
+    def _describe_other(self, session: zenoh.Session) -> str:
+        answer = query.ask(session, keys.verb(self.robot, self.service, "describe"), timeout=0.5)
+        return f"process {answer.get('pid', 'unknown')} on {answer.get('host', 'another host')}"
 
     def _sentence(self, holder: str) -> str:
         return f"Robot '{self.robot}' already has a '{self.service}' service: {holder}. Stop that one first."
@@ -114,10 +115,10 @@ class ServiceLock:
 
 @contextlib.contextmanager
 def instead_of(robot: str, service: str) -> Iterator[None]:
-    """Do what a service would do: it must not run on this machine, and cannot start, for as long as the context lasts.
+    """Take the place of a service, which cannot start on this machine while the context lasts.
 
     Raises:
-        AlreadyRunning: It runs.
+        AlreadyRunning: The service runs.
     """
     lock = ServiceLock(robot, service)
     lock.acquire()

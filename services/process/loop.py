@@ -1,4 +1,4 @@
-"""A named loop at a fixed rate: absolute grid, late and skipped counted, never a burst."""
+"""A named loop at a fixed rate on an absolute grid. Late and skipped ticks are counted; there is never a burst."""
 
 import logging
 import math
@@ -14,19 +14,19 @@ log = logging.getLogger(__name__)
 LOG_EVERY = 1.0
 """A tick that keeps failing is logged this often [s]."""
 ERROR_NEWS = 5.0
-"""How long [s] a failed tick is worth mentioning."""
+"""The error of a failed tick is reported for this time [s]."""
 KEPT = 0.9
-"""Share of its rate below which a loop, beside one tick, is told as too slow."""
+"""A loop that keeps less than this share of its rate, less one tick, is reported as too slow."""
 FULL = 0.9
-"""Share of the time inside the tick from which on it is the tick that is too long, and not the machine that is busy."""
+"""If the ticks of a slow loop take more than this share of the time, they are too long; else the machine is busy."""
 MARGIN = 0.1
-"""A loop that follows what it works on begins this share of its period after that has come."""
+"""A loop that follows its input begins this share of its period after the input has arrived."""
 EARLIER, LATER = 1 / 500, 4 / 500
-"""By how much of a period such a loop moves at once: four of five times all has then come before, however it varies."""
+"""Such a loop moves by these shares of its period per tick, so that in four of five ticks the input is there."""
 
 
 class Grid:
-    """Deadlines at multiples of a period from a start; a deadline that was slept through is skipped, not made up."""
+    """Deadlines at multiples of a period from a start; a missed deadline is skipped."""
 
     def __init__(self, period: float, start: float) -> None:
         self.period = period
@@ -36,11 +36,11 @@ class Grid:
 
     @classmethod
     def aligned(cls, period: float, offset: float, now: float) -> "Grid":
-        """From the last moment before now that lies `offset` [s] after a multiple of the period on the clock."""
+        """Make a grid that starts at the last moment `offset` [s] after a multiple of the period on the clock."""
         return cls(period, now - (now - offset) % period)
 
     def next(self, now: float) -> float:
-        """The next deadline [s]: in the future, or less than one period past."""
+        """Return the next deadline [s]: in the future, or less than one period past."""
         self._index += 1
         behind = math.floor((now - self._start) / self.period) - self._index
         if behind > 0:
@@ -49,32 +49,31 @@ class Grid:
         return self._start + self._index * self.period
 
     def follow(self, waited: float) -> None:
-        """Move the start a little, so that what a tick works on has waited for `MARGIN` of a period when it begins.
+        """Move the start a little, so that the input of a tick arrives `MARGIN` of a period before it.
 
         Args:
-            waited: How long that had waited at the last tick [s]; any number of periods more means the same.
+            waited: Waiting time of the input at the last tick [s], modulo the period.
         """
-        away = (waited / self.period - MARGIN + 0.5) % 1.0 - 0.5
-        self._start += self.period * (LATER if away < 0.0 else -EARLIER)
+        deviation = (waited / self.period - MARGIN + 0.5) % 1.0 - 0.5
+        self._start += self.period * (LATER if deviation < 0.0 else -EARLIER)
 
 
 class Loop:
-    """Calls `tick` at a fixed rate from a thread of its own.
+    """A thread that calls `tick` at a fixed rate.
 
     A tick that overruns delays the next one, which counts as late; whole periods that it covered are skipped and
-    counted. A tick that raises is counted and logged, and the loop goes on: whether that is safe is the tick's
-    business.
+    counted. A tick that raises is counted and logged, and the loop continues; the tick must make that safe.
 
     Args:
-        name: Names the thread and the statistics.
+        name: Name of the thread and of the statistics.
         rate: Ticks per second [Hz].
-        tick: What to do; takes nothing, returns nothing.
-        clock: What time it is.
+        tick: Function to call.
+        clock: Source of time.
         priority: SCHED_FIFO priority to try, 0 for none.
-        offset: When it ticks [s] after the multiples of its period on the clock: loops of one process share one
-            interpreter, and those that begin at the same moment wait for each other.
-        waited: Tells after a tick how long [s] what it worked on had waited when it began, None if that was nothing
-            new; the grid moves slowly until that is short. By itself it stays where it is.
+        offset: Time [s] from the multiples of the period on the clock to the ticks. Loops of one process share one
+            interpreter, and loops that begin at the same moment wait for each other.
+        waited: Returns after a tick the waiting time [s] of its input when it began; None if the input was not new. The
+            grid moves slowly until that time is short. Without this function the grid does not move.
     """
 
     def __init__(
@@ -90,9 +89,9 @@ class Loop:
         self.name = name
         self.rate = rate
         self.scheduling = "other"
-        """`fifo` when real-time scheduling was granted."""
+        """This is `fifo` when real-time scheduling was granted."""
         self.failed = 0
-        """Ticks that raised."""
+        """This is the number of ticks that raised."""
         self._tick = tick
         self._clock = clock or SystemClock()
         self._priority = priority
@@ -112,55 +111,55 @@ class Loop:
 
     @property
     def error(self) -> str:
-        """What the last tick that raised said; empty when that was long ago."""
+        """Error of the last tick that raised; empty after `ERROR_NEWS`."""
         return self._error if self._clock.monotonic() - self._failed_at < ERROR_NEWS else ""
 
     @property
     def trouble(self) -> str:
-        """What is wrong with this loop, in a sentence: `error`, or that it does not keep its rate; empty if nothing."""
+        """Problem of this loop in one sentence: `error`, or a rate that is not kept; empty without a problem."""
         return self.error or self._slow
 
     @property
     def is_slow(self) -> bool:
-        """Whether it did not keep its rate when `statistics` was last asked for."""
+        """Whether it did not keep its rate at the last call of `statistics`."""
         return bool(self._slow)
 
     @property
     def done(self) -> int:
-        """Ticks that ended without raising; where this stands still, the loop is stuck."""
+        """Number of ticks that did not raise; if it does not grow, the loop is stuck."""
         return self._ticks - self.failed
 
     def start(self) -> None:
-        """Begin ticking; the first tick is at most one period from now."""
+        """Start the thread; the first tick is at most one period from now."""
         if self._thread is not None:
             raise RuntimeError(f"Loop '{self.name}' was already started.")
         self._thread = threading.Thread(target=self._run, name=f"loop {self.name}", daemon=True)
         self._thread.start()
 
     def stop(self, patience: float | None = None) -> None:
-        """Finish the tick in progress, if any, and end. Safe to call twice, and before `start`.
+        """End after the tick in progress. Safe to call twice, and before `start`.
 
         Args:
-            patience: How long [s] to wait for a tick that does not end; for ever if None.
+            patience: Longest wait [s] for the tick in progress; unlimited if None.
         """
         self._stop.set()
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join(patience)
 
     def statistics(self) -> dict[str, float]:
-        """How the loop keeps time, for `Status.loops`.
+        """Return the timing of the loop, for `Status.loops`.
 
         Returns:
             `rate_wanted`; `rate` [Hz] and `busy` (share of the time inside the tick) since the last call; `late_p50`,
             `late_p99`, `late_max` [s] of the last second; `total_p50`, `total_p99`, `total_max` [s] since start;
-            `ticks`, `overruns` (ticks that could not begin in time because the one before still ran), `skipped` and
-            `failed` since start.
+            `ticks`, `overruns` (ticks that began late because the one before still ran), `skipped` and `failed` since
+            start.
         """
         now = self._clock.monotonic()
-        then, ticks, busy = self._counted
+        before, ticks, busy = self._counted
         self._counted = (now, self._ticks, self._busy)
-        elapsed = max(now - then, 1e-9)
-        self._slow = self._judged(self._ticks - ticks, self._busy - busy, elapsed)
+        elapsed = max(now - before, 1e-9)
+        self._slow = self._slowness(self._ticks - ticks, self._busy - busy, elapsed)
         return {
             "rate_wanted": self.rate,
             "rate": (self._ticks - ticks) / elapsed,
@@ -173,14 +172,14 @@ class Loop:
             "failed": self.failed,
         }
 
-    def _judged(self, ticks: int, busy: float, elapsed: float) -> str:
-        """Why so many ticks in so long a time [s] are too few; empty if they are enough."""
+    def _slowness(self, ticks: int, busy: float, elapsed: float) -> str:
+        """Return the reason for too few ticks in the elapsed time [s]; empty if they are enough."""
         if self._grid is None or ticks >= KEPT * self.rate * elapsed - 1.0:
             return ""
         kept = f"Keeps {ticks / elapsed:.3g} of {self.rate:g} Hz"
         if busy > FULL * elapsed and ticks:
-            return f"{kept}: a tick takes {1e3 * busy / ticks:.3g} ms, of {1e3 / self.rate:.3g} that it has."
-        return f"{kept}, though a tick needs but {busy / elapsed:.0%} of the time. Is this machine busy?"
+            return f"{kept}: a tick takes {1e3 * busy / ticks:.3g} ms, the period is {1e3 / self.rate:.3g} ms."
+        return f"{kept}, although the ticks take only {busy / elapsed:.0%} of the time. Is this machine busy?"
 
     def _run(self) -> None:
         self.scheduling = prepare_thread(self._priority)
@@ -195,16 +194,16 @@ class Loop:
             clock.sleep_until(deadline)
             if self._stop.is_set():
                 return
-            begun = clock.monotonic()
-            self._lateness.add(begun - deadline)
-            self._turn()
+            start = clock.monotonic()
+            self._lateness.add(start - deadline)
+            self._try_tick()
             now = clock.monotonic()
-            self._busy += now - begun
+            self._busy += now - start
             self._ticks += 1
             if self._waited is not None and (waited := self._waited()) is not None:
                 self._grid.follow(waited)
 
-    def _turn(self) -> None:
+    def _try_tick(self) -> None:
         try:
             self._tick()
         except Exception as error:

@@ -1,10 +1,10 @@
-"""Keeps a process on one core, where that is enough for it.
+"""Keep all threads of a process on one core, as long as one core is enough.
 
-Threads that share an interpreter run one after the other on however many cores. On several they only pay for it: to
-wake another one a thread has to interrupt a core that sleeps, and what it hands over has to come from that core's
-caches. On one core the service of a 25-element arm takes 26 % of it in place of 38 %, and its loops wait less for each
-other (`python -m studies.stack.loops --without-bus`). Compiled code of several threads could run at once on several; so
-a process that needs more than a core, or does not keep its rates, gets all of them back.
+Threads of one interpreter run one after the other, on any number of cores. On several cores a thread must wake a
+sleeping core to run another thread, which then reads its data from the first core's caches. On one core the service of
+a 25-element arm needs 26 % of it instead of 38 %, and its loops wait less for each other
+(`python -m studies.stack.loops --without-bus`). Compiled code of several threads can use several cores at once, so a
+process that needs more than one core, or does not keep its rates, gets all cores back.
 """
 
 import contextlib
@@ -13,50 +13,44 @@ import random
 import time
 from collections.abc import Callable
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 FULL = 0.7
-"""Share of a core from which on a process is not kept there."""
+"""A process that needs a larger share of a core gets all cores."""
 CROWDED = 0.25
-"""A core on which others run for so much more [share of the time] than on another one is left for that."""
+"""A process changes the core if others use its core for this share of time more than the least used one."""
 PATIENCE = 60.0
-"""How long [s] a process that had to have all cores keeps them."""
+"""A process that needed all cores keeps them for this time [s]."""
 SHORTEST = 0.2
-"""Shares are not taken over less time [s]: the kernel counts in hundredths of a second."""
+"""Shares are measured over at least this time [s]: the kernel counts in hundredths of a second."""
 _TICKS = os.sysconf("SC_CLK_TCK")
 
 Busy = dict[int, float]
-"""Core -> time [s] it has worked."""
+"""This maps a core to its busy time [s]."""
 
 
 def busy() -> Busy:
-    """How long every core has worked since the machine was started; nothing where the system does not tell."""
-    found: Busy = {}
-    try:
-        lines = Path("/proc/stat").read_text().splitlines()
-    except OSError:
-        return found
-    for line in lines:
-        name, *ticks = line.split()
-        if not name.startswith("cpu"):
-            break
-        if name != "cpu":
-            user, nice, system, _idle, _waiting, *other = map(int, ticks[:8])
-            found[int(name[3:])] = (user + nice + system + sum(other)) / _TICKS
-    return found
+    """Return the busy time of every core since the machine was started; empty where /proc/stat cannot be read."""
+    times: Busy = {}
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/stat").read_text().splitlines():
+            name, *ticks = line.split()
+            if name.startswith("cpu") and name != "cpu":
+                user, nice, system, _idle, _waiting, *other = map(int, ticks[:8])
+                times[int(name[3:])] = (user + nice + system + sum(other)) / _TICKS
+    return times
 
 
 class OneCore:
-    """Keeps all threads of this process on the core where others run least; a context manager that ends by letting go.
+    """A context manager that keeps all threads of this process on the core that others use least.
 
     Args:
-        busy: Tells how long every core has worked.
-        own: Tells how long this process has.
-        clock: Tells the time [s].
+        busy: Returns the busy time of every core.
+        own: Returns the processor time of this process [s].
+        clock: Returns the monotonic time [s].
 
     Attributes:
-        core: Where the process is kept; None if it may run anywhere that it was allowed to when this was made.
+        core: Core of the process; None if it may run on all cores that were allowed at the start.
     """
 
     def __init__(
@@ -74,17 +68,11 @@ class OneCore:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._go(None)
+    def __exit__(self, *_: object) -> None:
+        self._move(None)
 
     def look(self, is_slow: bool) -> None:
-        """Look again where to be; from time to time, once a second.
-
-        Args:
-            is_slow: Whether a loop of the process does not keep its rate.
-        """
+        """Choose the core anew; called once a second. `is_slow`: whether a loop does not keep its rate."""
         now, own = self._clock(), self._own()
         if len(self._allowed) < 2 or (self._read is not None and now - self._read[0] < SHORTEST):
             return
@@ -98,15 +86,15 @@ class OneCore:
         least = min(others.values())
         if is_slow or mine > FULL:
             self._free_until = now + PATIENCE
-            self._go(None)
+            self._move(None)
         elif now >= self._free_until and (self.core is None or others[self.core] > least + CROWDED):
-            # At random, for services that are started together look at the same moment.
-            self._go(random.choice([core for core, share in others.items() if share <= least + CROWDED / 2]))
+            # A random choice, because services that are started together choose at the same moment.
+            self._move(random.choice([core for core, share in others.items() if share <= least + CROWDED / 2]))
 
-    def _go(self, core: int | None) -> None:
+    def _move(self, core: int | None) -> None:
         if core == self.core:
             return
         self.core = core
         for entry in Path("/proc/self/task").iterdir():
-            with contextlib.suppress(OSError):  # the thread has ended meanwhile, or the core was taken from us
+            with contextlib.suppress(OSError):  # the thread has ended, or the core is no longer allowed
                 os.sched_setaffinity(int(entry.name), self._allowed if core is None else {core})

@@ -1,4 +1,4 @@
-"""What the kernel and the interpreter can do for a loop's punctuality; each is tried, none is required."""
+"""Settings of the kernel and the interpreter that make loops punctual; each is tried, none is required."""
 
 import contextlib
 import ctypes
@@ -12,18 +12,18 @@ from pathlib import Path
 log = logging.getLogger(__name__)
 
 SWITCH_INTERVAL = 0.0001
-"""How long [s] a Python thread may keep the interpreter from a waiting loop; Python's own 5 ms is a whole cycle."""
+"""A Python thread may keep a loop waiting for this time [s]; Python's default of 5 ms is a whole cycle."""
 _PR_SET_TIMERSLACK = 29
-_said = threading.Event()
+_is_refusal_logged = threading.Event()
 
 
 def prepare_process() -> None:
-    """Short turns between Python threads. Call once, at the start of a process that runs loops."""
+    """Let Python threads alternate quickly. Call once, at the start of a process that runs loops."""
     sys.setswitchinterval(SWITCH_INTERVAL)
 
 
 def freeze() -> None:
-    """Take everything that start-up made out of the garbage collector's sight, so that its pauses stay short."""
+    """Exclude all objects of the start-up from garbage collection, so that its pauses stay short."""
     gc.collect()
     gc.freeze()
 
@@ -35,7 +35,7 @@ def prepare_thread(priority: int) -> str:
         priority: SCHED_FIFO priority (1 to 99, higher first); 0 leaves the thread in normal scheduling.
 
     Returns:
-        `fifo` or `other`: how the thread is scheduled now. A refusal is logged once per process.
+        `fifo` or `other`, the scheduling of the thread now. A refusal is logged once per process.
     """
     # Normal threads wake up to 50 us late so that timers can share an interrupt; 1 ns turns that off.
     ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
@@ -45,22 +45,17 @@ def prepare_thread(priority: int) -> str:
 
 
 def promote(prefix: str, priority: int) -> None:
-    """Try real-time scheduling for threads that others started.
-
-    Args:
-        prefix: What the names of the threads begin with.
-        priority: SCHED_FIFO priority.
-    """
+    """Try real-time scheduling for the threads whose name begins with `prefix`."""
     for thread in threading.enumerate():
         if thread.name.startswith(prefix) and thread.native_id is not None:
             _use_fifo(thread.native_id, priority)
 
 
 def promote_rest(priority: int) -> None:
-    """Try real-time scheduling for every thread of this process that has none yet, zenoh's included.
+    """Try real-time scheduling for every other thread of this process, zenoh's included.
 
-    A loop in time is of no use if what it waits for or sends lies in a thread that does not come to run: with two other
-    busy processes on two cores, commands came to the HAL 100 ms late.
+    Otherwise the input and output of a punctual loop are delayed in threads that do not run: with two other busy
+    processes on two cores, commands reached the HAL 100 ms late.
     """
     for entry in Path("/proc/self/task").iterdir():
         with contextlib.suppress(ProcessLookupError):
@@ -72,10 +67,10 @@ def _use_fifo(thread: int, priority: int) -> bool:
     try:
         os.sched_setscheduler(thread, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
     except OSError as error:
-        if not _said.is_set():
-            _said.set()
+        if not _is_refusal_logged.is_set():
+            _is_refusal_logged.set()
             log.warning(
-                "No real-time scheduling (%s): loops keep time less well when the machine is busy. "
+                "No real-time scheduling (%s): loops are less punctual when the machine is busy. "
                 "To allow it, give the user an rtprio limit, or the container CAP_SYS_NICE.",
                 error.strerror,
             )

@@ -1,7 +1,7 @@
-"""`gemuco router`: the one place through which everybody but a robot's own services reaches the robots.
+"""The router (`gemuco router`), through which clients on other machines reach the robots.
 
-It is a zenoh session that routes, and knows nothing of robots. Samples and commands between HAL and model do not pass
-through it, so that nothing stops when it does.
+It is a zenoh session that routes messages and knows no robots. Samples and commands between HAL and model do not pass
+through it, so a robot works without it.
 """
 
 import logging
@@ -20,17 +20,17 @@ from services.wire.session import ROUTER_PORT, close_session, common_settings, o
 log = logging.getLogger(__name__)
 
 LISTEN = (f"tcp/127.0.0.1:{ROUTER_PORT}",)
-"""Where a router listens if nobody says otherwise: this machine only."""
+"""A router listens here by default: on this machine only."""
 WHO = "the router"
-RING_RATE = 1.0
-"""How often [Hz] the router rings at its own door, so that a health check can tell whether it still answers."""
+PROBE_RATE = 1.0
+"""The router probes its own endpoints at this rate [Hz], so that a health check notices if it does not answer."""
 
 
 def router_settings(listen: Iterable[str] = (), connect: Iterable[str] = ()) -> dict[str, Any]:
-    """The zenoh configuration of a router, as plain data.
+    """Return the zenoh configuration of a router, as plain data.
 
     Args:
-        listen: Endpoints; those of the role file if not given, else `LISTEN`.
+        listen: Endpoints; by default those of the role file, else `LISTEN`.
         connect: Endpoints of other routers, for a fleet, and the router's role file.
 
     Raises:
@@ -48,10 +48,10 @@ def router_settings(listen: Iterable[str] = (), connect: Iterable[str] = ()) -> 
         },
         **common_settings(),
     }
-    found = with_role_files(own, files, endpoints)
-    if chosen := [checked_endpoint(one) for one in listen]:
-        found["listen"]["endpoints"] = chosen
-    return found
+    configuration = with_role_files(own, files, endpoints)
+    if places := [checked_endpoint(endpoint) for endpoint in listen]:
+        configuration["listen"]["endpoints"] = places
+    return configuration
 
 
 def run_router(listen: Iterable[str] = (), connect: Iterable[str] = (), stop: threading.Event | None = None) -> None:
@@ -60,20 +60,20 @@ def run_router(listen: Iterable[str] = (), connect: Iterable[str] = (), stop: th
     Args:
         listen: As `router_settings`.
         connect: As `router_settings`.
-        stop: An event that ends it; signals are then left alone.
+        stop: Event that ends the router; signals are then not handled.
 
     Raises:
         ServiceError: A port is taken, an endpoint is malformed, or a role file cannot be read.
     """
     configuration = router_settings(listen, connect)
-    with until_stopped(stop) as told:
+    with until_stopped(stop) as stopped:
         session = open_with(configuration, WHO)
         print(f"Router listens on {', '.join(configuration['listen']['endpoints'])}.", flush=True)
-        door = Loop("door", RING_RATE, lambda: check_answers(configuration["listen"]["endpoints"]))
-        door.start()
+        probe = Loop("probe", PROBE_RATE, lambda: check_answers(configuration["listen"]["endpoints"]))
+        probe.start()
         try:
-            with Heartbeat(ROUTER, "", [door]):
-                told.wait()
+            with Heartbeat(ROUTER, "", [probe]):
+                stopped.wait()
         finally:
-            door.stop(0.0)
+            probe.stop(0.0)
             close_session(session)

@@ -1,4 +1,4 @@
-"""What every service process has: a lock, a session, a liveliness token, verbs, a status each second, an end."""
+"""The parts of every service process: a lock, a session, a liveliness token, verbs, a status each second, an end."""
 
 import logging
 import os
@@ -9,12 +9,11 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from importlib import metadata
-from types import TracebackType
 from typing import Any, Self, TypeVar
 
 import zenoh
 
-from services.process.heartbeat import Heartbeat, Turning
+from services.process.heartbeat import Activity, Heartbeat
 from services.process.lock import ServiceLock
 from services.wire import keys, query
 from services.wire.messages import Message, Status
@@ -26,15 +25,16 @@ log = logging.getLogger(__name__)
 
 STATUS_EVERY = 1.0
 STATUS_AT, STATUS_STEP = 0.0472, 0.1
-"""A status is made so long [s] after a multiple of the step [s] on the clock: at usual rates no loop of the model
-service begins near, and the HAL's turn has ended. One that met the update each second held up a twentieth of its ticks.
-Which of the ten moments of a second it is depends on the start, so that services of a machine do not meet."""
+"""A status is published at `STATUS_AT` [s] after a multiple of `STATUS_STEP` [s] on the clock. At usual rates no loop
+of the model service begins near that moment, and the HAL's tick has ended. A status at the time of the update delayed a
+twentieth of its ticks. The start of the service selects one of the ten moments of a second, so that the services of a
+machine differ."""
 ANSWERED_WITHIN = 0.5
-"""How long [s] a service that ends still answers what it was asked before."""
+"""A service that ends still answers earlier queries for this time [s]."""
 
 
 class _Statuses:
-    """The main thread's own turns, so that health sees it stand still too."""
+    """The activity of the main thread, so that a health check notices if it stops."""
 
     name, rate, error = "status", 1.0 / STATUS_EVERY, ""
 
@@ -52,7 +52,7 @@ class Service:
         robot: The robot's name.
         name: One of `keys.SERVICES`.
         connect: Endpoints, such as a router's, and role files.
-        describe: What `describe` tells beyond pid, host and boot.
+        describe: Returns what `describe` answers beside the identity of the process.
 
     Attributes:
         session: The open zenoh session.
@@ -73,9 +73,9 @@ class Service:
         self._connect = tuple(connect)
         self.describe = describe
         self._lock = ServiceLock(robot, name)
-        self._asked = query.PendingQueries()
+        self._pending = query.PendingQueries()
         self._statuses = _Statuses()
-        self._watched: list[Turning] = [self._statuses]
+        self._watched: list[Activity] = [self._statuses]
 
     def __enter__(self) -> Self:
         self._lock.acquire()
@@ -84,23 +84,21 @@ class Service:
             self.session = open_session(self.robot, self.name, self._connect)
             self._lock.check_network(self.session)
         except BaseException:
-            self.__exit__(None, None, None)
+            self.__exit__()
             raise
         self._token = self.session.liveliness().declare_token(keys.alive(self.robot, self.name))
         self._status = self.publisher(keys.status(self.robot, self.name), Status)
         self.verb("describe", lambda _: self.identity() | self.describe())
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if hasattr(self, "session"):
-            self._asked.wait(ANSWERED_WITHIN)
+            self._pending.wait(ANSWERED_WITHIN)
             close_session(self.session)
         self._lock.release()
 
     def identity(self) -> dict[str, Any]:
-        """Who this is: robot, service, pid, host, boot, and the version of the package."""
+        """Return the identity of this process: robot, service, pid, host, boot, and the version of the package."""
         return {
             "robot": self.robot,
             "service": self.name,
@@ -111,28 +109,25 @@ class Service:
         }
 
     def publisher(self, key: str, record: type[M]) -> Publisher[M]:
-        """A publisher on this session, marked with this run's boot."""
+        """Make a publisher on this session, marked with this run's boot."""
         return Publisher(self.session, key, record, self.boot)
 
     def newest(self, key: str, record: type[M]) -> Reader[M]:
-        """A reader of the newest message of a key."""
+        """Make a reader of the newest message of a key."""
         return Reader(self.session, key, record)
 
     def verb(
         self, name: str, handler: query.Handler, guard: query.Guard | None = None, *, always: bool = False
     ) -> None:
         """Answer a verb until the session closes; see `query.serve_verb`."""
-        query.serve_verb(self.session, keys.verb(self.robot, self.name, name), handler, guard, always, self._asked)
+        query.serve_verb(self.session, keys.verb(self.robot, self.name, name), handler, guard, always, self._pending)
 
-    def watch(self, *turning: Turning) -> None:
-        """What has to go on for this service to be healthy, its loops above all. Call before `run`."""
-        self._watched.extend(turning)
+    def watch(self, *activities: Activity) -> None:
+        """Add activities, such as loops, that must progress for this service to be healthy. Call before `run`."""
+        self._watched.extend(activities)
 
     def run(self, status: Callable[[], Status], stop: threading.Event) -> None:
-        """Publish `status()` every second until `stop` is set, and once more as `stopping`.
-
-        For as long as it lasts, health checks find out whether all that is watched goes on.
-        """
+        """Publish `status()` every second until `stop` is set, then `stopping`; meanwhile write the heartbeat."""
         due = time.monotonic()
         with Heartbeat(self.name, self.robot, self._watched):
             while not stop.wait(max(0.0, due - time.monotonic())):
@@ -142,7 +137,7 @@ class Service:
         self._status.put(Status(stamp_ns=time.time_ns(), service=self.name, state="stopping"))
 
     def publish_status(self, status: Callable[[], Status]) -> None:
-        """Publish a status now; one that cannot be made is logged, and never ends the service."""
+        """Publish a status now; a failure is logged and never ends the service."""
         try:
             self._status.put(status())
         except Exception:
@@ -150,25 +145,25 @@ class Service:
 
 
 def next_status(now: float) -> float:
-    """The moment for a status that is nearest to a period from now, both on the monotonic clock [s]."""
-    wanted = now + STATUS_EVERY
-    return wanted - ((wanted - STATUS_AT + 0.5 * STATUS_STEP) % STATUS_STEP - 0.5 * STATUS_STEP)
+    """Return the moment for a status that is nearest to one period from now [monotonic s]."""
+    due = now + STATUS_EVERY
+    return due - ((due - STATUS_AT + 0.5 * STATUS_STEP) % STATUS_STEP - 0.5 * STATUS_STEP)
 
 
 @contextmanager
 def until_stopped(stop: threading.Event | None = None) -> Iterator[threading.Event]:
-    """An event that SIGTERM and SIGINT set; the handlers before are put back at the end.
+    """Yield an event that SIGTERM and SIGINT set; restore the signal handlers at the end.
 
     Args:
-        stop: An event of the caller's, who then ends the service himself; signals are left alone.
+        stop: Event to yield instead; signals are then not handled.
     """
     if stop is not None:
         yield stop
         return
-    told = threading.Event()
-    before = {number: signal.signal(number, lambda *_: told.set()) for number in (signal.SIGTERM, signal.SIGINT)}
+    stopped = threading.Event()
+    before = {number: signal.signal(number, lambda *_: stopped.set()) for number in (signal.SIGTERM, signal.SIGINT)}
     try:
-        yield told
+        yield stopped
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

@@ -1,4 +1,4 @@
-"""Child processes that never outlive their parent: started in groups of their own, watched, and stopped in time."""
+"""Child processes that never outlive their parent: each has its own group, is watched, and is stopped in time."""
 
 import contextlib
 import ctypes
@@ -22,21 +22,21 @@ POLL = 0.05
 
 
 def gemuco_command(*arguments: str) -> list[str]:
-    """The command line of one of our own verbs."""
+    """Return the command line of a verb of gemuco."""
     return [sys.executable, "-m", "services.cli", *arguments]
 
 
 class ChildDied(ServiceError):
-    """A supervised process ended by itself; the text tells how, and what it said last."""
+    """A supervised process that ended by itself; the text gives its exit and its last output."""
 
 
 class NotReady(ServiceError):
-    """A supervised process did not become ready in time."""
+    """A supervised process that did not become ready in time."""
 
 
 @dataclass(slots=True)
 class Child:
-    """One supervised process."""
+    """A supervised process."""
 
     name: str
     command: tuple[str, ...]
@@ -44,20 +44,20 @@ class Child:
     process: subprocess.Popen[bytes]
 
     def ended(self) -> str:
-        """How it ended and its last lines, in one sentence; empty while it runs."""
+        """Return its exit and its last output in one sentence; empty while it runs."""
         code = self.process.poll()
         if code is None:
             return ""
-        how = f"was ended by {signal.Signals(-code).name}" if code < 0 else f"exited with {code}"
-        said = " / ".join(line.strip() for line in self.log.read_text(errors="replace").splitlines()[-LAST_LINES:])
-        return f"'{self.name}' {how}. Its last words: {said or 'none'}. All of them: {self.log}."
+        exit_text = f"was ended by {signal.Signals(-code).name}" if code < 0 else f"exited with {code}"
+        lines = " / ".join(line.strip() for line in self.log.read_text(errors="replace").splitlines()[-LAST_LINES:])
+        return f"'{self.name}' {exit_text}. Its last output: {lines or 'none'}. The whole output is in {self.log}."
 
 
 class Supervisor:
-    """Starts children and sees to it that none is left behind, whatever ends this process.
+    """A context manager that starts children and stops them all when this process ends for any reason.
 
-    A child gets a session of its own, so that Ctrl-C in the terminal reaches only the supervisor, which stops the
-    children in the opposite order of their start. The kernel ends a child when the supervisor dies without a word.
+    A child gets its own session, so that Ctrl-C in the terminal reaches only the supervisor, which stops the children
+    in the reverse order of their start. The kernel ends a child when the supervisor is killed.
     """
 
     def __init__(self, folder: Path, grace: float = 5.0, at_checks: bool = False) -> None:
@@ -65,15 +65,15 @@ class Supervisor:
 
         Args:
             folder: Logs go to `folder/<name>.log`.
-            grace: A child that ignores SIGTERM for so long [s] is killed.
-            at_checks: Obey Ctrl-C and SIGTERM in `check`, which must then be called all the time, and no sooner: an
-                exception in the midst of anything can leave a lock behind that another thread waits for for ever. A
-                second signal does not wait.
+            grace: A child that ignores SIGTERM for this time [s] is killed.
+            at_checks: Obey Ctrl-C and SIGTERM only in `check`, which must then be called often: an exception at any
+                other point can leave a lock held, and another thread would wait for it for ever. A second signal acts
+                at once.
         """
         self.folder = folder
         self.grace = grace
         self.at_checks = at_checks
-        self._asked: int | None = None
+        self._signal: int | None = None
         self.children: dict[str, Child] = {}
         self._handlers: dict[int, Any] = {}
 
@@ -127,36 +127,36 @@ class Supervisor:
             self.check()
             if time.monotonic() > deadline:
                 log = self.children[name].log
-                raise NotReady(f"'{name}' was not ready within {timeout:g} s. What it said is in {log}.")
+                raise NotReady(f"'{name}' was not ready within {timeout:g} s. Its output is in {log}.")
             time.sleep(POLL)
 
     def check(self) -> None:
-        """Raise `ChildDied` if a child has ended that nobody stopped, and what a signal asked for meanwhile."""
+        """Raise `ChildDied` if a child has ended by itself, or the exception of a signal that came meanwhile."""
         self._obey()
         for child in self.children.values():
-            if said := child.ended():
-                raise ChildDied(said)
+            if text := child.ended():
+                raise ChildDied(text)
 
     def _note(self, number: int, frame: FrameType | None) -> None:
-        was_asked, self._asked = self._asked is not None, number
-        if was_asked:
+        is_second, self._signal = self._signal is not None, number
+        if is_second:
             self._obey()
 
     def _obey(self) -> None:
-        asked, self._asked = self._asked, None
-        if asked == signal.SIGINT:
+        number, self._signal = self._signal, None
+        if number == signal.SIGINT:
             raise KeyboardInterrupt
-        if asked is not None:
-            raise SystemExit(128 + asked)
+        if number is not None:
+            raise SystemExit(128 + number)
 
     def kill(self, name: str) -> None:
-        """End a child as a crash would (SIGKILL), and forget it."""
+        """Kill a child (SIGKILL), as a crash would, and remove it."""
         child = self.children.pop(name)
         _signal_group(child.process, signal.SIGKILL)
         child.process.wait()
 
     def stop(self, *names: str) -> None:
-        """Ask children to end, one after the other, and kill those that do not within the grace time."""
+        """Ask children to end, one after the other, and kill those that still run after the grace time."""
         for child in [self.children[name] for name in names if name in self.children]:
             _signal_group(child.process, signal.SIGTERM)
             with contextlib.suppress(subprocess.TimeoutExpired):
@@ -166,7 +166,7 @@ class Supervisor:
             del self.children[child.name]
 
     def stop_all(self) -> None:
-        """Stop every child, the last started first; a second Ctrl-C meanwhile only makes it faster."""
+        """Stop every child, the last started first; a second Ctrl-C meanwhile kills them."""
         try:
             self.stop(*reversed(self.children))
         except BaseException:
@@ -181,17 +181,17 @@ def _leave(number: int, frame: FrameType | None) -> None:
 
 
 def die_with(parent: int) -> Callable[[], None]:
-    """What a child does before it becomes a program (`preexec_fn`), so that the kernel ends it with its parent."""
+    """Return a `preexec_fn` with which the kernel ends the child with its parent."""
 
     def in_child() -> None:
         _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-        if os.getppid() != parent:  # it died between fork and prctl
+        if os.getppid() != parent:  # the parent died between fork and prctl
             os._exit(1)
 
     return in_child
 
 
 def _signal_group(process: subprocess.Popen[bytes], number: signal.Signals) -> None:
-    """Signal the child's whole session; it is its own group's leader."""
+    """Send a signal to the child's whole process group, which it leads."""
     with contextlib.suppress(ProcessLookupError):
         os.killpg(process.pid, number)

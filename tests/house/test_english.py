@@ -18,7 +18,6 @@ NOT_YET = {
     "hal/protocols",
     "services/errors.py",
     "services/health.py",
-    "services/process",
     "services/runtime.py",
     "services/verbs/fleet_top.py",
     "services/verbs/fleet_watch.py",

@@ -181,7 +181,7 @@ class _Busy:
     [
         (0.002, 0.0, ""),
         (0.0095, 0.0, ""),
-        (0.025, 0.0, "a tick takes 25 ms, of 10 that it has"),
+        (0.025, 0.0, "a tick takes 25 ms, the period is 10 ms"),
         (0.001, 0.018, "of the time. Is this machine busy?"),
     ],
 )

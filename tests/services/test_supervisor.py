@@ -50,7 +50,7 @@ def test_a_stubborn_child_is_killed(tmp_path: Path) -> None:
 def test_the_last_words_of_a_dead_child_are_told(tmp_path: Path) -> None:
     with Supervisor(tmp_path) as supervisor:
         supervisor.start("brief", [sys.executable, "-c", "raise SystemExit('the bus is on fire')"])
-        with pytest.raises(ChildDied, match=r"'brief' exited with 1\. Its last words: the bus is on fire"):
+        with pytest.raises(ChildDied, match=r"'brief' exited with 1\. Its last output: the bus is on fire"):
             supervisor.wait_ready("brief", lambda: False, 10)
 
 
