@@ -1,4 +1,4 @@
-"""Homing and the handshake of profile position cycle by cycle (CiA 402-2), and the controlwords of a drive over time."""
+"""Homing and the handshake of profile position cycle by cycle (CiA 402-2), and controlwords of a drive over time."""
 
 import pytest
 from drive_bench import JointBench
