@@ -1,4 +1,4 @@
-"""Ends and defaults of the settings of all drivers: identifiers and sub-indices by CAN and CiA 301, else by the docs."""
+"""Ends and defaults of driver settings: identifiers and sub-indices by CAN and CiA 301, others by docs/devices.md."""
 
 import pytest
 from pydantic import ValidationError
