@@ -20,12 +20,12 @@ SDO_REQUEST = 0x600
 HEARTBEAT = 0x700
 
 SYNCHRONOUS = 1
-"""Transmission type: at every SYNC; n up to 240: at every n-th."""
+"""A PDO with this transmission type is sent at every SYNC; with n up to 240, at every n-th."""
 LAST_SYNCHRONOUS = 240
 EVENT_DRIVEN = (254, 255)
-"""Transmission types of PDOs that do not wait for a SYNC; the event timer (sub-index 5) sends them."""
+"""PDOs with these transmission types do not wait for a SYNC; the event timer (sub-index 5) sends them."""
 PDO_INVALID = 1 << 31
-"""Bit of a PDO's COB-ID entry: the PDO does not exist."""
+"""This bit of a PDO's COB-ID entry means that the PDO does not exist."""
 
 DEVICE_TYPE = 0x1000
 CONSUMER_HEARTBEAT = 0x1016
@@ -36,17 +36,17 @@ RPDO_MAPPING = 0x1600
 TPDO_PARAMETERS = 0x1800
 TPDO_MAPPING = 0x1A00
 PDO_PER_DIRECTION = 4
-"""PDO that the predefined connection set gives an identifier per direction."""
+"""The predefined connection set has identifiers for this number of PDOs per direction."""
 PDO_SIZE = 8
-"""Bytes that a PDO can carry."""
+"""A PDO carries at most this number of bytes."""
 ERROR_BEHAVIOUR = 0x1029
-"""Sub-index 1: what a node does when it misses a heartbeat."""
+"""Sub-index 1 of this object is the reaction of a node to a missing heartbeat."""
 BECOME_PRE_OPERATIONAL = 0
-"""Value of 1029h:1; in pre-operational a node takes no process data."""
+"""With this value of 1029h:1 a node becomes pre-operational and takes no process data."""
 
 
 class NmtCommand(IntEnum):
-    """What the NMT master can ask of a node."""
+    """Commands of the NMT master to a node."""
 
     START = 0x01
     STOP = 0x02
@@ -56,7 +56,7 @@ class NmtCommand(IntEnum):
 
 
 class NmtState(IntEnum):
-    """What a node says of itself in its heartbeat."""
+    """States in the heartbeat of a node."""
 
     BOOT_UP = 0x00
     STOPPED = 0x04
@@ -66,12 +66,12 @@ class NmtState(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Emergency:
-    """What an emergency object says.
+    """The content of an emergency object.
 
     Attributes:
         code: Error code; 0 means that all errors are gone.
         register: Error register, object 1001h.
-        detail: Five bytes of the manufacturer's.
+        detail: Five manufacturer specific bytes.
     """
 
     code: int
@@ -81,7 +81,7 @@ class Emergency:
 
 @dataclass(frozen=True, slots=True)
 class Mapped:
-    """An object that a PDO carries: where it is in the object dictionary, how many bits it has, and what they mean."""
+    """An object in a PDO: index, sub-index, size and type."""
 
     index: int
     subindex: int
@@ -90,12 +90,12 @@ class Mapped:
 
     @property
     def entry(self) -> int:
-        """The UNSIGNED32 of a mapping parameter."""
+        """Value of a mapping parameter (UNSIGNED32)."""
         return self.index << 16 | self.subindex << 8 | self.bits
 
     @property
     def format(self) -> str:
-        """Its character in `struct`, little-endian as CANopen is (7.1.4)."""
+        """Format character of `struct`; CANopen is little-endian (7.1.4)."""
         return _FORMATS[self.kind, self.bits]
 
     def __str__(self) -> str:
@@ -171,25 +171,25 @@ _CODES = {
 
 
 def nmt_command(command: NmtCommand, node: int) -> bytes:
-    """Data of the NMT frame; node 0 means all nodes."""
+    """Return the data of the NMT frame; node 0 means all nodes."""
     return bytes((command, node))
 
 
 def nmt_state(data: bytes | bytearray) -> int | None:
-    """The state in a heartbeat, without the toggle bit of node guarding; None if the frame is not a heartbeat."""
+    """Return the state in a heartbeat without the toggle bit of node guarding; None if the frame is not a heartbeat."""
     return data[0] & 0x7F if len(data) == 1 else None
 
 
 def emergency(data: bytes | bytearray) -> Emergency | None:
-    """What an emergency frame says; None if the frame is not one."""
+    """Return the content of an emergency frame; None if the frame is not one."""
     return Emergency(*_EMERGENCY.unpack(data)) if len(data) == _EMERGENCY.size else None
 
 
 def describe_emergency(code: int, register: int = 0, detail: bytes = b"") -> str:
-    """An emergency in words, as `communication: life guard or heartbeat error (8130h)`.
+    """Return an emergency in words, as `communication: life guard or heartbeat error (8130h)`.
 
-    The error register and the manufacturer's bytes are added where they say something: `(register: generic,
-    communication; manufacturer 01 00 00 00 00)`.
+    Error register and manufacturer specific bytes are added if they are not zero: `(register: generic, communication;
+    manufacturer 01 00 00 00 00)`.
     """
     family = _FAMILIES.get(code >> 8) or _FAMILIES.get(code >> 8 & 0xF0, "unknown family")
     exact = _CODES.get(code)
@@ -201,19 +201,19 @@ def describe_emergency(code: int, register: int = 0, detail: bytes = b"") -> str
 
 
 def mapped(place: str, kind: str) -> Mapped:
-    """The object that a person writes as `2200h:1` (or `2200h`, `0x2200:1`) of a type such as `int16`.
+    """Return the object `2200h:1` (or `2200h`, `0x2200:1`) with a type such as `int16`.
 
     Raises:
-        ValueError: Neither an object nor a type.
+        ValueError: The text is not an object, or the type is unknown.
     """
-    found = _PLACE.fullmatch(place.strip())
-    if found is None or int(found[2] or 0) > 0xFF:
+    match = _PLACE.fullmatch(place.strip())
+    if match is None or int(match[2] or 0) > 0xFF:
         raise ValueError(f"'{place}' is not an object such as 6064h or 2200h:1.")
     if kind not in _TYPES:
         raise ValueError(f"'{kind}' is not a type of an object. Known: {', '.join(_TYPES)}.")
-    return Mapped(int(found[1], 16), int(found[2] or 0), _TYPES[kind][1], _TYPES[kind][0])
+    return Mapped(int(match[1], 16), int(match[2] or 0), _TYPES[kind][1], _TYPES[kind][0])
 
 
 def consumer_heartbeat(node: int, limit: float) -> int:
-    """Entry of object 1016h: node whose heartbeat is watched, and after how long [s] it counts as lost."""
+    """Return the entry of object 1016h: the monitored node, and the time limit [s] of its heartbeat."""
     return node << 16 | round(limit * 1000)

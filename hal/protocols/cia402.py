@@ -46,13 +46,13 @@ TARGET_VELOCITY = Mapped(0x60FF, 0, 32, "signed")
 SUPPORTED_MODES = Mapped(0x6502, 0, 32)
 
 ABORT_QUICK_STOP = 3
-"""Value of 6007h: a lost connection is a quick stop."""
+"""This value of 6007h makes a lost connection cause a quick stop."""
 QUICK_STOP_AND_OFF = 2
-"""Value of 605Ah: slow down on the quick stop ramp, then switch on disabled."""
+"""With this value of 605Ah a drive slows down on the quick stop ramp, then enters 'switch on disabled'."""
 
 
 class Mode(IntEnum):
-    """Modes of operation that we use."""
+    """Modes of operation in use."""
 
     PROFILE_POSITION = 1
     HOMING = 6
@@ -93,21 +93,21 @@ SHUTDOWN = 0x0006
 SWITCH_ON = 0x0007
 ENABLE_OPERATION = 0x000F
 FAULT_RESET = 0x0080
-"""Acts on its rising edge."""
+"""This bit acts on its rising edge."""
 
 NEW_SET_POINT = 1 << 4
-"""Profile position: on its rising edge the target position is taken."""
+"""Profile position: the drive takes the target position on the rising edge of this bit."""
 CHANGE_AT_ONCE = 1 << 5
-"""Profile position: go to it at once, not after the one before."""
+"""Profile position: with this bit a new target position takes effect before the previous one is reached."""
 START_HOMING = 1 << 4
-"""Homing: begin, and go on while it is set."""
+"""Homing begins with this bit and continues while it is set."""
 
 WARNING = 1 << 7
 REMOTE = 1 << 9
-"""The controlword is followed; without it, the drive is led from its own panel."""
+"""The drive follows the controlword if this bit is set; else it is controlled from its own panel."""
 TARGET_REACHED = 1 << 10
 SET_POINT_TAKEN = 1 << 12
-"""Profile position: the answer to `NEW_SET_POINT`."""
+"""Profile position: this bit is the answer to `NEW_SET_POINT`."""
 HOMING_ATTAINED = 1 << 12
 HOMING_ERROR = 1 << 13
 
@@ -128,7 +128,7 @@ def _state_of(statusword: int) -> State:
 
 
 STATE_OF = tuple(_state_of(bits) for bits in range(0x70))
-"""State by `statusword & 0x6F`; a coding that the standard does not have counts as not ready."""
+"""State by `statusword & 0x6F`; a coding outside the standard is not ready."""
 
 _TOWARDS_ENABLED = {
     State.SWITCH_ON_DISABLED: SHUTDOWN,
@@ -140,49 +140,49 @@ _TOWARDS_ENABLED = {
 
 
 def state(statusword: int) -> State:
-    """The state that a statusword codes."""
+    """Return the state in a statusword."""
     return STATE_OF[statusword & 0x6F]
 
 
 def supports(modes: int, mode: Mode) -> bool:
-    """Whether object 6502h says that the drive has a mode."""
+    """Return whether the drive has a mode, by its object 6502h."""
     return bool(modes >> (mode - 1) & 1)
 
 
 def describe_modes(modes: int) -> str:
-    """Object 6502h in words."""
+    """Return the modes in object 6502h in words."""
     return ", ".join(name for mode, name in _MODE_NAMES.items() if modes >> (mode - 1) & 1) or "none"
 
 
 def describe_mode(mode: int) -> str:
-    """A value of 6060h or 6061h in words."""
+    """Return a value of 6060h or 6061h in words."""
     return _MODE_NAMES.get(mode, f"mode {mode}")
 
 
 def interpolation(period: float) -> tuple[int, int]:
-    """Value and power of ten of object 60C2h that come nearest to a period [s]: 5 and -3 for 5 ms.
+    """Return value and power of ten of object 60C2h nearest to a period [s]: 5 and -3 for 5 ms.
 
-    Milliseconds (-3), which every drive knows, are preferred.
+    Milliseconds (-3), which every drive supports, are preferred.
     """
-    found = [(round(period * 10**-index), index) for index in range(-1, -7, -1)]
-    fitting = [(value, index) for value, index in found if 1 <= value <= 255]
-    return min(fitting, key=lambda pair: (round(abs(pair[0] * 10.0 ** pair[1] / period - 1), 4), abs(pair[1] + 3)))
+    pairs = [(round(period * 10**-index), index) for index in range(-1, -7, -1)]
+    valid = [(value, index) for value, index in pairs if 1 <= value <= 255]
+    return min(valid, key=lambda pair: (round(abs(pair[0] * 10.0 ** pair[1] / period - 1), 4), abs(pair[1] + 3)))
 
 
 @dataclass(frozen=True, slots=True)
 class VelocityUnit:
-    """What one unit of a velocity object is.
+    """The unit of a velocity object.
 
     Attributes:
         per_second: Counts, or motor turns, in a second at a velocity of 1.
-        is_turns: Whether it is turns.
+        is_turns: Whether `per_second` counts motor turns.
     """
 
     per_second: float
     is_turns: bool
 
     def counts_per_second(self, counts_per_turn: float) -> float:
-        """Counts per second at a velocity of 1, with so many counts per motor turn."""
+        """Return the counts per second at a velocity of 1."""
         return self.per_second * counts_per_turn if self.is_turns else self.per_second
 
 
@@ -193,15 +193,16 @@ VELOCITY_UNITS = {
     "0.1 rpm": VelocityUnit(0.1 / 60, is_turns=True),
     "mrpm": VelocityUnit(1e-3 / 60, is_turns=True),
 }
-"""Units as a robot file names them."""
+"""Units by their names in a robot file."""
 
 _TURN, _INCREMENT, _SECOND, _MINUTE = 0xB4, 0xB5, 0x03, 0x47
 
 
 def velocity_unit(code: int) -> VelocityUnit | None:
-    """What object 60A9h says: power of ten, numerator and denominator (CiA 303-2); None if it is no speed of a motor.
+    """Return the unit in object 60A9h; None if it is not a motor speed.
 
-    00B44700h is revolutions per minute, FDB44700h a thousandth of that, 00B50300h increments per second.
+    The code has power of ten, numerator and denominator (CiA 303-2): 00B44700h is revolutions per minute, FDB44700h a
+    thousandth of that, 00B50300h increments per second.
     """
     exponent = (code >> 24 ^ 0x80) - 0x80
     numerator, denominator = code >> 16 & 0xFF, code >> 8 & 0xFF
@@ -212,16 +213,16 @@ def velocity_unit(code: int) -> VelocityUnit | None:
 
 
 def towards_enabled(now: State) -> int:
-    """The controlword that leads a drive in state `now` one step towards operation enabled; never out of a fault."""
+    """Return the controlword for one step from state `now` towards operation enabled; it never leaves a fault."""
     return _TOWARDS_ENABLED.get(now, DISABLE_VOLTAGE)
 
 
 def towards_disabled(now: State, slow_down: bool = False) -> int:
-    """The controlword that lets a drive in state `now` go, in a controlled way, to ready to switch on.
+    """Return the controlword for one step from state `now` towards ready to switch on.
 
     Args:
-        now: Its state.
-        slow_down: Disable the operation first, which lets the drive come to rest on its slow down ramp (605Ch).
+        now: State of the drive.
+        slow_down: Whether to disable the operation first, so that the drive stops on its slow down ramp (605Ch).
     """
     if now is State.OPERATION_ENABLED and slow_down:
         return SWITCH_ON

@@ -1,8 +1,8 @@
-"""Error frames: what a CAN controller tells of itself and of the bus, in the format of Linux.
+"""Error frames: reports of a CAN controller on itself and on the bus, in the format of Linux.
 
 Source: include/uapi/linux/can/error.h (classes in the identifier, details in eight data bytes). Error counters go up by
-8 per bad frame and down by 1 per good one; from 96 the controller warns, from 128 it is error passive, and beyond 255
-bad frames of its own it leaves the bus (ISO 11898-1, fault confinement).
+8 per bad frame and down by 1 per good one; from 96 the controller warns, from 128 it is error passive, and when its
+transmit counter exceeds 255 it leaves the bus (ISO 11898-1, fault confinement).
 """
 
 from dataclasses import dataclass
@@ -44,11 +44,11 @@ class Controller(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class ErrorFrame:
-    """What an error frame says.
+    """The content of an error frame.
 
     Attributes:
-        controller: The state that the controller is in now; None if the frame does not say.
-        text: What went wrong, in a sentence; empty if nothing did, as when the controller has recovered.
+        controller: Present state of the controller; None if it is not in the frame.
+        text: The error in a sentence; empty without one, as when the controller has recovered.
         counters: The controller's transmit and receive error counters; None if the frame has none.
     """
 
@@ -65,11 +65,11 @@ _STATES: dict[Controller | None, str] = {
 
 
 def error_frame(kind: int, data: bytes | bytearray) -> ErrorFrame:
-    """Read an error frame; bytes that are missing count as zero.
+    """Parse an error frame; missing bytes are zero.
 
     Args:
-        kind: The classes in its identifier.
-        data: Up to eight bytes.
+        kind: Error classes, from its identifier.
+        data: At most eight bytes.
     """
     detail = bytes(data[:8]).ljust(8, b"\0")
     counters = (detail[6], detail[7]) if kind & COUNTERS or (kind & CONTROLLER and any(detail[6:])) else None
@@ -100,7 +100,7 @@ def _controller(kind: int, detail: bytes, counters: tuple[int, int] | None) -> C
 
 def _text(kind: int, detail: bytes) -> str:
     if kind & NO_ACKNOWLEDGE:
-        return "Nobody acknowledges. Is any node powered, is the cable in?"
+        return "No node acknowledges frames. Is any node powered, is the cable in?"
     if kind & CONTROLLER:
         if detail[1] & _RX_OVERFLOW:
             return "The controller's receive buffer overflowed, frames were lost. Is this machine overloaded?"
@@ -109,8 +109,8 @@ def _text(kind: int, detail: bytes) -> str:
     if kind & TRANSCEIVER:
         return f"The transceiver reports a fault of the wires ({detail[4]:02X}h)."
     if kind & PROTOCOL:
-        found = [text for bit, text in _VIOLATIONS.items() if detail[2] & bit]
-        return f"Frames are disturbed: {', '.join(found) or 'the protocol was violated'}. Check wiring and termination."
+        violations = [text for bit, text in _VIOLATIONS.items() if detail[2] & bit] or ["the protocol was violated"]
+        return f"Frames are disturbed: {', '.join(violations)}. Check wiring and termination."
     if kind & BUS_ERROR:
         return "Frames are disturbed. Check wiring, termination and bit rate."
     if kind & TX_TIMEOUT:

@@ -1,4 +1,4 @@
-"""SDO transfers: requests and answers as bytes, reading an object of any length, abort codes.
+"""SDO transfers: requests, answers, reading of an object of any length, abort codes.
 
 Source: CiA 301, version 4.2: 7.2.4 (SDO), table 22 (abort codes).
 """
@@ -9,10 +9,10 @@ HEAD = struct.Struct("<BHB")
 """Command, index, sub-index."""
 LENGTH = 8
 MOST_BYTES = 4096
-"""A longer object is not taken: a node that never ends its segments must not fill the memory."""
+"""A longer object is refused, because a node that never ends its segments must not fill the memory."""
 
 UPLOAD = 2
-"""Upper three bits of an answer that begins the reading of an object."""
+"""The first answer of an upload has this value in its upper three bits."""
 _ABORT = 4
 _READ, _SEGMENT = 0x40, 0x60
 
@@ -42,23 +42,23 @@ ABORTS = {
 
 
 def describe_abort(code: int) -> str:
-    """An abort code in words, as `06020000h, there is no such object`."""
+    """Return an abort code in words, as `06020000h, there is no such object`."""
     return f"{code:08X}h, {ABORTS.get(code, 'see CiA 301, table 22')}"
 
 
 def expedited(data: bytes | bytearray) -> bytes:
-    """The value in an expedited transfer of 8 bytes."""
+    """Return the value in an expedited transfer of 8 bytes."""
     size = 4 - (data[0] >> 2 & 3) if data[0] & 1 else 4
     return bytes(data[4 : 4 + size])
 
 
 class Upload:
-    """Reading one object, without I/O: send `request`, feed the answers, and send again what is then `request`.
+    """The reading of one object, without I/O: send `request`, pass the answer to `answer`, and repeat until `is_done`.
 
     Attributes:
-        request: What to send, 8 bytes; sent again if no answer comes.
-        value: The object's bytes once they are all there, else None.
-        refused: Why the node does not tell; empty while it does.
+        request: Next request, 8 bytes; send it again if no answer comes.
+        value: The object's bytes when they are complete, else None.
+        refused: Reason of a refusal; empty without one.
     """
 
     def __init__(self, index: int, subindex: int) -> None:
@@ -66,25 +66,25 @@ class Upload:
         self.value: bytes | None = None
         self.refused = ""
         self.request = HEAD.pack(_READ, index, subindex).ljust(LENGTH, b"\0")
-        self._gathered = bytearray()
+        self._content = bytearray()
         self._toggle: int | None = None
 
     @property
     def is_done(self) -> bool:
-        """Whether nothing more is to be sent."""
+        """Whether the reading has ended."""
         return self.value is not None or bool(self.refused)
 
     def answer(self, data: bytes | bytearray) -> bool:
-        """Take an answer; whether it was one to `request`. What belongs to anything else is passed over."""
+        """Take an answer; ignore it and return False if it is not an answer to `request`."""
         if len(data) != LENGTH or self.is_done:
             return False
         command = data[0] >> 5
-        names_it = struct.unpack_from("<HB", data, 1) == (self.index, self.subindex)
-        if command == _ABORT and names_it:
+        is_of_object = struct.unpack_from("<HB", data, 1) == (self.index, self.subindex)
+        if command == _ABORT and is_of_object:
             self.refused = describe_abort(int.from_bytes(data[4:], "little"))
             return True
         if self._toggle is None:
-            return command == UPLOAD and names_it and self._begin(data)
+            return command == UPLOAD and is_of_object and self._begin(data)
         return command == 0 and data[0] >> 4 & 1 == self._toggle and self._take(data)
 
     def _begin(self, data: bytes | bytearray) -> bool:
@@ -96,10 +96,10 @@ class Upload:
         return True
 
     def _take(self, data: bytes | bytearray) -> bool:
-        self._gathered += data[1 : LENGTH - (data[0] >> 1 & 7)]
+        self._content += data[1 : LENGTH - (data[0] >> 1 & 7)]
         if data[0] & 1:
-            self.value = bytes(self._gathered)
-        elif len(self._gathered) > MOST_BYTES:
+            self.value = bytes(self._content)
+        elif len(self._content) > MOST_BYTES:
             self.refused = f"it does not end after {MOST_BYTES} bytes"
         else:
             self._toggle = 1 - (self._toggle or 0)

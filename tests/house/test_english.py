@@ -15,7 +15,6 @@ NOT_YET = {
     "hal/calibration",
     "hal/commissioning",
     "hal/finding",
-    "hal/protocols",
     "services/errors.py",
     "services/health.py",
     "services/runtime.py",

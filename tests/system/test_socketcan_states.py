@@ -67,7 +67,7 @@ pytestmark = pytest.mark.timeout(600)
         ("sp128000", "ERROR-PASSIVE", "passive", "error passive"),
         ("sw000100", "ERROR-WARNING", "warning", "counts many errors"),
         ("sa000000", "ERROR-ACTIVE", "ok", ""),
-        ("e1a", "ERROR-ACTIVE", "warning", "Nobody acknowledges"),
+        ("e1a", "ERROR-ACTIVE", "warning", "No node acknowledges"),
         ("e1o", "ERROR-ACTIVE", "warning", "overflowed"),
     ],
 )
