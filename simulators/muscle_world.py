@@ -18,7 +18,7 @@ from simulators.bullet import BulletBody
 from simulators.faults import MUSCLE_CUT, check_part
 from simulators.muscle_body import Body, Friction, Servo
 from simulators.muscle_kernels import held, pull
-from simulators.world import World
+from simulators.world import World, servo_index
 
 
 class MuscleWorld(World):
@@ -92,11 +92,7 @@ class MuscleWorld(World):
     @override
     def drive(self, element: str, target: float, enabled: bool) -> None:
         """Set the target of a servo; its element is its muscle's length."""
-        index = self._muscles.get(element)
-        if index is None:
-            raise KeyError(f"No servo moves '{element}'. Known servos: {', '.join(self._muscles)}.")
-        if not math.isfinite(target):
-            raise ValueError(f"The set-point of '{element}' is {target}; it must be a length in metres.")
+        index = servo_index(self._muscles, element, target, "a length in metres")
         self._target[index] = target + self._body.slack[index]
         if self._follows[index] != enabled:
             self._follows[index] = enabled

@@ -1,5 +1,6 @@
 """Contract of a simulated physics, which nodes and the direct backend read, drive and break."""
 
+import math
 from collections.abc import Mapping
 from typing import Protocol
 
@@ -39,3 +40,13 @@ class World(Protocol):
     def close(self) -> None:
         """Release the physics engine. Safe to call twice."""
         ...
+
+
+def servo_index(servos: Mapping[str, int], element: str, target: float, kind: str = "an angle in radians") -> int:
+    """Check a set-point and return the index of the servo that moves the element."""
+    index = servos.get(element)
+    if index is None:
+        raise KeyError(f"No servo moves '{element}'. Known servos: {', '.join(servos)}.")
+    if not math.isfinite(target):
+        raise ValueError(f"The set-point of '{element}' is {target}; it must be {kind}.")
+    return index

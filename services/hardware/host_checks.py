@@ -82,19 +82,20 @@ def real_time() -> Iterator[Finding]:
 
 def _try_fifo() -> str:
     """Return why a thread of this process cannot have real-time priority; empty if it can."""
-    refusals = []
+    refusal = ""
 
     def attempt() -> None:
+        nonlocal refusal
         try:
             flags = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
             os.sched_setscheduler(0, flags, os.sched_param(CYCLE_PRIORITY))
         except OSError as error:
-            refusals.append(error.strerror or str(error))
+            refusal = error.strerror or str(error)
 
     thread = threading.Thread(target=attempt)
     thread.start()
     thread.join()
-    return refusals[0] if refusals else ""
+    return refusal
 
 
 def _governors() -> list[str]:

@@ -6,15 +6,17 @@ Needs a running stack (`gemuco hal`, `gemuco serve`) on this machine. The same r
 """
 
 import argparse
+import contextlib
 import subprocess
 import sys
 import threading
 import time
+from collections.abc import Sequence
 
 import msgspec
 import viser
 from websockets.exceptions import ConnectionClosed
-from websockets.sync.client import ClientConnection, connect
+from websockets.sync.client import connect
 
 from services.client import Client
 from services.wire.messages import Status
@@ -28,21 +30,24 @@ CAMERA = {
 }  # fmt: skip
 
 
-def browser() -> tuple[ClientConnection, list[int]]:
-    """Connect a browser that reads everything; return it and the count of its bytes."""
-    page = connect(f"ws://127.0.0.1:{PORT}", subprotocols=[f"viser-v{viser.__version__}"], max_size=None)  # type: ignore[list-item]
-    page.send(msgspec.msgpack.encode(CAMERA))
-    got = [0]
+class Browser:
+    """A browser that reads everything.
 
-    def read() -> None:
-        while True:
-            try:
-                got[0] += len(page.recv())
-            except ConnectionClosed:
-                return
+    Attributes:
+        page: Its connection.
+        received: Number of bytes received so far.
+    """
 
-    threading.Thread(target=read, daemon=True).start()
-    return page, got
+    def __init__(self) -> None:
+        self.page = connect(f"ws://127.0.0.1:{PORT}", subprotocols=[f"viser-v{viser.__version__}"], max_size=None)  # type: ignore[list-item]
+        self.page.send(msgspec.msgpack.encode(CAMERA))
+        self.received = 0
+        threading.Thread(target=self._read, daemon=True).start()
+
+    def _read(self) -> None:
+        with contextlib.suppress(ConnectionClosed):
+            while True:
+                self.received += len(self.page.recv())
 
 
 def counted(client: Client) -> tuple[dict[str, float], dict[str, float]]:
@@ -56,16 +61,17 @@ def counted(client: Client) -> tuple[dict[str, float], dict[str, float]]:
     return ticks, skips
 
 
-def measure(client: Client, pids: dict[str, int], label: str, seconds: float, got: list[list[int]]) -> None:
+def measure(client: Client, pids: dict[str, int], label: str, seconds: float, browsers: Sequence[Browser]) -> None:
     """Print CPU, ticks and skips of every service over a time span [s], and the bytes that each browser got."""
     ticks, skips = counted(client)
-    before, began, bytes_before = {n: cpu(p) for n, p in pids.items()}, time.monotonic(), sum(count[0] for count in got)
+    before, began = {n: cpu(p) for n, p in pids.items()}, time.monotonic()
+    bytes_before = sum(browser.received for browser in browsers)
     time.sleep(seconds)
     took = time.monotonic() - began
     used = {n: 100 * (cpu(p) - before[n]) / took for n, p in pids.items()}
     later, skipped = counted(client)
     cells = [f"{used[n]:5.1f} %  {later[n] - ticks[n]:6.0f} / {skipped[n] - skips[n]:3.0f}" for n in SERVICES]
-    sent = (sum(count[0] for count in got) - bytes_before) / took / 1e3 / max(1, len(got))
+    sent = (sum(browser.received for browser in browsers) - bytes_before) / took / 1e3 / max(1, len(browsers))
     print(f"{label:16} {'   '.join(cells)}   {used.get('view', 0.0):5.1f} %   {sent:6.1f} kB/s", flush=True)
 
 
@@ -80,16 +86,16 @@ def main() -> None:
         print(f"{'':16} {'   '.join(f'{n}: CPU, ticks / skips' for n in SERVICES)}   view     per page")
         measure(client, pids, "no page server", options.seconds, [])
         view = subprocess.Popen([sys.executable, "-m", "services.cli", "view", options.robot, "--port", str(PORT)])
-        pages: list[tuple[ClientConnection, list[int]]] = []
+        browsers: list[Browser] = []
         try:
             time.sleep(10.0)
             for count in (0, 1, 5):
-                pages += [browser() for _ in range(count - len(pages))]
+                browsers += [Browser() for _ in range(count - len(browsers))]
                 time.sleep(2.0)
-                measure(client, pids | {"view": view.pid}, f"{count} browsers", options.seconds, [p[1] for p in pages])
+                measure(client, pids | {"view": view.pid}, f"{count} browsers", options.seconds, browsers)
         finally:
-            for page, _ in pages:
-                page.close()
+            for browser in browsers:
+                browser.page.close()
             view.terminate()
             view.wait(20.0)
         measure(client, pids, "no page server", options.seconds, [])

@@ -41,34 +41,26 @@ class AnalogConstants:
 
 
 class AnalogInput(CanopenNode):
-    """Every input is read in three types at once: 16 bit, 32 bit, and volt as a floating point number."""
+    """Inputs that are read in three types at once: 16 bit, 32 bit, and volt as a floating point number.
+
+    A broken converter reads its lower end.
+    """
 
     def __init__(self, spec: NodeSpec, plant: Plant, outbox: list[Frame]) -> None:
         assert isinstance(spec.constants, AnalogConstants)
         self._constants = spec.constants
         elements = enumerate((spec.element, *spec.constants.more), 1)
         self._cells = [(channel, element) for channel, element in elements if element]
-        self._is_broken = False
         super().__init__(spec, plant, outbox)
-
-    @override
-    def restart(self) -> None:
-        self._is_broken = False
-
-    @override
-    def break_down(self) -> None:
-        """Let the converter read its lower end from now on."""
-        super().break_down()
-        self._is_broken = True
 
     def sample(self) -> None:
         """Measure every channel that has a cell; the others read zero."""
         values = self.objects.values
-        status = _BROKEN if self._is_broken else 0
+        status = _BROKEN if self.is_broken else 0
         half = 1 << self._constants.bits - 1
         for channel, element in self._cells:
             share = (self.plant.read(element) + self._constants.unbalance) / self._constants.full_scale
-            if self._is_broken or math.isnan(share):
+            if self.is_broken or math.isnan(share):
                 share = -math.inf
             counts = round(max(-1.0, min(share, 1.0)) * half)
             if not -half < counts < half - 1:

@@ -29,7 +29,6 @@ class LoadCell(CanopenNode):
         self._constants = spec.constants
         elements = enumerate((spec.element, *spec.constants.more), 1)
         self._cells = [(channel, element) for channel, element in elements if element]
-        self._is_broken = False
         super().__init__(spec, plant, outbox)
         constants = self._constants
         for channel in range(1, CHANNELS + 1):
@@ -42,15 +41,6 @@ class LoadCell(CanopenNode):
         self.objects.on_write[0x6125] = self._tare
 
     @override
-    def restart(self) -> None:
-        self._is_broken = False
-
-    @override
-    def break_down(self) -> None:
-        super().break_down()
-        self._is_broken = True
-
-    @override
     def sample(self) -> None:
         """Measure; a channel without a cell stays as at power-on."""
         for channel, element in self._cells:
@@ -60,7 +50,7 @@ class LoadCell(CanopenNode):
         """Bring field value and process value of a channel up to date; its status."""
         values = self.objects.values
         force = self.plant.read(element) + self._constants.unbalance
-        if math.isnan(force) or self._is_broken or not values[0x6112, channel]:
+        if math.isnan(force) or self.is_broken or not values[0x6112, channel]:
             return NOT_VALID
         capacity = self._constants.capacity
         field_value = round(min(max(force, -capacity), capacity) * self._constants.counts_per_newton)

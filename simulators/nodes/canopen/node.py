@@ -55,6 +55,8 @@ class CanopenNode(SimulatedNode):
         self.is_powered = False
         self.is_muted = False
         """Sends no process data any more: its sensor is dead, its electronics are not."""
+        self.is_broken = False
+        """It reported a fault of its own since power-on."""
         self._heartbeat_due = 0.0
         self._watched: dict[int, tuple[float, float | None]] = {}
         self._now = 0.0
@@ -82,20 +84,21 @@ class CanopenNode(SimulatedNode):
 
     def break_down(self) -> None:
         """Report a fault of the device's own."""
+        self.is_broken = True
         self.emergency(HARDWARE, GENERIC)
 
     def power_up(self, now: float) -> None:
         """Start anew with the values of power-on and report with a boot-up message."""
         self._now = now
         self.is_powered = True
-        self.is_muted = False
+        self.is_muted = self.is_broken = False
         self.objects.restore()
         self.restart()
         self._boot()
 
     def power_down(self) -> None:
         """Fall silent at once."""
-        self.is_powered = False
+        self.is_powered = self.is_broken = False
         self.nmt = Nmt.BOOT
         self.restart()
 

@@ -11,7 +11,7 @@ from simulators.robots.kxr_humanoid.body import REST, Body
 from simulators.robots.kxr_humanoid.eye import PIXEL, POSITION, Eye
 from simulators.robots.kxr_humanoid.feet import center_of, foot_forces
 from simulators.robots.kxr_humanoid.statics import rest
-from simulators.world import World
+from simulators.world import World, servo_index
 
 COMMAND, FORCE, CENTER = "joint_position", "foot_force", "center_of_gravity"
 JOINTS = ("shoulder_pitch", "shoulder_yaw", "elbow_pitch", "ankle_pitch")
@@ -84,11 +84,7 @@ class HumanoidWorld(World):
     @override
     def drive(self, element: str, target: float, enabled: bool) -> None:
         """Set the target of a servo; without power it is held by the friction of its gear."""
-        index = self._servos.get(element)
-        if index is None:
-            raise KeyError(f"No servo moves '{element}'. Known servos: {', '.join(self._servos)}.")
-        if not math.isfinite(target):
-            raise ValueError(f"The set-point of '{element}' is {target}; it must be an angle in radians.")
+        index = servo_index(self._servos, element, target)
         self._target[index] = target
         self._follows[index] = enabled
 

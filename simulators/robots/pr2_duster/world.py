@@ -16,7 +16,7 @@ from simulators.faults import changed_tool, check_condition
 from simulators.robots.pr2_duster.body import FASTEST, LAG, REST, URDF, Body, chain
 from simulators.robots.pr2_duster.camera import SIGNAL, DepthCamera
 from simulators.robots.pr2_duster.duster import GRASPS, Grasp
-from simulators.world import World
+from simulators.world import World, servo_index
 
 
 class DusterWorld(World):
@@ -74,11 +74,7 @@ class DusterWorld(World):
     @override
     def drive(self, element: str, target: float, enabled: bool) -> None:
         """Set the target of a servo; its element is its joint's position."""
-        index = self._servos.get(element)
-        if index is None:
-            raise KeyError(f"No servo moves '{element}'. Known servos: {', '.join(self._servos)}.")
-        if not math.isfinite(target):
-            raise ValueError(f"The set-point of '{element}' is {target}; it must be an angle in radians.")
+        index = servo_index(self._servos, element, target)
         self._target[index] = target + self._body.zero[index]
         self._follows[index] = enabled
 
