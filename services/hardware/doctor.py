@@ -24,7 +24,7 @@ from services.process.lock import instead_of
 from services.wire import keys
 from services.wire.connect import certificate_end, expiry_warning, exposure_warning, role_file, split_connect
 from services.wire.messages import Status
-from services.wire.session import port
+from services.wire.session import is_loopback, port
 
 APPEARS_WITHIN = 3.0
 """The status of a running HAL arrives within this time [s]."""
@@ -168,7 +168,7 @@ def _network(config: RobotConfig, connect: tuple[str, ...]) -> Iterator[Finding]
     ports = {port(config.robot, service) for service in keys.SERVICES}
     outside: dict[str, set[int]] = {"tcp": set(), "udp": set()}
     for protocol, address, number in listening():
-        if number in ports and not _is_loopback(address):
+        if number in ports and not is_loopback(address):
             outside[protocol].add(number)
     if outside["tcp"]:
         numbers = ", ".join(map(str, sorted(outside["tcp"])))
@@ -198,7 +198,3 @@ def _address(text: str) -> str:
     """Convert an address from /proc: words of four bytes in the machine's byte order."""
     raw = b"".join(struct.pack("=I", int(text[start : start + 8], 16)) for start in range(0, len(text), 8))
     return socket.inet_ntop(socket.AF_INET if len(raw) == 4 else socket.AF_INET6, raw)
-
-
-def _is_loopback(address: str) -> bool:
-    return address.startswith("127.") or address in ("::1", "::ffff:127.0.0.1")

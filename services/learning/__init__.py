@@ -1,1 +1,1 @@
-"""From a robot that moves to a model of it."""
+"""Collection of training data, and training of a model."""

@@ -1,1 +1,1 @@
-"""What was said on the wire, in files: written, read, replayed, exported."""
+"""Recordings of all messages of a robot: writing, reading, replay, export."""

@@ -1,1 +1,1 @@
-"""Who may enter, and what each may do there: roles, certificates, role files, and the proof that they hold."""
+"""Access to robots: certificates, role files, access control, and attacks that test them."""

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from services.errors import ServiceError
 from services.wire.member import ALL, Member
 from services.wire.roles import PEOPLE, ROLES, ROUTER
-from services.wire.session import ROUTER_PORT
+from services.wire.session import ROUTER_PORT, is_loopback
 
 FILE = "plan.json"
 LISTENING = ("simulator", "hal", "vision", "model")
@@ -141,14 +141,6 @@ def is_host(text: str) -> bool:
     except ValueError:
         return bool(_HOST.fullmatch(text))
     return True
-
-
-def is_loopback(host: str) -> bool:
-    """Whether only this machine can reach the host."""
-    try:
-        return ipaddress.ip_address(host.strip("[]")).is_loopback
-    except ValueError:
-        return host == "localhost"
 
 
 def dialled(host: str, port: str | int) -> str:

@@ -1,11 +1,7 @@
 """Whether this page has buttons: only for an operator, and only where nobody else can press them."""
 
 from services.wire.member import Member
-
-
-def is_loopback(host: str) -> bool:
-    """Whether only this machine reaches a server that is bound there."""
-    return host.startswith("127.") or host in ("localhost", "::1")
+from services.wire.session import is_loopback
 
 
 def why_read_only(member: Member, robot: str, host: str) -> str:

@@ -10,10 +10,11 @@ from services.model import artifacts
 from services.process.service import until_stopped
 from services.view.controls import Controls
 from services.view.page import Page, serve_page
-from services.view.role import is_loopback, why_read_only
+from services.view.role import why_read_only
 from services.view.site import open_site
 from services.view.watch import Watch
 from services.wire.member import member_of
+from services.wire.session import is_loopback
 
 
 def view(

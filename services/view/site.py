@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from services.errors import ServiceError
-from services.view.role import is_loopback
+from services.wire.session import is_loopback
 
 if TYPE_CHECKING:
     import viser

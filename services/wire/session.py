@@ -6,6 +6,7 @@ nothing leaves the machine unless `connect` says so. Its items are endpoints, su
 (`tcp/192.168.0.5:7447`), and role files of `gemuco security init`: zenoh configurations that are merged into ours.
 """
 
+import ipaddress
 import json
 import logging
 import secrets
@@ -58,6 +59,17 @@ def address(robot: str) -> str:
     """
     rest = zlib.crc32(robot.encode()) // PORT_GROUPS
     return f"127.{1 + (rest >> 16)}.{rest >> 8 & 255}.{rest & 255}"
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine can reach the host."""
+    try:
+        number = ipaddress.ip_address(host.strip("[]"))
+    except ValueError:
+        return host == "localhost"
+    if isinstance(number, ipaddress.IPv6Address) and number.ipv4_mapped is not None:
+        number = number.ipv4_mapped
+    return number.is_loopback
 
 
 def endpoint(robot: str, service: str) -> str:

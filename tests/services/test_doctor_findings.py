@@ -10,6 +10,7 @@ from services.hardware import doctor, host_checks
 from services.security.init import init, placed
 from services.security.plan import InstallationPlan
 from services.wire.messages import Status
+from services.wire.session import is_loopback
 
 BUS = {"state": "ok", "text": "", "load": 0.41, "unknown": []}
 DEVICE = {"state": "ready", "text": "", "counters": {}}
@@ -60,8 +61,8 @@ def test_a_hal_that_is_not(changes: dict[str, object], what: str, verdict: Verdi
 def test_open_ports_are_seen_with_their_addresses() -> None:
     with socket.create_server(("127.0.0.1", 0)) as inside, socket.create_server(("0.0.0.0", 0)) as outside:
         ports = {number: address for protocol, address, number in doctor.listening() if protocol == "tcp"}
-        assert doctor._is_loopback(ports[inside.getsockname()[1]])
-        assert not doctor._is_loopback(ports[outside.getsockname()[1]])
+        assert is_loopback(ports[inside.getsockname()[1]])
+        assert not is_loopback(ports[outside.getsockname()[1]])
     with socket.socket(type=socket.SOCK_DGRAM) as outside:
         outside.bind(("0.0.0.0", 0))
         assert ("udp", "0.0.0.0", outside.getsockname()[1]) in doctor.listening()

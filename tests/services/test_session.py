@@ -14,6 +14,7 @@ from services.wire.session import (
     address,
     close_session,
     endpoint,
+    is_loopback,
     open_session,
     port,
     settings,
@@ -37,6 +38,17 @@ def test_robots_whose_ports_are_the_same_by_chance_live_beside_each_other() -> N
     sessions = [open_session(name, "hal") for name in (one, other)]
     for session in sessions:
         close_session(session)
+
+
+@pytest.mark.parametrize(
+    ("host", "expected"),
+    [
+        *((host, True) for host in ("127.0.0.1", "127.3.2.1", "::1", "[::1]", "::ffff:127.0.0.1", "localhost")),
+        *((host, False) for host in ("0.0.0.0", "::", "192.168.0.5", "127.example.org", "robot", "")),
+    ],
+)
+def test_loopback_is_known_by_its_number(host: str, expected: bool) -> None:
+    assert is_loopback(host) is expected
 
 
 def test_a_thousand_robots_have_endpoints_of_their_own_on_loopback() -> None:
