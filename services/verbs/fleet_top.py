@@ -1,7 +1,9 @@
-"""`gemuco top` without a robot: all robots of a network in one table, trouble first."""
+"""`gemuco top` without a robot: all robots of a network in one table, the worst first."""
 
+import math
 import time
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
@@ -9,23 +11,21 @@ from rich.table import Table
 from rich.text import Text
 
 from services import show
-from services.verbs.fleet_watch import SILENT_AFTER, FleetWatch, Glance, Level
+from services.client.live import FRESH_STATUS
+from services.verbs.top import STYLES
+from services.watch.fleet_watch import FleetWatch
+from services.watch.service_rows import Level, service_rows
+from services.watch.snapshot import Snapshot
+from services.watch.trouble import HEALTHY, Trouble, troubles, verdict
+from services.wire import keys
 from services.wire.plain_text import plain
 
 REFRESH = 0.5
+"""The terminal is written at this interval [s]."""
 FIRST_WAIT = 2.5
-"""How long [s] to wait for the first statuses when printing only once."""
-STYLES = {
-    Level.GOOD: "green",
-    Level.DEGRADED: "yellow",
-    Level.ANOMALY: "bold yellow",
-    Level.TROUBLE: "bold red",
-    Level.GONE: "red",
-}
-LATE = 0.02
-"""Lateness of a loop [s] that is worth a color."""
+"""`--once` waits at most this time [s] for the first statuses."""
 LONGEST = 200
-"""Letters of a sentence that are shown."""
+"""At most this number of letters of a sentence is shown."""
 
 
 def watch_fleet(once: bool, connect: Iterable[str], console: Console | None = None) -> int:
@@ -34,85 +34,108 @@ def watch_fleet(once: bool, connect: Iterable[str], console: Console | None = No
     Args:
         once: Print once, without taking over the terminal.
         connect: Endpoints, such as a router's, and role files; without any the robots of this machine are shown.
-        console: Where to print.
+        console: Output; standard output if not given.
 
     Returns:
-        0 if there are robots and none of them is in trouble, has an anomaly or has gone; else 1.
+        0 if there are robots, and all of them are good or degraded; else 1.
 
     Raises:
-        ServiceUnavailable: The router is not there.
+        ServiceUnavailable: The router does not answer.
     """
     console = console or show.console()
     where = tuple(connect)
     with FleetWatch(where) as fleet:
         if once:
             deadline = time.monotonic() + FIRST_WAIT
-            while not fleet.is_told() and time.monotonic() < deadline:
+            while not fleet.is_complete() and time.monotonic() < deadline:
                 time.sleep(0.05)
-            glances = fleet.glances()
-            console.print(view(glances, fleet, where))
-            return 0 if glances and max(one.level for one in glances) < Level.ANOMALY else 1
+            robots = ranked(fleet.snapshots())
+            console.print(view(robots, fleet, where))
+            return 0 if robots and robots[0][1].level < Level.ANOMALY else 1
         with Live(console=console, screen=console.is_terminal, auto_refresh=False) as live:
             while True:
                 fleet.look()
-                live.update(view(fleet.glances(), fleet, where), refresh=True)
+                live.update(view(ranked(fleet.snapshots()), fleet, where), refresh=True)
                 time.sleep(REFRESH)
 
 
-def view(glances: Sequence[Glance], fleet: FleetWatch, connect: Sequence[str]) -> RenderableType:
-    """The table, or why there is none."""
+def ranked(snapshots: Iterable[Snapshot]) -> list[tuple[Snapshot, Trouble]]:
+    """Return each robot with its worst trouble, the worst robot first, then by name."""
+    robots = [(snapshot, next(iter(troubles(snapshot)), HEALTHY)) for snapshot in snapshots]
+    return sorted(robots, key=lambda robot: (-robot[1].level, robot[0].robot))
+
+
+def view(robots: Sequence[tuple[Snapshot, Trouble]], fleet: FleetWatch, connect: Sequence[str]) -> RenderableType:
+    """Return the table, or the reason why there is none."""
     notes = []
     if not fleet.has_router:
-        notes.append(Text(f"No link to {', '.join(connect)}: what is shown is old.", style="bold red"))
+        notes.append(Text(f"No link to {', '.join(connect)}: the table is old.", style="bold red"))
     if fleet.rejected:
         notes.append(Text(f"{fleet.rejected} messages could not be read.", style="yellow"))
     if fleet.strange:
-        notes.append(Text(f"{fleet.strange} messages are of no service or of too many robots.", style="yellow"))
-    if not glances:
+        notes.append(Text(f"{fleet.strange} messages are of unknown services or of too many robots.", style="yellow"))
+    if not robots:
         place = f"through {', '.join(connect)}" if connect else "on this machine; others are behind a router: --connect"
         return Group(*notes, Text(f"No robot is seen {place}."))
-    return Group(*notes, table(glances))
+    return Group(*notes, table(robots))
 
 
-def table(glances: Sequence[Glance]) -> Table:
-    """A row for each robot, in the order given."""
-    counts = {level: sum(one.level == level for one in glances) for level in reversed(Level)}
-    told = ", ".join(f"{count} {level.name.lower()}" for level, count in counts.items() if count)
-    found = Table(title=f"{len(glances)} robots: {told}", title_justify="left", expand=True)
-    found.add_column("robot", no_wrap=True)
-    found.add_column("health", no_wrap=True)
-    for column in ("services", "motors", "who commands"):
-        found.add_column(column)
-    found.add_column("meas/est/none", justify="right", no_wrap=True)
-    found.add_column("anomaly")
-    found.add_column("worst late ms", justify="right")
-    found.add_column("heard s", justify="right")
-    found.add_column("what is wrong", ratio=1, min_width=20)
-    for one in glances:
-        found.add_row(*_row(one))
-    return found
+def table(robots: Sequence[tuple[Snapshot, Trouble]]) -> Table:
+    """Return one row per robot, in the order given."""
+    counts = {level: sum(worst.level == level for _, worst in robots) for level in reversed(Level)}
+    summary = ", ".join(f"{count} {level.name.lower()}" for level, count in counts.items() if count)
+    table = Table(title=f"{len(robots)} robots: {summary}", title_justify="left", expand=True)
+    table.add_column("robot", no_wrap=True)
+    table.add_column("health", no_wrap=True)
+    for column in ("services", "motors", "lease holder"):
+        table.add_column(column)
+    table.add_column("meas/est/none", justify="right", no_wrap=True)
+    table.add_column("anomaly")
+    table.add_column("worst late ms", justify="right")
+    table.add_column("heard s", justify="right")
+    table.add_column("what is wrong", ratio=1, min_width=20)
+    for snapshot, worst in robots:
+        table.add_row(*_row(snapshot, worst))
+    return table
 
 
-def _row(one: Glance) -> list[Text | str]:
-    style = STYLES[one.level]
-    measured = "-" if one.measured is None else "/".join(map(str, one.measured))
-    late = Text("-")
-    if one.late is not None:
-        late = Text(f"{1e3 * one.late[0]:.1f} {plain(one.late[1], 20)}", style="yellow" if one.late[0] > LATE else "")
+def _row(snapshot: Snapshot, worst: Trouble) -> list[Text | str]:
+    style = STYLES[worst.level]
+    counts, judged = _signal_counts(snapshot), verdict(snapshot)
+    holder = snapshot.lease_holder
+    age = snapshot.age
     return [
-        _said(one.robot, style),
-        Text(one.level.name.lower(), style=style),
-        " ".join(one.services) or "-",
-        _said(one.motors),
-        _said(one.holder),
-        Text(measured, style="yellow" if one.measured is not None and any(one.measured[1:]) else ""),
-        _said(one.anomaly, "bold yellow" if one.level == Level.ANOMALY else ""),
-        late,
-        Text(f"{one.age:.1f}", style="red" if one.age > SILENT_AFTER else ""),
-        _said(one.text, style) if one.text else "",
+        _plain(snapshot.robot, style),
+        Text(worst.level.name.lower(), style=style),
+        " ".join(name for name in keys.SERVICES if name in snapshot.alive) or "-",
+        _plain(snapshot.motors),
+        _plain("" if holder in ("none", "not known") else holder),
+        Text("/".join(map(str, counts)) or "-", style="yellow" if any(counts[1:]) else ""),
+        _plain("" if judged is None else str(judged), style if judged is not None and judged.is_anomaly else ""),
+        _worst_loop(snapshot),
+        Text(f"{age:.1f}" if math.isfinite(age) else "-", style="red" if age > FRESH_STATUS else ""),
+        _plain(str(worst), style) if worst.level > Level.GOOD else "",
     ]
 
 
-def _said(text: str, style: str = "") -> Text:
-    """What came from elsewhere: no markup, nothing that steers a terminal, and not without end."""
+def _signal_counts(snapshot: Snapshot) -> tuple[int, ...]:
+    """Return the numbers of signals that are measured, estimated and neither; empty if the model publishes none."""
+    facts = snapshot.facts("model").get("signals")
+    counts: list[Any] = []
+    if isinstance(facts, dict):
+        counts = [facts.get(name) for name in ("measured", "estimated", "none")]
+    return tuple(counts) if all(isinstance(count, int) for count in counts) else ()
+
+
+def _worst_loop(snapshot: Snapshot) -> Text:
+    """Return the largest lateness of a loop in the last second, and the loop."""
+    loops = [loop for row in service_rows(snapshot) if row.is_present for loop in row.loops if loop.worst >= 0]
+    worst = max(loops, key=lambda loop: loop.worst, default=None)
+    if worst is None:
+        return Text("-")
+    return Text(f"{1e3 * worst.worst:.1f} {plain(worst.name, 20)}", style="yellow" if worst.is_late else "")
+
+
+def _plain(text: str, style: str = "") -> Text:
+    """Return text of another program without markup or control characters, and not longer than 200 letters."""
     return Text(plain(text, LONGEST) or "-", style=style)

@@ -35,7 +35,7 @@ class Map:
 def project(biases: Mapping[str, Sequence[float]], way: np.ndarray) -> Map | None:
     """Lay the conditions and the way of p, shape (k, size), out in the plane; None where there is no p.
 
-    More than two dimensions are seen along the two in which the conditions differ most.
+    More than two dimensions are projected on the two in which the conditions differ most.
     """
     points = np.array([np.asarray(bias, float) for bias in biases.values()])
     if points.ndim != 2 or points.shape[1] == 0:

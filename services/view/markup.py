@@ -1,38 +1,38 @@
-"""What was seen, as HTML; everything that came over the network is escaped."""
+"""Snapshots as HTML; all text that came over the network is escaped."""
 
 import math
 import time
 from collections.abc import Iterator, Sequence
 from html import escape
 
-from services.view.attendance import ServiceRow
-from services.view.banner import Banner, Level
 from services.view.bias_map import Map
 from services.view.controls import Outcome
-from services.view.rows import Kind, Row
-from services.view.seen import Seen
 from services.view.styles import STYLE, numbers, page, table
 from services.view.taught import TaughtFile
+from services.watch.service_rows import Level, ServiceRow
+from services.watch.signal_rows import Kind, SignalRow
+from services.watch.snapshot import Snapshot
+from services.watch.trouble import HEALTHY, Trouble, verdict
 from services.wire.messages import Update
 
 SYMBOLS = {Kind.MEASURED: "●", Kind.ESTIMATED: "◆", Kind.MASKED: "○", Kind.OLD: "◌"}
 DECIMALS = {"rad": 3, "rad/s": 3, "m": 4, "N": 1, "N m": 2, "px": 0, "kg": 3, "degC": 1}
 LEVELS = {
-    Level.OK: ("ok", "✓"), Level.NOTE: ("note", "i"), Level.WARN: ("warn", "!"), Level.BAD: ("bad", "✕"),
-    Level.GONE: ("gone", "◌"),
+    Level.GOOD: ("ok", "✓"), Level.NOTE: ("note", "i"), Level.DEGRADED: ("warn", "!"), Level.ANOMALY: ("bad", "✕"),
+    Level.TROUBLE: ("bad", "✕"), Level.GONE: ("gone", "◌"),
 }  # fmt: skip
 ALSO = 3
-"""So many other troubles are told below the worst one."""
-GOOD, LOST = {"running", "ready"}, {"gone", "fault", "silent"}
+"""At most this number of other troubles is shown below the worst one."""
+TONES = {Level.GOOD: ("good", "●"), Level.DEGRADED: ("poor", "◆"), Level.TROUBLE: ("lost", "✕")}
 
 
 def number(value: float, unit: str) -> str:
-    """A value with as many decimals as its unit deserves; a dash where there is none."""
+    """Return a value with the decimals of its unit; a dash for NaN."""
     return f"{value:.{DECIMALS.get(unit, 3)}f}" if math.isfinite(value) else "–"
 
 
 def age(seconds: float) -> str:
-    """An age in ms, s or min, never longer than seven characters."""
+    """Return an age in ms, s or min, at most seven characters."""
     if not math.isfinite(seconds):
         return "–"
     if seconds < 1.0:
@@ -42,62 +42,53 @@ def age(seconds: float) -> str:
     return f"{seconds / 60.0:.0f} min" if seconds < 6000.0 else "> 1 h"
 
 
-def banner_html(found: Banner) -> str:
-    """The sentence that matters most."""
-    kind, symbol = LEVELS[found.level]
-    also = "".join(f'<div class="also">{escape(line)}</div>' for line in found.also[:ALSO])
-    title = f"<b><i>{symbol}</i>{escape(found.title)}</b>"
-    return STYLE + page(f'<div class="b {kind}">{title}{escape(found.text)}{also}</div>')
+def banner_html(troubles: Sequence[Trouble]) -> str:
+    """Return the worst trouble, and the next ones below it."""
+    worst, *others = troubles or [HEALTHY]
+    kind, symbol = LEVELS[worst.level]
+    also = "".join(f'<div class="also">{escape(str(trouble))}</div>' for trouble in others[:ALSO])
+    title = f"<b><i>{symbol}</i>{escape(worst.title)}</b>"
+    return STYLE + page(f'<div class="b {kind}">{title}{escape(worst.text)}{also}</div>')
 
 
-def facts_html(seen: Seen, source: str, read_only: str, last: Outcome | None) -> str:
-    """Who commands, what the motors do, where the data come from, what was last asked."""
-    mode = seen.mode
+def facts_html(snapshot: Snapshot, source: str, read_only: str, last: Outcome | None) -> str:
+    """Return the mode of the motors, the lease holder, the source of the data and the last request."""
+    mode = snapshot.motors
     tone = {"follow": "good", "hold": "good", "off": "dim", "": "dim", "fault": "lost"}.get(mode, "poor")
-    lines = [("motors", tone, mode or "not known"), ("command", "", _holder(seen)), ("source", "", source)]
+    lines = [("motors", tone, mode or "not known"), ("lease", "", snapshot.lease_holder), ("source", "", source)]
     if read_only:
         lines.append(("buttons", "dim", read_only))
     elif last is None:
-        lines.append(("asked", "dim", "nothing yet"))
+        lines.append(("request", "dim", "none yet"))
     else:
         when = time.strftime("%H:%M:%S", time.localtime(last.at))
-        lines.append(("asked", "good" if last.is_done else "lost", f"{when} {last.text}"))
+        lines.append(("request", "good" if last.is_done else "lost", f"{when} {last.text}"))
     wraps = ' style="white-space:normal"'
     cells = (
-        f'<span>{name}</span><span title="{escape(text)}"{wraps if name in ("asked", "buttons") else ""}>'
+        f'<span>{name}</span><span title="{escape(text)}"{wraps if name in ("request", "buttons") else ""}>'
         f'<span class="{tone}">{escape(text)}</span></span>'
         for name, tone, text in lines
     )
     return page(f'<div class="facts">{"".join(cells)}</div>')
 
 
-def _holder(seen: Seen) -> str:
-    holder = seen.fresh(seen.holder)
-    if holder is None:
-        return "not told"
-    if not holder.holder:
-        return "nobody"
-    return f"{holder.name or f'client {holder.holder}'}, {holder.left:.0f} s left"
-
-
-def signals_html(rows: Sequence[Row]) -> str:
-    """Every element of every signal."""
-    lines = list(_signal_lines(rows)) or ['<tr><td colspan="5" class="dim">No signal was heard of yet.</td></tr>']
+def signals_html(rows: Sequence[SignalRow]) -> str:
+    """Return the table of all elements of all signals."""
+    lines = list(_signal_lines(rows)) or ['<tr><td colspan="5" class="dim">No signal has arrived yet.</td></tr>']
     return page(table((31, 23, 17, 14, 15), ("element", "", ">value", ">± std", ">age"), lines))
 
 
-def _signal_lines(rows: Sequence[Row]) -> Iterator[str]:
+def _signal_lines(rows: Sequence[SignalRow]) -> Iterator[str]:
     for signal in dict.fromkeys(row.signal for row in rows):
         own = [row for row in rows if row.signal == signal]
         origin = next((row for row in own if row.source), None)
-        told = ""
+        recipe = ""
         if origin is not None:
             method = f" ({origin.method})" if origin.method not in ("", "mask") else ""
-            told = escape(f" estimated from {origin.source}{method}")
+            recipe = escape(f" estimated from {origin.source}{method}")
         unit = f"<small>[{escape(own[0].unit)}]</small>"
-        yield (
-            f'<tr class="s"><th colspan="5">{escape(signal)} {unit}<small class="k-estimated">{told}</small></th></tr>'
-        )
+        title = f'{escape(signal)} {unit}<small class="k-estimated">{recipe}</small>'
+        yield f'<tr class="s"><th colspan="5">{title}</th></tr>'
         for row in own:
             word = f'<span class="k-{row.kind}">{SYMBOLS[row.kind]} {row.kind}</span>'
             std = number(row.std, row.unit) if row.kind is Kind.ESTIMATED else ""
@@ -108,71 +99,68 @@ def _signal_lines(rows: Sequence[Row]) -> Iterator[str]:
 
 
 def services_html(services: Sequence[ServiceRow]) -> str:
-    """Who is there, and how the loops keep time."""
+    """Return the table of services and the timing of their loops."""
     heads = ("loop", ">want Hz", ">Hz", ">p99 ms", ">max ms", ">skips")
     lines = (line for service in services for line in _service_lines(service))
     return page(table((28, 15, 15, 14, 15, 13), heads, lines))
 
 
 def _service_lines(service: ServiceRow) -> Iterator[str]:
-    tone = "good" if service.state in GOOD else "lost" if service.state in LOST else "dim"
-    tone = "poor" if tone == "dim" and service.state != "absent" else tone
-    symbol = {"good": "●", "lost": "✕", "dim": "○", "poor": "◆"}[tone]
-    since = "" if service.is_there or not math.isfinite(service.age) else f" heard {age(service.age)} ago"
+    tone, symbol = TONES[service.level]
+    since = "" if service.is_present or not math.isfinite(service.age) else f" heard {age(service.age)} ago"
     yield (
         f'<tr class="s"><th colspan="6">{escape(service.name)} '
         f'<span class="{tone}">{symbol} {escape(service.state)}</span><small>{since}</small></th></tr>'
     )
     for loop in service.loops:
-        is_slow = loop.rate + 1.0 < 0.95 * loop.wanted  # a status covers a second: one tick more or less is no news
-        slow = "!" if service.is_there and is_slow else ""
-        late, worst = f"{1e3 * loop.late:.2f}", f"{1e3 * loop.worst:.2f}"
-        cells = numbers(f"~{loop.wanted:.0f}", f"{slow}{loop.rate:.1f}", late, worst, f"{loop.skipped}")
-        yield f'<tr class="{"" if service.is_there else "k-old"}"><td>{escape(loop.name)}</td>{cells}</tr>'
+        slow, late = ("!" if service.is_present and fault else "" for fault in (loop.is_slow, loop.is_late))
+        p99, worst = f"{1e3 * loop.p99:.2f}", f"{late}{1e3 * loop.worst:.2f}"
+        cells = numbers(f"~{loop.wanted:.0f}", f"{slow}{loop.rate:.1f}", p99, worst, f"{loop.skipped:.0f}")
+        yield f'<tr class="{"" if service.is_present else "k-old"}"><td>{escape(loop.name)}</td>{cells}</tr>'
     if service.text:
         yield f'<tr><td colspan="6" class="dim" style="white-space:normal">{escape(service.text)}</td></tr>'
 
 
-def anomaly_html(seen: Seen) -> str:
-    """The score in words."""
-    anomaly = seen.fresh(seen.anomaly)
-    if anomaly is None or not math.isfinite(anomaly.score):
-        told = "Not judged: no score comes, or it is not known what is normal."
-        return page(f'<div style="min-height:30px" class="dim">{told}</div>')
-    kind = {"anomaly": "lost", "environment": "poor"}.get(anomaly.verdict, "good")
-    word = {"": "nothing to judge", "environment": "environment changed"}.get(anomaly.verdict, anomaly.verdict)
-    blamed = f"{'most likely wrong' if anomaly.is_anomaly else 'contributes most'}: {anomaly.blamed or '–'}"
-    score = f'score <b>{anomaly.score:.1f}</b> <span class="dim">threshold</span> {anomaly.threshold:.1f}'
+def anomaly_html(snapshot: Snapshot) -> str:
+    """Return the anomaly score, the verdict and the blamed element."""
+    judged = verdict(snapshot)
+    if judged is None or not math.isfinite(judged.score):
+        text = "Not judged: no score arrives, or the model has no normal data."
+        return page(f'<div style="min-height:30px" class="dim">{text}</div>')
+    kind = {"anomaly": "lost", "environment": "poor"}.get(judged.kind, "good")
+    word = {"": "nothing to judge", "environment": "environment changed"}.get(judged.kind, judged.kind)
+    blamed = f"{'most likely wrong' if judged.is_anomaly else 'contributes most'}: {judged.blamed or '–'}"
+    score = f'score <b>{judged.score:.1f}</b> <span class="dim">threshold</span> {judged.threshold:.1f}'
     return page(
         f'<div style="display:flex;justify-content:space-between"><span>{score}</span>'
         f'<span class="{kind}">{escape(word)}</span></div><div class="dim">{escape(blamed)}</div>'
     )
 
 
-def bias_html(found: Map | None, picture: str, update: Update | None) -> str:
-    """The bias map with what the update does."""
-    facts = '<span class="dim">update</span> not heard of'
+def bias_html(bias_map: Map | None, picture: str, update: Update | None) -> str:
+    """Return the picture of the bias map, and the state of the online update."""
+    facts = '<span class="dim">update</span> not known'
     if update is not None:
         state = "resting" if not update.active else "learning" if update.settled else "recognising"
         loss = f", loss {update.loss:.4f}" if math.isfinite(update.loss) else ""
         facts = f'<span class="dim">update</span> {state}, model {update.model_version}, window {update.window}{loss}'
         facts += f", W rolled back {update.rolled_back} times" if update.rolled_back else ""
-    if found is None:
-        told = "This model knows one body only: no condition has a p of its own."
-        return page(f'<div>{facts}</div><div class="dim" style="margin-top:8px">{told}</div>')
-    near = "p is not told yet"
-    if found.nearest:
-        near = f"nearest condition: <b>{escape(found.nearest)}</b>"
-        near += f' <span class="dim">at {found.apart:.0%} of the spread</span>'
-    legend = "▫ trained condition   ⊕ p now, and where it came from"
+    if bias_map is None:
+        text = "This model knows one body only: no condition has a p of its own."
+        return page(f'<div>{facts}</div><div class="dim" style="margin-top:8px">{text}</div>')
+    near = "p is not known yet"
+    if bias_map.nearest:
+        near = f"nearest condition: <b>{escape(bias_map.nearest)}</b>"
+        near += f' <span class="dim">at {bias_map.apart:.0%} of the spread</span>'
+    legend = "▫ trained condition   ⊕ p now, and its past"
     return page(f'{picture}<div class="dim" style="white-space:pre">{legend}</div><div>{near}</div><div>{facts}</div>')
 
 
-def teach_html(is_taught: bool, is_moving: bool, said: str, file: TaughtFile) -> str:
-    """How teaching goes, and where the samples are."""
+def teach_html(is_taught: bool, is_moving: bool, message: str, file: TaughtFile) -> str:
+    """Return the state of teaching, the last message and the file of the samples."""
     state = '<span class="dim">○ not taken over</span>'
     if is_taught:
         state = '<span class="poor">◆ moving</span>' if is_moving else '<span class="good">● holding</span>'
-    told = f'<div style="min-height:30px;white-space:normal">{escape(said)}</div>'
+    text = f'<div style="min-height:30px;white-space:normal">{escape(message)}</div>'
     where = f'<div class="dim">{file.recorded} recorded here, in {escape(str(file.path))}</div>'
-    return page(f"<div><b>{state}</b></div>{told}{where}")
+    return page(f"<div><b>{state}</b></div>{text}{where}")

@@ -1,15 +1,14 @@
-"""The page: what is seen, put into widgets, so often and no more."""
+"""The page: what is snapshot, put into widgets, so often and no more."""
 
 import logging
+import math
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from services.view.attendance import service_rows
-from services.view.banner import Steady, banner
 from services.view.bias_map import BiasPicture, project
 from services.view.charts import Chart, Line, legend, signal_lines
 from services.view.controls import Controls
@@ -21,12 +20,14 @@ from services.view.markup import (
     services_html,
     signals_html,
 )
-from services.view.rows import Row, rows
 from services.view.scene import Scene
-from services.view.seen import Seen
 from services.view.styles import page
 from services.view.teach_panel import TeachPanel
 from services.view.trail import Trail
+from services.watch.service_rows import Level, service_rows
+from services.watch.signal_rows import SignalRow, signal_rows
+from services.watch.snapshot import Snapshot, fresh
+from services.watch.trouble import HEALTHY, Trouble, troubles
 
 if TYPE_CHECKING:
     import viser
@@ -39,6 +40,8 @@ TABLES = 0.25
 """Time [s] between new numbers: faster cannot be read."""
 CHARTS = 0.25
 SLOW = 1.0
+LINGERS = 1.0
+"""A trouble stays on the page for this time [s] after it has passed."""
 LEFT, RIGHT = 430, 400
 """Widths [px] of the two columns."""
 GROUPED = {"Engage": "engage", "Disengage": "disengage", "Reset": "reset"}
@@ -58,26 +61,44 @@ class _Due:
         return True
 
 
+class Steady:
+    """Filter of the banner: a worse trouble is shown at once, a milder one after a while, so that the page is quiet."""
+
+    def __init__(self) -> None:
+        self._shown: Sequence[Trouble] = ()
+        self._seen_at = -math.inf
+
+    def show(self, new: Sequence[Trouble], now: float) -> Sequence[Trouble]:
+        """Return the troubles to show at this time [monotonic s]."""
+        if _level(new) >= _level(self._shown) or now - self._seen_at > LINGERS:
+            self._shown, self._seen_at = new, now
+        return self._shown
+
+
+def _level(troubles: Sequence[Trouble]) -> Level:
+    return next(iter(troubles), HEALTHY).level
+
+
 class Page:
     """All widgets of one robot.
 
     Args:
         site: The empty page.
         robot: The robot's name.
-        look: Gives what is seen now; must not wait.
+        look: Gives what is snapshot now; must not wait.
         controls: What the buttons do, or why there are none.
         urdf: The robot's URDF; None if there is none.
         taught: Where taught samples are recorded.
     """
 
     def __init__(
-        self, site: "viser.ViserServer", robot: str, look: Callable[[], Seen], controls: Controls, urdf: Path | None,
-        taught: Path,
+        self, site: "viser.ViserServer", robot: str, look: Callable[[], Snapshot], controls: Controls,
+        urdf: Path | None, taught: Path,
     ) -> None:  # fmt: skip
         self._site, self._look, self._controls = site, look, controls
         self._trail, self._steady, self._bias = Trail(), Steady(), BiasPicture()
         self._chart, self._scores = Chart(180), Chart(100)
-        self._rows: tuple[Row, ...] = ()
+        self._rows: tuple[SignalRow, ...] = ()
         self._choices: tuple[str, ...] = ()
         self._tables, self._charts, self._slow = _Due(TABLES), _Due(CHARTS), _Due(SLOW)
         site.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, brand_color=(92, 160, 230))
@@ -93,25 +114,25 @@ class Page:
 
     def turn(self) -> None:
         """Look, remember, and show what is due; costs next to nothing while no browser looks."""
-        now, seen = time.monotonic(), self._look()
-        found = self._rows = rows(seen)
-        self._trail.add(now, seen, found)
+        now, snapshot = time.monotonic(), self._look()
+        rows = self._rows = signal_rows(snapshot)
+        self._trail.add(now, snapshot, rows)
         if self._teach is not None:
-            self._teach.show(seen, now)
-        shown = self._steady.show(banner(seen, found), now)
+            self._teach.show(snapshot, now)
+        shown = self._steady.show(troubles(snapshot, rows), now)
         if not self._site.get_clients():
             return
-        self._scene.show(seen, found)
+        self._scene.show(snapshot, rows)
         if self._tables.now(now):
-            _set(self._signals, signals_html(found))
+            _set(self._signals, signals_html(rows))
             _set(self._banner, banner_html(shown))
-            _set(self._facts, facts_html(seen, source(seen), self._controls.read_only, self._controls.last))
+            _set(self._facts, facts_html(snapshot, source(snapshot), self._controls.read_only, self._controls.last))
         if self._charts.now(now):
-            self._show_charts(seen, now)
+            self._show_charts(snapshot, now)
         if self._slow.now(now):
-            _set(self._services, services_html(service_rows(seen)))
-            self._choose_from(found)
-            self._show_bias(seen)
+            _set(self._services, services_html(service_rows(snapshot)))
+            self._choose_from(rows)
+            self._show_bias(snapshot)
 
     def _make_left(self) -> None:
         gui = self._site.gui
@@ -158,14 +179,14 @@ class Page:
             self._teach.teacher.let_go(f"{verb} was pressed, so the robot was let go.")
         self._controls.press(verb)
 
-    def _choose_from(self, found: tuple[Row, ...]) -> None:
+    def _choose_from(self, found: tuple[SignalRow, ...]) -> None:
         signals = tuple(dict.fromkeys(row.signal for row in found))
         choices = (*signals, *(row.name for row in found))
         if choices and choices != self._choices:
             self._choices = choices
             self._chosen.options = choices  # what was chosen stays, if it is there
 
-    def _show_charts(self, seen: Seen, now: float) -> None:
+    def _show_charts(self, snapshot: Snapshot, now: float) -> None:
         chosen = self._chosen.value
         found = [row for row in self._rows if chosen in (row.signal, row.name)]
         if found:
@@ -174,24 +195,24 @@ class Page:
             _set(self._plot, page(self._chart.svg(curves.time, lines, found[0].unit, chosen) + legend(lines)))
         time, score, threshold = self._trail.judged(now)
         judged = [Line("score", score, "#7cc0ff"), Line("threshold", threshold, "#ff7b7b", dashed=True)]
-        _set(self._anomaly, anomaly_html(seen) + page(self._scores.svg(time, judged, "score", "score")))
+        _set(self._anomaly, anomaly_html(snapshot) + page(self._scores.svg(time, judged, "score", "score")))
 
-    def _show_bias(self, seen: Seen) -> None:
-        biases: dict[str, Any] = dict(seen.model.get("biases", {}))
+    def _show_bias(self, snapshot: Snapshot) -> None:
+        biases: dict[str, Any] = dict(snapshot.model.get("biases", {}))
         found = project(biases, self._trail.bias()) if biases else None
-        update = seen.fresh(seen.update)
+        update = fresh(snapshot.update)
         picture = "" if found is None else self._bias.svg(found, update is None)
         _set(self._map, bias_html(found, picture, update))
 
 
-def source(seen: Seen) -> str:
+def source(snapshot: Snapshot) -> str:
     """Where what is shown comes from."""
-    sample = seen.fresh(seen.sample)
+    sample = fresh(snapshot.sample)
     if sample is None:
         return "nothing comes"
     if "replay" in sample.source:
         return "replay of a recording"
-    if sample.source == "simulated" or "simulator" in seen.alive:
+    if sample.source == "simulated" or "simulator" in snapshot.alive:
         return "simulated robot"
     return f"robot ({sample.source})"
 

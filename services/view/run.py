@@ -12,7 +12,7 @@ from services.view.controls import Controls
 from services.view.page import Page, serve_page
 from services.view.role import why_read_only
 from services.view.site import open_site
-from services.view.watch import Watch
+from services.watch.robot_watch import RobotWatch
 from services.wire.member import member_of
 from services.wire.session import is_loopback
 
@@ -35,7 +35,7 @@ def view(
     """
     connect = tuple(connect)
     read_only = why_read_only(member_of(connect), robot, host)
-    watch = Watch(robot, connect)
+    watch = RobotWatch(robot, connect)
     with until_stopped(stop) as end:
         site = open_site(host, port, f"gemuco view {robot}")
         try:

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from services.view.figure import Body, Figure, Paint
-from services.view.rows import Kind, Row
-from services.view.seen import Seen
+from services.watch.signal_rows import Kind, SignalRow
+from services.watch.snapshot import Snapshot
 
 if TYPE_CHECKING:
     import viser
@@ -46,7 +46,7 @@ class Scene:
             self._figures = {name: Figure(site, name, body, at) for name, at in self._at.items()}
         self._furnish(size, body is not None)
 
-    def show(self, seen: Seen, rows: Sequence[Row]) -> None:
+    def show(self, snapshot: Snapshot, rows: Sequence[SignalRow]) -> None:
         """Move both robots to what is known now; a link's color tells what all joints below it rest on."""
         kinds: dict[str, Kind] = {}
         for row in rows:
@@ -71,7 +71,7 @@ class Scene:
             return Paint(BLUE if name == "measured" else PALE)
         return Paint(AMBER) if name == "estimated" and below <= {Kind.MEASURED, Kind.ESTIMATED} else GHOST
 
-    def _show_points(self, rows: Sequence[Row]) -> None:
+    def _show_points(self, rows: Sequence[SignalRow]) -> None:
         for signal in dict.fromkeys(row.signal for row in rows if row.unit == "m"):
             three = {row.element: row for row in rows if row.signal == signal}
             if tuple(three) != POINT:

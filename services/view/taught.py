@@ -10,7 +10,7 @@ import numpy as np
 from gemuco.dataset import Dataset, Episode
 from gemuco.signals import Layout, Signal
 from services.errors import ServiceError
-from services.view.seen import Seen
+from services.watch.snapshot import Snapshot
 
 LONGEST_NAME = 60
 FRESH = 0.25
@@ -21,19 +21,19 @@ class NotRecorded(ServiceError):
     """Nothing was written, and what is in the file stays; the text says why."""
 
 
-def posture(seen: Seen) -> tuple[Layout, dict[str, np.ndarray]]:
+def posture(snapshot: Snapshot) -> tuple[Layout, dict[str, np.ndarray]]:
     """The present value [its unit] of every signal that the robot has.
 
     Raises:
         NotRecorded: Something is not measured now.
     """
-    signals = seen.hal.get("signals")
+    signals = snapshot.hal.get("signals")
     if not signals:
         raise NotRecorded("The HAL has not told its signals yet, so there is nothing to record. Is it running?")
     layout = Layout(tuple(Signal(n, len(s["elements"]), s["unit"], tuple(s["elements"])) for n, s in signals.items()))
     values: dict[str, np.ndarray] = {}
     for name, about in signals.items():
-        heard = seen.vision if about.get("source") == "vision" else seen.sample
+        heard = snapshot.vision if about.get("source") == "vision" else snapshot.sample
         sample = None if heard is None or heard.age > FRESH else heard.message
         if sample is None or name not in sample.values:
             raise NotRecorded(f"'{name}' is not measured now, so nothing was recorded.")

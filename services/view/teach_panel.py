@@ -12,9 +12,9 @@ from hal.errors import HalError
 from services.errors import ServiceError
 from services.view.controls import Controls
 from services.view.markup import teach_html
-from services.view.seen import Seen
 from services.view.taught import TaughtFile, posture
 from services.view.teaching import STEP, NotTeaching, Reach, Teacher
+from services.watch.snapshot import Snapshot
 
 if TYPE_CHECKING:
     import viser
@@ -33,11 +33,11 @@ class TeachPanel:
     Args:
         site: The page.
         controls: Says whether this page may command.
-        look: What is seen now.
+        look: Function that returns the present snapshot.
         path: Where samples are recorded.
     """
 
-    def __init__(self, site: "viser.ViserServer", controls: Controls, look: Callable[[], Seen], path: Path) -> None:
+    def __init__(self, site: "viser.ViserServer", controls: Controls, look: Callable[[], Snapshot], path: Path) -> None:
         self._site, self._look = site, look
         self.teacher = Teacher(controls.open_client)
         self.file = TaughtFile(path)
@@ -60,9 +60,9 @@ class TeachPanel:
         """Let go."""
         self.teacher.stop()
 
-    def show(self, seen: Seen, now: float) -> None:
+    def show(self, snapshot: Snapshot, now: float) -> None:
         """Show what is going on, and ask the page that took over whether it lives."""
-        self._make_sliders(seen)
+        self._make_sliders(snapshot)
         owner = self.teacher.owner
         teaching = owner is not None and self.teacher.set_point is not None
         if teaching != self._was_teaching:
@@ -101,12 +101,12 @@ class TeachPanel:
         if self.teacher.owner is not None:
             self.teacher.let_go("Let go.")
             return ""
-        seen = self._look()
-        model = seen.statuses.get("model")
+        snapshot = self._look()
+        model = snapshot.statuses.get("model")
         control = model.message.facts.get("control") if model is not None and model.is_fresh else None
         if isinstance(control, dict) and control.get("engaged"):
             raise NotTeaching("The model's controller moves the robot. Disengage it first.")
-        self._reach = Reach.of(seen.hal)
+        self._reach = Reach.of(snapshot.hal)
         self.teacher.take_over(owner, self._reach)
         return ""
 
@@ -115,12 +115,12 @@ class TeachPanel:
         count = self.file.add(self._condition.value, layout, values)
         return f"Recorded under '{self._condition.value.strip()}'; {count} samples are in the file."
 
-    def _make_sliders(self, seen: Seen) -> None:
+    def _make_sliders(self, snapshot: Snapshot) -> None:
         """Sliders of the commanded signal, once its limits are told; anew when they change."""
         try:
-            reach = Reach.of(seen.hal)
+            reach = Reach.of(snapshot.hal)
         except NotTeaching as error:
-            if seen.hal:
+            if snapshot.hal:
                 self._said = str(error)
             return
         known = self._reach

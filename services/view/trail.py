@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from services.view.rows import Kind, Row
-from services.view.seen import Seen
+from services.watch.signal_rows import Kind, SignalRow
+from services.watch.snapshot import Snapshot, fresh
 
 WINDOW = 30.0
 """How far back [s] the plots go."""
@@ -44,7 +44,7 @@ class Trail:
         self._judged: deque[tuple[float, float]] = deque(maxlen=POINTS)
         self._bias: deque[np.ndarray] = deque(maxlen=WAY)
 
-    def add(self, now: float, seen: Seen, rows: Sequence[Row]) -> None:
+    def add(self, now: float, snapshot: Snapshot, rows: Sequence[SignalRow]) -> None:
         """Note this moment [monotonic s]; calls that come sooner than the rate are ignored."""
         if self._times and now - self._times[-1] < 0.9 / RATE:
             return
@@ -56,9 +56,9 @@ class Trail:
             row = told.get(name)
             measured = row.value if row is not None and row.kind is Kind.MEASURED else np.nan
             values.append((measured, row.value if row is not None and row.kind is Kind.ESTIMATED else np.nan))
-        anomaly = seen.fresh(seen.anomaly)
+        anomaly = fresh(snapshot.anomaly)
         self._judged.append((np.nan, np.nan) if anomaly is None else (anomaly.score, anomaly.threshold))
-        update = seen.fresh(seen.update)
+        update = fresh(snapshot.update)
         if update is not None and len(update.bias) and np.isfinite(update.bias).all():
             self._add_bias(np.array(update.bias, float))
 

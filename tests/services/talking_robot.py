@@ -8,9 +8,11 @@ from typing import Any, Self
 import numpy as np
 
 from services.process.service import Service
+from services.watch.snapshot import Newest, Snapshot
 from services.wire import keys
 from services.wire.messages import Anomaly, Applied, Estimates, Holder, Sample, Status, Update
 
+BOTH = frozenset({"hal", "model"})
 ELEMENTS = ["shoulder", "elbow"]
 DESCRIBED = {
     "signals": {
@@ -50,6 +52,15 @@ def anomaly(verdict: str = "normal") -> Anomaly:
         cycle=1, score=30.0 if verdict == "anomaly" else 5.0, threshold=20.0, is_anomaly=verdict == "anomaly",
         blamed="muscle_tension.biceps", contribution={}, verdict=verdict, stamp_ns=time.time_ns(),
     )  # fmt: skip
+
+
+def seen(silent: bool = False, age: float = 0.01, **other: Any) -> Snapshot:
+    """Snapshot of both services, whose messages have this age [s]; `silent` is the elbow's encoder."""
+    facts: dict[str, Any] = {
+        "robot": "arm", "alive": BOTH, "hal": DESCRIBED, "sample": Newest(sample(silent), age),
+        "estimate": Newest(estimates(silent), age), "anomaly": Newest(anomaly(), age),
+    }  # fmt: skip
+    return Snapshot(**(facts | other))
 
 
 class TalkingRobot:

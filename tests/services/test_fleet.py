@@ -14,9 +14,11 @@ from services.process.router import run_router
 from services.process.service import Service
 from services.runtime import services_here
 from services.verbs import fleet_top
-from services.verbs.fleet_watch import FleetWatch, Glance, Level, RobotNews, Voice
+from services.watch.fleet_watch import FleetWatch, RobotRecord, ServiceRecord
+from services.watch.service_rows import Level
+from services.watch.snapshot import Newest, Snapshot
 from services.wire import keys
-from services.wire.messages import Status
+from services.wire.messages import Holder, Status
 from services.wire.session import CLIENT, close_session, open_session
 
 
@@ -31,83 +33,60 @@ def status(service: str, state: str = "running", boot: int = 1, **facts: object)
     return Status(service=service, state=state, boot=boot, facts=facts, loops={service: {"late_max": 0.004}})
 
 
-def robot_with(now: float, **voices: Voice) -> RobotNews:
-    news = RobotNews("arm", now)
-    news.voices.update(voices)
-    return news
+def robot_with(now: float, **services: ServiceRecord) -> RobotRecord:
+    robot = RobotRecord("arm", now)
+    robot.services.update(services)
+    return robot
 
 
-def voice(of: Status, heard: float, is_alive: bool = True) -> Voice:
-    found = Voice(is_alive=is_alive)
-    found.hear(of, heard)
-    return found
+def record(newest: Status, now: float) -> ServiceRecord:
+    service = ServiceRecord(is_alive=True)
+    service.add(newest, now)
+    return service
 
 
-GOOD = {"signals": {"measured": 3, "estimated": 0, "none": 0}, "anomaly": {"verdict": "normal", "is_anomaly": False}}
-SICK = {"anomaly": {"verdict": "anomaly", "is_anomaly": True, "blamed": "load.elbow"}}
+def printed(snapshots: list[Snapshot]) -> str:
+    console = Console(width=200)
+    with console.capture() as shown:
+        console.print(fleet_top.table(fleet_top.ranked(snapshots)))
+    return shown.get()
 
 
-@pytest.mark.parametrize(
-    ("hal", "model", "level", "says"),
-    [
-        (voice(status("hal", mode="off"), 9.5), voice(status("model", **GOOD), 9.5), Level.GOOD, ""),
-        (voice(status("hal"), 9.5), voice(status("model", "degraded"), 9.5), Level.DEGRADED, "model: degraded"),
-        (voice(status("hal"), 9.5), voice(status("model", **SICK), 9.5), Level.ANOMALY, "anomaly in load.elbow"),
-        (voice(status("hal", "fault"), 9.5), voice(status("model"), 9.5), Level.TROUBLE, "hal: fault"),
-        (voice(status("hal"), 5.0), voice(status("model"), 9.5), Level.TROUBLE, "'hal' is alive and says nothing"),
-        (voice(status("hal"), 9.5, False), voice(status("model"), 9.5), Level.TROUBLE, "'hal' is gone"),
-    ],
-)
-def test_what_is_worst_is_told(hal: Voice, model: Voice, level: Level, says: str) -> None:
-    found = robot_with(9.5, hal=hal, model=model).glance(10.0)
-    assert found.level == level
-    assert says in found.text
-
-
-def test_a_robot_that_has_gone_and_one_that_was_told_to_end() -> None:
-    gone = robot_with(1.0, hal=voice(status("hal"), 1.0, False)).glance(10.0)
-    ended = robot_with(1.0, hal=voice(status("hal", "stopping"), 1.0, False)).glance(10.0)
-    assert (gone.level, ended.level) == (Level.GONE, Level.GONE)
-    assert "Nothing is heard" in gone.text
-    assert "told to end" in ended.text
-    assert gone.age == 9.0
-
-
-def test_a_glance_tells_motors_signals_anomaly_and_lateness() -> None:
-    hal, model = voice(status("hal", mode="follow"), 9.0), voice(status("model", **GOOD), 9.9)
-    found = robot_with(9.9, hal=hal, model=model).glance(10.0)
-    assert (found.motors, found.measured, found.anomaly) == ("follow", (3, 0, 0), "normal")
-    assert found.late == (0.004, "model")
+def test_a_row_of_the_table_has_motors_signals_anomaly_and_lateness() -> None:
+    good = {"signals": {"measured": 3, "estimated": 1, "none": 0}, "anomaly": {"verdict": "normal"}}
+    hal, model = record(status("hal", mode="follow"), 9.0), record(status("model", **good), 9.9)
+    text = printed([robot_with(9.9, hal=hal, model=model).snapshot(10.0)])
+    for part in ("follow", "3/1/0", "normal", "4.0 hal", "good"):
+        assert part in text
 
 
 @pytest.mark.parametrize("facts", [{"mode": ["x"]}, {"signals": 3}, {"signals": {"measured": "x"}}, {"anomaly": [1]}])
 def test_facts_may_hold_anything(facts: dict[str, object]) -> None:
-    one = voice(status("hal", **facts), 9.5), voice(status("model", **facts), 9.5)
-    fleet_top.table([robot_with(9.5, hal=one[0], model=one[1]).glance(10.0)])
+    both = {name: record(status(name, **facts), 9.5) for name in ("hal", "model")}
+    assert "arm" in printed([robot_with(9.5, **both).snapshot(10.0)])
 
 
 def test_a_restart_is_no_twin_and_two_in_turns_are() -> None:
-    found = Voice()
+    found = ServiceRecord()
     for number, boot in enumerate((1, 1, 2, 2)):
-        found.hear(status("hal", boot=boot), float(number))
+        found.add(status("hal", boot=boot), float(number))
     assert found.twin_until < 4.0
-    found.hear(status("hal", boot=1), 4.0)
+    found.add(status("hal", boot=1), 4.0)
     assert found.twin_until > 4.0
     found.is_alive = True
-    text = robot_with(4.0, hal=found).glance(4.5)
-    assert text.level == Level.TROUBLE
-    assert "Two 'hal' services" in text.text
+    assert robot_with(4.0, hal=found).snapshot(4.5).twins == ("hal",)
 
 
-def test_trouble_is_on_top_and_nothing_that_came_steers_the_terminal() -> None:
-    glances = [
-        Glance("b_arm", Level.TROUBLE, "\x1b[2J[red]oh[/]", ("hal",), "off", "[bold]anna", None, "", None, 0.1),
-        Glance("a_arm", Level.GOOD, "", ("hal",), "off", "", (1, 0, 0), "normal", (0.001, "hal"), 0.1),
-    ]
-    console = Console(width=160)
-    with console.capture() as shown:
-        console.print(fleet_top.table(glances))
-    text = shown.get()
+def test_trouble_is_on_top_and_no_text_steers_the_terminal() -> None:
+    bad = Status(service="hal", state="fault", text="\x1b[2J[red]oh[/]")
+    holder = Newest(Holder(name="[bold]anna", holder=1), 0.1)
+    running = {name: Newest(status(name), 0.1) for name in ("hal", "model")}
+    both = frozenset({"hal", "model"})
+    text = printed([
+        Snapshot(robot="a_arm", has_streams=False, alive=both, statuses=running),
+        Snapshot(robot="b_arm", has_streams=False, alive=both, statuses=running | {"hal": Newest(bad, 0.1)},
+                 holder=holder),
+    ])  # fmt: skip
     assert text.index("b_arm") < text.index("a_arm")
     assert "[bold]anna" in text
     assert "\x1b" not in text
@@ -148,19 +127,22 @@ def test_all_robots_of_a_router_are_seen_and_one_that_vanishes_stays_listed(robo
     with (
         FleetWatch([router]) as fleet,
         Service(names[0], "hal", [router]) as one,
+        Service(names[0], "model", [router]) as its_model,
         Service(names[1], "hal", [router]) as two,
+        Service(names[1], "model", [router]) as other_model,
     ):
 
         def levels(*speaking: Service) -> dict[str, Level]:
             for service in speaking:
-                service.publish_status(lambda: status("hal"))
-            return {glance.robot: glance.level for glance in fleet.glances()}
+                service.publish_status(lambda name=service.name: status(name))
+            return {snapshot.robot: worst.level for snapshot, worst in fleet_top.ranked(fleet.snapshots())}
 
-        eventually(lambda: levels(one, two) == dict.fromkeys(names, Level.GOOD))
-        eventually(fleet.is_told)
-        close_session(one.session)  # as a crash would: no last word
-        eventually(lambda: levels(two) == {names[0]: Level.GONE, names[1]: Level.GOOD})
-        assert fleet.glances()[0].robot == names[0]
+        eventually(lambda: levels(one, its_model, two, other_model) == dict.fromkeys(names, Level.GOOD))
+        eventually(fleet.is_complete)
+        for service in (one, its_model):
+            close_session(service.session)  # as after a crash: without a last status
+        eventually(lambda: levels(two, other_model) == {names[0]: Level.GONE, names[1]: Level.GOOD})
+        assert fleet_top.ranked(fleet.snapshots())[0][0].robot == names[0]
         assert fleet.has_router
 
 
@@ -170,7 +152,7 @@ def test_without_a_router_the_robots_of_this_machine_are_found(robot: str) -> No
         assert (robot, "hal") in services_here()
         thread = run(service, told)
         with FleetWatch() as fleet:
-            eventually(lambda: any(one.robot == robot and one.services == ("hal",) for one in fleet.glances()))
+            eventually(lambda: any(one.robot == robot and one.alive == {"hal"} for one in fleet.snapshots()))
         told.set()
         thread.join()
 
@@ -182,13 +164,16 @@ def test_printed_once_the_exit_code_tells(robot: str, router: str) -> None:
     with console.capture() as shown:
         assert fleet_top.watch_fleet(True, [router], console) == 1
     assert "No robot is seen" in shown.get()
-    with Service(robot, "hal", [router]) as service:
-        thread = run(service, told)
-        with console.capture() as shown:
-            assert fleet_top.watch_fleet(True, [router], console) == 0
-        assert robot in shown.get()
-        told.set()
-        thread.join()
+    with Service(robot, "hal", [router]) as hal, Service(robot, "model", [router]) as model:
+        threads = [run(service, told) for service in (hal, model)]
+        try:
+            with console.capture() as shown:
+                assert fleet_top.watch_fleet(True, [router], console) == 0
+            assert robot in shown.get()
+        finally:
+            told.set()
+            for thread in threads:
+                thread.join()
 
 
 def test_the_same_robot_on_two_computers_of_one_router_is_refused(

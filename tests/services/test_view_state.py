@@ -1,61 +1,24 @@
 """What the page shows, without a browser and without a network."""
 
-import math
-
 import numpy as np
 import pytest
-from talking_robot import DESCRIBED, anomaly, estimates, sample
+from talking_robot import BOTH, seen
 
-from services.view.attendance import service_rows
-from services.view.banner import LINGERS, Banner, Level, Steady, banner
 from services.view.bias_map import BiasPicture, project
 from services.view.charts import Chart, Line, ticks
 from services.view.controls import Outcome
 from services.view.markup import banner_html, facts_html, services_html, signals_html
-from services.view.page import source
-from services.view.rows import Kind, rows
-from services.view.seen import Heard, Seen
+from services.view.page import LINGERS, Steady, source
 from services.view.trail import POINTS, Trail
+from services.watch.service_rows import Level, service_rows
+from services.watch.signal_rows import Kind, signal_rows
+from services.watch.snapshot import Newest
+from services.watch.trouble import Trouble, troubles
 from services.wire.messages import Holder, Status
-
-BOTH = frozenset({"hal", "model"})
-FAULT = {"hal": Heard(Status(service="hal", state="fault", text="It broke."), 0.1)}
-
-
-def seen(silent: bool = False, age: float = 0.01, **other: object) -> Seen:
-    facts: dict[str, object] = {
-        "robot": "arm", "alive": BOTH, "hal": DESCRIBED, "sample": Heard(sample(silent), age),
-        "estimate": Heard(estimates(silent), age), "anomaly": Heard(anomaly(), age),
-    }  # fmt: skip
-    return Seen(**(facts | other))  # type: ignore[arg-type]
-
-
-def shown(moment: Seen) -> Banner:
-    return banner(moment, rows(moment))
-
-
-def test_a_measured_value_is_shown_with_its_age():
-    row = rows(seen(age=0.1))[1]
-    assert (row.name, row.unit, row.kind, row.value) == ("joint_position.elbow", "rad", Kind.MEASURED, -0.5)
-    assert row.age == pytest.approx(0.101)
-
-
-def test_a_lost_sensor_is_estimated_and_says_from_what():
-    row = rows(seen(silent=True))[1]
-    assert (row.kind, row.value, row.std, row.source) == (Kind.ESTIMATED, -0.48, 0.02, "muscle_tension")
-    told = shown(seen(silent=True))
-    assert (told.level, told.title) == (Level.WARN, "Sensor lost")
-    assert told.text == "joint_position (elbow) is estimated from muscle_tension."
-
-
-def test_what_nobody_can_tell_is_masked_and_has_no_value():
-    row = rows(seen(silent=True, estimate=None))[1]
-    assert row.kind is Kind.MASKED
-    assert math.isnan(row.value)
 
 
 def test_old_values_are_never_shown_as_fresh():
-    found = rows(seen(age=3.0))
+    found = signal_rows(seen(age=3.0))
     assert [row.kind for row in found] == [Kind.OLD] * 3
     assert found[0].age == pytest.approx(3.001)
     html = signals_html(found)
@@ -63,49 +26,18 @@ def test_old_values_are_never_shown_as_fresh():
     assert "3.0 s" in html
 
 
-def test_an_old_estimate_is_no_estimate():
-    assert rows(seen(silent=True, estimate=Heard(estimates(True), 3.0)))[1].kind is Kind.MASKED
-
-
-@pytest.mark.parametrize(
-    ("moment", "level", "title"),
-    [
-        (seen(), Level.OK, "Healthy"),
-        (seen(anomaly=Heard(anomaly("anomaly"), 0.0)), Level.BAD, "Anomaly"),
-        (seen(anomaly=Heard(anomaly("environment"), 0.0)), Level.NOTE, "Environment changed"),
-        (seen(alive=frozenset({"hal"}), estimate=None), Level.BAD, "Model service gone"),
-        (seen(estimate=Heard(estimates(), 3.0)), Level.BAD, "Model service silent"),
-        (seen(age=5.0, alive=frozenset()), Level.GONE, "Robot gone"),
-        (seen(age=5.0), Level.GONE, "Robot silent"),
-        (Seen(robot="arm"), Level.GONE, "No robot"),
-        (seen(linked=False, link_text="Nobody there."), Level.GONE, "Router gone"),
-        (seen(statuses=FAULT), Level.BAD, "Fault"),
-    ],
-)  # fmt: skip
-def test_every_state_has_its_banner(moment, level, title):
-    told = shown(moment)
-    assert (told.level, told.title) == (level, title)
-
-
-def test_the_worst_is_told_first_and_the_rest_below_it():
-    told = shown(seen(silent=True, anomaly=Heard(anomaly("anomaly"), 0.0)))
-    assert told.title == "Anomaly"
-    assert "muscle_tension.biceps" in told.text
-    assert told.also == ("Sensor lost: joint_position (elbow) is estimated from muscle_tension.",)
-
-
 def test_worse_is_shown_at_once_and_better_after_a_while():
-    ok, bad, steady = Banner(Level.OK, "a", ""), Banner(Level.BAD, "b", ""), Steady()
-    assert steady.show(ok, 0.0) is ok
+    good, bad, steady = [], [Trouble(Level.TROUBLE, "b")], Steady()
+    assert steady.show(good, 0.0) is good
     assert steady.show(bad, 0.1) is bad
-    assert steady.show(ok, 0.5) is bad
-    assert steady.show(ok, 0.2 + LINGERS) is ok
+    assert steady.show(good, 0.5) is bad
+    assert steady.show(good, 0.2 + LINGERS) is good
 
 
 def test_services_that_are_gone_or_silent_are_not_shown_as_running():
     status = Status(service="model", state="running", loops={"estimation": {"rate": 200.0, "rate_wanted": 200.0}})
     found = {
-        row.name: row for row in service_rows(seen(alive=frozenset({"hal"}), statuses={"model": Heard(status, 9.0)}))
+        row.name: row for row in service_rows(seen(alive=frozenset({"hal"}), statuses={"model": Newest(status, 9.0)}))
     }
     assert (found["model"].state, found["hal"].state) == ("gone", "silent")
     assert "heard 9.0 s ago" in services_html(tuple(found.values()))
@@ -115,11 +47,12 @@ def test_whatever_came_over_the_network_is_escaped():
     evil = "<script>alert(1)</script>"
     signals = {"signals": {evil: {"unit": evil, "elements": [evil], "source": "hal"}}, "command": {}, "limits": {}}
     moment = seen(
-        hal=signals, holder=Heard(Holder(name=evil, holder=3, left=1.0), 0.0),
-        statuses={"hal": Heard(Status(service="hal", state=evil, text=evil, loops={evil: {}}), 0.0)},
+        hal=signals, holder=Newest(Holder(name=evil, holder=3, left=1.0), 0.0),
+        statuses={"hal": Newest(Status(service="hal", state=evil, text=evil, loops={evil: {}}), 0.0)},
     )  # fmt: skip
+    rows = signal_rows(moment)
     pages = [
-        signals_html(rows(moment)), services_html(service_rows(moment)), banner_html(shown(moment)),
+        signals_html(rows), services_html(service_rows(moment)), banner_html(troubles(moment, rows)),
         facts_html(moment, evil, "", Outcome(0.0, False, evil)),
         BiasPicture().svg(project({evil: [0.0, 1.0], "b": [1.0, 0.0]}, np.zeros((1, 2))), False),
     ]  # fmt: skip
@@ -180,7 +113,7 @@ def test_a_trail_is_bounded_and_knows_what_vanished():
     trail = Trail()
     for index in range(POINTS + 50):
         moment = seen(silent=index > POINTS)
-        trail.add(0.25 * index, moment, rows(moment))
+        trail.add(0.25 * index, moment, signal_rows(moment))
     curves = trail.curves(["joint_position.elbow", "nothing"], 0.25 * index)
     assert curves.measured.shape == (2, POINTS)
     assert curves.time[-1] == 0.0

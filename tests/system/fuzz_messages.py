@@ -41,7 +41,8 @@ from services.process.router import run_router  # noqa: E402
 from services.process.service import Service  # noqa: E402
 from services.recording.recorder import run_recorder  # noqa: E402
 from services.verbs import fleet_top, top  # noqa: E402
-from services.verbs.fleet_watch import FleetWatch  # noqa: E402
+from services.watch.fleet_watch import FleetWatch  # noqa: E402
+from services.watch.robot_watch import snapshot_of  # noqa: E402
 from services.wire import keys, messages  # noqa: E402
 from services.wire.session import CLIENT, close_session, new_boot, open_session  # noqa: E402
 from studies.stack import light_model, light_robot  # noqa: E402
@@ -261,8 +262,8 @@ class Stage:
         """What both kinds of `top` show, and everything a client can read."""
         console = Console(file=open(os.devnull, "w"), width=200)  # noqa: SIM115, PTH123
         with console.file:
-            console.print(top.view(self.client))
-            console.print(fleet_top.view(self.fleet.glances(), self.fleet, ["the router"]))
+            console.print(top.view(snapshot_of(self.client, self.client.alive())))
+            console.print(fleet_top.view(fleet_top.ranked(self.fleet.snapshots()), self.fleet, ["the router"]))
         for read in (self.client.truth, self.client.vision, self.client.applied, self.client.update):
             with contextlib.suppress(WrongVersion):
                 read()

@@ -1,0 +1,185 @@
+"""The one judge of what is wrong with a robot and how bad it is, for the page and both kinds of `gemuco top`."""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from services.watch.service_rows import Level, ServiceRow, needed, service_rows
+from services.watch.signal_rows import Kind, SignalRow
+from services.watch.snapshot import Snapshot, fresh
+from services.wire.query import starter
+
+NAMED = 3
+"""At most this number of elements of a signal is named; the others are counted."""
+TITLES = {"hal": "HAL", "model": "Model", "vision": "Camera", "simulator": "Simulator", "recorder": "Recorder"}
+
+
+@dataclass(frozen=True, slots=True)
+class Trouble:
+    """One thing that is wrong: a title of a few words and an explanation."""
+
+    level: Level
+    title: str
+    text: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.title}: {self.text}" if self.text else self.title
+
+
+HEALTHY = Trouble(Level.GOOD, "Healthy", "All signals are measured, and the body is as the model knows it.")
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Anomaly verdict of the model.
+
+    Attributes:
+        kind: `normal`, `environment`, `anomaly`, or empty while there is nothing to judge.
+        score: Anomaly score; NaN if it is not known.
+        threshold: Score above which the body is not normal; NaN if it is not known.
+        is_anomaly: Whether the score has been above the threshold for as long as the robot file requires.
+        blamed: Element or part that is most likely wrong.
+    """
+
+    kind: str
+    score: float
+    threshold: float
+    is_anomaly: bool
+    blamed: str
+
+    def __str__(self) -> str:
+        return f"anomaly in {self.blamed}" if self.is_anomaly and self.blamed else self.kind
+
+
+def troubles(snapshot: Snapshot, rows: Sequence[SignalRow] = ()) -> list[Trouble]:
+    """Return everything that is wrong with a robot, worst first; `rows` are those of `signal_rows`."""
+    return sorted(_troubles(snapshot, rows), key=lambda trouble: -trouble.level)
+
+
+def verdict(snapshot: Snapshot) -> Verdict | None:
+    """Return the model's present anomaly verdict, from its stream or from its status; None if there is none."""
+    if snapshot.has_streams:
+        anomaly = fresh(snapshot.anomaly)
+        if anomaly is None:
+            return None
+        return Verdict(anomaly.verdict, anomaly.score, anomaly.threshold, anomaly.is_anomaly, anomaly.blamed)
+    facts = snapshot.facts("model").get("anomaly")
+    if not isinstance(facts, dict) or not facts:
+        return None
+    kind, blamed = (text if isinstance(text := facts.get(name), str) else "" for name in ("verdict", "blamed"))
+    score, threshold = (_number(facts.get(name)) for name in ("score", "threshold"))
+    return Verdict(kind, score, threshold, facts.get("is_anomaly") is True, blamed)
+
+
+def _number(fact: object) -> float:
+    return float(fact) if isinstance(fact, int | float) else math.nan
+
+
+def _troubles(snapshot: Snapshot, rows: Sequence[SignalRow]) -> Iterator[Trouble]:
+    if not snapshot.linked:
+        text = snapshot.link_text or "There is no connection to the robot's network."
+        yield Trouble(Level.GONE, "Router gone", text)
+        return
+    for text in snapshot.refused:
+        yield Trouble(Level.TROUBLE, "Unreadable message", f"{text} Update the older of both programs.")
+    is_heard = any(newest.is_fresh for newest in (snapshot.sample, *snapshot.statuses.values()) if newest is not None)
+    if not snapshot.alive and not is_heard:
+        yield _gone(snapshot)
+        return
+    for service in snapshot.twins:
+        text = f"Two '{service}' services publish under this name: give one robot another name."
+        yield Trouble(Level.TROUBLE, "Name used twice", text)
+    yield from _services(snapshot)
+    yield from _streams(snapshot)
+    yield from _signals(rows)
+    yield from _body(snapshot)
+
+
+def _gone(snapshot: Snapshot) -> Trouble:
+    hint = f"Is {starter('hal')} running?"
+    if not math.isfinite(snapshot.age):
+        return Trouble(Level.GONE, "No robot", hint)
+    since = f"Nothing has been heard for {snapshot.age:.0f} s."
+    if any(newest.message.state == "stopping" for newest in snapshot.statuses.values()):
+        return Trouble(Level.GONE, "Robot gone", f"{since} It was stopped on request.")
+    return Trouble(Level.GONE, "Robot gone", f"{since} {hint}")
+
+
+def _services(snapshot: Snapshot) -> Iterator[Trouble]:
+    """Yield services that are missing or frozen, or whose status is not `running` or `ready`."""
+    for row in service_rows(snapshot):
+        title = TITLES[row.name]
+        if row.state in ("gone", "absent"):
+            if row.name in needed(snapshot):
+                yield _missing(snapshot, row)
+        elif row.is_frozen:
+            yield Trouble(
+                Level.TROUBLE, f"{title} service silent", "It is alive and publishes no status: is it frozen?"
+            )
+        elif row.state == "fault":
+            yield Trouble(Level.TROUBLE, f"{title} fault", row.text)
+        elif row.state in ("running", "ready"):
+            if row.text:
+                yield Trouble(Level.NOTE, f"{title} {row.state}", row.text)
+        # The rows of the signals name the estimated elements more exactly than the model's status.
+        elif row.is_present and not (snapshot.has_streams and row.text.startswith("Estimating")):
+            yield Trouble(Level.DEGRADED, f"{title} {row.state}", row.text)
+
+
+def _missing(snapshot: Snapshot, row: ServiceRow) -> Trouble:
+    title = f"{TITLES[row.name]} service gone"
+    if row.name == "hal" and fresh(snapshot.sample) is not None:
+        return Trouble(Level.DEGRADED, title, "Its samples still arrive; its token does not.")
+    since = f"Its last status is {row.age:.0f} s old. " if math.isfinite(row.age) else ""
+    effect = "Only measured values are known. " if row.name == "model" else ""
+    return Trouble(row.level, title, f"{since}{effect}Is {starter(row.name)} running?")
+
+
+def _streams(snapshot: Snapshot) -> Iterator[Trouble]:
+    """Yield live services whose samples or estimates do not arrive."""
+    if not snapshot.has_streams:
+        return
+    if fresh(snapshot.sample) is None:
+        if "hal" in snapshot.alive:
+            since = f"Nothing was measured for {snapshot.sample.age:.0f} s. " if snapshot.sample else ""
+            yield Trouble(Level.TROUBLE, "Robot silent", f"{since}The HAL is alive, and no sample arrives.")
+    elif "model" in snapshot.alive and fresh(snapshot.estimate) is None:
+        yield Trouble(Level.TROUBLE, "Model service silent", "It is alive, and no estimate arrives.")
+
+
+def _signals(rows: Sequence[SignalRow]) -> Iterator[Trouble]:
+    estimated = [row for row in rows if row.kind is Kind.ESTIMATED]
+    masked = [row for row in rows if row.kind is Kind.MASKED]
+    if estimated:
+        sources = " and ".join(dict.fromkeys(row.source for row in estimated if row.source))
+        origin = f" from {sources}" if sources else ""
+        yield Trouble(Level.DEGRADED, "Sensor lost", f"{_names(estimated)} {_is(estimated)} estimated{origin}.")
+    if masked:
+        text = f"{_names(masked)} {_is(masked)} neither measured nor estimated."
+        yield Trouble(Level.DEGRADED, "Not measured", text)
+
+
+def _body(snapshot: Snapshot) -> Iterator[Trouble]:
+    judged = verdict(snapshot)
+    if judged is None:
+        return
+    score = f" Score {judged.score:.1f}, threshold {judged.threshold:.1f}." if math.isfinite(judged.score) else ""
+    if judged.kind == "environment":
+        text = f"Another condition of the body explains what is measured.{score}"
+        yield Trouble(Level.NOTE, "Environment changed", text)
+    elif judged.is_anomaly:
+        yield Trouble(Level.ANOMALY, "Anomaly", f"Most likely wrong: {judged.blamed or 'unknown'}.{score}")
+
+
+def _names(rows: Sequence[SignalRow]) -> str:
+    """Return the signals with their elements, in words."""
+    names: list[str] = []
+    for signal in dict.fromkeys(row.signal for row in rows):
+        elements = [row.element for row in rows if row.signal == signal]
+        more = f" and {len(elements) - NAMED} more" if len(elements) > NAMED else ""
+        names.append(f"{signal} ({', '.join(elements[:NAMED])}{more})")
+    return ", ".join(names)
+
+
+def _is(rows: Sequence[SignalRow]) -> str:
+    return "is" if len(rows) == 1 else "are"
