@@ -83,7 +83,7 @@ class CanDevice(Device):
     def traffic(cls, settings: Any, rate: float) -> tuple[tuple[int, float] | tuple[int, float, bool], ...]:
         """Return data bytes and frames per second [Hz] of its whole traffic, at `rate` cycles per second.
 
-        A third value is True if the identifier has 29 bits.
+        A third value is True if the identifier has 29 bits. A driver defines this method, or `traffic_of`.
         """
         raise NotImplementedError
 
@@ -91,7 +91,7 @@ class CanDevice(Device):
     def traffic_of(
         cls, settings: Any, rate: float, quantities: tuple[str, ...]
     ) -> tuple[tuple[int, float] | tuple[int, float, bool], ...]:
-        """Return the `traffic` of a device if the robot file uses only these quantities."""
+        """Return the `traffic` of a device of which the robot file uses these quantities."""
         return cls.traffic(settings, rate)
 
     def __init__(self, place: Place, settings: DeviceSettings) -> None:

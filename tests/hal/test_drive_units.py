@@ -62,7 +62,7 @@ def test_traffic_is_that_of_the_quantities_which_the_file_names():
     beat = (1, 10.0)
     assert Cia402Drive.traffic_of(settings, 200.0, ("position",)) == ((6, 200.0), (6, 200.0), beat)
     every = ((6, 200.0), (8, 200.0), (8, 200.0), (2, 10.0), beat)
-    assert Cia402Drive.traffic(settings, 200.0) == every
+    assert Cia402Drive.traffic_of(settings, 200.0, settings.quantities) == every
     (one,) = budget.budgets(RobotConfig.model_validate(joint_description(quantities=("position",))))
     (all_of_them,) = budget.budgets(RobotConfig.model_validate(joint_description()))
     assert all_of_them.bits > one.bits

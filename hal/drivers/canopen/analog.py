@@ -103,11 +103,6 @@ class AnalogNode(CanopenNode):
 
     @classmethod
     @override
-    def traffic(cls, settings: Any, rate: float) -> tuple[tuple[int, float], ...]:
-        return cls.traffic_of(settings, rate, cls.quantities(settings))
-
-    @classmethod
-    @override
     def traffic_of(cls, settings: Any, rate: float, quantities: tuple[str, ...]) -> tuple[tuple[int, float], ...]:
         channels = zip(settings.channels, cls.quantities(settings), strict=True)
         objects = [cls._objects(settings, number) for number, quantity in channels if quantity in quantities]

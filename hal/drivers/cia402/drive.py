@@ -125,11 +125,6 @@ class Cia402Drive(CanopenNode):
 
     @classmethod
     @override
-    def traffic(cls, settings: DriveSettings, rate: float) -> tuple[tuple[int, float], ...]:
-        return cls.traffic_of(settings, rate, settings.quantities)
-
-    @classmethod
-    @override
     def traffic_of(
         cls, settings: DriveSettings, rate: float, quantities: tuple[str, ...]
     ) -> tuple[tuple[int, float], ...]:
