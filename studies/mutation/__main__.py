@@ -30,7 +30,10 @@ from typing import Any
 
 from studies.mutation.mutants import ROOT, Mutant, draw
 
-TESTS = ["tests/hal", *(f"tests/services/test_{name}.py" for name in ("command_intake", "lease", "permission"))]
+TESTS = [
+    "tests/hal",
+    *(f"tests/services/test_{name}.py" for name in ("client_lease", "command_intake", "lease", "permission")),
+]
 BUDGET = 40.0
 """The tests of one mutant take at most this time [s] when they pass."""
 TIMEOUT = 200.0
