@@ -336,3 +336,106 @@ def test_an_axis_that_refuses_is_told_with_its_reason():
         assert "its state is 'idle', not calibrated" in bench.device("elbow_axis")["text"]
     finally:
         bench.close()
+
+
+def sent_in(run, cycles, report=None):
+    """The cycles in which a run sends a frame, from 1; `report` is called before each."""
+    sent = []
+    for cycle in range(1, cycles + 1):
+        if report is not None:
+            report(cycle)
+        run.advance(lambda frame, cycle=cycle: sent.append(cycle) or True)
+    return sent
+
+
+def test_a_step_is_sent_again_every_02_s_and_fails_after_its_time(inbox):
+    on = {"signal": "Status.Mode", "equals": "ON", "within": 0.5}
+    run = Run("test", steps(inbox, {"send": "Go", "until": on}), 200.0)
+    assert not run.has_sent_last
+    assert sent_in(run, 1) == [1]
+    assert run.has_sent_last
+    assert sent_in(run, 99) == [40, 80]
+    assert not run.is_over
+    assert sent_in(run, 1) == []
+    assert run.is_over
+    assert "nothing" in run.failure
+
+
+def test_a_step_ends_in_the_cycle_of_its_confirmation(inbox):
+    on = {"signal": "Status.Mode", "equals": "ON", "within": 0.5}
+    run = Run("test", steps(inbox, {"send": "Go", "until": on}, {"send": "Go"}, {"until": on}), 200.0)
+    assert sent_in(run, 5, lambda cycle: hear(inbox, int(cycle >= 3))) == [1, 4]
+    assert not run.is_over
+    assert run.failure == ""
+    hear(inbox, 0)
+    assert sent_in(run, 1) == []
+    hear(inbox, 1)
+    assert sent_in(run, 1) == []
+    assert run.is_over
+
+
+@pytest.mark.parametrize(
+    ("condition", "raw", "is_met"),
+    [
+        ({"equals": "BUSY"}, 2, True),
+        ({"equals": "BUSY"}, 1, False),
+        ({"one_of": ["OFF", 3]}, 0, True),
+        ({"one_of": ["OFF", 3]}, 3, True),
+        ({"one_of": ["OFF", 3]}, 1, False),
+        ({"below": 2.5}, 2, True),
+        ({"below": 2.0}, 2, False),
+    ],
+)
+def test_conditions(inbox, condition, raw, is_met):
+    found = inbox.condition(StepConfig.model_validate({"until": {"signal": "Status.Mode", **condition}}).until)
+    inbox.seal()
+    assert not found.is_met()
+    hear(inbox, raw)
+    assert found.is_met() is is_met
+    assert not found.is_met(found.newest)
+    assert found.is_met(()) is is_met
+
+
+@pytest.mark.parametrize(
+    ("force", "is_met"), [(-9.0, True), (-11.0, True), (9.5, True), (10.5, False), (-10.5, False), (10.0, False)]
+)
+def test_a_condition_on_a_magnitude_is_in_the_unit_of_the_file(inbox, force, is_met):
+    condition = {"signal": "Load.Force", "below": 10.0}
+    found = inbox.condition(StepConfig.model_validate({"until": condition}).until)
+    inbox.seal()
+    inbox.messages["Load"].raws = ((force + 10.0) / 0.5,)  # the file's factor is 0.5, its offset -10
+    assert found.is_met() is (is_met and abs(force) < 10.0)
+
+
+@pytest.mark.parametrize(
+    ("node", "base", "extended", "identifier"),
+    [
+        (2, 256, None, (264, False)),
+        (2, 256, True, (264, True)),
+        (447, 256, None, (2044, False)),
+        (447, 259, None, (0x7FF, False)),
+        (448, 256, None, None),
+        (448, 256, True, (2048, True)),
+    ],
+)
+def test_identifiers_of_11_and_29_bits(node, base, extended, identifier):
+    address = Address(node, 4, extended)
+    if identifier is None:
+        with pytest.raises(ConfigError, match="node id is 447"):
+            address.identifier(base, False, "message 'Go'")
+    else:
+        assert address.identifier(base, False, "message 'Go'") == identifier
+
+
+@pytest.mark.parametrize(("period", "is_fault"), [(0.0049, False), (0.0031, False), (0.0029, True), (0.0025, True)])
+def test_sending_faster_than_stated_is_a_fault(place, period, is_fault):
+    """50 messages in less than 0.6 of the time that 50 periods take, twice in a row: two devices under one node id."""
+    device = DbcNode(place("position"), settings(DbcSettings, SENSOR))
+    device.is_commissioned = True
+    hear = device._bus.subscriber(256 + 8)
+    device._bus.subscriber(257 + 8)(bytearray.fromhex("00 00"), 0.0)
+    for number in range(149):
+        hear(bytearray.fromhex("00 28 23 00 00 00 00 00"), 10.0 + number * period)
+    assert device._fault() == ""
+    hear(bytearray.fromhex("00 28 23 00 00 00 00 00"), 10.0 + 149 * period)
+    assert bool(device._fault()) is is_fault

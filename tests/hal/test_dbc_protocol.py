@@ -169,3 +169,105 @@ def test_raw_values_in_words():
     assert dbc.describe(errors, 0x80, is_bits=True) == "bit 7"
     assert dbc.describe(errors, 3) == "3"
     assert dbc.describe(errors, math.nan) == "unknown"
+
+
+@pytest.mark.parametrize(
+    ("name", "low", "high"),
+    [
+        ("Mixed.Little", -2048, 2047),
+        ("Mixed.Flag", 0, 1),
+        ("Mixed.Big", -32768, 32767),
+        ("Mixed.Real", -3.4e38, 3.4e38),
+        ("BigBits.Head", 0, 1023),
+        ("Bounded.Speed", -1000, 1000),
+        ("Bounded.Mode", 0, 255),
+        ("Wide.Count", 0, 2**64 - 1),
+    ],
+)
+def test_the_smallest_and_largest_raw_value(mixed, name, low, high):
+    assert dbc.raw_bounds(mixed.signal(name)[1]) == (pytest.approx(low), pytest.approx(high))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "raw"),
+    [
+        ("Mixed.Little", 6.0, 10),  # (6 - 1) / 0.5
+        ("Mixed.Little", -2.0, -6),
+        ("Mixed.Little", 1.3, 1),  # 0.6, to the nearest
+        ("Mixed.Little", 1024.5, 2047),
+        ("Mixed.Real", 0.3, 0.3),
+        ("BigBits.Tail", 7.0, 5),  # (7 + 3) / 2
+        ("Bounded.Mode", "RUN", 2),
+        ("Bounded.Mode", 255, 255),
+        ("Bounded.Speed", -100.0, -1000),
+    ],
+)
+def test_a_value_of_the_file_as_a_raw_value(mixed, name, value, raw):
+    signal = mixed.signal(name)[1]
+    assert mixed.raw(signal, value) == raw
+    assert isinstance(mixed.raw(signal, value), int) == (name != "Mixed.Real")
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("Mixed.Little", 1025.0), ("Mixed.Little", -1024.0), ("Bounded.Speed", 100.2), ("Mixed.Flag", -1)],
+)
+def test_a_value_that_does_not_fit(mixed, name, value):
+    with pytest.raises(ConfigError, match="does not fit"):
+        mixed.raw(mixed.signal(name)[1], value)
+
+
+@pytest.mark.parametrize(
+    ("message", "data", "values"),
+    [
+        # bits counted by hand: Flag is bit 3, Little bits 4 to 15, Big bytes 2 and 3 with the highest first
+        ("Mixed", "08 00 00 00 00 00 00 00", {"Flag": 1, "Little": 0, "Big": 0}),
+        ("Mixed", "10 00 00 00 00 00 00 00", {"Flag": 0, "Little": 1}),
+        ("Mixed", "F0 FF 00 00 00 00 00 00", {"Little": -1}),
+        ("Mixed", "00 80 00 00 00 00 00 00", {"Little": -2048}),
+        ("Mixed", "00 00 01 02 00 00 80 3F", {"Big": 0x0102, "Real": 1.0}),
+        ("Mixed", "00 00 FF FE 00 00 00 00", {"Big": -2}),
+        # Head: bits 5 to 0 of byte 0, then bits 7 to 4 of byte 1. Tail: from bit 6 of byte 3, 17 bits
+        ("BigBits", "20 10 00 00 00 00", {"Head": 0x201}),
+        ("BigBits", "3F F0 00 00 00 00", {"Head": 1023}),
+        ("BigBits", "00 00 00 40 00 00", {"Tail": -65536}),
+        ("BigBits", "00 00 00 00 00 40", {"Tail": 1}),
+        ("BigBits", "00 00 00 00 01 00", {"Tail": 4}),
+        ("Words", "FF FE 00 00 00 00 01 02", {"First": -2, "Second": 0x0102}),
+        ("Wide", "01 00 00 00 00 00 00 80", {"Count": 2**63 + 1}),
+    ],
+)
+def test_frames_written_out_by_hand(mixed, message, data, values):
+    for names in (list(values), *([name] for name in values)):
+        reader = dbc.Reader(mixed.message(message), names)
+        found = dict(zip(reader.names, reader.read(bytes.fromhex(data)), strict=True))
+        assert found == {name: values[name] for name in names}
+
+
+def test_start_values_and_values_that_do_not_change(mixed):
+    writer = dbc.Writer(mixed, mixed.message("Mixed"), {"Flag": 1, "Little": 1.5}, "Big")
+    assert writer.data == bytes.fromhex("18 00 00 00 00 00 00 00")
+    writer.write(0x0102 + 0.4)
+    assert writer.data == bytes.fromhex("18 00 01 02 00 00 00 00")
+    writer.write(-2)
+    assert writer.data == bytes.fromhex("18 00 FF FE 00 00 00 00")
+    little = dbc.Writer(mixed, mixed.message("Mixed"), {"Big": 1}, "Little")
+    little.write(-1)
+    assert little.data == bytes.fromhex("F0 FF 00 01 00 00 00 00")
+    assert dbc.Writer(mixed, mixed.message("Empty"), {}).data == b""
+
+
+def test_many_names_are_not_all_listed():
+    body = "".join(f"BO_ {number} Message{number}: 0 A\n\n" for number in range(1, 43))
+    file = dbc.Dbc(Path("many.dbc"), dbc.cantools.database.load_string(HEAD + body, database_format="dbc"))
+    with pytest.raises(ConfigError) as caught:
+        file.message("Nothing of the kind")
+    assert str(caught.value).count("Message") == 40
+    assert "and 2 more" in str(caught.value)
+
+
+def test_bits_without_a_name():
+    errors = dbc.load(FILES / "odrive_cansimple.dbc").signal("Heartbeat.Axis_Error")[1]
+    assert dbc.describe(errors, 1 << 31, is_bits=True).startswith("bit 31") or errors.length < 32
+    assert dbc.describe(errors, 0x2000) == "motor over temp"
+    assert dbc.describe(errors, math.inf) == "unknown"

@@ -144,3 +144,94 @@ def test_an_ordinary_answer_is_no_register():
 
 def test_ranges_of_one_motor():
     assert Ranges(12.5, 50.0, 18.0, 500.0, 5.0) == AK80_9
+
+
+def test_errors_and_special_values_as_the_makers_document_them():
+    t_motor = ["too hot", "overcurrent", "overvoltage", "undervoltage", "encoder fault", "unbalanced phase currents"]
+    for code, text in enumerate(t_motor, 1):
+        assert text in mit.describe_error(code, Layout.T_MOTOR)
+    damiao = {0x8: "overvoltage", 0x9: "undervoltage", 0xA: "overcurrent", 0xB: "driver", 0xC: "rotor", 0xD: "CAN"}
+    for code, text in {**damiao, 0xE: "overload"}.items():
+        assert text in mit.describe_error(code, Layout.DAMIAO)
+        assert f"error {code:X}h" in mit.describe_error(code, Layout.DAMIAO)
+    for code, layout in ((7, Layout.T_MOTOR), (0, Layout.T_MOTOR), (7, Layout.DAMIAO), (0xF, Layout.DAMIAO)):
+        assert "not documented" in mit.describe_error(code, layout)
+    assert {code.name: code.value for code in Register} == {
+        "MASTER_ID": 7,
+        "NODE_ID": 8,
+        "TIMEOUT": 9,
+        "MODE": 10,
+        "SERIAL": 15,
+        "POSITION_RANGE": 21,
+        "VELOCITY_RANGE": 22,
+        "EFFORT_RANGE": 23,
+    }
+    assert (mit.REGISTERS, mit.NODES, mit.MIT_MODE, mit.TIMEOUT_UNIT) == (0x7FF, 0x7FF, 1, 50e-6)
+    assert (mit.ENABLED, mit.DISABLED, mit.T_MOTOR_COLDEST) == (1, 0, -40)
+    assert mit.SIZES == {Layout.MINI_CHEETAH: (6, 7), Layout.T_MOTOR: (6, 8), Layout.DAMIAO: (8,)}
+
+
+@pytest.mark.parametrize(
+    ("name", "layout", "position", "velocity", "effort"),
+    [
+        ("mini-cheetah", "mini_cheetah", 12.5, 65, 18),
+        ("AK10-9", "t_motor", 12.5, 50, 65),
+        ("AK60-6", "t_motor", 12.5, 45, 15),
+        ("AK70-10", "t_motor", 12.5, 50, 25),
+        ("AK80-6", "t_motor", 12.5, 76, 12),
+        ("AK80-9", "t_motor", 12.5, 50, 18),
+        ("AK80-64", "t_motor", 12.5, 8, 144),
+        ("DM3507", "damiao", 12.566, 50, 5),
+        ("DM4310", "damiao", 12.5, 30, 10),
+        ("DM4310-48V", "damiao", 12.5, 50, 10),
+        ("DM4310P", "damiao", 12.5, 50, 10),
+        ("DM4340", "damiao", 12.5, 10, 28),
+        ("DM4340-48V", "damiao", 12.5, 10, 28),
+        ("DM6006", "damiao", 12.5, 45, 20),
+        ("DM8006", "damiao", 12.5, 45, 40),
+        ("DM8009", "damiao", 12.5, 45, 54),
+        ("DM10010L", "damiao", 12.5, 25, 200),
+        ("DM10010", "damiao", 12.5, 20, 200),
+        ("DMH3510", "damiao", 12.5, 280, 1),
+        ("DMH6215", "damiao", 12.5, 45, 10),
+        ("DMG6220", "damiao", 12.5, 45, 10),
+    ],
+)
+def test_ranges_as_the_makers_print_them(name, layout, position, velocity, effort):
+    assert MOTORS[name].layout == layout
+    assert MOTORS[name].ranges == Ranges(position, velocity, effort, 500.0, 5.0)
+
+
+def test_counts_of_an_answer_and_its_ends():
+    assert mit.counts(bytes.fromhex("01 8001 802 403 00 00".replace(" ", ""))) == (0x8001, 0x802, 0x403)
+    lowest = mit.parse_answer(bytes.fromhex("11 0001 001 001 00 00".replace(" ", "")), Layout.DAMIAO, DM4310)
+    assert (lowest.position, lowest.velocity, lowest.effort) == (
+        pytest.approx(25 / 65535 - 12.5),
+        pytest.approx(60 / 4095 - 30),
+        pytest.approx(20 / 4095 - 10),
+    )
+    highest = mit.parse_answer(bytes.fromhex("11 FFFE FFE FFE 00 00".replace(" ", "")), Layout.DAMIAO, DM4310)
+    assert highest.position == pytest.approx(12.5 - 25 / 65535)
+    assert highest.effort == pytest.approx(10 - 20 / 4095)
+
+
+@pytest.mark.parametrize(
+    ("value", "counts"),
+    [(-1.0, 0), (-0.5, 1), (-0.499, 2), (0.0, 2), (0.001, 3), (0.5, 3), (1.0, 4), (2.0, 4), (-9, 0)],
+)
+def test_the_nearest_counts_and_half_a_count_is_rounded_down(value, counts):
+    """-1..1 in counts 0..4 is half a unit per count, here a quarter off: -0.75 and -0.25 lie between two counts."""
+    assert mit.to_counts(value, -1.0, 1.0, 4) == counts - (value in (-0.499, 0.001))
+    assert [mit.to_counts(half, -1.0, 1.0, 4) for half in (-0.75, -0.25, 0.25, 0.75)] == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize(("data", "is_register"), [("05 00 33", True), ("05 00 55", True), ("05 00 34", False)])
+def test_answers_to_register_requests(data, is_register):
+    frame = bytes.fromhex(data) + bytes.fromhex("0A 01 02 03 04")
+    found = mit.parse_register(frame, 5)
+    assert (found is not None) == is_register
+    if found:
+        assert (found.node, found.register, found.data, found.integer) == (5, 10, bytes((1, 2, 3, 4)), 0x04030201)
+    assert mit.parse_register(frame, 0x105) is None
+    far = bytes.fromhex("05 01") + frame[2:]
+    assert (mit.parse_register(far, 0x105) is not None) == is_register
