@@ -1,1 +1,1 @@
-"""Finding out: who is on a bus, what frames mean, what is wrong with a robot, and what a device really measures."""
+"""Tools for operators: scan of a bus, decoding of frames, checks of a robot, and measurements for a calibration."""

@@ -1,7 +1,7 @@
-"""What is known of the nodes of a bus, for whoever wants to say what its frames mean.
+"""Data about the nodes of a bus for the decoding of frames.
 
-A book begins with the robot file's data sheets and mappings, and learns those that an SDO client writes or reads while
-one listens.
+A book begins with the data sheets and mappings of the robot file, and learns mappings that an SDO client writes or
+reads meanwhile.
 """
 
 from collections.abc import Callable
@@ -14,10 +14,10 @@ from hal.protocols import cia301, sdo
 from hal.protocols.cia301 import Mapped
 
 Explain = Callable[[bytes], tuple[int | None, str]]
-"""Data of a frame that is not CANopen -> whose it is, and what it says."""
+"""An explainer returns node and text of the data of a frame that is not CANopen."""
 
 EXTENDED = 1 << 29
-"""Set in an identifier that has 29 bits."""
+"""This bit marks a 29-bit identifier."""
 _PDO_AREAS = ((0x1400, 0x1600, "RPDO"), (0x1800, 0x1A00, "TPDO"))
 _PDO_COUNT = 0x200
 
@@ -27,12 +27,12 @@ class Frame:
     """A frame as it was on the bus.
 
     Attributes:
-        stamp: When, as the interface says it [s since 1970].
-        identifier: 11 bits, or 29 if extended; of an error frame its class.
+        stamp: Time stamp of the interface [s since 1970].
+        identifier: 11 bits, or 29 if extended; the error class of an error frame.
         data: Up to 8 bytes.
         is_extended: Whether the identifier has 29 bits.
-        is_remote: Whether it asks for data.
-        is_error: Whether the controller reports an error with it.
+        is_remote: Whether the frame requests data.
+        is_error: Whether the frame is an error report of the controller.
     """
 
     stamp: float
@@ -45,7 +45,7 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class Pdo:
-    """A process data object: what it is called, whose it is, and what it carries."""
+    """A process data object: label, node and mapped objects."""
 
     label: str
     node: int
@@ -53,25 +53,25 @@ class Pdo:
 
 
 class Book:
-    """What is known of the nodes of one bus.
+    """Data about the nodes of one bus.
 
     Attributes:
         names: Node id -> name in the robot file.
-        dictionaries: Node id -> what its data sheet says.
-        pdos: Identifier -> what it carries.
-        explained: Identifier (with bit 29 set if extended) -> kind, and what explains a frame that is not CANopen.
+        dictionaries: Node id -> object dictionary of its data sheet.
+        pdos: Identifier -> process data object.
+        explainers: Identifier (with bit 29 set if extended) -> kind and explainer of frames that are not CANopen.
     """
 
     def __init__(self) -> None:
         self.names: dict[int, str] = {}
         self.dictionaries: dict[int, canopen.ObjectDictionary] = {}
         self.pdos: dict[int, Pdo] = {}
-        self.explained: dict[int, tuple[str, Explain]] = {}
+        self.explainers: dict[int, tuple[str, Explain]] = {}
         self._entries: dict[tuple[int, int, int], int] = {}
-        self._asked: dict[int, tuple[int, int, int]] = {}
+        self._requests: dict[int, tuple[int, int, int]] = {}
 
     def add(self, node: int, name: str, dictionary: canopen.ObjectDictionary) -> None:
-        """A CANopen node with a data sheet; its PDO are at first as the data sheet has them."""
+        """Add a CANopen node with its data sheet, which defines its first PDO."""
         self.names[node] = name
         self.dictionaries[node] = dictionary
         for parameters, mapping, _ in _PDO_AREAS:
@@ -84,17 +84,17 @@ class Book:
         self._map(node)
 
     def explain(self, identifier: int, kind: str, explain: Explain) -> None:
-        """An identifier (with bit 29 set if extended) that is not CANopen, and what explains its frames."""
-        self.explained[identifier] = (kind, explain)
+        """Set the explainer of an identifier (with bit 29 set if extended) that is not CANopen."""
+        self.explainers[identifier] = (kind, explain)
 
     def carry(self, node: int, label: str, identifier: int, objects: tuple[Mapped, ...]) -> None:
-        """A PDO is known to carry something else than the data sheet says."""
+        """Replace the mapping of a PDO."""
         for known in [key for key, pdo in self.pdos.items() if (pdo.node, pdo.label) == (node, label)]:
             del self.pdos[known]
         self.pdos[identifier] = Pdo(label, node, objects)
 
     def learn(self, frame: Frame) -> None:
-        """Take note of a mapping that an SDO client writes or reads; anything else is passed over."""
+        """Update a mapping that an SDO client writes or reads; ignore all other frames."""
         if frame.is_extended or frame.is_remote or frame.is_error or len(frame.data) != 8:
             return
         function, node = frame.identifier & 0x780, frame.identifier & 0x7F
@@ -105,15 +105,15 @@ class Book:
             return
         value = int.from_bytes(sdo.expedited(frame.data), "little")
         if function == cia301.SDO_REQUEST:
-            self._asked.pop(node, None)
+            self._requests.pop(node, None)
             if command & 0xE2 == 0x22:
-                self._asked[node] = (index, subindex, value)
+                self._requests[node] = (index, subindex, value)
             return
-        asked = self._asked.pop(node, None)
+        request = self._requests.pop(node, None)
         if command & 0xE2 == 0x42:
             self._entries[node, index, subindex] = value
-        elif command == 0x60 and asked is not None and asked[:2] == (index, subindex):
-            self._entries[node, index, subindex] = asked[2]
+        elif command == 0x60 and request is not None and request[:2] == (index, subindex):
+            self._entries[node, index, subindex] = request[2]
         else:
             return
         self._map(node)
@@ -130,7 +130,7 @@ class Book:
             self._entries[node, index, subindex] = entry.default
 
     def _map(self, node: int) -> None:
-        """Put together the PDO of a node whose identifier, count and entries are all known."""
+        """Set the PDO of a node whose identifier, count and entries are all known."""
         entries = self._entries
         numbers = {index & 0x1FF for known, index, _ in entries if known == node}
         for parameters, mapping, label in _PDO_AREAS:

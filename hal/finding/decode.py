@@ -1,4 +1,4 @@
-"""What a CAN frame says, in words: CANopen by object dictionaries and mappings, anything else by what the book knows.
+"""Description of a CAN frame in words, from object dictionaries, mappings and the explainers of a book.
 
 Source: CiA 301, version 4.2: 7.2.2 (PDO), 7.2.4 (SDO), 7.2.5 (SYNC), 7.2.6 (time), 7.2.7 (EMCY), 7.2.8 (NMT).
 """
@@ -16,7 +16,7 @@ from hal.protocols.error_frames import error_frame
 
 TIME = 0x100
 _INTEGERS = {2: True, 3: True, 4: True, 0x15: True, 5: False, 6: False, 7: False, 0x1B: False}
-"""Data type -> whether it is signed."""
+"""Integer data types are signed or not."""
 _REAL32, _TEXTS = 8, (9, 0xA, 0xB)
 _NMT_WORDS = {
     NmtCommand.START: "start",
@@ -29,12 +29,12 @@ _NMT_WORDS = {
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """What a frame says.
+    """Description of a frame.
 
     Attributes:
-        kind: `SYNC`, `NMT`, `heartbeat`, `EMCY`, `SDO`, `TPDO1`, ...; `?` if nobody knows.
-        node: The node that sent it or is asked, if one is meant.
-        text: In words.
+        kind: `SYNC`, `NMT`, `heartbeat`, `EMCY`, `SDO`, `TPDO1`, ...; `?` if unknown.
+        node: Node that sent the frame or receives it, if any.
+        text: Content in words.
     """
 
     kind: str
@@ -43,14 +43,14 @@ class Line:
 
 
 def describe(frame: Frame, book: Book) -> Line:
-    """What a frame says, as far as the book knows the node."""
+    """Return the description of a frame, as far as the book has data about the node."""
     if frame.is_error:
         return Line("error", None, _error(frame))
     key = frame.identifier | (EXTENDED if frame.is_extended else 0)
     if frame.is_remote:
         return Line("remote", None, "asks for the data of this identifier")
-    if key in book.explained:
-        kind, explain = book.explained[key]
+    if key in book.explainers:
+        kind, explain = book.explainers[key]
         return Line(kind, *explain(frame.data))
     if frame.is_extended:
         return Line("?", None, "")
@@ -60,7 +60,7 @@ def describe(frame: Frame, book: Book) -> Line:
 
 
 def _predefined(frame: Frame, book: Book) -> Line:
-    """By the predefined connection set (CiA 301, table 79)."""
+    """Return the description by the predefined connection set (CiA 301, table 79)."""
     identifier, data = frame.identifier, frame.data
     function, node = identifier & 0x780, identifier & 0x7F
     if identifier == cia301.NMT:
@@ -86,7 +86,7 @@ def _predefined(frame: Frame, book: Book) -> Line:
 
 
 def nmt_words(state: int) -> str:
-    """An NMT state in words."""
+    """Return an NMT state in words."""
     known = {NmtState.BOOT_UP: "boot-up", NmtState.PRE_OPERATIONAL: "pre-operational"}
     try:
         return known.get(NmtState(state), NmtState(state).name.lower())
@@ -105,25 +105,25 @@ def _nmt(data: bytes) -> Line:
 
 
 def _emergency(data: bytes) -> str:
-    found = cia301.emergency(data)
-    if found is None:
+    emergency = cia301.emergency(data)
+    if emergency is None:
         return "malformed"
-    if not found.code:
+    if not emergency.code:
         return "all errors are gone"
-    more = f", detail {found.detail.hex(' ').upper()}" if any(found.detail) else ""
-    return f"{cia301.describe_emergency(found.code)}, error register {found.register:02X}h{more}"
+    more = f", detail {emergency.detail.hex(' ').upper()}" if any(emergency.detail) else ""
+    return f"{cia301.describe_emergency(emergency.code)}, error register {emergency.register:02X}h{more}"
 
 
 def _pdo(pdo: Pdo, data: bytes, book: Book) -> Line:
-    wanted = sum(item.bits for item in pdo.objects)
-    if len(data) * 8 < wanted:
-        return Line(pdo.label, pdo.node, f"malformed: {len(data)} bytes in place of {(wanted + 7) // 8}")
+    size = sum(item.bits for item in pdo.objects)
+    if len(data) * 8 < size:
+        return Line(pdo.label, pdo.node, f"malformed: {len(data)} bytes in place of {(size + 7) // 8}")
     whole, place, parts = int.from_bytes(data, "little"), 0, []
     dictionary = book.dictionaries.get(pdo.node)
     for item in pdo.objects:
         bits = whole >> place & (1 << item.bits) - 1
         place += item.bits
-        if item.index > 7:  # below are the dummies of CiA 301, 7.4.7
+        if item.index > 7:  # lower indices are dummies (CiA 301, 7.4.7)
             entry = _entry(dictionary, item.index, item.subindex)
             raw = bits.to_bytes((item.bits + 7) // 8, "little")
             name = _name(entry) or f"{item.index:04X}h:{item.subindex}"
@@ -163,15 +163,15 @@ def _entry(dictionary: canopen.ObjectDictionary | None, index: int, subindex: in
 
 
 def _name(entry: ODVariable | None) -> str:
-    """An object's name, and that of the array or record around it unless it says that itself."""
+    """Return the name of an object, after the name of its array or record unless it contains that."""
     if entry is None:
         return ""
-    around = getattr(entry.parent, "name", None) or ""
-    return str(entry.name) if str(entry.name).startswith(around) else f"{around}.{entry.name}"
+    parent = getattr(entry.parent, "name", None) or ""
+    return str(entry.name) if str(entry.name).startswith(parent) else f"{parent}.{entry.name}"
 
 
 def _value(entry: ODVariable | None, raw: bytes, index: int) -> str:
-    """A value as its data type says; bytes where no data sheet tells the type."""
+    """Return a value as text by its data type; bytes if the type is unknown."""
     kind = entry.data_type if entry is not None else None
     if kind == _REAL32 and len(raw) == 4:
         return f"{struct.unpack('<f', raw)[0]:.7g}"
@@ -194,6 +194,6 @@ def _printable(raw: bytes) -> str:
 
 
 def _error(frame: Frame) -> str:
-    found = error_frame(frame.identifier, frame.data)
-    counted = f" (errors sending {found.counters[0]}, receiving {found.counters[1]})" if found.counters else ""
-    return (found.text or "The controller has recovered.") + counted
+    error = error_frame(frame.identifier, frame.data)
+    counters = f" (errors sending {error.counters[0]}, receiving {error.counters[1]})" if error.counters else ""
+    return (error.text or "The controller has recovered.") + counters

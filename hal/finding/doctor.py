@@ -1,6 +1,6 @@
-"""What is wrong with a robot's buses and devices, and what to do: one finding per thing that was looked at.
+"""Checks of a robot's buses and devices: one finding per check, with a remedy.
 
-Nothing is enabled: the devices are opened, turned for a second with their motors off, read back, and let go.
+No drive is enabled: the devices are opened, cycled for a second with their motors off, read back, and closed.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -25,7 +25,7 @@ from hal.wire.state import BusState
 
 
 class Verdict(StrEnum):
-    """How it stands, worst last."""
+    """Result of a check, worst last."""
 
     OK = "ok"
     WARNING = "warning"
@@ -34,12 +34,12 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing that was looked at.
+    """One check and its result.
 
     Attributes:
-        what: As in `interface can0`.
-        verdict: How it stands.
-        text: What was found, and if it is not good, what to do.
+        what: Subject of the check, as in `interface can0`.
+        verdict: Result.
+        text: Result in words, and the remedy if it is not good.
     """
 
     what: str
@@ -48,32 +48,32 @@ class Finding:
 
 
 def ok(what: str, text: str) -> Finding:
-    """All is well."""
+    """Return a finding without a problem."""
     return Finding(what, Verdict.OK, text)
 
 
 def warning(what: str, text: str) -> Finding:
-    """It works, but not for certain or not as well as it could."""
+    """Return a finding of a possible problem."""
     return Finding(what, Verdict.WARNING, text)
 
 
 def bad(what: str, text: str) -> Finding:
-    """It does not work."""
+    """Return a finding of a failure."""
     return Finding(what, Verdict.BAD, text)
 
 
 DURATION = 1.0
-"""How long [s] the devices are turned to see whether they answer every cycle."""
+"""The devices are cycled for this time [s]."""
 SETTLE = 10
-"""Cycles before they are counted."""
+"""This number of first cycles is not counted."""
 COMPLETE = 0.98
-"""Share of the cycles in which every device should answer."""
+"""Every device should answer in this share of the cycles."""
 MUTE = 0.5
-"""A device that misses more of the cycles is told by itself."""
+"""A device that misses a larger share of the cycles gets a finding of its own."""
 
 
-def described(config: RobotConfig) -> Iterator[Finding]:
-    """The robot file, the budget of its buses, and its calibrations: nothing is opened."""
+def check_file(config: RobotConfig) -> Iterator[Finding]:
+    """Check the robot file, the budget of its buses, and its calibrations; nothing is opened."""
     try:
         build(config, SystemClock(), _calibrations(config))
     except ConfigError as error:
@@ -81,21 +81,21 @@ def described(config: RobotConfig) -> Iterator[Finding]:
         return
     counts = f"{len(config.buses)} buses, {len(config.devices)} devices, {len(config.signals)} signals"
     yield ok("robot file", f"'{config.robot}': {counts}.")
-    for found in budget.budgets(config):
-        yield ok(f"budget {found.bus}", f"{found}.")
-    yield calibrated(config)
+    for bus_budget in budget.budgets(config):
+        yield ok(f"budget {bus_budget.bus}", f"{bus_budget}.")
+    yield check_calibration(config)
 
 
 def _calibrations(config: RobotConfig) -> dict[str, Calibration]:
-    """Those that are stored; none if one is refused, which `calibrated` tells: the rest can be looked at even so."""
+    """Return the stored calibrations; none if one is refused, which `check_calibration` reports."""
     try:
         return store.load(config)
     except ConfigError:
         return {}
 
 
-def calibrated(config: RobotConfig) -> Finding:
-    """Whether the calibrations hold, and which devices have none though their driver takes one."""
+def check_calibration(config: RobotConfig) -> Finding:
+    """Check that the calibrations are valid and complete."""
     try:
         stored = store.load(config)
         dates = [record.date[:10] for record in store.records(config) if record.device in stored]
@@ -106,20 +106,20 @@ def calibrated(config: RobotConfig) -> Finding:
     if nameless:
         return warning(
             "calibration",
-            f"{has}. {_listed(nameless)} cannot tell who they are: when you replace one, calibrate it again.",
+            f"{has}. {_listed(nameless)} have no identity: when you replace one, calibrate it again.",
         )
     missing = store.uncalibrated(config, stored)
     if missing:
         return warning(
             "calibration",
-            f"{has}; zero and scale of {_listed(missing)} are the robot file's. If these are "
+            f"{has}; zero and scale of {_listed(missing)} are those of the robot file. If these are "
             "not measured, use `gemuco calibrate`.",
         )
-    return ok("calibration", f"{has}; whatever else the robot has goes by the robot file.")
+    return ok("calibration", f"{has}; all other devices use the robot file.")
 
 
-def examine(config: RobotConfig, duration: float = DURATION) -> Iterator[Finding]:
-    """Open buses and devices, turn them with their motors off, and read back what they were told.
+def check_devices(config: RobotConfig, duration: float = DURATION) -> Iterator[Finding]:
+    """Open buses and devices, cycle them with their motors off, and read back their configuration.
 
     Raises:
         ConfigError: The robot file cannot be built.
@@ -130,18 +130,18 @@ def examine(config: RobotConfig, duration: float = DURATION) -> Iterator[Finding
     for bus in buses:
         bus.open()
     try:
-        there = {bus.name for bus in buses if bus.counters["opened"]}
-        asked = [device for device in devices if config.devices[device.name].bus in there]
-        errors = dict(zip(asked, pool.map(_opened, asked), strict=True))
+        opened = {bus.name for bus in buses if bus.counters["opened"]}
+        reachable = [device for device in devices if config.devices[device.name].bus in opened]
+        errors = dict(zip(reachable, pool.map(_open, reachable), strict=True))
         answering = [device for device, error in errors.items() if not error]
-        share, missed = _turn(config, buses, answering, clock, duration)
-        yield from _buses(buses, there, config)
-        yield from _answers(devices, errors, there, config)
+        share, missed = _cycle(config, buses, answering, clock, duration)
+        yield from _buses(buses, opened, config)
+        yield from _answers(devices, errors)
         if answering:
             yield from _complete(share, missed, answering, config.rates.hal)
         with pulse(buses):
-            checks = dict(zip(answering, pool.map(_checks, answering), strict=True))
-        yield from _inspected(checks)
+            checks = dict(zip(answering, pool.map(_inspect, answering), strict=True))
+        yield from _summary(checks)
     finally:
         list(pool.map(lambda device: device.close(), devices))
         pool.shutdown()
@@ -149,8 +149,8 @@ def examine(config: RobotConfig, duration: float = DURATION) -> Iterator[Finding
             bus.close()
 
 
-def _opened(device: Device) -> str:
-    """Open a device; why it cannot be, empty if it could."""
+def _open(device: Device) -> str:
+    """Open a device and return the error; empty without one."""
     try:
         device.open()
     except HalError as error:
@@ -158,10 +158,10 @@ def _opened(device: Device) -> str:
     return ""
 
 
-def _turn(
+def _cycle(
     config: RobotConfig, buses: Sequence[Bus], devices: Iterable[Device], clock: SystemClock, duration: float
 ) -> tuple[float, dict[str, float]]:
-    """Cycle with the motors off: share of cycles in which all answered, and in which each did not."""
+    """Cycle with the motors off; return the share of complete cycles, and that of missed cycles per device."""
     period, devices = 1.0 / config.rates.hal, list(devices)
     cycles = max(10, round(duration * config.rates.hal))
     missed = dict.fromkeys((device.name for device in devices), 0)
@@ -179,7 +179,7 @@ def _turn(
         for bus in buses:
             bus.wait(start + 0.8 * period)
         if number >= 0:
-            late = [one for one in devices if isinstance(one, CanDevice) and one.missed > one.patience]
+            late = [device for device in devices if isinstance(device, CanDevice) and device.missed > device.patience]
             for device in late:
                 missed[device.name] += 1
             whole += not late
@@ -188,13 +188,13 @@ def _turn(
     return whole / cycles, {name: count / cycles for name, count in missed.items()}
 
 
-def _buses(buses: Sequence[Bus], there: set[str], config: RobotConfig) -> Iterator[Finding]:
-    planned = {found.bus: found.load for found in budget.budgets(config)}
+def _buses(buses: Sequence[Bus], opened: set[str], config: RobotConfig) -> Iterator[Finding]:
+    planned = {bus_budget.bus: bus_budget.load for bus_budget in budget.budgets(config)}
     for bus in buses:
         what, settings = f"bus {bus.name}", config.buses[bus.name]
-        if bus.name not in there:
+        if bus.name not in opened:
             advice = (
-                " Start `gemuco simulate`, or name real interfaces." if settings.interface in store.SIMULATED else ""
+                " Start `gemuco simulate`, or set real interfaces." if settings.interface in store.SIMULATED else ""
             )
             yield bad(what, f"It does not open: {bus.text}{advice}")
             continue
@@ -210,13 +210,11 @@ def _buses(buses: Sequence[Bus], there: set[str], config: RobotConfig) -> Iterat
         if health["unknown"]:
             strangers = ", ".join(str(stranger) for stranger in health["unknown"])
             yield warning(
-                f"strangers {bus.name}", f"Frames of nobody in the robot file: {strangers}. `gemuco scan` tells more."
+                f"strangers {bus.name}", f"Frames that are not in the robot file: {strangers}. See `gemuco scan`."
             )
 
 
-def _answers(
-    devices: Sequence[Device], errors: dict[Device, str], there: set[str], config: RobotConfig
-) -> Iterator[Finding]:
+def _answers(devices: Sequence[Device], errors: dict[Device, str]) -> Iterator[Finding]:
     silent = [device.name for device in devices if device not in errors]
     for device, error in errors.items():
         if error:
@@ -235,7 +233,7 @@ def _complete(share: float, missed: dict[str, float], devices: Sequence[Device],
     for device in mute:
         yield bad(
             f"node {device.name}",
-            f"It answers when asked, and sends no process data in {missed[device.name]:.0%} of the cycles. "
+            f"It answers requests, but sends no process data in {missed[device.name]:.0%} of the cycles. "
             f"{device.health().text}",
         )
     if share >= COMPLETE:
@@ -249,31 +247,27 @@ def _complete(share: float, missed: dict[str, float], devices: Sequence[Device],
         )
 
 
-def _checks(device: Device) -> tuple[tuple[str, bool, str], ...]:
+def _inspect(device: Device) -> tuple[tuple[str, bool, str], ...]:
     try:
         return tuple((check.what, check.is_good, check.text) for check in device.inspect())
     except HalError as error:
         return (("inspection", False, str(error)),)
 
 
-def _inspected(checks: dict[Device, tuple[tuple[str, bool, str], ...]]) -> Iterator[Finding]:
-    """One line per kind of check if all devices pass it, and one per device that does not."""
-    kinds = list(
-        dict.fromkeys(what for found in checks.values() for what, _, _ in found if not what.startswith("object"))
-    )
-    for kind in kinds:
-        passed = [device.name for device, found in checks.items() if any(w == kind for w, _, _ in found)]
-        wrong = [
-            (d.name, text) for d, found in checks.items() for w, is_good, text in found if w == kind and not is_good
-        ]
+def _summary(checks: dict[Device, tuple[tuple[str, bool, str], ...]]) -> Iterator[Finding]:
+    """Yield one finding per kind of check that all devices pass, and one per device that fails."""
+    results = [(what, device.name, good, text) for device, own in checks.items() for what, good, text in own]
+    objects = [result for result in results if result[0].startswith("object")]
+    for kind in dict.fromkeys(what for what, *_ in results if not what.startswith("object")):
+        wrong = [(name, text) for what, name, is_good, text in results if what == kind and not is_good]
         for name, text in wrong:
             yield bad(f"{kind} {name}", text)
         if not wrong:
-            yield ok(kind, f"As it should be in {len(passed)} devices.")
-    for device, found in checks.items():
-        for what, is_good, text in found:
-            if what.startswith("object") and not is_good:
-                yield bad(f"{what} {device.name}", text)
+            count = len({name for what, name, _, _ in results if what == kind})
+            yield ok(kind, f"Correct in {count} devices.")
+    for what, name, is_good, text in objects:
+        if not is_good:
+            yield bad(f"{what} {name}", text)
 
 
 def _listed(names: Sequence[str], most: int = 4) -> str:
@@ -281,69 +275,70 @@ def _listed(names: Sequence[str], most: int = 4) -> str:
     return ", ".join(names[:most]) + more
 
 
-def interfaces(config: RobotConfig) -> Iterator[Finding]:
-    """Whether the interfaces are there, up, and set as the robot file says."""
+def check_interfaces(config: RobotConfig) -> Iterator[Finding]:
+    """Check that the interfaces exist, are up, and have the settings of the robot file."""
     for name, bus in config.buses.items():
         what = f"interface {name}"
         if bus.interface == "socketcan":
             commands = sum(bool(_commanded(config, device)) for device, at in config.devices.items() if at.bus == name)
-            yield from socketcan(what, bus, link.look_up(bus.channel), commands)
+            yield from check_socketcan(what, bus, link.look_up(bus.channel), commands)
         elif bus.interface == "virtual":
             yield warning(
-                what, "'virtual' lives inside one process, for tests. For two processes use `interface: hub`."
+                what, "'virtual' works inside one process, for tests. For two processes use `interface: hub`."
             )
         elif bus.interface == "hub":
             yield ok(what, f"hub '{bus.channel}', for simulated nodes: it has no bit rate and no errors of its own.")
         else:
-            yield warning(what, f"{bus.interface} {bus.channel}: what its adapter is set to cannot be looked up here.")
+            yield warning(what, f"{bus.interface} {bus.channel}: the settings of its adapter cannot be read here.")
 
 
-def socketcan(what: str, bus: BusConfig, found: link.Link | None, commands: int) -> Iterator[Finding]:
-    """The state of a Linux CAN interface; `commands` frames are sent at once beside the SYNC."""
+def check_socketcan(what: str, bus: BusConfig, state: link.Link | None, commands: int) -> Iterator[Finding]:
+    """Check a Linux CAN interface; `commands` frames are sent at once, in addition to the SYNC."""
+    name = what.split()[-1]
     up = f"sudo ip link set {bus.channel} up type can bitrate {bus.bitrate} restart-ms 100"
-    if found is None:
+    if state is None:
         known = ", ".join(link.known_links()) or "none"
         yield bad(
             what, f"There is no interface '{bus.channel}'. CAN interfaces here: {known}. Is the adapter plugged in?"
         )
         return
-    if not found.is_can:
-        yield bad(what, f"'{bus.channel}' is no CAN interface. Those here: {', '.join(link.known_links()) or 'none'}.")
+    if not state.is_can:
+        yield bad(
+            what, f"'{bus.channel}' is not a CAN interface. Those here: {', '.join(link.known_links()) or 'none'}."
+        )
         return
-    if not found.is_up:
-        command = up if found.kind in ("can", "") else f"sudo ip link set {bus.channel} up"
+    if not state.is_up:
+        command = up if state.kind in ("can", "") else f"sudo ip link set {bus.channel} up"
         yield bad(what, f"'{bus.channel}' is down. Set it up with `{command}`.")
         return
-    yield ok(what, f"'{bus.channel}' ({found.kind or 'CAN'}) is up.")
-    if found.kind == "can":
-        if found.bitrate != bus.bitrate:
+    yield ok(what, f"'{bus.channel}' ({state.kind or 'CAN'}) is up.")
+    if state.kind == "can":
+        if state.bitrate != bus.bitrate:
             yield bad(
-                f"bit rate {what.split()[-1]}",
-                f"{found.bitrate} bit/s, and the robot file says {bus.bitrate}. "
+                f"bit rate {name}",
+                f"{state.bitrate} bit/s, and the robot file says {bus.bitrate}. "
                 f"`sudo ip link set {bus.channel} down; {up}`",
             )
         else:
-            yield ok(f"bit rate {what.split()[-1]}", f"{bus.bitrate / 1e3:g} kbit/s.")
-        yield from _controller(what.split()[-1], bus, found)
-    if found.queue is not None and found.queue < commands + 2:
+            yield ok(f"bit rate {name}", f"{bus.bitrate / 1e3:g} kbit/s.")
+        yield from _controller(name, bus, state)
+    if state.queue is not None and state.queue < commands + 2:
         more = f"sudo ip link set {bus.channel} txqueuelen {4 * (commands + 2)}"
-        yield warning(
-            f"queue {what.split()[-1]}", f"{found.queue} frames, and {commands + 2} are sent at once. `{more}`"
-        )
+        yield warning(f"queue {name}", f"{state.queue} frames, and {commands + 2} are sent at once. `{more}`")
 
 
-def _controller(name: str, bus: BusConfig, found: link.Link) -> Iterator[Finding]:
-    if not found.restart:
+def _controller(name: str, bus: BusConfig, state: link.Link) -> Iterator[Finding]:
+    if not state.restart:
         yield warning(
             f"restart {name}",
             "The controller stays off after bus-off. "
             f"`sudo ip link set {bus.channel} down; sudo ip link set {bus.channel} type can restart-ms 100`",
         )
     else:
-        yield ok(f"restart {name}", f"{found.restart * 1e3:g} ms after bus-off.")
-    if found.state not in ("ERROR-ACTIVE", ""):
-        is_lost = found.state in ("BUS-OFF", "STOPPED")
-        text = f"The controller is {found.state}. Check wiring, both 120 ohm terminations, and every node's bit rate."
+        yield ok(f"restart {name}", f"{state.restart * 1e3:g} ms after bus-off.")
+    if state.state not in ("ERROR-ACTIVE", ""):
+        is_lost = state.state in ("BUS-OFF", "STOPPED")
+        text = f"The controller is {state.state}. Check wiring, both 120 ohm terminations, and every node's bit rate."
         yield bad(f"controller {name}", text) if is_lost else warning(f"controller {name}", text)
 
 

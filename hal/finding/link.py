@@ -1,6 +1,6 @@
-"""What Linux knows of a CAN interface: whether it is there and up, its bit rate, its state, and when it restarts.
+"""State of a CAN interface in Linux: presence, bit rate, controller state and restart.
 
-Source: `ip -details -json link show`; /sys/class/net where there is no `ip` (it knows neither bit rate nor restart).
+Source: `ip -details -json link show`; /sys/class/net without `ip` (which has neither bit rate nor restart).
 """
 
 import json
@@ -19,14 +19,14 @@ class Link:
     """A network interface.
 
     Attributes:
-        name: As in `can0`.
+        name: Name, such as `can0`.
         is_can: Whether it is a CAN interface.
-        is_up: Whether it is set up.
-        kind: `can` for a controller, `vcan`, `vxcan`, ...; empty if not known.
-        bitrate: [bit/s]; None if it has none, as a virtual one, or it is not known.
-        restart: After how long [s] a controller that is bus-off starts again; 0 for never, None if not known.
-        state: Of the controller, as `ERROR-ACTIVE`; empty if not known.
-        queue: Frames that wait at most to be sent; None if not known.
+        is_up: Whether it is up.
+        kind: `can` for a controller, `vcan`, `vxcan`, ...; empty if unknown.
+        bitrate: Bit rate [bit/s]; None if unknown, or for a virtual interface.
+        restart: Time [s] after which a controller in bus-off starts again; 0 for never, None if unknown.
+        state: State of the controller, such as `ERROR-ACTIVE`; empty if unknown.
+        queue: Capacity of the send queue [frames]; None if unknown.
     """
 
     name: str
@@ -40,26 +40,26 @@ class Link:
 
 
 def look_up(name: str) -> Link | None:
-    """An interface of this machine; None if there is no such interface."""
+    """Return an interface of this machine; None if it does not exist."""
     folder = NET / name
     if not folder.exists():
         return None
     try:
-        shown = subprocess.run(
+        result = subprocess.run(
             ["ip", "-details", "-json", "link", "show", "dev", name], capture_output=True, check=True, timeout=5.0
         )
-        return parse(json.loads(shown.stdout))
+        return parse(json.loads(result.stdout))
     except (OSError, subprocess.SubprocessError, ValueError, LookupError):
         return _from_sys(name, folder)
 
 
-def parse(shown: list[dict[str, Any]]) -> Link:
-    """What `ip -details -json link show dev NAME` printed.
+def parse(output: list[dict[str, Any]]) -> Link:
+    """Parse the output of `ip -details -json link show dev NAME`.
 
     Raises:
-        LookupError: It names no interface.
+        LookupError: The output has no interface.
     """
-    entry = next((entry for entry in shown if entry), {})  # older versions put empty ones around it
+    entry = next((entry for entry in output if entry), {})  # older versions add empty entries
     info = entry.get("linkinfo", {})
     data = info.get("info_data", {})
     restart = data.get("restart_ms", 0 if info.get("info_kind") == "can" else None)
@@ -76,7 +76,7 @@ def parse(shown: list[dict[str, Any]]) -> Link:
 
 
 def known_links() -> list[str]:
-    """Names of this machine's CAN interfaces."""
+    """Return the names of this machine's CAN interfaces."""
     return sorted(folder.name for folder in NET.iterdir() if _number(folder / "type") == _ARPHRD_CAN)
 
 

@@ -1,4 +1,4 @@
-"""One device of a robot, opened by itself with the motors off, and read while somebody knows the truth."""
+"""Measurement of one device with the motors off, at positions or loads that the operator knows."""
 
 import contextlib
 import math
@@ -22,20 +22,20 @@ from hal.wire.pulse import pulse
 
 TRIES = 3
 SETTLE = 10
-"""Cycles before values count."""
-LONGEST = 400
-"""After so many cycles, or four times what is wanted if that is more, a device has had its chance."""
+"""Values of this number of first cycles are not used."""
+MIN_CYCLES = 400
+"""A measurement ends without success after this number of cycles, or four times the required number if that is more."""
 
 
 @dataclass(frozen=True, slots=True)
 class Subject:
-    """What is to be calibrated.
+    """Element that is calibrated.
 
     Attributes:
         config: The robot file.
         device: Name of the device.
         element: `signal.element` that it measures.
-        place: Which of the channels of the device that is, from 0, of how many.
+        place: Index of the channel of the device, from 0, and number of channels.
         factor: Name of the setting beside `zero`: `direction` or `gain`.
     """
 
@@ -47,11 +47,11 @@ class Subject:
 
     @property
     def unit(self) -> str:
-        """Of the element."""
+        """Unit of the element."""
         return self.config.signals[self.element.partition(".")[0]].unit
 
     def in_force(self, identity: str) -> Line:
-        """Zero and direction or gain now: those of an earlier calibration of this very device, or the robot file's."""
+        """Return the present zero and factor, from an earlier calibration of this very device or the robot file."""
         return self._line(self._measured(identity))
 
     def _line(self, measured: Mapping[str, Any]) -> Line:
@@ -59,10 +59,10 @@ class Subject:
         return Line(self._at(settings.zero, 0.0), self._at(getattr(settings, self.factor), 1.0), 0.0)
 
     def settings(self, line: Line, identity: str) -> dict[str, Any]:
-        """What to lay over the robot file's settings, so that the element follows a line.
+        """Return the settings that replace those of the robot file, so that the element follows a line.
 
         Raises:
-            ConfigError: The driver does not take it.
+            ConfigError: The driver does not accept them.
         """
         _, now = registry.equipment(self.config, self.device, self._measured(identity))
         factor = round(line.factor) if self.factor == "direction" else line.factor
@@ -74,20 +74,19 @@ class Subject:
         return measured
 
     def limits(self) -> dict[str, LimitConfig]:
-        """The robot file's limits, those of the element turned into what it reads without zero, direction and gain."""
+        """Return the limits of the robot file, those of the element in its readings without zero and factor."""
         signal, _, element = self.element.partition(".")
         limit = self.config.limits.get(signal)
         if limit is None:
             return dict(self.config.limits)
         line, place = self._line({}), self.config.signals[signal].elements.index(element)
         low, high = self.config.bounds(signal)
-        ends = sorted((bound[place] - line.zero) / line.factor for bound in (low, high))
-        low[place], high[place] = ends
-        moved = limit.model_copy(update={"low": tuple(low.tolist()), "high": tuple(high.tolist())})
-        return {**self.config.limits, signal: moved}
+        low[place], high[place] = sorted((bound[place] - line.zero) / line.factor for bound in (low, high))
+        converted = limit.model_copy(update={"low": tuple(low.tolist()), "high": tuple(high.tolist())})
+        return {**self.config.limits, signal: converted}
 
     def wrap(self, line: Line) -> str:
-        """Why an encoder of one turn would jump within the joint's limits, in a sentence; empty if it would not."""
+        """Return a warning that an encoder of one turn would jump within the joint's limits; empty if it does not."""
         _, settings = registry.equipment(self.config, self.device)
         signal, _, element = self.element.partition(".")
         if getattr(settings, "around", 0.0) is not None:
@@ -97,15 +96,15 @@ class Subject:
         if not (math.isfinite(low) and math.isfinite(high)) or first <= low <= high <= last:
             return ""
         return (
-            f"If this encoder tells only one turn, its counts begin again at {line.zero:.4g} rad, within the limits "
+            f"If this encoder measures only one turn, its counts begin again at {line.zero:.4g} rad, within the limits "
             f"{low:.4g} to {high:.4g} rad: give it `around: {(low + high) / 2:.3g}` in the robot file."
         )
 
     def _measured(self, identity: str) -> Mapping[str, Any]:
-        """The settings of an earlier calibration of this very device, if there is one that holds."""
+        """Return the settings of a valid earlier calibration of this very device; empty without one."""
         for record in store.records(self.config):
             if record.device == self.device and record.identity == identity:
-                with contextlib.suppress(ConfigError):  # one that is refused is not in force
+                with contextlib.suppress(ConfigError):  # a refused calibration is not used
                     return store.checked(self.config, record).settings
         return {}
 
@@ -114,7 +113,7 @@ class Subject:
         return float(default if chosen is None else chosen)
 
     def _with(self, given: Any, value: float, default: float) -> Any:
-        """The value, or where there are several channels a list in which the others keep theirs."""
+        """Return the value, or for several channels a list with the given values of the others."""
         position, count = self.place
         if count == 1:
             return [value] if isinstance(given, list | tuple) else value
@@ -124,7 +123,7 @@ class Subject:
 
 
 def subject(config: RobotConfig, what: str, factor: str) -> Subject:
-    """Find what a person wants calibrated.
+    """Find the element that the operator wants to calibrate.
 
     Args:
         config: The robot file.
@@ -132,7 +131,7 @@ def subject(config: RobotConfig, what: str, factor: str) -> Subject:
         factor: `direction` or `gain`.
 
     Raises:
-        ConfigError: There is no such device or element, or its driver has no such setting.
+        ConfigError: The device or element does not exist, or its driver does not have the setting.
     """
     serving = [name for name, entry in config.devices.items() if what == name or what in entry.served]
     if not serving:
@@ -146,27 +145,27 @@ def subject(config: RobotConfig, what: str, factor: str) -> Subject:
             f"Device '{device}' has no setting '{missing[0]}' that could be measured. Is it `gemuco calibrate {other}`?"
         )
     entry, known = config.devices[device], driver.quantities(settings)
-    wanted = dict(entry.elements) if entry.element is None else {known[0]: entry.element}
-    named = [quantity for quantity, element in wanted.items() if element == what]
-    quantity = (named or [quantity for quantity in known if quantity in wanted])[0]
+    elements = dict(entry.elements) if entry.element is None else {known[0]: entry.element}
+    matches = [quantity for quantity, element in elements.items() if element == what]
+    quantity = (matches or [quantity for quantity in known if quantity in elements])[0]
     if factor == "direction" and "position" in known and quantity != "position":
-        if what != device or "position" not in wanted:
+        if what != device or "position" not in elements:
             raise ConfigError(f"'{what}' is the {quantity} of '{device}'; zero and direction are of its position.")
         quantity = "position"
     channels = len(getattr(settings, "channels", (1,)))
-    return Subject(config, device, wanted[quantity], (known.index(quantity) if channels > 1 else 0, channels), factor)
+    return Subject(config, device, elements[quantity], (known.index(quantity) if channels > 1 else 0, channels), factor)
 
 
-class Measuring:
-    """The device of a subject, open for as long as the context lasts; nothing is ever enabled.
+class Measurement:
+    """The device of a subject, open while the context lasts; it is never enabled.
 
-    It is read with a zero of 0 and a direction or gain of 1, so that what was stored before has no part in it.
+    It is read with a zero of 0 and a direction or gain of 1, so that earlier calibrations have no effect.
 
     Args:
-        what: What is to be calibrated.
+        what: Element that is calibrated.
 
     Attributes:
-        identity: Of the device that answered.
+        identity: Identity of the device that answered.
     """
 
     identity: str
@@ -176,7 +175,7 @@ class Measuring:
         config = what.config
         entry = config.devices[what.device]
         plain = {**entry.settings, "zero": 0.0, what.factor: 1 if what.factor == "direction" else 1.0}
-        if config.settings_of(what.device).get("around") is not None:  # which is of calibrated angles
+        if config.settings_of(what.device).get("around") is not None:  # `around` is a calibrated angle
             plain["around"] = None
         self._clock = SystemClock()
         self._period = 1.0 / config.rates.hal
@@ -203,7 +202,7 @@ class Measuring:
         return self
 
     def _revive(self) -> None:
-        """Open the device, also if it was lost in between, as by a cable that was pulled."""
+        """Open the device, also after it was lost, for example by a loose cable."""
         for left in reversed(range(TRIES)):
             if self._device.health().state is DeviceState.READY:
                 return
@@ -218,16 +217,16 @@ class Measuring:
     ) -> None:
         self._open.close()
 
-    def look(self, known: float, duration: float, noise: float) -> Point:
-        """Average what the device reads for a while.
+    def measure(self, known: float, duration: float, noise: float) -> Point:
+        """Average the readings of the device.
 
         Args:
-            known: What it is in truth [the signal's unit].
-            duration: How long [s].
-            noise: Largest standard deviation and largest drift [the signal's unit] of what stands still.
+            known: True value [the signal's unit].
+            duration: Duration [s].
+            noise: Largest standard deviation and largest drift allowed [the signal's unit].
 
         Raises:
-            CalibrationRefused: It brings no values, or they do not stand still.
+            CalibrationRefused: There are too few readings, or they are not constant.
         """
         cycles = max(20, round(duration / self._period))
         for left in reversed(range(TRIES)):
@@ -237,32 +236,32 @@ class Measuring:
                 break
             health = self._device.health()
             if health.state is DeviceState.READY or not left:
-                why = health.text or "Is the rate of the robot file more than it can do?"
-                raise CalibrationRefused(f"'{self._device.name}' brought {len(fresh)} values in {turns} cycles. {why}")
+                why = health.text or "Is the rate of the robot file too high for it?"
+                raise CalibrationRefused(f"'{self._device.name}' sent {len(fresh)} values in {turns} cycles. {why}")
         std, half = float(fresh.std()), len(fresh) // 2
         drift = abs(float(fresh[half:].mean() - fresh[:half].mean()))
         if max(std, drift) > noise:
             unit = self._what.unit
             raise CalibrationRefused(
                 f"'{self._device.name}' does not stand still: standard deviation {std:.3g} {unit}, drift {drift:.3g} "
-                f"{unit}, and at most {noise:g} {unit} is taken. Wait until it hangs still, or allow more with --noise."
+                f"{unit}, and at most {noise:g} {unit} is allowed. Wait until it is still, or allow more with --noise."
             )
         return Point(known=known, read=float(fresh.mean()), std=std, samples=len(fresh))
 
-    def _gather(self, wanted: int) -> tuple[np.ndarray, int]:
-        """So many new values [the signal's unit], shape (n,), or fewer if they do not come; in how many cycles."""
+    def _gather(self, count: int) -> tuple[np.ndarray, int]:
+        """Return up to `count` new values [the signal's unit], shape (n,), and the number of cycles."""
         fresh: list[float] = []
         turns = 0
         with self._turn:
             for _ in range(SETTLE):
                 self._cycle()
-            while len(fresh) < wanted and turns < max(4 * wanted, LONGEST):
+            while len(fresh) < count and turns < max(4 * count, MIN_CYCLES):
                 value, turns = self._cycle(), turns + 1
                 fresh += [value] if math.isfinite(value) else []
         return np.array(fresh), turns
 
     def _cycle(self) -> float:
-        """One cycle; the value [the signal's unit] if a new one has come, else NaN."""
+        """Run one cycle and return a new value [the signal's unit]; NaN without one."""
         start = self._clock.monotonic()
         self._bus.begin()
         self._device.idle()
@@ -276,14 +275,14 @@ class Measuring:
 
     @property
     def now(self) -> Line:
-        """Zero and direction or gain that are in force for the device that answered."""
+        """Present zero and factor of the device that answered."""
         return self._what.in_force(self.identity)
 
     def record(self, line: Line, points: tuple[Point, ...]) -> Record:
-        """What is to be stored; sealed.
+        """Return the sealed record to store.
 
         Raises:
-            ConfigError: The driver does not take the settings.
+            ConfigError: The driver does not accept the settings.
         """
         what = self._what
         settings = what.settings(line, self.identity)

@@ -1,4 +1,4 @@
-"""What a robot file tells of the frames on its buses: data sheets, PDO mappings, DBC files, ranges of MIT drives."""
+"""Books of the buses of a robot file: data sheets, PDO mappings, DBC files, ranges of MIT drives."""
 
 import math
 from typing import Any
@@ -18,22 +18,22 @@ from hal.wire.bus import OWN_NODE
 
 
 def books(config: RobotConfig) -> dict[str, Book]:
-    """Bus -> what is known of its nodes.
+    """Return the book of each bus.
 
     Raises:
-        ConfigError: The robot file cannot be built.
+        ConfigError: The devices of the robot file cannot be built.
     """
-    found = {name: Book() for name in config.buses}
-    for book in found.values():
+    result = {name: Book() for name in config.buses}
+    for book in result.values():
         book.names[OWN_NODE] = "HAL"
     _, devices = build(config, SystemClock(), {})
     for device in devices:
         entry = config.devices[device.name]
-        book = found[entry.bus]
+        book = result[entry.bus]
         book.names[entry.node] = device.name
         settings = registry.equipment(config, device.name)[1]
         _note(book, config, device, entry.node, settings)
-    return found
+    return result
 
 
 def _note(book: Book, config: RobotConfig, device: Device, node: int, settings: Any) -> None:
@@ -58,7 +58,7 @@ def _note_dbc(book: Book, file: dbc.Dbc, address: Address) -> None:
         def explain(data: bytes, message: Any = message) -> tuple[int | None, str]:
             try:
                 values = message.decode(data, allow_truncated=True)
-            except Exception as error:  # a decoder of cantools passes on whatever it meets in a frame
+            except Exception as error:  # a decoder of cantools may raise anything
                 return address.node, f"{message.name}: {error}"
             parts = (
                 f"{name} {value:.6g}" if isinstance(value, float) else f"{name} {value}"
@@ -74,37 +74,37 @@ def _note_mit(book: Book, node: int, settings: Any) -> None:
     reply = settings.master_id
     if reply is None:
         reply = node + 16 if layout is Layout.DAMIAO else 0
-    book.explain(node, "MIT", lambda data: (node, _asked(data, ranges)))
-    others = book.explained[reply][1] if reply in book.explained else None
+    book.explain(node, "MIT", lambda data: (node, _command(data, ranges)))
+    others = book.explainers[reply][1] if reply in book.explainers else None
     book.explain(reply, "MIT", _answers(node, layout, ranges, others))
 
 
-def _asked(data: bytes, ranges: Ranges) -> str:
-    asked = mit.parse_command(data, ranges)
-    if asked is None:
+def _command(data: bytes, ranges: Ranges) -> str:
+    command = mit.parse_command(data, ranges)
+    if command is None:
         return "malformed"
-    if isinstance(asked, mit.Special):
-        return asked.name.lower()
+    if isinstance(command, mit.Special):
+        return command.name.lower()
     return (
-        f"go to {asked.position:.4g} rad at {asked.velocity:.4g} rad/s with {asked.stiffness:.4g} N m/rad, "
-        f"{asked.damping:.4g} N m s/rad, and {asked.effort:.4g} N m"
+        f"go to {command.position:.4g} rad at {command.velocity:.4g} rad/s with {command.stiffness:.4g} N m/rad, "
+        f"{command.damping:.4g} N m s/rad, and {command.effort:.4g} N m"
     )
 
 
 def _answers(node: int, layout: Layout, ranges: Ranges, others: Explain | None) -> Explain:
-    """What explains the answers of one drive, and passes on those of the others under the same identifier."""
+    """Return an explainer of the answers of one drive, which passes answers of others to their explainer."""
     mask = 0x0F if layout is Layout.DAMIAO else 0xFF
 
     def explain(data: bytes) -> tuple[int | None, str]:
         if (not data or data[0] & mask != node & mask) and others is not None:
             return others(data)
-        found = mit.parse_answer(data, layout, ranges)
-        if found is None:
+        answer = mit.parse_answer(data, layout, ranges)
+        if answer is None:
             return node, "malformed"
-        if found.node != node & mask:
-            return None, f"of drive {found.node}, which the robot file does not have"
-        warmth = "" if math.isnan(found.temperature) else f", {found.temperature:g} degrees Celsius"
-        state = f", state {found.state:X}h" if found.state else ""
-        return node, (f"at {found.position:.4g} rad, {found.velocity:.4g} rad/s, {found.effort:.4g} N m{warmth}{state}")
+        if answer.node != node & mask:
+            return None, f"of drive {answer.node}, which is not in the robot file"
+        heat = "" if math.isnan(answer.temperature) else f", {answer.temperature:g} degrees Celsius"
+        state = f", state {answer.state:X}h" if answer.state else ""
+        return node, f"at {answer.position:.4g} rad, {answer.velocity:.4g} rad/s, {answer.effort:.4g} N m{heat}{state}"
 
     return explain

@@ -1,11 +1,11 @@
-"""Finding the nodes of a bus: first by listening, then by asking every CANopen node id for its identity.
+"""Scan of a bus: first it listens, then it requests the identity of every CANopen node id.
 
-Listening disturbs no node. Asking means SDO reads of identification objects, which change nothing in a node; but an SDO
-server has one client, so no node is asked while a master is heard (its SYNC, its heartbeat or its own SDO requests).
+Listening disturbs no node. The requests are SDO reads of identification objects, which change nothing in a node. But an
+SDO server has only one client, so no request is sent if a master is active (its SYNC, heartbeat or SDO requests).
 
 Source: CiA 301, version 4.2: 7.5.2 (1000h, 1008h, 1009h, 100Ah, 1018h); ODrive CANSimple (docs.odriverobotics.com):
-identifier = node << 5 | command, 01h is the heartbeat; `hal.protocols.mit` for drives in MIT mode, of which those of
-Damiao answer under their id + 16 as shipped.
+identifier = node << 5 | command, 01h is the heartbeat; `hal.protocols.mit` for drives in MIT mode (those of Damiao
+answer under their id + 16 by default).
 """
 
 import math
@@ -26,11 +26,11 @@ from hal.wire.bus import OWN_NODE
 _MIT_SPECIALS = {
     special(Special.ENTER): "enter motor mode",
     special(Special.EXIT): "leave motor mode",
-    special(Special.ZERO): "take its place as zero",
+    special(Special.ZERO): "set its position to zero",
 }
 _MIT_ANSWER = 16
 _BEGINS = (1, 2)
-"""Upper three bits of an SDO request that begins a transfer."""
+"""An SDO request that begins a transfer has one of these values in its upper three bits."""
 _ODRIVE_HEARTBEAT = 1
 _ODRIVE_STATES = range(15)
 _PROFILES = {
@@ -48,15 +48,15 @@ _PROFILES = {
 
 
 @dataclass(slots=True)
-class Found:
-    """A node.
+class Node:
+    """A node that was found.
 
     Attributes:
-        node: Its id.
+        node: Node id.
         protocol: `CANopen`, `ODrive` or `MIT`.
-        state: NMT state in words, or what else was heard of it.
-        objects: (index, sub-index) -> what it answered; only what it did answer.
-        is_doubled: More than one node answers as this id.
+        state: NMT state in words, or other received information.
+        objects: (index, sub-index) -> answer, for the objects that the node answered.
+        is_doubled: Whether more than one node answers under this id.
     """
 
     node: int
@@ -66,23 +66,23 @@ class Found:
     is_doubled: bool = False
 
     def number(self, index: int, subindex: int = 0) -> int | None:
-        """An object that is a number; None if it did not tell."""
+        """Return an object that is a number; None without an answer."""
         raw = self.objects.get((index, subindex))
         return None if raw is None else int.from_bytes(raw, "little")
 
     def text(self, index: int) -> str:
-        """An object that is a text; empty if it did not tell."""
+        """Return an object that is a text; empty without an answer."""
         return self.objects.get((index, 0), b"").rstrip(b"\0").decode("latin-1")
 
     @property
     def profile(self) -> int | None:
-        """Number of its device profile, the low word of 1000h; None if it did not tell."""
+        """Number of the device profile, the low word of 1000h; None without an answer."""
         kind = self.number(cia301.DEVICE_TYPE)
         return None if kind is None else kind & 0xFFFF
 
     @property
     def kind(self) -> str:
-        """What it is, in words."""
+        """Kind of device in words."""
         if self.protocol != "CANopen":
             return {"ODrive": "servo drive (ODrive)", "MIT": "servo drive (MIT mode)"}[self.protocol]
         if self.profile is None:
@@ -90,20 +90,20 @@ class Found:
         return f"{_PROFILES.get(self.profile, 'device')} ({self.profile})"
 
 
-class Heard:
-    """What was heard so far."""
+class Traffic:
+    """Frames that were received so far, and the nodes that sent them."""
 
     def __init__(self) -> None:
-        self.nodes: dict[tuple[str, int], Found] = {}
+        self.nodes: dict[tuple[str, int], Node] = {}
         self.counts: Counter[int] = Counter()
         self.bits = 0
         self._last: dict[int, bytes] = {}
         self._masters: set[str] = set()
         self.retried: set[int] = set()
-        """Nodes that were asked twice, so that a second answer means nothing."""
+        """Nodes with a repeated request, whose second answer does not prove a second node."""
 
     def note(self, frame: Frame | None) -> None:
-        """Take a frame into account."""
+        """Add a frame."""
         if frame is None or frame.is_error or frame.is_extended or frame.is_remote:
             return
         identifier, data = frame.identifier, frame.data
@@ -116,20 +116,20 @@ class Heard:
         elif identifier == cia301.HEARTBEAT + OWN_NODE:
             self._masters.add("a HAL's heartbeat")
         elif function == cia301.HEARTBEAT and node and len(data) == 1:
-            self.found("CANopen", node).state = nmt_words(data[0] & 0x7F)
+            self.node("CANopen", node).state = nmt_words(data[0] & 0x7F)
         elif function == cia301.SDO_REQUEST and node and len(data) == sdo.LENGTH and data[0] >> 5 in _BEGINS:
-            self._masters.add("its SDO requests")  # ours do not come back
+            self._masters.add("its SDO requests")  # own requests are not received
         elif function == cia301.SDO_ANSWER and node and len(data) == sdo.LENGTH:
-            self.found("CANopen", node)
+            self.node("CANopen", node)
         elif data in _MIT_SPECIALS:
-            self.found("MIT", identifier).state = f"was told to {_MIT_SPECIALS[data]}"
+            self.node("MIT", identifier).state = f"received the command to {_MIT_SPECIALS[data]}"
 
-    def found(self, protocol: str, node: int) -> Found:
-        """The record of a node, made when it is first heard."""
-        return self.nodes.setdefault((protocol, node), Found(node, protocol))
+    def node(self, protocol: str, node: int) -> Node:
+        """Return the record of a node, which is created at its first frame."""
+        return self.nodes.setdefault((protocol, node), Node(node, protocol))
 
     def odrives(self) -> list[int]:
-        """Nodes whose frames look like an ODrive's heartbeat, and like nothing of a CANopen node that is there."""
+        """Return the nodes whose frames look like the heartbeat of an ODrive and not like a known CANopen node."""
         likely = []
         for identifier, data in self._last.items():
             is_heartbeat = identifier & 0x1F == _ODRIVE_HEARTBEAT and len(data) == 8 and data[4] in _ODRIVE_STATES
@@ -138,20 +138,18 @@ class Heard:
         return likely
 
     def master(self) -> str:
-        """Why a master must be there; empty if none was heard."""
+        """Return the reason to assume a master; empty without one."""
         if not self._masters:
             return ""
-        return (
-            f"A master is at work ({', '.join(sorted(self._masters))} was heard): nobody was asked, to not disturb it."
-        )
+        return f"A master is active ({', '.join(sorted(self._masters))} was received), so no request was sent."
 
-    def attribute(self) -> None:
-        """Tell who the frames that are not CANopen come from."""
+    def add_odrives(self) -> None:
+        """Add the nodes that look like an ODrive."""
         for node in self.odrives():
-            self.found("ODrive", node).state = f"axis state {self._last[node << 5 | _ODRIVE_HEARTBEAT][4]}"
+            self.node("ODrive", node).state = f"axis state {self._last[node << 5 | _ODRIVE_HEARTBEAT][4]}"
 
     def unexplained(self) -> list[int]:
-        """Identifiers that belong to none of the nodes."""
+        """Return the identifiers that do not belong to a node."""
         return sorted(identifier for identifier in self.counts if not self._explained(identifier))
 
     def _explained(self, identifier: int) -> bool:
@@ -169,17 +167,18 @@ class Heard:
 
 TRIES = 2
 BURST = 4
-"""Requests in one go, and then a pause of twice their time on the wire: an interface's queue may have ten places."""
+"""This number of requests is sent at once. A pause of twice their time on the wire follows, because the queue of an
+interface may hold only ten frames."""
 AFTERWARDS = 0.05
-"""How long to wait [s] for the answer of a second node with the same id."""
+"""The scan waits this time [s] for the answer of a second node with the same id."""
 MIT_IDS = range(1, 33)
 MIT_ANSWER_TIME = 0.02
 _IDENTITY = ((0x1018, 1), (0x1018, 2), (0x1018, 3), (0x1018, 4), (0x1008, 0), (0x1009, 0), (0x100A, 0))
 
 
 @dataclass(slots=True)
-class _Talk:
-    """Questions to one node, one after the other."""
+class _Dialogue:
+    """Requests to one node, one after the other."""
 
     node: int
     uploads: deque[Upload]
@@ -187,44 +186,44 @@ class _Talk:
     tries: int = 0
 
 
-def ask_all(tap: Tap, heard: Heard, patience: float) -> None:
-    """First who is there, then who it is."""
-    barred = heard.odrives()  # an SDO request to id n is a command to ODrive 48 + n // 32
+def identify_all(tap: Tap, traffic: Traffic, patience: float) -> None:
+    """Find the CANopen nodes that answer, then request their identity."""
+    barred = traffic.odrives()  # an SDO request to id n is a command to ODrive 48 + n // 32
     ids = [node for node in range(1, 128) if (cia301.SDO_REQUEST + node) >> 5 not in barred]
-    _converse(tap, heard, {node: [(cia301.DEVICE_TYPE, 0)] for node in ids}, patience)
-    there = [found.node for found in heard.nodes.values() if found.protocol == "CANopen" and found.objects]
-    _converse(tap, heard, {node: list(_IDENTITY) for node in there}, patience)
+    _read_all(tap, traffic, {node: [(cia301.DEVICE_TYPE, 0)] for node in ids}, patience)
+    answering = [node.node for node in traffic.nodes.values() if node.protocol == "CANopen" and node.objects]
+    _read_all(tap, traffic, {node: list(_IDENTITY) for node in answering}, patience)
 
 
-def _converse(tap: Tap, heard: Heard, questions: dict[int, list[tuple[int, int]]], patience: float) -> None:
-    """Ask many nodes at the same time, each one question at a time; whoever does not answer is asked no more."""
-    talks = {node: _Talk(node, deque(Upload(*key) for key in keys)) for node, keys in questions.items()}
+def _read_all(tap: Tap, traffic: Traffic, keys_of: dict[int, list[tuple[int, int]]], patience: float) -> None:
+    """Read objects of many nodes in parallel, one request per node at a time, until a node does not answer."""
+    dialogues = {node: _Dialogue(node, deque(Upload(*key) for key in keys)) for node, keys in keys_of.items()}
     pause = max(0.002, 2 * BURST * frame_bits(sdo.LENGTH) / tap.config.bitrate)
     ended = next_burst = time.monotonic()
-    while talks or time.monotonic() < ended + AFTERWARDS:
+    while dialogues or time.monotonic() < ended + AFTERWARDS:
         now = time.monotonic()
         if now >= next_burst:
             next_burst = now + pause
-            due = [talk for talk in talks.values() if now - talk.sent > patience]
-            for talk in due[:BURST]:
-                _ask_again(tap, heard, talks, talk, now)
+            due = [dialogue for dialogue in dialogues.values() if now - dialogue.sent > patience]
+            for dialogue in due[:BURST]:
+                _send_again(tap, traffic, dialogues, dialogue, now)
         frame = tap.receive(0.002)
-        heard.note(frame)
+        traffic.note(frame)
         if frame is not None and _is_sdo_answer(frame):
-            _take(tap, heard, talks, frame)
-        if talks:
+            _take_sdo(tap, traffic, dialogues, frame)
+        if dialogues:
             ended = now
 
 
-def _ask_again(tap: Tap, heard: Heard, talks: dict[int, _Talk], talk: _Talk, now: float) -> None:
-    """A question that was not asked yet, or not answered in time."""
-    if talk.tries == TRIES:
-        del talks[talk.node]
+def _send_again(tap: Tap, traffic: Traffic, dialogues: dict[int, _Dialogue], dialogue: _Dialogue, now: float) -> None:
+    """Send a request for the first time, or again after a missing answer."""
+    if dialogue.tries == TRIES:
+        del dialogues[dialogue.node]
         return
-    if talk.tries:
-        heard.retried.add(talk.node)
-    talk.sent, talk.tries = now, talk.tries + 1
-    tap.send(cia301.SDO_REQUEST + talk.node, talk.uploads[0].request)
+    if dialogue.tries:
+        traffic.retried.add(dialogue.node)
+    dialogue.sent, dialogue.tries = now, dialogue.tries + 1
+    tap.send(cia301.SDO_REQUEST + dialogue.node, dialogue.uploads[0].request)
 
 
 def _is_sdo_answer(frame: Frame) -> bool:
@@ -233,43 +232,44 @@ def _is_sdo_answer(frame: Frame) -> bool:
     return is_data and answers and len(frame.data) == sdo.LENGTH
 
 
-def _take(tap: Tap, heard: Heard, talks: dict[int, _Talk], frame: Frame) -> None:
-    """An SDO answer has come."""
-    node = frame.identifier & 0x7F
-    found = heard.found("CANopen", node)
-    talk = talks.get(node)
-    if talk is None or not talk.uploads[0].answer(frame.data):
+def _take_sdo(tap: Tap, traffic: Traffic, dialogues: dict[int, _Dialogue], frame: Frame) -> None:
+    """Process an SDO answer and send the next request."""
+    number = frame.identifier & 0x7F
+    node = traffic.node("CANopen", number)
+    dialogue = dialogues.get(number)
+    if dialogue is None or not dialogue.uploads[0].answer(frame.data):
         command, *key = sdo.HEAD.unpack_from(frame.data)
-        found.is_doubled |= command >> 5 == sdo.UPLOAD and tuple(key) in found.objects and node not in heard.retried
+        is_second = tuple(key) in node.objects and number not in traffic.retried
+        node.is_doubled |= command >> 5 == sdo.UPLOAD and is_second
         return
-    upload = talk.uploads[0]
+    upload = dialogue.uploads[0]
     if upload.is_done:
         if upload.value is not None:
-            found.objects[upload.index, upload.subindex] = upload.value
-        talk.uploads.popleft()
-        if not talk.uploads:
-            del talks[node]
+            node.objects[upload.index, upload.subindex] = upload.value
+        dialogue.uploads.popleft()
+        if not dialogue.uploads:
+            del dialogues[number]
             return
-    talk.sent, talk.tries = time.monotonic(), 1
-    tap.send(cia301.SDO_REQUEST + node, talk.uploads[0].request)
+    dialogue.sent, dialogue.tries = time.monotonic(), 1
+    tap.send(cia301.SDO_REQUEST + number, dialogue.uploads[0].request)
 
 
-def look_for_mit(tap: Tap, heard: Heard, patience: float) -> None:
-    """End the motor mode of every possible MIT drive; one that is there answers with its id in the first byte."""
-    before = set(heard.counts)
-    odrives = heard.odrives()  # an identifier below 33 is a command to ODrive 0 or 1
-    asked: list[int] = []
+def find_mit(tap: Tap, traffic: Traffic, patience: float) -> None:
+    """End the motor mode of every possible MIT drive; a drive answers with its id in the first byte."""
+    before = set(traffic.counts)
+    odrives = traffic.odrives()  # an identifier below 33 is a command to ODrive 0 or 1
+    requests: list[int] = []
     for node in MIT_IDS:
         if node >> 5 in odrives:
             continue
         tap.send(node, special(Special.EXIT))
-        asked.append(node)
-        _take_mit(tap, heard, asked, before, MIT_ANSWER_TIME)
-    _take_mit(tap, heard, asked, before, patience)
+        requests.append(node)
+        _take_mit(tap, traffic, requests, before, MIT_ANSWER_TIME)
+    _take_mit(tap, traffic, requests, before, patience)
 
 
-def _take_mit(tap: Tap, heard: Heard, asked: list[int], before: set[int], duration: float) -> None:
-    """Whose answers come within `duration` [s]; a late one may be of any drive that was asked."""
+def _take_mit(tap: Tap, traffic: Traffic, requests: list[int], before: set[int], duration: float) -> None:
+    """Add the drives that answer within `duration` [s]; a late answer may be from any earlier request."""
     deadline = time.monotonic() + duration
     while (remaining := deadline - time.monotonic()) > 0:
         frame = tap.receive(remaining)
@@ -278,85 +278,87 @@ def _take_mit(tap: Tap, heard: Heard, asked: list[int], before: set[int], durati
         if len(frame.data) not in (6, 7, 8):
             continue
         first = frame.data[0]  # the id, or with Damiao's state above its lower four bits
-        likely = [node for node in reversed(asked) if first == node or first & 0x0F == node & 0x0F]
+        likely = [node for node in reversed(requests) if first == node or first & 0x0F == node & 0x0F]
         if likely:
             node = first if first in likely else likely[0]
-            heard.found("MIT", node).state = f"answers on {frame.identifier:03X}h"
+            traffic.node("MIT", node).state = f"answers on {frame.identifier:03X}h"
 
 
 LISTEN = 1.5
-"""How long to listen first [s]; most nodes send a heartbeat each second or more often."""
+"""A scan first listens for this time [s]; most nodes send a heartbeat each second or more often."""
 ANSWER_TIME = 0.15
-"""How long a node may take to answer [s]."""
+"""A node may take this time [s] to answer."""
 
 
 @dataclass(slots=True)
 class Scan:
-    """What was found on one bus.
+    """Result of a scan of one bus.
 
     Attributes:
-        bus: Its name.
-        nodes: In the order of their ids.
-        unknown: Identifier -> frames per second [Hz], of all that no known node explains.
+        bus: Name of the bus.
+        nodes: Nodes in the order of their ids.
+        unknown: Identifier -> frames per second [Hz], for identifiers that do not belong to a node.
         load: Share of the bit rate while listening, 0 to 1.
-        silence: Why nobody was asked; empty if everybody was.
+        silence: Reason why no request was sent; empty if requests were sent.
     """
 
     bus: str
-    nodes: list[Found]
+    nodes: list[Node]
     unknown: dict[int, float]
     load: float
     silence: str
 
 
 def scan(tap: Tap, listen: float = LISTEN, ask: bool = True, mit: bool = False, patience: float = ANSWER_TIME) -> Scan:
-    """Find out who is on a bus; takes `listen` and about two seconds.
+    """Find the nodes of a bus; takes `listen` and about two seconds.
 
     Args:
         tap: An open bus.
-        listen: How long to listen first [s].
-        ask: Whether to ask nodes who they are, unless a master is heard.
-        mit: Whether to look for MIT drives by ending their motor mode, which lets go of the joint.
-        patience: How long a node may take to answer [s].
+        listen: Duration of listening at the beginning [s].
+        ask: Whether to request the identity of nodes, unless a master is active.
+        mit: Whether to find MIT drives by ending their motor mode, which switches the motor off.
+        patience: Longest time for an answer [s].
 
     Raises:
         BusGone: The interface failed, or takes no frames.
     """
-    heard = Heard()
+    traffic = Traffic()
     deadline = time.monotonic() + listen
     while (remaining := deadline - time.monotonic()) > 0:
-        heard.note(tap.receive(min(remaining, 0.1)))
-    load = heard.bits / (listen * tap.config.bitrate) if listen else 0.0
-    rates = {identifier: count / listen for identifier, count in heard.counts.items()} if listen else {}
-    silence = heard.master()
+        traffic.note(tap.receive(min(remaining, 0.1)))
+    load = traffic.bits / (listen * tap.config.bitrate) if listen else 0.0
+    rates = {identifier: count / listen for identifier, count in traffic.counts.items()} if listen else {}
+    silence = traffic.master()
     if not ask:
-        silence = silence or "Only listened, as asked."
+        silence = silence or "Only listened, as requested."
     if not silence:
-        ask_all(tap, heard, patience)
-    if mit and not heard.master():
-        look_for_mit(tap, heard, patience)
-    heard.attribute()
-    nodes = sorted(heard.nodes.values(), key=lambda found: (found.protocol, found.node))
-    return Scan(tap.name, nodes, {key: rates.get(key, 0.0) for key in heard.unexplained()}, load, silence)
+        identify_all(tap, traffic, patience)
+    if mit and not traffic.master():
+        find_mit(tap, traffic, patience)
+    traffic.add_odrives()
+    nodes = sorted(traffic.nodes.values(), key=lambda node: (node.protocol, node.node))
+    return Scan(tap.name, nodes, {key: rates.get(key, 0.0) for key in traffic.unexplained()}, load, silence)
 
 
-def compare(found: Scan, config: RobotConfig) -> list[str]:
-    """What of a bus is not as the robot file says, a sentence each."""
-    wanted = {device.node: name for name, device in config.devices.items() if device.bus == found.bus}
-    drivers = {node: config.kinds[config.devices[name].kind].driver for node, name in wanted.items()}
-    told = []
-    there = {one.node: one for one in found.nodes}
-    for node, name in wanted.items():
-        if node not in there:
-            told.append(f"{found.bus}: node {node} ('{name}') was not found. Is it powered, is its node id right?")
+def compare(result: Scan, config: RobotConfig) -> list[str]:
+    """Return the differences between a bus and the robot file, one sentence each."""
+    devices = {device.node: name for name, device in config.devices.items() if device.bus == result.bus}
+    nodes = {node.node: node for node in result.nodes}
+    differences = []
+    for number, name in devices.items():
+        place, driver = f"{result.bus}: node {number} ('{name}')", config.kinds[config.devices[name].kind].driver
+        if number not in nodes:
+            differences.append(f"{place} was not found. Is it powered, is its node id right?")
             continue
-        profile = drivers[node].removeprefix("cia")
-        one = there[node]
-        if drivers[node].startswith("cia") and one.profile is not None and str(one.profile) != profile:
-            told.append(f"{found.bus}: node {node} ('{name}') is a {one.kind}, the robot file says {drivers[node]}.")
-    for one in found.nodes:
-        if one.node not in wanted:
-            told.append(f"{found.bus}: node {one.node} is not in the robot file: {one.kind or 'a CANopen node'}.")
-        if one.is_doubled:
-            told.append(f"{found.bus}: more than one node answers as node {one.node}. Give each an id of its own.")
-    return told
+        node = nodes[number]
+        if driver.startswith("cia") and node.profile is not None and str(node.profile) != driver.removeprefix("cia"):
+            differences.append(f"{place} is a {node.kind}, the robot file says {driver}.")
+    for node in result.nodes:
+        if node.node not in devices:
+            kind = node.kind or "a CANopen node"
+            differences.append(f"{result.bus}: node {node.node} is not in the robot file: {kind}.")
+        if node.is_doubled:
+            differences.append(
+                f"{result.bus}: more than one node answers as node {node.node}. Give each an id of its own."
+            )
+    return differences

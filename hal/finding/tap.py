@@ -1,6 +1,6 @@
-"""A bus looked at from the side: every frame, with the interface's own time stamp; sends only what it is told to.
+"""Receiver of every frame of a bus with the interface's own time stamp; it sends only on request.
 
-Beside a running HAL it needs an interface that more than one program can open: socketcan, hub, udp_multicast.
+Beside a running HAL it needs an interface that several programs can open: socketcan, hub, udp_multicast.
 """
 
 import math
@@ -18,15 +18,15 @@ from hal.errors import BusGone, ConfigError
 from hal.finding.book import Frame
 
 POLL = 0.1
-"""How long [s] a reader waits before it looks whether it shall end."""
+"""A reader checks with this period [s] whether it must end."""
 
 
 class Tap:
-    """One interface, opened for as long as the context lasts.
+    """One interface that is open while the context lasts.
 
     Args:
-        name: What messages call the bus.
-        config: Where it is.
+        name: Name of the bus in messages.
+        config: Interface and channel of the bus.
     """
 
     def __init__(self, name: str, config: BusConfig) -> None:
@@ -57,7 +57,7 @@ class Tap:
             self._can = None
 
     def receive(self, timeout: float) -> Frame | None:
-        """The next frame, or None if none comes within `timeout` [s].
+        """Return the next frame, or None if none arrives within `timeout` [s].
 
         Raises:
             BusGone: The interface failed.
@@ -79,10 +79,10 @@ class Tap:
         )
 
     def send(self, identifier: int, data: bytes) -> None:
-        """Put a frame with an 11-bit identifier on the bus.
+        """Send a frame with an 11-bit identifier.
 
         Raises:
-            BusGone: The interface does not take it; on socketcan that is how a bus looks on which nobody acknowledges.
+            BusGone: The interface does not take the frame, as socketcan if no other node acknowledges frames.
         """
         assert self._can is not None, "the tap is not open"
         try:
@@ -95,19 +95,19 @@ class Tap:
 
 
 def frames(buses: Mapping[str, BusConfig], seconds: float = math.inf) -> Iterator[tuple[str, Frame]]:
-    """What passes on some buses, in the order in which it is received here: (name of the bus, frame).
+    """Yield (name of the bus, frame) for all frames of some buses, in the order of reception here.
 
     Args:
-        buses: Names and where they are.
-        seconds: How long to listen [s].
+        buses: Names, interfaces and channels of the buses.
+        seconds: Duration [s].
 
     Raises:
-        BusGone: One of them cannot be opened, or failed.
+        BusGone: A bus cannot be opened, or failed.
     """
-    found: queue.Queue[tuple[str, Frame | BusGone]] = queue.Queue()
-    over = threading.Event()
+    received: queue.Queue[tuple[str, Frame | BusGone]] = queue.Queue()
+    stopping = threading.Event()
     threads = [
-        threading.Thread(target=_listen, args=(name, config, found, over), name=f"tap {name}", daemon=True)
+        threading.Thread(target=_listen, args=(name, config, received, stopping), name=f"tap {name}", daemon=True)
         for name, config in buses.items()
     ]
     for thread in threads:
@@ -116,26 +116,26 @@ def frames(buses: Mapping[str, BusConfig], seconds: float = math.inf) -> Iterato
     try:
         while (remaining := deadline - time.monotonic()) > 0:
             try:
-                name, frame = found.get(timeout=min(remaining, POLL))
+                name, frame = received.get(timeout=min(remaining, POLL))
             except queue.Empty:
                 continue
             if isinstance(frame, BusGone):
                 raise frame
             yield name, frame
     finally:
-        over.set()
+        stopping.set()
         for thread in threads:
             thread.join()
 
 
 def _listen(
-    name: str, config: BusConfig, found: queue.Queue[tuple[str, Frame | BusGone]], over: threading.Event
+    name: str, config: BusConfig, received: queue.Queue[tuple[str, Frame | BusGone]], stopping: threading.Event
 ) -> None:
     try:
         with Tap(name, config) as tap:
-            while not over.is_set():
+            while not stopping.is_set():
                 frame = tap.receive(POLL)
                 if frame is not None:
-                    found.put((name, frame))
+                    received.put((name, frame))
     except BusGone as error:
-        found.put((name, error))
+        received.put((name, error))

@@ -11,7 +11,7 @@ from hal.calibration import store
 from hal.calibration.line import CalibrationRefused, Line, cell_line, joint_line
 from hal.calibration.store import Point
 from hal.config import RobotConfig
-from hal.finding.measuring import Measuring, Subject, subject
+from hal.finding.measuring import Measurement, Subject, subject
 from services import show
 from services.errors import BadArguments
 from services.process.lock import instead_of
@@ -80,9 +80,9 @@ def _calibrate(
 ) -> int:
     """Measure each point, fit the line, show and store it."""
     console = show.console()
-    with instead_of(item.config.robot, "hal"), Measuring(item) as device:
+    with instead_of(item.config.robot, "hal"), Measurement(item) as device:
         console.print(f"{item.device}: {device.identity or 'no identity'}. Its motors are off.")
-        points = [device.look(known, options.seconds, noise) for known in _known_values(item, options, request)]
+        points = [device.measure(known, options.seconds, noise) for known in _known_values(item, options, request)]
         if not points:
             raise CalibrationRefused("No known value was given, so nothing was measured.")
         now = device.now

@@ -14,7 +14,7 @@ from rich.table import Table
 from hal.config import RobotConfig, load_robot
 from hal.errors import ConfigError
 from hal.finding import doctor
-from hal.finding.doctor import Finding, Verdict, bad, interfaces, ok, warning
+from hal.finding.doctor import Finding, Verdict, bad, check_interfaces, ok, warning
 from services import show
 from services.client import Client
 from services.errors import AlreadyRunning, ServiceError
@@ -66,11 +66,11 @@ def _findings(robot: str, connect: tuple[str, ...]) -> Iterator[Finding]:
     except ConfigError as error:
         yield bad("robot file", str(error))
         return
-    findings = list(doctor.described(config))
+    findings = list(doctor.check_file(config))
     yield from findings
     is_sound = all(finding.what != "robot file" or finding.verdict is Verdict.OK for finding in findings)
     if is_sound:
-        yield from interfaces(config)
+        yield from check_interfaces(config)
         yield from _devices(config, connect)
     yield from host_checks.clocks()
     yield from host_checks.real_time()
@@ -83,7 +83,7 @@ def _devices(config: RobotConfig, connect: tuple[str, ...]) -> Iterator[Finding]
     try:
         with instead_of(config.robot, "hal"):
             yield ok("HAL", "It does not run. The buses are opened here, with the motors off.")
-            yield from doctor.examine(config)
+            yield from doctor.check_devices(config)
     except ConfigError as error:
         yield bad("devices", str(error))
     except AlreadyRunning as error:

@@ -9,7 +9,7 @@ from rich.table import Table
 
 from hal.config import BusConfig, RobotConfig
 from hal.errors import BusGone
-from hal.finding.scan import Found, Scan, compare, scan
+from hal.finding.scan import Node, Scan, compare, scan
 from hal.finding.tap import Tap
 from services import show
 from services.errors import AlreadyRunning
@@ -77,7 +77,7 @@ def _show(console: Console, scans: Sequence[Scan], config: RobotConfig | None) -
             console.print(f"{result.bus}: frames of unknown nodes: {frames}")
 
 
-def _row(bus: str, node: Found) -> list[str]:
+def _row(bus: str, node: Node) -> list[str]:
     numbers = [node.number(0x1018, subindex) for subindex in (1, 2, 3, 4)]
     versions = " / ".join(text for text in (node.text(0x1009), node.text(0x100A)) if text)
     cells = [bus, str(node.node), node.kind or node.protocol]

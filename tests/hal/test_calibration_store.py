@@ -14,7 +14,7 @@ from hal.calibration.store import Point, Record
 from hal.clock import SystemClock
 from hal.config import RobotConfig
 from hal.errors import ConfigError, DeviceSilent, WrongDevice
-from hal.finding.measuring import Measuring, subject
+from hal.finding.measuring import Measurement, subject
 from hal.fleet import build
 from hal.robot import open_robot
 from simulators.rig import Rig
@@ -199,8 +199,8 @@ def test_a_record_of_a_device_that_is_gone_is_passed_over(config):
 def test_an_encoder_tells_the_truth_after_one_position(config, rig):
     what = subject(config, "elbow_encoder", "direction")
     settle(rig, angle=-0.7)
-    with Measuring(what) as device:
-        seen = device.look(0.3, 0.2, 0.005)
+    with Measurement(what) as device:
+        seen = device.measure(0.3, 0.2, 0.005)
         store.save(config, device.record(joint_line([seen], device.now.factor, 0.1), (seen,)))
         assert device.identity.startswith("canopen:")
     with open_robot(config) as robot:
@@ -218,16 +218,16 @@ def test_a_cell_tells_the_truth_after_three_weights_and_keeps_its_gain_at_a_tare
     what = subject(config, "muscle_tension.biceps", "gain")
     assert (what.device, what.unit) == ("biceps_cell", "N")
     points = []
-    with Measuring(what) as device:
+    with Measurement(what) as device:
         for known, told in ((0.0, 2.0), (10.0, 14.5), (20.0, 27.0)):  # N
             settle(rig, tension=told)
-            points.append(device.look(known, 0.2, 0.1))
+            points.append(device.measure(known, 0.2, 0.1))
         line = cell_line(points, device.now.factor, 0.1)
         store.save(config, device.record(line, tuple(points)))
         assert line.factor == pytest.approx(0.8, rel=1e-3)
         assert device.now.factor == pytest.approx(0.8, rel=1e-3)
         settle(rig, tension=4.5)
-        bare = device.look(0.0, 0.2, 0.1)
+        bare = device.measure(0.0, 0.2, 0.1)
         tared = cell_line([bare], device.now.factor, 0.1)
     assert tared.factor == line.factor
     assert tared.value(points[2].read) == pytest.approx(18.0, abs=0.05)  # N
@@ -235,11 +235,11 @@ def test_a_cell_tells_the_truth_after_three_weights_and_keeps_its_gain_at_a_tare
 
 @pytest.mark.long
 def test_a_drive_waits_for_the_next_position_without_a_fault_and_without_power(config, rig):
-    with Measuring(subject(config, "biceps_drive", "direction")) as device:
-        first = device.look(0.3, 0.1, 0.001)
+    with Measurement(subject(config, "biceps_drive", "direction")) as device:
+        first = device.measure(0.3, 0.1, 0.001)
         time.sleep(0.8)  # a person moves the joint; the drive's watchdog is shorter
         settle(rig, length=0.34)
-        second = device.look(0.34, 0.1, 0.001)
+        second = device.measure(0.34, 0.1, 0.001)
         assert rig.node("biceps_drive").objects.values[0x1001, 0] == 0
         assert not rig.node("biceps_drive").servo[1]
     assert joint_line([first, second], -1, 0.01).factor == 1
@@ -247,15 +247,15 @@ def test_a_drive_waits_for_the_next_position_without_a_fault_and_without_power(c
 
 @pytest.mark.long
 def test_an_encoder_that_lost_its_power_in_between_is_opened_again(config, rig):
-    with Measuring(subject(config, "elbow_encoder", "direction")) as device:
-        first = device.look(0.3, 0.1, 0.005)
+    with Measurement(subject(config, "elbow_encoder", "direction")) as device:
+        first = device.measure(0.3, 0.1, 0.005)
         rig.fault("node_reboot elbow_encoder")
-        assert device.look(0.3, 0.1, 0.005).read == pytest.approx(first.read)
+        assert device.measure(0.3, 0.1, 0.005).read == pytest.approx(first.read)
 
 
 @pytest.mark.long
 def test_a_device_that_moves_or_brings_nothing_is_refused(config, rig):
-    with Measuring(subject(config, "biceps_cell", "gain")) as device:
+    with Measurement(subject(config, "biceps_cell", "gain")) as device:
         noise, over = np.random.default_rng(0), threading.Event()
 
         def shake():
@@ -266,13 +266,13 @@ def test_a_device_that_moves_or_brings_nothing_is_refused(config, rig):
         thread.start()
         try:
             with pytest.raises(CalibrationRefused, match="does not stand still"):
-                device.look(0.0, 0.3, 0.1)
+                device.measure(0.0, 0.3, 0.1)
         finally:
             over.set()
             thread.join()
         settle(rig, tension=900.0)
-        with pytest.raises(CalibrationRefused, match=r"brought 0 values .*overload"):
-            device.look(0.0, 0.1, 0.1)
+        with pytest.raises(CalibrationRefused, match=r"sent 0 values .*overload"):
+            device.measure(0.0, 0.1, 0.1)
 
 
 def test_another_device_in_the_place_of_the_one_that_was_calibrated_is_refused(config, rig):
@@ -314,5 +314,8 @@ def test_what_cannot_be_calibrated_is_told(config):
 
 
 def test_a_device_that_is_silent_is_told(config):
-    with pytest.raises(DeviceSilent, match="'elbow_encoder'"), Measuring(subject(config, "elbow_encoder", "direction")):
+    with (
+        pytest.raises(DeviceSilent, match="'elbow_encoder'"),
+        Measurement(subject(config, "elbow_encoder", "direction")),
+    ):
         raise AssertionError("nobody is there")

@@ -155,7 +155,7 @@ MIXED = {
         (0x004, "7F FF", "MIT", 4, "malformed"),
         (0x014, "14 80 00 7F F7 FF 1E 1E", "MIT", 4, "at 0.0001907 rad, -0.002442 rad/s"),
         (0x014, "D6 80 00 7F F7 FF 1E 1E", "MIT", 6, "30 degrees Celsius, state Dh"),
-        (0x014, "17 80 00 7F F7 FF 1E 1E", "MIT", None, "of drive 7, which the robot file does not have"),
+        (0x014, "17 80 00 7F F7 FF 1E 1E", "MIT", None, "of drive 7, which is not in the robot file"),
         (0x121, "00 00 00 00 08 00 00 01", "DBC", 9, "Heartbeat: Axis_Error NONE, Axis_State CLOSED_LOOP_CONTROL"),
         (0x129, "00 00 80 3F 00 00 00 BF", "DBC", 9, "Get_Encoder_Estimates: Pos_Estimate 1, Vel_Estimate -0.5"),
         (0x129, "00 00", "DBC", 9, "Get_Encoder_Estimates"),

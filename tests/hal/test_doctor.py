@@ -10,7 +10,7 @@ from hal.calibration import store
 from hal.calibration.store import Point, Record
 from hal.config import BusConfig, RobotConfig
 from hal.finding import doctor
-from hal.finding.doctor import Verdict, interfaces, socketcan
+from hal.finding.doctor import Verdict, check_interfaces, check_socketcan
 from hal.finding.link import Link, look_up, parse
 from simulators.rig import Rig
 
@@ -49,20 +49,20 @@ def verdicts(findings):
 def test_a_robot_that_is_well():
     with running() as (config, _):
         for _ in range(5):  # this machine may be too busy for the nodes to answer in time
-            found = by_what([*doctor.described(config), *doctor.examine(config, 0.2)])
+            found = by_what([*doctor.check_file(config), *doctor.check_devices(config, 0.2)])
             bad = [finding for finding in found.values() if finding.verdict is Verdict.BAD]
             if not bad:
                 break
     assert not bad
     assert found["nodes"].text == "All 5 answer."
-    assert found["PDO mapping"].text == "As it should be in 5 devices."
+    assert found["PDO mapping"].text == "Correct in 5 devices."
     assert {"heartbeat", "watchdog", "identity", "bus can0", "budget can1", "calibration"} <= set(found)
     assert "computed" in found["bus can0"].text
 
 
 def test_nothing_is_enabled_and_everything_is_let_go():
     with running() as (config, rig):
-        list(doctor.examine(config, 0.1))
+        list(doctor.check_devices(config, 0.1))
         assert {rig.node(spec.name).nmt.name for spec in hardware()} == {"PRE_OPERATIONAL"}
         assert not any(rig.node(name).servo[1] for name in ("biceps_drive", "triceps_drive"))
 
@@ -70,24 +70,24 @@ def test_nothing_is_enabled_and_everything_is_let_go():
 def test_a_node_without_power_is_told_and_the_others_are_looked_at():
     with running() as (config, rig):
         rig.fault("node_silent triceps_cell")
-        found = by_what(doctor.examine(config, 0.1))
+        found = by_what(doctor.check_devices(config, 0.1))
     assert found["node triceps_cell"].verdict is Verdict.BAD
     assert "Is it powered" in found["node triceps_cell"].text
     assert found["nodes"].text == "4 of 5 answer."
-    assert found["PDO mapping"].text == "As it should be in 4 devices."
+    assert found["PDO mapping"].text == "Correct in 4 devices."
 
 
 def test_a_node_that_answers_but_measures_nothing_is_told():
     with running() as (config, rig):
         rig.fault("sensor_silent triceps_cell")
-        found = by_what(doctor.examine(config, 0.3))
+        found = by_what(doctor.check_devices(config, 0.3))
     assert "sends no process data in 100% of the cycles" in found["node triceps_cell"].text
 
 
 def test_what_somebody_else_changed_in_a_node_is_told():
     with running() as (config, rig):
         found = {}
-        for finding in doctor.examine(config, 0.1):
+        for finding in doctor.check_devices(config, 0.1):
             found[finding.what] = finding
             if finding.what == "nodes":
                 rig.node("elbow_encoder").objects.values[0x1017, 0] = 1000
@@ -97,7 +97,7 @@ def test_what_somebody_else_changed_in_a_node_is_told():
 
 def test_a_simulator_that_does_not_run():
     config = RobotConfig.model_validate(description(interface="hub"))
-    found = by_what(doctor.examine(config, 0.1))
+    found = by_what(doctor.check_devices(config, 0.1))
     assert found["bus can0"].verdict is Verdict.BAD
     assert "Start `gemuco simulate`" in found["bus can0"].text
     assert found["nodes"].text.startswith("0 of 5 answer")
@@ -106,7 +106,7 @@ def test_a_simulator_that_does_not_run():
 def test_a_robot_file_that_cannot_be_built():
     body = description()
     body["kinds"]["drive"]["settings"] = {**body["kinds"]["drive"]["settings"], "gear": 0}
-    found = list(doctor.described(RobotConfig.model_validate(body)))
+    found = list(doctor.check_file(RobotConfig.model_validate(body)))
     assert [(finding.what, finding.verdict) for finding in found] == [("robot file", Verdict.BAD)]
     assert "gear" in found[0].text
 
@@ -130,30 +130,30 @@ def with_a_record(folder, **changes):
 
 
 def test_a_calibration_that_holds(tmp_path):
-    found = doctor.calibrated(with_a_record(tmp_path))
+    found = doctor.check_calibration(with_a_record(tmp_path))
     assert found.verdict is Verdict.OK
     assert "1 devices, the oldest of 20" in found.text
 
 
 def test_a_calibration_that_does_not_hold_is_told_and_the_devices_are_looked_at(tmp_path):
     config = with_a_record(tmp_path, measured_with={"driver": "cia406", "counts_per_turn": 4096})
-    assert "was measured with counts_per_turn 4096" in doctor.calibrated(config).text
+    assert "was measured with counts_per_turn 4096" in doctor.check_calibration(config).text
     rig = Rig(config, BenchWorld(), hardware())
     rig.start()
     try:
-        assert by_what(doctor.examine(config, 0.1))["nodes"].verdict is Verdict.OK
+        assert by_what(doctor.check_devices(config, 0.1))["nodes"].verdict is Verdict.OK
     finally:
         rig.stop()
 
 
 def test_a_device_that_cannot_tell_who_it_is(tmp_path):
-    found = doctor.calibrated(with_a_record(tmp_path, identity=""))
+    found = doctor.check_calibration(with_a_record(tmp_path, identity=""))
     assert found.verdict is Verdict.WARNING
-    assert "elbow_encoder cannot tell who they are" in found.text
+    assert "elbow_encoder have no identity" in found.text
 
 
 def test_devices_on_real_buses_without_a_calibration_are_told():
-    found = doctor.calibrated(RobotConfig.model_validate(description(interface="socketcan")))
+    found = doctor.check_calibration(RobotConfig.model_validate(description(interface="socketcan")))
     assert found.verdict is Verdict.WARNING
     assert "biceps_drive, triceps_drive" in found.text and "gemuco calibrate" in found.text
 
@@ -163,7 +163,7 @@ def test_a_replaced_device_is_told(tmp_path):
     rig = Rig(config, BenchWorld(), hardware())
     rig.start()
     try:
-        found = by_what(doctor.examine(config, 0.1))
+        found = by_what(doctor.check_devices(config, 0.1))
     finally:
         rig.stop()
     assert "Was it replaced?" in found["node elbow_encoder"].text
@@ -182,7 +182,7 @@ def test_what_ip_prints_is_read():
     [
         ({}, "interface can0", Verdict.OK, "is up"),
         ({"is_up": False}, "interface can0", Verdict.BAD, "type can bitrate 1000000 restart-ms 100"),
-        ({"is_can": False}, "interface can0", Verdict.BAD, "no CAN interface"),
+        ({"is_can": False}, "interface can0", Verdict.BAD, "not a CAN interface"),
         ({"bitrate": 500000}, "bit rate can0", Verdict.BAD, "500000 bit/s, and the robot file says 1000000"),
         ({"restart": 0.0}, "restart can0", Verdict.WARNING, "stays off after bus-off"),
         ({"state": "ERROR-PASSIVE"}, "controller can0", Verdict.WARNING, "terminations"),
@@ -193,20 +193,20 @@ def test_what_ip_prints_is_read():
 )
 def test_a_linux_interface(changes, what, verdict, said):
     sound = Link("can0", True, True, "can", 1_000_000, 0.1, "ERROR-ACTIVE", 100)
-    found = by_what(socketcan("interface can0", CAN0, replace(sound, **changes), 5))
+    found = by_what(check_socketcan("interface can0", CAN0, replace(sound, **changes), 5))
     assert found[what].verdict is verdict
     assert said in found[what].text
 
 
 def test_an_interface_that_is_not_there():
     assert look_up("can_that_is_not") is None
-    (found,) = socketcan("interface can0", CAN0, None, 5)
+    (found,) = check_socketcan("interface can0", CAN0, None, 5)
     assert found.verdict is Verdict.BAD
     assert "CAN interfaces here:" in found.text
 
 
 def test_interfaces_that_are_no_hardware_say_so():
-    told = verdicts(interfaces(RobotConfig.model_validate(description())))
+    told = verdicts(check_interfaces(RobotConfig.model_validate(description())))
     assert told == {"interface can0": Verdict.WARNING, "interface can1": Verdict.WARNING}
-    told = verdicts(interfaces(RobotConfig.model_validate(description(interface="hub"))))
+    told = verdicts(check_interfaces(RobotConfig.model_validate(description(interface="hub"))))
     assert set(told.values()) == {Verdict.OK}

@@ -182,7 +182,9 @@ def test_mit_frames_are_recognised_by_listening():
         send(wire, 0x004, "FF FF FF FF FF FF FF FC")
         send(wire, 0x014, "14 80 00 7F F7 FF 1E 1E")
         found = scan(tap, listen=0.1, ask=False)
-    assert [(one.protocol, one.node, one.state) for one in found.nodes] == [("MIT", 4, "was told to enter motor mode")]
+    assert [(one.protocol, one.node, one.state) for one in found.nodes] == [
+        ("MIT", 4, "received the command to enter motor mode")
+    ]
     assert not found.unknown
 
 

@@ -14,7 +14,6 @@ CODE = ("gemuco", "hal", "simulators", "services", "studies", "examples")
 NOT_YET = {
     "hal/calibration",
     "hal/commissioning",
-    "hal/finding",
     "services/errors.py",
     "services/health.py",
     "services/runtime.py",
