@@ -150,8 +150,8 @@ class Cia402Drive(CanopenNode):
         self._is_watched = self._sdo.has(cia301.CONSUMER_HEARTBEAT, 1)
         self._handshake = SetPointHandshake()
         self._homing: HomingRun | None = None
-        self._is_wanted = False
-        self._was_reached = False
+        self._enable_requested = False
+        self._enable_succeeded = False
         self._text = ""
         self._resetting = self._quick_stopping = self._slowing = 0
         self._stopping_cycles = round(STOPPING * place.rate)
@@ -260,7 +260,7 @@ class Cia402Drive(CanopenNode):
     def _forget(self) -> None:
         """Drop the state of the drive and all requests."""
         self._state, self._statusword, self._counts = State.NOT_READY, -1, None
-        self._is_wanted, self._quick_stopping, self._slowing, self._homing = False, 0, 0, None
+        self._enable_requested, self._quick_stopping, self._slowing, self._homing = False, 0, 0, None
 
     @override
     def _drives(self) -> bool:
@@ -290,13 +290,13 @@ class Cia402Drive(CanopenNode):
 
     @override
     def enable(self) -> None:
-        self._is_wanted, self._was_reached, self._text, self._quick_stopping = True, False, "", 0
+        self._enable_requested, self._enable_succeeded, self._text, self._quick_stopping = True, False, "", 0
 
     @override
     def disable(self) -> None:
-        if self._is_wanted and self._mode in RAMPED:
+        if self._enable_requested and self._mode in RAMPED:
             self._slowing = self._stopping_cycles
-        self._is_wanted = False
+        self._enable_requested = False
         if (homing := self._homing) is not None:
             homing.give_up("was stopped")
 
@@ -387,17 +387,17 @@ class Cia402Drive(CanopenNode):
             rest: Target that does not move the drive.
         """
         state = self._state
-        if self._is_wanted and self._was_reached and state is not State.OPERATION_ENABLED:
-            self._is_wanted = False
+        if self._enable_requested and self._enable_succeeded and state is not State.OPERATION_ENABLED:
+            self._enable_requested = False
             self._text = f"{self._place} left 'operation enabled' by itself and is '{state}'."
-        if not self._is_wanted:
+        if not self._enable_requested:
             self.idle()
             return False
         if state is not State.OPERATION_ENABLED:
             self._send(cia402.towards_enabled(state), rest, self._mode)
             return False
-        if not self._was_reached:
-            self._was_reached = True
+        if not self._enable_succeeded:
+            self._enable_succeeded = True
             self._handshake.start(rest)
         return True
 

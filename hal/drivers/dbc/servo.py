@@ -48,8 +48,8 @@ class DbcServo(DbcNode):
         return (*super().traffic(settings, rate), *(sent for _ in (settings.command, *settings.cyclic)))
 
     def __init__(self, place: Place, settings: ServoSettings) -> None:
-        self._is_wanted = False
-        self._was_reached = False
+        self._enable_requested = False
+        self._enable_succeeded = False
         self._stopped_by_watchdog = False
         self._is_booting = False
         self._has_expired = False
@@ -145,13 +145,13 @@ class DbcServo(DbcNode):
         has_expired = self._expired is not None and self._expired.is_met()
         if has_expired and not self._has_expired:
             self._counters["watchdog_expired"] += 1
-            self._stopped_by_watchdog = self._is_wanted or self._was_enabled
+            self._stopped_by_watchdog = self._enable_requested or self._was_enabled
         self._has_expired = has_expired
 
     @override
     def _lose(self, text: str) -> None:
         super()._lose(text)
-        self._is_wanted = False
+        self._enable_requested = False
 
     @property
     def _is_enabled(self) -> bool:
@@ -169,7 +169,7 @@ class DbcServo(DbcNode):
 
     @override
     def _commission(self) -> None:
-        self._is_wanted = False
+        self._enable_requested = False
         self._activity = Run("nothing", (), self._rate)
         if not self._state.message.raws:
             self._comes(self._state.message)
@@ -218,19 +218,19 @@ class DbcServo(DbcNode):
 
     @override
     def enable(self) -> None:
-        self._is_wanted, self._was_reached, self._drop_text = True, False, ""
+        self._enable_requested, self._enable_succeeded, self._drop_text = True, False, ""
         first = self._sequences[RESET] if self._has_expired else ()
         self._activity = Run(ENABLE, (*first, *self._sequences[ENABLE]), self._rate)
 
     @override
     def disable(self) -> None:
-        self._is_wanted = False
+        self._enable_requested = False
         if not self._is_stopping:
             self._begin(DISABLE)
 
     @override
     def quick_stop(self) -> None:
-        self._is_wanted = False
+        self._enable_requested = False
         if not self._is_stopping:
             self._begin(QUICK_STOP)
             self._activity.advance(self._bus.send)  # at once, because the cycle may be stuck
@@ -259,16 +259,16 @@ class DbcServo(DbcNode):
 
     def _follow(self, target: float) -> None:
         """Send the set-point [SI]; until the servo is enabled, send one that does not move it, and enable it."""
-        if not self._is_wanted:
+        if not self._enable_requested:
             self.idle()
             return
         activity, is_enabled = self._activity, self._is_enabled
-        if activity.failure or (self._was_reached and not is_enabled):
+        if activity.failure or (self._enable_succeeded and not is_enabled):
             self._drop(activity.failure)
             self.idle()
             return
         if is_enabled and activity.is_over:
-            self._was_reached = True
+            self._enable_succeeded = True
             self._send(target)
             return
         if not activity.has_sent_last:
@@ -293,7 +293,7 @@ class DbcServo(DbcNode):
 
     def _drop(self, failure: str) -> None:
         """Disable a servo that cannot be enabled, or that left its enabled state by itself."""
-        self._is_wanted = False
+        self._enable_requested = False
         reason = f", {self._reason.describe()}" if self._reason else ""
         state = f"'{self._state.describe()}'{reason}"
         if failure:

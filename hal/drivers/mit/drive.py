@@ -119,7 +119,7 @@ class MitDrive(CanDevice):
         self._error = self._latched = 0
         self._counts: tuple[int, int, int] | None = None
         self._is_wrapped = False
-        self._is_powered = self._is_wanted = self._was_reached = self._is_watched = self._is_neutral = False
+        self._is_powered = self._enable_requested = self._enable_succeeded = self._is_watched = self._is_neutral = False
         self._drop_text = ""
         self._braking = self._clearing = 0
         self._frame = can.Message(arbitration_id=node, is_extended_id=False, data=bytearray(mit.COMMAND_LAYOUT.size))
@@ -166,7 +166,7 @@ class MitDrive(CanDevice):
 
     @override
     def _commission(self) -> None:
-        self._is_wanted = False
+        self._enable_requested = False
         self._counts = None
         for _ in range(CONFIRMATIONS):
             self._knock()
@@ -240,7 +240,7 @@ class MitDrive(CanDevice):
     @override
     def _lose(self, text: str) -> None:
         super()._lose(text)
-        self._is_wanted = False
+        self._enable_requested = False
 
     @override
     def _fault(self) -> str:
@@ -269,22 +269,22 @@ class MitDrive(CanDevice):
 
     @override
     def enable(self) -> None:
-        self._is_watched = self._is_neutral = self._was_reached = False
+        self._is_watched = self._is_neutral = self._enable_succeeded = False
         self._braking = 0
         self._drop_text = ""
         self._law.restart()
         if self._registers:
             self._registers.answer = None
-        self._is_wanted = True
+        self._enable_requested = True
 
     @override
     def disable(self) -> None:
-        self._is_wanted = False
+        self._enable_requested = False
         self._braking = 0
 
     @override
     def quick_stop(self) -> None:
-        self._is_wanted = False
+        self._enable_requested = False
         self._braking = round(QUICK_STOP_TIME * self._place.rate) if self._is_powered else 0
 
     @override
@@ -331,20 +331,20 @@ class MitDrive(CanDevice):
     def _may_move(self) -> bool:
         """Return whether the drive is enabled and takes a set-point; if not, send the frame of this cycle instead."""
         if self._latched or self._is_wrapped:
-            self._is_wanted = False
+            self._enable_requested = False
         self._check_for_drop()
-        if not self._is_wanted or not self.is_commissioned:
+        if not self._enable_requested or not self.is_commissioned:
             self.idle()
         elif self._is_powered and self._request is Special.ENTER:
-            self._was_reached = True
+            self._enable_succeeded = True
             return True
         else:
             self._power_on()
         return False
 
     def _check_for_drop(self) -> None:
-        if self._is_wanted and self._was_reached and not self._is_powered:
-            self._is_wanted = False
+        if self._enable_requested and self._enable_succeeded and not self._is_powered:
+            self._enable_requested = False
             self._drop_text = f"{self._place} powered off by itself. Was it restarted, was its supply interrupted?"
 
     def _power_on(self) -> None:
