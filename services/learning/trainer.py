@@ -12,6 +12,7 @@ from rich.table import Table
 from gemuco import checkpoint
 from gemuco.dataset import Dataset
 from gemuco.errors import CheckpointError, DatasetError, NotWritten
+from gemuco.learning.config import TrainConfig
 from gemuco.learning.history import History
 from gemuco.masks import label
 from gemuco.schema import BodySchema
@@ -23,7 +24,6 @@ from services.model.model_config import ModelConfig, model_config
 from services.show import Progress
 
 if TYPE_CHECKING:
-    from gemuco.learning.train import TrainConfig
     from gemuco.structure.determination import Structure
 
 GENTLER = 1.0 / 3.0
@@ -224,10 +224,8 @@ def remarks(history: History) -> list[str]:
     return sentences
 
 
-def train_config(config: ModelConfig, epochs: int, seed: int) -> "TrainConfig":
+def train_config(config: ModelConfig, epochs: int, seed: int) -> TrainConfig:
     """Return the robot file's settings of training, for a number of epochs."""
-    from gemuco.learning.train import TrainConfig
-
     return TrainConfig(
         hidden=config.network.hidden,
         latent=config.network.latent,

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
+from typing_extensions import override
 
 from simulators.faults import check_condition
 from simulators.robots.kxr_humanoid.body import TOOLS, VARIANTS, make_body, nominal
@@ -13,40 +14,23 @@ from simulators.robots.kxr_humanoid.eye import PIXEL, POSITION, Eye
 from simulators.robots.kxr_humanoid.hardware import hardware
 from simulators.robots.kxr_humanoid.statics import rest
 from simulators.robots.kxr_humanoid.world import CENTER, COMMAND, HumanoidWorld
+from simulators.robots.simulator import RobotSimulator
 
 if TYPE_CHECKING:
     from hal.config import RobotConfig
-    from hal.robot import Robot
-    from simulators.rig import Rig
 
 __all__ = ["KxrHumanoid", "forecast", "hardware", "simulator"]
 
 
-class KxrHumanoid:
+class KxrHumanoid(RobotSimulator):
     """Simulator of the robot."""
 
     variants = VARIANTS
     conditions = tuple(TOOLS)
 
+    @override
     def world(self, variant: str, seed: int, condition: str | None = None) -> HumanoidWorld:
-        """Return the physics of one variant; the seed chooses among actual robots, and their noise.
-
-        Raises:
-            ValueError: The variant or condition is not known.
-        """
         return HumanoidWorld(make_body(variant, seed), seed, condition)
-
-    def rig(self, config: RobotConfig, variant: str, seed: int, condition: str | None = None) -> Rig:
-        """Return the world behind simulated nodes on the robot file's bus."""
-        from simulators.rig import Rig
-
-        return Rig(config, self.world(variant, seed, condition), hardware())
-
-    def direct(self, config: RobotConfig, variant: str, seed: int, condition: str | None = None) -> Robot:
-        """Return the world without a bus, as fast as it computes."""
-        from simulators.direct import direct_robot
-
-        return direct_robot(config, self.world(variant, seed, condition))
 
     def vision(self, config: RobotConfig, variant: str, seed: int) -> Eye:
         """Return the camera of one variant."""
@@ -54,10 +38,10 @@ class KxrHumanoid:
 
     def geometric(self, condition: str | None, command: np.ndarray) -> Mapping[str, np.ndarray]:
         """Return the forecast of a stiff body, the model of a full-body inverse kinematics."""
-        return _told(condition, command, stiff=True)
+        return _posture(condition, command, stiff=True)
 
 
-simulator = KxrHumanoid()
+simulator = KxrHumanoid(hardware)
 
 
 def forecast(config: RobotConfig, condition: str | None, command: np.ndarray) -> Mapping[str, np.ndarray]:
@@ -70,10 +54,10 @@ def forecast(config: RobotConfig, condition: str | None, command: np.ndarray) ->
     Raises:
         UnknownPart: The condition is not known.
     """
-    return _told(condition, command, stiff=False)
+    return _posture(condition, command, stiff=False)
 
 
-def _told(condition: str | None, command: np.ndarray, stiff: bool) -> Mapping[str, np.ndarray]:
+def _posture(condition: str | None, command: np.ndarray, stiff: bool) -> Mapping[str, np.ndarray]:
     tool = TOOLS[str(check_condition(condition, tuple(TOOLS)))]
     state = rest(nominal(), tool, np.asarray(command, float), stiff)
     return {COMMAND: command, CENTER: state.center, POSITION: state.tip, PIXEL: state.pixel}

@@ -14,6 +14,7 @@ from hal.config import RobotConfig
 from services.hardware.stand_in import simulator_of
 from services.learning.playground import CollectionStopped, DirectPlayground, Values
 from services.model.living_model import layout_of
+from simulators.direct import direct_robot
 
 POSITION, TENSION, LENGTH = "joint_position", "muscle_tension", "muscle_length"
 SENT = "sent_length"
@@ -37,7 +38,7 @@ class ActualArm:
         simulator: Any = simulator_of(robot)
         self.robot = robot
         self._world = simulator.world("actual", arm)
-        self._body = simulator.without_bus(robot, self._world)
+        self._body = direct_robot(robot, self._world)
         self._rate = rate
 
     def __enter__(self) -> Self:
