@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping
 from typing import Protocol
 
 import numpy as np
+from typing_extensions import override
 
 from hal.clock import SystemClock
 from hal.config import RobotConfig
@@ -40,7 +41,7 @@ class Playground(Protocol):
         ...
 
 
-class DirectPlayground:
+class DirectPlayground(Playground):
     """Simulated robot without a bus; its time is the simulation's."""
 
     def __init__(self, robot: Robot, rate: float) -> None:
@@ -62,8 +63,8 @@ class DirectPlayground:
                 return
         raise CollectionStopped(f"The drives did not become enabled within {ENABLE_WITHIN:g} s: mode '{robot.mode}'.")
 
+    @override
     def play(self, command: np.ndarray, duration: float) -> Iterator[Values]:
-        """Hold a command for `duration` [s] and yield samples, as `Playground.play`."""
         robot = self._robot
         for _ in range(max(1, round(duration / robot.period))):
             robot.command(command, self._cycle)
@@ -73,8 +74,8 @@ class DirectPlayground:
             if self._cycle % self._every == 0:
                 yield sample
 
+    @override
     def elapsed(self) -> float:
-        """Return the robot's own time [s]."""
         return self._robot.clock.monotonic() - self._began
 
     def _turn(self) -> Values:
@@ -85,7 +86,7 @@ class DirectPlayground:
         return sample.values
 
 
-class BusPlayground:
+class BusPlayground(Playground):
     """Running robot, with its camera if it has one, in real time."""
 
     def __init__(self, robot: RobotConfig, client: Client, rate: float) -> None:
@@ -110,8 +111,8 @@ class BusPlayground:
             time.sleep(0.01)
         self.start = self._next_sample().values[robot.command.signal]
 
+    @override
     def play(self, command: np.ndarray, duration: float) -> Iterator[Values]:
-        """Hold a command for `duration` [s] and yield samples, as `Playground.play`."""
         end = time.monotonic() + duration
         while (now := time.monotonic()) < end:
             sample = self._next_sample()
@@ -124,8 +125,8 @@ class BusPlayground:
                 self._recorded = now
                 yield self._freshness.take()[1]
 
+    @override
     def elapsed(self) -> float:
-        """Return the robot's own time [s]."""
         return time.monotonic() - self._began
 
     def _next_sample(self) -> Sample:

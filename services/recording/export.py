@@ -12,6 +12,7 @@ from types import ModuleType
 from typing import Any, Protocol
 
 import numpy as np
+from typing_extensions import override
 
 from services.errors import RecordingError
 from services.recording.reading import Paths, Recorded, facts_of, one_robot, read
@@ -39,7 +40,7 @@ class Table(Protocol):
         """Finish the file."""
 
 
-class CsvTable:
+class CsvTable(Table):
     """Comma-separated text with the names of the columns in the first line; unmeasured values are empty."""
 
     def __init__(self, path: Path, columns: list[str], first: list[Any]) -> None:
@@ -48,16 +49,16 @@ class CsvTable:
         self._writer = csv.writer(self._file)
         self._writer.writerow(columns)
 
+    @override
     def write(self, rows: list[list[Any]]) -> None:
-        """Add rows."""
         self._writer.writerows(rows)
 
+    @override
     def close(self) -> None:
-        """Finish the file."""
         self._file.close()
 
 
-class ParquetTable:
+class ParquetTable(Table):
     """Apache Parquet file; unmeasured values are null."""
 
     def __init__(self, arrow: ModuleType, path: Path, columns: list[str], first: list[Any]) -> None:
@@ -72,16 +73,16 @@ class ParquetTable:
         self._schema = arrow.schema([(name, kinds[float if value is None else type(value)]) for name, value in pairs])
         self._writer = pyarrow.parquet.ParquetWriter(self.path, self._schema, compression="zstd")
 
+    @override
     def write(self, rows: list[list[Any]]) -> None:
-        """Add rows, as one row group."""
         arrays = [
             self._arrow.array(column, field.type)
             for column, field in zip(zip(*rows, strict=True), self._schema, strict=True)
         ]
         self._writer.write_table(self._arrow.Table.from_arrays(arrays, schema=self._schema))
 
+    @override
     def close(self) -> None:
-        """Finish the file."""
         self._writer.close()
 
 

@@ -37,12 +37,9 @@ def report_errors(verb: Callable[..., Any]) -> Callable[..., Any]:
 
         try:
             code = verb(*arguments, **options)
-        except ConfigError as error:
-            typer.echo(f"gemuco: {error}", err=True)
-            raise typer.Exit(2) from None
         except (SchemaError, HalError, ServiceError) as error:
             typer.echo(f"gemuco: {error}", err=True)
-            raise typer.Exit(1) from None
+            raise typer.Exit(2 if isinstance(error, ConfigError) else 1) from None
         except ModuleNotFoundError as error:
             if (error.name or "").partition(".")[0] in OURS:
                 raise
