@@ -1,4 +1,4 @@
-"""What can be wrong between processes."""
+"""The exceptions of `services`."""
 
 from hal.errors import CommandRefused
 
@@ -8,56 +8,56 @@ class ServiceError(Exception):
 
 
 class NoAnswer(ServiceError):
-    """A question was not answered; each way in which that happens has its own class."""
+    """A query without an answer; each cause has its own class."""
 
 
 class ServiceUnavailable(NoAnswer):
-    """Nobody is there: no such service, no router, no network."""
+    """No such service, no router, or no network."""
 
 
 class TooSlow(NoAnswer):
-    """Somebody is there, and did not answer within the deadline."""
+    """A service that did not answer within the deadline."""
 
 
 class NotAllowed(NoAnswer):
-    """This client's role may not ask or say that, or is not let in at all."""
+    """A request that the client's role does not allow, or a client that the router refuses."""
 
 
 class WrongVersion(NoAnswer):
-    """The other side speaks another version of the wire format."""
+    """Another version of the wire format on the other side."""
 
 
 class CommandHeld(ServiceError):
-    """Somebody else commands this robot; the text names the holder."""
+    """A robot that another client commands; the text names the holder."""
 
 
 class LeaseLost(ServiceError):
-    """This client commands no more: its lease ran out, or the HAL was restarted."""
+    """The end of this client's lease: it ran out, or the HAL was restarted."""
 
 
 class TooLate(ServiceError, CommandRefused):
-    """What may move the robot was asked for too long ago, or without telling when; it is not done."""
+    """A refused request to move the robot: it is too old, or its age is unknown."""
 
 
 class AlreadyRunning(ServiceError):
-    """The robot already has this service; a second one is refused."""
+    """A second service of a kind that the robot already has."""
 
 
 class RemoteError(ServiceError):
-    """A service refused, with an exception that this process does not know; the text names its class."""
+    """An exception of a service whose class this process does not know; the text names it."""
 
 
 class RecordingError(ServiceError):
-    """A recording cannot be written or read."""
+    """A recording that cannot be written or read."""
 
 
 class TargetRefused(ServiceError):
-    """A target was not accepted; the controller goes on with the one before."""
+    """A target that is not accepted; the controller keeps the one before."""
 
 
 class NotEngaged(ServiceError):
-    """The controller could not take over; nothing moved because of it."""
+    """A controller that could not engage; it moved nothing."""
 
 
 class BadArguments(ServiceError):
-    """A verb was asked with arguments it does not understand."""
+    """Unknown, missing or malformed arguments of a verb."""

@@ -1,7 +1,7 @@
-"""Tell a live service from a stuck one, from outside: each writes once a second how far its loops are.
+"""The health check of a service: every service writes the progress of its loops into a file once a second.
 
-`python -m services.health SERVICE ROBOT` looks at that file and prints one line; exit code 0 if the service is healthy.
-It imports as little as possible, so that a container can ask every few seconds.
+`python -m services.health SERVICE ROBOT` reads that file and prints one line; exit code 0 if the service is healthy. It
+imports as little as possible, so that a container can run it every few seconds.
 """
 
 import json
@@ -14,81 +14,81 @@ from services.errors import ServiceError
 from services.runtime import runtime_folder
 
 ROUTER = "router"
-"""The one service that belongs to no robot."""
+"""This is the only service that belongs to no robot."""
 STALE = 3.0
-"""A service that wrote nothing for so long [s] is frozen."""
+"""A service whose heartbeat is older than this [s] is frozen."""
 STUCK = 3.0
-"""A loop that completed nothing for so long [s] is stuck; a slow one has five periods."""
-_STARTED_AT = 19
-"""Where a process's start time is in /proc/PID/stat, counted after the name in parentheses."""
+"""A loop without progress for this time [s], or for five periods if that is longer, is stuck."""
+_START_TIME_FIELD = 19
+"""This field of /proc/PID/stat is the start time, counted after the name in parentheses."""
 
 
 def heartbeat_path(service: str, robot: str) -> Path:
-    """Where a service writes how far it is; the router's robot is empty."""
+    """Return the path of a service's heartbeat; the router's robot is empty."""
     return runtime_folder() / ".".join(filter(None, (robot, service, "heartbeat")))
 
 
-def judge(found: dict[str, Any], now: float) -> str:
-    """What is wrong with a service that wrote this, in one sentence; empty if nothing is.
+def judge(heartbeat: dict[str, Any], now: float) -> str:
+    """Return the fault of a service in one sentence; empty if it is healthy.
 
     Args:
-        found: What the file holds.
+        heartbeat: Content of its file.
         now: Monotonic time [s].
     """
-    if found["boot"] != this_boot():
+    if heartbeat["boot"] != this_boot():
         return "The heartbeat is from before this machine started: the service does not run."
-    pid = found["pid"]
-    if found["space"] == pid_space() and started(pid) != found["started"]:
-        return f"Process {pid} has ended without a word: killed, or crashed."
-    age = now - found["stamp"]
+    pid = heartbeat["pid"]
+    if heartbeat["space"] == pid_space() and started(pid) != heartbeat["started"]:
+        return f"Process {pid} was killed or has crashed."
+    age = now - heartbeat["stamp"]
     if age > STALE:
         return f"No heartbeat of process {pid} for {age:.1f} s: frozen, or without processor time."
-    for name, loop in found["loops"].items():
-        still = now - loop["at"]
-        if still > max(STUCK, 5.0 * loop["period"]):
-            why = f" Last error: {loop['error']}" if loop["error"] else ""
-            return f"Loop '{name}' of process {pid} has completed nothing for {still:.1f} s.{why}"
+    for name, loop in heartbeat["loops"].items():
+        idle = now - loop["at"]
+        if idle > max(STUCK, 5.0 * loop["period"]):
+            error = f" Last error: {loop['error']}" if loop["error"] else ""
+            return f"Loop '{name}' of process {pid} has completed nothing for {idle:.1f} s.{error}"
     return ""
 
 
 def check(service: str, robot: str) -> tuple[bool, str]:
-    """Whether a service of this machine is healthy, and one line that tells why."""
+    """Return whether a service of this machine is healthy, and the reason in one line."""
     try:
         path = heartbeat_path(service, robot)
-        found = json.loads(path.read_text())
-        problem = judge(found, time.monotonic())
+        heartbeat = json.loads(path.read_text())
+        fault = judge(heartbeat, time.monotonic())
     except ServiceError as error:
         return False, str(error)
     except FileNotFoundError:
         return False, f"No '{service}' runs here, or it is still starting: there is no '{path}'."
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         return False, f"The heartbeat '{path}' cannot be read: {error!r}."
-    if problem:
-        return False, problem
-    loops = ", ".join(f"{name} {loop['done']}" for name, loop in found["loops"].items())
-    return True, f"Process {found['pid']} is healthy; completed: {loops}."
+    if fault:
+        return False, fault
+    loops = ", ".join(f"{name} {loop['done']}" for name, loop in heartbeat["loops"].items())
+    return True, f"Process {heartbeat['pid']} is healthy; completed: {loops}."
 
 
 def this_boot() -> str:
-    """Random, and another one after the machine was started again."""
+    """Return the random identifier of the machine's last start."""
     return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
 
 
 def pid_space() -> str:
-    """Which namespace pids count in; another one's cannot be looked up here."""
+    """Return the namespace of this process's pids; pids of another namespace cannot be looked up here."""
     return str(Path("/proc/self/ns/pid").readlink())
 
 
 def started(pid: int) -> str:
-    """When a process started [ticks of the kernel]; empty if there is none: pids are used again."""
+    """Return the start time of a process [kernel ticks], because pids are used again; empty without a process."""
     try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[_STARTED_AT]
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[_START_TIME_FIELD]
     except (OSError, IndexError):
         return ""
 
 
 def main(arguments: list[str]) -> int:
-    """The command: exit code 0 if the service is healthy, 1 if not."""
+    """Run the command; return exit code 0 if the service is healthy, 1 if not, 2 for wrong arguments."""
     if not 1 <= len(arguments) <= 2:
         print("usage: python -m services.health SERVICE [ROBOT]", file=sys.stderr)
         return 2

@@ -1,4 +1,4 @@
-"""Where the files of running services lie: their locks and their heartbeats. Imports nothing that takes long."""
+"""The folder of running services' files, which are locks and heartbeats. It imports nothing that takes long."""
 
 import os
 from pathlib import Path
@@ -7,7 +7,7 @@ from services.errors import ServiceError
 
 
 def runtime_folder() -> Path:
-    """This user's folder: `$XDG_RUNTIME_DIR/gemuco`, or one in the temporary directory.
+    """Make and return this user's folder: `$XDG_RUNTIME_DIR/gemuco`, or one in the temporary directory.
 
     Raises:
         ServiceError: It cannot be made.
@@ -16,7 +16,7 @@ def runtime_folder() -> Path:
     if base:
         folder = Path(base) / "gemuco"
     else:
-        import tempfile  # takes longer than all the rest of a health check
+        import tempfile  # this import takes longer than the rest of a health check
 
         folder = Path(tempfile.gettempdir()) / f"gemuco-{os.getuid()}"
     try:
@@ -27,23 +27,19 @@ def runtime_folder() -> Path:
 
 
 def services_here() -> list[tuple[str, str]]:
-    """Robot and service of every service that this user runs on this machine, as far as their locks tell, sorted.
+    """Return (robot, service) of every service that this user runs on this machine, sorted.
 
     Raises:
-        ServiceError: There is no folder for them.
+        ServiceError: The folder of their locks cannot be made.
     """
-    found = []
-    for lock in runtime_folder().glob("*.lock"):
-        robot, _, service = lock.stem.rpartition(".")
-        if robot and _runs(lock):
-            found.append((robot, service))
-    return sorted(found)
+    names = [(lock.stem.rpartition("."), lock) for lock in runtime_folder().glob("*.lock")]
+    return sorted((robot, service) for (robot, _, service), lock in names if robot and _runs(lock))
 
 
 def _runs(lock: Path) -> bool:
-    """Whether the process that wrote its number into a lock's file is there; the file stays when it ends.
+    """Whether the process whose pid is in a lock's file exists; the file remains after its end.
 
-    The lock itself is not tried: whoever holds it for a moment would keep the service from starting.
+    The lock itself is not tried: a process that starts at that moment would be refused.
     """
     try:
         return Path(f"/proc/{int(lock.read_text())}").exists()

@@ -14,9 +14,6 @@ CODE = ("gemuco", "hal", "simulators", "services", "studies", "examples")
 NOT_YET = {
     "hal/calibration",
     "hal/commissioning",
-    "services/errors.py",
-    "services/health.py",
-    "services/runtime.py",
     "services/verbs/fleet_top.py",
     "services/verbs/fleet_watch.py",
     "services/verbs/page.py",

@@ -104,8 +104,8 @@ def written(**changed: object) -> None:
     [
         ({}, "is healthy"),
         ({"boot": "another"}, "before this machine started"),
-        ({"started": "1"}, "ended without a word"),
-        ({"pid": 2**22 + 1}, "ended without a word"),
+        ({"started": "1"}, "was killed or has crashed"),
+        ({"pid": 2**22 + 1}, "was killed or has crashed"),
         ({"stamp": 0.0}, "frozen"),
         ({"loops": None}, "cannot be read"),
     ],
@@ -195,7 +195,7 @@ def test_a_router_that_lives_is_frozen_and_dies() -> None:
             router.kill()
     found = asked("router")
     assert found.returncode == 1
-    assert "ended without a word" in found.stdout
+    assert "was killed or has crashed" in found.stdout
 
 
 def test_the_check_loads_nothing_that_takes_long() -> None:
