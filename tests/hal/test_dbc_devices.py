@@ -439,3 +439,15 @@ def test_sending_faster_than_stated_is_a_fault(place, period, is_fault):
     assert device._fault() == ""
     hear(bytearray.fromhex("00 28 23 00 00 00 00 00"), 10.0 + 149 * period)
     assert bool(device._fault()) is is_fault
+
+
+@pytest.mark.parametrize(("fault", "is_good"), [(4, False), (5, True), (6, False)])
+def test_only_the_good_value_of_the_error_signal_is_good(place, fault, is_good):
+    error = {"signal": "Status.Fault", "good": 5}
+    device = DbcNode(place("position"), settings(DbcSettings, SENSOR, error=error))
+    assert device._error_text() == ""
+    device.is_commissioned = True
+    device._bus.subscriber(257 + 8)(bytearray([0, fault]), 1.0)
+    device._bus.subscriber(256 + 8)(bytearray.fromhex("00 28 23 00 00 00 00 00"), 1.0)
+    assert math.isnan(device.read().values[0]) is not is_good
+    assert (device._error_text() == "") is is_good

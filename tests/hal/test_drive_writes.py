@@ -6,13 +6,14 @@ so 32 594.93 counts per radian. The wire has a spool of 10 mm: 3 259 493 counts 
 
 import math
 
+import canopen
 import pytest
 from drive_bench import HOMING, SETTINGS
 from hal_bench import ROBOTS
 
 from hal.drivers.canopen.node import data_sheet
 from hal.drivers.cia402.settings import DriveSettings, drive_units
-from hal.drivers.cia402.writes import drive_writes
+from hal.drivers.cia402.writes import check_objects, drive_writes
 from hal.errors import ConfigError
 from hal.protocols.cia402 import VELOCITY_UNITS
 
@@ -133,3 +134,72 @@ def test_damping_and_a_profile_need_their_modes():
             DriveSettings.model_validate({**SETTINGS, "mode": mode, **changes})
     with pytest.raises(ConfigError):
         data_sheet(ROBOTS / "eds" / "no_drive.eds")
+
+
+HOMED = {"homing": {**HOMING, "acceleration": 2.0, "offset": 0.1}}
+NEEDED = [
+    ({}, "6060h:0"),
+    ({"max_torque": 900}, "6072h:0"),
+    ({"following_error": 0.01}, "6065h:0"),
+    ({"mode": "profile_position", "profile": {"velocity": 1.0}}, "6081h:0"),
+    ({"mode": "profile_position", "profile": {"acceleration": 1.0}}, "6083h:0"),
+    ({"mode": "profile_position", "profile": {"deceleration": 1.0}}, "6084h:0"),
+    (HOMED, "6098h:0"),
+    (HOMED, "6099h:1"),
+    (HOMED, "6099h:2"),
+    (HOMED, "609Ah:0"),
+    (HOMED, "607Ch:0"),
+]
+
+
+def sheet_without(item):
+    sheet = canopen.import_od(str(ROBOTS / "eds" / "servo_drive.eds"))
+    index, sub = int(item[:4], 16), int(item[6:])
+    if sub:
+        del sheet[index].subindices[sub]
+    else:
+        del sheet[index]
+    return sheet
+
+
+@pytest.mark.parametrize(("settings", "item"), NEEDED)
+def test_a_setting_whose_object_the_drive_does_not_have(settings, item):
+    parsed = DriveSettings.model_validate({**SETTINGS, **settings})
+    sheet = sheet_without(item)
+    with pytest.raises(ConfigError, match=f"object {item} for"):
+        check_objects(parsed, False, sheet, "'elbow'")
+    if settings:
+        check_objects(DriveSettings.model_validate(SETTINGS), False, sheet, "'elbow'")
+    check_objects(parsed, True, data_sheet(ROBOTS / "eds" / "servo_drive.eds"), "'elbow'")
+
+
+def test_homing_without_acceleration_and_offset_needs_no_objects_for_them():
+    parsed = DriveSettings.model_validate({**SETTINGS, "homing": HOMING})
+    for item in ("609Ah:0", "607Ch:0"):
+        check_objects(parsed, False, sheet_without(item), "'elbow'")
+
+
+def test_an_effort_needs_the_rated_torque_from_the_drive_or_the_robot_file():
+    parsed = DriveSettings.model_validate(SETTINGS)
+    with pytest.raises(ConfigError, match="object 6076h:0 for"):
+        check_objects(parsed, True, sheet_without("6076h:0"), "'elbow'")
+    check_objects(parsed, False, sheet_without("6076h:0"), "'elbow'")
+    given = DriveSettings.model_validate({**SETTINGS, "rated_torque": 0.2})
+    check_objects(given, True, sheet_without("6076h:0"), "'elbow'")
+
+
+def test_a_drive_that_cannot_watch_the_hal_is_refused_unless_the_robot_file_accepts_it():
+    sheet = sheet_without("1016h:1")
+    with pytest.raises(ConfigError, match="allow_no_watchdog"):
+        check_objects(DriveSettings.model_validate(SETTINGS), False, sheet, "'elbow'")
+    check_objects(DriveSettings.model_validate({**SETTINGS, "allow_no_watchdog": True}), False, sheet, "'elbow'")
+
+
+def test_objects_that_the_drive_does_not_have_or_that_are_read_only_are_left_to_the_hal():
+    parsed = DriveSettings.model_validate({**SETTINGS, "max_velocity": 1.0})
+    sheet = sheet_without("6080h:0")
+    sheet[0x605A].access_type = "ro"
+    units = drive_units(parsed, VELOCITY_UNITS["counts/s"], 0.2)
+    found = {str(item) for item, _ in drive_writes(parsed, units, ANYWHERE, 0.005, sheet)}
+    assert not {"6080h:0", "605Ah:0"} & found
+    assert {"607Fh:0", "6007h:0", "1029h:1"} <= found

@@ -222,3 +222,84 @@ def test_a_load_that_is_not_known_limits_nothing_and_is_told():
     for limit in (SoftEffort(load(), *arguments), SoftEffortOfVelocity(load(), np.ones(1)), SoftEffortOfEffort(load())):
         assert one(limit, -0.3, 0.5, f=np.nan) == -0.3
         assert limit.blind({"f": np.array([np.nan])}) == ["elbow"]
+
+
+@pytest.mark.parametrize(
+    ("force", "most"),
+    [
+        (89.9, 1000.0),  # below the band, which is a tenth of 100 N, nothing is limited
+        (90.1, 10.198),  # at its lower end an effort may grow by 2 % per cycle
+        (95.0, 10.1),
+        (100.0, 10.0),
+        (105.0, 9.9),
+        (110.0, 9.8),
+        (150.0, 9.8),
+        (-105.0, 9.9),
+    ],
+)
+def test_how_much_an_effort_may_grow_per_cycle(force, most):
+    limit = SoftEffortOfEffort(load())
+    assert one(limit, 1000.0, 10.0, f=force) == pytest.approx(most)
+    assert one(limit, -1000.0, -10.0, f=force) == pytest.approx(-most)
+    assert one(limit, 0.5, 10.0, f=force) == 0.5
+
+
+@pytest.mark.parametrize(
+    ("tension", "speed"),
+    [(89.0, -100.0), (95.0, -0.1), (100.0, 0.0), (125.0, 0.05), (150.0, 0.1), (200.0, 0.2), (300.0, 0.2)],
+)
+def test_how_fast_a_tense_wire_is_paid_out(tension, speed):
+    """At most 0.2 m/s at 200 N, none at 100 N; in the band below the wire may be wound, slower and slower."""
+    limit = SoftEffort(load(), np.array([0.2]), np.array([LOW]), np.array([HIGH]), PERIOD)
+    assert one(limit, 0.0, 0.5, f=tension) == pytest.approx(max(0.5 + speed * PERIOD, 0.0))
+    velocity = SoftEffortOfVelocity(load(), np.array([0.2]))
+    assert one(velocity, -100.0, f=tension) == pytest.approx(speed)
+    assert one(velocity, 1.0, f=tension) == 1.0
+
+
+@pytest.mark.parametrize(("before", "step"), [(1.9995, 0.0005), (2.0, 0.0), (2.5, 0.0), (1.9, 0.001)])
+def test_paying_out_ends_at_the_end_of_the_range(before, step):
+    limit = SoftEffort(load(), np.array([0.2]), np.array([LOW]), np.array([HIGH]), PERIOD)
+    assert one(limit, 0.0, before, f=200.0) == pytest.approx(before + step)
+
+
+@pytest.mark.parametrize(("effort", "sign"), [(150.0, -1.0), (-150.0, 1.0)])
+def test_a_loaded_joint_gives_way_against_its_effort(effort, sign):
+    limit = SoftEffort(load(is_signed=True), np.array([0.2]), np.array([LOW]), np.array([HIGH]), PERIOD)
+    assert one(limit, 0.5, 0.5, f=effort) == pytest.approx(0.5 + sign * 0.1 * PERIOD)
+    assert one(SoftEffortOfVelocity(load(is_signed=True), np.array([0.2])), 0.0, f=effort) == pytest.approx(sign * 0.1)
+
+
+@pytest.mark.parametrize(
+    ("position", "up", "down"),
+    [(0.5, 15.0, -15.0), (1.9, 1.0, -29.0), (2.0, 0.0, -30.0), (2.1, 0.0, -31.0), (-1.0, 30.0, 0.0)],
+)
+def test_a_velocity_without_deceleration_closes_the_way_in_twice_the_age(position, up, down):
+    """The age is 0.05 s, so that the way that is left may be gone in 0.1 s."""
+    limit = EndsOfVelocity(way(), None, 0.05)
+    assert one(limit, 100.0, p=position) == pytest.approx(up)
+    assert one(limit, -100.0, p=position) == pytest.approx(down)
+
+
+@pytest.mark.parametrize("left", [0.01, 0.1, 1.0])
+def test_a_velocity_with_a_deceleration_stops_at_the_end(left):
+    """v * 0.1 s + v^2 / (2 * 4 / s^2) is the way that is left."""
+    speed = one(EndsOfVelocity(way(), np.array([4.0]), 0.05), 100.0, p=HIGH - left)
+    assert speed * 0.1 + speed**2 / 8.0 == pytest.approx(left)
+
+
+@pytest.mark.parametrize(
+    ("position", "wanted", "share"),
+    [(2.0, 5.0, 0.0), (1.85, 5.0, 0.5), (1.7, 5.0, 1.0), (1.85, -5.0, 1.0), (-0.85, -5.0, 0.5), (-0.85, 5.0, 1.0)],
+)
+def test_an_effort_fades_out_in_a_tenth_of_the_range(position, wanted, share):
+    """The range is 3 long."""
+    assert one(EndsOfEffort("range", way()), wanted, p=position) == pytest.approx(share * wanted)
+
+
+def test_an_effort_at_an_end_without_another_end():
+    """Without a range, it fades out in 0.1 of the unit."""
+    one_end = EndsOfEffort("range", way(low=-np.inf))
+    assert one(one_end, 5.0, p=1.95) == pytest.approx(2.5)
+    assert one(one_end, -5.0, p=-1e6) == -5.0
+    assert one(EndsOfEffort("velocity", way(low=-np.inf, high=np.inf)), 5.0, p=1e6) == 5.0
