@@ -25,7 +25,7 @@ class MuscleWorld(World):
     """World of a muscle-driven body. Signals: joint_position, muscle_tension, muscle_length."""
 
     _STEPS_PER_REFRESH = 2
-    """Moment arms and inertia are solved anew every this many steps; in between paths are linear in joint positions."""
+    """Moment arms and inertia are solved every this many steps; in between, paths are linear in joint positions."""
 
     def __init__(self, body: Body, seed: int, servo: Servo | None = None, longest_step: float = 0.0025) -> None:
         """Put the body at rest, its brakes on.

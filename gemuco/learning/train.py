@@ -60,7 +60,7 @@ def fit(
     layout = dataset.layout
     checked = tuple(mask(m, layout.names) for m in masks)
     if not checked or frozenset() in checked:
-        raise NotEnoughData("Training needs at least one mask, and none of them empty.")
+        raise NotEnoughData("Training needs at least one mask, and no mask may be empty.")
     outputs = layout.subset(layout.names if x_out is None else tuple(x_out)).names
     train_data, held_data = dataset.split(config.held_out, config.seed)
     scaler = Scaler.fit(layout, train_data.rows())

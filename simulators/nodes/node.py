@@ -46,7 +46,7 @@ class SimulatedNode(Protocol):
         ...
 
     def power_up(self, now: float) -> None:
-        """Start anew, as after power-on."""
+        """Start as after power-on."""
         ...
 
     def power_down(self) -> None:

@@ -21,7 +21,7 @@ class Arrivals:
         self.restart()
 
     def restart(self) -> None:
-        """Begin to count anew; a pause before is not counted."""
+        """Restart the count; a pause before is not counted."""
         self._newest: tuple[int, int, float] | None = None
         self.arrived = self.lost = self.gaps = 0
         self.longest = 0.0

@@ -66,7 +66,7 @@ class Ear:
         close_session(self._session)
 
     def restart(self) -> None:
-        """Begin to count anew."""
+        """Restart the count."""
         self.begun = time.monotonic()
         for arrivals in list(self.arrivals.values()):
             arrivals.restart()

@@ -70,7 +70,7 @@ class BareLoops:
 
 
 class _BareLoop:
-    """Loop that wakes at a rate [Hz] for ever and counts as `services.process.loop.Loop` does."""
+    """Endless loop that wakes at a rate [Hz] and counts as `services.process.loop.Loop` does."""
 
     def __init__(self, rate: float, priority: int) -> None:
         self._period, self._priority = 1.0 / rate, priority

@@ -36,7 +36,7 @@ READ = "Client.estimate(): the newest published"
 
 
 def echo(robot: str, connect: tuple[str, ...], answer: bytes) -> None:
-    """Answer the same bytes for ever, in a process of its own, in place of a recorder."""
+    """Answer always with the same bytes, in a separate process, in place of a recorder."""
     session = open_session(robot, "recorder", connect)
 
     def reply(query: zenoh.Query) -> None:

@@ -54,7 +54,7 @@ class CanopenNode(SimulatedNode):
         self.nmt = Nmt.BOOT
         self.is_powered = False
         self.is_muted = False
-        """Sends no process data any more: its sensor is dead, its electronics are not."""
+        """It sends no process data any more, because its sensor is dead; its electronics work."""
         self.is_broken = False
         """It reported a fault of its own since power-on."""
         self._heartbeat_due = 0.0
@@ -88,7 +88,7 @@ class CanopenNode(SimulatedNode):
         self.emergency(HARDWARE, GENERIC)
 
     def power_up(self, now: float) -> None:
-        """Start anew with the values of power-on and report with a boot-up message."""
+        """Start with the values of power-on and send a boot-up message."""
         self._now = now
         self.is_powered = True
         self.is_muted = self.is_broken = False

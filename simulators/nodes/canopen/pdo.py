@@ -91,7 +91,7 @@ class PdoTable:
         self.rebuild()
 
     def rebuild(self) -> None:
-        """Read all PDO objects anew."""
+        """Read all PDO objects again."""
         self.receive = [pdo for index in self._numbers(0x1400) if (pdo := self._build(index))]
         self.transmit = [pdo for index in self._numbers(0x1800) if (pdo := self._build(index))]
         self._changed()

@@ -94,7 +94,7 @@ class Segment:
                 self._reopen(error, is_running)
 
     def _answer_from(self, frames: list[Frame], monotonic: Callable[[], float], until: float) -> None:
-        """Answer these frames and those that wait, but not for ever: who is busy still says that it is alive."""
+        """Answer these frames and those that wait for a limited time, so that a busy node still sends its heartbeat."""
         with self.lock:
             while frames:
                 now = monotonic()

@@ -1,4 +1,4 @@
-"""A world without a body: what is moved follows its servo, and everything else reads what it was set to."""
+"""A world without a body: an element with a servo follows it, all others keep the values they were set to."""
 
 import math
 from collections.abc import Mapping
@@ -68,7 +68,7 @@ class BenchWorld(World):
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
-            raise UnknownPart(f"'{text}' is no number that {element} can be set to.")
+            raise UnknownPart(f"{element} cannot be set to '{text}', which is not a number.")
         signal, index = self._places[element]
         self._values[signal][index] = value
 

@@ -107,4 +107,4 @@ class HumanoidWorld(World):
 
 
 _STILL = 1e-5
-"""A motor that would move less than this in a step [rad] is at rest, and nothing is computed anew."""
+"""A motor that would move less than this in a step [rad] is at rest, and its state is not computed again."""

@@ -37,7 +37,7 @@ class Body:
         camera_shift: Offset of the camera's positions [m], shape (3,).
         encoder_noise: Standard deviation of the encoders [rad].
         camera_noise: Standard deviation of the camera [m].
-        rough_length: Standard deviation of the lengths at which people put a duster into the hand [m].
+        rough_length: Standard deviation of the lengths at which a duster is put into the hand [m].
         rough_angle: Standard deviation of the angles of the grasp [rad].
         condition: Grasp at the start.
     """

@@ -27,7 +27,7 @@ class DusterWorld(World):
 
         Args:
             body: What it is made of.
-            seed: Of the sensors' noise, and of how people put dusters into the hand.
+            seed: Seed of the sensors' noise and of the position of the duster in the hand.
             condition: The grasp; the body's own if not given.
 
         Raises:
