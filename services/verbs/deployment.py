@@ -67,7 +67,7 @@ def security_init(
         str, typer.Option(metavar="HOST", help="Host of a simulated robot; that of the HAL if empty.")
     ] = "",
     days: Annotated[
-        int | None, typer.Option(min=1, help="Validity of new certificates [days]; 730 if not given.")
+        int | None, typer.Option(min=1, help="Validity of new certificates \\[days]; 730 if not given.")
     ] = None,
     quic: Annotated[
         bool | None, typer.Option("--quic/--tls", help="Protocol of all links: QUIC, unless UDP is blocked.")

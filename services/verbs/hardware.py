@@ -18,10 +18,10 @@ Interface = Annotated[
     str | None, typer.Option(help="Instead of a robot: an interface of python-can, such as socketcan.")
 ]
 Channel = Annotated[str | None, typer.Option(help="Channel of the interface, such as can0.")]
-Bitrate = Annotated[int, typer.Option(min=10_000, help="Bit rate of the channel [bit/s].")]
+Bitrate = Annotated[int, typer.Option(min=10_000, help="Bit rate of the channel \\[bit/s].")]
 Device = Annotated[str, typer.Argument(metavar="DEVICE", help="A device, or an element that it measures.")]
-Seconds = Annotated[float, typer.Option(min=0.1, max=60.0, help="Averaging time at each point [s].")]
-Noise = Annotated[float | None, typer.Option(min=0.0, help="Largest standard deviation at rest [the signal's unit].")]
+Seconds = Annotated[float, typer.Option(min=0.1, max=60.0, help="Averaging time at each point \\[s].")]
+Noise = Annotated[float | None, typer.Option(min=0.0, help="Largest standard deviation at rest \\[the signal's unit].")]
 Yes = Annotated[bool, typer.Option("--yes", help="Measure the first point at once, and store without asking.")]
 
 
@@ -40,7 +40,7 @@ def scan(
     channel: Channel = None,
     bitrate: Bitrate = 1_000_000,
     seconds: Annotated[
-        float, typer.Option(min=0.1, max=60.0, help="Listening time before the first request [s].")
+        float, typer.Option(min=0.1, max=60.0, help="Listening time before the first request \\[s].")
     ] = 1.5,
     passive: Annotated[bool, typer.Option("--passive", help="Only listen, send nothing.")] = False,
     mit: Annotated[
@@ -77,7 +77,9 @@ def joint(
     device: Device,
     at: Annotated[
         list[float] | None,
-        typer.Option("--at", help="A known position that you will set [rad or m]; repeat for more. Asks if not given."),
+        typer.Option(
+            "--at", help="A known position that you will set \\[rad or m]; repeat for more. Asks if not given."
+        ),
     ] = None,
     seconds: Seconds = 1.0,
     noise: Noise = None,
@@ -129,7 +131,7 @@ def dump(
     bus: Annotated[str | None, typer.Option(help="Only this bus of the robot.")] = None,
     node: Annotated[int | None, typer.Option(min=0, help="Only frames of this node.")] = None,
     count: Annotated[int | None, typer.Option(min=1, help="Number of frames; no limit if not given.")] = None,
-    seconds: Annotated[float, typer.Option(min=0.1, help="Duration [s]; until Ctrl-C if not given.")] = math.inf,
+    seconds: Annotated[float, typer.Option(min=0.1, help="Duration \\[s]; until Ctrl-C if not given.")] = math.inf,
     summary: Annotated[
         bool, typer.Option("--summary", help="One line per identifier, with its rate, at the end.")
     ] = False,

@@ -162,6 +162,11 @@ def test_every_verb_explains_itself(words: tuple[str, ...]) -> None:
     assert "ROBOT" in told.output
 
 
+def test_help_shows_units() -> None:
+    text = CliRunner().invoke(app, ["calibrate", "joint", "--help"]).output
+    assert "[s]" in text and "[rad" in text
+
+
 @pytest.mark.long
 def test_doctor_finds_what_is_wrong(stage: Stage) -> None:
     told = stage.doctor(", 0 bad.")
