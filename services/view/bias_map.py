@@ -1,4 +1,4 @@
-"""The parametric bias as a map: where p of every trained condition lies, where p is now, and where it came from."""
+"""Map of the parametric bias: p of every trained condition, p now, and its past."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -8,32 +8,32 @@ import numpy as np
 
 WIDTH, HEIGHT = 372, 262
 EDGE = 26
-"""Room [px] around the outermost point."""
+"""The map has this margin [px] around the outermost point."""
 LABEL = 11
-"""Height [px] of a label."""
+"""Labels have this height [px]."""
 
 
 @dataclass(frozen=True, slots=True)
-class Map:
+class BiasMap:
     """Points in the plane.
 
     Attributes:
-        conditions: Name -> place, shape (2,).
-        way: Where p was and is, oldest first, shape (k, 2).
-        axes: What the axes are, in words.
-        nearest: The condition whose p is nearest to p, in all dimensions; empty without.
-        apart: How far p is from it, as a share of how far the conditions are apart.
+        conditions: Name -> point, shape (2,).
+        path: Past and present p, oldest first, shape (k, 2).
+        axes: Names of the axes.
+        nearest: Condition whose p is nearest to the present p, in all dimensions; empty without a present p.
+        distance: Distance of p from that condition, as a share of the conditions' mean distance from their mean.
     """
 
     conditions: Mapping[str, np.ndarray]
-    way: np.ndarray
+    path: np.ndarray
     axes: tuple[str, str]
     nearest: str
-    apart: float
+    distance: float
 
 
-def project(biases: Mapping[str, Sequence[float]], way: np.ndarray) -> Map | None:
-    """Lay the conditions and the way of p, shape (k, size), out in the plane; None where there is no p.
+def project(biases: Mapping[str, Sequence[float]], path: np.ndarray) -> BiasMap | None:
+    """Return the conditions and the path of p, shape (k, size), in the plane; None if the model has no p.
 
     More than two dimensions are projected on the two in which the conditions differ most.
     """
@@ -41,12 +41,12 @@ def project(biases: Mapping[str, Sequence[float]], way: np.ndarray) -> Map | Non
     if points.ndim != 2 or points.shape[1] == 0:
         return None
     size = points.shape[1]
-    way = way.reshape(-1, size) if way.size and way.shape[-1] == size else np.zeros((0, size))
-    nearest, apart = "", np.nan
-    if len(way):
-        distances = np.linalg.norm(points - way[-1], axis=1)
+    path = path.reshape(-1, size) if path.size and path.shape[-1] == size else np.zeros((0, size))
+    nearest, distance = "", np.nan
+    if len(path):
+        distances = np.linalg.norm(points - path[-1], axis=1)
         spread = float(np.linalg.norm(points - points.mean(axis=0), axis=1).mean()) or 1.0
-        nearest, apart = list(biases)[int(np.argmin(distances))], float(distances.min()) / spread
+        nearest, distance = list(biases)[int(np.argmin(distances))], float(distances.min()) / spread
     if size == 1:
         plane, axes = np.array([[1.0, 0.0]]), ("p", "")
         origin = np.zeros(1)
@@ -61,19 +61,19 @@ def project(biases: Mapping[str, Sequence[float]], way: np.ndarray) -> Map | Non
         first, second = (float(share[index]) if index < len(share) else 0.0 for index in (0, 1))
         axes = (f"principal axis 1 of {size}, {first:.0%}", f"axis 2, {second:.0%}")
     placed = dict(zip(biases, (points - origin) @ plane, strict=True))
-    return Map(placed, (way - origin) @ plane, axes, nearest, apart)
+    return BiasMap(placed, (path - origin) @ plane, axes, nearest, distance)
 
 
 class BiasPicture:
-    """Draws the map; remembers its frame, so that nothing jumps when p leaves it."""
+    """Picture of the map, which keeps its range, so that no point jumps when p leaves it."""
 
     def __init__(self) -> None:
         self._frame: tuple[np.ndarray, np.ndarray] | None = None
         self._names: tuple[str, ...] = ()
 
-    def svg(self, found: Map, is_old: bool) -> str:
-        """The picture as SVG."""
-        low, high = self._box(found)
+    def svg(self, bias_map: BiasMap, is_old: bool) -> str:
+        """Return the picture as SVG; `is_old` draws it pale."""
+        low, high = self._box(bias_map)
 
         def place(point: np.ndarray) -> tuple[float, float]:
             share = (point - low) / (high - low)
@@ -81,12 +81,14 @@ class BiasPicture:
 
         parts = [f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" class="gm-map{" gm-old" if is_old else ""}" role="img">']
         parts.append(f'<rect x="0.5" y="0.5" width="{WIDTH - 1}" height="{HEIGHT - 1}" rx="4" class="frame"/>')
-        parts.append(f'<text x="{WIDTH - 8}" y="{HEIGHT - 8}" text-anchor="end" class="axis">{found.axes[0]} →</text>')
-        if found.axes[1]:
-            parts.append(f'<text x="8" y="16" class="axis">{found.axes[1]} ↑</text>')
-        parts += self._points(found, place)
-        if len(found.way):
-            places = [place(point) for point in found.way]
+        parts.append(
+            f'<text x="{WIDTH - 8}" y="{HEIGHT - 8}" text-anchor="end" class="axis">{bias_map.axes[0]} →</text>'
+        )
+        if bias_map.axes[1]:
+            parts.append(f'<text x="8" y="16" class="axis">{bias_map.axes[1]} ↑</text>')
+        parts += self._points(bias_map, place)
+        if len(bias_map.path):
+            places = [place(point) for point in bias_map.path]
             line = " ".join(f"{x:.1f},{y:.1f}" for x, y in places)
             x, y = places[-1]
             parts.append(f'<polyline points="{line}" class="way"/>')
@@ -94,12 +96,12 @@ class BiasPicture:
             parts.append(f'<path d="M{x - 10:.1f} {y:.1f}h20M{x:.1f} {y - 10:.1f}v20" class="now"/>')
         return "".join(parts) + "</svg>"
 
-    def _points(self, found: Map, place: Callable[[np.ndarray], tuple[float, float]]) -> list[str]:
+    def _points(self, bias_map: BiasMap, place: Callable[[np.ndarray], tuple[float, float]]) -> list[str]:
         parts: list[str] = []
         taken: list[tuple[float, float]] = []
-        for name, point in found.conditions.items():
+        for name, point in bias_map.conditions.items():
             x, y = place(point)
-            chosen = " near" if name == found.nearest else ""
+            chosen = " near" if name == bias_map.nearest else ""
             parts.append(f'<rect x="{x - 3.5:.1f}" y="{y - 3.5:.1f}" width="7" height="7" class="condition{chosen}"/>')
             at = y + 4
             while any(abs(at - other) < LABEL and abs(x - where) < 90 for where, other in taken):
@@ -111,11 +113,11 @@ class BiasPicture:
             parts.append(f"{text}{escape(name)}</text>")
         return parts
 
-    def _box(self, found: Map) -> tuple[np.ndarray, np.ndarray]:
-        points = np.array([*found.conditions.values(), *found.way])
+    def _box(self, bias_map: BiasMap) -> tuple[np.ndarray, np.ndarray]:
+        points = np.array([*bias_map.conditions.values(), *bias_map.path])
         low, high = points.min(axis=0), points.max(axis=0)
-        if self._names != tuple(found.conditions):
-            self._frame, self._names = None, tuple(found.conditions)
+        if self._names != tuple(bias_map.conditions):
+            self._frame, self._names = None, tuple(bias_map.conditions)
         if self._frame is not None:
             low, high = np.minimum(low, self._frame[0]), np.maximum(high, self._frame[1])
         flat = high - low < 1e-9

@@ -1,7 +1,4 @@
-"""Curves over the last seconds as SVG: gaps stay gaps, and the axes move only when they must.
-
-viser's uPlot draws a line across values that are not there.
-"""
+"""Curves of the last 30 s as SVG: missing values stay gaps, and the axes move only when necessary."""
 
 import math
 from collections.abc import Sequence
@@ -17,15 +14,15 @@ COLORS = (
 )  # fmt: skip
 WIDTH = 376
 LEFT, RIGHT, TOP, BOTTOM = 46, 8, 6, 18
-"""Room [px] around the curves."""
+"""The curves have these margins [px]."""
 SECONDS = (-30, -20, -10, 0)
 ROOMY = 3.0
-"""The axis is made smaller only when it is so many times larger than what is to be seen."""
+"""The axis shrinks only if its range is more than this factor larger than that of the values."""
 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """One curve: a name for the legend, its values, shape (k,), NaN where there is a gap, and how it is drawn."""
+    """One curve: name in the legend, values with NaN in gaps, shape (k,), color and style."""
 
     name: str
     values: np.ndarray
@@ -34,10 +31,10 @@ class Line:
 
 
 class Chart:
-    """Draws curves against time; remembers its axis.
+    """Picture of curves against time, which keeps its axis.
 
     Args:
-        height: Of the picture [px].
+        height: Height of the picture [px].
     """
 
     def __init__(self, height: int) -> None:
@@ -46,13 +43,13 @@ class Chart:
         self._key = ""
 
     def svg(self, time: np.ndarray, lines: Sequence[Line], unit: str, key: str) -> str:
-        """The picture.
+        """Return the picture as SVG.
 
         Args:
-            time: Relative to now [s], shape (k,).
-            lines: The curves.
-            unit: Of all of them.
-            key: What is drawn; another one gets another axis.
+            time: Time relative to now [s], shape (k,).
+            lines: Curves.
+            unit: Unit of all curves.
+            key: Name of the picture; a new name gets a new axis.
         """
         low, high = self._axis(lines, key)
         parts = [f'<svg viewBox="0 0 {WIDTH} {self._height}" class="gm-map" role="img">']
@@ -65,9 +62,9 @@ class Chart:
         for second in SECONDS:
             x = self._x(np.array([float(second)]))[0]
             parts.append(f'<path d="M{x:.1f} {TOP}V{bottom}" class="grid"/>')
-            told = f"{second} s" if second == 0 else f"{second}"
+            label = f"{second} s" if second == 0 else f"{second}"
             anchor = "end" if second == 0 else "middle"
-            parts.append(f'<text x="{x:.1f}" y="{self._height - 5}" text-anchor="{anchor}" class="axis">{told}</text>')
+            parts.append(f'<text x="{x:.1f}" y="{self._height - 5}" text-anchor="{anchor}" class="axis">{label}</text>')
         parts.append(f'<text x="{LEFT + 4}" y="{TOP + 10}" class="axis">{escape(unit)}</text>')
         xs = self._x(time)
         parts += [self._curve(xs, line, low, high) for line in lines]
@@ -91,7 +88,7 @@ class Chart:
         return f'<path d="{"".join(path)}" fill="none" stroke="{line.color}"{look}/>'
 
     def _axis(self, lines: Sequence[Line], key: str) -> tuple[float, float]:
-        """Lowest and highest value of the axis."""
+        """Return the lowest and the highest value of the axis."""
         known = np.concatenate([line.values[np.isfinite(line.values)] for line in lines] or [np.zeros(0)])
         if key != self._key:
             self._range, self._key = None, key
@@ -106,7 +103,7 @@ class Chart:
 
 
 def ticks(low: float, high: float) -> list[float]:
-    """Three to six round numbers between two values."""
+    """Return three to six round numbers between two values."""
     rough = (high - low) / 4.0
     size = 10.0 ** math.floor(math.log10(rough))
     step = next(size * factor for factor in (1, 2, 5, 10) if size * factor >= rough)
@@ -115,16 +112,16 @@ def ticks(low: float, high: float) -> list[float]:
 
 
 def legend(lines: Sequence[Line]) -> str:
-    """Names of the curves that are not dashed, in their colors."""
+    """Return the names of the solid curves, in their colors."""
     names = (f'<span style="color:{line.color}">━ {escape(line.name)}</span>' for line in lines if not line.dashed)
     return f'<div class="legend">{" ".join(names)} <span class="dim">╍ estimated</span></div>'
 
 
 def signal_lines(elements: Sequence[str], measured: np.ndarray, estimated: np.ndarray) -> list[Line]:
-    """Measured and estimated curves of elements, each of shape (elements, k)."""
-    found: list[Line] = []
+    """Return the curves of elements from measured and estimated values, each of shape (elements, k)."""
+    lines: list[Line] = []
     for index, element in enumerate(elements):
         color = COLORS[index % len(COLORS)]
-        found.append(Line(element, measured[index], color))
-        found.append(Line(element, estimated[index], "#ffb454" if len(elements) == 1 else color, dashed=True))
-    return found
+        lines.append(Line(element, measured[index], color))
+        lines.append(Line(element, estimated[index], "#ffb454" if len(elements) == 1 else color, dashed=True))
+    return lines

@@ -1,4 +1,4 @@
-"""What the buttons do: a verb each, asked again and again only by a person, refused where the page is read only."""
+"""The buttons of the page: one verb each, refused where the page is read only."""
 
 import time
 from collections.abc import Callable
@@ -9,6 +9,8 @@ from gemuco.errors import SchemaError
 from hal.errors import HalError
 from services.client import Client
 from services.errors import NotAllowed, ServiceError
+from services.wire.member import Member
+from services.wire.session import is_loopback
 
 Ask = Callable[[Client], dict[str, Any]]
 
@@ -23,7 +25,13 @@ VERBS: dict[str, Ask] = {
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What came of the last press: when [wall clock s], whether it was done, and a sentence."""
+    """Result of the last press.
+
+    Attributes:
+        at: Time of the press [wall clock s].
+        is_done: Whether the service did it.
+        text: Result in one sentence.
+    """
 
     at: float
     is_done: bool
@@ -31,11 +39,11 @@ class Outcome:
 
 
 class Controls:
-    """Asks the robot on behalf of whoever presses; any thread may.
+    """Sender of the requests of the buttons, for any thread.
 
     Args:
-        client: Gives the open client, or None.
-        read_only: Why nothing may be asked; empty if it may.
+        client: Function that returns the open client, or None.
+        read_only: Reason why the page may request nothing; empty if it may.
     """
 
     def __init__(self, client: Callable[[], Client | None], read_only: str) -> None:
@@ -44,16 +52,15 @@ class Controls:
         self._client = client
 
     def press(self, verb: str) -> Outcome:
-        """Do what a button says; what is wrong is the outcome's sentence, never raised."""
+        """Do the verb of a button; an error is the text of the outcome, never raised."""
         try:
-            told = self._told(verb, self._ask(verb))
-            self.last = Outcome(time.time(), True, told)
+            self.last = Outcome(time.time(), True, _in_words(verb, self._ask(verb)))
         except (ServiceError, HalError, SchemaError) as error:
             self.last = Outcome(time.time(), False, f"{verb}: {error}")
         return self.last
 
     def open_client(self) -> Client:
-        """The client, for whoever may command.
+        """Return the client, for requests that may move the robot.
 
         Raises:
             NotAllowed: This page is read only.
@@ -71,10 +78,24 @@ class Controls:
             raise ServiceError(f"There is no button '{verb}'. Buttons: {', '.join(VERBS)}.")
         return VERBS[verb](self.open_client())
 
-    @staticmethod
-    def _told(verb: str, answer: dict[str, Any]) -> str:
-        if verb == "estop" and not answer.get("complete", True):
-            late = [one["device"] for one in answer.get("devices", ()) if not one["stopped"]]
-            return f"estop: NOT COMPLETE: {', '.join(late)} did not stop. CUT THE POWER."
-        mode = answer.get("mode")
-        return f"{verb}: done{f', motors {mode}' if mode else ''}"
+
+def _in_words(verb: str, answer: dict[str, Any]) -> str:
+    if verb == "estop" and not answer.get("complete", True):
+        late = [device["device"] for device in answer.get("devices", ()) if not device["stopped"]]
+        return f"estop: NOT COMPLETE: {', '.join(late)} did not stop. CUT THE POWER."
+    mode = answer.get("mode")
+    return f"{verb}: done{f', motors {mode}' if mode else ''}"
+
+
+def why_read_only(member: Member, robot: str, host: str) -> str:
+    """Return the reason why the page has no buttons, in one sentence; empty if it has buttons.
+
+    Only an operator has buttons, and only where no other person can reach the page.
+    """
+    if not member.is_for(robot):
+        return f"Read only: the role file is for {', '.join(member.robots) or 'no robot'}, not for '{robot}'."
+    if not member.may_publish(robot, "hal/command") or not member.may_ask(robot, "hal", "enable"):
+        return f"Read only: the role is {member.role}, not operator."
+    if not is_loopback(host):
+        return f"Read only: the page is served on {host} to everyone; there are buttons on 127.0.0.1 only."
+    return ""

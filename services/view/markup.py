@@ -5,7 +5,7 @@ import time
 from collections.abc import Iterator, Sequence
 from html import escape
 
-from services.view.bias_map import Map
+from services.view.bias_map import BiasMap
 from services.view.controls import Outcome
 from services.view.styles import STYLE, numbers, page, table
 from services.view.taught import TaughtFile
@@ -137,7 +137,7 @@ def anomaly_html(snapshot: Snapshot) -> str:
     )
 
 
-def bias_html(bias_map: Map | None, picture: str, update: Update | None) -> str:
+def bias_html(bias_map: BiasMap | None, picture: str, update: Update | None) -> str:
     """Return the picture of the bias map, and the state of the online update."""
     facts = '<span class="dim">update</span> not known'
     if update is not None:
@@ -151,7 +151,7 @@ def bias_html(bias_map: Map | None, picture: str, update: Update | None) -> str:
     near = "p is not known yet"
     if bias_map.nearest:
         near = f"nearest condition: <b>{escape(bias_map.nearest)}</b>"
-        near += f' <span class="dim">at {bias_map.apart:.0%} of the spread</span>'
+        near += f' <span class="dim">at {bias_map.distance:.0%} of the spread</span>'
     legend = "▫ trained condition   ⊕ p now, and its past"
     return page(f'{picture}<div class="dim" style="white-space:pre">{legend}</div><div>{near}</div><div>{facts}</div>')
 

@@ -1,4 +1,4 @@
-"""The page: what is snapshot, put into widgets, so often and no more."""
+"""The page: widgets that show the snapshots of a robot, at fixed rates."""
 
 import logging
 import math
@@ -35,21 +35,23 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 RATE = 12.0
-"""Looks per second [Hz]; the 3D view goes with it."""
+"""The state is read and the 3D view updated at this rate [Hz]."""
 TABLES = 0.25
-"""Time [s] between new numbers: faster cannot be read."""
+"""Tables are written at this interval [s]; faster ones cannot be read."""
 CHARTS = 0.25
+"""Plots are written at this interval [s]."""
 SLOW = 1.0
+"""Loops and the map of p are written at this interval [s]."""
 LINGERS = 1.0
 """A trouble stays on the page for this time [s] after it has passed."""
 LEFT, RIGHT = 430, 400
-"""Widths [px] of the two columns."""
+"""The left and right columns have these widths [px]."""
 GROUPED = {"Engage": "engage", "Disengage": "disengage", "Reset": "reset"}
 
 
 @dataclass(slots=True)
 class _Due:
-    """When something is to be shown next [monotonic s]."""
+    """Interval [s] and next time [monotonic s] of an update of the page."""
 
     every: float
     at: float = 0.0
@@ -84,11 +86,11 @@ class Page:
 
     Args:
         site: The empty page.
-        robot: The robot's name.
-        look: Gives what is snapshot now; must not wait.
-        controls: What the buttons do, or why there are none.
-        urdf: The robot's URDF; None if there is none.
-        taught: Where taught samples are recorded.
+        robot: Name of the robot.
+        look: Function that returns the present snapshot; it must not wait.
+        controls: Sender of the buttons' requests.
+        urdf: URDF of the robot; None if there is none.
+        taught: File of taught samples.
     """
 
     def __init__(
@@ -108,12 +110,12 @@ class Page:
         self._make_right(robot, taught)
 
     def close(self) -> None:
-        """Let the robot go, if it was taught."""
+        """End teaching."""
         if self._teach is not None:
             self._teach.close()
 
     def turn(self) -> None:
-        """Look, remember, and show what is due; costs next to nothing while no browser looks."""
+        """Read the state and write what is due; without a browser nothing is written."""
         now, snapshot = time.monotonic(), self._look()
         rows = self._rows = signal_rows(snapshot)
         self._trail.add(now, snapshot, rows)
@@ -179,37 +181,37 @@ class Page:
             self._teach.teacher.let_go(f"{verb} was pressed, so the robot was let go.")
         self._controls.press(verb)
 
-    def _choose_from(self, found: tuple[SignalRow, ...]) -> None:
-        signals = tuple(dict.fromkeys(row.signal for row in found))
-        choices = (*signals, *(row.name for row in found))
+    def _choose_from(self, rows: tuple[SignalRow, ...]) -> None:
+        signals = tuple(dict.fromkeys(row.signal for row in rows))
+        choices = (*signals, *(row.name for row in rows))
         if choices and choices != self._choices:
             self._choices = choices
-            self._chosen.options = choices  # what was chosen stays, if it is there
+            self._chosen.options = choices  # the present choice stays if it is among them
 
     def _show_charts(self, snapshot: Snapshot, now: float) -> None:
         chosen = self._chosen.value
-        found = [row for row in self._rows if chosen in (row.signal, row.name)]
-        if found:
-            curves = self._trail.curves([row.name for row in found], now)
-            lines = signal_lines([row.element for row in found], curves.measured, curves.estimated)
-            _set(self._plot, page(self._chart.svg(curves.time, lines, found[0].unit, chosen) + legend(lines)))
-        time, score, threshold = self._trail.judged(now)
-        judged = [Line("score", score, "#7cc0ff"), Line("threshold", threshold, "#ff7b7b", dashed=True)]
-        _set(self._anomaly, anomaly_html(snapshot) + page(self._scores.svg(time, judged, "score", "score")))
+        rows = [row for row in self._rows if chosen in (row.signal, row.name)]
+        if rows:
+            curves = self._trail.curves([row.name for row in rows], now)
+            lines = signal_lines([row.element for row in rows], curves.measured, curves.estimated)
+            _set(self._plot, page(self._chart.svg(curves.time, lines, rows[0].unit, chosen) + legend(lines)))
+        time, score, threshold = self._trail.scores(now)
+        lines = [Line("score", score, "#7cc0ff"), Line("threshold", threshold, "#ff7b7b", dashed=True)]
+        _set(self._anomaly, anomaly_html(snapshot) + page(self._scores.svg(time, lines, "score", "score")))
 
     def _show_bias(self, snapshot: Snapshot) -> None:
         biases: dict[str, Any] = dict(snapshot.model.get("biases", {}))
-        found = project(biases, self._trail.bias()) if biases else None
+        bias_map = project(biases, self._trail.bias()) if biases else None
         update = fresh(snapshot.update)
-        picture = "" if found is None else self._bias.svg(found, update is None)
-        _set(self._map, bias_html(found, picture, update))
+        picture = "" if bias_map is None else self._bias.svg(bias_map, update is None)
+        _set(self._map, bias_html(bias_map, picture, update))
 
 
 def source(snapshot: Snapshot) -> str:
-    """Where what is shown comes from."""
+    """Return the source of the samples, in words."""
     sample = fresh(snapshot.sample)
     if sample is None:
-        return "nothing comes"
+        return "no samples"
     if "replay" in sample.source:
         return "replay of a recording"
     if sample.source == "simulated" or "simulator" in snapshot.alive:
@@ -223,7 +225,7 @@ def _set(handle: Any, content: str) -> None:
 
 
 def serve_page(turn: Callable[[], None], stop: threading.Event) -> None:
-    """Turn the page until told to stop; a turn that fails is logged, and the next one is made."""
+    """Call `turn` until `stop` is set; an error in a turn is logged, and the next turn follows."""
     from services.process.loop import Loop
 
     loop = Loop("page", RATE, turn)

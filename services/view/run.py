@@ -1,4 +1,4 @@
-"""`gemuco view`: everything put together, until Ctrl-C."""
+"""`gemuco view`: serve the page until Ctrl-C."""
 
 import threading
 from collections.abc import Iterable
@@ -8,9 +8,8 @@ import typer
 
 from services.model import artifacts
 from services.process.service import until_stopped
-from services.view.controls import Controls
+from services.view.controls import Controls, why_read_only
 from services.view.page import Page, serve_page
-from services.view.role import why_read_only
 from services.view.site import open_site
 from services.watch.robot_watch import RobotWatch
 from services.wire.member import member_of
@@ -23,12 +22,12 @@ def view(
     """Serve the page of a robot until SIGTERM, SIGINT or `stop`.
 
     Args:
-        robot: The robot's name.
+        robot: Name of the robot.
         host: Address to bind.
         port: Port to bind; 0 for any.
         connect: Endpoints, such as a router's, and role files.
-        urdf: What the robot looks like; None for a page without 3D.
-        stop: Ends it in place of the signals.
+        urdf: URDF of the robot; None for a page without 3D.
+        stop: Event that ends the page in place of the signals.
 
     Raises:
         ServiceError: The port is taken, a package is missing, or a role file or the URDF cannot be read.
@@ -42,10 +41,9 @@ def view(
             page = Page(site, robot, watch.look, Controls(lambda: watch.client, read_only), urdf, taught_path(robot))
             watch.start()
             if not is_loopback(host):
-                text = f"*** THE PAGE OF '{robot}' ASKS NOBODY WHO HE IS: WHOEVER REACHES {host} MAY LOOK ***"
+                text = f"*** THE PAGE OF '{robot}' HAS NO LOGIN: EVERYONE WHO REACHES {host} CAN READ IT ***"
                 typer.echo(text, err=True)
-            told = f"http://{host}:{site.get_port()}  {read_only or 'With buttons.'}  Ctrl-C ends it."
-            typer.echo(told)
+            typer.echo(f"http://{host}:{site.get_port()}  {read_only or 'With buttons.'}  Ctrl-C ends it.")
             try:
                 serve_page(page.turn, end)
             finally:
@@ -56,5 +54,5 @@ def view(
 
 
 def taught_path(robot: str) -> Path:
-    """Where taught samples are recorded; `gemuco train --data` takes it."""
+    """Return the file of taught samples, which `gemuco train --data` reads."""
     return artifacts.RUNS / robot / "taught.npz"

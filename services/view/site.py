@@ -1,4 +1,4 @@
-"""The web server of the page: viser, with what it leaves open closed."""
+"""Web server of the page: viser on loopback, closed to pages of another origin and to publishing."""
 
 import functools
 import logging
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import viser
 
 LOOPBACK_PAGES = re.compile(r"http://(127\.\d+\.\d+\.\d+|localhost|\[::1\])(:\d+)?")
-"""Pages that may open a connection to a server on loopback: a page of somebody else's in the same browser may not."""
+"""Only pages of these origins may connect to a server on loopback; other pages in the same browser may not."""
 MISSING = "The live page needs two more packages: pip install 'gemuco[view]' (viser and yourdfpy)."
 
 
@@ -25,10 +25,10 @@ def open_site(host: str, port: int, title: str) -> "viser.ViserServer":
     Args:
         host: Address to bind.
         port: Port to bind; 0 for any.
-        title: Of the page.
+        title: Title of the page.
 
     Raises:
-        ServiceError: The packages are not installed, the port is taken, or the address is not of this machine.
+        ServiceError: The packages are not installed, the port is taken, or this machine does not have the address.
     """
     try:
         import rich
@@ -38,21 +38,21 @@ def open_site(host: str, port: int, title: str) -> "viser.ViserServer":
         raise ServiceError(MISSING) from None
     _check_free(host, port)
     rich.get_console().quiet = True  # viser prints a table to stdout
-    for name in ("websockets", "websockets.server"):  # a traceback per browser that vanished
+    for name in ("websockets", "websockets.server"):  # else one traceback per browser that disconnects
         logging.getLogger(name).setLevel(logging.CRITICAL)
     with _only_pages(LOOPBACK_PAGES if is_loopback(host) else None):
         site = viser.ViserServer(host=host, port=port, label=title, verbose=False)
     if port and site.get_port() != port:  # viser takes the next free one
         site.stop()
         raise ServiceError(_taken(host, port))
-    # Anybody with the page open could have it published on the internet.
+    # This request of a browser would publish the page on the internet.
     site._websock_server.unregister_handler(_messages.ShareUrlRequest)
     return site
 
 
 @contextmanager
 def _only_pages(allowed: "re.Pattern[str] | None") -> Iterator[None]:
-    """Have viser's server refuse other pages' connections; viser does not pass this on to websockets."""
+    """Let viser's server refuse connections of other pages; viser has no option for it."""
     from websockets.asyncio import server
 
     whole = server.serve
@@ -71,7 +71,7 @@ def _check_free(host: str, port: int) -> None:
         try:
             probe.bind((host, port))
         except socket.gaierror:
-            raise ServiceError(f"'{host}' is no address that is known here.") from None
+            raise ServiceError(f"'{host}' is not a known address.") from None
         except PermissionError:
             raise ServiceError(f"Port {port} needs root; take one above 1023 with --port.") from None
         except OSError as error:

@@ -1,4 +1,4 @@
-"""The page's style sheet, and tables whose numbers stand below each other."""
+"""Style sheet of the page, and tables with aligned numbers."""
 
 from collections.abc import Iterable, Sequence
 
@@ -38,16 +38,16 @@ STYLE = """<style>
 
 
 def page(content: str) -> str:
-    """A piece of the page in its own style."""
+    """Return a part of the page in its own style."""
     return f'<div class="gm">{content}</div>'
 
 
 def table(widths: Sequence[int], heads: Sequence[str], lines: Iterable[str]) -> str:
-    """A table of fixed columns.
+    """Return a table with columns of fixed width.
 
     Args:
-        widths: Of the columns [%].
-        heads: Their titles; one that begins with `>` is of numbers.
+        widths: Widths of the columns [%].
+        heads: Titles of the columns; a title that begins with `>` is aligned with numbers.
         lines: Rows in HTML.
     """
     columns = "".join(f'<col style="width:{width}%">' for width in widths)
@@ -56,6 +56,6 @@ def table(widths: Sequence[int], heads: Sequence[str], lines: Iterable[str]) -> 
 
 
 def numbers(*cells: str) -> str:
-    """Cells of numbers; one that begins with `~` is of less interest, one with `!` wants attention."""
+    """Return cells of numbers; `~` before a number makes it grey, `!` amber."""
     marks = {"~": "u", "!": "poor"}
     return "".join(f'<td class="n {marks.get(c[:1], "")}">{c[1:] if c[:1] in marks else c}</td>' for c in cells)

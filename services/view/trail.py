@@ -1,4 +1,4 @@
-"""The last seconds of everything that is plotted, in bounded memory."""
+"""Values of the last 30 s for the plots, in bounded memory."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -10,24 +10,24 @@ from services.watch.signal_rows import Kind, SignalRow
 from services.watch.snapshot import Snapshot, fresh
 
 WINDOW = 30.0
-"""How far back [s] the plots go."""
+"""The plots show this time [s]."""
 RATE = 5.0
-"""Points per second [Hz]."""
+"""Points are added at this rate [Hz]."""
 POINTS = round(WINDOW * RATE)
 WAY = 60
-"""Points of the parametric bias's trail."""
+"""The past of the parametric bias has at most this number of points."""
 MOVED = 1e-3
-"""The trail's next point is at least so far from the last."""
+"""The next point of the bias is at least this far from the last one."""
 
 
 @dataclass(frozen=True, slots=True)
 class Curves:
-    """What is plotted of some elements.
+    """Curves of some elements.
 
     Attributes:
-        time: Relative to now [s], shape (k,).
-        measured: Per element, NaN where it was not measured, shape (elements, k).
-        estimated: Per element, NaN where it was measured, shape (elements, k).
+        time: Time relative to now [s], shape (k,).
+        measured: Measured values, NaN where there are none, shape (elements, k).
+        estimated: Estimated values, NaN where there are none, shape (elements, k).
     """
 
     time: np.ndarray
@@ -36,34 +36,34 @@ class Curves:
 
 
 class Trail:
-    """Remembers; one thread adds and reads."""
+    """Recent values, for one thread that adds and reads."""
 
     def __init__(self) -> None:
         self._times: deque[float] = deque(maxlen=POINTS)
         self._values: dict[str, deque[tuple[float, float]]] = {}
-        self._judged: deque[tuple[float, float]] = deque(maxlen=POINTS)
+        self._scores: deque[tuple[float, float]] = deque(maxlen=POINTS)
         self._bias: deque[np.ndarray] = deque(maxlen=WAY)
 
     def add(self, now: float, snapshot: Snapshot, rows: Sequence[SignalRow]) -> None:
-        """Note this moment [monotonic s]; calls that come sooner than the rate are ignored."""
+        """Add the values of a moment [monotonic s]; calls above the rate are ignored."""
         if self._times and now - self._times[-1] < 0.9 / RATE:
             return
-        told = {row.name: row for row in rows}
-        for name in told.keys() - self._values.keys():
+        present = {row.name: row for row in rows}
+        for name in present.keys() - self._values.keys():
             self._values[name] = deque([(np.nan, np.nan)] * len(self._times), maxlen=POINTS)
         self._times.append(now)
         for name, values in self._values.items():
-            row = told.get(name)
+            row = present.get(name)
             measured = row.value if row is not None and row.kind is Kind.MEASURED else np.nan
             values.append((measured, row.value if row is not None and row.kind is Kind.ESTIMATED else np.nan))
         anomaly = fresh(snapshot.anomaly)
-        self._judged.append((np.nan, np.nan) if anomaly is None else (anomaly.score, anomaly.threshold))
+        self._scores.append((np.nan, np.nan) if anomaly is None else (anomaly.score, anomaly.threshold))
         update = fresh(snapshot.update)
         if update is not None and len(update.bias) and np.isfinite(update.bias).all():
             self._add_bias(np.array(update.bias, float))
 
     def curves(self, names: Sequence[str], now: float) -> Curves:
-        """Of elements (`signal.element`), as far as they are known."""
+        """Return the curves of elements (`signal.element`); NaN for unknown elements."""
         time = self._since(now)
         both = np.full((2, len(names), len(time)), np.nan)
         for index, name in enumerate(names):
@@ -71,13 +71,13 @@ class Trail:
                 both[:, index] = np.array(values).T
         return Curves(time, both[0], both[1])
 
-    def judged(self, now: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Time relative to now [s], score and threshold, each of shape (k,)."""
-        scores = np.array(self._judged, float).reshape(-1, 2)
+    def scores(self, now: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return time relative to now [s], anomaly score and threshold, each of shape (k,)."""
+        scores = np.array(self._scores, float).reshape(-1, 2)
         return self._since(now), scores[:, 0], scores[:, 1]
 
     def bias(self) -> np.ndarray:
-        """Where p was, oldest first, shape (k, size)."""
+        """Return the past values of p, oldest first, shape (k, size)."""
         return np.array(self._bias)
 
     def _since(self, now: float) -> np.ndarray:

@@ -32,17 +32,11 @@ def test_file_can_be_read_in_one_sitting(path: Path) -> None:
     assert len(lines) <= LONGEST_FILE, f"{_name(path)} has {len(lines)} lines: split it by what it is about"
 
 
-OVERFULL = {"services/view"}
-"""Folders that are not yet divided."""
-
-
 @pytest.mark.parametrize("folder", sorted({path.parent for path in MODULES}), ids=_name)
 def test_folder_is_seen_at_a_glance(folder: Path) -> None:
     modules = [path.name for path in folder.glob("*.py") if path.name != "__init__.py"]
     limit = COMPILED_MODULES if _name(folder) == "gemuco/compiled" else MOST_MODULES
-    assert _name(folder) in OVERFULL or len(modules) <= limit, (
-        f"{_name(folder)} has {len(modules)} modules: which of them are a room of their own?"
-    )
+    assert len(modules) <= limit, f"{_name(folder)} has {len(modules)} modules: which of them are a room of their own?"
 
 
 @pytest.mark.parametrize("path", MODULES, ids=_name)

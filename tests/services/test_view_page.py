@@ -18,8 +18,7 @@ from websockets.exceptions import InvalidStatus
 from gemuco.dataset import Dataset
 from services.errors import ServiceError
 from services.view import run
-from services.view.controls import Controls
-from services.view.role import why_read_only
+from services.view.controls import Controls, why_read_only
 from services.view.site import open_site
 from services.wire.member import Member
 

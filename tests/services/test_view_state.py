@@ -62,7 +62,7 @@ def test_whatever_came_over_the_network_is_escaped():
 def test_where_data_come_from():
     assert source(seen()) == "robot (can)"
     assert source(seen(alive=BOTH | {"simulator"})) == "simulated robot"
-    assert source(seen(age=9.0)) == "nothing comes"
+    assert source(seen(age=9.0)) == "no samples"
 
 
 @pytest.mark.parametrize("size", [1, 2, 5])
@@ -72,8 +72,8 @@ def test_p_is_mapped_whatever_its_size(size):
     found = project(biases, np.array([biases["b"] * 0.9, biases["b"]]))
     assert found is not None
     assert found.nearest == "b"
-    assert found.apart == pytest.approx(0.0)
-    assert found.way.shape == (2, 2)
+    assert found.distance == pytest.approx(0.0)
+    assert found.path.shape == (2, 2)
     assert "b</text>" in BiasPicture().svg(found, False)
 
 
