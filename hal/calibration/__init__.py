@@ -1,1 +1,1 @@
-"""Counts to SI units: what a robot file says of it, and what was measured of one device."""
+"""Conversion of counts to SI units, fits of calibrations, and their file."""

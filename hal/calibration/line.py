@@ -1,4 +1,4 @@
-"""Counts to SI units and back, and fits of zero, direction and gain to known values."""
+"""Conversion of counts to SI units and back, and fits of zero, direction and gain to known values."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -13,11 +13,11 @@ from hal.errors import HalError
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """What was measured of one very device; it belongs to that device and no other.
+    """Measured settings of one very device; they are not valid for another device.
 
     Attributes:
-        identity: `Device.identity` of the device that was measured.
-        settings: Settings of its driver, such as `zero` and `direction`, to be laid over those of the robot file.
+        identity: `Device.identity` of the measured device.
+        settings: Settings of its driver, such as `zero` and `direction`, which replace those of the robot file.
     """
 
     identity: str
@@ -37,34 +37,35 @@ class Linear:
     scale: float
 
     def to_si(self, counts: float) -> float:
-        """Value [SI unit] at so many counts."""
+        """Return the value [SI unit] at a number of counts."""
         return self.zero + self.scale * counts
 
     def to_counts(self, value: float) -> int:
-        """Nearest whole number of counts for a value [SI unit]."""
+        """Return the nearest whole number of counts for a value [SI unit]."""
         return round((value - self.zero) / self.scale)
 
 
 def rotary(counts_per_turn: float, gear: float, direction: int, zero: float) -> Linear:
-    """A joint [rad] whose encoder sits before a gear of `gear` motor turns per joint turn."""
+    """Return the line of a joint [rad] with an encoder before a gear of `gear` motor turns per joint turn."""
     return Linear(zero, direction * 2.0 * math.pi / (counts_per_turn * gear))
 
 
 def spool(counts_per_turn: float, gear: float, direction: int, zero: float, radius: float) -> Linear:
-    """A wire [m] wound on a spool of `radius` [m] behind such a gear."""
+    """Return the line of a wire [m] on a spool of `radius` [m] behind a gear as in `rotary`."""
     return Linear(zero, rotary(counts_per_turn, gear, direction, 0.0).scale * radius)
 
 
 SCALE_TOLERANCE = 0.1
-"""How far a joint's change may be from what was told; a wrong gear or count is off by more, a hand by less."""
+"""The measured motion of a joint may differ by this share from the known one. A wrong gear or count causes more, a
+motion by hand less."""
 RESIDUAL_SHARE = 0.02
-"""Largest residual of a load cell as a share of the span of its weights."""
+"""The residual of a load cell may have this share of the span of its weights."""
 
 
 class Point(Section):
-    """What a device read while the truth was known.
+    """Mean reading of a device at a known value.
 
-    Both are in the signal's unit; what was read is without `zero`, and with a `gain` or `direction` of 1.
+    Both have the signal's unit. The reading is with `zero` 0 and a `gain` or `direction` of 1.
     """
 
     known: float
@@ -74,16 +75,16 @@ class Point(Section):
 
 
 class CalibrationRefused(HalError):
-    """What was measured is no ground for a calibration."""
+    """A measurement that does not allow a calibration."""
 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """value = zero + factor * what the device reads.
+    """The line value = zero + factor * reading.
 
     Attributes:
-        zero: [the signal's unit].
-        factor: -1 or 1 for a joint, anything but 0 for a cell.
+        zero: Value at a reading of 0 [the signal's unit].
+        factor: -1 or 1 for a joint, any number but 0 for a cell.
         residual: Largest difference at the points [the signal's unit].
     """
 
@@ -92,20 +93,20 @@ class Line:
     residual: float
 
     def value(self, read: float) -> float:
-        """What the calibrated device tells [the signal's unit] where it read `read`."""
+        """Return the calibrated value [the signal's unit] of the reading `read`."""
         return self.zero + self.factor * read
 
 
 def joint_line(points: Sequence[Point], direction: float, least: float) -> Line:
-    """Zero from one known position, zero and direction from two or more.
+    """Fit the zero to one known position, zero and direction to two or more.
 
     Args:
-        points: At least one.
-        direction: What to keep with one point, -1 or 1.
-        least: By how much [the signal's unit] positions must differ to tell a direction.
+        points: At least one point.
+        direction: Direction if there is only one point, -1 or 1.
+        least: Smallest difference of the positions [the signal's unit] for a fit of the direction.
 
     Raises:
-        CalibrationRefused: The positions do not differ, or the joint moved by another angle than was told.
+        CalibrationRefused: The positions do not differ, or the measured motion differs from the known one.
     """
     known, read = _columns(points)
     if len(points) > 1:
@@ -114,7 +115,7 @@ def joint_line(points: Sequence[Point], direction: float, least: float) -> Line:
         if np.ptp(read) < 0.2 * least:
             raise CalibrationRefused(
                 f"The device read the same at positions that differ by {np.ptp(known):.3g}. Is it the device of this "
-                "joint, is it coupled to it?"
+                "joint, is it coupled to the joint?"
             )
         slope = float(np.polyfit(read, known, 1)[0])
         direction = 1.0 if slope > 0 else -1.0
@@ -128,15 +129,15 @@ def joint_line(points: Sequence[Point], direction: float, least: float) -> Line:
 
 
 def cell_line(points: Sequence[Point], gain: float, noise: float) -> Line:
-    """Zero from one known force, zero and gain from two or more.
+    """Fit the zero to one known force, zero and gain to two or more.
 
     Args:
-        points: At least one.
-        gain: What to keep with one point.
-        noise: By how much [the signal's unit] a value may be off anyway.
+        points: At least one point.
+        gain: Gain if there is only one point.
+        noise: Noise of a value [the signal's unit].
 
     Raises:
-        CalibrationRefused: The forces do not differ, the cell does not feel them, or they are not on a line.
+        CalibrationRefused: The forces do not differ, the cell does not measure them, or they are not on a line.
     """
     known, read = _columns(points)
     if len(points) > 1:
@@ -154,16 +155,16 @@ def cell_line(points: Sequence[Point], gain: float, noise: float) -> Line:
         if residual > RESIDUAL_SHARE * span + 3 * noise:
             raise CalibrationRefused(
                 f"The points are not on a line: the largest residual is {residual:.3g} N of {span:.3g} N. Does the "
-                "cell hang freely, was each weight told right?"
+                "cell hang freely, was each weight given correctly?"
             )
     zero = float(np.mean(known - gain * read))
     return Line(zero, gain, _residual(known, zero + gain * read))
 
 
 def _columns(points: Sequence[Point]) -> tuple[np.ndarray, np.ndarray]:
-    """Known and read values, shape (n,) each."""
+    """Return known values and readings, shape (n,) each."""
     return np.array([point.known for point in points]), np.array([point.read for point in points])
 
 
-def _residual(known: np.ndarray, told: np.ndarray) -> float:
-    return float(np.max(np.abs(known - told)))
+def _residual(known: np.ndarray, fit: np.ndarray) -> float:
+    return float(np.max(np.abs(known - fit)))

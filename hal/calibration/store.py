@@ -1,7 +1,7 @@
-"""What was measured of a robot's devices, kept in a file beside the robot file that a person can read.
+"""Calibrations of a robot's devices, in a readable file beside the robot file.
 
-Each record belongs to one very device and is sealed by a hash, so that neither another device nor a slip of the editor
-moves a joint. A record is refused when what it was measured with has changed since, as a gear or a number of counts.
+Each record belongs to one very device and has a hash, so that neither another device nor a mistake in an editor moves a
+joint. A record is refused if its conditions have changed since, such as a gear or a number of counts.
 """
 
 import hashlib
@@ -21,9 +21,9 @@ from hal.config import RobotConfig, Section, explain
 from hal.errors import ConfigError
 
 SIMULATED = ("hub", "virtual")
-"""Interfaces behind which there is nothing to be calibrated."""
+"""Devices on these interfaces are simulated and need no calibration."""
 KEPT = ".before"
-"""Added to the name of the file as it was before the last change."""
+"""A copy of the file before the last change has this suffix."""
 WITHOUT_EFFECT = frozenset(
     (
         *("eds", "pdo", "master_id", "silent_after", "frozen_after", "periods", "heartbeat", "identity", "around"),
@@ -33,7 +33,7 @@ WITHOUT_EFFECT = frozenset(
         *("open", "tare", "enable", "disable", "quick_stop", "reset"),
     )
 )
-"""Settings that do not change what a number of the device means; any other one makes a calibration void."""
+"""These settings do not change the meaning of a reading; a change of any other setting invalidates a calibration."""
 _AGAIN = "Delete the record, or measure again with `gemuco calibrate`."
 _HEAD = """\
 # What `gemuco calibrate` measured of this robot's devices. Its settings take precedence over those of the robot file.
@@ -47,65 +47,65 @@ class Record(Section):
     device: str
     """Name in the robot file."""
     identity: str
-    """`Device.identity`; empty if the device does not tell who it is."""
+    """`Device.identity`; empty if the device has none."""
     settings: dict[str, Any]
-    """Laid over the robot file's."""
+    """Settings that replace those of the robot file."""
     measured_with: dict[str, Any]
-    """The driver and its other settings at the time."""
+    """Driver and other settings at the time of the calibration."""
     unit: str
     points: tuple[Point, ...]
     residual: float
-    """Largest difference [unit] between a known value and what the calibrated device would have read."""
+    """Largest difference [unit] between a known value and the calibrated reading."""
     date: str = ""
-    """When it was measured, UTC."""
+    """Time of the calibration, UTC."""
     hash: str = ""
 
     @property
     def seal(self) -> str:
-        """Hash of all the rest."""
+        """Hash of all other fields."""
         content = json.dumps(self.model_dump(exclude={"hash"}), sort_keys=True)
         return hashlib.sha256(content.encode()).hexdigest()[:16]
 
 
 def path_of(config: RobotConfig) -> Path:
-    """Where a robot's calibrations are."""
+    """Return the path of a robot's calibrations."""
     return config.folder / f"{config.robot}.calibration.yaml"
 
 
 def measured_with(config: RobotConfig, device: str, measured: Mapping[str, Any]) -> dict[str, Any]:
-    """What a calibration of `measured` settings rests upon: the driver, and the settings that give counts a meaning."""
+    """Return driver and settings on which a calibration of the `measured` settings depends."""
     settings = config.settings_of(device)
-    kept = {key: value for key, value in settings.items() if key not in WITHOUT_EFFECT and key not in measured}
-    return {"driver": config.kinds[config.devices[device].kind].driver, **json.loads(json.dumps(kept, default=str))}
+    others = {key: value for key, value in settings.items() if key not in WITHOUT_EFFECT and key not in measured}
+    return {"driver": config.kinds[config.devices[device].kind].driver, **json.loads(json.dumps(others, default=str))}
 
 
 def records(config: RobotConfig) -> list[Record]:
-    """Every record of a robot, as it is in the file.
+    """Return every record of a robot, as it is in the file.
 
     Raises:
         ConfigError: The file cannot be read.
     """
     path = path_of(config)
-    found = []
+    result = []
     for name, entry in _raw(path).items():
         try:
-            found.append(Record.model_validate(entry))
+            result.append(Record.model_validate(entry))
         except ValidationError as error:
             raise ConfigError(f"'{path}', record '{name}': {explain(error, Record)} {_AGAIN}") from None
-    return found
+    return result
 
 
 def load(config: RobotConfig) -> dict[str, Calibration]:
-    """Device -> what is to be laid over its settings; whether the very device answers is for its driver to check.
+    """Return the calibration of each device; its driver checks that the same device answers.
 
     Raises:
-        ConfigError: The file cannot be read, a record was edited, or what it was measured with has changed.
+        ConfigError: The file cannot be read, a record was edited, or its conditions have changed.
     """
-    return {one.device: checked(config, one) for one in records(config) if one.device in config.devices}
+    return {record.device: checked(config, record) for record in records(config) if record.device in config.devices}
 
 
 def uncalibrated(config: RobotConfig, stored: Iterable[str]) -> list[str]:
-    """Devices that go by the zero of the robot file though they could be calibrated; simulated ones need not be."""
+    """Return the devices that could be calibrated but are not, without simulated devices."""
     done = set(stored)
     return [
         name
@@ -117,10 +117,10 @@ def uncalibrated(config: RobotConfig, stored: Iterable[str]) -> list[str]:
 
 
 def checked(config: RobotConfig, record: Record) -> Calibration:
-    """The calibration of a record.
+    """Check a record and return its calibration.
 
     Raises:
-        ConfigError: It was edited, or what it was measured with has changed.
+        ConfigError: The record was edited, or its conditions have changed.
     """
     where = f"The calibration of '{record.device}' in '{path_of(config)}'"
     if record.hash != record.seal:
@@ -130,37 +130,37 @@ def checked(config: RobotConfig, record: Record) -> Calibration:
         before, after = record.measured_with.get(key), now.get(key)
         if before != after:
             raise ConfigError(
-                f"{where} was measured with {key} {_said(before)}, the robot file has {_said(after)} now. {_AGAIN}"
+                f"{where} was measured with {key} {_text(before)}, the robot file has {_text(after)} now. {_AGAIN}"
             )
     return Calibration(record.identity, record.settings)
 
 
-def _said(value: Any) -> str:
+def _text(value: Any) -> str:
     return "not given" if value is None else str(value)
 
 
 def sealed(record: Record) -> Record:
-    """The record with the time and its hash."""
+    """Return the record with the present time and its hash."""
     dated = record.model_copy(update={"date": datetime.now(UTC).isoformat(timespec="seconds"), "hash": ""})
     return dated.model_copy(update={"hash": dated.seal})
 
 
 def save(config: RobotConfig, record: Record) -> Path:
-    """Put a sealed record in the place of any other of that device or of that identity; other records stay.
+    """Save a sealed record, which replaces any other of this device or of this identity.
 
-    The file is replaced as a whole, and kept as it was under a name that ends in `KEPT`.
+    The file is replaced as a whole; a copy of the old file has the suffix `KEPT`.
 
     Raises:
-        ConfigError: The file that is there cannot be read, or the folder cannot be written.
+        ConfigError: The present file cannot be read, or the folder cannot be written.
     """
     path = path_of(config)
-    kept = {
+    entries = {
         name: entry
         for name, entry in _raw(path).items()
         if name != _name(record) and not (isinstance(entry, dict) and entry.get("device") == record.device)
     }
-    kept[_name(record)] = record.model_dump(mode="json")
-    text = _HEAD + yaml.safe_dump(kept, sort_keys=False, width=120)
+    entries[_name(record)] = record.model_dump(mode="json")
+    text = _HEAD + yaml.safe_dump(entries, sort_keys=False, width=120)
     fresh = path.with_name(f"{path.name}.{os.getpid()}")
     try:
         with fresh.open("w") as file:
@@ -172,7 +172,7 @@ def save(config: RobotConfig, record: Record) -> Path:
         fresh.replace(path)
     except OSError as error:
         fresh.unlink(missing_ok=True)
-        raise ConfigError(f"The calibration cannot be kept in '{path}': {error.strerror}.") from None
+        raise ConfigError(f"The calibration cannot be saved in '{path}': {error.strerror}.") from None
     return path
 
 
@@ -186,8 +186,8 @@ def _raw(path: Path) -> dict[str, Any]:
     except FileNotFoundError:
         return {}
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        told = " ".join(str(error).split())
-        raise ConfigError(f"Calibrations '{path}' cannot be read: {told}. Move the file away.") from None
+        reason = " ".join(str(error).split())
+        raise ConfigError(f"Calibrations '{path}' cannot be read: {reason}. Move the file away.") from None
     if raw is None:
         return {}
     if not isinstance(raw, dict):

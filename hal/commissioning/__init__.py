@@ -1,1 +1,1 @@
-"""A CANopen node before its first cycle: asked who it is, told what to send, and read back."""
+"""Commissioning of a CANopen node before its first cycle: identity, configuration and its verification."""

@@ -1,4 +1,4 @@
-"""Bring a CANopen node into a known configuration, and check that it has it."""
+"""Configuration of a CANopen node, and its verification."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -15,14 +15,14 @@ from hal.wire.bus import OWN_NODE, PATIENCE, Bus
 
 _COB_ID = 0x7FF
 _NO_REQUESTS = 1 << 30
-"""Bit of a TPDO's COB-ID entry: it is not sent on request; a node that has it set may refuse to have it cleared."""
+"""This bit in the COB-ID entry of a TPDO excludes remote requests; a node may refuse to clear it."""
 _TIMER = 5
-"""Sub-index of the event timer [ms]."""
+"""The event timer [ms] has this sub-index."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Side:
-    """One direction: where its objects are and what its frames are called."""
+    """One direction: name, first indices of its objects, and first identifier of its frames."""
 
     name: str
     parameters: int
@@ -35,23 +35,23 @@ _SENDS = _Side("TPDO", cia301.TPDO_PARAMETERS, cia301.TPDO_MAPPING, cia301.TPDO1
 
 
 def cob_id(first: int, number: int, node: int) -> int:
-    """Identifier of a PDO by the predefined connection set (CiA 301, 7.3.3), `first` being that of number 1."""
+    """Return the identifier of a PDO by the predefined connection set (CiA 301, 7.3.3); `first` is that of PDO 1."""
     return first + 0x100 * (number - 1) + node
 
 
 def configure_pdos(sdo: SdoClient, pdos: PdoMap, node: int, label: str) -> None:
-    """Make a node send and receive these PDOs and no others; a fixed mapping is only compared.
+    """Configure a node to send and receive these PDOs and no others; a fixed mapping is only compared.
 
     Raises:
         DeviceSilent: The node stopped answering.
-        DeviceRefused: It does not take the mapping, or its fixed one is another; the message has both.
+        DeviceRefused: The node refuses the mapping, or its fixed mapping differs; the message has both.
     """
     _silence_others(sdo, pdos, node)
     for side, pdo in _each(pdos):
-        if pdos.is_fixed and (found := _mapped(sdo, side, pdo.number)) != [item.entry for item in pdo.objects]:
+        if pdos.is_fixed and (entries := _mapped(sdo, side, pdo.number)) != [item.entry for item in pdo.objects]:
             raise DeviceRefused(
-                f"{label} has another PDO mapping than it should: {side.name}{pdo.number} carries {_describe(found)}, "
-                f"and should carry {pdo}. Is it the right data sheet, the right `pdo` in the robot file?"
+                f"{label} has a wrong PDO mapping: {side.name}{pdo.number} carries {_describe(entries)}, and should "
+                f"carry {pdo}. Is it the right data sheet, the right `pdo` in the robot file?"
             )
         try:
             _map(sdo, side, pdo, cob_id(side.cob_id, pdo.number, node), pdos.is_fixed)
@@ -64,7 +64,7 @@ def configure_pdos(sdo: SdoClient, pdos: PdoMap, node: int, label: str) -> None:
 
 
 def compare_pdos(sdo: SdoClient, pdos: PdoMap, node: int) -> Iterator[tuple[bool, str]]:
-    """Read every PDO of a node back: whether it is as it should be, and a sentence.
+    """Read back every PDO of a node; yield whether it is correct, and a sentence.
 
     Raises:
         DeviceSilent: The node does not answer.
@@ -73,17 +73,17 @@ def compare_pdos(sdo: SdoClient, pdos: PdoMap, node: int) -> Iterator[tuple[bool
         where, cob = f"{side.name}{pdo.number}", cob_id(side.cob_id, pdo.number, node)
         index = side.parameters + pdo.number - 1
         try:
-            found, kind = sdo.read(index, 1), sdo.read(index, 2)
+            actual, kind = sdo.read(index, 1), sdo.read(index, 2)
             entries = _mapped(sdo, side, pdo.number)
         except DeviceRefused as error:
             yield False, f"{where} cannot be read: {error}"
             continue
         if entries != [item.entry for item in pdo.objects]:
             yield False, f"{where} carries {_describe(entries)}, and should carry {pdo}."
-        elif found & cia301.PDO_INVALID:
+        elif actual & cia301.PDO_INVALID:
             yield False, f"{where} is switched off."
-        elif found & _COB_ID != cob:
-            yield False, f"{where} has the identifier {found & _COB_ID:03X}h, and should have {cob:03X}h."
+        elif actual & _COB_ID != cob:
+            yield False, f"{where} has the identifier {actual & _COB_ID:03X}h, and should have {cob:03X}h."
         elif kind != pdo.transmission:
             yield False, f"{where} has transmission type {kind}, and should have {pdo.transmission}."
         else:
@@ -97,7 +97,7 @@ def _each(pdos: PdoMap) -> Iterator[tuple[_Side, Pdo]]:
 
 
 def _mapped(sdo: SdoClient, side: _Side, number: int) -> list[int]:
-    """The mapping entries that a node has now."""
+    """Return the present mapping entries of a node."""
     index = side.mapping + number - 1
     return [sdo.read(index, place) for place in range(1, sdo.read(index, 0) + 1)]
 
@@ -107,7 +107,7 @@ def _describe(entries: list[int]) -> str:
 
 
 def _map(sdo: SdoClient, side: _Side, pdo: Pdo, cob: int, is_fixed: bool) -> None:
-    """Set one PDO up in the order that CiA 301 (7.5.2.36) asks for: off, empty, fill, count, on."""
+    """Configure one PDO in the order of CiA 301 (7.5.2.36): off, empty, fill, count, on."""
     parameters, mapping = side.parameters + pdo.number - 1, side.mapping + pdo.number - 1
     cob |= _no_requests(sdo, parameters)
     sdo.write(parameters, 1, cia301.PDO_INVALID | cob, 4)
@@ -120,13 +120,13 @@ def _map(sdo: SdoClient, side: _Side, pdo: Pdo, cob: int, is_fixed: bool) -> Non
             sdo.write_checked(mapping, place, item.entry, 4)
         sdo.write_checked(mapping, 0, len(pdo.objects), 1)
     sdo.write(parameters, 1, cob, 4)
-    found = sdo.read(parameters, 1)
-    if found & (cia301.PDO_INVALID | _COB_ID) != cob & _COB_ID:
-        raise DeviceRefused(f"PDO parameter {parameters:04X}h:1 reads back {found:08X}h after writing {cob:08X}h.")
+    actual = sdo.read(parameters, 1)
+    if actual & (cia301.PDO_INVALID | _COB_ID) != cob & _COB_ID:
+        raise DeviceRefused(f"PDO parameter {parameters:04X}h:1 reads back {actual:08X}h after writing {cob:08X}h.")
 
 
 def _no_requests(sdo: SdoClient, parameters: int) -> int:
-    """The bit as the node has it; not set in one that does not tell."""
+    """Return the present bit of the node; 0 if it cannot be read."""
     try:
         return sdo.read(parameters, 1) & _NO_REQUESTS
     except DeviceRefused:
@@ -134,7 +134,7 @@ def _no_requests(sdo: SdoClient, parameters: int) -> int:
 
 
 def _silence_others(sdo: SdoClient, pdos: PdoMap, node: int) -> None:
-    """Switch off what would load the bus unasked."""
+    """Switch off all PDOs that are not used."""
     for side, of_side in ((_RECEIVES, pdos.receives), (_SENDS, pdos.sends)):
         used = {pdo.number for pdo in of_side}
         for number in range(1, cia301.PDO_PER_DIRECTION + 1):
@@ -144,18 +144,18 @@ def _silence_others(sdo: SdoClient, pdos: PdoMap, node: int) -> None:
 
 
 HEARTBEAT_TIME = 0.1
-"""Period [s] of a node's heartbeat."""
+"""A node sends its heartbeat with this period [s]."""
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What a node shall be told.
+    """Configuration of a node.
 
     Attributes:
         profile: Device profile number, the low word of object 1000h.
-        pdos: What it sends and receives in the cycle.
-        writes: Further objects and the values to write to them before the node is started.
-        watch_time: How long [s] the node waits for the HAL's heartbeat before it stops; 0 if it does not watch.
+        pdos: PDOs that the node sends and receives in the cycle.
+        writes: Further objects and their values, written before the node is started.
+        watch_time: Time [s] without the HAL's heartbeat after which the node stops; 0 for never.
     """
 
     profile: int
@@ -165,20 +165,20 @@ class Plan:
 
 
 def nmt(bus: Bus, command: NmtCommand, node: int) -> None:
-    """Send an NMT command; nobody answers it, the node's heartbeat tells."""
+    """Send an NMT command, which has no answer; the node's heartbeat shows its effect."""
     data = cia301.nmt_command(command, node)
     bus.send(can.Message(arbitration_id=cia301.NMT, is_extended_id=False, data=data), PATIENCE)
 
 
 def identify(sdo: SdoClient, profile: int, label: str) -> str:
-    """Check that the node is what its data sheet says, and tell it from all others; one try, since nobody may be there.
+    """Check that the node has the identity of its data sheet; one try, since the node may be absent.
 
     Returns:
         `canopen:<vendor>-<product>-<serial>` in hexadecimal digits.
 
     Raises:
-        DeviceSilent: No answer.
-        WrongDevice: Another profile, vendor or product.
+        DeviceSilent: The node does not answer.
+        WrongDevice: Profile, vendor or product differ.
     """
     device_type = sdo.read(cia301.DEVICE_TYPE, 0, tries=1)
     if device_type & 0xFFFF != profile:
@@ -191,10 +191,10 @@ def identify(sdo: SdoClient, profile: int, label: str) -> str:
             names.append(0)
             continue
         expected = sdo.default(cia301.IDENTITY, subindex)
-        found = sdo.read(cia301.IDENTITY, subindex)
-        names.append(found)
-        if expected and found != expected:
-            raise WrongDevice(f"{label} has {what} {found:X}h, its EDS file says {expected:X}h. Is it the right file?")
+        actual = sdo.read(cia301.IDENTITY, subindex)
+        names.append(actual)
+        if expected and actual != expected:
+            raise WrongDevice(f"{label} has {what} {actual:X}h, its EDS file says {expected:X}h. Is it the right file?")
     return "canopen:" + "-".join(f"{name:08X}" for name in names)
 
 
@@ -203,7 +203,7 @@ def commission(sdo: SdoClient, plan: Plan, node: int, label: str) -> None:
 
     Raises:
         DeviceSilent: The node stopped answering.
-        DeviceRefused: It does not take a value, or its fixed PDO mapping is another.
+        DeviceRefused: The node refuses a value, or its fixed PDO mapping differs.
     """
     configure_pdos(sdo, plan.pdos, node, label)
     sdo.write_checked(cia301.PRODUCER_HEARTBEAT, 0, round(HEARTBEAT_TIME * 1000), 2)
@@ -214,23 +214,23 @@ def commission(sdo: SdoClient, plan: Plan, node: int, label: str) -> None:
 
 
 def watch_us(sdo: SdoClient, limit: float) -> None:
-    """Have the node stop when the HAL's heartbeat fails for `limit` [s]; 0 to end that.
+    """Configure the node to stop after `limit` [s] without the HAL's heartbeat; 0 for never.
 
     Raises:
-        DeviceSilent: No answer.
-        DeviceRefused: The node cannot.
+        DeviceSilent: The node does not answer.
+        DeviceRefused: The node does not support this.
     """
     sdo.write_checked(cia301.CONSUMER_HEARTBEAT, 1, cia301.consumer_heartbeat(OWN_NODE, limit) if limit else 0, 4)
 
 
-_AGAIN = "Something else configures the node; end it, and let the HAL open the device again."
+_AGAIN = "Another program configures the node; end it, and let the HAL open the device again."
 
 
 def inspect_node(sdo: SdoClient, plan: Plan, node: int, identity: str) -> tuple[Check, ...]:
-    """Compare a node with what it was told.
+    """Compare a node with its plan.
 
     Raises:
-        DeviceSilent: It does not answer.
+        DeviceSilent: The node does not answer.
     """
     checks = [_device_type(sdo, plan), Check("identity", bool(identity), identity or "Not read yet: open the device.")]
     for is_good, text in compare_pdos(sdo, plan.pdos, node):
@@ -246,26 +246,26 @@ def inspect_node(sdo: SdoClient, plan: Plan, node: int, identity: str) -> tuple[
 
 
 def _device_type(sdo: SdoClient, plan: Plan) -> Check:
-    found = sdo.read(cia301.DEVICE_TYPE, 0)
-    profile = found & 0xFFFF
+    device_type = sdo.read(cia301.DEVICE_TYPE, 0)
+    profile = device_type & 0xFFFF
     if profile == plan.profile:
-        return Check("device type", True, f"{found:08X}h, device profile {profile}.")
+        return Check("device type", True, f"{device_type:08X}h, device profile {profile}.")
     return Check("device type", False, f"Device profile {profile}, not {plan.profile}. Are two node ids swapped?")
 
 
-def _value(sdo: SdoClient, what: str, item: Mapped, wanted: int, describe: Callable[[int], str]) -> Check:
-    """Whether an object still has the value that was written."""
+def _value(sdo: SdoClient, what: str, item: Mapped, expected: int, describe: Callable[[int], str]) -> Check:
+    """Check that an object still has the value that was written."""
     try:
-        found = sdo.read(item.index, item.subindex)
+        actual = sdo.read(item.index, item.subindex)
     except DeviceRefused as error:
         return Check(what, False, f"{error} Is it the right EDS file?")
-    if found == wanted:
-        return Check(what, True, f"{describe(found)} ({item}).")
-    return Check(what, False, f"{describe(found)} ({item}), and should be {describe(wanted)}. {_AGAIN}")
+    if actual == expected:
+        return Check(what, True, f"{describe(actual)} ({item}).")
+    return Check(what, False, f"{describe(actual)} ({item}), and should be {describe(expected)}. {_AGAIN}")
 
 
 def _watchdog(entry: int) -> str:
-    """Entry of 1016h in words."""
+    """Return an entry of 1016h in words."""
     if not entry & 0xFFFF:
-        return "watches nobody"
+        return "expects no heartbeat"
     return f"stops {entry & 0xFFFF} ms after the last heartbeat of node {entry >> 16 & 0x7F}"

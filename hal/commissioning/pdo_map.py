@@ -1,4 +1,4 @@
-"""Which objects travel in which PDO: laid out, read from a robot file, and checked against a node's data sheet."""
+"""Mapping of objects to PDO: computed, or read from a robot file, and compared with a node's data sheet."""
 
 import functools
 import struct
@@ -22,9 +22,9 @@ class Pdo:
 
     Attributes:
         number: 1 to 4.
-        objects: What it carries, in order; at most 8 bytes together.
+        objects: Mapped objects in order; at most 8 bytes together.
         transmission: 1 to 240: with every n-th SYNC; 254, 255: by its event timer.
-        event_time: Period of the event timer [s]; 0 if it has none.
+        event_time: Period of the event timer [s]; 0 without one.
     """
 
     number: int
@@ -34,21 +34,21 @@ class Pdo:
 
     @property
     def layout(self) -> struct.Struct:
-        """How the objects lie in the frame; the same instance for the same objects."""
+        """Format of the frame; the same instance for the same objects."""
         return _layout(self.objects)
 
     @property
     def size(self) -> int:
-        """Data bytes."""
+        """Number of data bytes."""
         return sum(item.bits for item in self.objects) // 8
 
     @property
     def answers_sync(self) -> bool:
-        """Whether it comes with every SYNC, so that a cycle is not complete without it."""
+        """Whether the PDO is sent with every SYNC, so that a cycle is not complete without it."""
         return self.transmission == cia301.SYNCHRONOUS
 
     def frame_rate(self, cycle_rate: float) -> float:
-        """Frames per second at so many SYNCs per second [Hz]."""
+        """Return the frames per second at a rate of SYNCs [Hz]."""
         if self.transmission in cia301.EVENT_DRIVEN:
             return 1.0 / self.event_time if self.event_time else 0.0
         return cycle_rate / self.transmission
@@ -62,9 +62,9 @@ class PdoMap:
     """All PDOs of a node.
 
     Attributes:
-        receives: RPDOs, what the node receives.
-        sends: TPDOs, what the node sends.
-        is_fixed: The node's mapping cannot be written; it is read and must be this one.
+        receives: RPDOs, which the node receives.
+        sends: TPDOs, which the node sends.
+        is_fixed: Whether the mapping of the node cannot be written, and must be this one.
     """
 
     receives: tuple[Pdo, ...] = ()
@@ -72,26 +72,26 @@ class PdoMap:
     is_fixed: bool = False
 
     def frames(self, rate: float) -> tuple[tuple[int, float], ...]:
-        """(Data bytes, frames per second) of each PDO, for the bus budget."""
+        """Return (data bytes, frames per second) of each PDO, for the bus budget."""
         return tuple((pdo.size, pdo.frame_rate(rate)) for pdo in (*self.receives, *self.sends))
 
 
 class PdoEntry(Section):
-    """One PDO as a robot file gives it."""
+    """One PDO of a robot file."""
 
     number: Annotated[int, Field(ge=1, le=cia301.PDO_PER_DIRECTION)]
     objects: Annotated[tuple[str, ...], Field(min_length=1, max_length=64)]
-    """Each an object and its type, as `6064h int32` or `2200h:1 uint16`, in the order of the frame."""
+    """Objects with their types, such as `6064h int32` or `2200h:1 uint16`, in the order of the frame."""
     transmission: Annotated[int, Field(ge=1, le=255)] = cia301.SYNCHRONOUS
-    """1 to 240: with every n-th SYNC; 254 or 255: by the event timer."""
+    """A value of 1 to 240 sends with every n-th SYNC, 254 or 255 by the event timer."""
     event_time: Positive | None = None
     """Period of the event timer [s]."""
 
     def pdo(self, where: str) -> Pdo:
-        """The PDO.
+        """Return the PDO.
 
         Raises:
-            ConfigError: An object that is none, too many bytes, or a transmission that never happens.
+            ConfigError: An object is malformed, there are too many bytes, or the transmission is not possible.
         """
         if cia301.LAST_SYNCHRONOUS < self.transmission < cia301.EVENT_DRIVEN[0]:
             raise ConfigError(f"{where}: transmission {self.transmission} is reserved. Use 1 to 240, 254 or 255.")
@@ -111,29 +111,29 @@ class PdoEntry(Section):
 
 
 class PdoSettings(Section):
-    """A layout that the robot file forces."""
+    """PDO mapping that the robot file defines."""
 
     sends: tuple[PdoEntry, ...] = ()
-    """TPDOs: what the node sends."""
+    """TPDOs, which the node sends."""
     receives: tuple[PdoEntry, ...] = ()
-    """RPDOs: what the node receives."""
+    """RPDOs, which the node receives."""
     fixed: bool = False
-    """The node's mapping cannot be written: it is read and compared."""
+    """Whether the mapping of the node cannot be written, and is only compared."""
 
     def map(self, label: str) -> PdoMap:
-        """The PDOs.
+        """Return the PDOs.
 
         Raises:
-            ConfigError: An entry that makes no sense, or a number given twice.
+            ConfigError: An entry is not possible, or a number is given twice.
         """
-        found = {}
+        pdos = {}
         for direction in ("receives", "sends"):
             entries: tuple[PdoEntry, ...] = getattr(self, direction)
             numbers = [entry.number for entry in entries]
             if len(set(numbers)) < len(numbers):
                 raise ConfigError(f"{label}: pdo.{direction} names a number twice: {', '.join(map(str, numbers))}.")
-            found[direction] = tuple(entry.pdo(f"{label}: pdo.{direction} {entry.number}") for entry in entries)
-        return PdoMap(found["receives"], found["sends"], self.fixed)
+            pdos[direction] = tuple(entry.pdo(f"{label}: pdo.{direction} {entry.number}") for entry in entries)
+        return PdoMap(pdos["receives"], pdos["sends"], self.fixed)
 
 
 def lay_out(
@@ -142,13 +142,13 @@ def lay_out(
     transmission: int = cia301.SYNCHRONOUS,
     event_time: float = 0.0,
 ) -> tuple[Pdo, ...]:
-    """PDOs that carry some objects: each in the first that has room, so that those named first travel together.
+    """Return PDOs for some objects; each object is in the first PDO with space for it.
 
     Args:
-        objects: What is to be carried; an object that is named twice is carried once, those of a tuple travel together.
+        objects: Objects; an object that is given twice is sent once, those of a tuple are in the same PDO.
         first: Number of the first PDO.
-        transmission: Of all these PDOs.
-        event_time: Of all these PDOs [s].
+        transmission: Transmission type of all these PDOs.
+        event_time: Period of the event timer of all these PDOs [s].
     """
     places: list[list[Mapped]] = []
     for item in dict.fromkeys(objects):
@@ -163,10 +163,10 @@ def lay_out(
 
 
 def check_map(pdos: PdoMap, sheet: canopen.ObjectDictionary, label: str) -> None:
-    """Refuse a layout that a node cannot have, by what its data sheet says.
+    """Check that the data sheet of a node allows a mapping.
 
     Raises:
-        ConfigError: Too many PDOs, or an object that is not there, not to be mapped, or of another length.
+        ConfigError: There are too many PDOs, or an object does not exist, cannot be mapped, or has another length.
     """
     sides = (
         (pdos.receives, "RPDO", "receive", cia301.RPDO_PARAMETERS, "w"),
@@ -180,7 +180,7 @@ def check_map(pdos: PdoMap, sheet: canopen.ObjectDictionary, label: str) -> None
                 )
                 raise ConfigError(
                     f"{label} would need {name}{pdo.number} to {verb} {pdo}; its data sheet has {offered} of them. "
-                    "Ask for fewer quantities."
+                    "Use fewer quantities."
                 )
     for side, _, verb, _, access in sides:
         for pdo in side:
@@ -204,7 +204,7 @@ def _check_object(item: Mapped, entry: ODVariable | None, what: str, access: str
 
 
 def describe(objects: Sequence[Mapped]) -> str:
-    """Objects in a person's words: `6041h:0 (16 bit), 6064h:0 (32 bit)`."""
+    """Return objects as text: `6041h:0 (16 bit), 6064h:0 (32 bit)`."""
     return ", ".join(f"{item} ({item.bits} bit)" for item in objects) or "nothing"
 
 
@@ -214,64 +214,66 @@ def _layout(objects: tuple[Mapped, ...]) -> struct.Struct:
 
 
 _SIGNED, _FLOATS = (2, 3, 4, 0x15), (8, 0x11)
-"""Data types INTEGER8 to 32 and 64, REAL32 and 64 (CiA 301, table 44)."""
+"""These are the data types INTEGER8 to 32 and 64, and REAL32 and 64 (CiA 301, table 44)."""
 
 
 def is_fixed(sheet: canopen.ObjectDictionary) -> bool:
-    """Whether a data sheet says that no PDO mapping can be written."""
+    """Whether the data sheet does not allow writing any PDO mapping."""
     places = [(base + n, 1) for base in (cia301.RPDO_MAPPING, cia301.TPDO_MAPPING) for n in range(4)]
-    found = [entry for place in places if (entry := sheet.get_variable(*place)) is not None]
-    return bool(found) and not any("w" in entry.access_type for entry in found)
+    entries = [entry for place in places if (entry := sheet.get_variable(*place)) is not None]
+    return bool(entries) and not any("w" in entry.access_type for entry in entries)
 
 
-def chosen_pdos(sheet: canopen.ObjectDictionary, wanted: PdoMap, may_receive: Collection[Mapped], label: str) -> PdoMap:
-    """Of the PDOs that a node has, those that carry what is wanted.
+def chosen_pdos(
+    sheet: canopen.ObjectDictionary, required: PdoMap, may_receive: Collection[Mapped], label: str
+) -> PdoMap:
+    """Return those PDOs of a node with a fixed mapping that carry the required objects.
 
     Args:
-        sheet: Its data sheet.
-        wanted: PDOs with the objects that are wanted.
-        may_receive: What else it may be sent; a PDO with anything else is not used, for that would be sent as 0.
-        label: Named in what is raised.
+        sheet: Data sheet of the node.
+        required: PDOs with the required objects.
+        may_receive: Other objects that may be sent to the node as 0; a PDO with any further object is not used.
+        label: Name of the node in error messages.
 
     Raises:
-        ConfigError: They do not carry all that is wanted; the message has what they carry.
+        ConfigError: The PDOs do not carry all required objects; the message has their objects.
     """
-    asked = [item for pdo in wanted.receives for item in pdo.objects]
-    usable = [pdo for pdo in _given(sheet, cia301.RPDO_MAPPING) if {*pdo.objects} <= {*asked, *may_receive}]
-    receives = _covering(asked, usable, _given(sheet, cia301.RPDO_MAPPING), f"{label} cannot receive")
-    there = _given(sheet, cia301.TPDO_MAPPING)
+    objects = [item for pdo in required.receives for item in pdo.objects]
+    usable = [pdo for pdo in _given(sheet, cia301.RPDO_MAPPING) if {*pdo.objects} <= {*objects, *may_receive}]
+    receives = _covering(objects, usable, _given(sheet, cia301.RPDO_MAPPING), f"{label} cannot receive")
+    given = _given(sheet, cia301.TPDO_MAPPING)
     sends: tuple[Pdo, ...] = ()
-    for pdo in wanted.sends:
+    for pdo in required.sends:
         left = [item for item in pdo.objects if not any(item in other.objects for other in sends)]
-        found = _covering(left, [one for one in there if one not in sends], there, f"{label} cannot send")
-        sends += tuple(replace(one, transmission=pdo.transmission, event_time=pdo.event_time) for one in found)
+        chosen = _covering(left, [other for other in given if other not in sends], given, f"{label} cannot send")
+        sends += tuple(replace(other, transmission=pdo.transmission, event_time=pdo.event_time) for other in chosen)
     return PdoMap(receives, sends, is_fixed=True)
 
 
-def _covering(asked: Sequence[Mapped], usable: Sequence[Pdo], there: Sequence[Pdo], what: str) -> tuple[Pdo, ...]:
-    """The fewest PDOs, taking the fullest first, that carry all that is asked for."""
-    left, found = list(asked), []
+def _covering(objects: Sequence[Mapped], usable: Sequence[Pdo], given: Sequence[Pdo], what: str) -> tuple[Pdo, ...]:
+    """Return PDOs that carry all objects, those with most of the objects first."""
+    left, chosen = list(objects), []
     while left:
         best = max(usable, key=lambda pdo: sum(item in pdo.objects for item in left), default=None)
         covered = [item for item in left if best is not None and item in best.objects]
         if best is None or not covered:
-            has = "; ".join(f"{pdo.number}: {pdo}" for pdo in there) or "none"
+            has = "; ".join(f"{pdo.number}: {pdo}" for pdo in given) or "none"
             raise ConfigError(f"{what} {describe(left)}: its mapping is fixed by its data sheet. Its PDOs: {has}.")
-        found.append(best)
+        chosen.append(best)
         left = [item for item in left if item not in covered]
-    return tuple(found)
+    return tuple(chosen)
 
 
 def _given(sheet: canopen.ObjectDictionary, mapping: int) -> list[Pdo]:
-    """The PDOs of a direction by the data sheet's defaults, without those that carry single bits."""
-    found = []
+    """Return the PDOs of a direction from the defaults of the data sheet, without those that carry single bits."""
+    pdos = []
     for number in range(1, cia301.PDO_PER_DIRECTION + 1):
         entries = [_default(sheet, mapping + number - 1, place) for place in range(1, 9)]
         count = _default(sheet, mapping + number - 1, 0)
         objects = tuple(_mapped(sheet, entry) for entry in entries[:count])
         if objects and all(item.bits in (8, 16, 32, 64) for item in objects):
-            found.append(Pdo(number, objects))
-    return found
+            pdos.append(Pdo(number, objects))
+    return pdos
 
 
 def _default(sheet: canopen.ObjectDictionary, index: int, subindex: int) -> int:

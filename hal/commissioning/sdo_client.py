@@ -1,7 +1,7 @@
-"""Read and write small objects of one CANopen node (CiA 301, 7.2.4: expedited SDO).
+"""Access to small objects of one CANopen node (CiA 301, 7.2.4: expedited SDO).
 
-canopen's SDO client carries the requests; its matching of answers is not relied upon, since a late answer to one
-request would be taken as the answer to the next (it compares the index when reading, and nothing when writing).
+The SDO client of canopen sends the requests. Its matching of answers is not used, since it takes a late answer as the
+answer to the next request (it compares the index when reading, and nothing when writing).
 """
 
 import queue
@@ -18,7 +18,7 @@ from hal.protocols.sdo import describe_abort
 from hal.wire.bus import Bus
 
 ANSWER_TIME = 0.3
-"""How long [s] a node may take to answer a request."""
+"""A node may take this time [s] to answer a request."""
 TRIES = 3
 
 _REQUEST = struct.Struct("<BHB4s")
@@ -27,7 +27,7 @@ _ABORT = 0x80
 
 
 class SdoClient:
-    """Reads and writes small objects of one node; each answer is matched with its request."""
+    """Client that reads and writes small objects of one node, and matches each answer with its request."""
 
     def __init__(self, bus: Bus, node: int, dictionary: canopen.ObjectDictionary, label: str) -> None:
         self._remote = bus.network.add_node(canopen.RemoteNode(node, dictionary))
@@ -36,21 +36,21 @@ class SdoClient:
         self._bus = bus
         self._node = node
         self._listening = False
-        self._asking = threading.Lock()
+        self._lock = threading.Lock()
         bus.subscribe(cia301.SDO_ANSWER + node, self._on_answer)
 
     def _on_answer(self, data: bytearray, received: float) -> None:
-        if self._listening and len(data) == 8:  # nobody asked: it would only fill canopen's queue
+        if self._listening and len(data) == 8:  # other answers would only fill the queue of canopen
             self._bus.network.notify(cia301.SDO_ANSWER + self._node, data, received)
 
     def read(self, index: int, subindex: int, tries: int = TRIES) -> int:
-        """An unsigned value of up to 32 bits.
+        """Return an unsigned value of up to 32 bits.
 
         Raises:
-            DeviceSilent: No answer.
-            DeviceRefused: There is no such object, or it is longer.
+            DeviceSilent: The node does not answer.
+            DeviceRefused: The object does not exist, or is longer.
         """
-        answer = self._ask(_REQUEST.pack(_READ, index, subindex, bytes(4)), tries)
+        answer = self._request(_REQUEST.pack(_READ, index, subindex, bytes(4)), tries)
         if not answer[0] & 0x02:
             raise DeviceRefused(f"{self._label}: object {index:04X}h:{subindex} is longer than four bytes.")
         size = 4 - (answer[0] >> 2 & 3) if answer[0] & 0x01 else 4
@@ -60,36 +60,36 @@ class SdoClient:
         """Write `value` in `size` bytes, two's complement if negative.
 
         Raises:
-            DeviceSilent: No answer.
-            DeviceRefused: The node does not take it.
+            DeviceSilent: The node does not answer.
+            DeviceRefused: The node refuses the value.
         """
         data = value.to_bytes(size, "little", signed=value < 0).ljust(4, b"\0")
-        self._ask(_REQUEST.pack(0x23 | (4 - size) << 2, index, subindex, data), TRIES)
+        self._request(_REQUEST.pack(0x23 | (4 - size) << 2, index, subindex, data), TRIES)
 
     def write_checked(self, index: int, subindex: int, value: int, size: int) -> None:
         """Write, read back and compare.
 
         Raises:
-            DeviceSilent: No answer.
-            DeviceRefused: The node does not take it, or answers another value.
+            DeviceSilent: The node does not answer.
+            DeviceRefused: The node refuses the value, or has another value after that.
         """
         self.write(index, subindex, value, size)
-        found = self.read(index, subindex)
-        if found != value % (1 << 8 * size):
+        actual = self.read(index, subindex)
+        if actual != value % (1 << 8 * size):
             raise DeviceRefused(
-                f"{self._label}: object {index:04X}h:{subindex} reads back {found:X}h after writing {value:X}h. "
+                f"{self._label}: object {index:04X}h:{subindex} reads back {actual:X}h after writing {value:X}h. "
                 "Is it writable in this firmware?"
             )
 
     def read_signed(self, index: int, subindex: int, bits: int) -> int:
-        """A signed value of `bits` bits.
+        """Return a signed value of `bits` bits.
 
         Raises:
-            DeviceSilent: No answer.
-            DeviceRefused: There is no such object.
+            DeviceSilent: The node does not answer.
+            DeviceRefused: The object does not exist.
         """
-        found = self.read(index, subindex) % (1 << bits)
-        return found - (1 << bits) if found >> (bits - 1) else found
+        value = self.read(index, subindex) % (1 << bits)
+        return value - (1 << bits) if value >> (bits - 1) else value
 
     def has(self, index: int, subindex: int = 0) -> bool:
         """Whether the data sheet lists an object."""
@@ -101,13 +101,13 @@ class SdoClient:
         return entry is not None and "w" in entry.access_type
 
     def default(self, index: int, subindex: int) -> int | None:
-        """What the data sheet gives as an object's value; None if it gives none."""
+        """Return the default of an object in the data sheet; None without one."""
         entry: ODVariable | None = self._dictionary.get_variable(index, subindex)
         return entry.default if entry is not None and isinstance(entry.default, int) else None
 
-    def _ask(self, request: bytes, tries: int) -> bytes:
+    def _request(self, request: bytes, tries: int) -> bytes:
         sdo = self._remote.sdo
-        with self._asking:
+        with self._lock:
             self._listening = True
             try:
                 for _ in range(tries):
@@ -125,7 +125,7 @@ class SdoClient:
         )
 
     def _matching(self, request: bytes) -> bytes | None:
-        """The answer to a request, or None in time; answers to anything else are passed over."""
+        """Return the answer to a request, or None after `ANSWER_TIME`; ignore all other answers."""
         deadline = time.monotonic() + ANSWER_TIME
         while (remaining := deadline - time.monotonic()) > 0:
             try:

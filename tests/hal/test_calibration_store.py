@@ -187,7 +187,7 @@ def test_a_file_that_is_none_is_refused(config, text, said):
 
 def test_a_file_that_cannot_be_written_is_told(config, tmp_path):
     record = a_record(config)
-    with pytest.raises(ConfigError, match="cannot be kept"):
+    with pytest.raises(ConfigError, match="cannot be saved"):
         store.save(config.model_copy(update={"folder": tmp_path / "nowhere"}), record)
 
 

@@ -241,7 +241,7 @@ def test_inspection_finds_what_somebody_changed(joint):
     assert "TPDO1 carries 6041h:0 (16 bit), 6062h:0 (32 bit), 6077h:0 (16 bit), and should carry 6041h:0" in told
     assert "TPDO2 has transmission type 5, and should have 1." in told
     assert "heartbeat: 0 ms (1017h:0), and should be 100 ms." in told
-    assert "watchdog: watches nobody (1016h:1)" in told
+    assert "watchdog: expects no heartbeat (1016h:1)" in told
     assert "object 6072h:0: 3000 (6072h:0), and should be 700." in told
     assert "mode: The drive is in mode cyclic synchronous velocity. Open it again" in told
     assert all(line[-1] == "." for line in wrong)

@@ -12,8 +12,6 @@ import pytest
 ROOT = Path(__file__).parents[2]
 CODE = ("gemuco", "hal", "simulators", "services", "studies", "examples")
 NOT_YET = {
-    "hal/calibration",
-    "hal/commissioning",
     "services/verbs/fleet_top.py",
     "services/verbs/fleet_watch.py",
     "services/verbs/page.py",
