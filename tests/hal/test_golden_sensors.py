@@ -252,6 +252,16 @@ def test_an_encoder_maps_speed_where_it_is_wanted():
         assert not any("03 60" in request[3:8] for request in puppet.requests), "the preset is never touched"
 
 
+@pytest.mark.parametrize(("data", "counts"), [("FE 7F", 32766), ("FF 7F", None), ("02 80", -32766), ("01 80", None)])
+def test_a_speed_at_the_end_of_its_range_is_not_known(data, counts):
+    """INTEGER16: 32767 and below -32766 may be a speed that does not fit."""
+    elements = {"position": "joint_position.elbow", "velocity": "joint_velocity.elbow"}
+    with encoder(elements=elements) as (device, puppet):
+        velocity = told(device, puppet, f"00 08 00 00 00 00 {data}")[1]
+        expected = math.nan if counts is None else counts / 4096 * TURN
+        assert velocity == pytest.approx(expected, nan_ok=True)
+
+
 def test_speed_in_turns_per_minute():
     elements = {"position": "joint_position.elbow", "velocity": "joint_velocity.elbow"}
     objects = {**ENCODER, "6031:3": "3C 00", "6031:4": "00 10"}  # times 60, divided by 4096

@@ -197,3 +197,39 @@ def test_limits_that_contradict_each_other_are_refused_at_load(limits, told):
 def test_a_stop_that_does_not_fit_is_refused_at_load(stop, told):
     with pytest.raises(ValueError, match=told):
         RobotConfig.model_validate(description(stop=stop))
+
+
+@pytest.mark.parametrize(("tension", "speed"), [(200.0, 0.0), (300.0, 0.1), (400.0, 0.2), (500.0, 0.2)])
+def test_without_a_trip_limit_a_muscle_is_paid_out_fastest_at_twice_its_soft_limit(tension, speed):
+    soft = limiter(muscle_length={"low": 0.1, "high": 0.5, "rate": 0.2}, muscle_tension={"soft_high": 200})
+    applied, _ = step(soft, [0.3, 0.3], [0.3, 0.3], tense(tension, 20.0))
+    np.testing.assert_allclose(applied, [0.3 + speed * PERIOD, 0.3])
+
+
+@pytest.mark.parametrize(
+    ("bounds", "rate", "speed"), [({"low": 0.1, "high": 0.5}, None, 0.4), ({}, None, 1.0), ({}, 0.2, 0.2)]
+)
+def test_without_a_rate_a_muscle_is_paid_out_by_its_range_per_second_or_one_unit(bounds, rate, speed):
+    length = {**bounds, **({"rate": rate} if rate else {})}
+    soft = limiter(**({"muscle_length": length} if length else {}), muscle_tension={"soft_high": 200, "trip_high": 400})
+    applied, _ = step(soft, [0.3, 0.3], [0.3, 0.3], tense(400.0, 20.0))
+    np.testing.assert_allclose(applied, [0.3 + speed * PERIOD, 0.3])
+
+
+@pytest.mark.parametrize(
+    ("length", "is_excluded", "trips"),
+    [
+        (0.0925, False, False),
+        (0.0915, True, False),
+        (0.0805, True, False),
+        (0.0795, True, True),
+        (0.5075, False, False),
+        (0.5085, True, False),
+        (0.5195, True, False),
+        (0.5205, True, True),
+    ],
+)
+def test_a_robot_starts_within_2_percent_beyond_its_range_and_stops_beyond_5(full, length, is_excluded, trips):
+    """Of a range of 0.4 m."""
+    assert bool(full.excluded(at(length, 0.3))) is is_excluded
+    assert bool(full.trip(at(length, 0.3))) is trips
