@@ -112,12 +112,12 @@ class _Source:
         is_any = usable(values, valid, age, *layout[1], self._stale_after, row)
         return _unwritable(row), is_any
 
-    def _places(self, theirs: Elements) -> tuple[np.ndarray, np.ndarray]:
+    def _places(self, sent: Elements) -> tuple[np.ndarray, np.ndarray]:
         """Return the indices of the model's elements in a sample, and here; a signal of another size is ignored."""
-        names = [name for name in self._names if theirs.counts.get(name) == self._elements.counts[name]]
-        of, to = ([np.r_[all_of.places[name]] for name in names] for all_of in (theirs, self._elements))
-        nowhere = np.zeros(0, int)
-        return np.concatenate([nowhere, *of]), np.concatenate([nowhere, *to])
+        names = [name for name in self._names if sent.counts.get(name) == self._elements.counts[name]]
+        source, target = ([np.r_[elements.places[name]] for name in names] for elements in (sent, self._elements))
+        empty = np.zeros(0, int)
+        return np.concatenate([empty, *source]), np.concatenate([empty, *target])
 
 
 def _unwritable(array: np.ndarray) -> np.ndarray:

@@ -79,12 +79,12 @@ class OneCore:
         before, self._read = self._read, (now, own, self._busy())
         if before is None:
             return
-        elapsed, mine = now - before[0], (own - before[1]) / (now - before[0])
+        elapsed, own_share = now - before[0], (own - before[1]) / (now - before[0])
         others = {core: (self._read[2].get(core, 0.0) - before[2].get(core, 0.0)) / elapsed for core in self._allowed}
         if self.core is not None:
-            others[self.core] -= mine
+            others[self.core] -= own_share
         least = min(others.values())
-        if is_slow or mine > FULL:
+        if is_slow or own_share > FULL:
             self._free_until = now + PATIENCE
             self._move(None)
         elif now >= self._free_until and (self.core is None or others[self.core] > least + CROWDED):

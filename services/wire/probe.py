@@ -36,7 +36,7 @@ def check_answers(endpoints: Sequence[str]) -> None:
 
 
 def is_listening(endpoint: str) -> bool:
-    """Whether a process, even a frozen one, listens at an endpoint (TCP, TLS, QUIC or websocket)."""
+    """Whether a process, even a frozen one, listens at a TCP, TLS, QUIC or ws endpoint; False for others."""
     protocol, _, place = endpoint.partition("/")
     if protocol not in ("tcp", "tls", "quic", "ws"):
         return False

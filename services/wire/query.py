@@ -277,14 +277,14 @@ def starter(service: str) -> str:
 
 
 def describe_presence(session: zenoh.Session, robot: str) -> str:
-    """Describe the services that are visible when the wanted one is not: a sentence that begins with a space."""
+    """Describe the services that are visible although the queried one is not: a sentence that begins with a space."""
     if not session.info.transports():
         return " At the moment this program has no connection: no router, and no service of the robot."
     if services := alive(session, robot):  # first alone: a role may not see other robots
-        return f" Of this robot there is: {', '.join(sorted(services))}."
+        return f" Running services of this robot: {', '.join(sorted(services))}."
     if others := sorted(_running(session)):
-        return f" There is no robot '{robot}'; there is: {', '.join(others)}."
-    return " The router is there, and no robot."
+        return f" There is no robot '{robot}'. Visible robots: {', '.join(others)}."
+    return " The router runs, but no robot is visible."
 
 
 def _no_answer(session: zenoh.Session, key: str, timeout: float, late: bool) -> NoAnswer:

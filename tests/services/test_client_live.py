@@ -244,16 +244,16 @@ def test_iterators_go_on_when_the_router_was_away(robot: str, router: Router) ->
 @pytest.mark.long
 def test_a_robot_that_is_not_there_is_told_with_those_that_are(robot: str, router: Router) -> None:
     with Client(f"{robot}_x", router.endpoint) as far:
-        with pytest.raises(ServiceUnavailable, match="The router is there, and no robot"):
+        with pytest.raises(ServiceUnavailable, match="The router runs, but no robot is visible"):
             far.ask("hal", "describe", timeout=0.2)
         with Service(robot, "hal", [router.endpoint]), Client(robot, router.endpoint) as near:
             assert near.describe("hal")
-            says = rf"There is no robot '{robot}_x'; there is: {robot}\."
+            says = rf"There is no robot '{robot}_x'\. Visible robots: {robot}\."
             with pytest.raises(ServiceUnavailable, match=says):
                 far.ask("hal", "describe", timeout=0.2)
             with pytest.raises(ServiceUnavailable, match=says):
                 next(far.sensors(deadline=0.2))
-            with pytest.raises(ServiceUnavailable, match="Of this robot there is: hal"):
+            with pytest.raises(ServiceUnavailable, match="Running services of this robot: hal"):
                 near.ask("model", "engage", timeout=0.2)
 
 
