@@ -57,7 +57,7 @@ class TrainingConfig(Section):
     patience: Count | None = DEFAULT.patience
     """Training stops after this many epochs without a better held-out loss; with `null` it runs all epochs."""
     outliers: Positive = DEFAULT.outliers
-    """A measured signal that the others contradict by this many robust standard deviations is rejected; `.inf`: none."""
+    """A signal that the others contradict by this many robust standard deviations is rejected; `.inf`: none."""
 
 
 class UpdateConfig(Section):
