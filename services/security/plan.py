@@ -8,6 +8,7 @@ from typing import Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from services.errors import ServiceError
+from services.wire.connect import host_and_port
 from services.wire.member import ALL, Member
 from services.wire.roles import PEOPLE, ROLES, ROUTER
 from services.wire.session import ROUTER_PORT, is_loopback
@@ -163,7 +164,7 @@ def _bracketed(host: str) -> str:
 
 
 def _host(place: str) -> str:
-    return place.rpartition(":")[0].strip("[]")
+    return host_and_port(place)[0].strip("[]")
 
 
 def _first(error: OSError | ValidationError) -> str:

@@ -12,7 +12,7 @@ from services.errors import ServiceError
 from services.security import access
 from services.security.authority import Identity, decoded, encoded
 from services.security.plan import LINKS, LISTENING, InstallationPlan, dialled, listened
-from services.wire.connect import merge, role_file
+from services.wire.connect import host_and_port, merge, role_file
 from services.wire.member import Member
 from services.wire.roles import ROLES, ROUTER
 from services.wire.session import common_settings, port
@@ -101,7 +101,7 @@ def _router(plan: InstallationPlan, known: Mapping[str, Secrets]) -> dict[str, A
     place, host = plan.routers[0], plan.hosts(ROUTER)[0]
     return {
         "mode": "router",
-        "listen": {"endpoints": [f"{plan.protocol}/{listened(host, place.rpartition(':')[2])}"]},
+        "listen": {"endpoints": [f"{plan.protocol}/{listened(host, host_and_port(place)[1])}"]},
         "transport": {
             "unicast": {"max_sessions": ROUTER_SESSIONS, "accept_timeout": ROUTER_ACCEPTS_MS},
             "auth": {"usrpwd": {"dictionary": _dictionary(members, known)}},

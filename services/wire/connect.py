@@ -49,10 +49,16 @@ def checked_endpoint(text: str) -> str:
     example = "An endpoint reads tcp/192.168.0.5:7447 or quic/robot.local:7447"
     if protocol not in PROTOCOLS or not place:
         raise ServiceError(f"'{text}' is not an endpoint. {example}; known protocols: {', '.join(PROTOCOLS)}.")
-    host, _, number = re.split(r"[?#]", place)[0].rpartition(":")
+    host, number = host_and_port(place)
     if protocol in NETWORKED and (not host or not number.isdecimal() or int(number) > 65535):
         raise ServiceError(f"The endpoint '{text}' has no host and port. {example}.")
     return text
+
+
+def host_and_port(place: str) -> tuple[str, str]:
+    """Return host (an IPv6 address in brackets) and port of `HOST:PORT?METADATA#OPTIONS`; empty where missing."""
+    host, _, port = re.split(r"[?#]", place)[0].rpartition(":")
+    return host, port
 
 
 def role_file(path: str | Path) -> dict[str, Any]:

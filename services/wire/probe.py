@@ -4,6 +4,7 @@ import socket
 from collections.abc import Sequence
 
 from services.errors import ServiceError
+from services.wire.connect import host_and_port
 
 PATIENCE = 2.0
 """A router has to react within this time [s]."""
@@ -28,9 +29,9 @@ def check_answers(endpoints: Sequence[str]) -> None:
             continue
         try:
             if protocol == "quic":
-                _probe_quic(_host_and_port(place), PATIENCE)
+                _probe_quic(_address(place), PATIENCE)
             else:
-                _probe_tcp(_host_and_port(place))
+                _probe_tcp(_address(place))
         except OSError as error:
             raise ServiceError(f"No answer at {endpoint}: {error}.") from None
 
@@ -42,16 +43,16 @@ def is_listening(endpoint: str) -> bool:
         return False
     try:
         if protocol == "quic":
-            _probe_quic(_host_and_port(place), LISTEN_WITHIN)
+            _probe_quic(_address(place), LISTEN_WITHIN)
         else:
-            socket.create_connection(_host_and_port(place), timeout=LISTEN_WITHIN).close()
+            socket.create_connection(_address(place), timeout=LISTEN_WITHIN).close()
     except OSError:
         return False
     return True
 
 
-def _host_and_port(place: str) -> tuple[str, int]:
-    host, _, port = place.partition("?")[0].partition("#")[0].rpartition(":")
+def _address(place: str) -> tuple[str, int]:
+    host, port = host_and_port(place)
     return _ANY_HOST.get(host, host.strip("[]")), int(port)
 
 

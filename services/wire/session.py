@@ -19,7 +19,7 @@ import zenoh
 
 from services.errors import NotAllowed, ServiceError, ServiceUnavailable
 from services.wire import keys
-from services.wire.connect import expiry_warning, split_connect, with_password_file, with_role_files
+from services.wire.connect import expiry_warning, host_and_port, split_connect, with_password_file, with_role_files
 from services.wire.member import member_in
 from services.wire.messages import MAX_BYTES
 from services.wire.probe import is_listening
@@ -32,7 +32,7 @@ PORT_GROUPS = 2500
 """This number of groups gives ports 20000 to 32499: registered, and below Linux's ephemeral ports (32768 and up)."""
 CLIENT = "client"
 ROUTER_PORT = 7447
-LOOPBACK = ("127.", "localhost", "[::1]")
+
 OPEN_WITHIN = 3.0
 """A client waits at most this long [s] for its router."""
 LEASE_MS = 900
@@ -146,7 +146,7 @@ def unsecured_endpoints(configuration: dict[str, Any]) -> list[str]:
     return [
         endpoint
         for endpoint in configuration.get("listen", {}).get("endpoints", ())
-        if not endpoint.partition("/")[2].startswith(LOOPBACK)
+        if not is_loopback(host_and_port(endpoint.partition("/")[2])[0])
         and not (is_mutual and endpoint.startswith(("tls/", "quic/")))
         and not endpoint.startswith("unixsock")
     ]
@@ -199,7 +199,7 @@ def open_with(configuration: dict[str, Any], who: str) -> zenoh.Session:
 def _taken_port(endpoints: list[str], text: str) -> str:
     """Return the port that zenoh reports as taken."""
     named = [endpoint for endpoint in endpoints if endpoint in text] or endpoints
-    return named[0].rpartition(":")[2]
+    return host_and_port(named[0])[1]
 
 
 def _no_link(configuration: dict[str, Any], who: str) -> ServiceError:

@@ -93,7 +93,8 @@ def test_a_bad_role_file_is_told(tmp_path: Path, text: str | None, says: str) ->
 @pytest.mark.parametrize(
     ("listen", "mutual", "is_open"),
     [("tcp/0.0.0.0:7447", False, True), ("tcp/127.0.0.1:7447", False, False), ("quic/0.0.0.0:7447", True, False),
-     ("quic/0.0.0.0:7447", False, True), ("tcp/[::1]:7447", False, False), ("tcp/0.0.0.0:7447", True, True)],
+     ("tcp/127.example.org:7447", False, True), ("quic/0.0.0.0:7447", False, True),
+     ("tcp/[::1]:7447", False, False), ("tcp/0.0.0.0:7447", True, True)],
 )  # fmt: skip
 def test_what_listens_elsewhere_without_security_is_known(listen: str, mutual: bool, is_open: bool) -> None:
     link = {"link": {"tls": {"enable_mtls": mutual}}}
