@@ -1,4 +1,4 @@
-"""The verbs of what a person looks at: the live page."""
+"""The verb `view`: the live page."""
 
 from pathlib import Path
 from typing import Annotated
@@ -18,11 +18,12 @@ def view(
     robot: RobotFile,
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page; 0 for any.")] = 8090,
     host: Annotated[
-        str, typer.Option(help="Address to serve on. Elsewhere than 127.0.0.1 anybody may look, and has no buttons.")
+        str,
+        typer.Option(
+            help="Address to serve on. Elsewhere than 127.0.0.1 everyone can read the page, and it has no buttons."
+        ),
     ] = "127.0.0.1",
-    urdf: Annotated[
-        Path | None, typer.Option(help="What the robot looks like; as the robot file says if not given.")
-    ] = None,
+    urdf: Annotated[Path | None, typer.Option(help="URDF of the robot; that of the robot file if not given.")] = None,
     connect: Connect = None,
 ) -> None:
     """Show a running robot in the browser: signals, the robot in 3D, plots, anomaly, loops, buttons, teaching.
@@ -35,7 +36,7 @@ def view(
 
 
 def _urdf_of(robot: str) -> Path | None:
-    """As the robot file says, where there is one: a client needs none."""
+    """Return the URDF in the robot file; None without a robot file, which a client does not need."""
     from hal.config import load_robot
     from hal.errors import ConfigError
 

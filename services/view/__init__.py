@@ -1,1 +1,1 @@
-"""The live page: one more client of a robot, and a small web server that shows what it hears."""
+"""Live page of a robot: a client and a small web server."""

@@ -1,4 +1,4 @@
-"""A robot in the scene: the links of its URDF, or rods between its joints where the URDF has no shapes."""
+"""A robot in the 3D scene: a rod for each link of its URDF and a sphere for each joint."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,14 +13,14 @@ if TYPE_CHECKING:
     import viser
 
 ROD, KNOB = 0.09, 0.13
-"""Radius of rods and joints, as a share of the mean length of the robot's links."""
+"""Rods and joints have these radii, as a share of the mean length of the robot's links."""
 SHORT = 1e-3
 """Links shorter than this [m] have no rod."""
 
 
 @dataclass(frozen=True, slots=True)
 class Paint:
-    """Color (red, green, blue; 0 to 255), and opacity; None for opaque."""
+    """Color (red, green, blue; 0 to 255) and opacity; None for opaque."""
 
     color: tuple[int, int, int]
     opacity: float | None = None
@@ -38,7 +38,7 @@ class Body:
 
         try:
             self._urdf = yourdfpy.URDF.load(str(path), build_scene_graph=True, load_meshes=False)
-        except Exception as error:  # yourdfpy and lxml raise what they like
+        except Exception as error:  # yourdfpy and lxml document no exceptions
             raise ServiceError(f"The URDF '{path}' cannot be read: {' '.join(str(error).split())}.") from None
         self.joints: tuple[str, ...] = tuple(self._urdf.actuated_joint_names)
         self.links: tuple[str, ...] = tuple(self._urdf.link_map)
@@ -46,35 +46,36 @@ class Body:
         self._parent = {joint.child: joint.parent for joint in self._urdf.joint_map.values()}
 
     def poses(self, angles: Mapping[str, float]) -> dict[str, np.ndarray]:
-        """Link -> its frame in that of the root, shape (4, 4); joints that are not given are at zero."""
+        """Return link -> its frame in the frame of the root, shape (4, 4); joints without an angle are at zero."""
         self._urdf.update_cfg({name: float(angles.get(name, 0.0)) for name in self.joints})
         return {link: np.asarray(self._urdf.get_transform(link)) for link in self.links}
 
     def carried_by(self, link: str) -> tuple[str, ...]:
-        """The movable joints between the root and a link."""
-        found = []
+        """Return the movable joints between the root and a link."""
+        joints = []
         while link in self._mover:
             if self._mover[link] in self.joints:
-                found.append(self._mover[link])
+                joints.append(self._mover[link])
             link = self._parent[link]
-        return tuple(found)
+        return tuple(joints)
 
     def rods(self) -> dict[str, list[np.ndarray]]:
-        """Link -> where its rods end, in its frame [m]: at the next joints, or as far behind its centre of mass as
-        the joint is before it.
+        """Return link -> ends of its rods in its frame [m].
+
+        A rod ends at the next joint. A last link ends as far behind its center of mass as its joint is before it.
         """
-        found: dict[str, list[np.ndarray]] = {link: [] for link in self.links}
+        rods: dict[str, list[np.ndarray]] = {link: [] for link in self.links}
         for joint in self._urdf.joint_map.values():
             origin = np.eye(4) if joint.origin is None else np.asarray(joint.origin)
-            found[joint.parent].append(origin[:3, 3])
-        for link, ends in found.items():
+            rods[joint.parent].append(origin[:3, 3])
+        for link, ends in rods.items():
             inertial = self._urdf.link_map[link].inertial
             if not ends and link in self._mover and inertial is not None and inertial.origin is not None:
                 ends.append(2.0 * np.asarray(inertial.origin)[:3, 3])
-        return {link: [end for end in ends if np.linalg.norm(end) > SHORT] for link, ends in found.items()}
+        return {link: [end for end in ends if np.linalg.norm(end) > SHORT] for link, ends in rods.items()}
 
     def reach(self) -> float:
-        """How far the robot extends from its root in its zero posture [m]."""
+        """Return the largest distance of a rod's end from the root in the zero posture [m]."""
         rods = self.rods()
         ends = [
             (pose @ np.append(end, 1.0))[:3]
@@ -88,10 +89,10 @@ class Figure:
     """One drawn robot.
 
     Args:
-        site: Where it is drawn.
-        name: Its name in the scene.
-        body: Its kinematics.
-        at: Where its root stands [m], shape (3,).
+        site: The page.
+        name: Name in the scene.
+        body: Kinematics.
+        at: Position of the root [m], shape (3,).
     """
 
     def __init__(self, site: "viser.ViserServer", name: str, body: Body, at: np.ndarray) -> None:
@@ -113,7 +114,7 @@ class Figure:
             self._shapes[link] = shapes
 
     def show(self, angles: Mapping[str, float], paints: Mapping[str, Paint]) -> None:
-        """Move to joint angles [rad], and paint every link."""
+        """Move to joint angles [rad] and paint every link."""
         from viser.transforms import SO3
 
         for link, pose in self._body.poses(angles).items():
@@ -130,7 +131,7 @@ class Figure:
 
 
 def _rod(end: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and faces of a rod from the origin to a point [m]."""
+    """Return vertices and faces of a rod from the origin to a point [m]."""
     import trimesh
 
     mesh = trimesh.creation.cylinder(radius=radius, segment=np.array([np.zeros(3), end]), sections=18)

@@ -1,4 +1,4 @@
-"""The robot twice: as it is measured, and as the model says it is."""
+"""The robot drawn twice: as measured, and with the model's estimates."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,17 +16,17 @@ if TYPE_CHECKING:
 BLUE, AMBER, PALE = (92, 160, 230), (255, 176, 74), (196, 204, 216)
 GREY = Paint((105, 112, 124))
 GHOST = Paint((105, 112, 124), 0.35)
-"""What is not known now, and stays where it was."""
+"""Links with this paint have an unknown position and stay at the last one."""
 POINT = ("x", "y", "z")
-"""Elements of a signal in m that is shown as a point."""
+"""A signal in m with these elements is shown as a point."""
 
 
 class Scene:
-    """Draws both robots; without a URDF only the points, and a word.
+    """Both drawn robots; without a URDF only points and a label.
 
     Args:
-        site: Where to draw.
-        urdf: The robot's URDF; None if there is none.
+        site: The page.
+        urdf: URDF of the robot; None if there is none.
 
     Raises:
         ServiceError: The URDF cannot be read.
@@ -47,7 +47,7 @@ class Scene:
         self._furnish(size, body is not None)
 
     def show(self, snapshot: Snapshot, rows: Sequence[SignalRow]) -> None:
-        """Move both robots to what is known now; a link's color tells what all joints below it rest on."""
+        """Move both robots to the present values; the color of a link shows the origin of all joints that carry it."""
         kinds: dict[str, Kind] = {}
         for row in rows:
             if row.element not in self._joints or row.unit != "rad" or row.element in kinds:

@@ -1,4 +1,4 @@
-"""A file of taught samples, which grows by one at a time and is never overwritten."""
+"""File of taught samples, which grows by one sample at a time and is never overwritten."""
 
 import fcntl
 from collections.abc import Iterator, Mapping
@@ -13,67 +13,68 @@ from services.errors import ServiceError
 from services.watch.snapshot import Snapshot
 
 LONGEST_NAME = 60
+"""Names of conditions have at most this number of letters."""
 FRESH = 0.25
-"""A sample older than this [s] is not the present posture."""
+"""A sample is the present posture up to this age [s]."""
 
 
 class NotRecorded(ServiceError):
-    """Nothing was written, and what is in the file stays; the text says why."""
+    """Error for a sample that was not written; the file is unchanged, and the text gives the reason."""
 
 
 def posture(snapshot: Snapshot) -> tuple[Layout, dict[str, np.ndarray]]:
-    """The present value [its unit] of every signal that the robot has.
+    """Return the signals of the robot and their present values [their unit].
 
     Raises:
-        NotRecorded: Something is not measured now.
+        NotRecorded: An element is not measured at present.
     """
     signals = snapshot.hal.get("signals")
     if not signals:
-        raise NotRecorded("The HAL has not told its signals yet, so there is nothing to record. Is it running?")
+        raise NotRecorded("The HAL has not described its signals yet, so nothing was recorded. Is it running?")
     layout = Layout(tuple(Signal(n, len(s["elements"]), s["unit"], tuple(s["elements"])) for n, s in signals.items()))
     values: dict[str, np.ndarray] = {}
     for name, about in signals.items():
-        heard = snapshot.vision if about.get("source") == "vision" else snapshot.sample
-        sample = None if heard is None or heard.age > FRESH else heard.message
+        newest = snapshot.vision if about.get("source") == "vision" else snapshot.sample
+        sample = None if newest is None or newest.age > FRESH else newest.message
         if sample is None or name not in sample.values:
             raise NotRecorded(f"'{name}' is not measured now, so nothing was recorded.")
-        wrong = np.flatnonzero(~(sample.valid[name] & np.isfinite(sample.values[name])))
-        if wrong.size:
-            elements = ", ".join(about["elements"][index] for index in wrong)
+        missing = np.flatnonzero(~(sample.valid[name] & np.isfinite(sample.values[name])))
+        if missing.size:
+            elements = ", ".join(about["elements"][index] for index in missing)
             raise NotRecorded(f"{name} ({elements}) is not measured now, so nothing was recorded.")
         values[name] = np.array(sample.values[name], float)
     return layout, values
 
 
 class TaughtFile:
-    """Samples of taught postures, in the form that `gemuco train --data` reads.
+    """Samples of taught postures, in the format that `gemuco train --data` reads.
 
-    Every sample is written at once, to a draft that takes the file's place; what was in the file stays in it. Another
-    process that records into the same file is waited for.
+    Every sample is written at once, to a draft that replaces the file. Earlier samples stay. A lock makes
+    processes that record into the same file wait for each other.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._mine: list[np.ndarray] = []
-        """Rows that were recorded here, in the order of the file's end."""
+        self._own: list[np.ndarray] = []
+        """Rows that this object recorded, in the order of the file."""
         self._in_episode = ""
-        """The condition of the episode that was begun here and goes on."""
+        """Condition of the episode that this object began last."""
 
     @property
     def recorded(self) -> int:
-        """How many samples were recorded here and not taken back."""
-        return len(self._mine)
+        """Number of samples that this object recorded and did not take back."""
+        return len(self._own)
 
     def add(self, condition: str, layout: Layout, values: Mapping[str, np.ndarray]) -> int:
-        """Write one more sample, and tell how many are in the file.
+        """Write one more sample and return the number of samples in the file.
 
         Args:
-            condition: How the body is now, such as its tool.
-            layout: The signals.
+            condition: Condition of the body, such as its tool.
+            layout: Layout of the signals.
             values: Signal -> present value [its unit], shape (n,).
 
         Raises:
-            NotRecorded: No name, a value that is none, or a file that does not fit.
+            NotRecorded: The name is missing, a value is not finite, or the file has other signals.
         """
         name = condition.strip()
         if not name or len(name) > LONGEST_NAME or not name.isprintable():
@@ -86,7 +87,7 @@ class TaughtFile:
         with self._locked():
             dataset = self._load(layout)
             episodes = list(dataset.episodes)
-            if self._in_episode == name and episodes and self._ends_with_mine(dataset):
+            if self._in_episode == name and episodes and self._ends_with_own(dataset):
                 rows = np.vstack([layout.join(episodes.pop().values), row])
             else:
                 rows = row[None]
@@ -94,21 +95,21 @@ class TaughtFile:
             grown = Dataset(layout, tuple(episodes))
             grown.save(self.path)
         self._in_episode = name
-        self._mine.append(row)
+        self._own.append(row)
         return len(grown)
 
     def undo(self) -> int:
-        """Take the last sample that was recorded here out of the file, and tell how many are left.
+        """Remove the last sample that this object recorded and return the number of samples left.
 
         Raises:
-            NotRecorded: There is none, or somebody else recorded after it.
+            NotRecorded: There is none, or another process recorded after it.
         """
-        if not self._mine:
-            raise NotRecorded("There is nothing to take back: what was recorded before this page began stays.")
+        if not self._own:
+            raise NotRecorded("There is nothing to take back: samples from before this page was started stay.")
         with self._locked():
             dataset = self._load(None)
-            if not self._ends_with_mine(dataset):
-                raise NotRecorded(f"'{self.path}' ends with somebody else's sample, so nothing was taken back.")
+            if not self._ends_with_own(dataset):
+                raise NotRecorded(f"'{self.path}' ends with a sample of another process, so nothing was taken back.")
             *kept, last = dataset.episodes
             rows = dataset.layout.join(last.values)[:-1]
             if len(rows):
@@ -117,15 +118,15 @@ class TaughtFile:
                 self._in_episode = ""
             left = Dataset(dataset.layout, tuple(kept))
             left.save(self.path)
-        self._mine.pop()
+        self._own.pop()
         return len(left)
 
-    def _ends_with_mine(self, dataset: Dataset) -> bool:
+    def _ends_with_own(self, dataset: Dataset) -> bool:
         rows = dataset.rows()
-        return bool(self._mine and len(rows) and np.array_equal(rows[-1], self._mine[-1]))
+        return bool(self._own and len(rows) and np.array_equal(rows[-1], self._own[-1]))
 
     def _load(self, layout: Layout | None) -> Dataset:
-        """What is in the file; nothing yet if there is none and a layout is told."""
+        """Return the samples in the file; with a layout, none if there is no file."""
         if layout is not None and not self.path.exists():
             return Dataset(layout, ())
         dataset = Dataset.load(self.path)

@@ -1,4 +1,4 @@
-"""The teaching panel: sliders, a button to hold, and a button that records."""
+"""Teaching panel: sliders, a button that moves the robot while it is held, and a button that records."""
 
 import logging
 from collections.abc import Callable
@@ -22,30 +22,30 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 EVERY = 1.0
-"""Time [s] between questions whether the page that took over lives."""
+"""The page that took over is queried at this interval [s]."""
 NOTCHES = 500
-"""Steps of a slider over its range."""
+"""A slider has this number of steps."""
 
 
 class TeachPanel:
-    """Widgets around a `Teacher` and a `TaughtFile`.
+    """Widgets of a `Teacher` and a `TaughtFile`.
 
     Args:
         site: The page.
-        controls: Says whether this page may command.
+        controls: Source of a client that may command.
         look: Function that returns the present snapshot.
-        path: Where samples are recorded.
+        path: File of the recorded samples.
     """
 
     def __init__(self, site: "viser.ViserServer", controls: Controls, look: Callable[[], Snapshot], path: Path) -> None:
         self._site, self._look = site, look
         self.teacher = Teacher(controls.open_client)
         self.file = TaughtFile(path)
-        self._said = ""
+        self._message = ""
         self._reach: Reach | None = None
         self._sliders: list[Any] = []
-        self._was_teaching = False
-        self._asked_at = 0.0
+        self._is_teaching = False
+        self._queried_at = 0.0
         self._status = site.gui.add_html("")
         self._take = site.gui.add_button("Take over and hold", color="yellow")
         self._folder = site.gui.add_folder("where to", visible=False)
@@ -57,32 +57,32 @@ class TeachPanel:
         self._wire()
 
     def close(self) -> None:
-        """Let go."""
+        """Let the robot go and end the thread."""
         self.teacher.stop()
 
     def show(self, snapshot: Snapshot, now: float) -> None:
-        """Show what is going on, and ask the page that took over whether it lives."""
+        """Show the state of teaching, and query the page that took over."""
         self._make_sliders(snapshot)
         owner = self.teacher.owner
         teaching = owner is not None and self.teacher.set_point is not None
-        if teaching != self._was_teaching:
-            self._was_teaching = teaching
+        if teaching != self._is_teaching:
+            self._is_teaching = teaching
             for handle in (self._folder, self._move, self._step):
                 handle.visible = teaching
             self._take.label = "Let go" if owner is not None else "Take over and hold"
             if teaching:
                 self._place_sliders()
-        if owner is not None and now - self._asked_at > EVERY:
-            self._asked_at = now
-            self._site._thread_executor.submit(self._ask_page, owner)
-        html = teach_html(owner is not None, self.teacher.is_moving, self._said or self.teacher.text, self.file)
+        if owner is not None and now - self._queried_at > EVERY:
+            self._queried_at = now
+            self._site._thread_executor.submit(self._query_page, owner)
+        html = teach_html(owner is not None, self.teacher.is_moving, self._message or self.teacher.text, self.file)
         if html != self._status.content:
             self._status.content = html
 
     def _wire(self) -> None:
-        self._take.on_click(lambda event: self._try(lambda: self._take_or_let_go(_who(event))))
-        self._move.on_hold(lambda event: self.teacher.hold(_who(event)), callback_hz=10.0)
-        self._step.on_click(lambda event: self.teacher.step(_who(event)))
+        self._take.on_click(lambda event: self._try(lambda: self._take_or_let_go(_browser(event))))
+        self._move.on_hold(lambda event: self.teacher.hold(_browser(event)), callback_hz=10.0)
+        self._step.on_click(lambda event: self.teacher.step(_browser(event)))
         self._record.on_click(lambda _: self._try(self._add))
         self._undo.on_click(lambda _: self._try(lambda: f"Taken back; {self.file.undo()} samples are in the file."))
         self._site.on_client_disconnect(
@@ -93,9 +93,9 @@ class TeachPanel:
 
     def _try(self, act: Callable[[], str]) -> None:
         try:
-            self._said = act()
+            self._message = act()
         except (ServiceError, HalError, SchemaError) as error:
-            self._said = str(error)
+            self._message = str(error)
 
     def _take_or_let_go(self, owner: int) -> str:
         if self.teacher.owner is not None:
@@ -116,12 +116,12 @@ class TeachPanel:
         return f"Recorded under '{self._condition.value.strip()}'; {count} samples are in the file."
 
     def _make_sliders(self, snapshot: Snapshot) -> None:
-        """Sliders of the commanded signal, once its limits are told; anew when they change."""
+        """Make the sliders of the commanded signal when its limits are known, and again when they change."""
         try:
             reach = Reach.of(snapshot.hal)
         except NotTeaching as error:
             if snapshot.hal:
-                self._said = str(error)
+                self._message = str(error)
             return
         known = self._reach
         if (
@@ -141,7 +141,7 @@ class TeachPanel:
                     f"{element} [{reach.unit}]", min=float(low), max=float(high), step=step,
                     initial_value=float(round((low + high) / 2 / step) * step),
                 )  # fmt: skip
-                slider.on_update(lambda _: self._wish())
+                slider.on_update(lambda _: self._set_target())
                 self._sliders.append(slider)
 
     def _place_sliders(self) -> None:
@@ -151,19 +151,19 @@ class TeachPanel:
         for slider, value, low, high in zip(self._sliders, at, self._reach.low, self._reach.high, strict=True):
             slider.value = float(np.clip(value, low, high))
 
-    def _wish(self) -> None:
-        self.teacher.wish(np.array([slider.value for slider in self._sliders]))
+    def _set_target(self) -> None:
+        self.teacher.set_target(np.array([slider.value for slider in self._sliders]))
 
-    def _ask_page(self, owner: int) -> None:
-        """An answer of the page's own program tells that it does not hang."""
+    def _query_page(self, owner: int) -> None:
+        """Query the page's program; its answer shows that the page does not hang."""
         client = self._site.get_clients().get(owner)
         try:
             if client is not None:
                 client.local_storage.get_item("gemuco", timeout=EVERY)
-                self.teacher.page_lives(owner)
+                self.teacher.confirm_page(owner)
         except (RuntimeError, TimeoutError) as error:
             log.info("The page that teaches did not answer: %s", error)
 
 
-def _who(event: Any) -> int:
+def _browser(event: Any) -> int:
     return int(event.client_id)

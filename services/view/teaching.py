@@ -1,8 +1,8 @@
-"""Moving a robot by hand from the page: towards where the sliders are, only while a button is held, or one step.
+"""Motion of a robot from the page: towards the sliders while a button is held, or by one step.
 
-A thread sends set-points at a fixed rate, as any client does, and the HAL limits them once more. It lets go at once
-when the page that took over is closed or hangs, when the robot leaves the modes in which it follows, or when nothing
-is measured; then the HAL stops as the robot file says.
+A thread sends set-points at a fixed rate, as any client does, and the HAL limits them. The thread lets the robot go
+when the page that took over is closed or hangs, when the robot leaves the modes `hold` and `follow`, or when no
+sample arrives; then the HAL stops as the robot file defines.
 """
 
 import logging
@@ -25,28 +25,29 @@ from services.process.loop import Loop
 log = logging.getLogger(__name__)
 
 RATE = 50.0
-"""Set-points per second [Hz]."""
+"""Set-points are sent at this rate [Hz]."""
 SPEED = 0.3
-"""Share of the robot file's largest rate at which taught motion goes."""
+"""Taught motion has this share of the robot file's rate limit."""
 UNSTATED = 0.1
-"""Share of the range per second, where the robot file states no rate."""
+"""Without a rate limit, taught motion covers this share of the range per second."""
 STEP = 0.02
-"""Share of the range that one step goes at most."""
+"""One step covers at most this share of the range."""
 PRESSED = 0.35
-"""How long [s] a held button counts as held after it last said so; it says so ten times a second."""
+"""A button counts as held for this time [s] after its last message; it sends ten messages per second."""
 PAGE_PATIENCE = 3.0
-"""How long [s] the page that took over may be silent."""
+"""The page that took over may be silent for this time [s]."""
 ENABLE_WITHIN = 5.0
+"""The drives have to be enabled within this time [s]."""
 LIVE = ("hold", "follow")
 
 
 class NotTeaching(ServiceError):
-    """The robot cannot be moved from the page now; the text says why."""
+    """Error for a robot that cannot be moved from the page at present; the text gives the reason."""
 
 
 @dataclass(frozen=True, slots=True)
 class Reach:
-    """Where the commanded signal may go: bounds [unit] and speed [unit/s], each of shape (n,)."""
+    """Limits of the commanded signal: bounds [unit] and speed [unit/s], each of shape (n,)."""
 
     signal: str
     unit: str
@@ -58,13 +59,13 @@ class Reach:
 
     @classmethod
     def of(cls, hal: Mapping[str, Any]) -> "Reach":
-        """As the HAL's `describe` tells.
+        """Return the limits in the answer of the HAL's `describe`.
 
         Raises:
             NotTeaching: The robot file states no bounds.
         """
         if not hal:
-            raise NotTeaching("The HAL has not told its limits yet. Is it running?")
+            raise NotTeaching("The HAL has not described its limits yet. Is it running?")
         signal = hal["command"]["signal"]
         about, limit = hal["signals"][signal], hal["limits"].get(signal, {})
         count = len(about["elements"])
@@ -78,44 +79,44 @@ class Reach:
 
 
 class Teacher:
-    """Holds a robot, and moves it while it is told to.
+    """Sender of the set-points of one browser window, which took over the robot.
 
     Args:
-        client: Gives the open client; raises `ServiceError` when this page may not command.
-        clock: For deadlines.
+        client: Function that returns the open client; it raises `ServiceError` if this page may not command.
+        clock: Clock of the deadlines.
     """
 
     def __init__(self, client: Callable[[], Client], clock: Clock | None = None) -> None:
         self.text = ""
-        """Why it let go last, or what it waits for."""
+        """Reason why the robot was let go, or the state of enabling."""
         self._client, self._clock = client, clock or SystemClock()
         self._lock = threading.RLock()
         self._owner: int | None = None
         self._lease: Any = None
         self._reach: Reach | None = None
         self._at: np.ndarray | None = None
-        self._wish = np.zeros(0)
+        self._target = np.zeros(0)
         self._goal: np.ndarray | None = None
         self._enable_by = self._held_until = self._page_at = -math.inf
         self._loop = Loop("teaching", RATE, self.tick, self._clock)
 
     def start(self) -> None:
-        """Begin the thread; nothing is sent before `take_over`."""
+        """Start the thread; it sends nothing before `take_over`."""
         self._loop.start()
 
     def stop(self) -> None:
-        """Let go, and end the thread."""
+        """Let the robot go and end the thread."""
         self.let_go("The page was ended.")
         self._loop.stop(2.0)
 
     @property
     def owner(self) -> int | None:
-        """The browser that took over; None if nobody did."""
+        """Browser window that took over; None if none did."""
         return self._owner
 
     @property
     def set_point(self) -> np.ndarray | None:
-        """What is sent now [unit], shape (n,); None while nothing is."""
+        """Set-point that is sent now [unit], shape (n,); None while none is sent."""
         at = self._at
         return None if at is None else at.copy()
 
@@ -125,10 +126,10 @@ class Teacher:
         return self._goal is not None or self._clock.monotonic() < self._held_until
 
     def take_over(self, owner: int, reach: Reach) -> None:
-        """Enable the robot where it is, and hold it there.
+        """Enable the drives at the present position and hold it.
 
         Raises:
-            ServiceError, HalError: Somebody else commands, nobody answers, or the HAL refuses.
+            ServiceError, HalError: Another client commands, no service answers, or the HAL refuses.
         """
         client = self._client()
         with self._lock:
@@ -147,39 +148,39 @@ class Teacher:
             self._enable_by, self._held_until, self._page_at = now + ENABLE_WITHIN, -math.inf, now
             self.text = "The drives are being enabled."
 
-    def wish(self, values: np.ndarray) -> None:
-        """Where the sliders are [unit], shape (n,); nothing moves by this alone."""
+    def set_target(self, values: np.ndarray) -> None:
+        """Set the target from the sliders [unit], shape (n,); this moves nothing."""
         with self._lock:
             if self._reach is not None:
-                self._wish = np.clip(values, self._reach.low, self._reach.high)
+                self._target = np.clip(values, self._reach.low, self._reach.high)
 
     def hold(self, owner: int) -> None:
-        """The button to move is held down, and says so again and again."""
+        """Move for the next 0.35 s; called repeatedly while the button is held."""
         with self._lock:
             if owner == self._owner:
                 self._held_until = self._page_at = self._clock.monotonic()
                 self._held_until += PRESSED
 
     def step(self, owner: int) -> None:
-        """Go one step towards where the sliders are."""
+        """Move one step towards the target."""
         with self._lock:
             if owner == self._owner and self._reach is not None and self._at is not None:
                 most = STEP * (self._reach.high - self._reach.low)
-                self._goal = self._at + np.clip(self._wish - self._at, -most, most)
+                self._goal = self._at + np.clip(self._target - self._at, -most, most)
                 self._page_at = self._clock.monotonic()
 
-    def page_lives(self, owner: int) -> None:
-        """The page that took over has answered."""
+    def confirm_page(self, owner: int) -> None:
+        """Note that the page that took over has answered."""
         with self._lock:
             if owner == self._owner:
                 self._page_at = self._clock.monotonic()
 
     def let_go(self, why: str = "", owner: int | None = None) -> None:
-        """Send nothing any more, and have the HAL stop as the robot file says.
+        """Send no more set-points, and let the HAL stop as the robot file defines.
 
         Args:
-            why: Told on the page.
-            owner: Only if this browser took over; whoever did if None.
+            why: Reason for the page.
+            owner: Browser window that must have taken over; any if None.
         """
         with self._lock:
             if self._owner is None or (owner is not None and owner != self._owner):
@@ -190,12 +191,12 @@ class Teacher:
         try:
             self._client().stop()
         except (ServiceError, HalError, SchemaError) as error:
-            log.info("Let go, and the HAL did not take it: %s. Its watchdog stops the robot.", error)
+            log.info("Let go, but the HAL did not confirm the stop: %s. Its watchdog stops the robot.", error)
         if lease is not None:
             lease.__exit__(None, None, None)
 
     def tick(self) -> None:
-        """Send one set-point, if somebody teaches and all is well."""
+        """Send one set-point while a browser window teaches; let the robot go on any problem."""
         try:
             with self._lock:
                 why = self._turn()
@@ -205,7 +206,7 @@ class Teacher:
             self.let_go(why)
 
     def _turn(self) -> str:
-        """Why to let go; empty if there is no reason."""
+        """Send one set-point; return a reason to let the robot go, or an empty text."""
         reach = self._reach
         if self._owner is None or reach is None:
             return ""
@@ -216,7 +217,7 @@ class Teacher:
         sample, applied = client.sample(reach.time_to_live), client.applied(reach.time_to_live)
         if sample is None or applied is None:
             if self._at is None and now < self._enable_by:
-                return ""  # a client subscribes when it is first asked
+                return ""  # a client subscribes at its first call
             return "No sample comes from the HAL any more, so the robot was let go."
         if self._at is None:
             return self._begin(applied.mode, sample.values[reach.signal], sample.valid[reach.signal], now)
@@ -227,9 +228,9 @@ class Teacher:
         return ""
 
     def _begin(self, mode: str, values: np.ndarray, valid: np.ndarray, now: float) -> str:
-        """Take where the robot is as the first set-point, once the drives are enabled."""
+        """Take the present position as the first set-point when the drives are enabled."""
         if mode in LIVE and valid.all():
-            self._at, self._wish, self.text = values.copy(), values.copy(), ""
+            self._at, self._target, self.text = values.copy(), values.copy(), ""
             return ""
         if now > self._enable_by or mode == "fault":
             return f"The drives did not become enabled (mode '{mode}'), so the robot was let go."
@@ -237,7 +238,7 @@ class Teacher:
 
     def _advance(self, reach: Reach, now: float) -> None:
         assert self._at is not None
-        goal = self._wish if now < self._held_until else self._goal
+        goal = self._target if now < self._held_until else self._goal
         if goal is None:
             return
         most = reach.speed / RATE

@@ -46,7 +46,7 @@ def test_what_is_not_measured_is_not_recorded(tmp_path: Path):
         posture(seen(silent=True))
     with pytest.raises(NotRecorded, match="not measured now"):
         posture(seen(age=2.0))
-    with pytest.raises(NotRecorded, match="has not told its signals"):
+    with pytest.raises(NotRecorded, match="has not described its signals"):
         posture(Snapshot(robot="arm"))
 
 
@@ -82,7 +82,7 @@ def test_somebody_elses_sample_is_not_taken_back(tmp_path: Path):
     moved = Sample(**{name: getattr(sample(), name) for name in ("cycle", "source", "complete", "age", "valid")},
                    values={"joint_position": np.array([0.9, 0.9]), "muscle_tension": np.array([1.0])})  # fmt: skip
     other.add("light", *posture(Snapshot(robot="arm", hal=DESCRIBED, sample=Newest(moved, 0.0))))
-    with pytest.raises(NotRecorded, match="somebody else"):
+    with pytest.raises(NotRecorded, match="another process"):
         file.undo()
     assert len(Dataset.load(file.path)) == 2
 

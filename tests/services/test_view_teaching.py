@@ -56,14 +56,14 @@ def test_limits_are_those_of_the_robot_file():
     assert np.all(reach.speed < 2.0)
     with pytest.raises(NotTeaching, match="needs limits"):
         Reach.of(HAL | {"limits": {}})
-    with pytest.raises(NotTeaching, match="has not told"):
+    with pytest.raises(NotTeaching, match="has not described"):
         Reach.of({})
 
 
 @pytest.mark.long
 def test_it_moves_while_the_button_is_held_and_stops_when_it_is_not(arm: Processes, teacher: Teacher):
     start = taken(arm, teacher)
-    teacher.wish(start + 5.0)
+    teacher.set_target(start + 5.0)
     time.sleep(0.3)  # nothing but time would show that it moves by itself
     assert np.allclose(lengths(arm), start, atol=2e-3)
     until = time.monotonic() + 0.6
@@ -83,7 +83,7 @@ def test_it_moves_while_the_button_is_held_and_stops_when_it_is_not(arm: Process
 @pytest.mark.long
 def test_a_step_goes_so_far_and_no_further(arm: Processes, teacher: Teacher):
     start = taken(arm, teacher)
-    teacher.wish(np.array([0.2, start[1]]))
+    teacher.set_target(np.array([0.2, start[1]]))
     teacher.step(OTHER)
     assert not teacher.is_moving
     teacher.step(PAGE)
@@ -115,7 +115,7 @@ def test_a_page_that_answers_keeps_the_robot(arm: Processes, teacher: Teacher):
     taken(arm, teacher)
     until = time.monotonic() + PAGE_PATIENCE + 0.5
     while time.monotonic() < until:
-        teacher.page_lives(PAGE)
+        teacher.confirm_page(PAGE)
         time.sleep(0.1)
     assert teacher.owner == PAGE
 
