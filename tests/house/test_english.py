@@ -26,7 +26,7 @@ def _name(path: Path) -> str:
 
 
 MODULES = [path for folder in CODE for path in sorted((ROOT / folder).rglob("*.py"))]
-PAGES = [path for path in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
 @pytest.mark.parametrize("path", MODULES, ids=_name)
