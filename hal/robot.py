@@ -15,7 +15,7 @@ from hal.errors import CommandRefused
 from hal.fleet import build
 from hal.modes import Act, Mode, ModeMachine
 from hal.safety.cycle_lock import PATIENCE, CycleLock
-from hal.safety.emergency import Emergency, EmergencyStop
+from hal.safety.emergency import EmergencyStop, StopResult
 from hal.safety.limiter import Limiter
 from hal.safety.start import Start
 from hal.safety.watchdog import CommandWatchdog, CycleWatchdog, checked
@@ -191,7 +191,7 @@ class Robot:
             self._stop_reason = reason
             self._modes.stop(self._clock.monotonic())
 
-    def estop(self, reason: str) -> Emergency:
+    def estop(self, reason: str) -> StopResult:
         """Stop every drive as fast as it can, in every mode, and stay in fault until `reset`.
 
         Several threads may call this at once, also while the cycle is stuck. It blocks until every drive reports that

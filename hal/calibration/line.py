@@ -79,7 +79,7 @@ class CalibrationRefused(HalError):
 
 
 @dataclass(frozen=True, slots=True)
-class Line:
+class CalibrationLine:
     """The line value = zero + factor * reading.
 
     Attributes:
@@ -97,7 +97,7 @@ class Line:
         return self.zero + self.factor * read
 
 
-def joint_line(points: Sequence[Point], direction: float, least: float) -> Line:
+def joint_line(points: Sequence[Point], direction: float, least: float) -> CalibrationLine:
     """Fit the zero to one known position, zero and direction to two or more.
 
     Args:
@@ -125,10 +125,10 @@ def joint_line(points: Sequence[Point], direction: float, least: float) -> Line:
                 f"times gear, or the radius, are wrong by a factor of {1.0 / abs(slope):.3g}."
             )
     zero = float(np.mean(known - direction * read))
-    return Line(zero, direction, _residual(known, zero + direction * read))
+    return CalibrationLine(zero, direction, _residual(known, zero + direction * read))
 
 
-def cell_line(points: Sequence[Point], gain: float, noise: float) -> Line:
+def cell_line(points: Sequence[Point], gain: float, noise: float) -> CalibrationLine:
     """Fit the zero to one known force, zero and gain to two or more.
 
     Args:
@@ -158,7 +158,7 @@ def cell_line(points: Sequence[Point], gain: float, noise: float) -> Line:
                 "cell hang freely, was each weight given correctly?"
             )
     zero = float(np.mean(known - gain * read))
-    return Line(zero, gain, _residual(known, zero + gain * read))
+    return CalibrationLine(zero, gain, _residual(known, zero + gain * read))
 
 
 def _columns(points: Sequence[Point]) -> tuple[np.ndarray, np.ndarray]:

@@ -44,7 +44,7 @@ class Frame:
 
 
 @dataclass(frozen=True, slots=True)
-class Pdo:
+class NamedPdo:
     """A process data object: label, node and mapped objects."""
 
     label: str
@@ -65,7 +65,7 @@ class Book:
     def __init__(self) -> None:
         self.names: dict[int, str] = {}
         self.dictionaries: dict[int, canopen.ObjectDictionary] = {}
-        self.pdos: dict[int, Pdo] = {}
+        self.pdos: dict[int, NamedPdo] = {}
         self.explainers: dict[int, tuple[str, Explain]] = {}
         self._entries: dict[tuple[int, int, int], int] = {}
         self._requests: dict[int, tuple[int, int, int]] = {}
@@ -91,7 +91,7 @@ class Book:
         """Replace the mapping of a PDO."""
         for known in [key for key, pdo in self.pdos.items() if (pdo.node, pdo.label) == (node, label)]:
             del self.pdos[known]
-        self.pdos[identifier] = Pdo(label, node, objects)
+        self.pdos[identifier] = NamedPdo(label, node, objects)
 
     def learn(self, frame: Frame) -> None:
         """Update a mapping that an SDO client writes or reads; ignore all other frames."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import canopen
 from canopen.objectdictionary import ODVariable
 
-from hal.finding.book import EXTENDED, Book, Frame, Pdo
+from hal.finding.book import EXTENDED, Book, Frame, NamedPdo
 from hal.protocols import cia301, cia402, sdo
 from hal.protocols.cia301 import NmtCommand, NmtState
 from hal.protocols.error_frames import error_frame
@@ -28,7 +28,7 @@ _NMT_WORDS = {
 
 
 @dataclass(frozen=True, slots=True)
-class Line:
+class FrameText:
     """Description of a frame.
 
     Attributes:
@@ -42,47 +42,47 @@ class Line:
     text: str
 
 
-def describe(frame: Frame, book: Book) -> Line:
+def describe(frame: Frame, book: Book) -> FrameText:
     """Return the description of a frame, as far as the book has data about the node."""
     if frame.is_error:
-        return Line("error", None, _error(frame))
+        return FrameText("error", None, _error(frame))
     key = frame.identifier | (EXTENDED if frame.is_extended else 0)
     if frame.is_remote:
-        return Line("remote", None, "asks for the data of this identifier")
+        return FrameText("remote", None, "asks for the data of this identifier")
     if key in book.explainers:
         kind, explain = book.explainers[key]
-        return Line(kind, *explain(frame.data))
+        return FrameText(kind, *explain(frame.data))
     if frame.is_extended:
-        return Line("?", None, "")
+        return FrameText("?", None, "")
     if frame.identifier in book.pdos:
         return _pdo(book.pdos[frame.identifier], frame.data, book)
     return _predefined(frame, book)
 
 
-def _predefined(frame: Frame, book: Book) -> Line:
+def _predefined(frame: Frame, book: Book) -> FrameText:
     """Return the description by the predefined connection set (CiA 301, table 79)."""
     identifier, data = frame.identifier, frame.data
     function, node = identifier & 0x780, identifier & 0x7F
     if identifier == cia301.NMT:
         return _nmt(data)
     if identifier == cia301.SYNC:
-        return Line("SYNC", None, f"counter {data[0]}" if len(data) == 1 else "")
+        return FrameText("SYNC", None, f"counter {data[0]}" if len(data) == 1 else "")
     if identifier == TIME:
-        return Line("TIME", None, "")
+        return FrameText("TIME", None, "")
     if not node:
-        return Line("?", None, "")
+        return FrameText("?", None, "")
     if function == cia301.EMERGENCY:
-        return Line("EMCY", node, _emergency(data))
+        return FrameText("EMCY", node, _emergency(data))
     if function == cia301.HEARTBEAT:
         state = cia301.nmt_state(data)
-        return Line("heartbeat", node, "malformed" if state is None else nmt_words(state))
+        return FrameText("heartbeat", node, "malformed" if state is None else nmt_words(state))
     if function in (cia301.SDO_REQUEST, cia301.SDO_ANSWER):
-        return Line("SDO", node, _sdo(data, function == cia301.SDO_ANSWER, book.dictionaries.get(node)))
+        return FrameText("SDO", node, _sdo(data, function == cia301.SDO_ANSWER, book.dictionaries.get(node)))
     if cia301.TPDO1 <= identifier < cia301.SDO_ANSWER:
         number = (function - cia301.TPDO1) // 0x100 + 1
         label = "RPDO" if function & 0x80 == 0 else "TPDO"
-        return Line(f"{label}{number}", node, "its mapping is not known")
-    return Line("?", None, "")
+        return FrameText(f"{label}{number}", node, "its mapping is not known")
+    return FrameText("?", None, "")
 
 
 def nmt_words(state: int) -> str:
@@ -94,14 +94,14 @@ def nmt_words(state: int) -> str:
         return f"unknown state {state:02X}h"
 
 
-def _nmt(data: bytes) -> Line:
+def _nmt(data: bytes) -> FrameText:
     if len(data) != 2:
-        return Line("NMT", None, "malformed")
+        return FrameText("NMT", None, "malformed")
     try:
         words = _NMT_WORDS[NmtCommand(data[0])]
     except ValueError:
         words = f"unknown command {data[0]:02X}h"
-    return Line("NMT", data[1] or None, f"{words}: {f'node {data[1]}' if data[1] else 'all nodes'}")
+    return FrameText("NMT", data[1] or None, f"{words}: {f'node {data[1]}' if data[1] else 'all nodes'}")
 
 
 def _emergency(data: bytes) -> str:
@@ -114,10 +114,10 @@ def _emergency(data: bytes) -> str:
     return f"{cia301.describe_emergency(emergency.code)}, error register {emergency.register:02X}h{more}"
 
 
-def _pdo(pdo: Pdo, data: bytes, book: Book) -> Line:
+def _pdo(pdo: NamedPdo, data: bytes, book: Book) -> FrameText:
     size = sum(item.bits for item in pdo.objects)
     if len(data) * 8 < size:
-        return Line(pdo.label, pdo.node, f"malformed: {len(data)} bytes in place of {(size + 7) // 8}")
+        return FrameText(pdo.label, pdo.node, f"malformed: {len(data)} bytes in place of {(size + 7) // 8}")
     whole, place, parts = int.from_bytes(data, "little"), 0, []
     dictionary = book.dictionaries.get(pdo.node)
     for item in pdo.objects:
@@ -128,7 +128,7 @@ def _pdo(pdo: Pdo, data: bytes, book: Book) -> Line:
             raw = bits.to_bytes((item.bits + 7) // 8, "little")
             name = _name(entry) or f"{item.index:04X}h:{item.subindex}"
             parts.append(f"{name} {_value(entry, raw, item.index)}")
-    return Line(pdo.label, pdo.node, ", ".join(parts))
+    return FrameText(pdo.label, pdo.node, ", ".join(parts))
 
 
 def _sdo(data: bytes, is_answer: bool, dictionary: canopen.ObjectDictionary | None) -> str:

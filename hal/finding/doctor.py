@@ -24,7 +24,7 @@ from hal.wire.pulse import pulse
 from hal.wire.state import BusState
 
 
-class Verdict(StrEnum):
+class Severity(StrEnum):
     """Result of a check, worst last."""
 
     OK = "ok"
@@ -43,23 +43,23 @@ class Finding:
     """
 
     what: str
-    verdict: Verdict
+    verdict: Severity
     text: str
 
 
 def ok(what: str, text: str) -> Finding:
     """Return a finding without a problem."""
-    return Finding(what, Verdict.OK, text)
+    return Finding(what, Severity.OK, text)
 
 
 def warning(what: str, text: str) -> Finding:
     """Return a finding of a possible problem."""
-    return Finding(what, Verdict.WARNING, text)
+    return Finding(what, Severity.WARNING, text)
 
 
 def bad(what: str, text: str) -> Finding:
     """Return a finding of a failure."""
-    return Finding(what, Verdict.BAD, text)
+    return Finding(what, Severity.BAD, text)
 
 
 DURATION = 1.0
@@ -292,7 +292,7 @@ def check_interfaces(config: RobotConfig) -> Iterator[Finding]:
             yield warning(what, f"{bus.interface} {bus.channel}: the settings of its adapter cannot be read here.")
 
 
-def check_socketcan(what: str, bus: BusConfig, state: link.Link | None, commands: int) -> Iterator[Finding]:
+def check_socketcan(what: str, bus: BusConfig, state: link.Interface | None, commands: int) -> Iterator[Finding]:
     """Check a Linux CAN interface; `commands` frames are sent at once, in addition to the SYNC."""
     name = what.split()[-1]
     up = f"sudo ip link set {bus.channel} up type can bitrate {bus.bitrate} restart-ms 100"
@@ -327,7 +327,7 @@ def check_socketcan(what: str, bus: BusConfig, state: link.Link | None, commands
         yield warning(f"queue {name}", f"{state.queue} frames, and {commands + 2} are sent at once. `{more}`")
 
 
-def _controller(name: str, bus: BusConfig, state: link.Link) -> Iterator[Finding]:
+def _controller(name: str, bus: BusConfig, state: link.Interface) -> Iterator[Finding]:
     if not state.restart:
         yield warning(
             f"restart {name}",

@@ -15,7 +15,7 @@ _UP = 1
 
 
 @dataclass(frozen=True, slots=True)
-class Link:
+class Interface:
     """A network interface.
 
     Attributes:
@@ -39,7 +39,7 @@ class Link:
     queue: int | None = None
 
 
-def look_up(name: str) -> Link | None:
+def look_up(name: str) -> Interface | None:
     """Return an interface of this machine; None if it does not exist."""
     folder = NET / name
     if not folder.exists():
@@ -53,7 +53,7 @@ def look_up(name: str) -> Link | None:
         return _from_sys(name, folder)
 
 
-def parse(output: list[dict[str, Any]]) -> Link:
+def parse(output: list[dict[str, Any]]) -> Interface:
     """Parse the output of `ip -details -json link show dev NAME`.
 
     Raises:
@@ -63,7 +63,7 @@ def parse(output: list[dict[str, Any]]) -> Link:
     info = entry.get("linkinfo", {})
     data = info.get("info_data", {})
     restart = data.get("restart_ms", 0 if info.get("info_kind") == "can" else None)
-    return Link(
+    return Interface(
         name=entry["ifname"],
         is_can=entry.get("link_type") == "can",
         is_up="UP" in entry.get("flags", ()),
@@ -80,9 +80,9 @@ def known_links() -> list[str]:
     return sorted(folder.name for folder in NET.iterdir() if _number(folder / "type") == _ARPHRD_CAN)
 
 
-def _from_sys(name: str, folder: Path) -> Link:
+def _from_sys(name: str, folder: Path) -> Interface:
     flags = _number(folder / "flags") or 0
-    return Link(
+    return Interface(
         name, _number(folder / "type") == _ARPHRD_CAN, bool(flags & _UP), queue=_number(folder / "tx_queue_len")
     )
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from hal import registry
 from hal.calibration import store
-from hal.calibration.line import CalibrationRefused, Line
+from hal.calibration.line import CalibrationLine, CalibrationRefused
 from hal.calibration.store import Point, Record
 from hal.clock import SystemClock
 from hal.config import LimitConfig, RobotConfig
@@ -50,15 +50,15 @@ class Subject:
         """Unit of the element."""
         return self.config.signals[self.element.partition(".")[0]].unit
 
-    def in_force(self, identity: str) -> Line:
+    def in_force(self, identity: str) -> CalibrationLine:
         """Return the present zero and factor, from an earlier calibration of this very device or the robot file."""
         return self._line(self._measured(identity))
 
-    def _line(self, measured: Mapping[str, Any]) -> Line:
+    def _line(self, measured: Mapping[str, Any]) -> CalibrationLine:
         _, settings = registry.equipment(self.config, self.device, measured)
-        return Line(self._at(settings.zero, 0.0), self._at(getattr(settings, self.factor), 1.0), 0.0)
+        return CalibrationLine(self._at(settings.zero, 0.0), self._at(getattr(settings, self.factor), 1.0), 0.0)
 
-    def settings(self, line: Line, identity: str) -> dict[str, Any]:
+    def settings(self, line: CalibrationLine, identity: str) -> dict[str, Any]:
         """Return the settings that replace those of the robot file, so that the element follows a line.
 
         Raises:
@@ -85,7 +85,7 @@ class Subject:
         converted = limit.model_copy(update={"low": tuple(low.tolist()), "high": tuple(high.tolist())})
         return {**self.config.limits, signal: converted}
 
-    def wrap(self, line: Line) -> str:
+    def wrap(self, line: CalibrationLine) -> str:
         """Return a warning that an encoder of one turn would jump within the joint's limits; empty if it does not."""
         _, settings = registry.equipment(self.config, self.device)
         signal, _, element = self.element.partition(".")
@@ -274,11 +274,11 @@ class Measurement:
         return value
 
     @property
-    def now(self) -> Line:
+    def now(self) -> CalibrationLine:
         """Present zero and factor of the device that answered."""
         return self._what.in_force(self.identity)
 
-    def record(self, line: Line, points: tuple[Point, ...]) -> Record:
+    def record(self, line: CalibrationLine, points: tuple[Point, ...]) -> Record:
         """Return the sealed record to store.
 
         Raises:

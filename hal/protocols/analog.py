@@ -49,7 +49,7 @@ UNDERLOAD = 0x04
 
 
 @dataclass(frozen=True, slots=True)
-class Form:
+class ValueForm:
     """One form of a measured value in a CiA 404 device; the sub-index of its objects is the channel.
 
     Attributes:
@@ -66,11 +66,11 @@ class Form:
 
 
 FORMS = {
-    "float32": Form(Mapped(0x6130, 0, 32, "float")),
-    "int16": Form(Mapped(0x7130, 0, 16, "signed"), has_digits=True),
-    "int32": Form(Mapped(0x9130, 0, 32, "signed"), has_digits=True),
-    "counts16": Form(Mapped(0x7100, 0, 16, "signed"), has_unit=False),
-    "counts32": Form(Mapped(0x9100, 0, 32, "signed"), has_unit=False),
+    "float32": ValueForm(Mapped(0x6130, 0, 32, "float")),
+    "int16": ValueForm(Mapped(0x7130, 0, 16, "signed"), has_digits=True),
+    "int32": ValueForm(Mapped(0x9130, 0, 32, "signed"), has_digits=True),
+    "counts16": ValueForm(Mapped(0x7100, 0, 16, "signed"), has_unit=False),
+    "counts32": ValueForm(Mapped(0x9100, 0, 32, "signed"), has_unit=False),
 }
 """The process value in three types, and the field value: the converter's counts before any scaling."""
 

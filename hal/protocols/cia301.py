@@ -65,7 +65,7 @@ class NmtState(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Emergency:
+class EmergencyMessage:
     """The content of an emergency object.
 
     Attributes:
@@ -180,9 +180,9 @@ def nmt_state(data: bytes | bytearray) -> int | None:
     return data[0] & 0x7F if len(data) == 1 else None
 
 
-def emergency(data: bytes | bytearray) -> Emergency | None:
+def emergency(data: bytes | bytearray) -> EmergencyMessage | None:
     """Return the content of an emergency frame; None if the frame is not one."""
-    return Emergency(*_EMERGENCY.unpack(data)) if len(data) == _EMERGENCY.size else None
+    return EmergencyMessage(*_EMERGENCY.unpack(data)) if len(data) == _EMERGENCY.size else None
 
 
 def describe_emergency(code: int, register: int = 0, detail: bytes = b"") -> str:

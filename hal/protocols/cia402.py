@@ -51,7 +51,7 @@ QUICK_STOP_AND_OFF = 2
 """With this value of 605Ah a drive slows down on the quick stop ramp, then enters 'switch on disabled'."""
 
 
-class Mode(IntEnum):
+class OperationMode(IntEnum):
     """Modes of operation in use."""
 
     PROFILE_POSITION = 1
@@ -144,7 +144,7 @@ def state(statusword: int) -> State:
     return STATE_OF[statusword & 0x6F]
 
 
-def supports(modes: int, mode: Mode) -> bool:
+def supports(modes: int, mode: OperationMode) -> bool:
     """Return whether the drive has a mode, by its object 6502h."""
     return bool(modes >> (mode - 1) & 1)
 

@@ -136,7 +136,7 @@ def raw_bounds(signal: Signal) -> tuple[float, float]:
     return (max(low, min(stated)), min(high, max(stated))) if len(stated) == 2 else (low, high)
 
 
-class Reader:
+class SignalReader:
     """Reads signals from a message's data.
 
     Attributes:

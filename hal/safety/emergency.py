@@ -39,7 +39,7 @@ class DriveStop:
 
 
 @dataclass(frozen=True, slots=True)
-class Emergency:
+class StopResult:
     """Result of an emergency stop.
 
     Attributes:
@@ -92,7 +92,7 @@ class EmergencyStop:
         requests.join(REQUEST_TIME)
         return requests
 
-    def watch(self, requests: "Requests", cycles: Callable[[], int]) -> Emergency:
+    def watch(self, requests: "Requests", cycles: Callable[[], int]) -> StopResult:
         """Wait for the drives' reactions, and repeat the requests if the cycle is stuck.
 
         Args:
@@ -119,7 +119,7 @@ class EmergencyStop:
         text = "The HAL's cycle is stuck; the drives were stopped without it. Restart the HAL." if is_stuck else ""
         for stop in stops:
             log.log(logging.WARNING if stop.has_stopped else logging.CRITICAL, "'%s' %s", stop.device, stop.text)
-        return Emergency(stops, text)
+        return StopResult(stops, text)
 
     def _repeat(self, requests: "Requests", now: float) -> None:
         """Repeat, in place of the cycle, the control words and the SYNC that drives answer."""

@@ -26,7 +26,7 @@ heartbeats and boot-ups of nodes that are not in the robot file."""
 _WINDOW_FRAMES = round(BABBLE * WINDOW)
 
 
-class Route:
+class FrameRoute:
     """Handler and frame count of one identifier."""
 
     __slots__ = ("counted", "handler", "limit", "quiet", "seen")
@@ -43,7 +43,7 @@ class Routes:
     """Map from identifier to route, for subscribed identifiers and for strangers (identifiers without subscriber)."""
 
     def __init__(self, bus: str) -> None:
-        self.of: dict[int, Route] = {}
+        self.of: dict[int, FrameRoute] = {}
         """Routes by identifier; a 29-bit identifier has the bit `EXTENDED`."""
         self.window_end = 0.0
         self._bus = bus
@@ -63,14 +63,14 @@ class Routes:
         if present is not None and present.handler is not None:
             raise ConfigError(f"Two devices on bus '{self._bus}' use the identifier {identifier:03X}h.")
         self._strangers -= present is not None
-        self.of[key] = Route(handler)
+        self.of[key] = FrameRoute(handler)
 
-    def stranger(self, key: int) -> Route | None:
+    def stranger(self, key: int) -> FrameRoute | None:
         """Add an identifier without a subscriber and return its route; None if there are too many."""
         if self._strangers >= STRANGERS:
             return None
         self._strangers += 1
-        self.of[key] = route = Route(None)
+        self.of[key] = route = FrameRoute(None)
         return route
 
     def open_window(self, now: float) -> None:

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from hal.calibration import store
-from hal.calibration.line import CalibrationRefused, Line, cell_line, joint_line
+from hal.calibration.line import CalibrationLine, CalibrationRefused, cell_line, joint_line
 from hal.calibration.store import Point
 from hal.config import RobotConfig
 from hal.finding.measuring import Measurement, Subject, subject
@@ -76,7 +76,7 @@ def _calibrate(
     options: CalibrationOptions,
     noise: float,
     request: str,
-    fit: Callable[[Sequence[Point], Line], Line],
+    fit: Callable[[Sequence[Point], CalibrationLine], CalibrationLine],
 ) -> int:
     """Measure each point, fit the line, show and store it."""
     console = show.console()
@@ -114,7 +114,9 @@ def _known_values(item: Subject, options: CalibrationOptions, request: str) -> I
             typer.echo(f"'{answer}' is not a number.")
 
 
-def _show(console: Console, item: Subject, points: Sequence[Point], now: Line, line: Line) -> None:
+def _show(
+    console: Console, item: Subject, points: Sequence[Point], now: CalibrationLine, line: CalibrationLine
+) -> None:
     unit = item.unit
     table = Table(title=f"{item.element} [{unit}]".replace("[", r"\["), box=None, title_justify="left")
     for column in ("known", "reads now", "std", "samples", "will read", "residual"):

@@ -14,7 +14,7 @@ from rich.table import Table
 from hal.config import RobotConfig, load_robot
 from hal.errors import ConfigError
 from hal.finding import doctor
-from hal.finding.doctor import Finding, Verdict, bad, check_interfaces, ok, warning
+from hal.finding.doctor import Finding, Severity, bad, check_interfaces, ok, warning
 from services import show
 from services.client import Client
 from services.errors import AlreadyRunning, ServiceError
@@ -32,7 +32,7 @@ CONNECTS_WITHIN = 0.5
 """A new client sees running services within this time [s]."""
 LATE = 0.005
 """A p99 of the cycle's lateness above this value [s] is a warning."""
-_MARKS = {Verdict.OK: "[green]ok[/]", Verdict.WARNING: "[yellow]warning[/]", Verdict.BAD: "[bold red]bad[/]"}
+_MARKS = {Severity.OK: "[green]ok[/]", Severity.WARNING: "[yellow]warning[/]", Severity.BAD: "[bold red]bad[/]"}
 _LISTENING = {"tcp": "0A", "udp": "07"}
 """In /proc/net, a listening socket has this state."""
 
@@ -44,7 +44,7 @@ def run_doctor(robot: str, connect: Iterable[str] = ()) -> int:
         robot: Name or file.
         connect: Endpoints, such as a router's, and role files.
     """
-    counts = dict.fromkeys(Verdict, 0)
+    counts = dict.fromkeys(Severity, 0)
     console = show.console()
     for finding in _findings(robot, tuple(connect)):
         counts[finding.verdict] += 1
@@ -56,8 +56,8 @@ def run_doctor(robot: str, connect: Iterable[str] = ()) -> int:
             console.print(row)
         else:  # a table would wrap lines in a file or pipe
             print(f"{finding.verdict:<8} {finding.what:<24} {finding.text}")
-    console.print(f"{counts[Verdict.OK]} ok, {counts[Verdict.WARNING]} warnings, {counts[Verdict.BAD]} bad.")
-    return 1 if counts[Verdict.BAD] else 0
+    console.print(f"{counts[Severity.OK]} ok, {counts[Severity.WARNING]} warnings, {counts[Severity.BAD]} bad.")
+    return 1 if counts[Severity.BAD] else 0
 
 
 def _findings(robot: str, connect: tuple[str, ...]) -> Iterator[Finding]:
@@ -68,7 +68,7 @@ def _findings(robot: str, connect: tuple[str, ...]) -> Iterator[Finding]:
         return
     findings = list(doctor.check_file(config))
     yield from findings
-    is_sound = all(finding.what != "robot file" or finding.verdict is Verdict.OK for finding in findings)
+    is_sound = all(finding.what != "robot file" or finding.verdict is Severity.OK for finding in findings)
     if is_sound:
         yield from check_interfaces(config)
         yield from _devices(config, connect)

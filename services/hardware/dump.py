@@ -11,7 +11,7 @@ from rich.table import Table
 
 from hal.config import BusConfig, RobotConfig
 from hal.finding.book import Book, Frame
-from hal.finding.decode import Line, describe
+from hal.finding.decode import FrameText, describe
 from hal.finding.robot_book import books
 from hal.finding.tap import frames
 from services import show
@@ -38,7 +38,7 @@ class DumpOptions:
 class _Traffic:
     """Frames of one identifier: the last one, and counts."""
 
-    line: Line
+    line: FrameText
     frame: Frame
     kinds: Counter[str] = field(default_factory=Counter)
     count: int = 0
@@ -73,7 +73,7 @@ def run_dump(buses: Mapping[str, BusConfig], config: RobotConfig | None, options
     return 0
 
 
-def _line(bus: str, frame: Frame, line: Line, book: Book) -> str:
+def _line(bus: str, frame: Frame, line: FrameText, book: Book) -> str:
     seconds, fraction = divmod(frame.stamp, 1.0)
     clock = time.strftime("%H:%M:%S", time.localtime(seconds))
     width = 8 if frame.is_extended else 3
@@ -84,12 +84,12 @@ def _line(bus: str, frame: Frame, line: Line, book: Book) -> str:
     ).rstrip()
 
 
-def _node(line: Line, book: Book) -> str:
+def _node(line: FrameText, book: Book) -> str:
     """Return number and name of the node of a line; empty if it has no node."""
     return "" if line.node is None else f"{line.node} {book.names.get(line.node, '')}".strip()
 
 
-def _count(traffic: dict[tuple[str, int, bool], _Traffic], bus: str, frame: Frame, line: Line) -> None:
+def _count(traffic: dict[tuple[str, int, bool], _Traffic], bus: str, frame: Frame, line: FrameText) -> None:
     key = (bus, frame.identifier, frame.is_extended)
     entry = traffic.setdefault(key, _Traffic(line, frame))
     entry.line, entry.frame = line, frame

@@ -11,7 +11,7 @@ from hal.clock import Clock
 from hal.config import RobotConfig
 from services.errors import CommandHeld, NotEngaged, TargetRefused, TooLate
 from services.model.control_config import ControlConfig
-from services.model.estimation import Estimation, Newest
+from services.model.estimation import Estimation, SampleSource
 from services.wire.messages import Applied, Command, Sample, Target
 from services.wire.plain_text import shown
 from services.wire.streams import Arrival
@@ -64,7 +64,7 @@ class Control:
         self,
         robot: RobotConfig,
         config: ControlConfig,
-        newest: Newest,
+        newest: SampleSource,
         applied: Callable[[], Applied | None],
         estimation: Estimation,
         solver: Solver,

@@ -17,7 +17,7 @@ from services.model.living_model import layout_of
 from services.wire.messages import Estimates, Sample
 from services.wire.streams import Arrival
 
-Newest = Callable[[], Arrival[Sample] | None]
+SampleSource = Callable[[], Arrival[Sample] | None]
 """A function of this type returns the newest sample, of any age."""
 
 
@@ -32,9 +32,9 @@ class Freshness:
     def __init__(
         self,
         robot: RobotConfig,
-        newest: Newest,
+        newest: SampleSource,
         clock: Clock,
-        seen: Newest | None = None,
+        seen: SampleSource | None = None,
         names: Iterable[str] = (),
     ) -> None:
         """Prepare for the model's signals.

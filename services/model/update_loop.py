@@ -28,7 +28,7 @@ Values = Mapping[str, np.ndarray]
 """Signal -> value [its unit], shape (n,)."""
 
 
-class Learner(Protocol):
+class BodyUpdater(Protocol):
     """An updater of p and W with its own window (`gemuco.adaption.update.Updater`)."""
 
     schema: BodySchema
@@ -54,7 +54,7 @@ class OnlineUpdate:
         freshness: Freshness,
         living: LivingModel,
         config: UpdateConfig,
-        learner: Callable[[BodySchema], Learner],
+        learner: Callable[[BodySchema], BodyUpdater],
         is_engaged: Callable[[], bool],
         publish: Callable[[Update], None],
         clock: Clock,
@@ -79,7 +79,7 @@ class OnlineUpdate:
         self._is_engaged = is_engaged
         self._make_learner, self._publish, self._clock = learner, publish, clock
         self._lock = threading.Lock()
-        self._learner: Learner | None = None
+        self._learner: BodyUpdater | None = None
         self._since_change: deque[Values] = deque(maxlen=config.window)
         self._last: np.ndarray | None = None
         self._awaits_first = False
@@ -179,7 +179,7 @@ class OnlineUpdate:
         self._awaits_first, self._last, self._taken_at = False, row, now
         return values, moved
 
-    def _learn(self, learner: Learner, sample: Values | None) -> Update:
+    def _learn(self, learner: BodyUpdater, sample: Values | None) -> Update:
         if sample is not None:
             learner.add(sample)
         result = learner.step()

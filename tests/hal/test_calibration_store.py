@@ -9,7 +9,7 @@ import yaml
 from hal_bench import ROBOTS, BenchWorld, description, hardware
 
 from hal.calibration import store
-from hal.calibration.line import CalibrationRefused, Line, cell_line, joint_line
+from hal.calibration.line import CalibrationLine, CalibrationRefused, cell_line, joint_line
 from hal.calibration.store import Point, Record
 from hal.clock import SystemClock
 from hal.config import RobotConfig
@@ -288,10 +288,10 @@ def test_another_device_in_the_place_of_the_one_that_was_calibrated_is_refused(c
 def test_an_encoder_that_would_begin_again_within_the_limits_is_told(config):
     limits = {**description()["limits"], "joint_position": {"low": -1.0, "high": 1.0}}
     what = subject(RobotConfig.model_validate(description(limits=limits)), "elbow_encoder", "direction")
-    assert "begin again at 0.5 rad" in what.wrap(Line(0.5, 1, 0.0))
-    assert "`around: 0`" in what.wrap(Line(0.5, -1, 0.0))
-    assert not what.wrap(Line(-3.0, 1, 0.0))
-    assert not subject(config, "elbow_encoder", "direction").wrap(Line(0.5, 1, 0.0))  # it has no limits
+    assert "begin again at 0.5 rad" in what.wrap(CalibrationLine(0.5, 1, 0.0))
+    assert "`around: 0`" in what.wrap(CalibrationLine(0.5, -1, 0.0))
+    assert not what.wrap(CalibrationLine(-3.0, 1, 0.0))
+    assert not subject(config, "elbow_encoder", "direction").wrap(CalibrationLine(0.5, 1, 0.0))  # it has no limits
 
 
 def test_limits_are_turned_into_what_the_device_reads():

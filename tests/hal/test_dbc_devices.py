@@ -11,7 +11,7 @@ from hal.config import BusConfig
 from hal.device import DeviceState
 from hal.drivers.can_device import Place
 from hal.drivers.dbc.sensor import DbcNode
-from hal.drivers.dbc.sequence import Address, Inbox, Run, compile_steps
+from hal.drivers.dbc.sequence import Address, Inbox, SequenceRun, compile_steps
 from hal.drivers.dbc.servo import DbcServo
 from hal.drivers.dbc.settings import DbcSettings, ServoSettings, StepConfig
 from hal.errors import CommandRefused, ConfigError
@@ -266,7 +266,7 @@ def test_raw_frames(inbox):
 
 def test_steps_go_on_when_they_are_confirmed_by_something_new(inbox):
     on = {"signal": "Status.Mode", "equals": "ON", "within": 1.0}
-    run = Run("test", steps(inbox, {"send": "Go", "until": on}, {"frame": {"id": 1}}), 200.0)
+    run = SequenceRun("test", steps(inbox, {"send": "Go", "until": on}, {"frame": {"id": 1}}), 200.0)
     sent: list[can.Message] = []
     hear(inbox, 1)
     for _ in range(10):
@@ -285,14 +285,14 @@ def test_a_step_that_is_not_confirmed_is_sent_again_and_then_given_up(inbox):
     on = {"signal": "Status.Mode", "one_of": ["ON", "BUSY"], "within": 0.5}
     compiled = steps(inbox, {"send": "Go", "values": {"Mode": "ON"}, "until": on}, {"frame": {"id": 1}})
     for goes_on, frames in ((False, 3), (True, 4)):
-        run = Run("test", compiled, 200.0, goes_on)
+        run = SequenceRun("test", compiled, 200.0, goes_on)
         sent: list[can.Message] = []
         for _ in range(110):
             hear(inbox, 0)
             run.advance(sent.append)
         assert len(sent) == frames
         assert run.is_over
-    failed = Run("test", compiled, 200.0)
+    failed = SequenceRun("test", compiled, 200.0)
     while not failed.is_over:
         failed.advance(lambda frame: True)
     assert failed.failure == "after Go ON it does not report Status.Mode ON or BUSY, but off"
@@ -300,7 +300,7 @@ def test_a_step_that_is_not_confirmed_is_sent_again_and_then_given_up(inbox):
 
 def test_a_step_that_is_not_needed_is_left_out(inbox):
     off = {"signal": "Status.Mode", "equals": "OFF"}
-    run = Run("test", steps(inbox, {"send": "Go", "unless": off}), 200.0)
+    run = SequenceRun("test", steps(inbox, {"send": "Go", "unless": off}), 200.0)
     sent: list[can.Message] = []
     hear(inbox, 0)
     run.advance(sent.append)
@@ -350,7 +350,7 @@ def sent_in(run, cycles, report=None):
 
 def test_a_step_is_sent_again_every_02_s_and_fails_after_its_time(inbox):
     on = {"signal": "Status.Mode", "equals": "ON", "within": 0.5}
-    run = Run("test", steps(inbox, {"send": "Go", "until": on}), 200.0)
+    run = SequenceRun("test", steps(inbox, {"send": "Go", "until": on}), 200.0)
     assert not run.has_sent_last
     assert sent_in(run, 1) == [1]
     assert run.has_sent_last
@@ -363,7 +363,7 @@ def test_a_step_is_sent_again_every_02_s_and_fails_after_its_time(inbox):
 
 def test_a_step_ends_in_the_cycle_of_its_confirmation(inbox):
     on = {"signal": "Status.Mode", "equals": "ON", "within": 0.5}
-    run = Run("test", steps(inbox, {"send": "Go", "until": on}, {"send": "Go"}, {"until": on}), 200.0)
+    run = SequenceRun("test", steps(inbox, {"send": "Go", "until": on}, {"send": "Go"}, {"until": on}), 200.0)
     assert sent_in(run, 5, lambda cycle: hear(inbox, int(cycle >= 3))) == [1, 4]
     assert not run.is_over
     assert run.failure == ""

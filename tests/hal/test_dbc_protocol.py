@@ -71,7 +71,7 @@ def test_reads_what_cantools_reads(mixed):
     compiled = 0
     for _, message in every_message(mixed):
         for names in [[s.name for s in message.signals], *([s.name] for s in message.signals)]:
-            reader = dbc.Reader(message, names)
+            reader = dbc.SignalReader(message, names)
             compiled += reader.is_compiled
             for _ in range(20):
                 data = chance.randbytes(message.length)
@@ -90,7 +90,7 @@ def test_writes_what_cantools_reads_back(mixed):
         for signal in message.signals:
             others = {"Page": int(signal.name == "Heat")} if message.name == "Muxed" else {}
             writer = dbc.Writer(file, message, others, signal.name)
-            reader = dbc.Reader(message, [signal.name])
+            reader = dbc.SignalReader(message, [signal.name])
             low, high = writer.bounds
             for _ in range(10):
                 raw = chance.uniform(max(low, -1e4), min(high, 1e4))
@@ -111,7 +111,7 @@ def test_what_does_not_fit_is_held_at_the_nearest(mixed):
     real = dbc.load(FILES / "odrive_cansimple.dbc")
     writer = dbc.Writer(real, real.message("Set_Input_Pos"), {}, "Input_Pos")
     writer.write(1e300)
-    assert math.isfinite(dbc.Reader(real.message("Set_Input_Pos"), ["Input_Pos"]).read(writer.data)[0])
+    assert math.isfinite(dbc.SignalReader(real.message("Set_Input_Pos"), ["Input_Pos"]).read(writer.data)[0])
 
 
 def test_whole_bytes_and_whole_numbers_need_no_cantools(mixed):
@@ -126,11 +126,11 @@ def test_whole_bytes_and_whole_numbers_need_no_cantools(mixed):
         ("Words", ["First", "Second"], True),
         ("Wide", ["Count"], True),
     ):
-        assert dbc.Reader(mixed.message(name), signals).is_compiled is is_compiled, (name, signals)
+        assert dbc.SignalReader(mixed.message(name), signals).is_compiled is is_compiled, (name, signals)
 
 
 def test_a_page_that_does_not_carry_a_signal_is_no_value(mixed):
-    reader = dbc.Reader(mixed.message("Muxed"), ["Speed", "Heat"])
+    reader = dbc.SignalReader(mixed.message("Muxed"), ["Speed", "Heat"])
     speed, heat = reader.read(bytes.fromhex("00 0A 00 00 00 00 00 00"))
     assert speed == 10
     assert math.isnan(heat)
@@ -239,7 +239,7 @@ def test_a_value_that_does_not_fit(mixed, name, value):
 )
 def test_frames_written_out_by_hand(mixed, message, data, values):
     for names in (list(values), *([name] for name in values)):
-        reader = dbc.Reader(mixed.message(message), names)
+        reader = dbc.SignalReader(mixed.message(message), names)
         found = dict(zip(reader.names, reader.read(bytes.fromhex(data)), strict=True))
         assert found == {name: values[name] for name in names}
 

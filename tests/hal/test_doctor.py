@@ -10,8 +10,8 @@ from hal.calibration import store
 from hal.calibration.store import Point, Record
 from hal.config import BusConfig, RobotConfig
 from hal.finding import doctor
-from hal.finding.doctor import Verdict, check_interfaces, check_socketcan
-from hal.finding.link import Link, look_up, parse
+from hal.finding.doctor import Severity, check_interfaces, check_socketcan
+from hal.finding.link import Interface, look_up, parse
 from simulators.rig import Rig
 
 SHOWN = {
@@ -50,7 +50,7 @@ def test_a_robot_that_is_well():
     with running() as (config, _):
         for _ in range(5):  # this machine may be too busy for the nodes to answer in time
             found = by_what([*doctor.check_file(config), *doctor.check_devices(config, 0.2)])
-            bad = [finding for finding in found.values() if finding.verdict is Verdict.BAD]
+            bad = [finding for finding in found.values() if finding.verdict is Severity.BAD]
             if not bad:
                 break
     assert not bad
@@ -71,7 +71,7 @@ def test_a_node_without_power_is_told_and_the_others_are_looked_at():
     with running() as (config, rig):
         rig.fault("node_silent triceps_cell")
         found = by_what(doctor.check_devices(config, 0.1))
-    assert found["node triceps_cell"].verdict is Verdict.BAD
+    assert found["node triceps_cell"].verdict is Severity.BAD
     assert "Is it powered" in found["node triceps_cell"].text
     assert found["nodes"].text == "4 of 5 answer."
     assert found["PDO mapping"].text == "Correct in 4 devices."
@@ -91,14 +91,14 @@ def test_what_somebody_else_changed_in_a_node_is_told():
             found[finding.what] = finding
             if finding.what == "nodes":
                 rig.node("elbow_encoder").objects.values[0x1017, 0] = 1000
-    assert found["heartbeat elbow_encoder"].verdict is Verdict.BAD
+    assert found["heartbeat elbow_encoder"].verdict is Severity.BAD
     assert "1000 ms" in found["heartbeat elbow_encoder"].text
 
 
 def test_a_simulator_that_does_not_run():
     config = RobotConfig.model_validate(description(interface="hub"))
     found = by_what(doctor.check_devices(config, 0.1))
-    assert found["bus can0"].verdict is Verdict.BAD
+    assert found["bus can0"].verdict is Severity.BAD
     assert "Start `gemuco simulate`" in found["bus can0"].text
     assert found["nodes"].text.startswith("0 of 5 answer")
 
@@ -107,7 +107,7 @@ def test_a_robot_file_that_cannot_be_built():
     body = description()
     body["kinds"]["drive"]["settings"] = {**body["kinds"]["drive"]["settings"], "gear": 0}
     found = list(doctor.check_file(RobotConfig.model_validate(body)))
-    assert [(finding.what, finding.verdict) for finding in found] == [("robot file", Verdict.BAD)]
+    assert [(finding.what, finding.verdict) for finding in found] == [("robot file", Severity.BAD)]
     assert "gear" in found[0].text
 
 
@@ -131,7 +131,7 @@ def with_a_record(folder, **changes):
 
 def test_a_calibration_that_holds(tmp_path):
     found = doctor.check_calibration(with_a_record(tmp_path))
-    assert found.verdict is Verdict.OK
+    assert found.verdict is Severity.OK
     assert "1 devices, the oldest of 20" in found.text
 
 
@@ -141,20 +141,20 @@ def test_a_calibration_that_does_not_hold_is_told_and_the_devices_are_looked_at(
     rig = Rig(config, BenchWorld(), hardware())
     rig.start()
     try:
-        assert by_what(doctor.check_devices(config, 0.1))["nodes"].verdict is Verdict.OK
+        assert by_what(doctor.check_devices(config, 0.1))["nodes"].verdict is Severity.OK
     finally:
         rig.stop()
 
 
 def test_a_device_that_cannot_tell_who_it_is(tmp_path):
     found = doctor.check_calibration(with_a_record(tmp_path, identity=""))
-    assert found.verdict is Verdict.WARNING
+    assert found.verdict is Severity.WARNING
     assert "elbow_encoder have no identity" in found.text
 
 
 def test_devices_on_real_buses_without_a_calibration_are_told():
     found = doctor.check_calibration(RobotConfig.model_validate(description(interface="socketcan")))
-    assert found.verdict is Verdict.WARNING
+    assert found.verdict is Severity.WARNING
     assert "biceps_drive, triceps_drive" in found.text and "gemuco calibrate" in found.text
 
 
@@ -170,9 +170,9 @@ def test_a_replaced_device_is_told(tmp_path):
 
 
 def test_what_ip_prints_is_read():
-    assert parse([{}, SHOWN]) == Link("can0", True, True, "can", 500000, 0.1, "ERROR-ACTIVE", 10)
+    assert parse([{}, SHOWN]) == Interface("can0", True, True, "can", 500000, 0.1, "ERROR-ACTIVE", 10)
     virtual = {**SHOWN, "ifname": "vcan0", "linkinfo": {"info_kind": "vcan"}}
-    assert parse([virtual]) == Link("vcan0", True, True, "vcan", None, None, "", 10)
+    assert parse([virtual]) == Interface("vcan0", True, True, "vcan", None, None, "", 10)
     with pytest.raises(LookupError):
         parse([])
 
@@ -180,19 +180,19 @@ def test_what_ip_prints_is_read():
 @pytest.mark.parametrize(
     ("changes", "what", "verdict", "said"),
     [
-        ({}, "interface can0", Verdict.OK, "is up"),
-        ({"is_up": False}, "interface can0", Verdict.BAD, "type can bitrate 1000000 restart-ms 100"),
-        ({"is_can": False}, "interface can0", Verdict.BAD, "not a CAN interface"),
-        ({"bitrate": 500000}, "bit rate can0", Verdict.BAD, "500000 bit/s, and the robot file says 1000000"),
-        ({"restart": 0.0}, "restart can0", Verdict.WARNING, "stays off after bus-off"),
-        ({"state": "ERROR-PASSIVE"}, "controller can0", Verdict.WARNING, "terminations"),
-        ({"state": "BUS-OFF"}, "controller can0", Verdict.BAD, "terminations"),
-        ({"queue": 3}, "queue can0", Verdict.WARNING, "txqueuelen"),
-        ({"kind": "vcan", "bitrate": None, "restart": None}, "interface can0", Verdict.OK, "vcan"),
+        ({}, "interface can0", Severity.OK, "is up"),
+        ({"is_up": False}, "interface can0", Severity.BAD, "type can bitrate 1000000 restart-ms 100"),
+        ({"is_can": False}, "interface can0", Severity.BAD, "not a CAN interface"),
+        ({"bitrate": 500000}, "bit rate can0", Severity.BAD, "500000 bit/s, and the robot file says 1000000"),
+        ({"restart": 0.0}, "restart can0", Severity.WARNING, "stays off after bus-off"),
+        ({"state": "ERROR-PASSIVE"}, "controller can0", Severity.WARNING, "terminations"),
+        ({"state": "BUS-OFF"}, "controller can0", Severity.BAD, "terminations"),
+        ({"queue": 3}, "queue can0", Severity.WARNING, "txqueuelen"),
+        ({"kind": "vcan", "bitrate": None, "restart": None}, "interface can0", Severity.OK, "vcan"),
     ],
 )
 def test_a_linux_interface(changes, what, verdict, said):
-    sound = Link("can0", True, True, "can", 1_000_000, 0.1, "ERROR-ACTIVE", 100)
+    sound = Interface("can0", True, True, "can", 1_000_000, 0.1, "ERROR-ACTIVE", 100)
     found = by_what(check_socketcan("interface can0", CAN0, replace(sound, **changes), 5))
     assert found[what].verdict is verdict
     assert said in found[what].text
@@ -201,12 +201,12 @@ def test_a_linux_interface(changes, what, verdict, said):
 def test_an_interface_that_is_not_there():
     assert look_up("can_that_is_not") is None
     (found,) = check_socketcan("interface can0", CAN0, None, 5)
-    assert found.verdict is Verdict.BAD
+    assert found.verdict is Severity.BAD
     assert "CAN interfaces here:" in found.text
 
 
 def test_interfaces_that_are_no_hardware_say_so():
     told = verdicts(check_interfaces(RobotConfig.model_validate(description())))
-    assert told == {"interface can0": Verdict.WARNING, "interface can1": Verdict.WARNING}
+    assert told == {"interface can0": Severity.WARNING, "interface can1": Severity.WARNING}
     told = verdicts(check_interfaces(RobotConfig.model_validate(description(interface="hub"))))
-    assert set(told.values()) == {Verdict.OK}
+    assert set(told.values()) == {Severity.OK}

@@ -4,10 +4,10 @@ import pytest
 from drive_bench import JointBench
 
 from hal.drivers.cia402.modes import HomingRun, SetPointHandshake
-from hal.protocols.cia402 import Mode, State
+from hal.protocols.cia402 import OperationMode, State
 
 ON, OFF = State.OPERATION_ENABLED, State.READY_TO_SWITCH_ON
-OWN, HOMING = Mode.CYCLIC_SYNCHRONOUS_POSITION, Mode.HOMING
+OWN, HOMING = OperationMode.CYCLIC_SYNCHRONOUS_POSITION, OperationMode.HOMING
 ENABLED, START = 0x0F, 0x1F
 FOUND, PART, ERROR = 0x1437, 0x1037, 0x2437
 """Statuswords: homing attained and target reached, only attained, and a homing error."""

@@ -71,7 +71,9 @@ def test_an_upload_takes_any_answer_and_ends():
 @pytest.mark.parametrize("name", ["odrive_cansimple", "load_cell"])
 def test_a_dbc_reader_takes_any_bytes_of_its_length(name):
     file = dbc.load(ROBOTS / "dbc" / f"{name}.dbc")
-    readers = [dbc.Reader(message, [s.name for s in message.signals]) for message in file.messages if message.signals]
+    readers = [
+        dbc.SignalReader(message, [s.name for s in message.signals]) for message in file.messages if message.signals
+    ]
     draw = random.Random(3)
     for reader in itertools.islice(itertools.cycle(readers), BYTES):
         found = reader.read(draw.randbytes(reader.size))

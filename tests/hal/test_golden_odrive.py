@@ -81,7 +81,7 @@ def test_command_numbers():
 )
 def test_what_an_axis_says(signal, data, value):
     message, found = FILE.signal(signal)
-    assert dbc.Reader(message, [found.name]).read(bytes.fromhex(data)) == (value,)
+    assert dbc.SignalReader(message, [found.name]).read(bytes.fromhex(data)) == (value,)
 
 
 def test_errors_and_states_by_number():

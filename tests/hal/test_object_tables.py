@@ -109,7 +109,7 @@ def test_bits_of_controlword_and_statusword():
     assert (cia402.WARNING, cia402.REMOTE, cia402.TARGET_REACHED) == (0x0080, 0x0200, 0x0400)
     assert (cia402.SET_POINT_TAKEN, cia402.HOMING_ATTAINED, cia402.HOMING_ERROR) == (0x1000, 0x1000, 0x2000)
     assert (cia402.ABORT_QUICK_STOP, cia402.QUICK_STOP_AND_OFF, cia402.PROFILE) == (3, 2, 402)
-    assert sorted(cia402.Mode) == [1, 6, 8, 9, 10]
+    assert sorted(cia402.OperationMode) == [1, 6, 8, 9, 10]
 
 
 @pytest.mark.parametrize(

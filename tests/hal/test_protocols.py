@@ -34,7 +34,7 @@ def test_heartbeat(frame, state):
 
 def test_emergency():
     heartbeat_lost = cia301.emergency(bytes.fromhex("30 81 11 01 02 03 04 05"))
-    assert heartbeat_lost == cia301.Emergency(0x8130, 0x11, bytes((1, 2, 3, 4, 5)))
+    assert heartbeat_lost == cia301.EmergencyMessage(0x8130, 0x11, bytes((1, 2, 3, 4, 5)))
     assert cia301.describe_emergency(0x8130) == "communication: life guard or heartbeat error (8130h)"
     assert cia301.describe_emergency(0x4310) == "temperature (4310h)"
     assert cia301.describe_emergency(0x0700) == "unknown family (0700h)"

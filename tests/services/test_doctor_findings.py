@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from hal.finding.doctor import Verdict
+from hal.finding.doctor import Severity
 from services.hardware import doctor, host_checks
 from services.security.init import init, placed
 from services.security.plan import InstallationPlan
@@ -26,7 +26,7 @@ FACTS = {
 LOOP = {"rate": 200.0, "rate_wanted": 200.0, "late_p99": 0.0002}
 
 
-def told(**changes: object) -> dict[str, tuple[Verdict, str]]:
+def told(**changes: object) -> dict[str, tuple[Severity, str]]:
     loops = {"hal": {**LOOP, **changes.pop("loop", {})}}  # type: ignore[dict-item]
     status = Status(service="hal", state="running", loops=loops, facts={**FACTS, **changes})
     return {found.what: (found.verdict, found.text) for found in doctor.from_status(status)}
@@ -34,25 +34,25 @@ def told(**changes: object) -> dict[str, tuple[Verdict, str]]:
 
 def test_a_hal_that_is_well() -> None:
     found = told()
-    assert {verdict for verdict, _ in found.values()} == {Verdict.OK}
+    assert {verdict for verdict, _ in found.values()} == {Severity.OK}
     assert "All 2 answer" in found["nodes"][1]
 
 
 @pytest.mark.parametrize(
     ("changes", "what", "verdict", "said"),
     [
-        ({"fault": "The elbow is stuck."}, "fault", Verdict.BAD, "stuck"),
-        ({"buses": {"can0": {**BUS, "state": "passive", "text": "Check wiring."}}}, "bus can0", Verdict.BAD, "wiring"),
-        ({"buses": {"can0": {**BUS, "state": "warning", "text": "Hm."}}}, "bus can0", Verdict.WARNING, "Hm."),
-        ({"buses": {"can0": {**BUS, "unknown": ["node 33"]}}}, "unknown nodes can0", Verdict.WARNING, "node 33"),
-        ({"devices": {"elbow": {**DEVICE, "state": "silent", "text": "Gone."}}}, "node elbow", Verdict.BAD, "Gone."),
-        ({"devices": {"elbow": {**DEVICE, "text": "Warm."}}}, "node elbow", Verdict.WARNING, "Warm."),
-        ({"incomplete": 100}, "cycles", Verdict.WARNING, "90.0% of 1000 cycles"),
-        ({"loop": {"late_p99": 0.02}}, "cycle time", Verdict.WARNING, "Is this machine busy?"),
-        ({"limits": "Blind."}, "limits", Verdict.WARNING, "Blind."),
+        ({"fault": "The elbow is stuck."}, "fault", Severity.BAD, "stuck"),
+        ({"buses": {"can0": {**BUS, "state": "passive", "text": "Check wiring."}}}, "bus can0", Severity.BAD, "wiring"),
+        ({"buses": {"can0": {**BUS, "state": "warning", "text": "Hm."}}}, "bus can0", Severity.WARNING, "Hm."),
+        ({"buses": {"can0": {**BUS, "unknown": ["node 33"]}}}, "unknown nodes can0", Severity.WARNING, "node 33"),
+        ({"devices": {"elbow": {**DEVICE, "state": "silent", "text": "Gone."}}}, "node elbow", Severity.BAD, "Gone."),
+        ({"devices": {"elbow": {**DEVICE, "text": "Warm."}}}, "node elbow", Severity.WARNING, "Warm."),
+        ({"incomplete": 100}, "cycles", Severity.WARNING, "90.0% of 1000 cycles"),
+        ({"loop": {"late_p99": 0.02}}, "cycle time", Severity.WARNING, "Is this machine busy?"),
+        ({"limits": "Blind."}, "limits", Severity.WARNING, "Blind."),
     ],
 )
-def test_a_hal_that_is_not(changes: dict[str, object], what: str, verdict: Verdict, said: str) -> None:
+def test_a_hal_that_is_not(changes: dict[str, object], what: str, verdict: Severity, said: str) -> None:
     found = told(**changes)
     assert found[what][0] is verdict
     assert said in found[what][1]
@@ -79,14 +79,14 @@ def test_role_files_are_checked_for_their_expiry(tmp_path: Path) -> None:
     folder, home = tmp_path / "keys", placed("127.0.0.1")
     init(folder, InstallationPlan(routers=["127.0.0.1"], robots={"a": home}, days=400))
     viewer = folder / "viewer.json"
-    assert [found.verdict for found in doctor.role_files([str(viewer)])] == [Verdict.OK]
+    assert [found.verdict for found in doctor.role_files([str(viewer)])] == [Severity.OK]
     viewer.chmod(0o644)
-    assert [found.verdict for found in doctor.role_files([str(viewer)])] == [Verdict.OK, Verdict.BAD]
+    assert [found.verdict for found in doctor.role_files([str(viewer)])] == [Severity.OK, Severity.BAD]
     init(tmp_path / "soon", InstallationPlan(routers=["127.0.0.1"], robots={"a": home}, days=9))
     (found,) = doctor.role_files([str(tmp_path / "soon" / "viewer.json")])
-    assert found.verdict is Verdict.WARNING
+    assert found.verdict is Severity.WARNING
     assert "in 8 days" in found.text
     (found,) = doctor.role_files([str(tmp_path / "none.json"), "tcp/127.0.0.1:7447"])
-    assert found.verdict is Verdict.BAD
+    assert found.verdict is Severity.BAD
     assert "cannot be read" in found.text
     assert not list(doctor.role_files(["tcp/127.0.0.1:7447"]))

@@ -297,11 +297,11 @@ class Preset:
     """Properties of an amplifier that a robot file selects by a name.
 
     Attributes:
-        form: Form of its measured value.
+        form: ValueForm of its measured value.
         unit: Unit of its numbers; None: read from the device (6131h).
     """
 
-    form: analog.Form
+    form: analog.ValueForm
     unit: str | None = None
 
 

@@ -18,7 +18,7 @@ from hal.device import Check
 from hal.drivers.can_device import CanDevice, DeviceSettings, Place
 from hal.errors import ConfigError, DeviceRefused, HalError
 from hal.protocols import cia301
-from hal.protocols.cia301 import Emergency, Mapped, NmtCommand, NmtState
+from hal.protocols.cia301 import EmergencyMessage, Mapped, NmtCommand, NmtState
 from hal.wire.bus import Handler
 
 log = logging.getLogger(__name__)
@@ -90,7 +90,7 @@ class CanopenNode(CanDevice):
         self._pdos = pdos
         check_map(self._pdos, sheet, str(place))
         self._sdo = SdoClient(place.bus, place.node, sheet, str(place))
-        self._emergency: Emergency | None = None
+        self._emergency: EmergencyMessage | None = None
         self._started = threading.Event()
         self._beat_due = math.inf
         self._beat_patience = max(BEATS_FORGIVEN * HEARTBEAT_TIME, settings.silent_after)
@@ -277,7 +277,7 @@ class CanopenNode(CanDevice):
                 log.warning("%s reports %s", self._place, _describe(emergency))
 
 
-def _describe(emergency: Emergency) -> str:
+def _describe(emergency: EmergencyMessage) -> str:
     return cia301.describe_emergency(emergency.code, emergency.register, emergency.detail)
 
 

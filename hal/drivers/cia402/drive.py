@@ -20,13 +20,13 @@ from hal.drivers.cia402.writes import Write, check_objects, drive_writes
 from hal.errors import CommandRefused, ConfigError, DeviceRefused
 from hal.protocols import cia301, cia402
 from hal.protocols.cia301 import Mapped
-from hal.protocols.cia402 import Mode, State, VelocityUnit
+from hal.protocols.cia402 import OperationMode, State, VelocityUnit
 from hal.wire.bus import Bus
 
 UNWATCHED = "{} does not detect the loss of the HAL (no 1016h)."
 
 
-def drive_checks(sdo: SdoClient, mode: Mode, is_watched: bool, label: str) -> Iterator[Check]:
+def drive_checks(sdo: SdoClient, mode: OperationMode, is_watched: bool, label: str) -> Iterator[Check]:
     """Check the mode of the drive, and yield failed checks for objects that its data sheet lacks.
 
     Args:
@@ -100,7 +100,7 @@ RESET_PERIOD = 4
 """A fault reset has one rising edge in this number of cycles."""
 STOPPING = 0.8
 """After this time [s] for a quick stop, or for slowing down, the drive is powered off."""
-RAMPED = (Mode.PROFILE_POSITION, Mode.CYCLIC_SYNCHRONOUS_VELOCITY)
+RAMPED = (OperationMode.PROFILE_POSITION, OperationMode.CYCLIC_SYNCHRONOUS_VELOCITY)
 """In these modes a drive may move when it is disabled, so it slows down first."""
 ANSWER_TIME = 1.0
 """`health` warns if a drive takes longer than this time [s] to acknowledge a set-point."""
@@ -188,7 +188,7 @@ class Cia402Drive(CanopenNode):
         if not self._sdo.has(cia402.SUPPORTED_MODES.index):
             return
         modes = self._sdo.read(cia402.SUPPORTED_MODES.index, 0)
-        for mode in (self._mode, *((Mode.HOMING,) if self._settings.homing else ())):
+        for mode in (self._mode, *((OperationMode.HOMING,) if self._settings.homing else ())):
             if not cia402.supports(modes, mode):
                 raise DeviceRefused(
                     f"{self._place} does not have the mode {cia402.describe_mode(mode)}. By its object 6502h it has "
@@ -335,7 +335,7 @@ class Cia402Drive(CanopenNode):
         if not self._leads_to_enabled(target if self.command_quantity == "position" else 0):
             return
         bits = 0
-        if self._mode is Mode.PROFILE_POSITION:
+        if self._mode is OperationMode.PROFILE_POSITION:
             bits, target = self._handshake.step(target, self._statusword)
         self._send(cia402.ENABLE_OPERATION | bits, target, self._mode)
 
@@ -407,14 +407,14 @@ class Cia402Drive(CanopenNode):
         if not homing.problem:
             self._counters["homed"] += 1
 
-    def _homing_mode(self) -> Mode:
-        return self._mode if self._homing is None else Mode.HOMING
+    def _homing_mode(self) -> OperationMode:
+        return self._mode if self._homing is None else OperationMode.HOMING
 
     def _rest(self) -> int:
         """Return a target that does not move the drive: its position, or zero velocity or torque."""
         return (self._counts or 0) if self.command_quantity == "position" else 0
 
-    def _send(self, word: int, target: int, mode: Mode) -> None:
+    def _send(self, word: int, target: int, mode: OperationMode) -> None:
         """Send the command, if the drive has reported its state and position since it was commissioned."""
         has_reported = self._statusword >= 0 and (self._counts is not None or self.command_quantity != "position")
         if self.is_commissioned and has_reported:

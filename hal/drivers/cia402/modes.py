@@ -3,7 +3,7 @@
 from enum import StrEnum
 
 from hal.protocols import cia402
-from hal.protocols.cia402 import Mode, State
+from hal.protocols.cia402 import OperationMode, State
 
 IGNORED = 5
 """In this number of cycles after the start of homing its status bits may still be old."""
@@ -49,7 +49,7 @@ class _Phase(StrEnum):
 class HomingRun:
     """One homing run, which begins and ends with a drive without power."""
 
-    def __init__(self, own_mode: Mode, longest: int) -> None:
+    def __init__(self, own_mode: OperationMode, longest: int) -> None:
         """Begin.
 
         Args:
@@ -75,7 +75,7 @@ class HomingRun:
         if self._phase is not _Phase.LEAVE:
             self.problem, self._phase = reason, _Phase.LEAVE
 
-    def step(self, state: State, statusword: int, mode: int) -> tuple[int, Mode]:
+    def step(self, state: State, statusword: int, mode: int) -> tuple[int, OperationMode]:
         """Return controlword and mode of operation of this cycle.
 
         Args:
@@ -86,22 +86,22 @@ class HomingRun:
         self._cycles += 1
         if self._cycles > self._longest:
             self.give_up(f"took longer than allowed while {self.phase}")
-        if self._phase is _Phase.MODE and mode == Mode.HOMING:
+        if self._phase is _Phase.MODE and mode == OperationMode.HOMING:
             self._phase = _Phase.ENABLE
         if self._phase is _Phase.ENABLE:
             if state is not State.OPERATION_ENABLED:
-                return cia402.towards_enabled(state), Mode.HOMING
+                return cia402.towards_enabled(state), OperationMode.HOMING
             self._phase, self._search_start = _Phase.SEARCH, self._cycles
-            return cia402.ENABLE_OPERATION, Mode.HOMING
+            return cia402.ENABLE_OPERATION, OperationMode.HOMING
         if self._phase is _Phase.SEARCH:
             self._check_search(state, statusword)
         if self._phase is _Phase.SEARCH:
-            return cia402.ENABLE_OPERATION | cia402.START_HOMING, Mode.HOMING
+            return cia402.ENABLE_OPERATION | cia402.START_HOMING, OperationMode.HOMING
         if self._phase is _Phase.LEAVE:
             is_off = state not in (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE)
             self.is_over = is_off and (mode == self._own_mode or self._cycles > 2 * self._longest)
-            return cia402.towards_disabled(state), self._own_mode if is_off else Mode.HOMING
-        return cia402.towards_disabled(state), Mode.HOMING
+            return cia402.towards_disabled(state), self._own_mode if is_off else OperationMode.HOMING
+        return cia402.towards_disabled(state), OperationMode.HOMING
 
     def _check_search(self, state: State, statusword: int) -> None:
         if state is not State.OPERATION_ENABLED:

@@ -12,13 +12,13 @@ from hal.config import Finite, Positive, Section
 from hal.drivers.canopen.node import NodeSettings
 from hal.protocols import cia301, cia402
 from hal.protocols.cia301 import Mapped
-from hal.protocols.cia402 import Mode, VelocityUnit
+from hal.protocols.cia402 import OperationMode, VelocityUnit
 
 MODES = {
-    "profile_position": Mode.PROFILE_POSITION,
-    "csp": Mode.CYCLIC_SYNCHRONOUS_POSITION,
-    "csv": Mode.CYCLIC_SYNCHRONOUS_VELOCITY,
-    "cst": Mode.CYCLIC_SYNCHRONOUS_TORQUE,
+    "profile_position": OperationMode.PROFILE_POSITION,
+    "csp": OperationMode.CYCLIC_SYNCHRONOUS_POSITION,
+    "csv": OperationMode.CYCLIC_SYNCHRONOUS_VELOCITY,
+    "cst": OperationMode.CYCLIC_SYNCHRONOUS_TORQUE,
 }
 """Modes by their names in a robot file."""
 COMMANDED = {"profile_position": "position", "csp": "position", "csv": "velocity", "cst": "effort"}

@@ -9,7 +9,7 @@ from typing_extensions import override
 
 from hal.device import Check, DeviceState
 from hal.drivers.can_device import CanDevice, Place
-from hal.drivers.dbc.sequence import Address, Inbox, InputMessage, Raws, Run, Step, compile_steps
+from hal.drivers.dbc.sequence import Address, Inbox, InputMessage, Raws, SequenceRun, Step, compile_steps
 from hal.drivers.dbc.settings import MOTION, DbcSettings, QuantityConfig, StepConfig
 from hal.errors import ConfigError, DeviceRefused, DeviceSilent
 from hal.protocols import dbc
@@ -247,7 +247,7 @@ class DbcNode(CanDevice):
         Raises:
             DeviceRefused: A step was not confirmed, unless the run `goes_on`.
         """
-        run = Run(name, steps, self._rate, goes_on)
+        run = SequenceRun(name, steps, self._rate, goes_on)
         while not run.is_over:
             run.advance(self._bus.send)
             time.sleep(1.0 / self._rate)

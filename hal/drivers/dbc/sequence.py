@@ -10,7 +10,7 @@ from cantools.database.can.signal import Signal
 
 from hal.drivers.dbc.settings import ConditionConfig, FrameConfig, StepConfig
 from hal.errors import ConfigError
-from hal.protocols.dbc import Dbc, Reader, Writer, describe
+from hal.protocols.dbc import Dbc, SignalReader, Writer, describe
 
 TOLERANCE = 1e-6
 """Two values that are not whole numbers are equal within this relative difference."""
@@ -34,7 +34,7 @@ class InputMessage:
 
     definition: Message
     names: set[str] = field(default_factory=set)
-    reader: Reader | None = None
+    reader: SignalReader | None = None
     raws: Raws = ()
     received: float = -math.inf
     count: int = 0
@@ -132,7 +132,7 @@ class Inbox:
     def seal(self) -> None:
         """Make the readers; no further signals can be requested."""
         for message in self.messages.values():
-            message.reader = Reader(message.definition, message.names)
+            message.reader = SignalReader(message.definition, message.names)
         for signal in self._signals:
             assert signal.message.reader is not None
             signal.index = signal.message.reader.names.index(signal.definition.name)
@@ -242,7 +242,7 @@ def _raw(config: FrameConfig, address: Address) -> can.Message:
     )
 
 
-class Run:
+class SequenceRun:
     """One run of a sequence of steps. Call `advance` in every cycle until `is_over`."""
 
     def __init__(self, name: str, steps: Sequence[Step], rate: float, goes_on: bool = False) -> None:

@@ -11,7 +11,7 @@ from typing_extensions import override
 from hal.device import UNDER_POWER, Check, DeviceState
 from hal.drivers.can_device import Place
 from hal.drivers.dbc.sensor import FRAME_BYTES, POLL, DbcNode
-from hal.drivers.dbc.sequence import InputMessage, Raws, Run, Step, message_of
+from hal.drivers.dbc.sequence import InputMessage, Raws, SequenceRun, Step, message_of
 from hal.drivers.dbc.settings import DbcSettings, QuantityConfig, ServoSettings, Value
 from hal.errors import ConfigError, DeviceSilent
 from hal.protocols.dbc import Writer
@@ -57,7 +57,7 @@ class DbcServo(DbcNode):
         self._drop_text = ""
         self._hold = 0.0
         super().__init__(place, settings)
-        self._activity = Run("nothing", (), place.rate)
+        self._activity = SequenceRun("nothing", (), place.rate)
         self._slot = self._slots[settings.command.quantity]
 
     @override
@@ -170,7 +170,7 @@ class DbcServo(DbcNode):
     @override
     def _commission(self) -> None:
         self._enable_requested = False
-        self._activity = Run("nothing", (), self._rate)
+        self._activity = SequenceRun("nothing", (), self._rate)
         if not self._state.message.raws:
             self._comes(self._state.message)
         if self._is_enabled:
@@ -220,7 +220,7 @@ class DbcServo(DbcNode):
     def enable(self) -> None:
         self._enable_requested, self._enable_succeeded, self._drop_text = True, False, ""
         first = self._sequences[RESET] if self._has_expired else ()
-        self._activity = Run(ENABLE, (*first, *self._sequences[ENABLE]), self._rate)
+        self._activity = SequenceRun(ENABLE, (*first, *self._sequences[ENABLE]), self._rate)
 
     @override
     def disable(self) -> None:
@@ -246,7 +246,7 @@ class DbcServo(DbcNode):
         self._begin(RESET)
 
     def _begin(self, name: str) -> None:
-        self._activity = Run(name, self._sequences[name], self._rate, goes_on=True)
+        self._activity = SequenceRun(name, self._sequences[name], self._rate, goes_on=True)
 
     @override
     def apply(self, values: np.ndarray) -> None:

@@ -48,7 +48,7 @@ def structure_of(robot: RobotConfig, schema: BodySchema) -> Structure:
 
 
 @dataclass(frozen=True, slots=True)
-class Update:
+class UpdateResult:
     """Result of an online update.
 
     Attributes:
@@ -63,7 +63,7 @@ class Update:
     errors: np.ndarray
 
 
-def learn(robot: RobotConfig, schema: BodySchema, lived: Dataset, seed: int) -> Update:
+def learn(robot: RobotConfig, schema: BodySchema, lived: Dataset, seed: int) -> UpdateResult:
     """Run the robot file's online update over a recording."""
     config = model_config(robot).update
     updater = Updater(schema, UpdateConfig(**config.model_dump(exclude={"interval"}), seed=seed))
@@ -72,7 +72,7 @@ def learn(robot: RobotConfig, schema: BodySchema, lived: Dataset, seed: int) -> 
         errors.append(float(joint_errors(updater.schema, row[None])[0]))
         updater.add(schema.layout.split(row))
         updater.step()
-    return Update(updater.schema, np.arange(1, len(errors) + 1) / RATE, np.array(errors))
+    return UpdateResult(updater.schema, np.arange(1, len(errors) + 1) / RATE, np.array(errors))
 
 
 def joint_errors(schema: BodySchema, rows: np.ndarray) -> np.ndarray:
