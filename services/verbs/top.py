@@ -1,5 +1,6 @@
 """`gemuco top ROBOT`: one running robot in a terminal."""
 
+import contextlib
 import math
 import time
 from collections.abc import Iterable, Sequence
@@ -12,7 +13,8 @@ from rich.text import Text
 
 from services import show
 from services.client import Client
-from services.watch.robot_watch import snapshot_of
+from services.errors import ServiceError
+from services.watch.robot_watch import Descriptions, snapshot_of
 from services.watch.service_rows import Level, LoopRow, ServiceRow, service_rows
 from services.watch.signal_rows import Kind, SignalRow, signal_rows
 from services.watch.snapshot import Snapshot, fresh
@@ -45,23 +47,44 @@ def watch(robot: str, once: bool, connect: Iterable[str], console: Console | Non
     """
     console = console or show.console()
     with Client(robot, connect) as client:
-        snapshot = snapshot_of(client, client.alive())  # subscribes
+        descriptions = Descriptions()
         if once:
-            snapshot = _first_statuses(client)
+            snapshot = _first(client, descriptions)
             console.print(view(snapshot))
             return 0 if snapshot.alive else 1
-        with Live(view(snapshot), console=console, screen=console.is_terminal, auto_refresh=False) as live:
+        with Live(console=console, screen=console.is_terminal, auto_refresh=False) as live:
             while True:
-                live.update(view(snapshot_of(client, client.alive())), refresh=True)
+                live.update(view(_snapshot(client, descriptions)), refresh=True)
                 time.sleep(REFRESH)
+
+
+def _snapshot(client: Client, descriptions: Descriptions) -> Snapshot:
+    alive = client.alive()
+    with contextlib.suppress(ServiceError):  # without a description, elements have numbers as names
+        descriptions.update(client, alive)
+    answers = descriptions.answers
+    return snapshot_of(client, alive, hal=answers["hal"], model=answers["model"])
+
+
+def _first(client: Client, descriptions: Descriptions) -> Snapshot:
+    """Wait until every live service has published its status, and return the snapshot."""
+    deadline = time.monotonic() + FIRST_WAIT
+    while True:
+        snapshot = _snapshot(client, descriptions)
+        is_complete = bool(snapshot.alive) and all(fresh(snapshot.statuses.get(name)) for name in snapshot.alive)
+        if time.monotonic() > deadline or is_complete:
+            return snapshot
+        time.sleep(0.05)
 
 
 def view(snapshot: Snapshot) -> RenderableType:
     """Return everything that is known of the robot: troubles, services, loops, signals, anomaly score, update."""
     services, rows = service_rows(snapshot), signal_rows(snapshot)
     notes = (Text(plain(str(trouble)), style=STYLES[trouble.level]) for trouble in troubles(snapshot, rows))
+    motors = plain(snapshot.motors) or "not known"
     return Group(
-        _services(snapshot, services),
+        Text(f"{snapshot.robot}   motors: {motors}   lease holder: {plain(snapshot.lease_holder)}"),
+        _services(services),
         *notes,
         _loops(services),
         _signals(rows),
@@ -70,21 +93,8 @@ def view(snapshot: Snapshot) -> RenderableType:
     )
 
 
-def _first_statuses(client: Client) -> Snapshot:
-    """Wait until every live service has published its status, and return the snapshot."""
-    deadline = time.monotonic() + FIRST_WAIT
-    while True:
-        snapshot = snapshot_of(client, client.alive())
-        is_complete = bool(snapshot.alive) and all(fresh(snapshot.statuses.get(name)) for name in snapshot.alive)
-        if is_complete or time.monotonic() > deadline:
-            return snapshot
-        time.sleep(0.05)
-
-
-def _services(snapshot: Snapshot, services: Sequence[ServiceRow]) -> Table:
-    motors = plain(snapshot.motors) or "not known"
-    title = f"{snapshot.robot}   motors: {motors}   lease holder: {plain(snapshot.lease_holder)}"
-    table = Table(title=Text(title), title_justify="left")
+def _services(services: Sequence[ServiceRow]) -> Table:
+    table = Table()
     for column in ("service", "state", ""):
         table.add_column(column)
     for row in services:

@@ -2,8 +2,7 @@
 
 import logging
 import threading
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable
 from typing import Any, TypeVar
 
 from hal.clock import Clock, SystemClock
@@ -58,12 +57,25 @@ def snapshot_of(client: Client, alive: Iterable[str], clock: Clock | None = None
     )
 
 
-@dataclass(slots=True)
-class _Description:
-    """Answer of a service's `describe`, and the boot of the run that gave it."""
+class Descriptions:
+    """Answers of the HAL's and the model's `describe`, queried once per run of each service."""
 
-    boot: int = 0
-    about: Mapping[str, Any] = field(default_factory=dict)
+    def __init__(self) -> None:
+        self._boots: dict[str, int] = {}
+        self.answers: dict[str, dict[str, Any]] = {"hal": {}, "model": {}}
+        """Service -> its answer; empty before."""
+
+    def update(self, client: Client, alive: Iterable[str]) -> None:
+        """Query the live services that were started since the last call.
+
+        Raises:
+            ServiceError: A service does not answer.
+        """
+        for service in self.answers.keys() & set(alive):
+            last = client.reader(keys.status(client.robot, service), Status).last()
+            if last is not None and last.message.boot != self._boots.get(service):
+                self.answers[service] = client.describe(service)
+                self._boots[service] = last.message.boot
 
 
 class RobotWatch:
@@ -82,7 +94,7 @@ class RobotWatch:
         self._client: Client | None = None
         self._alive: frozenset[str] = frozenset()
         self._linked, self._link_text = not self._connect, ""
-        self._described = {"hal": _Description(), "model": _Description()}
+        self._descriptions = Descriptions()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="watch", daemon=True)
 
@@ -106,9 +118,13 @@ class RobotWatch:
         if client is None:
             return Snapshot(robot=self.robot, linked=self._linked, link_text=self._link_text)
         return snapshot_of(
-            client, self._alive, self._clock, linked=self._linked, link_text=self._link_text,
-            hal=self._described["hal"].about, model=self._described["model"].about,
-        )  # fmt: skip
+            client,
+            self._alive,
+            self._clock,
+            linked=self._linked,
+            link_text=self._link_text,
+            **self._descriptions.answers,
+        )
 
     def _run(self) -> None:
         while not self._stop.is_set():
@@ -137,8 +153,4 @@ class RobotWatch:
             self._link_text = f"No answer from {where}. Is `gemuco router` running? The page continues by itself."
             return
         self._alive = frozenset(client.alive())
-        for service, description in self._described.items():
-            last = client.reader(keys.status(self.robot, service), Status).last()
-            if service in self._alive and last is not None and last.message.boot != description.boot:
-                description.about = client.describe(service)
-                description.boot = last.message.boot
+        self._descriptions.update(client, self._alive)
