@@ -15,7 +15,7 @@ from services.client.live import FRESH_STATUS
 from services.verbs.top import STYLES
 from services.watch.fleet_watch import FleetWatch
 from services.watch.service_rows import Level, service_rows
-from services.watch.snapshot import Snapshot
+from services.watch.snapshot import RobotSnapshot
 from services.watch.trouble import HEALTHY, Trouble, troubles, verdict
 from services.wire import keys
 from services.wire.plain_text import plain
@@ -59,13 +59,13 @@ def watch_fleet(once: bool, connect: Iterable[str], console: Console | None = No
                 time.sleep(REFRESH)
 
 
-def ranked(snapshots: Iterable[Snapshot]) -> list[tuple[Snapshot, Trouble]]:
+def ranked(snapshots: Iterable[RobotSnapshot]) -> list[tuple[RobotSnapshot, Trouble]]:
     """Return each robot with its worst trouble, the worst robot first, then by name."""
     robots = [(snapshot, next(iter(troubles(snapshot)), HEALTHY)) for snapshot in snapshots]
     return sorted(robots, key=lambda robot: (-robot[1].level, robot[0].robot))
 
 
-def view(robots: Sequence[tuple[Snapshot, Trouble]], fleet: FleetWatch, connect: Sequence[str]) -> RenderableType:
+def view(robots: Sequence[tuple[RobotSnapshot, Trouble]], fleet: FleetWatch, connect: Sequence[str]) -> RenderableType:
     """Return the table, or the reason why there is none."""
     notes = []
     if not fleet.has_router:
@@ -80,7 +80,7 @@ def view(robots: Sequence[tuple[Snapshot, Trouble]], fleet: FleetWatch, connect:
     return Group(*notes, table(robots))
 
 
-def table(robots: Sequence[tuple[Snapshot, Trouble]]) -> Table:
+def table(robots: Sequence[tuple[RobotSnapshot, Trouble]]) -> Table:
     """Return one row per robot, in the order given."""
     counts = {level: sum(worst.level == level for _, worst in robots) for level in reversed(Level)}
     summary = ", ".join(f"{count} {level.name.lower()}" for level, count in counts.items() if count)
@@ -99,7 +99,7 @@ def table(robots: Sequence[tuple[Snapshot, Trouble]]) -> Table:
     return table
 
 
-def _row(snapshot: Snapshot, worst: Trouble) -> list[Text | str]:
+def _row(snapshot: RobotSnapshot, worst: Trouble) -> list[Text | str]:
     style = STYLES[worst.level]
     counts, judged = _signal_counts(snapshot), verdict(snapshot)
     holder = snapshot.lease_holder
@@ -118,7 +118,7 @@ def _row(snapshot: Snapshot, worst: Trouble) -> list[Text | str]:
     ]
 
 
-def _signal_counts(snapshot: Snapshot) -> tuple[int, ...]:
+def _signal_counts(snapshot: RobotSnapshot) -> tuple[int, ...]:
     """Return the numbers of signals that are measured, estimated and neither; empty if the model publishes none."""
     facts = snapshot.facts("model").get("signals")
     counts: list[Any] = []
@@ -127,7 +127,7 @@ def _signal_counts(snapshot: Snapshot) -> tuple[int, ...]:
     return tuple(counts) if all(isinstance(count, int) for count in counts) else ()
 
 
-def _worst_loop(snapshot: Snapshot) -> Text:
+def _worst_loop(snapshot: RobotSnapshot) -> Text:
     """Return the largest lateness of a loop in the last second, and the loop."""
     loops = [loop for row in service_rows(snapshot) if row.is_present for loop in row.loops if loop.worst >= 0]
     worst = max(loops, key=lambda loop: loop.worst, default=None)

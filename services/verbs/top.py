@@ -17,7 +17,7 @@ from services.errors import ServiceError
 from services.watch.robot_watch import Descriptions, snapshot_of
 from services.watch.service_rows import Level, LoopRow, ServiceRow, service_rows
 from services.watch.signal_rows import Kind, SignalRow, signal_rows
-from services.watch.snapshot import Snapshot, fresh
+from services.watch.snapshot import RobotSnapshot, fresh
 from services.watch.trouble import troubles, verdict
 from services.wire.messages import Update
 from services.wire.plain_text import plain
@@ -58,7 +58,7 @@ def watch(robot: str, once: bool, connect: Iterable[str], console: Console | Non
                 time.sleep(REFRESH)
 
 
-def _snapshot(client: Client, descriptions: Descriptions) -> Snapshot:
+def _snapshot(client: Client, descriptions: Descriptions) -> RobotSnapshot:
     alive = client.alive()
     with contextlib.suppress(ServiceError):  # without a description, elements have numbers as names
         descriptions.update(client, alive)
@@ -66,7 +66,7 @@ def _snapshot(client: Client, descriptions: Descriptions) -> Snapshot:
     return snapshot_of(client, alive, hal=answers["hal"], model=answers["model"])
 
 
-def _first(client: Client, descriptions: Descriptions) -> Snapshot:
+def _first(client: Client, descriptions: Descriptions) -> RobotSnapshot:
     """Wait until every live service has published its status, and return the snapshot."""
     deadline = time.monotonic() + FIRST_WAIT
     while True:
@@ -77,7 +77,7 @@ def _first(client: Client, descriptions: Descriptions) -> Snapshot:
         time.sleep(0.05)
 
 
-def view(snapshot: Snapshot) -> RenderableType:
+def view(snapshot: RobotSnapshot) -> RenderableType:
     """Return everything that is known of the robot: troubles, services, loops, signals, anomaly score, update."""
     services, rows = service_rows(snapshot), signal_rows(snapshot)
     notes = (Text(plain(str(trouble)), style=STYLES[trouble.level]) for trouble in troubles(snapshot, rows))
@@ -159,7 +159,7 @@ def _numbers(values: Sequence[float] | np.ndarray, kinds: Sequence[Kind] = ()) -
     return " ".join(f"{value:.{digits}f}{mark}" for value, mark in zip(values, marks, strict=True))
 
 
-def _anomaly(snapshot: Snapshot) -> Text:
+def _anomaly(snapshot: RobotSnapshot) -> Text:
     judged = verdict(snapshot)
     if judged is None or not math.isfinite(judged.score):
         return Text("anomaly: not judged")

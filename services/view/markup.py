@@ -11,7 +11,7 @@ from services.view.styles import STYLE, numbers, page, table
 from services.view.taught import TaughtFile
 from services.watch.service_rows import Level, ServiceRow
 from services.watch.signal_rows import Kind, SignalRow
-from services.watch.snapshot import Snapshot
+from services.watch.snapshot import RobotSnapshot
 from services.watch.trouble import HEALTHY, Trouble, verdict
 from services.wire.messages import Update
 
@@ -51,7 +51,7 @@ def banner_html(troubles: Sequence[Trouble]) -> str:
     return STYLE + page(f'<div class="b {kind}">{title}{escape(worst.text)}{also}</div>')
 
 
-def facts_html(snapshot: Snapshot, source: str, read_only: str, last: Outcome | None) -> str:
+def facts_html(snapshot: RobotSnapshot, source: str, read_only: str, last: Outcome | None) -> str:
     """Return the mode of the motors, the lease holder, the source of the data and the last request."""
     mode = snapshot.motors
     tone = {"follow": "good", "hold": "good", "off": "dim", "": "dim", "fault": "lost"}.get(mode, "poor")
@@ -121,7 +121,7 @@ def _service_lines(service: ServiceRow) -> Iterator[str]:
         yield f'<tr><td colspan="6" class="dim" style="white-space:normal">{escape(service.text)}</td></tr>'
 
 
-def anomaly_html(snapshot: Snapshot) -> str:
+def anomaly_html(snapshot: RobotSnapshot) -> str:
     """Return the anomaly score, the verdict and the blamed element."""
     judged = verdict(snapshot)
     if judged is None or not math.isfinite(judged.score):

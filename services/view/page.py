@@ -26,7 +26,7 @@ from services.view.teach_panel import TeachPanel
 from services.view.trail import Trail
 from services.watch.service_rows import Level, service_rows
 from services.watch.signal_rows import SignalRow, signal_rows
-from services.watch.snapshot import Snapshot, fresh
+from services.watch.snapshot import RobotSnapshot, fresh
 from services.watch.trouble import HEALTHY, Trouble, troubles
 
 if TYPE_CHECKING:
@@ -94,7 +94,7 @@ class Page:
     """
 
     def __init__(
-        self, site: "viser.ViserServer", robot: str, look: Callable[[], Snapshot], controls: Controls,
+        self, site: "viser.ViserServer", robot: str, look: Callable[[], RobotSnapshot], controls: Controls,
         urdf: Path | None, taught: Path,
     ) -> None:  # fmt: skip
         self._site, self._look, self._controls = site, look, controls
@@ -188,7 +188,7 @@ class Page:
             self._choices = choices
             self._chosen.options = choices  # the present choice stays if it is among them
 
-    def _show_charts(self, snapshot: Snapshot, now: float) -> None:
+    def _show_charts(self, snapshot: RobotSnapshot, now: float) -> None:
         chosen = self._chosen.value
         rows = [row for row in self._rows if chosen in (row.signal, row.name)]
         if rows:
@@ -199,7 +199,7 @@ class Page:
         lines = [Line("score", score, "#7cc0ff"), Line("threshold", threshold, "#ff7b7b", dashed=True)]
         _set(self._anomaly, anomaly_html(snapshot) + page(self._scores.svg(time, lines, "score", "score")))
 
-    def _show_bias(self, snapshot: Snapshot) -> None:
+    def _show_bias(self, snapshot: RobotSnapshot) -> None:
         biases: dict[str, Any] = dict(snapshot.model.get("biases", {}))
         bias_map = project(biases, self._trail.bias()) if biases else None
         update = fresh(snapshot.update)
@@ -207,7 +207,7 @@ class Page:
         _set(self._map, bias_html(bias_map, picture, update))
 
 
-def source(snapshot: Snapshot) -> str:
+def source(snapshot: RobotSnapshot) -> str:
     """Return the source of the samples, in words."""
     sample = fresh(snapshot.sample)
     if sample is None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from services.view.figure import Body, Figure, Paint
 from services.watch.signal_rows import Kind, SignalRow
-from services.watch.snapshot import Snapshot
+from services.watch.snapshot import RobotSnapshot
 
 if TYPE_CHECKING:
     import viser
@@ -46,7 +46,7 @@ class Scene:
             self._figures = {name: Figure(site, name, body, at) for name, at in self._at.items()}
         self._furnish(size, body is not None)
 
-    def show(self, snapshot: Snapshot, rows: Sequence[SignalRow]) -> None:
+    def show(self, snapshot: RobotSnapshot, rows: Sequence[SignalRow]) -> None:
         """Move both robots to the present values; the color of a link shows the origin of all joints that carry it."""
         kinds: dict[str, Kind] = {}
         for row in rows:

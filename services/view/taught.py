@@ -10,7 +10,7 @@ import numpy as np
 from gemuco.dataset import Dataset, Episode
 from gemuco.signals import Layout, Signal
 from services.errors import ServiceError
-from services.watch.snapshot import Snapshot
+from services.watch.snapshot import RobotSnapshot
 
 LONGEST_NAME = 60
 """Names of conditions have at most this number of letters."""
@@ -22,7 +22,7 @@ class NotRecorded(ServiceError):
     """Error for a sample that was not written; the file is unchanged, and the text gives the reason."""
 
 
-def posture(snapshot: Snapshot) -> tuple[Layout, dict[str, np.ndarray]]:
+def posture(snapshot: RobotSnapshot) -> tuple[Layout, dict[str, np.ndarray]]:
     """Return the signals of the robot and their present values [their unit].
 
     Raises:

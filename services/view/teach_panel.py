@@ -14,7 +14,7 @@ from services.view.controls import Controls
 from services.view.markup import teach_html
 from services.view.taught import TaughtFile, posture
 from services.view.teaching import STEP, NotTeaching, Reach, Teacher
-from services.watch.snapshot import Snapshot
+from services.watch.snapshot import RobotSnapshot
 
 if TYPE_CHECKING:
     import viser
@@ -37,7 +37,9 @@ class TeachPanel:
         path: File of the recorded samples.
     """
 
-    def __init__(self, site: "viser.ViserServer", controls: Controls, look: Callable[[], Snapshot], path: Path) -> None:
+    def __init__(
+        self, site: "viser.ViserServer", controls: Controls, look: Callable[[], RobotSnapshot], path: Path
+    ) -> None:
         self._site, self._look = site, look
         self.teacher = Teacher(controls.open_client)
         self.file = TaughtFile(path)
@@ -60,7 +62,7 @@ class TeachPanel:
         """Let the robot go and end the thread."""
         self.teacher.stop()
 
-    def show(self, snapshot: Snapshot, now: float) -> None:
+    def show(self, snapshot: RobotSnapshot, now: float) -> None:
         """Show the state of teaching, and query the page that took over."""
         self._make_sliders(snapshot)
         owner = self.teacher.owner
@@ -115,7 +117,7 @@ class TeachPanel:
         count = self.file.add(self._condition.value, layout, values)
         return f"Recorded under '{self._condition.value.strip()}'; {count} samples are in the file."
 
-    def _make_sliders(self, snapshot: Snapshot) -> None:
+    def _make_sliders(self, snapshot: RobotSnapshot) -> None:
         """Make the sliders of the commanded signal when its limits are known, and again when they change."""
         try:
             reach = Reach.of(snapshot.hal)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from services.watch.signal_rows import Kind, SignalRow
-from services.watch.snapshot import Snapshot, fresh
+from services.watch.snapshot import RobotSnapshot, fresh
 
 WINDOW = 30.0
 """The plots show this time [s]."""
@@ -44,7 +44,7 @@ class Trail:
         self._scores: deque[tuple[float, float]] = deque(maxlen=POINTS)
         self._bias: deque[np.ndarray] = deque(maxlen=WAY)
 
-    def add(self, now: float, snapshot: Snapshot, rows: Sequence[SignalRow]) -> None:
+    def add(self, now: float, snapshot: RobotSnapshot, rows: Sequence[SignalRow]) -> None:
         """Add the values of a moment [monotonic s]; calls above the rate are ignored."""
         if self._times and now - self._times[-1] < 0.9 / RATE:
             return

@@ -14,7 +14,7 @@ import zenoh
 from hal.clock import Clock, SystemClock
 from services.runtime import services_here
 from services.watch.service_rows import needed
-from services.watch.snapshot import Newest, Snapshot
+from services.watch.snapshot import Newest, RobotSnapshot
 from services.wire import keys
 from services.wire.member import member_of
 from services.wire.messages import Holder, Message, MessageError, Status
@@ -80,14 +80,14 @@ class RobotRecord:
         """Names of the live services."""
         return frozenset(name for name, service in self.services.items() if service.is_alive)
 
-    def snapshot(self, now: float) -> Snapshot:
+    def snapshot(self, now: float) -> RobotSnapshot:
         """Return everything that is known of the robot now [monotonic s]."""
         statuses = {
             name: Newest(service.status, max(0.0, now - service.received))
             for name, service in self.services.items()
             if service.status is not None
         }
-        return Snapshot(
+        return RobotSnapshot(
             robot=self.robot,
             has_streams=False,
             alive=self.alive,
@@ -143,7 +143,7 @@ class FleetWatch:
             self._close()
             self._open()
 
-    def snapshots(self) -> list[Snapshot]:
+    def snapshots(self) -> list[RobotSnapshot]:
         """Return a snapshot of each robot."""
         now = self._clock.monotonic()
         with self._lock:

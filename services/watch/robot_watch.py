@@ -9,7 +9,7 @@ from hal.clock import Clock, SystemClock
 from services.client import Client
 from services.client.live import FRESH_STATUS
 from services.errors import ServiceError
-from services.watch.snapshot import Newest, Snapshot
+from services.watch.snapshot import Newest, RobotSnapshot
 from services.wire import keys
 from services.wire.caller import own_name
 from services.wire.messages import Anomaly, Applied, Estimates, Holder, Message, Sample, Status, Update
@@ -21,7 +21,7 @@ EVERY = 0.5
 """The live services are looked up at this interval [s]."""
 
 
-def snapshot_of(client: Client, alive: Iterable[str], clock: Clock | None = None, **more: Any) -> Snapshot:
+def snapshot_of(client: Client, alive: Iterable[str], clock: Clock | None = None, **more: Any) -> RobotSnapshot:
     """Return all newest messages of a client's robot; the first call subscribes to them.
 
     Args:
@@ -41,7 +41,7 @@ def snapshot_of(client: Client, alive: Iterable[str], clock: Clock | None = None
 
     robot = client.robot
     statuses = {name: newest(keys.status(robot, name), Status) for name in keys.SERVICES}
-    return Snapshot(
+    return RobotSnapshot(
         robot=robot,
         alive=frozenset(alive),
         sample=newest(keys.sample(robot), Sample),
@@ -112,11 +112,11 @@ class RobotWatch:
         """The open client; None if there is none."""
         return self._client
 
-    def look(self) -> Snapshot:
+    def look(self) -> RobotSnapshot:
         """Return everything that is known of the robot now."""
         client = self._client
         if client is None:
-            return Snapshot(robot=self.robot, linked=self._linked, link_text=self._link_text)
+            return RobotSnapshot(robot=self.robot, linked=self._linked, link_text=self._link_text)
         return snapshot_of(
             client,
             self._alive,

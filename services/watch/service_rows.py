@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from enum import IntEnum
 
-from services.watch.snapshot import Snapshot
+from services.watch.snapshot import RobotSnapshot
 from services.wire import keys
 
 LATE = 0.02
@@ -97,13 +97,13 @@ class ServiceRow:
         return Level.TROUBLE if is_missed or self.is_frozen or self.state == "fault" else Level.DEGRADED
 
 
-def needed(snapshot: Snapshot) -> tuple[str, ...]:
+def needed(snapshot: RobotSnapshot) -> tuple[str, ...]:
     """Return the services that this robot needs: vision only if a status reports a camera."""
     has_camera = any(newest.message.facts.get("camera") for newest in snapshot.statuses.values())
     return ("hal", "model", "vision") if has_camera else ("hal", "model")
 
 
-def service_rows(snapshot: Snapshot) -> tuple[ServiceRow, ...]:
+def service_rows(snapshot: RobotSnapshot) -> tuple[ServiceRow, ...]:
     """Return a row for every service that is alive, was heard, or is needed."""
     rows = []
     for name in keys.SERVICES:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from services.watch.snapshot import Newest, Snapshot, fresh
+from services.watch.snapshot import Newest, RobotSnapshot, fresh
 from services.wire.messages import Estimates, Sample
 
 
@@ -51,7 +51,7 @@ class SignalRow:
         return f"{self.signal}.{self.element}"
 
 
-def signal_rows(snapshot: Snapshot) -> tuple[SignalRow, ...]:
+def signal_rows(snapshot: RobotSnapshot) -> tuple[SignalRow, ...]:
     """Return the rows in the order of `describe`; signals that it does not list come last."""
     estimate = fresh(snapshot.estimate)
     rows: list[SignalRow] = []
@@ -60,7 +60,7 @@ def signal_rows(snapshot: Snapshot) -> tuple[SignalRow, ...]:
     return tuple(rows)
 
 
-def _signals(snapshot: Snapshot) -> dict[str, dict[str, Any]]:
+def _signals(snapshot: RobotSnapshot) -> dict[str, dict[str, Any]]:
     """Return signal -> unit, elements and source; before `describe` answered, elements are named by numbers."""
     signals: dict[str, dict[str, Any]] = {}
     for description in (snapshot.hal, snapshot.model):
@@ -73,7 +73,7 @@ def _signals(snapshot: Snapshot) -> dict[str, dict[str, Any]]:
     return signals
 
 
-def _newest_with(snapshot: Snapshot, signal: str, about: dict[str, Any]) -> Newest[Sample] | None:
+def _newest_with(snapshot: RobotSnapshot, signal: str, about: dict[str, Any]) -> Newest[Sample] | None:
     """Return the newest sample with this signal, whatever its age."""
     sources = (snapshot.vision,) if about.get("source") == "vision" else (snapshot.sample, snapshot.vision)
     return next((newest for newest in sources if newest is not None and signal in newest.message.values), None)

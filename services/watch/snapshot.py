@@ -32,7 +32,7 @@ class Newest(Generic[M]):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Snapshot:
+class RobotSnapshot:
     """Everything that is known of a robot at one moment.
 
     Attributes:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from services.watch.service_rows import Level, ServiceRow, needed, service_rows
 from services.watch.signal_rows import Kind, SignalRow
-from services.watch.snapshot import Snapshot, fresh
+from services.watch.snapshot import RobotSnapshot, fresh
 from services.wire.query import starter
 
 NAMED = 3
@@ -30,7 +30,7 @@ HEALTHY = Trouble(Level.GOOD, "Healthy", "All signals are measured, and the body
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class AnomalyVerdict:
     """Anomaly verdict of the model.
 
     Attributes:
@@ -51,31 +51,31 @@ class Verdict:
         return f"anomaly in {self.blamed}" if self.is_anomaly and self.blamed else self.kind
 
 
-def troubles(snapshot: Snapshot, rows: Sequence[SignalRow] = ()) -> list[Trouble]:
+def troubles(snapshot: RobotSnapshot, rows: Sequence[SignalRow] = ()) -> list[Trouble]:
     """Return everything that is wrong with a robot, worst first; `rows` are those of `signal_rows`."""
     return sorted(_troubles(snapshot, rows), key=lambda trouble: -trouble.level)
 
 
-def verdict(snapshot: Snapshot) -> Verdict | None:
+def verdict(snapshot: RobotSnapshot) -> AnomalyVerdict | None:
     """Return the model's present anomaly verdict, from its stream or from its status; None if there is none."""
     if snapshot.has_streams:
         anomaly = fresh(snapshot.anomaly)
         if anomaly is None:
             return None
-        return Verdict(anomaly.verdict, anomaly.score, anomaly.threshold, anomaly.is_anomaly, anomaly.blamed)
+        return AnomalyVerdict(anomaly.verdict, anomaly.score, anomaly.threshold, anomaly.is_anomaly, anomaly.blamed)
     facts = snapshot.facts("model").get("anomaly")
     if not isinstance(facts, dict) or not facts:
         return None
     kind, blamed = (text if isinstance(text := facts.get(name), str) else "" for name in ("verdict", "blamed"))
     score, threshold = (_number(facts.get(name)) for name in ("score", "threshold"))
-    return Verdict(kind, score, threshold, facts.get("is_anomaly") is True, blamed)
+    return AnomalyVerdict(kind, score, threshold, facts.get("is_anomaly") is True, blamed)
 
 
 def _number(fact: object) -> float:
     return float(fact) if isinstance(fact, int | float) else math.nan
 
 
-def _troubles(snapshot: Snapshot, rows: Sequence[SignalRow]) -> Iterator[Trouble]:
+def _troubles(snapshot: RobotSnapshot, rows: Sequence[SignalRow]) -> Iterator[Trouble]:
     if not snapshot.linked:
         text = snapshot.link_text or "There is no connection to the robot's network."
         yield Trouble(Level.GONE, "Router gone", text)
@@ -95,7 +95,7 @@ def _troubles(snapshot: Snapshot, rows: Sequence[SignalRow]) -> Iterator[Trouble
     yield from _body(snapshot)
 
 
-def _gone(snapshot: Snapshot) -> Trouble:
+def _gone(snapshot: RobotSnapshot) -> Trouble:
     hint = f"Is {starter('hal')} running?"
     if not math.isfinite(snapshot.age):
         return Trouble(Level.GONE, "No robot", hint)
@@ -105,7 +105,7 @@ def _gone(snapshot: Snapshot) -> Trouble:
     return Trouble(Level.GONE, "Robot gone", f"{since} {hint}")
 
 
-def _services(snapshot: Snapshot) -> Iterator[Trouble]:
+def _services(snapshot: RobotSnapshot) -> Iterator[Trouble]:
     """Yield services that are missing or frozen, or whose status is not `running` or `ready`."""
     for row in service_rows(snapshot):
         title = TITLES[row.name]
@@ -126,7 +126,7 @@ def _services(snapshot: Snapshot) -> Iterator[Trouble]:
             yield Trouble(Level.DEGRADED, f"{title} {row.state}", row.text)
 
 
-def _missing(snapshot: Snapshot, row: ServiceRow) -> Trouble:
+def _missing(snapshot: RobotSnapshot, row: ServiceRow) -> Trouble:
     title = f"{TITLES[row.name]} service gone"
     if row.name == "hal" and fresh(snapshot.sample) is not None:
         return Trouble(Level.DEGRADED, title, "Its samples still arrive; its token does not.")
@@ -135,7 +135,7 @@ def _missing(snapshot: Snapshot, row: ServiceRow) -> Trouble:
     return Trouble(row.level, title, f"{since}{effect}Is {starter(row.name)} running?")
 
 
-def _streams(snapshot: Snapshot) -> Iterator[Trouble]:
+def _streams(snapshot: RobotSnapshot) -> Iterator[Trouble]:
     """Yield live services whose samples or estimates do not arrive."""
     if not snapshot.has_streams:
         return
@@ -159,7 +159,7 @@ def _signals(rows: Sequence[SignalRow]) -> Iterator[Trouble]:
         yield Trouble(Level.DEGRADED, "Not measured", text)
 
 
-def _body(snapshot: Snapshot) -> Iterator[Trouble]:
+def _body(snapshot: RobotSnapshot) -> Iterator[Trouble]:
     judged = verdict(snapshot)
     if judged is None:
         return

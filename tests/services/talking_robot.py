@@ -8,7 +8,7 @@ from typing import Any, Self
 import numpy as np
 
 from services.process.service import Service
-from services.watch.snapshot import Newest, Snapshot
+from services.watch.snapshot import Newest, RobotSnapshot
 from services.wire import keys
 from services.wire.messages import Anomaly, Applied, Estimates, Holder, Sample, Status, Update
 
@@ -54,13 +54,13 @@ def anomaly(verdict: str = "normal") -> Anomaly:
     )  # fmt: skip
 
 
-def seen(silent: bool = False, age: float = 0.01, **other: Any) -> Snapshot:
-    """Snapshot of both services, whose messages have this age [s]; `silent` is the elbow's encoder."""
+def seen(silent: bool = False, age: float = 0.01, **other: Any) -> RobotSnapshot:
+    """RobotSnapshot of both services, whose messages have this age [s]; `silent` is the elbow's encoder."""
     facts: dict[str, Any] = {
         "robot": "arm", "alive": BOTH, "hal": DESCRIBED, "sample": Newest(sample(silent), age),
         "estimate": Newest(estimates(silent), age), "anomaly": Newest(anomaly(), age),
     }  # fmt: skip
-    return Snapshot(**(facts | other))
+    return RobotSnapshot(**(facts | other))
 
 
 class TalkingRobot:

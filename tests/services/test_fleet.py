@@ -16,7 +16,7 @@ from services.runtime import services_here
 from services.verbs import fleet_top
 from services.watch.fleet_watch import FleetWatch, RobotRecord, ServiceRecord
 from services.watch.service_rows import Level
-from services.watch.snapshot import Newest, Snapshot
+from services.watch.snapshot import Newest, RobotSnapshot
 from services.wire import keys
 from services.wire.messages import Holder, Status
 from services.wire.session import CLIENT, close_session, open_session
@@ -45,7 +45,7 @@ def record(newest: Status, now: float) -> ServiceRecord:
     return service
 
 
-def printed(snapshots: list[Snapshot]) -> str:
+def printed(snapshots: list[RobotSnapshot]) -> str:
     console = Console(width=200)
     with console.capture() as shown:
         console.print(fleet_top.table(fleet_top.ranked(snapshots)))
@@ -83,8 +83,8 @@ def test_trouble_is_on_top_and_no_text_steers_the_terminal() -> None:
     running = {name: Newest(status(name), 0.1) for name in ("hal", "model")}
     both = frozenset({"hal", "model"})
     text = printed([
-        Snapshot(robot="a_arm", has_streams=False, alive=both, statuses=running),
-        Snapshot(robot="b_arm", has_streams=False, alive=both, statuses=running | {"hal": Newest(bad, 0.1)},
+        RobotSnapshot(robot="a_arm", has_streams=False, alive=both, statuses=running),
+        RobotSnapshot(robot="b_arm", has_streams=False, alive=both, statuses=running | {"hal": Newest(bad, 0.1)},
                  holder=holder),
     ])  # fmt: skip
     assert text.index("b_arm") < text.index("a_arm")

@@ -10,12 +10,12 @@ from talking_robot import DESCRIBED, sample
 from gemuco.dataset import Dataset
 from gemuco.signals import Layout, Signal
 from services.view.taught import NotRecorded, TaughtFile, posture
-from services.watch.snapshot import Newest, Snapshot
+from services.watch.snapshot import Newest, RobotSnapshot
 from services.wire.messages import Sample
 
 
-def seen(silent: bool = False, age: float = 0.01) -> Snapshot:
-    return Snapshot(robot="arm", hal=DESCRIBED, sample=Newest(sample(silent), age))
+def seen(silent: bool = False, age: float = 0.01) -> RobotSnapshot:
+    return RobotSnapshot(robot="arm", hal=DESCRIBED, sample=Newest(sample(silent), age))
 
 
 def record(file: TaughtFile, condition: str) -> int:
@@ -47,7 +47,7 @@ def test_what_is_not_measured_is_not_recorded(tmp_path: Path):
     with pytest.raises(NotRecorded, match="not measured now"):
         posture(seen(age=2.0))
     with pytest.raises(NotRecorded, match="has not described its signals"):
-        posture(Snapshot(robot="arm"))
+        posture(RobotSnapshot(robot="arm"))
 
 
 def test_a_value_that_is_no_number_is_refused(tmp_path: Path):
@@ -81,7 +81,7 @@ def test_somebody_elses_sample_is_not_taken_back(tmp_path: Path):
     record(file, "light")
     moved = Sample(**{name: getattr(sample(), name) for name in ("cycle", "source", "complete", "age", "valid")},
                    values={"joint_position": np.array([0.9, 0.9]), "muscle_tension": np.array([1.0])})  # fmt: skip
-    other.add("light", *posture(Snapshot(robot="arm", hal=DESCRIBED, sample=Newest(moved, 0.0))))
+    other.add("light", *posture(RobotSnapshot(robot="arm", hal=DESCRIBED, sample=Newest(moved, 0.0))))
     with pytest.raises(NotRecorded, match="another process"):
         file.undo()
     assert len(Dataset.load(file.path)) == 2

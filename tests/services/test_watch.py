@@ -9,7 +9,7 @@ from talking_robot import BOTH, anomaly, estimates, sample, seen
 from services.verbs import top
 from services.watch.service_rows import Level, service_rows
 from services.watch.signal_rows import Kind, signal_rows
-from services.watch.snapshot import Newest, Snapshot
+from services.watch.snapshot import Newest, RobotSnapshot
 from services.watch.trouble import HEALTHY, Trouble, troubles, verdict
 from services.wire.messages import Holder, Status
 
@@ -18,7 +18,7 @@ CHANGED = {"verdict": "environment", "is_anomaly": False, "blamed": "", "score":
 NEW_PROGRAM = "The message has version 3; this program reads 2."
 
 
-def judged(snapshot: Snapshot) -> Trouble:
+def judged(snapshot: RobotSnapshot) -> Trouble:
     return next(iter(troubles(snapshot, signal_rows(snapshot))), HEALTHY)
 
 
@@ -29,10 +29,10 @@ def statuses(age: float = 0.1, text: str = "", hal: str = "running", model: str 
     }
 
 
-def glance(**attributes: object) -> Snapshot:
-    """Snapshot of a fleet view, which reads no streams."""
+def glance(**attributes: object) -> RobotSnapshot:
+    """RobotSnapshot of a fleet view, which reads no streams."""
     facts: dict = {"robot": "arm", "has_streams": False, "alive": BOTH, "statuses": statuses()}
-    return Snapshot(**(facts | attributes))
+    return RobotSnapshot(**(facts | attributes))
 
 
 def test_a_measured_value_has_its_age():
@@ -56,7 +56,7 @@ def test_without_a_fresh_estimate_a_lost_element_is_masked(estimate):
 
 
 def test_a_camera_that_no_service_described_is_still_hidden_when_the_model_says_so():
-    moment = Snapshot(robot="arm", vision=Newest(sample(), 0.1), estimate=Newest(estimates(True), 0.1))
+    moment = RobotSnapshot(robot="arm", vision=Newest(sample(), 0.1), estimate=Newest(estimates(True), 0.1))
     assert signal_rows(moment)[1].kind is Kind.ESTIMATED
 
 
@@ -76,7 +76,7 @@ ENDED = {"hal": Newest(Status(service="hal", state="running"), 9.0)}
         (seen(alive=frozenset({"model"}), age=5.0), Level.TROUBLE, "HAL service gone"),
         (seen(age=5.0), Level.TROUBLE, "Robot silent"),
         (seen(age=5.0, alive=frozenset()), Level.GONE, "Robot gone"),
-        (Snapshot(robot="arm"), Level.GONE, "No robot"),
+        (RobotSnapshot(robot="arm"), Level.GONE, "No robot"),
         (seen(linked=False, link_text="No answer."), Level.GONE, "Router gone"),
         (seen(refused=(NEW_PROGRAM,)), Level.TROUBLE, "Unreadable message"),
         (seen(statuses=FAULT), Level.TROUBLE, "HAL fault"),
@@ -149,7 +149,7 @@ def test_top_shows_troubles_signals_and_a_robot_without_a_model():
     console = Console(width=160)
     measured = Newest(sample(silent=True), 0.01)
     with console.capture() as shown:
-        console.print(top.view(Snapshot(robot="arm", alive=frozenset({"hal"}), sample=measured)))
+        console.print(top.view(RobotSnapshot(robot="arm", alive=frozenset({"hal"}), sample=measured)))
     text = shown.get()
     assert "Model service gone: Only measured values are known. Is `gemuco serve` running?" in text
     row = next(line for line in text.splitlines() if "joint_position" in line and "1/2" in line)
