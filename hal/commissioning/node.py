@@ -10,7 +10,7 @@ from hal.commissioning.sdo_client import SdoClient
 from hal.device import Check
 from hal.errors import DeviceRefused, WrongDevice
 from hal.protocols import cia301
-from hal.protocols.cia301 import Mapped, NmtCommand
+from hal.protocols.cia301 import MappedObject, NmtCommand
 from hal.wire.bus import OWN_NODE, PATIENCE, Bus
 
 _COB_ID = 0x7FF
@@ -103,7 +103,7 @@ def _mapped(sdo: SdoClient, side: _Side, number: int) -> list[int]:
 
 
 def _describe(entries: list[int]) -> str:
-    return describe([Mapped(entry >> 16, entry >> 8 & 0xFF, entry & 0xFF) for entry in entries])
+    return describe([MappedObject(entry >> 16, entry >> 8 & 0xFF, entry & 0xFF) for entry in entries])
 
 
 def _map(sdo: SdoClient, side: _Side, pdo: Pdo, cob: int, is_fixed: bool) -> None:
@@ -160,7 +160,7 @@ class Plan:
 
     profile: int
     pdos: PdoMap
-    writes: tuple[tuple[Mapped, int], ...] = field(default=())
+    writes: tuple[tuple[MappedObject, int], ...] = field(default=())
     watch_time: float = 0.0
 
 
@@ -236,10 +236,12 @@ def inspect_node(sdo: SdoClient, plan: Plan, node: int, identity: str) -> tuple[
     for is_good, text in compare_pdos(sdo, plan.pdos, node):
         checks.append(Check("PDO mapping", is_good, text if is_good else f"{text} {_AGAIN}"))
     period = round(HEARTBEAT_TIME * 1000)
-    checks.append(_value(sdo, "heartbeat", Mapped(cia301.PRODUCER_HEARTBEAT, 0, 16), period, lambda ms: f"{ms} ms"))
+    checks.append(
+        _value(sdo, "heartbeat", MappedObject(cia301.PRODUCER_HEARTBEAT, 0, 16), period, lambda ms: f"{ms} ms")
+    )
     if plan.watch_time:
         watched = cia301.consumer_heartbeat(OWN_NODE, plan.watch_time)
-        checks.append(_value(sdo, "watchdog", Mapped(cia301.CONSUMER_HEARTBEAT, 1, 32), watched, _watchdog))
+        checks.append(_value(sdo, "watchdog", MappedObject(cia301.CONSUMER_HEARTBEAT, 1, 32), watched, _watchdog))
     for item, value in plan.writes:
         checks.append(_value(sdo, f"object {item}", item, value % (1 << item.bits), str))
     return tuple(checks)
@@ -253,7 +255,7 @@ def _device_type(sdo: SdoClient, plan: Plan) -> Check:
     return Check("device type", False, f"Device profile {profile}, not {plan.profile}. Are two node ids swapped?")
 
 
-def _value(sdo: SdoClient, what: str, item: Mapped, expected: int, describe: Callable[[int], str]) -> Check:
+def _value(sdo: SdoClient, what: str, item: MappedObject, expected: int, describe: Callable[[int], str]) -> Check:
     """Check that an object still has the value that was written."""
     try:
         actual = sdo.read(item.index, item.subindex)

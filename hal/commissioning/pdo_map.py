@@ -13,7 +13,7 @@ from pydantic import Field
 from hal.config import Positive, Section
 from hal.errors import ConfigError
 from hal.protocols import cia301
-from hal.protocols.cia301 import Mapped
+from hal.protocols.cia301 import MappedObject
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,13 +22,13 @@ class Pdo:
 
     Attributes:
         number: 1 to 4.
-        objects: Mapped objects in order; at most 8 bytes together.
+        objects: MappedObject objects in order; at most 8 bytes together.
         transmission: 1 to 240: with every n-th SYNC; 254, 255: by its event timer.
         event_time: Period of the event timer [s]; 0 without one.
     """
 
     number: int
-    objects: tuple[Mapped, ...]
+    objects: tuple[MappedObject, ...]
     transmission: int = cia301.SYNCHRONOUS
     event_time: float = 0.0
 
@@ -137,7 +137,7 @@ class PdoSettings(Section):
 
 
 def lay_out(
-    objects: Iterable[Mapped | tuple[Mapped, ...]],
+    objects: Iterable[MappedObject | tuple[MappedObject, ...]],
     first: int = 1,
     transmission: int = cia301.SYNCHRONOUS,
     event_time: float = 0.0,
@@ -150,7 +150,7 @@ def lay_out(
         transmission: Transmission type of all these PDOs.
         event_time: Period of the event timer of all these PDOs [s].
     """
-    places: list[list[Mapped]] = []
+    places: list[list[MappedObject]] = []
     for item in dict.fromkeys(objects):
         together = item if isinstance(item, tuple) else (item,)
         bits = sum(other.bits for other in together)
@@ -190,7 +190,7 @@ def check_map(pdos: PdoMap, sheet: canopen.ObjectDictionary, label: str) -> None
                 )
 
 
-def _check_object(item: Mapped, entry: ODVariable | None, what: str, access: str) -> None:
+def _check_object(item: MappedObject, entry: ODVariable | None, what: str, access: str) -> None:
     if entry is None:
         raise ConfigError(f"{what} by PDO: its data sheet has no such object. Is it the right EDS file?")
     if not entry.pdo_mappable:
@@ -203,13 +203,13 @@ def _check_object(item: Mapped, entry: ODVariable | None, what: str, access: str
         raise ConfigError(f"{what} as {item.bits} bits: its data sheet gives '{entry.name}' {len(entry)} bits.")
 
 
-def describe(objects: Sequence[Mapped]) -> str:
+def describe(objects: Sequence[MappedObject]) -> str:
     """Return objects as text: `6041h:0 (16 bit), 6064h:0 (32 bit)`."""
     return ", ".join(f"{item} ({item.bits} bit)" for item in objects) or "nothing"
 
 
 @functools.lru_cache(maxsize=256)
-def _layout(objects: tuple[Mapped, ...]) -> struct.Struct:
+def _layout(objects: tuple[MappedObject, ...]) -> struct.Struct:
     return struct.Struct("<" + "".join(item.format for item in objects))
 
 
@@ -225,7 +225,7 @@ def is_fixed(sheet: canopen.ObjectDictionary) -> bool:
 
 
 def chosen_pdos(
-    sheet: canopen.ObjectDictionary, required: PdoMap, may_receive: Collection[Mapped], label: str
+    sheet: canopen.ObjectDictionary, required: PdoMap, may_receive: Collection[MappedObject], label: str
 ) -> PdoMap:
     """Return those PDOs of a node with a fixed mapping that carry the required objects.
 
@@ -250,7 +250,9 @@ def chosen_pdos(
     return PdoMap(receives, sends, is_fixed=True)
 
 
-def _covering(objects: Sequence[Mapped], usable: Sequence[Pdo], given: Sequence[Pdo], what: str) -> tuple[Pdo, ...]:
+def _covering(
+    objects: Sequence[MappedObject], usable: Sequence[Pdo], given: Sequence[Pdo], what: str
+) -> tuple[Pdo, ...]:
     """Return PDOs that carry all objects, those with most of the objects first."""
     left, chosen = list(objects), []
     while left:
@@ -282,7 +284,7 @@ def _default(sheet: canopen.ObjectDictionary, index: int, subindex: int) -> int:
     return value if isinstance(value, int) else 0
 
 
-def _mapped(sheet: canopen.ObjectDictionary, entry: int) -> Mapped:
+def _mapped(sheet: canopen.ObjectDictionary, entry: int) -> MappedObject:
     index, subindex, bits = entry >> 16, entry >> 8 & 0xFF, entry & 0xFF
     kind: Literal["unsigned", "signed", "float"] = "unsigned"
     variable = sheet.get_variable(index, subindex)
@@ -290,4 +292,4 @@ def _mapped(sheet: canopen.ObjectDictionary, entry: int) -> Mapped:
         kind = "signed"
     elif variable is not None and variable.data_type in _FLOATS:
         kind = "float"
-    return Mapped(index, subindex, bits, kind)
+    return MappedObject(index, subindex, bits, kind)

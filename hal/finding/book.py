@@ -11,7 +11,7 @@ import canopen
 from canopen.objectdictionary import ODVariable
 
 from hal.protocols import cia301, sdo
-from hal.protocols.cia301 import Mapped
+from hal.protocols.cia301 import MappedObject
 
 Explain = Callable[[bytes], tuple[int | None, str]]
 """An explainer returns node and text of the data of a frame that is not CANopen."""
@@ -49,7 +49,7 @@ class NamedPdo:
 
     label: str
     node: int
-    objects: tuple[Mapped, ...]
+    objects: tuple[MappedObject, ...]
 
 
 class Book:
@@ -87,7 +87,7 @@ class Book:
         """Set the explainer of an identifier (with bit 29 set if extended) that is not CANopen."""
         self.explainers[identifier] = (kind, explain)
 
-    def carry(self, node: int, label: str, identifier: int, objects: tuple[Mapped, ...]) -> None:
+    def carry(self, node: int, label: str, identifier: int, objects: tuple[MappedObject, ...]) -> None:
         """Replace the mapping of a PDO."""
         for known in [key for key, pdo in self.pdos.items() if (pdo.node, pdo.label) == (node, label)]:
             del self.pdos[known]
@@ -140,5 +140,7 @@ class Book:
                 parts = [entries.get((node, mapping + number, place)) for place in range(1, count + 1)]
                 if identifier is None or not parts or None in parts or identifier & cia301.PDO_INVALID:
                     continue
-                objects = tuple(Mapped(part >> 16, part >> 8 & 0xFF, part & 0xFF) for part in parts if part is not None)
+                objects = tuple(
+                    MappedObject(part >> 16, part >> 8 & 0xFF, part & 0xFF) for part in parts if part is not None
+                )
                 self.carry(node, f"{label}{number + 1}", identifier & 0x7FF, objects)

@@ -14,19 +14,19 @@ the weight of that mass at standard gravity.
 
 from dataclasses import dataclass
 
-from hal.protocols.cia301 import Mapped
+from hal.protocols.cia301 import MappedObject
 
 INPUT_PROFILE = 401
 """Device profile number of generic input modules."""
 CELL_PROFILE = 404
 """Device profile number of measuring devices."""
 
-INTERRUPT_ENABLE = Mapped(0x6423, 0, 8)
+INTERRUPT_ENABLE = MappedObject(0x6423, 0, 8)
 """Global interrupt enable, a BOOLEAN that SDO carries in one byte."""
 INPUTS = {
-    "int16": Mapped(0x6401, 0, 16, "signed"),
-    "int32": Mapped(0x6402, 0, 32, "signed"),
-    "float32": Mapped(0x6403, 0, 32, "float"),
+    "int16": MappedObject(0x6401, 0, 16, "signed"),
+    "int32": MappedObject(0x6402, 0, 32, "signed"),
+    "float32": MappedObject(0x6403, 0, 32, "float"),
 }
 """Objects of an analogue input (CiA 401), without their channel."""
 
@@ -40,7 +40,7 @@ UNIT_CODE = 0x6131
 """Object with the unit code of the process value."""
 DIGITS = 0x6132
 """Object with the number of decimal digits of a whole process value."""
-STATUS = Mapped(0x6150, 0, 8)
+STATUS = MappedObject(0x6150, 0, 8)
 """Object with the status of a channel, without the channel."""
 
 INVALID = 0x01
@@ -59,18 +59,18 @@ class ValueForm:
         status: The object with its status, 0 if the value is good; None without a status.
     """
 
-    value: Mapped
+    value: MappedObject
     has_unit: bool = True
     has_digits: bool = False
-    status: Mapped | None = STATUS
+    status: MappedObject | None = STATUS
 
 
 FORMS = {
-    "float32": ValueForm(Mapped(0x6130, 0, 32, "float")),
-    "int16": ValueForm(Mapped(0x7130, 0, 16, "signed"), has_digits=True),
-    "int32": ValueForm(Mapped(0x9130, 0, 32, "signed"), has_digits=True),
-    "counts16": ValueForm(Mapped(0x7100, 0, 16, "signed"), has_unit=False),
-    "counts32": ValueForm(Mapped(0x9100, 0, 32, "signed"), has_unit=False),
+    "float32": ValueForm(MappedObject(0x6130, 0, 32, "float")),
+    "int16": ValueForm(MappedObject(0x7130, 0, 16, "signed"), has_digits=True),
+    "int32": ValueForm(MappedObject(0x9130, 0, 32, "signed"), has_digits=True),
+    "counts16": ValueForm(MappedObject(0x7100, 0, 16, "signed"), has_unit=False),
+    "counts32": ValueForm(MappedObject(0x9100, 0, 32, "signed"), has_unit=False),
 }
 """The process value in three types, and the field value: the converter's counts before any scaling."""
 

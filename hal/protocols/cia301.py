@@ -80,7 +80,7 @@ class EmergencyMessage:
 
 
 @dataclass(frozen=True, slots=True)
-class Mapped:
+class MappedObject:
     """An object in a PDO: index, sub-index, size and type."""
 
     index: int
@@ -200,7 +200,7 @@ def describe_emergency(code: int, register: int = 0, detail: bytes = b"") -> str
     return f"{text} ({'; '.join(more)})" if more else text
 
 
-def mapped(place: str, kind: str) -> Mapped:
+def mapped(place: str, kind: str) -> MappedObject:
     """Return the object `2200h:1` (or `2200h`, `0x2200:1`) with a type such as `int16`.
 
     Raises:
@@ -211,7 +211,7 @@ def mapped(place: str, kind: str) -> Mapped:
         raise ValueError(f"'{place}' is not an object such as 6064h or 2200h:1.")
     if kind not in _TYPES:
         raise ValueError(f"'{kind}' is not a type of an object. Known: {', '.join(_TYPES)}.")
-    return Mapped(int(match[1], 16), int(match[2] or 0), _TYPES[kind][1], _TYPES[kind][0])
+    return MappedObject(int(match[1], 16), int(match[2] or 0), _TYPES[kind][1], _TYPES[kind][0])
 
 
 def consumer_heartbeat(node: int, limit: float) -> int:

@@ -4,24 +4,24 @@ Source: CiA 406, version 3.2: 6000h to 6004h, 6030h, 6031h, 6501h to 6506h. The 
 is in the robot file, so an encoder that loses its preset does not move the joint's zero.
 """
 
-from hal.protocols.cia301 import Mapped
+from hal.protocols.cia301 import MappedObject
 
 PROFILE = 406
 
-OPERATING_PARAMETERS = Mapped(0x6000, 0, 16)
+OPERATING_PARAMETERS = MappedObject(0x6000, 0, 16)
 SCALING_ON = 1 << 2
 """This bit of 6000h selects the units of 6001h and 6002h for the position, else those of 6501h and 6502h."""
-UNITS_PER_TURN = Mapped(0x6001, 0, 32)
-TOTAL_UNITS = Mapped(0x6002, 0, 32)
-POSITION = Mapped(0x6004, 0, 32)
-SPEED = Mapped(0x6030, 1, 16, "signed")
+UNITS_PER_TURN = MappedObject(0x6001, 0, 32)
+TOTAL_UNITS = MappedObject(0x6002, 0, 32)
+POSITION = MappedObject(0x6004, 0, 32)
+SPEED = MappedObject(0x6030, 1, 16, "signed")
 """Its unit is position units per second, unless 6031h defines another."""
-SPEED_MULTIPLIER = Mapped(0x6031, 3, 16)
-SPEED_DIVIDER = Mapped(0x6031, 4, 16)
-PHYSICAL_PER_TURN = Mapped(0x6501, 0, 32)
-PHYSICAL_TURNS = Mapped(0x6502, 0, 16)
-ALARMS = Mapped(0x6503, 0, 16)
-WARNINGS = Mapped(0x6505, 0, 16)
+SPEED_MULTIPLIER = MappedObject(0x6031, 3, 16)
+SPEED_DIVIDER = MappedObject(0x6031, 4, 16)
+PHYSICAL_PER_TURN = MappedObject(0x6501, 0, 32)
+PHYSICAL_TURNS = MappedObject(0x6502, 0, 16)
+ALARMS = MappedObject(0x6503, 0, 16)
+WARNINGS = MappedObject(0x6505, 0, 16)
 
 POSITION_ERROR = 0x0001
 COMMISSIONING_DIAGNOSTIC = 0x0002

@@ -9,7 +9,7 @@ from hal.drivers.canopen.node import data_sheet
 from hal.finding.book import EXTENDED, Book, Frame
 from hal.finding.decode import describe
 from hal.finding.robot_book import books
-from hal.protocols.cia301 import Mapped
+from hal.protocols.cia301 import MappedObject
 from hal.protocols.sdo import Upload
 
 EDS = Path(__file__).parents[2] / "robots" / "eds"
@@ -106,7 +106,7 @@ def test_a_mapping_that_is_read_is_learnt_even_of_an_unknown_node():
 
 
 def test_what_the_driver_maps_takes_precedence(book):
-    book.carry(11, "TPDO1", 0x18B, (Mapped(0x6150, 1, 8), Mapped(0x9130, 1, 32)))
+    book.carry(11, "TPDO1", 0x18B, (MappedObject(0x6150, 1, 8), MappedObject(0x9130, 1, 32)))
     text = describe(frame(0x18B, "04 39 30 00 00"), book).text
     assert text.endswith("12345") and " 4, " in text
 

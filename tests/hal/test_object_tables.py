@@ -56,7 +56,7 @@ ENCODER = {
 
 @pytest.mark.parametrize(("protocol", "table"), [(cia402, DRIVE), (cia406, ENCODER)], ids=["cia402", "cia406"])
 def test_objects_of_a_profile(protocol, table):
-    objects = {name: item for name, item in vars(protocol).items() if isinstance(item, cia301.Mapped)}
+    objects = {name: item for name, item in vars(protocol).items() if isinstance(item, cia301.MappedObject)}
     assert objects == {name: cia301.mapped(*text.split()) for name, text in table.items()}
 
 

@@ -8,10 +8,14 @@ from pydantic import ValidationError
 from hal.commissioning.pdo_map import Pdo, PdoMap, PdoSettings, check_map, lay_out
 from hal.errors import ConfigError
 from hal.protocols import cia301
-from hal.protocols.cia301 import Mapped
+from hal.protocols.cia301 import MappedObject
 
-STATUS, POSITION, VELOCITY = Mapped(0x6041, 0, 16), Mapped(0x6064, 0, 32, "signed"), Mapped(0x606C, 0, 32, "signed")
-TORQUE, MODE = Mapped(0x6077, 0, 16, "signed"), Mapped(0x6061, 0, 8, "signed")
+STATUS, POSITION, VELOCITY = (
+    MappedObject(0x6041, 0, 16),
+    MappedObject(0x6064, 0, 32, "signed"),
+    MappedObject(0x606C, 0, 32, "signed"),
+)
+TORQUE, MODE = MappedObject(0x6077, 0, 16, "signed"), MappedObject(0x6061, 0, 8, "signed")
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +38,7 @@ def test_nothing_needs_no_frame():
 
 def test_frames_per_second_follow_the_transmission():
     pdos = PdoMap(
-        lay_out((Mapped(0x6040, 0, 16),)),
+        lay_out((MappedObject(0x6040, 0, 16),)),
         (Pdo(1, (STATUS, POSITION)), Pdo(2, (TORQUE,), 20), Pdo(3, (MODE,), 254, 0.25), Pdo(4, (MODE,), 255)),
     )
     assert pdos.frames(200.0) == ((2, 200.0), (6, 200.0), (2, 10.0), (1, 4.0), (1, 0.0))
@@ -73,8 +77,8 @@ def test_a_layout_from_the_robot_file():
         }
     )
     assert settings.map("it") == PdoMap(
-        (Pdo(2, (Mapped(0x6040, 0, 16),)),),
-        (Pdo(1, (STATUS, POSITION)), Pdo(3, (Mapped(0x2200, 1, 16, "signed"),), 254, 0.1)),
+        (Pdo(2, (MappedObject(0x6040, 0, 16),)),),
+        (Pdo(1, (STATUS, POSITION)), Pdo(3, (MappedObject(0x2200, 1, 16, "signed"),), 254, 0.1)),
         is_fixed=True,
     )
 
@@ -103,15 +107,23 @@ def test_numbers_and_objects_are_bounded(entry):
 
 
 def test_a_layout_that_the_data_sheet_allows(sheet):
-    check_map(PdoMap(lay_out((Mapped(0x6040, 0, 16),)), lay_out((STATUS, POSITION, TORQUE))), sheet, "'elbow'")
+    check_map(PdoMap(lay_out((MappedObject(0x6040, 0, 16),)), lay_out((STATUS, POSITION, TORQUE))), sheet, "'elbow'")
 
 
 @pytest.mark.parametrize(
     ("receives", "sends", "told"),
     [
-        ((), (Mapped(0x6099, 9, 32),), "'elbow' cannot send 6099h:9 by PDO: its data sheet has no such object"),
-        ((), (Mapped(0x6502, 0, 32),), "'elbow' cannot send 6502h:0 by PDO: .* 'Supported drive modes' cannot be"),
-        ((), (Mapped(0x6064, 0, 16),), "'elbow' cannot send 6064h:0 as 16 bits: .* 'Position actual value' 32 bits"),
+        ((), (MappedObject(0x6099, 9, 32),), "'elbow' cannot send 6099h:9 by PDO: its data sheet has no such object"),
+        (
+            (),
+            (MappedObject(0x6502, 0, 32),),
+            "'elbow' cannot send 6502h:0 by PDO: .* 'Supported drive modes' cannot be",
+        ),
+        (
+            (),
+            (MappedObject(0x6064, 0, 16),),
+            "'elbow' cannot send 6064h:0 as 16 bits: .* 'Position actual value' 32 bits",
+        ),
         ((STATUS,), (), "'elbow' cannot receive 6041h:0 by PDO: .* 'Statusword' is read only"),
     ],
 )

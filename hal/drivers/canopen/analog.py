@@ -17,7 +17,7 @@ from hal.drivers.can_device import Place
 from hal.drivers.canopen.node import HEARTBEAT, CanopenNode, NodeSettings, PdoHandler, data_sheet
 from hal.errors import CommandRefused, ConfigError, DeviceRefused, HalError
 from hal.protocols import analog, cia301
-from hal.protocols.cia301 import Mapped
+from hal.protocols.cia301 import MappedObject
 
 
 def _refuse_duplicates(values: tuple[int, ...]) -> tuple[int, ...]:
@@ -76,8 +76,8 @@ class Channel:
 
     number: int
     quantity: str
-    value: Mapped
-    status: Mapped | None
+    value: MappedObject
+    status: MappedObject | None
     slot: int
     zero: float
     gain: float
@@ -109,7 +109,7 @@ class AnalogNode(CanopenNode):
         return (*_map(objects).frames(rate), HEARTBEAT)
 
     @classmethod
-    def _objects(cls, settings: Any, channel: int) -> tuple[Mapped, Mapped | None]:
+    def _objects(cls, settings: Any, channel: int) -> tuple[MappedObject, MappedObject | None]:
         """Return the objects of value and status of a channel."""
         raise NotImplementedError
 
@@ -144,7 +144,7 @@ class AnalogNode(CanopenNode):
         bounds = self._bounds(settings, value)
         return Channel(number, quantity, value, status, slot, zero or 0.0, gain or 1.0, bounds)
 
-    def _bounds(self, settings: Any, value: Mapped) -> tuple[float, float]:
+    def _bounds(self, settings: Any, value: MappedObject) -> tuple[float, float]:
         """Return the ends of the value's type; a number at or beyond one of them is an overload."""
         if value.kind == "float":
             return -math.inf, math.inf
@@ -202,7 +202,7 @@ class AnalogNode(CanopenNode):
         return DeviceState.READY, f"{self._place}: {'; '.join(troubles)}." if troubles else ""
 
 
-def parse(text: str, channel: int, what: str) -> Mapped:
+def parse(text: str, channel: int, what: str) -> MappedObject:
     """Parse the object of a channel, as `7130h int16` or, with its sub-index, `2120h:0 uint16`.
 
     Raises:
@@ -213,7 +213,7 @@ def parse(text: str, channel: int, what: str) -> Mapped:
         item = cia301.mapped(entry, kind.strip())
     except ValueError as error:
         raise ConfigError(f"{what} '{text}': {error} Write an object and its type: 7130h int16.") from None
-    return item if ":" in entry else Mapped(item.index, channel, item.bits, item.kind)
+    return item if ":" in entry else MappedObject(item.index, channel, item.bits, item.kind)
 
 
 def _of(value: float | tuple[float, ...] | None, settings: AnalogSettings, position: int, what: str) -> float | None:
@@ -225,7 +225,7 @@ def _of(value: float | tuple[float, ...] | None, settings: AnalogSettings, posit
     return value[position]
 
 
-def _map(channels: Sequence[tuple[Mapped, Mapped | None]]) -> PdoMap:
+def _map(channels: Sequence[tuple[MappedObject, MappedObject | None]]) -> PdoMap:
     """Map a channel's value and its own status to one PDO; a status common to all channels to the first PDO."""
     statuses = [status for _, status in channels]
     shared = statuses[0] if statuses and len(channels) > 1 and len(set(statuses)) == 1 else None
@@ -255,9 +255,9 @@ class Cia401Input(AnalogNode):
 
     @classmethod
     @override
-    def _objects(cls, settings: InputSettings, channel: int) -> tuple[Mapped, Mapped | None]:
+    def _objects(cls, settings: InputSettings, channel: int) -> tuple[MappedObject, MappedObject | None]:
         item = INPUT_PRESETS[settings.preset]
-        value = Mapped(item.index, channel, item.bits, item.kind)
+        value = MappedObject(item.index, channel, item.bits, item.kind)
         if settings.value is not None:
             value = parse(settings.value, channel, "value")
         return value, None if settings.status is None else parse(settings.status, channel, "status")
@@ -268,7 +268,7 @@ class Cia401Input(AnalogNode):
         super().__init__(place, settings, analog.INPUT_PROFILE)
 
     @override
-    def _bounds(self, settings: Any, value: Mapped) -> tuple[float, float]:
+    def _bounds(self, settings: Any, value: MappedObject) -> tuple[float, float]:
         low, high = super()._bounds(settings, value)
         bits = settings.resolution
         if bits is None or value.kind == "float" or bits >= value.bits:
@@ -281,7 +281,7 @@ class Cia401Input(AnalogNode):
             channel.scale = 1.0
 
     @override
-    def _writes(self) -> tuple[tuple[Mapped, int], ...]:
+    def _writes(self) -> tuple[tuple[MappedObject, int], ...]:
         enable = analog.INTERRUPT_ENABLE
         return ((enable, 1),) if self._sdo.has(enable.index) else ()
 
@@ -332,10 +332,11 @@ class Cia404Cell(AnalogNode):
 
     @classmethod
     @override
-    def _objects(cls, settings: CellSettings, channel: int) -> tuple[Mapped, Mapped | None]:
+    def _objects(cls, settings: CellSettings, channel: int) -> tuple[MappedObject, MappedObject | None]:
         form = CELL_PRESETS[settings.preset].form
         value, status = (
-            Mapped(item.index, channel, item.bits, item.kind) if item else None for item in (form.value, form.status)
+            MappedObject(item.index, channel, item.bits, item.kind) if item else None
+            for item in (form.value, form.status)
         )
         if settings.value is not None:
             value = parse(settings.value, channel, "value")

@@ -12,7 +12,7 @@ from hal.drivers.can_device import Place
 from hal.drivers.canopen.node import HEARTBEAT, CanopenNode, NodeSettings, PdoHandler, data_sheet
 from hal.errors import DeviceRefused
 from hal.protocols import cia406
-from hal.protocols.cia301 import PDO_SIZE, Mapped
+from hal.protocols.cia301 import PDO_SIZE, MappedObject
 
 _SPEED_END = 2**15 - 1
 
@@ -79,7 +79,7 @@ class Cia406Encoder(CanopenNode):
         multiplier = self._optional(cia406.SPEED_MULTIPLIER) or 1
         self._speed_scale = self._scale * (self._optional(cia406.SPEED_DIVIDER) or 1) / multiplier
 
-    def _optional(self, item: Mapped) -> int:
+    def _optional(self, item: MappedObject) -> int:
         """Return the value of an object; 0 if the data sheet does not have it."""
         return self._sdo.read(item.index, item.subindex) if self._sdo.has(item.index, item.subindex) else 0
 

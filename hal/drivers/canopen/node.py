@@ -18,7 +18,7 @@ from hal.device import Check
 from hal.drivers.can_device import CanDevice, DeviceSettings, Place
 from hal.errors import ConfigError, DeviceRefused, HalError
 from hal.protocols import cia301
-from hal.protocols.cia301 import EmergencyMessage, Mapped, NmtCommand, NmtState
+from hal.protocols.cia301 import EmergencyMessage, MappedObject, NmtCommand, NmtState
 from hal.wire.bus import Handler
 
 log = logging.getLogger(__name__)
@@ -62,7 +62,7 @@ class CanopenNode(CanDevice):
     Settings: ClassVar[type[NodeSettings]] = NodeSettings
     NEEDS_SYNC = True
     COUNTERS = (*CanDevice.COUNTERS, "doubled")
-    MAY_RECEIVE: ClassVar[tuple[Mapped, ...]] = ()
+    MAY_RECEIVE: ClassVar[tuple[MappedObject, ...]] = ()
     """Further objects that a fixed RPDO may carry, because the driver has values for them."""
 
     def __init__(self, place: Place, settings: NodeSettings, profile: int, pdos: PdoMap) -> None:
@@ -114,7 +114,7 @@ class CanopenNode(CanDevice):
         """Return the handler of one TPDO; called once, before the first frame."""
         raise NotImplementedError
 
-    def _writes(self) -> tuple[tuple[Mapped, int], ...]:
+    def _writes(self) -> tuple[tuple[MappedObject, int], ...]:
         """Return the objects and values to write, besides those of PDOs and heartbeats."""
         return ()
 

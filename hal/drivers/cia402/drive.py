@@ -19,7 +19,7 @@ from hal.drivers.cia402.settings import MODES, OBJECTS, TARGETS, DriveSettings, 
 from hal.drivers.cia402.writes import Write, check_objects, drive_writes
 from hal.errors import CommandRefused, ConfigError, DeviceRefused
 from hal.protocols import cia301, cia402
-from hal.protocols.cia301 import Mapped
+from hal.protocols.cia301 import MappedObject
 from hal.protocols.cia402 import OperationMode, State, VelocityUnit
 from hal.wire.bus import Bus
 
@@ -53,7 +53,7 @@ def drive_checks(sdo: SdoClient, mode: OperationMode, is_watched: bool, label: s
 class CommandFrames:
     """The RPDOs with controlword, mode and target."""
 
-    def __init__(self, pdos: Sequence[Pdo], node: int, target: Mapped, label: str) -> None:
+    def __init__(self, pdos: Sequence[Pdo], node: int, target: MappedObject, label: str) -> None:
         """Prepare the frames.
 
         Args:

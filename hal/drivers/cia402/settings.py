@@ -11,7 +11,7 @@ from hal.commissioning.pdo_map import Pdo, PdoMap, lay_out
 from hal.config import Finite, Positive, Section
 from hal.drivers.canopen.node import NodeSettings
 from hal.protocols import cia301, cia402
-from hal.protocols.cia301 import Mapped
+from hal.protocols.cia301 import MappedObject
 from hal.protocols.cia402 import OperationMode, VelocityUnit
 
 MODES = {
@@ -60,7 +60,7 @@ class TemperatureSettings(Section):
         return self
 
     @property
-    def mapped(self) -> Mapped:
+    def mapped(self) -> MappedObject:
         """Object of the temperature."""
         return cia301.mapped(self.object, self.type)
 
@@ -170,7 +170,7 @@ class DriveSettings(NodeSettings):
             receives.insert(1, cia402.MODE_OF_OPERATION)
         return PdoMap(lay_out(receives), sends)
 
-    def _slow(self, objects: list[Mapped], first: int) -> tuple[Pdo, ...]:
+    def _slow(self, objects: list[MappedObject], first: int) -> tuple[Pdo, ...]:
         timing = self.temperature or TemperatureSettings(object="2200h")
         if timing.event_time is None:
             return lay_out(objects, first, timing.every)

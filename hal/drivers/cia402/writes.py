@@ -8,11 +8,11 @@ import canopen
 from hal.drivers.cia402.settings import LARGEST_COUNT, MODES, DriveSettings, DriveUnits
 from hal.errors import ConfigError
 from hal.protocols import cia301, cia402
-from hal.protocols.cia301 import Mapped
+from hal.protocols.cia301 import MappedObject
 
-Write = tuple[Mapped, int]
+Write = tuple[MappedObject, int]
 
-ERROR_BEHAVIOUR = Mapped(cia301.ERROR_BEHAVIOUR, 1, 8)
+ERROR_BEHAVIOUR = MappedObject(cia301.ERROR_BEHAVIOUR, 1, 8)
 POSITION_MARGIN = 0.1
 """The drive's limits are wider than the robot file's by this part of the range: a drive slightly out of range must not
 jump into it when it is enabled. A drive further out of range is not enabled."""
@@ -35,7 +35,7 @@ def check_objects(settings: DriveSettings, has_effort: bool, sheet: canopen.Obje
         )
 
 
-def _needed(settings: DriveSettings, has_effort: bool) -> Iterator[tuple[str, Mapped]]:
+def _needed(settings: DriveSettings, has_effort: bool) -> Iterator[tuple[str, MappedObject]]:
     yield "its mode", cia402.MODE_OF_OPERATION
     if has_effort and settings.rated_torque is None:
         yield "the rated torque (or the setting rated_torque)", cia402.RATED_TORQUE
@@ -95,7 +95,7 @@ def drive_writes(
     )
 
 
-def _takes(sheet: canopen.ObjectDictionary, item: Mapped) -> bool:
+def _takes(sheet: canopen.ObjectDictionary, item: MappedObject) -> bool:
     """Return whether the data sheet has the object and allows writing it."""
     entry = sheet.get_variable(item.index, item.subindex)
     return entry is not None and "w" in entry.access_type
