@@ -1,1 +1,1 @@
-"""The rules for who may move a robot: one lease, commands and targets that are on time, and one intake for both."""
+"""Rules that decide which client may move a robot: the lease, the age of a request, and the intake of messages."""

@@ -12,61 +12,61 @@ from services.errors import CommandHeld, LeaseLost, NoAnswer, ServiceError, TooL
 log = logging.getLogger(__name__)
 
 SECONDS = 3.0
-"""Default length of a lease [s]: it outlives a slow moment, and ends soon after its holder was killed."""
+"""A lease has this length [s] by default: it survives a short delay and ends soon after its holder was killed."""
 RENEWALS = 3
-"""A lease is renewed this many times in its length: two renewals may be lost."""
-BACK_WITHIN = 1.0
-"""Longest wait [s] for the HAL to take the lease back; it also runs out by itself."""
+"""A lease is renewed this many times during its length, so two renewals may be lost."""
+RELEASE_TIMEOUT = 1.0
+"""The client waits at most this long [s] for the HAL to end the lease; without an answer the lease expires."""
 NEEDS_LEASE = {
     "hal": ("enable", "reset", "home", "tare"),
     "model": ("engage", "target", "adapt", "rollback", "normal"),
 }
-"""Service -> verbs that are refused while another client commands, and after the caller has lost its lease."""
+"""These verbs of each service are refused while another client has the lease, and after the caller lost its lease."""
 
 
-class Asker(Protocol):
-    """The part of a client that a lease needs."""
+class LeaseLink(Protocol):
+    """The methods of a client that a lease needs."""
 
     held_lease: "ClientLease | None"
 
     def ask(self, service: str, verb: str, arguments: Mapping[str, Any] | None = None, timeout: float = ...) -> Any:
-        """Ask a verb of a service."""
+        """Query a verb of a service."""
         ...
 
 
 class ClientLease:
-    """The lease of a robot, as a context manager: no other client commands meanwhile; every client may stop the robot.
+    """The lease of a robot, as a context manager: only its holder commands the robot; every client may stop the robot.
 
-    A lease that could not be renewed in time, or whose HAL was restarted, is lost: until the end of the context
-    commands and verbs that need it raise `LeaseLost`. By the clock of this process it ends before it does in the HAL.
+    The lease is lost if it was not renewed in time or the HAL was restarted. Then commands, and verbs that need the
+    lease, raise `LeaseLost` until the end of the context. This process ends the lease earlier than the HAL does.
 
     Args:
-        client: The client that is to command.
-        seconds: Time [s] that it runs without renewal; a short one is free for others soon after this process died.
+        client: The client that takes the lease.
+        seconds: Length of the lease without a renewal [s]; if this process dies, other clients wait this long.
     """
 
-    def __init__(self, client: Asker, seconds: float = SECONDS) -> None:
+    def __init__(self, client: LeaseLink, seconds: float = SECONDS) -> None:
         self._client, self._seconds = client, seconds
         self._number = 0
-        self._until = 0.0
-        self._lost = ""
-        self._trouble = ""
-        self._done = threading.Event()
+        self._end = 0.0
+        self._lost_text = ""
+        self._renewal_fault = ""
+        self._stop = threading.Event()
         self._thread = threading.Thread(target=self._renew, name="lease", daemon=True)
 
     def __enter__(self) -> Self:
         """Take the lease.
 
         Raises:
-            CommandHeld: Another client commands; the text names it.
+            CommandHeld: Another client has the lease; the text names this client.
             NoAnswer: The HAL does not answer.
-            BadArguments: The time is not allowed.
+            BadArguments: The length is not allowed.
         """
         if self._client.held_lease is not None:
-            raise CommandHeld("This client commands the robot already; one lease is enough.")
-        asked = time.monotonic()
+            raise CommandHeld("This client already has the lease of this robot; one lease is enough.")
+        request_time = time.monotonic()
         answer = self._client.ask("hal", "lease", {"seconds": self._seconds})
-        self._number, self._until = answer["number"], asked + self._seconds
+        self._number, self._end = answer["number"], request_time + self._seconds
         self._client.held_lease = self
         self._thread.start()
         return self
@@ -75,38 +75,38 @@ class ClientLease:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._client.held_lease = None
-        self._done.set()
-        self._thread.join(BACK_WITHIN)
+        self._stop.set()
+        self._thread.join(RELEASE_TIMEOUT)
         try:
-            self._client.ask("hal", "release", timeout=BACK_WITHIN)
+            self._client.ask("hal", "release", timeout=RELEASE_TIMEOUT)
         except ServiceError as failure:
-            log.warning("The lease was not given back, and runs out by itself: %s", failure)
+            log.warning("The lease could not be released; it expires by itself: %s", failure)
 
     @property
     def text(self) -> str:
         """The reason why the lease was lost; empty while it runs."""
-        if not self._lost and time.monotonic() >= self._until:
-            self._lose(f"it was not renewed for {self._seconds:g} s. {self._trouble}")
-        return self._lost
+        if not self._lost_text and time.monotonic() >= self._end:
+            self._lose(f"the lease was not renewed for {self._seconds:g} s. {self._renewal_fault}")
+        return self._lost_text
 
     def check(self) -> None:
         """Raise `LeaseLost` if the lease was lost."""
         if text := self.text:
             raise LeaseLost(text)
 
-    def _lose(self, why: str) -> None:
-        self._lost = self._lost or f"This client commands no more: {why}".rstrip()
+    def _lose(self, reason: str) -> None:
+        self._lost_text = self._lost_text or f"This client no longer commands the robot: {reason}".rstrip()
 
     def _renew(self) -> None:
         pause = self._seconds / RENEWALS
-        while not self._done.wait(pause) and not self.text:
-            asked = time.monotonic()
+        while not self._stop.wait(pause) and not self.text:
+            request_time = time.monotonic()
             arguments = {"seconds": self._seconds, "number": self._number}
             try:
-                self._client.ask("hal", "lease", arguments, min(pause, self._until - asked))
+                self._client.ask("hal", "lease", arguments, min(pause, self._end - request_time))
             except (NoAnswer, TooLate) as error:
-                self._trouble = str(error)
-            except Exception as error:  # whatever it is, this client must not go on to command
+                self._renewal_fault = str(error)
+            except Exception as error:  # after any other error this client must not command
                 self._lose(str(error))
             else:
-                self._trouble, self._until = "", asked + self._seconds
+                self._renewal_fault, self._end = "", request_time + self._seconds

@@ -1,10 +1,9 @@
-"""Commands and targets from the network: each is read and checked; a bad one is counted and reported, not followed."""
+"""Intake of commands and targets from the network: a bad message is counted and reported, not followed."""
 
 import logging
 import math
 import time
 from collections.abc import Callable
-from functools import partial
 from typing import Any, Generic, TypeVar
 
 import zenoh
@@ -13,7 +12,6 @@ from hal.errors import CommandRefused
 from hal.robot import Robot
 from services.command.lease import Lease
 from services.errors import CommandHeld, LeaseLost, TargetRefused
-from services.wire import messages
 from services.wire.caller import LONGEST_NAME, Caller
 from services.wire.messages import Command, Message, MessageError
 from services.wire.plain_text import plain, shown
@@ -23,25 +21,25 @@ M = TypeVar("M", bound=Message)
 log = logging.getLogger(__name__)
 
 DEPTH = 8
-"""Messages kept between two turns: a bad one must not push out a good one, nor a flood fill the turn."""
+"""At most this many messages wait for a tick: a bad one must not displace a good one, and a flood must stay short."""
 LOG_EVERY = 1.0
-"""Shortest time [s] between two log lines about bad messages."""
+"""Two log lines about bad messages are at least this long [s] apart."""
 NEWS_FOR = 5.0
-"""A bad message is mentioned in the status for this long [s]."""
+"""The status reports a bad message for this long [s]."""
 
 
 class Intake(Generic[M]):
-    """Hands on the messages of a key that came since the last turn, in their order.
+    """Subscription of a tick: the messages of a key since the last tick, followed in their order.
 
     Args:
         session: An open session.
         key: Key to subscribe to.
         record: Type of its messages.
-        use: Follows a message; raises `CommandRefused`, `CommandHeld`, `LeaseLost`, `TooLate` or `TargetRefused` if it
-            must not.
+        use: Function that follows a message; raises `CommandRefused`, `CommandHeld`, `LeaseLost`, `TooLate` or
+            `TargetRefused` if the message is refused.
 
     Attributes:
-        counters: How many messages were `accepted`, `refused` and `malformed`.
+        counters: Numbers of messages that were `accepted`, `refused` and `malformed`.
     """
 
     def __init__(self, session: zenoh.Session, key: str, record: type[M], use: Callable[[M], None]) -> None:
@@ -52,35 +50,31 @@ class Intake(Generic[M]):
         self._subscriber = session.declare_subscriber(key, zenoh.handlers.RingChannel(DEPTH))
 
     def take(self) -> None:
-        """Follow the messages that came; never blocks, and never raises because of a message."""
+        """Follow the waiting messages; never wait, and never raise because of a message."""
         for _ in range(DEPTH):
             sample = self._subscriber.try_recv()
             if sample is None:
                 return
-            self._offer(partial(received_message, sample, self._record))
+            self._follow(sample)
 
-    def offer(self, data: bytes) -> None:
-        """Follow one message in its wire form."""
-        self._offer(lambda: messages.decode(data, self._record))
-
-    def _offer(self, read: Callable[[], M]) -> None:
+    def _follow(self, sample: zenoh.Sample) -> None:
         try:
-            self._use(read())
+            self._use(received_message(sample, self._record))
         except (CommandRefused, CommandHeld, LeaseLost, TargetRefused) as error:
             self._refuse("refused", str(error))
         except MessageError as error:
             self._refuse("malformed", str(error))
-        except Exception as error:  # the turn must go on, whatever came
+        except Exception as error:  # no message may end the tick
             self._refuse("malformed", f"A {self._record.TYPE} could not be read: {type(error).__name__}: {error}")
         else:
             self.counters["accepted"] += 1
 
     def facts(self) -> dict[str, Any]:
-        """Return the counters, and in `text` the fault of the last bad message."""
+        """Return the counters, and the fault of the last bad message as `text`."""
         return {**self.counters, "text": self._text}
 
     def news(self) -> str:
-        """Return the fault of a bad message of the last `NEWS_FOR` seconds; empty if there was none."""
+        """Return the fault of the last bad message for `NEWS_FOR` seconds; empty otherwise."""
         return self._text if time.monotonic() - self._refused_at < NEWS_FOR else ""
 
     def _refuse(self, counter: str, text: str) -> None:
@@ -94,13 +88,13 @@ class Intake(Generic[M]):
 
 
 class Commands:
-    """The rules by which the HAL follows a command: right signal, this run of the HAL, and the sender may command.
+    """Check of each command in the HAL: its signal, its run of the HAL, and the permission of its sender.
 
     Args:
         robot: The robot that is commanded.
-        signal: Its commanded signal.
-        boot: This run of the HAL.
-        lease: The robot's lease; a client that streams commands takes it if it is free.
+        signal: The robot's commanded signal.
+        boot: Number of this run of the HAL.
+        lease: The robot's lease; a client that streams commands takes a free lease.
 
     Attributes:
         sender: `boot` of the sender of the last accepted command; 0 before the first.
@@ -114,7 +108,7 @@ class Commands:
         """Give the robot a command.
 
         Raises:
-            CommandRefused: It is for another signal or run of the HAL, or the robot refuses it.
+            CommandRefused: The command is for another signal or run of the HAL, or the robot refuses the command.
             CommandHeld, LeaseLost: The sender may not command; see `Lease.check_stream`.
         """
         caller = Caller(plain(command.name, LONGEST_NAME), command.boot)
@@ -123,7 +117,7 @@ class Commands:
                 f"A command of {shown(command.signal)} was refused. This robot takes '{self._signal}'."
             )
         if command.hal_boot != self._boot:
-            raise CommandRefused("A command was refused that answers a sample of another run of the HAL.")
+            raise CommandRefused("A command was refused because it answers a sample of another run of the HAL.")
         self._lease.check_stream(caller)
         self._robot.command(command.values, command.cycle)
         self._lease.stream(caller)

@@ -1,6 +1,7 @@
-"""The lease of a robot: one client at a time commands it, for as long as it renews its lease.
+"""Lease of a robot: only the client that has the lease, and renews it, commands the robot.
 
-The lease keeps clients out of each other's way. It does not stop a client that lies about its identity; roles do.
+The lease protects clients from commanding at the same time. A client with a false identity is stopped by the roles, not
+by the lease.
 """
 
 import math
@@ -15,21 +16,21 @@ from services.wire.caller import UNKNOWN, Caller
 from services.wire.plain_text import shown
 
 LONGEST = 60.0
-"""Longest lease [s]; a client that vanishes must not keep others out for long."""
+"""No lease is longer than this [s], so that a client that vanished does not exclude the others for long."""
 SHORTEST = 0.2
-"""Shortest lease [s]; it must be possible to renew it in time on a busy machine."""
+"""No lease is shorter than this [s], so that it can be renewed in time on a busy machine."""
 STREAM = 1.0
-"""A client without a lease still commands for this long [s] after its last command."""
+"""A client that streams commands without a lease is the holder for this long [s] after its last command."""
 
 
 @dataclass(frozen=True, slots=True)
 class Tenure:
-    """The time for which one client commands.
+    """Time during which one client commands.
 
     Attributes:
-        caller: The holder; a caller without a boot before the first.
+        caller: The holder; a caller without a boot before the first tenure.
         until: End [monotonic s].
-        through: `boot` of the service that commands for the holder; 0 if the holder does so itself.
+        through: `boot` of the service that commands for the holder; 0 if the holder commands itself.
         number: Number of this lease; 0 if a stream of commands took it.
     """
 
@@ -40,7 +41,7 @@ class Tenure:
 
 
 class Lease:
-    """The one lease of a robot, for any thread. Looking at it and streaming commands never wait."""
+    """The only lease of a robot, for any thread. Reading it and streaming commands never wait."""
 
     def __init__(self, clock: Clock | None = None) -> None:
         self._clock = clock or SystemClock()
@@ -49,26 +50,24 @@ class Lease:
 
     @property
     def tenure(self) -> Tenure | None:
-        """The tenure that runs now; None if the robot has no holder."""
+        """The present tenure; None if the robot has no holder."""
         tenure = self._tenure
         return tenure if tenure.caller.boot and self._clock.monotonic() < tenure.until else None
 
     def left(self) -> float:
-        """Return how long [s] the lease still runs; 0 without a holder."""
+        """Return the remaining time of the lease [s]; 0 without a holder."""
         return max(0.0, self._tenure.until - self._clock.monotonic())
 
     def take(self, caller: Caller, seconds: Any) -> Tenure:
-        """Give the caller the lease for this time [s] from now; its holder may take it again.
+        """Give the caller the lease for this time [s] from now; the holder may take its lease again.
 
         Raises:
-            CommandHeld: Another client has it.
+            CommandHeld: Another client has the lease.
             BadArguments: The time is not allowed, or the caller has no boot.
         """
         duration = _checked(seconds)
         if not caller.boot:
-            raise BadArguments(
-                "A client that wants the lease must send a `boot`, a random number, beside its question."
-            )
+            raise BadArguments("A client that takes the lease must send a `boot`, a random number, with its query.")
         with self._lock:
             tenure, until = self.tenure, self._clock.monotonic() + duration
             if tenure is not None and tenure.caller.boot != caller.boot:
@@ -81,13 +80,13 @@ class Lease:
         """Extend a lease.
 
         Args:
-            caller: Its holder.
-            seconds: Time [s] for which it shall run from now.
+            caller: Holder of the lease.
+            seconds: New remaining time of the lease [s].
             number: Number of the lease, from `take`.
 
         Raises:
-            LeaseLost: It ran out or was given back, or the HAL was restarted.
-            CommandHeld: Another client has taken it since.
+            LeaseLost: The lease expired or was released, or the HAL was restarted.
+            CommandHeld: Another client has taken the lease since.
             BadArguments: The time is not allowed.
         """
         duration = _checked(seconds)
@@ -101,7 +100,7 @@ class Lease:
             return self._tenure
 
     def give_back(self, caller: Caller) -> None:
-        """End the caller's lease, if it has it; the service that commanded for the caller must stop then."""
+        """End the lease if the caller has it; a service that commanded for the caller must then stop."""
         with self._lock:
             if caller.boot and self._tenure.caller.boot == caller.boot:
                 self._tenure = replace(self._tenure, until=-math.inf)
@@ -112,11 +111,11 @@ class Lease:
         if tenure is None or (caller.boot and caller.boot in (tenure.caller.boot, tenure.through)):
             return
         if caller.through and caller.through == tenure.caller.boot:
-            return  # the service streams without a lease: it commands for each client that asks it
+            return  # a service that streams without a lease commands for any client
         raise self._refusal(tenure)
 
     def delegate(self, caller: Caller) -> None:
-        """Let the service that asks on the caller's behalf command for it, as long as the caller's lease runs.
+        """Let the service that queries for the caller also command for the caller, until the caller's lease ends.
 
         Raises:
             CommandHeld: Another client commands.
@@ -130,9 +129,9 @@ class Lease:
                 self._tenure = replace(tenure, through=caller.through)
 
     def stream(self, caller: Caller) -> None:
-        """Note that a command of this caller was followed; without a lease it then commands for `STREAM` seconds.
+        """Make the caller of an accepted command the holder for `STREAM` seconds, if no client has a lease.
 
-        Never waits: if another thread is busy with the lease, the next command counts instead.
+        Never waits: while another thread uses the lease, the call has no effect, and the next command repeats it.
         """
         if not self._lock.acquire(blocking=False):
             return
@@ -144,21 +143,21 @@ class Lease:
             self._lock.release()
 
     def check_stream(self, caller: Caller) -> None:
-        """Check that a command of this caller may be followed.
+        """Check that this caller may command.
 
         Raises:
-            CommandHeld: Another client commands, or the caller does not say who it is.
+            CommandHeld: Another client commands, or the caller has no boot.
             LeaseLost: The caller commanded for a client whose lease has ended.
         """
         if not caller.boot:
             raise CommandHeld("A command without its sender's `boot` was refused.")
         tenure = self._tenure
         if tenure.through == caller.boot and self.tenure is None:
-            raise LeaseLost(f"The lease of {tenure.caller} has ended, so commands on its behalf are not followed.")
+            raise LeaseLost(f"The lease of {tenure.caller} has ended, so commands sent for this client are refused.")
         self.check(caller)
 
     def end_stream(self) -> None:
-        """End the tenure of a client that only streams: the robot takes no commands now."""
+        """End the tenure of a client without a lease, because the robot takes no commands now."""
         tenure = self._tenure
         if tenure.number or tenure.until == -math.inf or not self._lock.acquire(blocking=False):
             return
@@ -171,7 +170,7 @@ class Lease:
     def _refusal(self, tenure: Tenure) -> CommandHeld:
         left = max(0.0, tenure.until - self._clock.monotonic())
         return CommandHeld(
-            f"{tenure.caller} commands this robot, for another {left:.1f} s unless it goes on. "
+            f"{tenure.caller} commands this robot for another {left:.1f} s, and longer if it continues. "
             "Stopping is always allowed."
         )
 
@@ -180,6 +179,6 @@ def _checked(seconds: Any) -> float:
     is_number = isinstance(seconds, int | float) and not isinstance(seconds, bool)
     if not is_number or not SHORTEST <= seconds <= LONGEST:  # also refuses NaN
         raise BadArguments(
-            f"A lease runs for {SHORTEST:g} to {LONGEST:g} s, not for {shown(seconds)}; renew it to keep it longer."
+            f"A lease has a length of {SHORTEST:g} to {LONGEST:g} s, not {shown(seconds)}; renew it to keep it longer."
         )
     return float(seconds)

@@ -1,4 +1,4 @@
-"""The model service's permission to move the robot, by what the HAL publishes about who commands."""
+"""Permission for a client to use the model service to move the robot, from the lease holder that the HAL publishes."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -11,15 +11,15 @@ from services.wire.messages import Holder, Sample, Target
 from services.wire.streams import Arrival, Reader
 
 HEARD_WITHIN = 2.5
-"""A `Holder` message is believed for this long [s]; the HAL publishes one a second."""
+"""A `Holder` message is valid for this long [s]; the HAL publishes one per second."""
 
 
 class Permission:
-    """The model service's rules for who may direct it: the lease holder, and any client while the robot has none.
+    """Check of the clients that direct the model service: only the lease holder may, or any client without a holder.
 
     Args:
         boot: `boot` of the model service.
-        newest: Returns the last sample of the HAL, however old.
+        newest: Function that returns the last sample of the HAL, of any age.
         holder: Reader of the HAL's `Holder` messages.
         rate: Rate of the HAL's cycle [Hz].
         clock: Clock of this process.
@@ -36,19 +36,19 @@ class Permission:
         rate: float,
         clock: Clock,
     ) -> None:
-        self._boot, self._newest, self._holder, self._rate, self._clock = boot, newest, holder, rate, clock
+        self._boot, self._newest, self._holders, self._rate, self._clock = boot, newest, holder, rate, clock
         self._was_through = False
         self.engaged_by = Caller()
 
     def check(self, caller: Caller) -> None:
-        """Raise `CommandHeld` if another client commands; while the model itself does, any client may direct it."""
-        held = self._held()
-        if held is None or held.holder == self._boot or (caller.boot and caller.boot == held.holder):
+        """Raise `CommandHeld` if another client commands; if the model service commands, any client may direct it."""
+        holder = self._valid_holder()
+        if holder is None or holder.holder == self._boot or (caller.boot and caller.boot == holder.holder):
             return
-        raise CommandHeld(f"{held.name} commands this robot. Stopping is always allowed.")
+        raise CommandHeld(f"{holder.name} commands this robot. Stopping is always allowed.")
 
     def may_move(self, caller: Caller) -> None:
-        """Raise `CommandHeld` as `check` does, and `TooLate` if the question was asked too long ago."""
+        """Raise `CommandHeld` as `check` does, and `TooLate` if the request is too old."""
         self.check(caller)
         newest, age = self._newest(), float("inf")
         if newest is not None:
@@ -61,11 +61,11 @@ class Permission:
         self.may_move(Caller("", target.boot, 0, target.hal_boot, target.cycle))
 
     def begin(self, caller: Caller) -> None:
-        """Note that the controller is engaged for a caller."""
+        """Store the caller that engaged the controller."""
         self.engaged_by, self._was_through = caller, False
 
     def on_behalf(self, caller: Caller) -> Caller:
-        """Return the caller as the model service sends it to the HAL: with the newest sample that the model has."""
+        """Return the caller for a query to the HAL: marked as sent by the model service, with its newest sample."""
         newest = self._newest()
         boot, cycle = (0, 0) if newest is None else (newest.message.boot, newest.message.cycle)
         return replace(caller, through=self._boot, hal_boot=boot, cycle=cycle)
@@ -76,20 +76,20 @@ class Permission:
         return f"model service, engaged by {self.engaged_by}"
 
     def ended(self) -> str:
-        """Return in one sentence why an engaged controller must let go; empty while it need not."""
-        held = self._held()
-        through = 0 if held is None else held.through
+        """Return the reason to disengage the controller, as one sentence; empty if there is no reason."""
+        holder = self._valid_holder()
+        through = 0 if holder is None else holder.through
         if through == self._boot:
             self._was_through = True
-        elif held is not None and held.holder != self._boot and held.holder != self.engaged_by.boot:
-            return f"{held.name} commands the robot now, so the controller let go."
+        elif holder is not None and holder.holder not in (self._boot, self.engaged_by.boot):
+            return f"{holder.name} commands the robot now, so the controller was disengaged."
         elif self._was_through:
-            return f"The lease of {self.engaged_by} has ended, so the controller let go."
+            return f"The lease of {self.engaged_by} has ended, so the controller was disengaged."
         return ""
 
-    def _held(self) -> Holder | None:
-        last = self._holder.last()
+    def _valid_holder(self) -> Holder | None:
+        last = self._holders.last()
         if last is None:
             return None
-        waited, held = self._clock.monotonic() - last.received, last.message
-        return held if held.holder and waited <= HEARD_WITHIN and waited < held.left else None
+        age, holder = self._clock.monotonic() - last.received, last.message
+        return holder if holder.holder and age <= HEARD_WITHIN and age < holder.left else None

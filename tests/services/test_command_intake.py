@@ -71,6 +71,7 @@ class Taken:
     def __init__(self, robot: str) -> None:
         config = RobotConfig.model_validate(description(robot))
         self.clock = ManualClock()
+        self.robot_name = robot
         self.robot = Robot(config, [Wires(config, self.clock)], clock=self.clock)
         self.session = open_session(robot, "client")
         self.commands = Commands(self.robot, config.command.signal, BOOT, Lease(self.clock))
@@ -81,6 +82,10 @@ class Taken:
         self.sample = self.cycle()
         while self.robot.mode != "hold":
             self.sample = self.cycle()
+
+    def offer(self, data: bytes) -> None:
+        self.session.put(keys.command(self.robot_name), data)
+        self.intake.take()
 
     def cycle(self) -> Sample:
         self.clock.advance(self.robot.period)
@@ -108,7 +113,7 @@ def test_a_bad_command_is_counted_and_told(taken: Taken, wrong: str) -> None:
     if wrong == "an old cycle":
         for _ in range(60):
             taken.cycle()
-    taken.intake.offer(data)
+    taken.offer(data)
     taken.cycle()
     facts = taken.intake.facts()
     assert facts[counter] == 1
@@ -122,7 +127,7 @@ def test_a_good_command_is_followed_and_its_sender_known(taken: Taken) -> None:
     good = Command(
         boot=9, signal="muscle_length", values=np.array([0.001, 0.0]), cycle=taken.sample.cycle, hal_boot=BOOT
     )
-    taken.intake.offer(messages.encode(good))
+    taken.offer(messages.encode(good))
     taken.cycle()
     assert taken.robot.mode == "follow"
     assert taken.commands.sender == 9
@@ -132,7 +137,7 @@ def test_a_good_command_is_followed_and_its_sender_known(taken: Taken) -> None:
 
 def test_bad_commands_are_logged_once_a_second(taken: Taken, caplog: pytest.LogCaptureFixture) -> None:
     for _ in range(50):
-        taken.intake.offer(b"\xc1")
+        taken.offer(b"\xc1")
     assert taken.intake.facts()["malformed"] == 50
     assert len(caplog.records) == 1
 

@@ -92,7 +92,9 @@ def test_a_second_client_is_refused_by_name_and_may_stop(hal: Hal, anna: Client,
             lambda: bert.home("wires"),
             lambda: bert.tare("wires"),
         ):
-            with pytest.raises(CommandHeld, match=r"anna commands this robot, for another .* s unless it goes on"):
+            with pytest.raises(
+                CommandHeld, match=r"anna commands this robot for another .* s, and longer if it continues"
+            ):
                 refused()
         with pytest.raises(CommandHeld, match="one lease is enough"):
             anna.lease().__enter__()
@@ -118,7 +120,7 @@ def test_a_lease_is_renewed_until_its_end_also_when_that_is_an_exception(anna: C
             bert.reset()
         raise ZeroDivisionError
     bert.reset()
-    with pytest.raises(BadArguments, match="A lease runs for"):
+    with pytest.raises(BadArguments, match="A lease has a length of"):
         bert.lease(float("nan")).__enter__()
     anna.reset()
 
@@ -160,7 +162,7 @@ def test_a_hal_that_was_restarted_has_forgotten_the_holder_who_hears_of_it(hal: 
         hal.end()
         hal.start()
         eventually(lambda: bool(lease.text))
-        with pytest.raises(LeaseLost, match="This client commands no more: "):
+        with pytest.raises(LeaseLost, match="This client no longer commands the robot: "):
             anna.enable()
         sample = anna.next_sample()
         assert sample is not None
@@ -175,7 +177,7 @@ def test_a_hal_that_was_restarted_has_forgotten_the_holder_who_hears_of_it(hal: 
 def test_a_holder_that_was_frozen_longer_than_its_lease_knows_that_it_commands_no_more(anna: Client) -> None:
     lease = anna.lease(0.6)
     with lease:
-        lease._done.set()  # as if its thread had not come to run
+        lease._stop.set()  # as if its thread had not come to run
         eventually(lambda: bool(lease.text))
         with pytest.raises(LeaseLost, match=r"not renewed for 0\.6 s"):
             anna.reset()
@@ -203,8 +205,8 @@ def test_what_may_move_the_robot_is_not_done_late(hal: Hal, anna: Client, verb: 
     asked = replace(anna._link.caller, hal_boot=run, cycle=cycle)
     eventually(lambda: anna._link.seen()[1] - cycle > 1.1 * hal.config.rates.hal)
     for caller, says in (
-        (asked, "s old when the question came|there was no cycle"),
-        (anna._link.caller, "does not say which sample of the HAL its sender saw"),
+        (asked, "s old when the request arrived|there was no cycle"),
+        (anna._link.caller, "does not name its sender's newest sample"),
         (replace(asked, hal_boot=run + 1), "another run of the HAL"),
     ):
         with pytest.raises(TooLate, match=says):

@@ -117,7 +117,7 @@ def test_the_controller_lets_go_with_the_lease_that_it_was_engaged_under(told: T
     assert told.permission.ended() == ""
     assert "engaged by anna" in told.permission.name
     told.clock.advance(HEARD_WITHIN + 0.01)
-    assert told.permission.ended() == "The lease of anna has ended, so the controller let go."
+    assert told.permission.ended() == "The lease of anna has ended, so the controller was disengaged."
     told.permission.begin(anna())
     assert told.permission.ended() == "", "engaged anew"
 
@@ -127,7 +127,7 @@ def test_the_controller_lets_go_when_somebody_else_commands(told: Told) -> None:
     told.holder("model service", MODEL)
     assert told.permission.ended() == ""
     told.holder("bert", BERT)
-    assert told.permission.ended() == "bert commands the robot now, so the controller let go."
+    assert told.permission.ended() == "bert commands the robot now, so the controller was disengaged."
 
 
 def test_it_asks_the_hal_for_whoever_asked_it_with_what_it_has_seen_itself(told: Told) -> None:
