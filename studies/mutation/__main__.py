@@ -4,10 +4,10 @@
 
 Every place has the same chance to be drawn, and at each place one change is drawn. The tests run once to record the
 calls of each test (`--calls` reads an older record). A mutant inside a function then meets the tests that call it; a
-mutant elsewhere, or in a function that no test calls, meets those that call its module or a module that imports it. The
-fastest tests of all files come first, until one fails or `BUDGET` is spent. Controls are the same runs without a
-change: a control that fails shows how often a mutant counts as killed by chance. Everything runs in copies of the tree;
-the results are written to runs/mutation.
+mutant elsewhere meets the files that import its module, and the tests that call it or a module that imports it. Short
+tests come first, then one of each file in turn, until one fails or `BUDGET` is spent. Controls are the same runs
+without a change: a control that fails shows how often a mutant counts as killed by chance. Everything runs in copies of
+the tree; the results are written to runs/mutation.
 """
 
 import argparse
@@ -36,7 +36,7 @@ TESTS = [
 ]
 BUDGET = 20.0
 """The tests of one mutant take at most this time [s] when they pass."""
-TIMEOUT = 200.0
+TIMEOUT = 400.0
 """A mutant whose tests take longer [s] is killed: a test does not end."""
 STEADY = 0.1
 """A test that takes less time [s] does not depend on the load of the machine."""
@@ -69,7 +69,7 @@ def importers(path: str) -> frozenset[str]:
     module = path.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
     parent, _, name = module.rpartition(".")
     files = {path}
-    for file in chain(*((ROOT / package).rglob("*.py") for package in ("hal", "services", "simulators"))):
+    for file in chain(*((ROOT / package).rglob("*.py") for package in ("hal", "services", "simulators", "tests"))):
         for node in ast.walk(ast.parse(file.read_text())):
             if isinstance(node, ast.ImportFrom) and (
                 node.module == module or (node.module == parent and name in {alias.name for alias in node.names})
@@ -83,12 +83,16 @@ def tests_of(mutant: Mutant, calls: Calls) -> Iterator[str]:
     key, files = f"{mutant.path}:{mutant.function}", importers(mutant.path)
     names = [name for name, (_, keys) in calls.items() if key in keys]
     if not names:
-        names = [name for name, (_, keys) in calls.items() if any(key.split(":")[0] in files for key in keys)]
+        users = (name for name, (_, keys) in calls.items() if any(key.split(":")[0] in files for key in keys))
+        names = [*(name for name in calls if name.split("::")[0] in files), *users]
+    names = sorted(set(names), key=lambda name: (name.split("::")[0] not in files, *calls[name]))
     rows = defaultdict(list)
-    for name in sorted(names, key=lambda name: calls[name][0]):
-        rows[name.split("::")[0]].append(name)
+    for name in names:
+        if calls[name][0] >= STEADY:
+            rows[name.split("::")[0]].append(name)
+    steady = (name for name in names if calls[name][0] < STEADY)
     left = BUDGET
-    for name in filter(None, chain(*zip_longest(*rows.values()))):
+    for name in filter(None, chain(steady, *zip_longest(*rows.values()))):
         left -= calls[name][0]
         if left > 0:
             yield name
@@ -101,7 +105,7 @@ def first_failure(tree: Path, names: list[str], calls: Calls) -> str:
     """
     while names:
         (tree / "names.txt").write_text("\n".join(names))
-        status, output = pytest(tree, "-x", "--timeout=20", "@names.txt", timeout=TIMEOUT)
+        status, output = pytest(tree, "-x", "--timeout=60", "@names.txt", timeout=TIMEOUT)
         if status == 0:
             return ""
         if status == 4:
@@ -111,7 +115,7 @@ def first_failure(tree: Path, names: list[str], calls: Calls) -> str:
             return output.strip().split("\n")[-1]
         name = max(failed, key=len)
         (tree / "names.txt").write_text(name)
-        if calls[name][0] < STEADY or pytest(tree, "--timeout=20", "@names.txt", timeout=TIMEOUT)[0]:
+        if calls[name][0] < STEADY or pytest(tree, "--timeout=60", "@names.txt", timeout=TIMEOUT)[0]:
             return name
         names = names[names.index(name) + 1 :]
     return ""
