@@ -319,3 +319,16 @@ def test_a_device_that_is_silent_is_told(config):
         Measurement(subject(config, "elbow_encoder", "direction")),
     ):
         raise AssertionError("nobody is there")
+
+
+def test_the_hash_does_not_depend_on_the_order_of_settings():
+    """An editor may sort the keys of the file."""
+    fields = {"device": "elbow", "identity": "a:1", "unit": "rad", "points": (), "residual": 0.0}
+    settings = {"zero": 0.1, "direction": -1}
+    seals = {
+        Record(**fields, settings=dict(order), measured_with=dict(order)).seal
+        for order in (settings.items(), reversed(settings.items()))
+    }
+    assert len(seals) == 1
+    other = Record(**fields, settings={**settings, "zero": 0.2}, measured_with=settings)
+    assert other.seal not in seals

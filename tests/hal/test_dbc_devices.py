@@ -451,3 +451,11 @@ def test_only_the_good_value_of_the_error_signal_is_good(place, fault, is_good):
     device._bus.subscriber(256 + 8)(bytearray.fromhex("00 28 23 00 00 00 00 00"), 1.0)
     assert math.isnan(device.read().values[0]) is not is_good
     assert (device._error_text() == "") is is_good
+
+
+def test_a_value_in_words_is_no_bit_field_unless_the_robot_file_says_so(inbox):
+    fault = inbox.signal("Status.Fault")
+    inbox.seal()
+    inbox.messages["Status"].raws = (6.0,)
+    assert fault.describe() == "6"
+    assert fault.describe(is_bits=True) == "bit 1, bit 2"
