@@ -327,7 +327,7 @@ def test_the_hash_does_not_depend_on_the_order_of_settings():
     settings = {"zero": 0.1, "direction": -1}
     seals = {
         Record(**fields, settings=dict(order), measured_with=dict(order)).seal
-        for order in (settings.items(), reversed(settings.items()))
+        for order in ([*settings.items()], [*reversed(settings.items())])
     }
     assert len(seals) == 1
     other = Record(**fields, settings={**settings, "zero": 0.2}, measured_with=settings)
