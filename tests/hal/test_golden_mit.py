@@ -235,3 +235,11 @@ def test_answers_to_register_requests(data, is_register):
     assert mit.parse_register(frame, 0x105) is None
     far = bytes.fromhex("05 01") + frame[2:]
     assert (mit.parse_register(far, 0x105) is not None) == is_register
+
+
+@pytest.mark.parametrize("last", ["FB", "FC", "FD", "FE"])
+def test_a_command_that_ends_like_a_special_frame_is_a_command(last):
+    for first in ("8A 3D 66 63 33 33 3B", "FF FF FF FF FF FF FE"):
+        assert isinstance(mit.parse_command(bytes.fromhex(f"{first} {last}"), AK80_9), Command)
+    assert mit.parse_command(bytes.fromhex(f"FF FF FF FF FF FF FF {last}"), AK80_9) == Special(int(last, 16))
+    assert isinstance(mit.parse_command(bytes.fromhex("FF FF FF FF FF FF FF FF"), AK80_9), Command)

@@ -1,5 +1,6 @@
 """How many frames a CANopen node may send at the wrong time before it is taken for two nodes under one id."""
 
+import can
 import pytest
 from drive_bench import JointBench
 
@@ -49,3 +50,44 @@ def test_heartbeats_and_emergencies_of_a_wrong_length_are_counted(joint):
     assert drive.is_commissioned
     drive._bus.subscriber(0x705)(OPERATIONAL, now)
     assert drive.is_commissioned
+
+
+@pytest.fixture
+def wire(joint):
+    bus = can.Bus(interface="virtual", channel=joint.config.buses["can0"].channel)
+    yield bus
+    bus.shutdown()
+
+
+def halts(wire):
+    """Requests of pre-operational (NMT command 80h) to the node since the last call."""
+    count = 0
+    while (message := wire.recv(0)) is not None:
+        count += message.arbitration_id == 0x000 and bytes(message.data) == bytes((0x80, 5))
+    return count
+
+
+def test_a_node_that_was_lost_and_is_operational_is_taken_out_of_operation(joint, wire):
+    now = joint.clock.monotonic()
+    beat = joint.drive._bus.subscriber(0x705)
+    beat(OPERATIONAL, now)
+    assert halts(wire) == 0
+    beat(STOPPED, now)
+    assert halts(wire) == 1
+    beat(OPERATIONAL, now)
+    assert halts(wire) == 1
+
+
+def test_after_a_boot_up_not_before_its_process_data_are_counted(joint, wire):
+    now = joint.clock.monotonic()
+    beat, pdo = joint.drive._bus.subscriber(0x705), joint.drive._bus.subscriber(0x185)
+    beat(BOOT_UP, now)
+    beat(OPERATIONAL, now)
+    for _ in range(2):
+        pdo(PDO, now)
+        beat(OPERATIONAL, now)
+    assert halts(wire) == 0
+    pdo(PDO, now)
+    assert halts(wire) == 1
+    beat(OPERATIONAL, now)
+    assert halts(wire) == 1
