@@ -1,8 +1,8 @@
-"""How many frames a CANopen node may send at the wrong time before it is taken for two nodes under one id."""
+"""Frames of a CANopen node one by one: process data at the wrong time, heartbeats, emergencies, torque and mode."""
 
 import can
 import pytest
-from drive_bench import JointBench
+from drive_bench import HOMING, JointBench
 
 BOOT_UP, OPERATIONAL, STOPPED = bytearray([0x00]), bytearray([0x05]), bytearray([0x04])
 PDO = bytearray(6)
@@ -91,3 +91,34 @@ def test_after_a_boot_up_not_before_its_process_data_are_counted(joint, wire):
     assert halts(wire) == 1
     beat(OPERATIONAL, now)
     assert halts(wire) == 1
+
+
+def test_an_emergency_is_logged_once_until_it_changes(joint, caplog):
+    """Error code 2310h or 4210h, error register, five bytes of the maker."""
+    emergency, now = joint.drive._bus.subscriber(0x085), joint.clock.monotonic()
+    logged = []
+    for data in ("10 23 03", "10 23 03", "10 42 09", "00 00 00", "10 42 09"):
+        caplog.clear()
+        emergency(bytearray.fromhex(data) + bytes(5), now)
+        logged.append(len(caplog.records))
+    assert logged == [1, 0, 1, 0, 1]
+    assert joint.drive.health().counters["emergencies"] == 4
+
+
+def test_the_rated_torque_is_in_thousandths_of_a_newton_metre():
+    bench = JointBench("csp", quantities=("position", "effort")).open()
+    try:
+        assert bench.objects[0x6076, 0] == 200
+        assert bench.drive._units.effort == pytest.approx(0.01)  # N m per thousandth of 0.2 N m times 50
+    finally:
+        bench.close()
+
+
+def test_the_mode_is_read_behind_a_temperature_in_the_same_frame():
+    bench = JointBench("csp", quantities=("position", "temperature"), homing=HOMING).open()
+    try:
+        bench.cycle(41)
+        assert bench.drive._actual_mode == 8  # cyclic synchronous position
+        assert bench.value("temperature") == pytest.approx(25.0, abs=0.5)  # degrees Celsius
+    finally:
+        bench.close()
