@@ -38,6 +38,10 @@ BO_ 6 Bounded: 4 B
  SG_ Speed : 0|16@1- (0.1,0) [-100|100] "rpm" A
  SG_ Mode : 16|8@1+ (1,0) [0|0] "" A
 
+BO_ 8 Seven: 7 A
+ SG_ Low : 36|8@1+ (1,0) [0|0] "" B
+ SG_ Last : 50|6@1+ (1,0) [0|0] "" B
+
 BO_ 2147483655 Wide: 8 A
  SG_ Count : 0|64@1+ (1,0) [0|0] "" B
 
@@ -234,6 +238,7 @@ def test_a_value_that_does_not_fit(mixed, name, value):
         ("BigBits", "00 00 00 00 00 40", {"Tail": 1}),
         ("BigBits", "00 00 00 00 01 00", {"Tail": 4}),
         ("Words", "FF FE 00 00 00 00 01 02", {"First": -2, "Second": 0x0102}),
+        ("Seven", "00 00 00 00 50 0A FC", {"Low": 0xA5, "Last": 63}),
         ("Wide", "01 00 00 00 00 00 00 80", {"Count": 2**63 + 1}),
     ],
 )

@@ -435,4 +435,5 @@ def test_counters_of_a_controller_error():
     assert error_frame(0x004, bytes.fromhex("00 40 00 00 00 00 01 02")).counters == (1, 2)
     assert error_frame(0x004, bytes.fromhex("00 40 00 00 00 00 00 03")).counters == (0, 3)
     assert error_frame(0x001, bytes.fromhex("00 40 00 00 00 00 01 02")).counters is None
+    assert error_frame(0x004, bytes.fromhex("00 00 00 00 00 00 80 00")).controller is None
     assert error_frame(0x204, bytes.fromhex("00 10 00 00 00 00 00 01")).controller is Controller.PASSIVE
