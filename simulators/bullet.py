@@ -1,6 +1,6 @@
 """Rigid bodies in PyBullet: torques in, joint positions and velocities out.
 
-This is the only file that imports pybullet. Every call names its physics client, so that worlds do not see each other.
+This is the only file that imports pybullet. Every call names its physics client, so that worlds are independent.
 """
 
 import contextlib
@@ -15,14 +15,14 @@ from simulators.chain import GRAVITY
 
 @contextlib.contextmanager
 def _without_greeting() -> Iterator[None]:
-    """Keep off the file descriptor of standard error what C code prints there."""
-    kept, sink = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    """Discard the output of C code to the file descriptor of standard error."""
+    stderr, sink = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     os.dup2(sink, 2)
     try:
         yield
     finally:
-        os.dup2(kept, 2)
-        os.close(kept)
+        os.dup2(stderr, 2)
+        os.close(stderr)
         os.close(sink)
 
 
@@ -114,7 +114,7 @@ class BulletBody:
         return float(0.5 * self.velocity @ mass @ self.velocity + GRAVITY * height)
 
     def add_mass(self, joint: str, mass: float, radius: float) -> None:
-        """Put a ball of `mass` [kg] and `radius` [m] at the centre of mass of the link behind `joint`."""
+        """Add a ball of `mass` [kg] and `radius` [m] at the centre of mass of the link behind `joint`."""
         index = self._index[joint]
         link_mass, _, inertia, *_ = pybullet.getDynamicsInfo(self._body, index, physicsClientId=self._client)
         added = 0.4 * mass * radius**2

@@ -1,4 +1,4 @@
-"""A World as a hal device without a bus, and the clock it moves: faster than real time, for data collection."""
+"""A world as a hal device without a bus, and its clock: faster than real time, for data collection."""
 
 import time
 from collections.abc import Mapping
@@ -13,7 +13,7 @@ from simulators.world import World
 
 
 class WorldClock:
-    """A clock whose sleep is the world's motion, so that a cycle takes no longer than its computation."""
+    """A clock that steps the world in place of sleeping, so that a cycle takes only its computation time."""
 
     def __init__(self, world: World) -> None:
         self._world = world
@@ -25,7 +25,7 @@ class WorldClock:
         return self._now
 
     def now_ns(self) -> int:
-        """Return the simulated time after the wall-clock time at which this clock was made [ns since 1970]."""
+        """Return the wall-clock time at the start of this clock plus the simulated time [ns since 1970]."""
         return self._start_ns + round(self._now * 1e9)
 
     def sleep_until(self, deadline: float) -> None:
@@ -37,7 +37,7 @@ class WorldClock:
 
 
 class DirectDevice(Device):
-    """Every sensor, camera and servo of a world in one device; it can neither fall silent nor fault."""
+    """All sensors, cameras and servos of a world in one device; it has no faults and is never silent."""
 
     def __init__(self, config: RobotConfig, world: World, clock: WorldClock, name: str = "direct") -> None:
         self.name = name

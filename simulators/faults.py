@@ -1,10 +1,10 @@
-"""Parts of a body that can break, named as a person types them: `muscle_cut:biceps`, `heavy_object`."""
+"""Parts of a body that can break, such as `muscle_cut:biceps` and `heavy_object`."""
 
 from collections.abc import Iterable, Sequence
 
 
 class UnknownPart(ValueError):
-    """No such part can break; the message lists those that can."""
+    """The part cannot break; the message lists the parts that can."""
 
 
 MUSCLE_CUT = "muscle_cut"
@@ -18,7 +18,7 @@ def known_parts(muscles: Iterable[str]) -> list[str]:
 
 
 def check_part(part: str, muscles: Iterable[str]) -> tuple[str, str]:
-    """Split a part into the kind of its fault and what it concerns (empty for the body as a whole).
+    """Split a part into the kind of fault and the muscle (empty for the whole body).
 
     Raises:
         UnknownPart: The part is not known.

@@ -1,8 +1,8 @@
 """A CAN bus between processes over a Unix socket: a python-can interface and the server that it talks to.
 
 `can.Bus(interface="hub", channel="musashi_arm_can0")` joins the bus that a `HubServer` of that name serves. No frame
-is lost between programs that read; a program that does not read is cut off rather than fed with gaps. A packet on the
-socket holds one or more records of one frame each, which is what makes a burst of answers cheap.
+is lost between programs that read. A program that does not read is disconnected; it never receives frames with gaps.
+A packet on the socket has one or more records of one frame each, so a burst of answers needs few packets.
 """
 
 import contextlib
@@ -23,14 +23,14 @@ from simulators.wire_time import ERROR, EXTENDED, REMOTE
 __all__ = ["HubBus", "HubServer"]
 
 _PATIENCE = 1.0
-"""A server has this time [s] to admit a program, and to take a frame unless the sender gives another."""
+"""The server must admit a program, or accept a frame sent without a timeout, within this time [s]."""
 
 
 class HubBus(can.BusABC):
-    """One program's place on a bus that a `HubServer` serves.
+    """Connection of one program to a bus that a `HubServer` serves.
 
-    Classic frames only. One thread may receive while others send. There is no `fileno`: frames wait in the object as
-    well as in the socket.
+    Classic frames only. One thread may receive while others send. There is no `fileno`, because frames wait in the
+    object as well as in the socket.
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class HubBus(can.BusABC):
         Args:
             channel: Name of the channel, or the absolute path of its socket.
             can_filters: Filters as for every python-can bus.
-            receive_own_messages: Also receive what this object sends, at once.
+            receive_own_messages: Also receive the frames that this object sends, at once.
             **kwargs: `bitrate` and the like, which concern the server.
 
         Raises:
@@ -65,7 +65,7 @@ class HubBus(can.BusABC):
         super().__init__(channel=channel, can_filters=can_filters, **kwargs)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Send one frame; waits up to `timeout` [s] (1 s if not given) while the bus takes none.
+        """Send one frame; wait up to `timeout` [s] (1 s if not given) while the bus accepts no frame.
 
         Raises:
             can.CanOperationError: The server is gone or takes no frames, or the frame is not a classic one.
@@ -119,7 +119,7 @@ class HubBus(can.BusABC):
         return (self._waiting.popleft() if self._waiting else None), False
 
     def _packet(self, timeout: float | None) -> bytes:
-        """Return the next packet; empty if none came."""
+        """Return the next packet; empty after `timeout` [s]."""
         if not self._readable.poll(None if timeout is None else timeout * 1e3):
             return b""
         try:
@@ -159,7 +159,7 @@ def _join(channel: str, path: Path) -> socket.socket:
         link.connect(str(path))
         if link.recv(PACKET) == HELLO:
             return link
-        reason = "what answers is no hub"
+        reason = "another program answers"
     except OSError as error:
         reason = error.strerror or "no answer"
     link.close()

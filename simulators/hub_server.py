@@ -1,4 +1,4 @@
-"""Server of a hub channel: it hands every frame to all other clients, at once or at the pace of a real bus."""
+"""Server of a hub channel: it sends every frame to all other clients, at once or with the timing of a real bus."""
 
 import contextlib
 import fcntl
@@ -20,11 +20,12 @@ from simulators.wire_time import ERROR, Wire
 _log = logging.getLogger(__name__)
 
 _BACKLOG = 100_000 * RECORD.size
-"""A program that does not read is cut off beyond this many waiting bytes, ten seconds of a full 1 Mbit/s bus."""
+"""A client with more waiting bytes than this is disconnected: ten seconds of a full 1 Mbit/s bus."""
 _QUEUE = 256
-"""The server takes no more frames from senders when this many wait for a timed bus."""
+"""The server accepts no frames while this many frames wait for a timed bus."""
 _GRAIN = 3e-4
-"""A timed bus sleeps at least this long [s] while frames wait: two or three leave together, at half the cost."""
+"""While frames wait, a timed bus sleeps at least this time [s]. Two or three frames then leave together, at half the
+cost."""
 
 
 @dataclass(eq=False, slots=True)
@@ -34,10 +35,10 @@ class _Client:
 
 
 class HubServer:
-    """Serves one channel from a thread of its own.
+    """Server of one channel, with its own thread.
 
-    Without a bit rate a frame reaches the others as soon as it comes. With one, frames wait for arbitration, the
-    lowest identifier first, and arrive when their last bit would have, stamped with that time.
+    Without a bit rate a frame is sent to the other clients at once. With a bit rate, frames wait for arbitration, the
+    lowest identifier first. They are sent, and stamped, at the time of their last bit on a real bus.
     """
 
     def __init__(self, channel: str, bitrate: int | None = None) -> None:
@@ -45,7 +46,7 @@ class HubServer:
 
         Args:
             channel: Name of the channel, or the absolute path of its socket.
-            bitrate: Bit rate to keep [bit/s]; None for no delay.
+            bitrate: Simulated bit rate [bit/s]; None for no delay.
         """
         self.channel = channel
         self._path = socket_path(channel)
@@ -56,7 +57,7 @@ class HubServer:
         self._counters = {"frames": 0, "joined": 0, "cut_off": 0, "malformed": 0}
 
     def start(self) -> None:
-        """Open the channel; from now on programs can join.
+        """Open the channel, so that programs can join.
 
         Raises:
             can.CanInitializationError: Another server has the channel, or its folder is not ours.
@@ -122,7 +123,7 @@ class HubServer:
         return max(due - time.monotonic(), _GRAIN if len(self._wire) else 0.0)
 
     def _admit(self) -> None:
-        with contextlib.suppress(OSError):  # who knocked may have gone again
+        with contextlib.suppress(OSError):  # the program may have ended already
             peer, _ = self._listener.accept()
             peer.setblocking(False)
             peer.send(HELLO, socket.MSG_NOSIGNAL)
@@ -130,7 +131,7 @@ class HubServer:
             self._counters["joined"] += 1
 
     def _take(self, client: _Client) -> None:
-        for _ in range(64):  # then the others have their turn
+        for _ in range(64):  # then serve the other clients
             try:
                 packet = client.socket.recv(PACKET)
             except BlockingIOError:
@@ -142,7 +143,7 @@ class HubServer:
                 return
             if len(packet) % RECORD.size:
                 self._counters["malformed"] += 1
-                _log.warning("hub %s: a client that does not speak the hub's language is cut off", self.channel)
+                _log.warning("hub %s: disconnected a client that sent a packet of a wrong size", self.channel)
                 self._drop(client)
                 return
             self._counters["frames"] += len(packet) // RECORD.size
@@ -183,7 +184,7 @@ class HubServer:
             del client.outbox[:sent]
         if len(client.outbox) > _BACKLOG:
             self._counters["cut_off"] += 1
-            _log.warning("hub %s: a client that does not read is cut off", self.channel)
+            _log.warning("hub %s: disconnected a client that does not read", self.channel)
             self._drop(client)
 
     def _drop(self, client: _Client) -> None:
@@ -197,7 +198,7 @@ def _lock_path(path: Path) -> Path:
 
 
 def _claim(path: Path, channel: str) -> int:
-    """Lock a channel for this process; the lock goes with the process, however it ends."""
+    """Lock a channel for this process. The lock ends with the process, also after a crash."""
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     while True:
         try:
@@ -216,4 +217,4 @@ def _claim(path: Path, channel: str) -> int:
         with contextlib.suppress(FileNotFoundError):
             if os.fstat(lock).st_ino == _lock_path(path).stat().st_ino:
                 return lock
-        os.close(lock)  # the owner before removed the file while we opened it
+        os.close(lock)  # the previous owner removed the file after this process opened it

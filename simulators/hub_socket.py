@@ -12,7 +12,7 @@ RECORD = struct.Struct("<IB3xd8s")
 PACKET = 128 * RECORD.size
 """A packet has at most this many bytes."""
 HELLO = b"gemuco hub 1"
-"""This is the first packet from the server; from then on the program misses no frame."""
+"""This is the first packet from the server. The program receives every frame after it."""
 
 
 def socket_path(channel: str) -> Path:
@@ -27,7 +27,7 @@ def socket_path(channel: str) -> Path:
         path = _folder() / f"{channel}.can"
     else:
         raise can.CanInitializationError(
-            f"Channel '{channel}' is no name for a hub: letters, digits, '_', '-' and '.' only, or an absolute path."
+            f"'{channel}' is not the name of a hub channel: use letters, digits, '_', '-', '.', or an absolute path."
         )
     if len(os.fsencode(path)) > 107:
         raise can.CanInitializationError(f"The socket path '{path}' is longer than the 107 bytes that Linux allows.")

@@ -11,7 +11,7 @@ from simulators.muscles import Elastic, Paths
 
 @dataclass(frozen=True, slots=True)
 class Friction:
-    """Dry friction with a presliding range, so that it holds at rest: force = limit * (slid / presliding).
+    """Dry friction with a presliding range, so that it also acts at rest: force = limit * (slid / presliding).
 
     Attributes:
         joint_torque: Coulomb torque of each joint [N m], shape (n,).
@@ -37,8 +37,8 @@ class Servo:
     Attributes:
         speed: Highest speed of the wire [m/s].
         lag: Time constant of the position loop [s].
-        force: Tension at which the spool gives way while driven [N].
-        brake: Tension at which the brake gives way [N].
+        force: Tension at which the driven spool slips [N].
+        brake: Tension at which the brake slips [N].
     """
 
     speed: float = 0.2
@@ -52,9 +52,9 @@ class Body:
     """One variant of a muscle-driven robot.
 
     Attributes:
-        urdf: Its rigid links.
-        paths: Its wires.
-        elastic: Their elastic elements.
+        urdf: File of the rigid links.
+        paths: Paths of the wires.
+        elastic: Elastic elements of the wires.
         slack: Wire length that counts as zero: path length minus reported length [m], shape (m,).
         joint_damping: Viscous torque of each joint [N m s/rad], shape (n,).
         loss_time: Loss time of the elastic elements [s]: f = elastic(x) * (1 + loss_time * rate * dx/dt).

@@ -1,11 +1,11 @@
 """A muscle-driven body as a World: rigid links in PyBullet; wires, elastic elements, spool servos and friction
 in compiled loops; sensors in numpy.
 
-A wire's length is what its spool has paid out; the path is longer by what the elastic element gives. The load cell sits
-at the spool: friction on the way makes it read more than the elastic element carries when the wire was last wound in,
-and less when it was paid out. Tensions of the elastic elements are brought to the joints by the moment arms,
-tau = -G^T f, once per physics step. Wires are stiff and a forearm is light, so steps are linearly implicit: tensions
-are taken where the joints will be at the end of the step.
+The length of a wire is the length that the spool has released. The path is longer by the elongation of the elastic
+element. The load cell is at the spool. Because of friction between spool and elastic element, the load cell reads more
+than the tension of the elastic element after the wire was wound in, and less after it was released. The moment arms
+convert the tensions of the elastic elements to joint torques, tau = -G^T f, once per physics step. Wires are stiff and
+a forearm is light, so steps are linearly implicit: they use the tensions at the end of the step.
 """
 
 import math
@@ -28,14 +28,14 @@ class MuscleWorld(World):
     """Moment arms and inertia are solved every this many steps; in between, paths are linear in joint positions."""
 
     def __init__(self, body: Body, seed: int, servo: Servo | None = None, longest_step: float = 0.0025) -> None:
-        """Put the body at rest, its brakes on.
+        """Create the body at rest, with the brakes on.
 
         Args:
-            body: What it is made of.
-            seed: Of the sensors' noise.
-            servo: What its spools can do.
-            longest_step: Of the physics [s]; with the default, random motion differs from a ten times finer one by
-                0.001 rad and 0.5 N (root mean square).
+            body: Parts of the body.
+            seed: Seed of the sensors' noise.
+            servo: Limits of the spool servos.
+            longest_step: Longest step of the physics [s]. With the default, random motion differs from that with
+                a ten times shorter step by 0.001 rad and 0.5 N (root mean square).
         """
         self.time = 0.0
         self._longest_step = longest_step
@@ -61,7 +61,7 @@ class MuscleWorld(World):
         self._spool[:] = self._target[:] = self._lengths - body.elastic.elongation(body.rest_tension)
         self._hold_or_drive()
         self._whole[:] = 1.0
-        self._pulled(longest_step, self._wires.copy(), self._slid_joint.copy())  # compiled now, and not on the way
+        self._pulled(longest_step, self._wires.copy(), self._slid_joint.copy())  # compile now, not in the first step
 
     @override
     def step(self, duration: float) -> None:
@@ -113,10 +113,10 @@ class MuscleWorld(World):
         self._bullet.close()
 
     def _refresh(self, duration: float) -> None:
-        """Solve the paths at the present posture, and what makes steps of `duration` [s] implicit.
+        """Solve the paths at the present posture, and the matrix for implicit steps of `duration` [s].
 
-        With joint stiffness K and damping D at hand, (M + D dt + K dt^2) dv = (tau - bias) dt; PyBullet gets the torque
-        that makes M dv of it.
+        With joint stiffness K and damping D, (M + D dt + K dt^2) dv = (tau - bias) dt. PyBullet gets the torque that
+        gives the same dv with M alone.
         """
         body = self._body
         self._solved_at = self._bullet.position.copy()
@@ -129,7 +129,7 @@ class MuscleWorld(World):
         self._implicit = np.linalg.solve(resisted, mass).T
 
     def _hold_or_drive(self) -> None:
-        """Return the largest elongation of each elastic element [m] before its motor, or its brake, gives way."""
+        """Compute the largest elongation of each elastic element [m], at which its motor or its brake slips."""
         force = np.where(self._follows > 0, self._servo.force, self._servo.brake)
         self._grip[:] = self._body.elastic.elongation(force)
 

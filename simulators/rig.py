@@ -1,4 +1,4 @@
-"""A simulated robot on its buses: a world, the nodes that measure and move it, and the time they share."""
+"""A simulated robot on its buses: a world, the nodes that measure and move it, and their common time."""
 
 import logging
 import sys
@@ -21,29 +21,29 @@ from simulators.world import World
 _log = logging.getLogger(__name__)
 
 PERIOD = 0.005
-"""The physics thread has this step [s]; half of it costs a few percent of a core more."""
+"""The physics thread has this step [s]. Half of this step needs a few percent of a core more."""
 _SWITCH_INTERVAL = 5e-4
-"""A Python thread keeps the others waiting at most this long [s]; the default delays answers to SYNC by 5 ms."""
+"""The interpreter switches between threads after this time [s]; the default delays answers to SYNC by 5 ms."""
 
 
 class UnknownFault(ValueError):
-    """No such fault, or no such node; the message lists what is known."""
+    """The fault or the node does not exist; the message lists the known ones."""
 
 
 class Rig:
     """Simulated hardware of one robot.
 
     `start` runs it in real time: a hub server for every bus of interface `hub`, one thread per bus that answers, and
-    one that moves the world. `step` moves it by hand instead, for tests on interface `virtual`.
+    one thread that moves the world. `step` moves it in simulated time instead, for tests on interface `virtual`.
     """
 
     def __init__(self, config: RobotConfig, world: World, hardware: Sequence[NodeSpec]) -> None:
-        """Wire up a robot; nothing runs and no bus is open yet.
+        """Connect the parts of a robot, without opening a bus or starting a thread.
 
         Args:
-            config: Only buses, signals and their elements are read; what the hardware is comes from `hardware`.
+            config: Robot file; only buses, signals and their elements are used.
             world: The physics.
-            hardware: What hangs on the buses.
+            hardware: Nodes on the buses.
 
         Raises:
             ValueError: A node is on a bus, or measures an element, that the robot file does not have.
@@ -71,7 +71,7 @@ class Rig:
         self._now = 0.0
         self._ticks = {"steps": 0, "skipped": 0}
         self.failure = ""
-        """Why the rig stopped by itself; empty while all is well."""
+        """Reason why the rig stopped by itself; empty without a failure."""
 
     def start(self) -> None:
         """Run in real time until `stop`.
@@ -107,7 +107,7 @@ class Rig:
         self._world.close()
 
     def step(self, duration: float) -> None:
-        """Answer what waits on the buses, then move world and nodes by `duration` [s]; 0 only answers.
+        """Answer the waiting frames, then move world and nodes by `duration` [s]; 0 only answers.
 
         The buses are opened, and the nodes boot, at the first call.
         """
@@ -209,9 +209,7 @@ class Rig:
                 time.sleep(-late)
 
     def _guard(self, name: str, job: Callable[[], None]) -> None:
-        """Run a thread's job; when it fails, stop the rig, because nodes must not go on with a world that stands
-        still.
-        """
+        """Run a thread's job; if it fails, stop the rig, so that nodes do not run without the world."""
         try:
             job()
         except Exception as error:

@@ -1,8 +1,7 @@
 """A wire between the HAL and its nodes that loses, repeats, cuts, delays and forges frames, by settings and a seed.
 
-It joins two python-can buses of any interface, one with the HAL on it and one with the nodes, and moves frames between
-them only on request, so that on interface `virtual` a test of seconds takes no time and runs the same way each
-time.
+It joins two python-can buses of any interface, one with the HAL and one with the nodes. It moves frames between them
+only on request, so on interface `virtual` a test does not wait in real time and every run is the same.
 """
 
 import random
@@ -29,9 +28,9 @@ class Chances:
         loss: The frame does not arrive.
         duplicate: The frame arrives twice.
         short: Its last bytes are missing.
-        long: Bytes are added, eight together at most.
-        corrupt: One of its bytes is changed; only from a node, since a checksum protects what is on the wire.
-        delay: The frame arrives `delayed_by` later, behind frames that were sent after it.
+        long: Bytes are added; the frame has at most eight bytes.
+        corrupt: One of its bytes is changed. Only frames of nodes, because a checksum protects frames on the wire.
+        delay: The frame arrives `delayed_by` later, after frames that were sent after it.
         delayed_by: Delay [s].
     """
 
@@ -46,7 +45,7 @@ class Chances:
 
 @dataclass(slots=True)
 class _Direction:
-    """Frames one way: where they come from, where they go, and those that are late."""
+    """Source, target and delayed frames of one direction."""
 
     name: str
     source: can.BusABC
@@ -57,8 +56,8 @@ class _Direction:
 class FaultyWire:
     """Wire between the HAL and the nodes of one bus; without settings it only passes frames on.
 
-    Random numbers are drawn from one stream per direction and identifier, so that a request that comes at another
-    moment does not change the faults of all others.
+    Each direction and identifier has its own stream of random numbers, so a request at another time does not change
+    the faults of the other frames.
     """
 
     def __init__(self, hal: can.BusABC, nodes: can.BusABC, seed: int = 0) -> None:
@@ -67,7 +66,7 @@ class FaultyWire:
         Args:
             hal: Bus on the channel that the HAL opens, for this wire only.
             nodes: Bus on the channel that the nodes open, for this wire only.
-            seed: Seed of everything random.
+            seed: Seed of all random numbers.
         """
         self._hal, self._nodes = hal, nodes
         self._to_nodes = _Direction("to nodes", hal, nodes)
@@ -78,30 +77,30 @@ class FaultyWire:
         self.is_cut = False
         """Whether the wire is cut: no frame arrives, without an error."""
         self.lost: frozenset[int] = frozenset()
-        """Identifiers of which no frame arrives."""
+        """Identifiers whose frames do not arrive."""
         self.readdressed: Mapping[int, int] = {}
-        """Node -> id under which it is on the bus instead of its own; of another node: both have it."""
+        """Node id -> wrong id that the node uses on the bus; two nodes may have the same id."""
         self.babble: Callable[[random.Random], list[tuple[int, bytes]]] | None = None
-        """Frames that one more node sends each time the wire is moved."""
+        """Frames that an additional node sends each time `to_hal` is called."""
         self.counters = {"passed": 0, "lost": 0, "changed": 0}
 
     def to_nodes(self, now: float) -> None:
-        """Pass on what the HAL has sent until time `now` [s]."""
+        """Pass on the frames that the HAL has sent until time `now` [s]."""
         self._move(self._to_nodes, now)
 
     def to_hal(self, now: float) -> None:
-        """Pass on what the nodes have sent until time `now` [s]."""
+        """Pass on the frames that the nodes have sent until time `now` [s]."""
         self._move(self._to_hal, now)
         if self.babble is not None and not self.is_cut:
             for identifier, data in self.babble(self._stream("babble", 0)):
                 self.say(identifier, data)
 
     def say(self, identifier: int, data: bytes) -> None:
-        """Send a data frame to the HAL that no node has sent."""
+        """Send a forged data frame to the HAL."""
         self.pass_on(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
 
     def pass_on(self, message: can.Message) -> None:
-        """Send any frame to the HAL that no node has sent."""
+        """Send a forged frame of any kind to the HAL."""
         _put(self._hal, message)
 
     def error(self, kind: int, detail: int = 0) -> None:
@@ -114,40 +113,40 @@ class FaultyWire:
         self._hal.shutdown()
         self._nodes.shutdown()
 
-    def _move(self, way: _Direction, now: float) -> None:
+    def _move(self, direction: _Direction, now: float) -> None:
         fresh = []
-        while (message := way.source.recv(0)) is not None:
+        while (message := direction.source.recv(0)) is not None:
             fresh.append(message)
-        while way.late and way.late[0][0] <= now:
-            self._deliver(way, way.late.popleft()[1])
+        while direction.late and direction.late[0][0] <= now:
+            self._deliver(direction, direction.late.popleft()[1])
         for message in fresh:
-            for readdressed in self._addressed(way, message):
-                self._pass(way, readdressed, now)
+            for readdressed in self._addressed(direction, message):
+                self._pass(direction, readdressed, now)
 
-    def _addressed(self, way: _Direction, message: can.Message) -> list[can.Message]:
+    def _addressed(self, direction: _Direction, message: can.Message) -> list[can.Message]:
         """Return the frame as readdressed nodes receive it: once, twice, or not at all."""
         node = message.arbitration_id & _NODE
         if not self.readdressed or message.is_error_frame or message.arbitration_id in _SHARED:
             return [message]
-        if way is self._to_hal:
+        if direction is self._to_hal:
             return [_with_node(message, self.readdressed.get(node, node))]
         listeners = [own for own, shown in self.readdressed.items() if shown == node]
         if node not in self.readdressed:
             listeners.append(node)
         return [_with_node(message, listener) for listener in listeners]
 
-    def _pass(self, way: _Direction, message: can.Message, now: float) -> None:
-        chances, draw = self.chances, self._stream(way.name, message.arbitration_id)
+    def _pass(self, direction: _Direction, message: can.Message, now: float) -> None:
+        chances, draw = self.chances, self._stream(direction.name, message.arbitration_id)
         if self.is_cut or message.arbitration_id in self.lost or draw.random() < chances.loss:
             self.counters["lost"] += 1
             return
-        message = self._changed(message, draw, way is self._to_hal)
+        message = self._changed(message, draw, direction is self._to_hal)
         if draw.random() < chances.duplicate:
-            self._deliver(way, message)
+            self._deliver(direction, message)
         if draw.random() < chances.delay:
-            way.late.append((now + chances.delayed_by, message))
+            direction.late.append((now + chances.delayed_by, message))
         else:
-            self._deliver(way, message)
+            self._deliver(direction, message)
 
     def _changed(self, message: can.Message, draw: random.Random, is_from_node: bool) -> can.Message:
         data, chances = bytes(message.data), self.chances
@@ -163,9 +162,9 @@ class FaultyWire:
         self.counters["changed"] += 1
         return can.Message(arbitration_id=message.arbitration_id, data=data, is_extended_id=message.is_extended_id)
 
-    def _deliver(self, way: _Direction, message: can.Message) -> None:
+    def _deliver(self, direction: _Direction, message: can.Message) -> None:
         self.counters["passed"] += 1
-        _put(way.target, message)
+        _put(direction.target, message)
 
     def _stream(self, name: str, identifier: int) -> random.Random:
         key = (name, identifier)

@@ -4,11 +4,11 @@ import heapq
 from dataclasses import dataclass
 
 EXTENDED, REMOTE, ERROR = 1 << 31, 1 << 30, 1 << 29
-"""These are flags above the identifier, as SocketCAN has them."""
+"""These flags are in the bits above the identifier, as in SocketCAN."""
 
 _TAIL_BITS = 13
-"""CRC delimiter, acknowledge slot and delimiter, end of frame and the 3 bits between frames take these bits,
-unstuffed.
+"""CRC delimiter, acknowledge slot and delimiter, end of frame and the 3 bits between frames have this length [bits];
+they are not stuffed.
 """
 
 
@@ -39,7 +39,7 @@ def _stuff(state: int, bits: int, count: int) -> tuple[int, int]:
 _CRC = _crc_table()
 _STUFF = tuple(tuple(_stuff(state, byte, 8) for byte in range(256)) for state in range(16))
 _IDLE = 1 << 3
-"""The bus before a frame is recessive; the run length 0 makes the start bit the first of its run."""
+"""Before a frame the bus is recessive. With a run length of 0 the start bit is the first of its run."""
 
 
 def frame_bits(identifier: int, data: bytes, length: int | None = None) -> int:
@@ -95,9 +95,9 @@ class _Waiting:
 
 
 class Wire:
-    """One bus: of all frames that wait the one with the lowest identifier is sent, and takes its time.
+    """Timing of one bus: the waiting frame with the lowest identifier is sent next.
 
-    A frame in flight is not interrupted. Times [s] are those of one monotonic clock.
+    A frame that is being sent is not interrupted. Times [s] are those of one monotonic clock.
     """
 
     def __init__(self, bitrate: int) -> None:
@@ -107,13 +107,13 @@ class Wire:
         self._flying: _Waiting | None = None
         self._free_at = 0.0
         self.busy = 0.0
-        """Seconds during which the bus carried a frame."""
+        """Total time during which the bus carried a frame [s]."""
 
     def __len__(self) -> int:
         return len(self._waiting)
 
     def push(self, now: float, sender: object, identifier: int, data: bytes, length: int, frame: bytes) -> None:
-        """Hand a frame to the bus."""
+        """Add a frame to the waiting frames."""
         entry = _Waiting(sender, frame, now, frame_bits(identifier, data, length) * self._bit)
         self._count += 1
         heapq.heappush(self._waiting, (arbitration(identifier), self._count, entry))

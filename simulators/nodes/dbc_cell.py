@@ -1,4 +1,4 @@
-"""A simulated load cell that speaks as robots/dbc/load_cell.dbc says: 24 bits of force, a status, a counter."""
+"""A simulated load cell with the messages of robots/dbc/load_cell.dbc: 24 bits of force, a status, a counter."""
 
 import math
 from collections.abc import Callable
@@ -36,7 +36,7 @@ class DbcCellConstants:
 
 
 class DbcCell(SimulatedNode):
-    """One cell, which sends by its own clock."""
+    """One load cell that sends with its own clock."""
 
     def __init__(self, spec: NodeSpec, plant: Plant, outbox: list[Frame]) -> None:
         assert isinstance(spec.constants, DbcCellConstants)
@@ -63,7 +63,7 @@ class DbcCell(SimulatedNode):
 
     @override
     def sync(self, now: float) -> None:
-        """Ignore SYNC, which such a cell does not know."""
+        """Ignore SYNC, which this cell does not use."""
 
     @override
     def power_up(self, now: float) -> None:

@@ -1,8 +1,8 @@
 """A simulated servo drive in MIT mode: T-Motor, Damiao or mini-cheetah, with its rotor, its memory and its faults.
 
-Written after the documents that `hal.protocols.mit` names, without a line of it. What firmwares do differently is here
-in its worst form: T-Motor ignores frames while it is off and follows its last one again when it is entered, and its
-position starts again at the other end of its range.
+The source is the documents that `hal.protocols.mit` names; no code is shared. If firmwares differ, the node has the
+worst behaviour: T-Motor ignores frames while it is off and follows its last frame again when motor mode is entered,
+and its position wraps to the other end of its range.
 """
 
 import math
@@ -88,7 +88,7 @@ class MitConstants:
 
 @dataclass(frozen=True, slots=True)
 class MitCommand:
-    """The frame that is followed: position [rad], velocity [rad/s], gains, torque [N m]."""
+    """Command that the drive follows: position [rad], velocity [rad/s], gains, torque [N m]."""
 
     position: float = 0.0
     velocity: float = 0.0
@@ -98,7 +98,7 @@ class MitCommand:
 
 
 class MitDriveNode(SimulatedNode, SimulatedDrive):
-    """One drive: answers each frame with one, and moves its rotor as the last one said."""
+    """One drive: it answers each frame with one frame, and its rotor follows the last command."""
 
     def __init__(self, spec: NodeSpec, plant: Plant, outbox: list[Frame]) -> None:
         assert isinstance(spec.constants, MitConstants)
