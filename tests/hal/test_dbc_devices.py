@@ -12,7 +12,7 @@ from hal.device import DeviceState
 from hal.drivers.can_device import Place
 from hal.drivers.dbc.sensor import DbcNode
 from hal.drivers.dbc.sequence import Address, Inbox, SequenceRun, compile_steps
-from hal.drivers.dbc.servo import DbcServo
+from hal.drivers.dbc.servo import DISABLE, QUICK_STOP, DbcServo
 from hal.drivers.dbc.settings import DbcSettings, ServoSettings, StepConfig
 from hal.errors import CommandRefused, ConfigError
 from hal.protocols import dbc
@@ -459,3 +459,17 @@ def test_a_value_in_words_is_no_bit_field_unless_the_robot_file_says_so(inbox):
     inbox.messages["Status"].raws = (6.0,)
     assert fault.describe() == "6"
     assert fault.describe(is_bits=True) == "bit 1, bit 2"
+
+
+def test_disable_does_not_break_off_a_quick_stop(place):
+    device = DbcServo(place("position"), settings(ServoSettings, SERVO))
+    device.disable()
+    assert device._activity.name == DISABLE
+    device._begin(QUICK_STOP)
+    device.disable()
+    assert device._activity.name == QUICK_STOP
+    for _ in range(101):
+        device._activity.advance(lambda frame: True)
+    assert device._activity.is_over
+    device.disable()
+    assert device._activity.name == DISABLE
