@@ -1,9 +1,9 @@
-"""Draw the picture of the front page: a recorded joint angle whose encoder falls silent and comes back.
+"""Picture of the front page: a recorded joint angle while its encoder is silent for some seconds.
 
     gemuco record ROBOT run.mcap        # meanwhile: gemuco query ROBOT fault "sensor_silent elbow_pitch_encoder"
     python -m studies.picture run.mcap  # writes docs/images/lost_sensor.gif
 
-Everything that moves is from the recording: what the model service published, and the truth of the simulator.
+All motion is from the recording: the estimates of the model service, and the truth of the simulator.
 """
 
 import argparse
@@ -37,11 +37,11 @@ class Run:
     """One element of a recording on the time of the model's estimates.
 
     Attributes:
-        time: From the loss [s], shape (n,).
-        value: As published [rad], shape (n,).
-        std: Standard deviation as published [rad], shape (n,); 0 while measured.
+        time: Time since the loss [s], shape (n,).
+        value: Published value [rad], shape (n,).
+        std: Published standard deviation [rad], shape (n,); 0 while measured.
         is_estimated: Whether the value was estimated, shape (n,).
-        truth: What the simulator says [rad], shape (n,).
+        truth: True value from the simulator [rad], shape (n,).
         upper: True angle of the link above [rad], shape (n,).
     """
 

@@ -1,1 +1,1 @@
-"""Accuracy of models on bodies that are simulated, measured or made up."""
+"""Accuracy of models on simulated, measured and synthetic bodies."""

@@ -1,4 +1,4 @@
-"""Share of cut muscles and shifted encoders that are blamed rightly: from one sample, and from a window.
+"""Share of cut muscles and shifted encoders that are identified correctly, from one sample and from a window.
 
     python -m studies.accuracy.blame [--arms 3]
 
@@ -26,7 +26,8 @@ from services.model.model_config import model_config
 from studies.accuracy.actual_arms import model, record
 
 JOINTS, TENSIONS = "joint_position", "muscle_tension"
-OFF = 0.3  # [rad]
+OFF = 0.3
+"""A shifted encoder reads this angle too much [rad]."""
 WINDOW = 20
 
 
@@ -43,7 +44,10 @@ def learn(robot: RobotConfig, schema: BodySchema, arm: int) -> BodySchema:
 
 
 def judge(schema: BodySchema, rows: dict[str, np.ndarray], right: str) -> tuple[float, float] | None:
-    """Return the share of single samples that blame the right name, and 1.0 if the window does; None if too few."""
+    """Return the share of single samples that blame the correct name, and 1.0 if the window blames it, else 0.0.
+
+    Return None with fewer than three samples above the threshold.
+    """
     x = schema.normalise(rows)
     assert schema.normal is not None
     odd = x[schema.normal.distances(prediction_errors(schema, x)) > schema.normal.threshold][:WINDOW]

@@ -2,9 +2,9 @@
 
     python -m studies.accuracy.imperfect_data
 
-1 % of all training values are put ten standard deviations off; errors are those of the tool tip inferred from the
-joints on clean samples of another motion, under each grasp's own p. Fine-tuning takes 250 samples of each of the
-flexible duster's six grasps, with and without replay of the old training's anchors, and is judged on 60 others.
+1 % of all training values are shifted by ten standard deviations. The errors are those of the tool tip inferred from
+the joints, on clean samples of another motion, with each grasp's own p. Fine-tuning uses 250 samples of each of the
+flexible duster's six grasps, with and without replay of the old training's anchors. It is tested on 60 other samples.
 """
 
 import math

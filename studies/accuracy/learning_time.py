@@ -4,7 +4,7 @@
 
 Collection is without a bus, one condition, best of three runs, in times real time by the wall clock and by CPU time.
 Training is on the data of `gemuco collect` in runs/<robot>/data.npz; missing data are collected first and not counted.
-CPU time is what the work takes on a core of its own; other programs on the machine add to the wall time.
+Other programs on the machine increase the wall time, but not the CPU time.
 """
 
 import argparse

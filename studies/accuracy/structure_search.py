@@ -2,11 +2,10 @@
 
     python -m studies.accuracy.structure_search [--signals 12] [--seeds 3] [--samples 10000]
 
-On made-up bodies (`synthetic_body.py`). One network is trained; then all 2^n - 1 masks are measured with it (up
-to 12 signals), and the search is run with the same network. A feasible mask of the exhaustive answer counts as found if
-the search returned it, or a part of it that is feasible too; it counts as served if one of the masks kept for the
-schema (at most 64) is a part of it. Beside them stands what a perfect model of that body would find. Times are those
-of all processor cores together.
+The bodies are synthetic (`synthetic_body.py`). One network is trained. All 2^n - 1 masks are measured with it (up to 12
+signals), and the search uses the same network. A feasible mask of the exhaustive result counts as found if the search
+returned it or a feasible part of it. It counts as served if one of the masks of the schema (at most 64) is part of it.
+The last line has the result of a perfect model of the body. Times are CPU times, summed over all cores.
 """
 
 import argparse
@@ -37,7 +36,7 @@ def minimal(masks: np.ndarray) -> np.ndarray:
 
 
 def run(signals: int, samples: int, seed: int) -> None:
-    """Search one body; print the feasible masks that were found and the time it took."""
+    """Search one body; print the number of feasible masks and the time."""
     body = SyntheticBody.random(signals, seed)
     names, thresholds = body.layout.names, Thresholds()
     started = time.process_time()

@@ -1,9 +1,9 @@
-"""A made-up body of many signals whose best possible inference is known exactly, to judge structure determination by.
+"""A synthetic body of many signals whose smallest possible error is known exactly, to test structure determination.
 
-Latent coordinates q ~ N(0, I). Every signal sees one to three of them: element = g(a . q + noise), a of random
-direction, together of variance 1, of which the noise is 1 to 5 %; g(y) = y + sin(y) / 2 bends every element and can be
-undone. The last signal is noise alone. Because g can be undone, x determines y, and y is jointly normal: for
-every mask, the least mean squared error that any model can reach has a closed form (`least_errors`).
+Latent coordinates q ~ N(0, I). Every signal depends on one to three of them: element = g(a . q + noise), where a has a
+random direction. The argument of g has variance 1, of which the noise is 1 to 5 %. g(y) = y + sin(y) / 2 is nonlinear
+and invertible. The last signal is noise alone. Because g is invertible, x determines y, and y is jointly normal. The
+smallest mean squared error that any model can reach therefore has a closed form for every mask (`least_errors`).
 """
 
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ BEND = 0.5
 
 @dataclass(frozen=True)
 class SyntheticBody:
-    """A made-up body.
+    """A synthetic body.
 
     Attributes:
         layout: The signals, `s0` and so on.

@@ -1,4 +1,4 @@
-"""Speed beside peers, in under a quarter of an hour: writes docs/benchmarks.md.
+"""Comparison of the speed of gemuco with that of peers, in under a quarter of an hour; writes docs/benchmarks.md.
 
     make bench                                     # or: python -m studies.speed.all [--minutes 10]
 
@@ -26,14 +26,15 @@ PAGE, RECORD = Path("docs/benchmarks.md"), Path("docs/benchmarks.json")
 ROBOT = Path("robots/musashi_arm.yaml")
 RATES = "estimation=500,control=100,anomaly=200,update=20"
 WORSE = 4.0 / 3.0
+_BEYOND = "the compared value is the difference to the bare loop"
 INTRODUCTION = """# Benchmarks
 
-`python -m studies.speed.all --minutes {minutes:g}` on {machine}, {day}; `--minutes` is how long the loops ran (0: not
-at all; `make bench`: ten). One thread each unless said otherwise. Ours and the peer are measured in turn in the same
-run; their ratio is taken in each round, and the table has the median. Microseconds differ between machines, ratios
-nearly do not. The peer does the same work; torch is eager, float32, on one thread: what a user writes first.
+`python -m studies.speed.all --minutes {minutes:g}` on {machine}, {day}. The loops run for `--minutes` (with 0 they
+do not run; `make bench` uses 10). Each side uses one thread unless a note gives another number. Each round measures
+gemuco and the peer one after the other and takes the ratio; the table has the median over the rounds. Times differ
+between machines, ratios differ little. The peer does the same work. torch is eager, float32, on one thread.
 
-| what | against | ours | theirs | result | bar | |
+| measurement | peer | gemuco | result of the peer | compared value | bar | |
 |---|---|---|---|---|---|---|
 """
 
@@ -47,9 +48,7 @@ def loop_rows(minutes: float) -> Iterator[Row]:
         bare = loop["bare"]
         share, other = (100 * x["skipped"] / max(x["ticks"] + x["skipped"], 1) for x in (loop, bare))
         what = f"{name} loop at {loop['rate_wanted']:g} Hz, {minutes:g} min"
-        yield Row(
-            f"{what}: missed ticks", "bare timer loop", share, other, "%", share - other, 0.1, True, "beyond the bare"
-        )
+        yield Row(f"{what}: missed ticks", "bare timer loop", share, other, "%", share - other, 0.1, True, _BEYOND)
         late, least = 1e3 * loop["total_p99"], 1e3 * bare["total_p99"]
         yield Row(f"{what}: p99 lateness", "bare timer loop", late, least, "ms", late / least, 3.0, True)
     cores = 100 * result["cores"]["serve"]
@@ -57,7 +56,7 @@ def loop_rows(minutes: float) -> Iterator[Row]:
 
 
 def chapters(minutes: float) -> dict[str, Iterator[Row]]:
-    """Return all results; the loops first, while no other measurement runs."""
+    """Return the rows of every chapter; the loops are first, because no other measurement may run beside them."""
     first = {"loops": loop_rows(minutes)} if minutes else {}
     return first | {
         "solvers": solvers.rows(),

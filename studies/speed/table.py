@@ -1,4 +1,4 @@
-"""Measure ours and a peer in turn; rows of a table with a bar."""
+"""Measurements of gemuco and a peer in alternation; rows of a table with a bar."""
 
 import time
 from collections.abc import Callable, Iterable
@@ -16,13 +16,13 @@ class Row:
     Attributes:
         what: The measured quantity.
         against: The peer.
-        ours: Result of ours, in `unit`.
+        ours: Result of gemuco, in `unit`.
         theirs: Result of the peer, in `unit`.
-        unit: Unit of both.
+        unit: Unit of `ours` and `theirs`.
         value: Number that is compared with the bar: a ratio, or the quantity that `what` names.
         bar: Limit to reach: a lower limit unless `is_most`; 0 without a limit.
         is_most: The bar is an upper limit.
-        note: Remark for below the table.
+        note: Remark that is printed below the table.
     """
 
     what: str
@@ -65,12 +65,12 @@ def timed(job: Job, repeats: int) -> float:
 
 
 def side_by_side(ours: Job, theirs: Job, rounds: int = 7, share: float = 0.03) -> tuple[float, float, float]:
-    """Return median times [us] of ours and theirs, and the median over rounds of their ratio in the same round.
+    """Return the median times [us] of gemuco and the peer, and the median of the ratios within each round.
 
     Args:
-        ours: One call.
+        ours: One call of gemuco.
         theirs: One call of the peer.
-        rounds: Number of rounds; each measures both, in turn.
+        rounds: Number of rounds; each measures one batch of gemuco and one batch of the peer.
         share: Time [s] of one batch of calls.
     """
     counts = []
@@ -85,6 +85,6 @@ def side_by_side(ours: Job, theirs: Job, rounds: int = 7, share: float = 0.03) -
 
 
 def faster(what: str, against: str, ours: Job, theirs: Job, bar: float, note: str = "", rounds: int = 7) -> Row:
-    """Return a row whose value is the peer's time divided by ours."""
+    """Return a row whose value is the peer's time divided by that of gemuco."""
     mine, other, ratio = side_by_side(ours, theirs, rounds)
     return Row(what, against, mine, other, "us", ratio, bar, note=note)

@@ -67,7 +67,7 @@ def inference() -> Iterator[Row]:
         lambda: estimate(schema, values),
         named_by_torch,
         0.0,
-        "no bar was named",
+        "no bar is set",
     )
 
 
@@ -88,7 +88,7 @@ def step_on_weights() -> Row:
         lambda: updater._relearner.step(schema, True, False),
         torch_step(network, gates, tails, torch.from_numpy(lived.astype(np.float32)), random),
         1.7,
-        "drawing, masking and the check of W are in it",
+        "the time includes drawing, masking and the check of W",
     )
 
 

@@ -1,4 +1,4 @@
-"""Estimates of one robot as they arrive at a remote client."""
+"""Count of the estimates of one robot at a remote client."""
 
 import threading
 import time
@@ -8,7 +8,7 @@ import numpy as np
 
 
 class Arrivals:
-    """Counter of the estimates of one robot, of lost ones, and of pauses between them.
+    """Counter of the estimates of one robot, of lost estimates, and of pauses between estimates.
 
     Args:
         gap: A longer pause [s] between two estimates is a gap.
@@ -21,7 +21,7 @@ class Arrivals:
         self.restart()
 
     def restart(self) -> None:
-        """Restart the count; a pause before is not counted."""
+        """Restart the count; a pause before the restart is not counted."""
         self._newest: tuple[int, int, float] | None = None
         self.arrived = self.lost = self.gaps = 0
         self.longest = 0.0

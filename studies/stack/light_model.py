@@ -1,4 +1,4 @@
-"""A small model of the light robot; apart from the robot, whose processes must not load what trains."""
+"""A small model of the light robot. It has its own file, because the robot's processes must not load training code."""
 
 from pathlib import Path
 
@@ -24,7 +24,7 @@ def states(config: RobotConfig, count: int, seed: int) -> dict[str, np.ndarray]:
 
 
 def make(file: Path, folder: Path) -> None:
-    """Train a small model within seconds, unless the folder has one that fits; it fits every light robot."""
+    """Train a small model within seconds, unless the folder has a model that fits; it fits every light robot."""
     robot = load_robot(file)
     if trainer.fits(robot, folder):
         return

@@ -1,11 +1,12 @@
-"""Punctuality of the loops of HAL and service, beside bare timer loops of the same rates at the same time.
+"""Lateness of the loops of HAL and service, compared with bare timer loops of the same rates at the same time.
 
     python -m studies.stack.loops --minutes 10 [--without-bus]
 
 The whole stack runs as on a robot: simulated nodes on the hub, HAL, service; a client engages the controller, sends a
-new target every second and keeps the online update on. Another process runs bare timer loops at the same rates with
-the same scheduling and counts how punctual the machine is meanwhile. Without a bus the arm's physics lies in the HAL's
-own process: 25 simulated nodes and the frames between them cost more than the measured service, and no robot has them.
+new target every second and keeps the online update on. At the same time another process runs bare timer loops at the
+same rates with the same scheduling and measures their lateness. Without a bus the arm's physics runs in the HAL's
+process, because 25 simulated nodes and their frames cost more than the measured service, and a real robot has no
+simulated nodes.
 """
 
 import argparse
@@ -50,7 +51,7 @@ def stack(robot_file: Path, with_bus: bool) -> dict[str, list[str]]:
 
 
 def run(robot_file: Path, minutes: float, with_bus: bool = True) -> dict[str, Any]:
-    """Return loop name -> statistics of ours and of the bare loop, process -> share of a core."""
+    """Return loop name -> statistics of the loop and of the bare loop, process -> share of a core."""
     robot = load_robot(robot_file)
     model(robot, Console())
     rates = {name: rate for name, rate in robot.rates.model_dump().items() if name in ("hal", *PRIORITIES)}
@@ -89,7 +90,7 @@ def statuses(client: Client) -> dict[str, Status]:
     """Return service -> its newest status.
 
     Raises:
-        TimeoutError: A service published none within 3 s.
+        TimeoutError: A service published no status within 3 s.
     """
     newest = {}
     for name in ("hal", "model"):
@@ -127,7 +128,7 @@ def with_rates(robot_file: Path, rates: str) -> Iterator[Path]:
         yield robot_file
         return
     described = yaml.safe_load(robot_file.read_text())
-    described["rates"] |= {name: float(rate) for name, _, rate in (one.partition("=") for one in rates.split(","))}
+    described["rates"] |= {name: float(rate) for name, _, rate in (pair.partition("=") for pair in rates.split(","))}
     with tempfile.NamedTemporaryFile("w", suffix=".yaml", dir=robot_file.parent) as file:
         yaml.safe_dump(described, file)
         file.flush()

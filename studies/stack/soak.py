@@ -4,10 +4,10 @@
 
 Router, simulator, HAL, model with online update, and recorder of a light robot (six CANopen nodes on a hub bus) run as
 processes; this process is the remote client, through the router. The robot is engaged and moves to a random target
-every two seconds. Ten seconds into each minute one joint's encoder falls silent, thirty seconds later it is back. Once
-a minute memory, threads, open files and processor time of every process are read, and ticks, skips and lateness of
-every loop; bare timer loops with the same rates and priorities show what the machine itself skips meanwhile. Ends with
-verdicts and a JSON file.
+every two seconds. Ten seconds after the start of each minute the encoder of one joint goes silent; it returns after
+thirty seconds. Once a minute the study reads memory, threads, open files and processor time of every process, and
+ticks, skips and lateness of every loop. Bare timer loops with the same rates and priorities measure the skips that the
+machine causes. The study ends with verdicts and a JSON file.
 """
 
 import argparse
@@ -39,7 +39,7 @@ from studies.stack.driving import PATIENCE, Mover
 from studies.stack.processes import BareLoops, look
 
 RATE = 50.0
-"""Rate of HAL and estimation [Hz]; modest, because other work runs on the machine too."""
+"""HAL and estimation run at this rate [Hz], which is low because other work runs on the machine too."""
 LOST_AT, BACK_AT, MINUTE = 10.0, 40.0, 60.0
 TARGET_EVERY, REACH = 2.0, 0.5
 READY_WITHIN = 300.0
