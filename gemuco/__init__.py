@@ -1,7 +1,7 @@
-"""The model: a body schema on plain arrays, with no robot, no bus and no clock in it.
+"""The model: a body schema on plain arrays, without robot, bus or clock.
 
-`from gemuco import estimate` and the like is the front door. A name is imported from its room when it is first used, so
-that `import gemuco` loads neither numpy nor torch.
+Users import from here: `from gemuco import estimate`. A name is imported from its room at its first use, so
+`import gemuco` loads neither numpy nor torch.
 """
 
 from importlib import import_module

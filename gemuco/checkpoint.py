@@ -1,4 +1,4 @@
-"""A body schema on disk: model.safetensors for the arrays, manifest.json for everything that people read."""
+"""A body schema on disk: model.safetensors for the arrays, manifest.json for everything else."""
 
 import hashlib
 import json
@@ -31,7 +31,7 @@ SCALES = ("mean", "std", "low", "high", "dead")
 def save(schema: BodySchema, folder: str | Path) -> None:
     """Write model.safetensors and manifest.json into a folder.
 
-    The manifest comes last, with the hash of the arrays and its own, so that any damage is noticed.
+    The manifest is written last. It contains a hash of the arrays and a hash of itself, so that `load` detects damage.
 
     Raises:
         NotWritten: The disk is full, or the folder may not be written to.
@@ -69,9 +69,9 @@ def save(schema: BodySchema, folder: str | Path) -> None:
 
 def signed(head: Mapping[str, Any]) -> dict[str, Any]:
     """Return the manifest with the hash of all its other entries."""
-    rest = {name: value for name, value in head.items() if name != "sha256"}
-    text = json.dumps(rest, sort_keys=True)
-    return {**rest, "sha256": hashlib.sha256(text.encode()).hexdigest()}
+    entries = {name: value for name, value in head.items() if name != "sha256"}
+    text = json.dumps(entries, sort_keys=True)
+    return {**entries, "sha256": hashlib.sha256(text.encode()).hexdigest()}
 
 
 def _replace(path: Path, data: bytes) -> None:
@@ -102,7 +102,7 @@ def _tensors(schema: BodySchema) -> dict[str, np.ndarray]:
 
 
 def load(folder: str | Path) -> BodySchema:
-    """Read what `save` wrote.
+    """Read a schema that `save` wrote.
 
     Raises:
         CheckpointError: The model is missing, damaged, not a body schema, or of another version.
@@ -115,8 +115,10 @@ def load(folder: str | Path) -> BodySchema:
         raise CheckpointError(f"The model in '{folder}' has no {TENSORS}; train it again.") from None
     try:
         if hashlib.sha256(data).hexdigest() != head["tensors"]["sha256"]:
-            raise CheckpointError(f"{TENSORS} in '{folder}' is not the file of its manifest; train it again.")
-        return _sound(_schema(head, load_tensors(data)))
+            raise CheckpointError(f"{TENSORS} in '{folder}' does not match its manifest; train the model again.")
+        schema = _schema(head, load_tensors(data))
+        _check_arrays(schema)
+        return schema
     except CheckpointError:
         raise
     except (KeyError, TypeError, ValueError, AttributeError, IndexError, SafetensorError, SchemaError) as error:
@@ -188,11 +190,11 @@ def _activation(name: Any) -> str:
     return LINEAR if name == LINEAR else check_activation(name)
 
 
-def _sound(schema: BodySchema) -> BodySchema:
-    """Return the schema after a check of its arrays.
+def _check_arrays(schema: BodySchema) -> None:
+    """Check that the arrays of a schema fit each other.
 
     Raises:
-        ValueError: Arrays do not fit each other.
+        ValueError: An array has the wrong shape or an impossible value.
     """
     size, outputs, p = schema.layout.size, len(schema.out_index), len(schema.bias)
     shapes: list[tuple[str, np.ndarray, tuple[int, ...]]] = [
@@ -222,4 +224,3 @@ def _sound(schema: BodySchema) -> BodySchema:
             raise ValueError(f"array {name} points beyond {count} entries")
     if (schema.scaler.std <= 0).any():
         raise ValueError("array scaler.std is not positive")
-    return schema

@@ -15,14 +15,14 @@ from gemuco.writing import writing
 FORMAT = "gemuco.dataset"
 VERSION = 1
 MIN_EPISODES = 5
-"""A condition with fewer episodes than this is split by time block instead of by episode."""
+"""A condition with fewer episodes than this is split by time blocks instead of episodes."""
 BLOCKS = 10
-"""An episode is then cut into this many blocks."""
+"""A split by time blocks cuts an episode into at most this many."""
 
 
 @dataclass(frozen=True, slots=True)
 class Episode:
-    """A stretch of time under one condition.
+    """A recording under one condition.
 
     Attributes:
         condition: State of the body: tool, load, wear.
@@ -76,9 +76,9 @@ class Dataset:
         return np.concatenate(parts) if parts else np.zeros(0, int)
 
     def split(self, held_out: float, seed: int = 0) -> tuple["Dataset", "Dataset"]:
-        """Split into training and held-out data, by episodes of every condition, or by time blocks if these are few.
+        """Split every condition into training and held-out data, by episodes, or by time blocks if there are few.
 
-        A split by random rows would measure memory, for neighbours in time are nearly equal.
+        A split by random rows would only measure memory, because neighbours in time are nearly equal.
 
         Args:
             held_out: Share of the episodes or blocks to hold out, 0 to 1; at least one of every condition.
@@ -98,9 +98,9 @@ class Dataset:
                     "training and held-out data. Collect more of it, or leave it out."
                 )
             count = min(max(1, round(held_out * len(parts))), len(parts) - 1)
-            chosen = set(random.permutation(len(parts))[:count].tolist())
+            held_out_parts = set(random.permutation(len(parts))[:count].tolist())
             for index, part in enumerate(parts):
-                (held if index in chosen else training).append(part)
+                (held if index in held_out_parts else training).append(part)
         if not training:
             raise NotEnoughData("There are no samples to train from; record some with `gemuco collect`.")
         return Dataset(self.layout, tuple(training)), Dataset(self.layout, tuple(held))
@@ -110,7 +110,7 @@ class Dataset:
         return self.rows()[self.condition_of_rows() == self.conditions.index(condition)]
 
     def _parts(self, condition: str) -> list[Episode]:
-        """Return the parts that a split leaves whole: a condition's episodes, or blocks of time if these are few."""
+        """Return the parts of a condition that a split does not divide: episodes, or time blocks if there are few."""
         episodes = [e for e in self.episodes if e.condition == condition and len(self.layout.join(e.values))]
         if len(episodes) >= MIN_EPISODES:
             return episodes
@@ -122,10 +122,10 @@ class Dataset:
         return blocks
 
     def with_layout(self, layout: Layout) -> "Dataset":
-        """Return the same episodes with the signals of another layout, in its order.
+        """Return the episodes with the signals of another layout, in its order.
 
         Raises:
-            DatasetError: A signal is not in the data, or has another unit or other elements there.
+            DatasetError: A signal is not in the data, or its unit or elements in the data differ.
         """
         if layout == self.layout:
             return self
@@ -168,7 +168,7 @@ class Dataset:
 
     @classmethod
     def load(cls, path: str | Path) -> "Dataset":
-        """Read what `save` wrote.
+        """Read a dataset that `save` wrote.
 
         Raises:
             DatasetError: The file is missing, damaged, or not a dataset of this version.
@@ -177,7 +177,9 @@ class Dataset:
             with np.load(path, allow_pickle=False) as archive:
                 head = json.loads(str(archive["head"]))
                 if head["format"] != FORMAT or head["version"] != VERSION:
-                    raise DatasetError(f"'{path}' is {head['format']} version {head['version']}; this reads {VERSION}.")
+                    raise DatasetError(
+                        f"'{path}' is {head['format']} version {head['version']}; this gemuco reads {VERSION}."
+                    )
                 layout = Layout(tuple(Signal(n, size, unit, tuple(e)) for n, size, unit, e in head["signals"]))
                 episodes = tuple(
                     Episode(condition, layout.split(archive[f"episode_{i}"]))
@@ -195,11 +197,11 @@ class Dataset:
 
 
 Arrays = Mapping[str, np.ndarray]
-"""One episode as plain data: signal -> array [its unit], shape (samples, n), or (samples,) for one element."""
+"""An episode of plain data maps a signal to an array [its unit], shape (samples, n), or (samples,) for one element."""
 Data = Dataset | Arrays | Sequence[Arrays] | Mapping[str, Arrays | Sequence[Arrays]]
-"""A dataset, or plain data: an episode, a sequence of them, or a mapping of condition -> episodes."""
+"""Data are a dataset or plain: an episode, a sequence of episodes, or a mapping of condition -> episodes."""
 CONDITION = "default"
-"""The condition of plain data that name none."""
+"""Plain data without a condition get this one."""
 
 
 def as_dataset(data: Data, units: Mapping[str, str] | None = None) -> Dataset:
@@ -211,7 +213,7 @@ def as_dataset(data: Data, units: Mapping[str, str] | None = None) -> Dataset:
         units: Signal -> unit, of plain data.
 
     Raises:
-        WrongKind: The data are neither.
+        WrongKind: The data have another form.
         DatasetError: A unit is missing or superfluous.
         UnknownSignal: An episode has a signal that the first one lacks.
         WrongSize: Arrays do not fit each other.
@@ -245,7 +247,7 @@ def _plain_episodes(data: object) -> list[tuple[str, Arrays]]:
 
 
 def _is_episodes(part: object) -> bool:
-    """Whether a value of a mapping is an episode or a list of them, not an array."""
+    """Whether a value of a mapping is an episode or a list of episodes, and not an array."""
     first = part[0] if isinstance(part, list | tuple) and len(part) else part
     return isinstance(first, Mapping)
 

@@ -1,4 +1,4 @@
-"""Values that a room works out of a body schema once, kept with the schema (`BodySchema.derived`)."""
+"""Values that a room computes from a body schema once and keeps with it (`BodySchema.derived`)."""
 
 from collections.abc import Callable
 from typing import Generic, TypeVar
@@ -11,28 +11,28 @@ PATTERNS = 64
 
 
 class ByPattern(Generic[T]):
-    """Values that depend on which elements of a sample were measured, kept for at most `PATTERNS` patterns.
+    """Values that depend on which elements of a sample are measured: a cache of at most `PATTERNS` patterns.
 
-    Threads that ask at the same moment may each work the value out; the results are equal.
+    Two threads may compute the same value at the same moment; the results are equal.
     """
 
-    def __init__(self, work_out: Callable[[np.ndarray], T]) -> None:
-        self._work_out = work_out
-        self._kept: dict[bytes, T] = {}
+    def __init__(self, compute: Callable[[np.ndarray], T]) -> None:
+        self._compute = compute
+        self._values: dict[bytes, T] = {}
         self._last: bytes | None = None
 
     def __call__(self, finite: np.ndarray) -> T:
-        """Return the value for a pattern, truth values, shape (size,)."""
+        """Return the value for the finite elements of a sample, truth values, shape (size,)."""
         key = self._last = finite.tobytes()
-        kept = self._kept.get(key)
-        if kept is None:
-            kept = self._work_out(finite)
-            if len(self._kept) >= PATTERNS:
-                self._kept.clear()
-            self._kept[key] = kept
-        return kept
+        value = self._values.get(key)
+        if value is None:
+            value = self._compute(finite)
+            if len(self._values) >= PATTERNS:
+                self._values.clear()
+            self._values[key] = value
+        return value
 
     def follow(self, other: "ByPattern[T]") -> None:
-        """Work out the value for the pattern that another one was asked for last."""
+        """Compute the value for the last pattern of another cache."""
         if other._last is not None:
             self(np.frombuffer(other._last, bool))

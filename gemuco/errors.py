@@ -4,7 +4,7 @@ from numbers import Integral
 
 
 class SchemaError(Exception):
-    """Base of every exception that `gemuco` raises on purpose."""
+    """Base of all exceptions of `gemuco`."""
 
 
 class UnknownSignal(SchemaError):
@@ -12,7 +12,7 @@ class UnknownSignal(SchemaError):
 
 
 class UnknownCondition(SchemaError):
-    """A condition of the body was not among those the schema was trained on."""
+    """The schema was not trained on this condition of the body."""
 
 
 class WrongSize(SchemaError):
@@ -20,7 +20,7 @@ class WrongSize(SchemaError):
 
 
 class WrongKind(SchemaError):
-    """An argument is of another kind than the one that is needed."""
+    """An argument has the wrong class."""
 
 
 class NotFinite(SchemaError):
@@ -48,23 +48,23 @@ class CheckpointError(SchemaError):
 
 
 def check_kind(what: str, value: object, kind: type | tuple[type, ...], needed: str) -> None:
-    """Refuse a value of another kind.
+    """Refuse a value of another class.
 
     Args:
-        what: Begins the sentence, such as `The schema`.
+        what: First words of the message, such as `The schema`.
         value: The argument.
         kind: Allowed classes.
-        needed: Ends the sentence, such as `a BodySchema`.
+        needed: Last words of the message, such as `a BodySchema`.
 
     Raises:
-        WrongKind: The value is not an instance of the kind.
+        WrongKind: The value is not an instance of an allowed class.
     """
     if not isinstance(value, kind):
         raise WrongKind(f"{what} must be {needed}, not {described(value)}.")
 
 
 def described(value: object) -> str:
-    """Return a few words on what a value is: `an array of shape (3,)`, `the class Signal`, `an int`."""
+    """Return a short description of a value: `an array of shape (3,)`, `the class Signal`, `an int`."""
     if isinstance(value, type):
         return f"the class {value.__name__}"
     if hasattr(value, "shape"):
@@ -74,10 +74,10 @@ def described(value: object) -> str:
 
 
 def whole_number(what: str, value: object, least: int) -> None:
-    """Refuse a value that is not a whole number, or is too small.
+    """Refuse a value that is not a whole number or is below the least allowed one.
 
     Raises:
-        SchemaError: The value is refused; the sentence begins with `what`.
+        SchemaError: The value is refused; the message begins with `what`.
     """
     if not isinstance(value, Integral):
         raise SchemaError(f"{what} is {value!r}; it must be a whole number.")

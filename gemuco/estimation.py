@@ -1,4 +1,4 @@
-"""State estimation (paper, II-G) of missing values: by a feasible mask, by descent on z, or by descent on x_in."""
+"""Estimation of missing values (paper, II-G): by a feasible mask, by descent on z, or by descent on x_in."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -21,17 +21,18 @@ SEARCH = NewtonConfig()
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """Measured and estimated values of a signal in one sample; of several samples, every attribute has a row each.
+    """Measured and estimated values of a signal in one sample; of several samples, with one row per sample.
 
     Attributes:
         value: Measured values, and estimates of missing elements [unit], shape (n,); NaN if there is no estimate.
         std: Expected error (1 sigma, from held-out data) [unit], shape (n,); 0 where measured, NaN where unknown.
-        estimated: Whether each element was estimated, shape (n,).
+        estimated: Whether each element is an estimate, shape (n,).
         method: `measured`, `mask` (usages a and b), `latent` (e), `input` (f) or `none`.
-        mask: The signals it was estimated from; empty where measured.
+        mask: The signals from which it was estimated; empty where measured.
         residual: Root mean square of the given values minus the model's [standard deviations of the training data];
-            0 where measured, NaN without estimate. For `latent` the estimate is given to the network once more, and the
-            larger error counts: a z beside the manifold of the data may fit values that no body has.
+            0 where measured, NaN without estimate. For `latent` the network also predicts the given values from the
+            estimate, and the larger error counts, because a z outside the manifold of the data may fit values that no
+            body has.
     """
 
     value: np.ndarray
@@ -44,10 +45,10 @@ class Estimate:
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """The steps that complete samples which lack the same elements; all but the values is known beforehand.
+    """Steps that complete all samples with the same missing elements, and the results that need no values.
 
     Attributes:
-        steps: Method, mask, estimated elements as truth values, shape (size,), and their signals.
+        steps: Each step: method, mask, the elements to estimate as truth values, shape (size,), and their signals.
         std: Expected error of every element [unit], shape (size,); see `Estimate`.
         estimated: Whether each element is estimated, shape (size,).
         method: Signal -> method.
@@ -64,15 +65,15 @@ class Recipe:
 
     @classmethod
     def of(cls, schema: BodySchema, finite: np.ndarray) -> "Recipe":
-        """Prepare for samples with these finite elements, truth values, shape (size,)."""
+        """Make the recipe for samples with these finite elements, truth values, shape (size,)."""
         slices, whole = schema.layout.slices, schema.layout.whole(finite)
-        named: dict[tuple[str, Mask], list[str]] = {}
+        signals: dict[tuple[str, Mask], list[str]] = {}
         for name in slices:
             source = ("measured", frozenset()) if name in whole else _route(schema, name, whole, finite)
-            named.setdefault(source, []).append(name)
+            signals.setdefault(source, []).append(name)
         std, estimated = np.zeros(len(finite)), np.zeros(len(finite), bool)
         steps = []
-        for (method, mask), names in named.items():
+        for (method, mask), names in signals.items():
             missing = np.zeros(len(finite), bool)
             for name in names:
                 missing[slices[name]] = ~finite[slices[name]]
@@ -80,12 +81,12 @@ class Recipe:
             estimated |= missing & (method != "none")
             if method != "measured":
                 steps.append((method, mask, missing, tuple(names)))
-        of_signal = {name: source for source, names in named.items() for name in names}
+        sources = {name: source for source, names in signals.items() for name in names}
         std.setflags(write=False)
         estimated.setflags(write=False)
-        masks = {name: of_signal[name][1] for name in slices}
+        masks = {name: sources[name][1] for name in slices}
         labels = {name: label(mask, schema.layout.names) for name, mask in masks.items()}
-        return cls(tuple(steps), std, estimated, {name: of_signal[name][0] for name in slices}, masks, labels)
+        return cls(tuple(steps), std, estimated, {name: sources[name][0] for name in slices}, masks, labels)
 
 
 class Completion(NamedTuple):
@@ -94,7 +95,7 @@ class Completion(NamedTuple):
     Attributes:
         value: Every element [its unit], shape (size,).
         residual: Signal -> residual; see `Estimate`.
-        recipe: Everything that is known of it without its values.
+        recipe: The steps, expected errors and methods.
     """
 
     value: np.ndarray
@@ -103,12 +104,12 @@ class Completion(NamedTuple):
 
 
 def recipes(schema: BodySchema) -> ByPattern[Recipe]:
-    """Return the recipes of a schema, by the finite elements of a sample."""
+    """Return the recipes of a schema by the finite elements of a sample."""
     return ByPattern(partial(Recipe.of, schema))
 
 
 def estimate(schema: BodySchema, values: Mapping[str, np.ndarray]) -> dict[str, Estimate]:
-    """Return every signal: measured where it can be, estimated where it cannot.
+    """Return every signal, with estimates of all missing elements.
 
     Args:
         schema: The body schema.
@@ -153,7 +154,7 @@ def _batch(schema: BodySchema, samples: list[Completion]) -> dict[str, Estimate]
 def fill(schema: BodySchema, joined: np.ndarray) -> Completion:
     """Complete a sample in one array [unit of each element], shape (size,), NaN where missing; see `estimate`.
 
-    The array must be read-only, as it is in a service: the code is compiled for that kind alone.
+    The array must be read-only, as in a service: the code is compiled for read-only arrays.
     """
     recipe = schema.derived(recipes)(np.isfinite(joined))
     value, residual = joined.copy(), dict.fromkeys(recipe.method, 0.0)
@@ -169,7 +170,7 @@ def fill(schema: BodySchema, joined: np.ndarray) -> Completion:
 
 
 def _route(schema: BodySchema, name: str, whole: Mask, finite: np.ndarray) -> tuple[str, Mask]:
-    """Choose the method for a signal, and the signals to estimate it from."""
+    """Choose the method for a signal, and the signals from which it is estimated."""
     if name in schema.x_out:
         mask = next((m for m in schema.ranked(name) if m <= whole), None)
         if mask is not None:
@@ -181,7 +182,7 @@ def _route(schema: BodySchema, name: str, whole: Mask, finite: np.ndarray) -> tu
 
 
 def _search(schema: BodySchema, method: str, mask: Mask, joined: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return every element as the search predicts it [unit], shape (size,), NaN where it does not; and the residual."""
+    """Return the predictions of a search [unit], shape (size,), NaN where there are none, and the residual."""
     x = np.where(np.isfinite(joined), schema.scaler.normalise(joined), np.nan)
     full = np.full(schema.layout.size, np.nan)
     if method == "latent":
@@ -190,12 +191,12 @@ def _search(schema: BodySchema, method: str, mask: Mask, joined: np.ndarray) -> 
         full = input_search(schema, x, mask)
     residual = _residual(x, full)
     if method == "latent":
-        residual = max(residual, _residual(x, _again(schema, full)))
+        residual = max(residual, _residual(x, _predict_again(schema, full)))
     return schema.scaler.restore(full), residual
 
 
 def _std(schema: BodySchema, method: str, mask: Mask) -> np.ndarray:
-    """Return the expected error of every element of the layout [unit], shape (size,); NaN where it is not known."""
+    """Return the expected error of every element of the layout [unit], shape (size,); NaN where unknown."""
     std = np.full(schema.layout.size, np.nan)
     known = schema.errors.get((method, mask))
     if known is not None:
@@ -209,17 +210,17 @@ def _residual(x: np.ndarray, full: np.ndarray) -> float:
     return float(np.sqrt(np.mean((full[given] - x[given]) ** 2))) if given.any() else float("nan")
 
 
-def _again(schema: BodySchema, full: np.ndarray) -> np.ndarray:
-    """Give an estimate to the network again, under the first mask that it covers, shape (size,)."""
-    again = full.copy()
+def _predict_again(schema: BodySchema, full: np.ndarray) -> np.ndarray:
+    """Return an estimate with x_out predicted from the estimate itself, under the first covered mask, shape (size,)."""
+    predicted = full.copy()
     covered = covered_by(schema.masks, schema.layout.whole(np.isfinite(full)))
     if covered:
-        again[schema.out_index] = schema.infer(full, covered[0])
-    return again
+        predicted[schema.out_index] = schema.infer(full, covered[0])
+    return predicted
 
 
 def latent_search(schema: BodySchema, x: np.ndarray) -> np.ndarray:
-    """Return the x_out of the z that fits the given ones best, usage (e), shape (out_size,) [standard deviations].
+    """Return x_out for the z that fits the measured x_out best, usage (e), shape (out_size,) [standard deviations].
 
     Args:
         schema: The body schema.
@@ -232,7 +233,7 @@ def latent_search(schema: BodySchema, x: np.ndarray) -> np.ndarray:
 
 
 def input_search(schema: BodySchema, x: np.ndarray, available: Mask) -> np.ndarray:
-    """Search the missing x_in that make the network's output fit the given signals, usage (f).
+    """Search the missing x_in for which the network's output fits the measured signals best, usage (f).
 
     Args:
         schema: The body schema.

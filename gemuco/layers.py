@@ -1,9 +1,8 @@
 """Forward and backward passes of the network on plain numpy arrays; no torch, no state.
 
 A chain of layers is y = W_n(... a(x W_1 + b_1) ...) + b_n, with a the activation of each layer. The latent state and
-the output are linear, so encoder, decoder and both together are all chains, and one set of functions serves them all.
-Rows are samples. Derivatives are named by their direction: `pull` takes a gradient from the output to the input
-(reverse mode), `push` takes a change of the input to the output (forward mode).
+the output are linear, so the encoder, the decoder and the whole network are chains. Rows are samples. `pull` propagates
+a gradient from the output to the input (reverse mode), `push` a change of the input to the output (forward mode).
 """
 
 from collections.abc import Callable
@@ -21,8 +20,8 @@ LINEAR = "linear"
 class Activation(NamedTuple):
     """A function y = a(x), element by element.
 
-    Slope and bend are functions of y alone, so that a trace keeps nothing but values. This holds for monotone
-    functions; SiLU and GELU would need x too.
+    Slope and bend are functions of y alone, so a trace contains values only. This is possible for monotone functions;
+    SiLU and GELU would also need x.
 
     Attributes:
         apply: x -> y, in place.
@@ -49,7 +48,7 @@ def _elu(x: np.ndarray) -> None:
 
 
 def _softplus(x: np.ndarray) -> None:
-    below = np.log1p(np.exp(-np.abs(x)))  # logaddexp warns of every missing sample
+    below = np.log1p(np.exp(-np.abs(x)))  # logaddexp warns of NaN
     np.maximum(x, 0.0, out=x)
     x += below
 
@@ -63,7 +62,7 @@ ACTIVATIONS = {
     "elu": Activation(_elu, lambda y: np.minimum(y, 0.0) + 1.0, lambda y, slope: np.where(y > 0.0, 0.0, slope)),
     "softplus": Activation(_softplus, lambda y: -np.expm1(-y), lambda y, slope: slope * (1.0 - slope)),
 }
-"""Name -> function, of every activation a network can have."""
+"""A network can have these activations: name -> function."""
 
 
 def check_activation(name: str) -> str:
@@ -78,7 +77,7 @@ def check_activation(name: str) -> str:
 
 
 class Layer(NamedTuple):
-    """One affine map and the name of the activation that follows: matrix (n_in, n_out), offset (n_out,)."""
+    """An affine map, matrix (n_in, n_out) and offset (n_out,), and the name of the activation after it."""
 
     matrix: np.ndarray
     offset: np.ndarray
@@ -87,7 +86,7 @@ class Layer(NamedTuple):
 
 Chain = tuple[Layer, ...]
 Trace = list[np.ndarray]
-"""Input and the value after every layer, shapes (samples, n)."""
+"""A trace contains the input and the value after every layer, shapes (samples, n)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +106,7 @@ class Weights:
         return [array for layer in self.whole for array in (layer.matrix, layer.offset)]
 
     def replaced(self, arrays: list[np.ndarray]) -> "Weights":
-        """Return the same network with other numbers, given in the order of `arrays`."""
+        """Return the same network with other matrices and offsets, in the order of `arrays`."""
         layers = tuple(Layer(arrays[2 * i], arrays[2 * i + 1], layer.activation) for i, layer in enumerate(self.whole))
         return Weights(layers[: len(self.encoder)], layers[len(self.encoder) :])
 
@@ -127,7 +126,7 @@ def run(chain: Chain, x: np.ndarray) -> np.ndarray:
 
 
 def trace(chain: Chain, x: np.ndarray) -> Trace:
-    """Run forward and keep the values that the other passes need."""
+    """Run forward and return the values that the other passes need."""
     values = [x]
     for matrix, offset, activation in chain:
         x = x @ matrix
@@ -139,7 +138,7 @@ def trace(chain: Chain, x: np.ndarray) -> Trace:
 
 
 def pull(chain: Chain, values: Trace, gradient: np.ndarray) -> np.ndarray:
-    """Take the gradient of a scalar from the output to the input, shapes (samples, n)."""
+    """Propagate the gradient of a scalar from the output to the input, shapes (samples, n)."""
     for (matrix, _, activation), value in zip(reversed(chain), reversed(values), strict=False):
         if activation != LINEAR:
             gradient = gradient * ACTIVATIONS[activation].slope(value)
@@ -148,7 +147,7 @@ def pull(chain: Chain, values: Trace, gradient: np.ndarray) -> np.ndarray:
 
 
 def push(chain: Chain, values: Trace, tangent: np.ndarray) -> np.ndarray:
-    """Take a change of the input to the output, to first order, shapes (samples, n)."""
+    """Propagate a change of the input to the output, to first order, shapes (samples, n)."""
     for (matrix, _, activation), value in zip(chain, values[1:], strict=True):
         tangent = tangent @ matrix
         if activation != LINEAR:
@@ -159,8 +158,8 @@ def push(chain: Chain, values: Trace, tangent: np.ndarray) -> np.ndarray:
 class Curvature:
     """First and mixed second derivatives of s = w . y(x): its gradient g = dy/dx^T w, then d(u . g)/dx for a fixed u.
 
-    Forward over reverse: the tangent u is pushed forward through the net, and w . (dy/dx u) is pulled back again. The
-    chain of gradients that the second pull needs is the one that gave g, so it is kept.
+    Forward over reverse mode: the tangent u is pushed forward through the network, and w . (dy/dx u) is pulled back.
+    The second pull needs the same gradients at the layers as the pull that computed g, so they are stored.
     """
 
     __slots__ = ("_chain", "_gradients", "_slopes", "_values", "gradient")
@@ -182,7 +181,7 @@ class Curvature:
         self.gradient = gradient
 
     def mixed(self, tangent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return dy/dx u, shape (samples, n_out), and d(u . g)/dx, shape (samples, n_in), of a tangent u."""
+        """Return dy/dx u, shape (samples, n_out), and d(u . g)/dx, shape (samples, n_in), for a tangent u."""
         tangents: list[np.ndarray] = []
         for (matrix, _, _), slope in zip(self._chain, self._slopes, strict=True):
             tangent = tangent @ matrix

@@ -20,22 +20,22 @@ def mask(names: Iterable[str], known: Sequence[str]) -> Mask:
     """Return a mask after a check of its names.
 
     Raises:
-        UnknownSignal: A name is not among the known ones.
+        UnknownSignal: A name is not a known signal.
     """
-    chosen = frozenset(names)
-    for name in sorted(chosen - set(known)):
+    signals = frozenset(names)
+    for name in sorted(signals - set(known)):
         raise UnknownSignal(f"Mask names '{name}', which is not in the schema. Known signals: {', '.join(known)}.")
-    return chosen
+    return signals
 
 
-def bits(chosen: Mask, names: Sequence[str]) -> np.ndarray:
-    """Return the network's m of a mask: 1 where a signal is given, shape (len(names),), float32."""
-    return np.array([name in chosen for name in names], np.float32)
+def bits(signals: Mask, names: Sequence[str]) -> np.ndarray:
+    """Return m as the network receives it: 1 for every name in the mask, else 0, shape (len(names),), float32."""
+    return np.array([name in signals for name in names], np.float32)
 
 
-def label(chosen: Mask, names: Sequence[str]) -> str:
-    """Return the text of a mask: names joined by `+`, in the order of the layout."""
-    return "+".join(name for name in names if name in chosen)
+def label(signals: Mask, names: Sequence[str]) -> str:
+    """Return a mask as text: its names joined by `+`, in the order of `names`."""
+    return "+".join(name for name in names if name in signals)
 
 
 def covered_by(masks: Iterable[Mask], available: Iterable[str]) -> tuple[Mask, ...]:
@@ -45,6 +45,6 @@ def covered_by(masks: Iterable[Mask], available: Iterable[str]) -> tuple[Mask, .
 
 
 def best(masks: Iterable[Mask], available: Iterable[str], error: Callable[[Mask], float]) -> Mask | None:
-    """Return the covered mask of the smallest error; None if no mask is covered."""
+    """Return the mask of the smallest error whose signals are all available; None if there is none."""
     covered = covered_by(masks, available)
     return min(covered, key=error) if covered else None

@@ -15,10 +15,10 @@ FLOOR = 0.01
 """The standard deviation of an error is at least this share of the signal's own standard deviation."""
 
 PATTERNS = 64
-"""At most this many inverse covariances are kept, one for every set of elements that was judged lately."""
+"""At most this many inverse covariances are cached, one per set of judged elements."""
 
 HELD_OUT = 0.3
-"""This share of the normal data, its end, sets the threshold and is not used for mean and covariance."""
+"""The last part of the normal data, this share, sets the threshold and is not used for mean and covariance."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,10 +26,10 @@ class Normal:
     """Statistics of the prediction errors of a healthy body.
 
     Attributes:
-        mean: Mean error [unit], shape (out_size,); NaN where errors were never seen.
+        mean: Mean error [unit], shape (out_size,); NaN where no errors are known.
         covariance: Regularised covariance [unit^2], shape (out_size, out_size).
-        threshold: Score that a healthy body exceeds at the given false alarm rate.
-        false_alarm: That rate, per sample.
+        threshold: A healthy body's score is above this with the probability `false_alarm`.
+        false_alarm: Probability of a false alarm per sample.
         usual: Number of elements that are judged when none is missing.
     """
 
@@ -45,11 +45,11 @@ class Normal:
 
     @classmethod
     def fit(cls, errors: np.ndarray, spread: np.ndarray, false_alarm: float = 1e-3) -> "Normal":
-        """Learn from errors of a healthy body, oldest first.
+        """Compute the statistics of a healthy body.
 
         Args:
-            errors: Prediction errors [unit], shape (samples, out_size), NaN where one is not known.
-            spread: Standard deviation of every x_out element itself [unit], shape (out_size,).
+            errors: Prediction errors [unit], oldest first, shape (samples, out_size), NaN where unknown.
+            spread: Standard deviation of every x_out element [unit], shape (out_size,).
             false_alarm: Share of healthy samples that may lie above the threshold.
 
         Raises:
@@ -79,8 +79,8 @@ class Normal:
         """Return the distance of one error [unit], shape (out_size,), judged by its finite elements.
 
         Returns:
-            The Mahalanobis distance, each element's contribution to its square (the drop of the square when that
-            element alone is left out: (P e)_i^2 / P_ii), and the number of judged elements.
+            The Mahalanobis distance, the contribution of each element (the decrease of the squared distance without
+            this element: (P e)_i^2 / P_ii), and the number of judged elements.
         """
         index, precision = self.precision(np.isfinite(error - self.mean))
         if not len(index):
@@ -95,10 +95,10 @@ class Normal:
         return np.sqrt(np.einsum("ij,jk,ik->i", e, precision, e).clip(min=0.0))
 
     def threshold_of(self, judged: int | np.ndarray) -> np.ndarray:
-        """Return the threshold for fewer judged elements: the square of a distance grows with their number.
+        """Return the threshold for a number of judged elements; its square is proportional to this number.
 
         Args:
-            judged: Number of judged elements, one or of shape (samples,).
+            judged: Number of judged elements, a scalar or of shape (samples,).
 
         Returns:
             The threshold; NaN where no element is judged.
@@ -112,18 +112,18 @@ class Normal:
         Args:
             judged: Truth values, shape (out_size,); an element needs a known error and a known mean.
         """
-        kept = self._precisions.get(judged.tobytes())
-        if kept is None:
+        precision = self._precisions.get(judged.tobytes())
+        if precision is None:
             index = np.flatnonzero(judged)
-            kept = index, np.linalg.inv(self.covariance[np.ix_(index, index)])
+            precision = index, np.linalg.inv(self.covariance[np.ix_(index, index)])
             if len(self._precisions) >= PATTERNS:
                 self._precisions.clear()
-            self._precisions[judged.tobytes()] = kept
-        return kept
+            self._precisions[judged.tobytes()] = precision
+        return precision
 
 
 def _tail(scores: np.ndarray, false_alarm: float) -> float:
-    """Return the score exceeded with a small probability: as observed, at least as in a log-normal tail."""
+    """Return the score that is exceeded with a small probability: the observed or the log-normal one, the larger."""
     logs = np.log(np.maximum(scores, 1e-9))
     z = NormalDist().inv_cdf(1.0 - false_alarm)
     return max(float(np.quantile(scores, 1.0 - false_alarm)), float(np.exp(logs.mean() + z * logs.std())))

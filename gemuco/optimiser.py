@@ -1,4 +1,4 @@
-"""Optimisers that move numbers by their gradient: Adam, or descent with momentum."""
+"""Gradient descent: Adam, or descent with momentum."""
 
 import numpy as np
 
@@ -8,12 +8,12 @@ OPTIMISERS = ("adam", "sgd")
 
 
 class Optimiser:
-    """Descent of numbers along their gradient, in place.
+    """Gradient descent of an array, in place.
 
     Args:
         kind: `adam` or `sgd` (with momentum 0.9).
         rate: Learning rate.
-        size: How many numbers are moved.
+        size: Length of the array.
 
     Attributes:
         time: Number of steps.
@@ -33,5 +33,5 @@ class Optimiser:
             adam(numbers, gradient, self._slow, self._square, float(self.rate), self.time)
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return the arrays that the next step depends on beside `time`; a resumed training writes into them."""
+        """Return the internal arrays; a resumed training writes its stored values into them."""
         return {"slow": self._slow, "square": self._square}

@@ -8,15 +8,15 @@ from gemuco.errors import NotEnoughData
 from gemuco.signals import Layout
 
 FLOOR = 0.02
-"""The standard deviation of an element is at least this share of the largest in its signal, so that the noise of an
-element that hardly moved in the training data is not scaled up to the size of a motion."""
+"""The standard deviation of an element is at least this share of the largest in its signal. Otherwise the noise of an
+element that hardly moved in the training data would be scaled up to the size of a motion."""
 
 CLIP = 4.0
-"""Network inputs are clipped to this many standard deviations, for outside of its data a network is of no use."""
+"""Network inputs are clipped to this many standard deviations: outside its training data a network is useless."""
 
 CORE = (0.02, 0.98)
-"""The usual values of an element lie between these quantiles. A value further outside than these are apart (6 standard
-deviations of a normal distribution) may be learned but does not set the scale: one outlier must not set it."""
+"""The scale of an element is computed without outliers: values that lie further outside these quantiles than the
+distance between them (6 standard deviations from the mean of a normal distribution). They may still be learned."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,13 +39,13 @@ class Scaler:
 
     @classmethod
     def fit(cls, layout: Layout, rows: np.ndarray) -> "Scaler":
-        """Learn the scale from rows [unit], shape (samples, size); NaN or infinite where nothing was measured.
+        """Compute the scale of rows [unit], shape (samples, size); NaN or infinite where nothing was measured.
 
-        A dead element gets its constant value as mean (0 if it was never measured) and the floor of its signal as
-        standard deviation, so that its noise is not scaled up; 1 unit if the whole signal is dead.
+        The mean of a dead element is its constant value, or 0 if it was never measured. Its standard deviation is the
+        floor of its signal, so that its noise is not scaled up, or 1 unit if the whole signal is dead.
 
         Raises:
-            NotEnoughData: There is no row with a number in it.
+            NotEnoughData: No row contains a finite number.
         """
         if not np.isfinite(rows).any():
             raise NotEnoughData("The training data hold no measured value at all; check what was recorded.")
@@ -73,7 +73,7 @@ class Scaler:
 
 
 def _usual(values: np.ndarray) -> np.ndarray:
-    """Drop values far outside of nearly all others; keep all if nearly all are the same."""
+    """Return the values without outliers (see `CORE`); all values if nearly all are the same."""
     if len(values) < 2:
         return values
     low, high = np.quantile(values, CORE)

@@ -1,7 +1,7 @@
 """The body schema: a learned model of a body, as one immutable value.
 
-Nothing changes in place. Learning later makes another schema (`with_weights`, `with_normal`), so that a loop goes on
-with the one it holds while another thread makes the next.
+A schema never changes. Learning makes another schema (`with_weights`, `with_normal`), so a loop can use one schema
+while another thread makes the next.
 """
 
 from collections.abc import Callable, Mapping
@@ -23,8 +23,8 @@ from gemuco.signals import Layout
 T = TypeVar("T")
 
 ErrorTable = Mapping[tuple[str, Mask], np.ndarray]
-"""The table has (method, given signals) -> expected error of every x_out element [unit], shape (out_size,); for the
-method `input`, which also estimates signals outside of x_out, of every element of the layout, shape (size,)."""
+"""The table maps (method, given signals) to the expected error of every x_out element [unit], shape (out_size,). The
+method `input` also estimates signals outside x_out, so its errors are those of the whole layout, shape (size,)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -38,10 +38,10 @@ class BodySchema:
         masks: The feasible masks: sets of signals that are enough to infer x_out.
         scaler: Conversion between units and standard deviations.
         weights: The network's W.
-        errors: Errors of every mask on held-out data (1 sigma).
-        anchors: Some rows of the training data [standard deviations], shape (n, layout.size); a descent starts there.
+        errors: Expected errors on held-out data (1 sigma), see `ErrorTable`.
+        anchors: Samples of the training data [standard deviations], shape (n, layout.size), at which a descent starts.
         anchor_conditions: Index into `biases` of every anchor, shape (n,); empty without parametric bias.
-        normal: Statistics of the prediction errors of a healthy body; None if not known.
+        normal: Statistics of the prediction errors of a healthy body; None if unknown.
         bias: The parametric bias p of the present condition, shape (bias_size,).
         biases: Condition -> its p.
         manifest: Further facts that are stored with the schema (JSON values).
@@ -100,7 +100,7 @@ class BodySchema:
         return "\n".join(lines)
 
     def summary(self) -> str:
-        """Return a table of the signals, and one of the root mean square errors of every mask on held-out data."""
+        """Return a table of the signals and a table of the root mean square errors of all masks on held-out data."""
         width = max(map(len, self.layout.names))
         lines = [f"{'signal':<{width}}  elements  unit   role"]
         for signal in self.layout.signals:
@@ -117,22 +117,22 @@ class BodySchema:
         return "\n".join(lines)
 
     def __reduce__(self) -> tuple[type["BodySchema"], tuple[Any, ...]]:
-        """Pickle the given values only; another process derives the rest anew."""
+        """Pickle only the arguments; another process derives the rest again."""
         return BodySchema, tuple(getattr(self, f.name) for f in fields(self) if f.init)
 
     def derived(self, kind: Callable[["BodySchema"], T]) -> T:
-        """Return `kind(schema)`, made at the first call and then kept with the schema."""
-        kept = self._derived.get(kind)
-        if kept is None:
-            kept = self._derived[kind] = kind(self)
-        return kept
+        """Return `kind(schema)`, computed at the first call and then kept with the schema."""
+        value = self._derived.get(kind)
+        if value is None:
+            value = self._derived[kind] = kind(self)
+        return value
 
     def prepare(self, before: "BodySchema") -> None:
-        """Derive all that was derived from another schema, so that no loop has to wait for it later."""
+        """Compute every value that was derived from another schema, so that no loop has to wait for it later."""
         for kind, value in list(before._derived.items()):
-            fresh = self.derived(kind)
-            if isinstance(fresh, ByPattern):
-                fresh.follow(value)
+            derived = self.derived(kind)
+            if isinstance(derived, ByPattern):
+                derived.follow(value)
 
     @property
     def predictor(self) -> Predictor:
@@ -145,7 +145,7 @@ class BodySchema:
         return self.derived(_parts)
 
     def gate(self, mask: Mask) -> tuple[np.ndarray, np.ndarray]:
-        """Return the gate of a mask: 0 or 1 per x_in element, and the input's tail of m and p, float32."""
+        """Return the gate of a mask, 0 or 1 per x_in element, and the end of the network input, m and p; float32."""
         gate = self._gates.get(mask)
         if gate is None:
             for name in sorted(mask - set(self.x_in)):
@@ -157,7 +157,7 @@ class BodySchema:
         return gate
 
     def ranked(self, name: str) -> tuple[Mask, ...]:
-        """Return the feasible masks, the one that infers a signal of x_out best first."""
+        """Return the feasible masks, sorted by the error of a signal of x_out, the smallest first."""
         ranked = self._ranked.get(name)
         if ranked is None:
             ranked = self._ranked[name] = tuple(sorted(self.masks, key=lambda m: self.mask_error(m, name)))
@@ -165,19 +165,20 @@ class BodySchema:
 
     def mask_error(self, mask: Mask, name: str) -> float:
         """Return the mean squared held-out error of a signal under a mask [standard deviations]; 1 if unknown."""
-        known = self.errors.get(("mask", mask))
-        if known is None:
+        errors = self.errors.get(("mask", mask))
+        if errors is None:
             return 1.0
-        scaled = known / self.scaler.std[self.out_index]
+        scaled = errors / self.scaler.std[self.out_index]
         return float(np.mean(scaled[self.out_layout.slice(name)] ** 2))
 
     def network_input(self, normalised: np.ndarray, mask: Mask, bias: np.ndarray | None = None) -> np.ndarray:
-        """Return x_in masked and clipped, followed by m and p.
+        """Return the network input: x_in masked and clipped, then m and p.
 
         Args:
-            normalised: Every signal [standard deviations], shape (size,) or (samples, size); may be NaN where masked.
+            normalised: Every signal [standard deviations], shape (size,) or (samples, size); signals outside the mask
+                may be NaN.
             mask: The given signals.
-            bias: p of every sample, shape (samples, bias_size), or one for all; the present one if not given.
+            bias: p of every sample, shape (samples, bias_size), or of all samples; the schema's p if not given.
         """
         through, tail = self.gate(mask)
         x = np.empty((*normalised.shape[:-1], len(through) + len(tail)), np.float32)
@@ -193,7 +194,7 @@ class BodySchema:
         return run(self.weights.whole, self.network_input(normalised, mask))
 
     def normalise(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Join named arrays [unit] into a vector [standard deviations]; NaN where a value is absent or infinite."""
+        """Join named arrays [unit] into a vector [standard deviations]; NaN for absent and infinite values."""
         return self._normalised(self.layout.join(values))
 
     def normalise_one(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -205,23 +206,23 @@ class BodySchema:
         return self.scaler.normalise(joined)
 
     def error_rows(self) -> list[tuple[str, str, str, float]]:
-        """Return rows of a table: mask, signal, unit, root mean square error over its elements on held-out data."""
+        """Return (mask, signal, unit, root mean square error over the signal's elements on held-out data) for all."""
         rows: list[tuple[str, str, str, float]] = []
         for mask in self.masks:
-            known = self.errors.get(("mask", mask))
-            if known is None:
+            errors = self.errors.get(("mask", mask))
+            if errors is None:
                 continue
-            for name, part in self.out_layout.split(known).items():
+            for name, part in self.out_layout.split(errors).items():
                 rms = float(np.sqrt(np.mean(part**2)))
                 rows.append((label(mask, self.layout.names), name, self.layout.signal(name).unit, rms))
         return rows
 
     def with_weights(self, weights: Weights, errors: ErrorTable | None = None) -> "BodySchema":
-        """Return the same body with another W, and with its errors if they are known."""
+        """Return the same body with another W, and with other errors if given."""
         return replace(self, weights=weights, errors=self.errors if errors is None else errors)
 
     def with_bias(self, bias: np.ndarray) -> "BodySchema":
-        """Return the same network under another p, shape (bias_size,).
+        """Return the same network with another p, shape (bias_size,).
 
         Raises:
             WrongSize: p does not have this schema's size.
@@ -235,7 +236,7 @@ class BodySchema:
         return replace(self, bias=p)
 
     def under(self, condition: str) -> "BodySchema":
-        """Return the same network under the p that a condition had in training.
+        """Return the same network with the trained p of a condition.
 
         Raises:
             UnknownCondition: No condition has this name.
@@ -258,7 +259,7 @@ def check_schema(value: object) -> None:
     """Refuse anything but a body schema as the first argument of a verb.
 
     Raises:
-        WrongKind: The value is something else.
+        WrongKind: The value is not a body schema.
     """
     check_kind("The first argument", value, BodySchema, "a BodySchema")
 

@@ -1,4 +1,4 @@
-"""Named vectors and the one long vector that they are parts of."""
+"""Signals, which are named vectors, and their layout in one long vector."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -38,10 +38,10 @@ class Signal:
 
 
 def check_samples(samples: object) -> None:
-    """Refuse one sample, or anything that is no sequence of them.
+    """Refuse anything but a sequence of samples.
 
     Raises:
-        WrongKind: The samples are something else.
+        WrongKind: The argument is a single sample or no sequence.
     """
     if isinstance(samples, Mapping | str) or not isinstance(samples, Iterable):
         raise WrongKind(f"Samples must be a list of mappings of signal -> array, not {described(samples)}.")
@@ -49,13 +49,13 @@ def check_samples(samples: object) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Several signals in a fixed order, and their places in the vector of all elements.
+    """Signals in a fixed order, and the position of each in the vector of all elements.
 
     Attributes:
         signals: The signals in their order.
-        names: Their names.
+        names: Names of the signals.
         size: Number of elements of all signals together.
-        slices: Signal -> its place in the vector.
+        slices: Signal -> its slice of the vector.
     """
 
     signals: tuple[Signal, ...]
@@ -81,7 +81,7 @@ class Layout:
         object.__setattr__(self, "_starts", np.array([span.start for span in slices.values()], int))
 
     def slice(self, name: str) -> slice:
-        """Return the place of a signal in the vector.
+        """Return a signal's slice of the vector.
 
         Raises:
             UnknownSignal: No signal has this name.
@@ -93,19 +93,19 @@ class Layout:
             raise UnknownSignal(f"Signal '{name}' is not in the schema. Known signals: {known}.") from None
 
     def signal(self, name: str) -> Signal:
-        """Return the signal of a name."""
+        """Return the signal with a name."""
         self.slice(name)
         return self.signals[self.names.index(name)]
 
     def subset(self, names: Iterable[str]) -> "Layout":
-        """Return the layout of some of the signals, in the order of this one."""
-        chosen = set(names)
-        for name in chosen:
+        """Return the layout of the named signals, in the order of this layout."""
+        selection = set(names)
+        for name in selection:
             self.slice(name)
-        return Layout(tuple(signal for signal in self.signals if signal.name in chosen))
+        return Layout(tuple(signal for signal in self.signals if signal.name in selection))
 
     def indices(self, names: Iterable[str]) -> np.ndarray:
-        """Return the positions of the elements of some signals, in the order of the layout, shape (n,)."""
+        """Return the positions of the elements of the named signals, in the order of the layout, shape (n,)."""
         subset = self.subset(names)
         parts = [np.arange(self.slices[name].start, self.slices[name].stop) for name in subset.names]
         return np.concatenate(parts) if parts else np.zeros(0, int)
@@ -138,7 +138,7 @@ class Layout:
             return self._join_any(values)
 
     def _join_sample(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Join one sample of arrays that fit, which is what loops give; anything else raises something."""
+        """Join one sample of arrays of the right shape, fast, as loops need it; raise an error for anything else."""
         joined = np.empty(self.size)
         joined.fill(np.nan)
         for name, value in values.items():
@@ -149,7 +149,7 @@ class Layout:
         return joined
 
     def _join_any(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Join values of any allowed form, or say what is wrong with them."""
+        """Join values of any allowed form, or raise an error with a clear message."""
         if not isinstance(values, Mapping):
             raise WrongKind(f"Values must be a mapping of signal -> array, not {described(values)}.")
         arrays: dict[str, np.ndarray] = {}
@@ -183,7 +183,7 @@ class Layout:
         joined = self.join(values)
         if joined.ndim != 1:
             raise WrongSize(
-                f"One sample at a time is taken, an array of shape (n,) per signal; there are {len(joined)} samples. "
+                f"One sample at a time is allowed, an array of shape (n,) per signal; there are {len(joined)} samples. "
                 "Give them one after the other."
             )
         return joined
@@ -195,7 +195,7 @@ class Layout:
         return {name: vector[..., span] for name, span in self.slices.items()}
 
     def whole(self, finite: np.ndarray) -> frozenset[str]:
-        """Return the signals that are complete; `finite` has a truth value per element, shape (size,)."""
+        """Return the signals whose elements are all finite; `finite` has a truth value per element, shape (size,)."""
         if not self.signals:
             return frozenset()
         complete = np.logical_and.reduceat(finite, self._starts).tolist()

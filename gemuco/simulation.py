@@ -1,4 +1,4 @@
-"""Simulation (paper, II-J): the state of the body that a command and constraints bring about, step after step."""
+"""Simulation (paper, II-J): the states of the body that result from commands and constraints, step by step."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,12 +21,13 @@ class SimulatedState:
     """State of the body after a command.
 
     Attributes:
-        values: Signal -> value [its unit], shape (n,); of the command the value reached.
+        values: Signal -> value [its unit], shape (n,); for the commanded signal the reached value.
         loss: Sum of the terms.
-        residual: Root mean square over x_out of the state minus the network's prediction from it [standard deviations],
-            large for a state beside the manifold of the data and a command that is not reached; NaN without a mask.
+        residual: Root mean square over x_out of the state minus the network's prediction from it [standard deviations].
+            It is large if the state is outside the manifold of the data or the command is not reached; NaN if no mask
+            allows the prediction.
         route: `mask` (usages a and b), `latent` (e) or `input` (f).
-        mask: The signals given to the network; empty for `latent`.
+        mask: Signals given to the network; empty for `latent`.
     """
 
     values: dict[str, np.ndarray]
@@ -37,13 +38,16 @@ class SimulatedState:
 
 
 class Simulator:
-    """A simulation from state to state; each search begins at the end of the last one.
+    """A simulation from state to state. Each search starts from the previous state.
 
-    Route `auto` is the paper's rule, that of estimation. `mask`: there are no terms, and commanded and held signals
-    cover a feasible mask; `latent`: z is searched for terms about x_out; `input`: some x_in are searched.
+    Route `auto` selects a route by the paper's rule for estimation:
 
-    With route `input` a mask can be named. The command is given to the network if it is in the mask, and else inferred
-    and matched, as l is under (theta, f): every state is then consistent for the network.
+    - `mask`: there are no terms, and the commanded and held signals include a feasible mask.
+    - `latent`: z is searched; all terms are about x_out.
+    - `input`: some of x_in are searched.
+
+    With route `input` a mask can be specified. If the mask contains the command, the command is given to the network;
+    otherwise it is inferred and matched, such as l under (theta, f), and every state is consistent for the network.
     """
 
     def __init__(
@@ -56,11 +60,11 @@ class Simulator:
         mask: Mask | None = None,
         limits: Limits | None = None,
     ) -> None:
-        """Prepare to simulate commands of one signal.
+        """Prepare the simulation for commands of one signal.
 
         Args:
             schema: The body schema.
-            terms: Constraints; a `Match` of the command is added if they lack one.
+            terms: Constraints; a `Match` of the command is added if there is none.
             command: The signal that is commanded.
             route: `auto`, `mask`, `latent` or `input`.
             search: Settings of the search.
@@ -80,7 +84,7 @@ class Simulator:
         self.constrain(terms)
 
     def constrain(self, terms: Sequence[Term | Hold]) -> None:
-        """Continue under other constraints.
+        """Use other constraints from now on.
 
         Raises:
             UnknownSignal: A term is about a signal that is not in the layout.
@@ -101,12 +105,12 @@ class Simulator:
         given: Mapping[str, np.ndarray] | None = None,
         now: Mapping[str, np.ndarray] | None = None,
     ) -> SimulatedState:
-        """Return the state that a command brings about.
+        """Return the state after a command.
 
         Args:
             command: The command [unit of the commanded signal], shape (n,).
             given: Signal -> reference of other terms [its unit], such as the posture of a `Hold`.
-            now: Signal -> value [its unit] of the state to begin from, at the first step.
+            now: Signal -> value [its unit] of the initial state, used at the first step.
 
         Raises:
             WrongSize: An array does not have its signal's size.
@@ -115,18 +119,18 @@ class Simulator:
         """
         schema = self.schema
         target = {**(given or {}), self.command: np.asarray(command, float)}
-        sent = schema.normalise_one({self.command: target[self.command]})
-        if not np.isfinite(sent[schema.layout.slice(self.command)]).all():
+        commanded = schema.normalise_one({self.command: target[self.command]})
+        if not np.isfinite(commanded[schema.layout.slice(self.command)]).all():
             raise NotFinite(f"The command of '{self.command}' is not finite; every element needs a number.")
         self._check(target)
         now = {} if now is None else now
         schema.layout.join_one(now)
         self._request.read(target, now)
-        fixed = np.where(np.isfinite(sent), sent, self._request.held)
-        outcome = self._search.find(self._request, fixed, self._choose, lambda: schema.normalise_one(now))
+        inputs = np.where(np.isfinite(commanded), commanded, self._request.held)
+        outcome = self._search.find(self._request, inputs, self._choose, lambda: schema.normalise_one(now))
         values = schema.layout.split(schema.scaler.restore(outcome.x))
-        state = {name: part.copy() for name, part in values.items() if np.isfinite(part).all()}
-        residual = self._residual(outcome.x, sent, outcome.mask)
+        state = {name: value.copy() for name, value in values.items() if np.isfinite(value).all()}
+        residual = self._residual(outcome.x, commanded, outcome.mask)
         return SimulatedState(state, outcome.loss, residual, outcome.route, outcome.mask)
 
     def run(
@@ -135,7 +139,7 @@ class Simulator:
         given: Mapping[str, np.ndarray] | None = None,
         now: Mapping[str, np.ndarray] | None = None,
     ) -> Iterator[SimulatedState]:
-        """Yield the states that commands bring about one after the other; see `step`."""
+        """Yield the state after each command; see `step`."""
         for command in commands:
             yield self.step(command, given, now)
 
@@ -143,48 +147,48 @@ class Simulator:
         for name in target:
             self.schema.layout.slice(name)
             if name not in self._request.needed:
-                known = ", ".join(self._request.needed)
-                raise NotObservable(f"The reference '{name}' is in no term. Signals of the terms: {known}.")
+                signals = ", ".join(self._request.needed)
+                raise NotObservable(f"The reference '{name}' is in no term. Signals of the terms: {signals}.")
 
-    def _choose(self, fixed: Mask) -> tuple[str, Mask]:
-        """Choose route and mask; `fixed` are the signals that are commanded or held completely."""
+    def _choose(self, inputs: Mask) -> tuple[str, Mask]:
+        """Choose route and mask from the signals whose elements are all commanded or held."""
         schema, terms = self.schema, self._request.terms
         if self.mask is not None:
-            if self.route == "mask" and not self.mask <= fixed:
-                missing = label(self.mask - fixed, schema.layout.names)
+            if self.route == "mask" and not self.mask <= inputs:
+                missing = label(self.mask - inputs, schema.layout.names)
                 raise NotObservable(f"Route mask needs {missing} commanded or held; use route input.")
             return self.route, self.mask
-        free = [term for term in terms if not (isinstance(term, Match) and term.signal == self.command)]
-        covering = best(schema.masks, fixed, lambda m: -len(m))
-        if self.route == "mask" or (self.route == "auto" and not free):
-            if covering is not None:
-                return "mask", covering
+        constraints = [term for term in terms if not (isinstance(term, Match) and term.signal == self.command)]
+        largest = best(schema.masks, inputs, lambda m: -len(m))
+        if self.route == "mask" or (self.route == "auto" and not constraints):
+            if largest is not None:
+                return "mask", largest
             if self.route == "mask":
-                known = label(fixed, schema.layout.names)
-                raise NotObservable(f"Route mask needs a feasible mask within {known}; use route latent or input.")
-        about = {name for term in terms for name in term.signals}
-        if self.route == "latent" or (self.route == "auto" and about <= set(schema.x_out)):
-            for name in sorted(about - set(schema.x_out)):
+                names = label(inputs, schema.layout.names)
+                raise NotObservable(f"Route mask needs a feasible mask within {names}; use route latent or input.")
+        signals = {name for term in terms for name in term.signals}
+        if self.route == "latent" or (self.route == "auto" and signals <= set(schema.x_out)):
+            for name in sorted(signals - set(schema.x_out)):
                 raise NotObservable(f"Route latent predicts only x_out, but a term is about '{name}'; use route input.")
             return "latent", frozenset()
-        inferring = [m for m in schema.masks if self.command in m or self.command in schema.x_out]
-        if not inferring:
-            raise NotObservable(f"No feasible mask takes '{self.command}', and it is not inferred.")
-        return "input", max(inferring, key=lambda m: (self.command not in m, len(m)))
+        masks = [m for m in schema.masks if self.command in m or self.command in schema.x_out]
+        if not masks:
+            raise NotObservable(f"No feasible mask contains '{self.command}', and it is not inferred.")
+        return "input", max(masks, key=lambda m: (self.command not in m, len(m)))
 
-    def _residual(self, x: np.ndarray, sent: np.ndarray, mask: Mask) -> float:
-        """Return the error of the state when the network predicts it from the sent command and a mask."""
+    def _residual(self, x: np.ndarray, commanded: np.ndarray, mask: Mask) -> float:
+        """Return the error of the state when the network predicts it from the command and a mask."""
         schema = self.schema
         if not mask:
-            known = schema.layout.whole(np.isfinite(x))
+            available = schema.layout.whole(np.isfinite(x))
             mask = min(
-                (m for m in schema.masks if m <= known),
+                (m for m in schema.masks if m <= available),
                 key=lambda m: (self.command not in m, len(m)),
                 default=frozenset(),
             )
             if not mask:
                 return float("nan")
-        state = np.where(np.isfinite(sent), sent, x)
+        state = np.where(np.isfinite(commanded), commanded, x)
         prediction = schema.infer(np.where(np.isfinite(state), state, 0.0), mask)
         return float(np.sqrt(np.mean((prediction - state[schema.out_index]) ** 2)))
 
@@ -199,15 +203,15 @@ def simulate(
     now: Mapping[str, np.ndarray] | None = None,
     **options: Any,
 ) -> list[SimulatedState]:
-    """Return the states that commands bring about one after the other; `Simulator` takes them singly.
+    """Return the state after each command; a `Simulator` takes one command at a time.
 
     Args:
         schema: The body schema.
         commands: The commands [unit of the commanded signal], each of shape (n,).
         command: The signal that is commanded.
         terms: Constraints.
-        given: Signal -> reference of terms that take one [its unit].
-        now: Signal -> value [its unit] of the state to begin from.
-        options: Of `Simulator`: route, mask, search, limits.
+        given: Signal -> reference [its unit] of other terms, such as the posture of a `Hold`.
+        now: Signal -> value [its unit] of the initial state.
+        options: Further arguments of `Simulator`: route, mask, search, limits.
     """
     return list(Simulator(schema, terms, command, **options).run(commands, given, now))

@@ -1,9 +1,9 @@
-"""Compilation of all code ahead of the first tick of a loop.
+"""Compilation of all code before the first tick of a loop.
 
     python -m gemuco.warm
 
-The first time on a machine this takes a minute; the code is kept (`gemuco.compiled.jit`) and later loaded within a
-second or two. A small body is used in every way that a service does.
+On a new machine this takes a minute. The compiled code is saved (`gemuco.compiled.jit`) and later loaded within two
+seconds. To compile everything, all functions that a service uses are called once with a small body.
 """
 
 import time
@@ -64,7 +64,7 @@ def body(outputs: tuple[str, ...] = OUTPUTS) -> BodySchema:
 
 
 def running(schema: BodySchema) -> Iterator[str]:
-    """Use the body in every way that a service does; yield the name of each step before it."""
+    """Call all functions that a service uses; yield the name of each step before it."""
     whole = {name: np.zeros(size) for name, (size, _) in SIGNALS.items()}
     yield "samples"
     received = np.frombuffer(bytes(8), "<f8"), np.frombuffer(bytes(1), bool), np.frombuffer(bytes(8), "<f8")
@@ -92,7 +92,7 @@ def running(schema: BodySchema) -> Iterator[str]:
 
 
 def learning(schema: BodySchema) -> Iterator[str]:
-    """Use the body as training and the paper's experiments do; yield the name of each step before it."""
+    """Call all functions of training and of the paper's experiments; yield the name of each step before it."""
     from gemuco.structure.mask_errors import MaskErrors
     from gemuco.structure.mask_judge import Judge, Thresholds
 
@@ -101,9 +101,9 @@ def learning(schema: BodySchema) -> Iterator[str]:
     Controller(schema, [Match("position")], "tension", search=search).solve({"position": np.full(1, 0.1)}, {})
     yield "structure determination"
     schema, rows, size = body(tuple(SIGNALS)), 100, schema.layout.size
-    there, whole = np.ones((rows, size), bool), np.ones((rows, len(SIGNALS)), bool)
+    counts, whole = np.ones((rows, size), bool), np.ones((rows, len(SIGNALS)), bool)
     x, p = np.zeros((rows, size), np.float32), np.zeros((rows, len(schema.bias)), np.float32)
-    errors = MaskErrors(schema.layout, schema.weights.whole, x, there, whole, p, np.ones(size))
+    errors = MaskErrors(schema.layout, schema.weights.whole, x, counts, whole, p, np.ones(size))
     Judge(schema.layout.names, (errors,), Thresholds()).measure(np.eye(len(SIGNALS), dtype=bool))
 
 
@@ -111,19 +111,19 @@ def warm(report: Callable[[float, str], None] | None = None, is_service: bool = 
     """Compile everything.
 
     Args:
-        report: Called with the share done, 0 to 1, and the name of the next step.
+        report: Called with the finished share, 0 to 1, and the name of the next step.
         is_service: Whether to leave out code that a service never uses and to unload the compiler, to save memory.
 
     Returns:
         Duration [s].
     """
-    begun, schema = time.monotonic(), body()
+    start, schema = time.monotonic(), body()
     for index, step in enumerate(chain(running(schema), () if is_service else learning(schema))):
         if report is not None:
             report(index / (STEPS["running"] if is_service else sum(STEPS.values())), step)
     if is_service:
         let_compiler_go()
-    return time.monotonic() - begun
+    return time.monotonic() - start
 
 
 def main() -> None:
@@ -132,8 +132,8 @@ def main() -> None:
 
     with Progress(TextColumn("compiling"), BarColumn(), TextColumn("{task.description}"), transient=True) as bar:
         task = bar.add_task("", total=1.0)
-        took = warm(lambda done, what: bar.update(task, completed=done, description=what))
-    print(f"Compiled code is ready after {took:.1f} s, {f'kept in {FOLDER}' if FOLDER else 'kept nowhere'}.")
+        duration = warm(lambda share, step: bar.update(task, completed=share, description=step))
+    print(f"Compiled code is ready after {duration:.1f} s, {f'saved in {FOLDER}' if FOLDER else 'not saved'}.")
 
 
 if __name__ == "__main__":

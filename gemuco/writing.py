@@ -1,4 +1,4 @@
-"""One sentence for files that cannot be written."""
+"""Error message for files that cannot be written."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,14 +11,14 @@ from gemuco.errors import NotWritten
 
 @contextmanager
 def writing(what: str, path: Path) -> Iterator[None]:
-    """Turn an error of the file system inside into one sentence.
+    """Replace an error of the file system by one with a clear message.
 
     Args:
-        what: Begins the sentence, such as `The model`.
+        what: First words of the message, such as `The model`.
         path: The file or folder.
 
     Raises:
-        NotWritten: The disk is full, the place is read-only, a folder is a file, ...
+        NotWritten: The disk is full, the folder is read-only, a file has the name of the folder, ...
     """
     try:
         yield

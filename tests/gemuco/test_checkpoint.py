@@ -90,8 +90,8 @@ def break_tensor(folder):
         (lambda f: change(f, signals=[]), "is damaged"),
         (lambda f: change(f, normal=[]), "is damaged"),
         (lambda f: change(f, network={"encoder": ["tanh"] * 9, "decoder": ["linear"]}), "is damaged"),
-        (break_tensor, "is not the file of its manifest"),
-        (lambda f: (f / "model.safetensors").write_bytes(b""), "is not the file of its manifest"),
+        (break_tensor, "does not match its manifest"),
+        (lambda f: (f / "model.safetensors").write_bytes(b""), "does not match its manifest"),
     ],
 )
 def test_says_in_a_sentence_what_is_wrong(folder, damage, text):
