@@ -1,4 +1,4 @@
-"""A remote client in ten lines: read the newest of everything, ask for what a robot can do."""
+"""Remote client of a robot: its newest messages, its services' verbs, its lease."""
 
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -35,29 +35,29 @@ M = TypeVar("M", bound=Message)
 SLOW_TIMEOUT = 10.0
 """A verb that computes has this deadline [s]."""
 LONG_TIMEOUT = 60.0
-"""A verb that computes step after step, or has a long answer, has this deadline [s]."""
+"""A verb that computes many steps, or has a long answer, has this deadline [s]."""
 
 Values = Mapping[str, Sequence[float] | np.ndarray]
 """Values map a signal to numbers [its unit], shape (n,)."""
 
 
 class Client:
-    """Client of a robot, for any process; it needs no robot file, and nothing of the robot's code.
+    """Client of a robot, for any process; it needs neither the robot file nor the robot's code.
 
         with Client("musashi_arm") as arm:
             for now in arm.estimates():
                 print(now.values["joint_position"])
 
-    There are three ways to read: `sample`, `estimate` and the like return the newest message, or None rather than an
-    old one; `sensors`, `estimates`, `anomalies` and `health` iterate without end and raise when nothing comes; verbs
-    query a service.
+    `sample`, `estimate` and similar methods return the newest message, or None if that message is old. `sensors`,
+    `estimates`, `anomalies` and `health` iterate without end, and raise an error if no message arrives. Verbs query a
+    service.
 
-    Every call ends: verbs and iterators have deadlines. A verb raises the error of the service, of the same class.
-    Without a service it is `ServiceUnavailable`; a role without the right gets `NotAllowed`; another version of the
-    wire format is `WrongVersion`; a service that does not answer in time is `TooSlow`.
+    Every call ends: verbs and iterators have deadlines. A verb raises the service's error, with the same class. The
+    error is `ServiceUnavailable` without a service, `NotAllowed` for a role without the right, `WrongVersion` for
+    another version of the wire format, and `TooSlow` for a service that does not answer in time.
 
-    Verbs and readers may be used from several threads, each iterator and `command` and `target` from one at a time.
-    The client goes on by itself when a service or a router was away.
+    Verbs and readers may be used from several threads; each iterator, `command` and `target` from one thread at a time.
+    The client continues by itself after a service or a router was absent.
 
     Args:
         robot: The robot's name.
@@ -131,23 +131,23 @@ class Client:
         return self.reader(keys.sample(self.robot), Sample).wait(timeout)
 
     def vision(self, max_age: float = FRESH, timeout: float = 0.0) -> Sample | None:
-        """Return the newest measurement of a camera, or None, as `sample`."""
+        """Return the newest measurement of a camera, or None, like `sample`."""
         return self._link.fresh(keys.vision(self.robot), Sample, max_age, timeout)
 
     def applied(self, max_age: float = FRESH, timeout: float = 0.0) -> Applied | None:
-        """Return the command last sent to the drives, or None, as `sample`."""
+        """Return the command last sent to the drives, or None, like `sample`."""
         return self._link.fresh(keys.applied(self.robot), Applied, max_age, timeout)
 
     def update(self, max_age: float = 4 * FRESH, timeout: float = 0.0) -> Update | None:
-        """Return the newest state of the online update, or None, as `sample`."""
+        """Return the newest state of the online update, or None, like `sample`."""
         return self._link.fresh(keys.update(self.robot), Update, max_age, timeout)
 
     def truth(self, max_age: float = FRESH, timeout: float = 0.0) -> Sample | None:
-        """Return the newest truth of a simulator, or None, as `sample`."""
+        """Return the newest truth of a simulator, or None, like `sample`."""
         return self._link.fresh(keys.truth(self.robot), Sample, max_age, timeout)
 
     def status(self, service: str, max_age: float = FRESH_STATUS, timeout: float = 0.0) -> Status | None:
-        """Return the newest status of a service, or None, as `sample`."""
+        """Return the newest status of a service, or None, like `sample`."""
         return self._link.fresh(keys.status(self.robot, service), Status, max_age, timeout)
 
     def holder(self, timeout: float = TIMEOUT) -> Holder:
@@ -165,14 +165,14 @@ class Client:
     def estimate(
         self, values: Values | None = None, hide: Iterable[str] = (), *, max_age: float = FRESH, timeout: float = 0.0
     ) -> Estimates | None:
-        """Return the newest estimate of every signal, or None, as `sample`.
+        """Return the newest estimate of every signal, or None, like `sample`.
 
-        With values, or with signals to hide, the model estimates from those instead, as `gemuco.estimate` does.
+        With `values` or `hide` the model service estimates anew, as `gemuco.estimate` does.
         """
         hidden = list(hide)
         if values is None and not hidden:
             return self._link.fresh(keys.estimate(self.robot), Estimates, max_age, timeout)
-        answer = self.ask("model", "estimate", _given(values) | {"hide": hidden}, SLOW_TIMEOUT)
+        answer = self.ask("model", "estimate", _values_argument(values) | {"hide": hidden}, SLOW_TIMEOUT)
         signals: dict[str, dict[str, Any]] = answer["signals"]
         elements = Elements.of({name: len(part["values"]) for name, part in signals.items()})
         return Estimates(
@@ -189,15 +189,14 @@ class Client:
     def anomaly(
         self, values: Values | None = None, hide: Iterable[str] = (), *, max_age: float = FRESH, timeout: float = 0.0
     ) -> Anomaly | None:
-        """Return the newest anomaly score, or None, as `sample`.
+        """Return the newest anomaly score, or None, like `sample`.
 
-        With values, or with signals to hide, the model judges those instead, as `gemuco.score` does, as a single
-        sample.
+        With `values` or `hide` the model service scores this single sample anew, as `gemuco.score` does.
         """
         hidden = list(hide)
         if values is None and not hidden:
             return self._link.fresh(keys.anomaly(self.robot), Anomaly, max_age, timeout)
-        answer = self.ask("model", "anomaly", _given(values) | {"hide": hidden}, SLOW_TIMEOUT)
+        answer = self.ask("model", "anomaly", _values_argument(values) | {"hide": hidden}, SLOW_TIMEOUT)
         contribution = Numbers.of(answer["contribution"])
         names = ("cycle", "score", "threshold", "is_anomaly", "blamed")
         return Anomaly(contribution=contribution, **{name: answer[name] for name in names})
@@ -209,25 +208,25 @@ class Client:
 
         Args:
             service: `hal`, or `vision` for a camera.
-            deadline: Time [s] to wait for the next one before an error; None waits without end.
+            deadline: Longest wait for a measurement [s]; None waits without end.
 
         Raises:
-            ServiceUnavailable, TooSlow, WrongVersion: From `next`, when none came in time; it may be called again.
-            NotAllowed: At once.
+            ServiceUnavailable, TooSlow, WrongVersion: `next` found no measurement in time; it may be called again.
+            NotAllowed: This client's role may not read the measurements.
         """
         key = keys.vision(self.robot) if service == "vision" else keys.sample(self.robot)
         return self._live(key, Sample, deadline)
 
     def estimates(self, deadline: float | None = DEADLINE) -> Iterator[Estimates]:
-        """Return an iterator over estimates of every signal, as `sensors`."""
+        """Return an iterator over estimates of every signal, like `sensors`."""
         return self._live(keys.estimate(self.robot), Estimates, deadline)
 
     def anomalies(self, deadline: float | None = DEADLINE) -> Iterator[Anomaly]:
-        """Return an iterator over anomaly scores, as `sensors`."""
+        """Return an iterator over anomaly scores, like `sensors`."""
         return self._live(keys.anomaly(self.robot), Anomaly, deadline)
 
     def health(self, deadline: float | None = DEADLINE) -> Iterator[Health]:
-        """Return an iterator over the health of the robot's services, after every change and status, as `sensors`."""
+        """Return an iterator over the health of the robot's services, after every change and status, like `sensors`."""
         link = self._link
         readers = [self.reader(keys.status(self.robot, service), Status) for service in keys.SERVICES]
         return LiveHealth(
@@ -241,12 +240,12 @@ class Client:
     # Commands.
 
     def command(self, signal: str, values: np.ndarray, answers: Sample) -> None:
-        """Send desired values to the drives; the HAL follows while they are younger than the time to live.
+        """Send desired values to the drives; the HAL follows them until their time to live has passed.
 
         Args:
             signal: The commanded signal.
             values: Desired values [its unit], shape (n,).
-            answers: The sample that the command was made from; its age is the command's age.
+            answers: The sample from which the command was computed; its age is the command's age.
 
         Raises:
             LeaseLost: This client's lease was lost.
@@ -264,10 +263,10 @@ class Client:
         Args:
             signal: Signal to reach, such as `joint_position`.
             values: Reference [its unit], shape (n,).
-            timeout: Time [s] to wait for a model service that listens.
+            timeout: Longest wait for a model service that takes targets [s].
 
         Raises:
-            ServiceUnavailable: No model service listens.
+            ServiceUnavailable: No model service takes targets.
         """
         publisher = self._link.publisher(keys.target(self.robot), Target)
         deadline = time.monotonic() + timeout
@@ -291,19 +290,19 @@ class Client:
             with arm.lease():
                 arm.enable()
 
-        Entering raises `CommandHeld`, which names the holder, while another client commands. After the lease was lost
-        (this process was frozen, the HAL restarted) commands and verbs that need it raise `LeaseLost`. Every client may
-        still stop the robot.
+        Entering raises `CommandHeld`, which names the holder, while another client commands. If the lease is lost
+        (this process was frozen, or the HAL was restarted), commands and verbs that need the lease raise `LeaseLost`.
+        Every client may still stop the robot.
 
         Args:
-            seconds: Time [s] that the lease outlives this process; it is renewed in the background.
+            seconds: Length of the lease [s], which is renewed in the background.
         """
         return ClientLease(self._link, seconds)
 
     # Verbs of the HAL.
 
     def enable(self) -> dict[str, Any]:
-        """Let the drives follow commands; the answer has the mode, which soon is `hold` or `fault`."""
+        """Enable the drives, which then follow commands; the answer has the mode, which soon is `hold` or `fault`."""
         return self.ask("hal", "enable")
 
     def disable(self) -> dict[str, Any]:
@@ -315,15 +314,15 @@ class Client:
         return self.ask("hal", "stop")
 
     def reset(self) -> dict[str, Any]:
-        """Leave a fault; this never enables."""
+        """Leave a fault; the drives stay disabled."""
         return self.ask("hal", "reset")
 
     def home(self, device: str) -> dict[str, Any]:
-        """Let a drive search its zero, which moves it; the robot must be off, and its mode is then `homing`."""
+        """Let a drive move and search its zero; the robot must be off, and its mode is then `homing`."""
         return self.ask("hal", "home", {"device": device})
 
     def tare(self, device: str) -> dict[str, Any]:
-        """Let a sensor take its present reading as zero while the robot is off; its health has the result."""
+        """Set a sensor's zero to its present reading while the robot is off; the sensor's health has the result."""
         return self.ask("hal", "tare", {"device": device})
 
     def estop(self, reason: str = "") -> dict[str, Any]:
@@ -331,7 +330,7 @@ class Client:
 
         Returns:
             `complete`: whether every drive stopped; `devices`: the result of each (`device`, `stopped`, `text`);
-            `text`: other faults; `mode`. If it is not complete, or no HAL answers, cut the power: this is not a
+            `text`: other faults; `mode`. If `complete` is false, or no HAL answers, cut the power: this is not a
             safety-rated emergency stop.
         """
         return self.ask("hal", "estop", {"reason": reason}, SLOW_TIMEOUT)
@@ -355,17 +354,19 @@ class Client:
         return self.ask("model", "rollback", timeout=SLOW_TIMEOUT)
 
     def infer(self, signal: str, values: Values | None = None, hide: Iterable[str] = ()) -> dict[str, Any]:
-        """Query the model for a signal, from given values or from the newest sample with some signals hidden."""
-        return self.ask("model", "estimate", {"signal": signal, "hide": list(hide)} | _given(values), SLOW_TIMEOUT)
+        """Query the model for a signal, from `values` or from the newest sample, with some signals hidden."""
+        return self.ask(
+            "model", "estimate", {"signal": signal, "hide": list(hide)} | _values_argument(values), SLOW_TIMEOUT
+        )
 
     def control(self, target: Values, values: Values | None = None) -> dict[str, Any]:
-        """Query the command that brings about a target, and its expected result; the robot does not move.
+        """Query the command that reaches a target, and its expected result; the robot does not move.
 
         Args:
             target: Signal -> reference [its unit].
             values: Present state of the body [its unit]; the newest sample if not given.
         """
-        return self.ask("model", "control", {"target": _plain(target)} | _given(values), SLOW_TIMEOUT)
+        return self.ask("model", "control", {"target": _plain(target)} | _values_argument(values), SLOW_TIMEOUT)
 
     def simulate(
         self,
@@ -373,18 +374,20 @@ class Client:
         given: Values | None = None,
         values: Values | None = None,
     ) -> dict[str, Any]:
-        """Query the states that successive commands bring about; the robot does not move.
+        """Query the states after successive commands; the robot does not move.
 
         Args:
             commands: Commands [unit of the commanded signal], each of shape (n,).
-            given: References of the robot file's constraints that take one [its unit].
+            given: References of the constraints in the robot file that have a reference [its unit].
             values: Present state of the body [its unit]; the newest sample if not given.
         """
         arguments = {"commands": [np.asarray(command, float).tolist() for command in commands]}
-        return self.ask("model", "simulate", arguments | {"given": _plain(given or {})} | _given(values), LONG_TIMEOUT)
+        return self.ask(
+            "model", "simulate", arguments | {"given": _plain(given or {})} | _values_argument(values), LONG_TIMEOUT
+        )
 
     def history(self, seconds: float, signals: Iterable[str] | None = None, timeout: float = SLOW_TIMEOUT) -> History:
-        """Return the estimates of the last seconds, from the model service's memory of one minute.
+        """Return the estimates of the last seconds, of at most one minute, from the model service's memory.
 
         Args:
             seconds: Length of time [s].
@@ -409,8 +412,8 @@ class Client:
         """Return a description of the robot, or of one of its services.
 
         Without a service: `signals` (unit, elements, source), `x_in`, `x_out`, `masks`, `conditions`, `rates`,
-        `limits`, `command`, `controls`, `devices`, `versions`, `services` that are alive, and `missing`: parts whose
-        service is away.
+        `limits`, `command`, `controls`, `devices`, `versions`, live `services`, and the `missing` parts of absent
+        services.
         """
         return self.ask(service, "describe", timeout=timeout) if service else description.of(self._link, timeout)
 
@@ -424,5 +427,5 @@ def _joined(signals: dict[str, dict[str, Any]], field: str, kind: type) -> np.nd
     return np.array([number for part in signals.values() for number in part[field]], kind)
 
 
-def _given(values: Values | None) -> dict[str, Any]:
+def _values_argument(values: Values | None) -> dict[str, Any]:
     return {} if values is None else {"values": _plain(values)}

@@ -21,7 +21,7 @@ def of(link: Link, timeout: float) -> dict[str, Any]:
 
     Raises:
         ServiceUnavailable: No service of this robot runs.
-        NotAllowed: This client's role may not query it.
+        NotAllowed: This client's role may not query `describe`.
     """
     begun = time.monotonic()
     while not {*DESCRIBING} <= (alive := link.alive()) and time.monotonic() - begun < min(timeout, CONNECTS_WITHIN):

@@ -1,6 +1,6 @@
-"""Link to one robot: a session, readers and publishers made at their first use, queries, and the error of a silence.
+"""Link to one robot: session, readers, publishers, queries, and the errors for messages that do not arrive.
 
-An exchange that the role may not do is refused here at once, with a sentence; the router refuses it too, silently.
+An exchange that the role may not do is refused here at once with an error text; the router refuses it without one.
 """
 
 import threading
@@ -27,9 +27,9 @@ M = TypeVar("M", bound=Message)
 TIMEOUT = 2.0
 """A verb has this deadline [s]."""
 SEEN_WITHIN = 0.5
-"""A query is dated by a sample of at most this age [s], waited for at most this long."""
+"""A query names a sample of at most this age [s]; the client waits at most this long for the sample."""
 LATELY = 2.0
-"""A message of another version counts as the reason of a silence for this long [s]."""
+"""A message of another version explains the absence of valid messages for this long [s]."""
 ENDS_WITHIN = 1.0
 """The threads of readers have this time [s] to end after the session was closed."""
 
@@ -50,15 +50,15 @@ class Link:
         self.member = Member()
         """Role and its robots, from the role file."""
         self.held_lease: ClientLease | None = None
-        """Lease of this client, also after it was lost, until its context ends."""
+        """Lease of this client until the end of its context, even if the lease was lost."""
         self.changed = threading.Condition()
-        """Condition that every status, and every service that comes or goes, notifies."""
+        """Condition that is notified by every status, and by every service that starts or ends."""
         self._connect = (connect,) if isinstance(connect, str) else tuple(connect)
         self._session: zenoh.Session | None = None
         self._readers: dict[str, Reader[Any]] = {}
         self._publishers: dict[str, Publisher[Any]] = {}
         self._presence: Presence | None = None
-        self._making = threading.Lock()
+        self._make_lock = threading.Lock()
 
     def open(self) -> None:
         """Open the session.
@@ -101,8 +101,8 @@ class Link:
         return query.alive(self.session, self.robot)
 
     def presence(self) -> Presence:
-        """Return the set of live services, kept up to date from the first call on."""
-        with self._making:
+        """Return the set of live services, which is updated from the first call on."""
+        with self._make_lock:
             if self._presence is None:
                 self._presence = Presence(self.session, self.robot, self.changed)
             return self._presence
@@ -110,7 +110,7 @@ class Link:
     def ask(
         self, service: str, verb: str, arguments: Mapping[str, Any] | None = None, timeout: float = TIMEOUT
     ) -> dict[str, Any]:
-        """Query any verb of any service, as `query.ask`.
+        """Query any verb of any service, like `query.ask`.
 
         Raises:
             NotAllowed: This client's role may not query the verb.
@@ -127,14 +127,14 @@ class Link:
         return query.ask(self.session, key, arguments, timeout, self._dated_caller)
 
     def check_lease(self) -> None:
-        """Raise `LeaseLost` if this client had a lease, and lost it."""
+        """Raise `LeaseLost` if this client lost its lease."""
         if self.held_lease is not None:
             self.held_lease.check()
 
     def seen(self, timeout: float = SEEN_WITHIN) -> tuple[int, int]:
-        """Return boot and cycle of the HAL's newest sample here; zeros if none arrives within `timeout` [s].
+        """Return boot and cycle of the HAL's newest sample; zeros if no sample arrives within `timeout` [s].
 
-        A verb that may move the robot carries them, so that it is done at once or never.
+        A verb that may move the robot carries both numbers, so that a late query is refused.
         """
         reader = self.reader(keys.sample(self.robot), Sample)
         last = reader.last()
@@ -147,12 +147,12 @@ class Link:
         return replace(self.caller, hal_boot=hal_boot, cycle=cycle)
 
     def reader(self, key: str, record: type[M]) -> Reader[M]:
-        """Return the reader of a key, made at the first call.
+        """Return the reader of a key; the first call makes the reader.
 
         Raises:
             NotAllowed: This client's role may not read the key.
         """
-        with self._making:
+        with self._make_lock:
             if key not in self._readers:
                 _, service, noun = keys.parse(key)
                 if not self.member.may_subscribe(self.robot, f"{service}/{noun}"):
@@ -162,12 +162,12 @@ class Link:
             return self._readers[key]
 
     def publisher(self, key: str, record: type[M]) -> Publisher[M]:
-        """Return the publisher of a key, made at the first call.
+        """Return the publisher of a key; the first call makes the publisher.
 
         Raises:
             NotAllowed: This client's role may not publish the key.
         """
-        with self._making:
+        with self._make_lock:
             if key not in self._publishers:
                 _, service, noun = keys.parse(key)
                 if not self.member.may_publish(self.robot, f"{service}/{noun}"):
@@ -176,7 +176,7 @@ class Link:
             return self._publishers[key]
 
     def fresh(self, key: str, record: type[M], max_age: float, timeout: float) -> M | None:
-        """Return the newest message of a key; None if none arrived in the last `max_age` [s] or within `timeout` [s].
+        """Return the newest message of a key, not older than `max_age` [s]; None if none arrives within `timeout` [s].
 
         Raises:
             NotAllowed: This client's role may not read the key.
@@ -193,7 +193,7 @@ class Link:
         return message
 
     def silence(self, reader: Reader[Any], waited: float) -> NoAnswer:
-        """Return the error for a key on which nothing came for `waited` [s]."""
+        """Return the error for a key without a message for `waited` [s]."""
         _, service, noun = keys.parse(reader.key)
         if reader.has_ended or self._session is None:
             return ServiceUnavailable(f"The client of robot '{self.robot}' was closed.")
@@ -202,8 +202,8 @@ class Link:
         unread = f" {reader.rejected} messages could not be read: {reader.rejected_text}" if reader.rejected else ""
         if service in self.alive():
             return TooSlow(
-                f"The '{service}' service of robot '{self.robot}' is there, but no '{noun}' came within {waited:.1f} s."
-                f" Is it busy, or stopped?{unread}"
+                f"The '{service}' service of robot '{self.robot}' is alive, but no '{noun}' came within {waited:.1f} s."
+                f" Is the service busy or stopped?{unread}"
             )
         return ServiceUnavailable(
             f"No '{noun}' of the '{service}' service of robot '{self.robot}' came within {waited:.1f} s. "
@@ -211,11 +211,11 @@ class Link:
         )
 
     def no_health(self, readers: Iterable[Reader[Any]], waited: float) -> NoAnswer:
-        """Return the error for a robot of which no service was heard for `waited` [s]."""
+        """Return the error for a robot without any message for `waited` [s]."""
         if self._session is None:
             return ServiceUnavailable(f"The client of robot '{self.robot}' was closed.")
         for reader in readers:
             if text := reader.other_version(waited + LATELY):
                 return WrongVersion(f"{text} Update the older of both programs.")
         others = describe_presence(self._session, self.robot)
-        return ServiceUnavailable(f"Nothing was heard of robot '{self.robot}' for {waited:.1f} s.{others}")
+        return ServiceUnavailable(f"No message of robot '{self.robot}' arrived for {waited:.1f} s.{others}")

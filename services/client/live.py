@@ -1,4 +1,4 @@
-"""Iterators over the messages of a robot, always the newest and never a backlog."""
+"""Iterators over the newest messages of a robot; older messages are skipped."""
 
 import threading
 import time
@@ -21,20 +21,20 @@ FRESH_STATUS = 2.5
 """A status is returned up to this age [s]."""
 
 Silence = Callable[[float], Exception]
-"""A function of this type takes the time [s] in which nothing came, and returns the error to raise."""
+"""A function of this type takes the time without a message [s], and returns the error to raise."""
 
 
 class Live(Generic[M]):
-    """Iterator whose `next` returns the newest message that was not returned yet, as soon as there is one.
+    """Iterator whose `next` waits for a new message and returns the newest.
 
-    A slow caller skips some. A message older than `max_age` is not returned. It goes on when a service or a router was
-    away; after an error `next` may be called again. For one thread.
+    A slow caller skips messages. A message older than `max_age` is not returned. The iterator continues after a service
+    or a router was absent; after an error `next` may be called again. For one thread.
 
     Args:
         reader: Reader of the messages.
         deadline: Time [s] to wait for a message; None waits without end.
         max_age: Largest age of a message [s].
-        silence: Makes the error when none came in time.
+        silence: Makes the error if no message came in time.
     """
 
     def __init__(self, reader: Reader[M], deadline: float | None, max_age: float, silence: Silence) -> None:
@@ -62,8 +62,8 @@ class Health:
     """Health of a robot's services.
 
     Attributes:
-        alive: Names of live services; one that froze or was cut off counts for another second.
-        statuses: Service -> its newest status, if that came in the last 2.5 s.
+        alive: Names of live services; a frozen or disconnected service stays listed for another second.
+        statuses: Service -> its newest status of the last 2.5 s.
     """
 
     alive: frozenset[str] = frozenset()
@@ -71,20 +71,20 @@ class Health:
 
 
 class Presence:
-    """Set of a robot's live services, kept up to date by zenoh until the session ends."""
+    """Set of a robot's live services, updated by zenoh until the session ends."""
 
     def __init__(self, session: zenoh.Session, robot: str, changed: threading.Condition) -> None:
-        """`changed` is notified of every service that comes or goes."""
+        """Notify `changed` of every service that starts or ends."""
         self._changed = changed
         self._alive: set[str] = set()
-        self._subscriber = session.liveliness().declare_subscriber(keys.alive(robot, "*"), self._hear, history=True)
+        self._subscriber = session.liveliness().declare_subscriber(keys.alive(robot, "*"), self._update, history=True)
 
     def now(self) -> frozenset[str]:
         """Return the names of live services."""
         with self._changed:
             return frozenset(self._alive)
 
-    def _hear(self, token: zenoh.Sample) -> None:
+    def _update(self, token: zenoh.Sample) -> None:
         service = keys.parse(str(token.key_expr))[1]
         with self._changed:
             (self._alive.add if token.kind == zenoh.SampleKind.PUT else self._alive.discard)(service)
@@ -92,17 +92,16 @@ class Presence:
 
 
 class LiveHealth:
-    """Iterator whose `next` returns the robot's health after a status, or after a service came or went.
+    """Iterator whose `next` waits for a status, or for a service that starts or ends, and returns the robot's health.
 
-    Meanwhile it waits, as `Live`; for a robot that vanishes it returns one health without live services. For one
-    thread.
+    When the last service ends, `next` returns a health without live services once. For one thread.
 
     Args:
         presence: Live services.
         readers: Readers of all services' statuses, which notify the same condition as `presence`.
-        changed: That condition.
+        changed: The condition that all of them notify.
         deadline: Time [s] to wait; None waits without end.
-        silence: Makes the error when nothing was heard in time.
+        silence: Makes the error if nothing changed in time.
     """
 
     def __init__(
@@ -123,15 +122,17 @@ class LiveHealth:
     def __next__(self) -> Health:
         begun = time.monotonic()
         with self._changed:
-            heard = self._changed.wait_for(lambda: self._heard() != self._returned or self._has_ended(), self._deadline)
-            if not heard or self._has_ended():
+            has_changed = self._changed.wait_for(
+                lambda: self._state() != self._returned or self._has_ended(), self._deadline
+            )
+            if not has_changed or self._has_ended():
                 raise self._silence(time.monotonic() - begun)
-            self._returned = self._heard()
+            self._returned = self._state()
         fresh = [reader.get(FRESH_STATUS) for reader in self._readers]
         return Health(self._presence.now(), {status.service: status for status in fresh if status is not None})
 
-    def _heard(self) -> tuple[object, ...]:
-        """Return the live services and the arrival of each status, which differ after every change."""
+    def _state(self) -> tuple[object, ...]:
+        """Return the live services and the arrival time of each status."""
         return (self._presence.now(), *(None if (last := r.last()) is None else last.received for r in self._readers))
 
     def _has_ended(self) -> bool:

@@ -1,4 +1,4 @@
-"""Actions of every story on a robot: engage, send a target, wait, and go on after the HAL stopped it."""
+"""Actions of every story: engage the controller, send a target, wait, and continue after the HAL stopped the robot."""
 
 import time
 from collections.abc import Callable
@@ -14,9 +14,9 @@ NOTICED_WITHIN = 3.0
 """An event must be reported within this time [s]."""
 ENGAGED_WITHIN = 1.0
 FOLLOWS_WITHIN = 15.0
-"""The robot must follow within this time [s]: drives are released, nodes come back, and refusals are repeated."""
+"""The robot must follow within this time [s], in which nodes restart and refused requests are repeated."""
 TRIES = 3
-"""A target is given at most this often, if the HAL stops the robot on the way each time."""
+"""A target is sent at most this often if the HAL stops the robot before the end."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,10 +25,10 @@ class Stage:
 
     Attributes:
         name: Name of the stage.
-        start: Its beginning [s of the timeline].
-        end: Its end [s of the timeline].
+        start: Start of the stage [s of the timeline].
+        end: End of the stage [s of the timeline].
         figures: Sentences on measured values, in physical units.
-        observed: Whether the event of the stage was really observed.
+        observed: Whether the expected event was observed.
     """
 
     name: str
@@ -39,16 +39,16 @@ class Stage:
 
 
 class Actor:
-    """Mover of a robot, through a client as any remote program."""
+    """Client program that moves the robot of a story."""
 
     def __init__(self, client: Client, idle: Callable[[], None], report: Callable[[str], None]) -> None:
-        """`idle` is called again and again while waiting, `report` with a line of text per event."""
+        """Call `idle` repeatedly while waiting, and `report` with a line of text per event."""
         self._client, self._idle, self._report = client, idle, report
         self.stops = 0
         """Number of times that the HAL stopped the robot by itself."""
 
     def engage(self) -> None:
-        """Engage, also out of a fault, and repeatedly, since a sample may be late at that moment.
+        """Engage the controller, after a reset if there is a fault; try again after a refusal.
 
         Raises:
             ServiceError: The robot does not follow.
@@ -68,7 +68,7 @@ class Actor:
             self.wait(self._follows, ENGAGED_WITHIN)
 
     def go(self, signal: str, values: np.ndarray, duration: float) -> None:
-        """Give a target [its unit], shape (n,), and wait `duration` [s]; repeat if the HAL stopped the robot."""
+        """Send a target [its unit], shape (n,), and wait `duration` [s]; repeat if the HAL stopped the robot."""
         for _ in range(TRIES):
             if not self._follows():
                 self._recover()
@@ -78,7 +78,7 @@ class Actor:
                 return
 
     def wait(self, condition: Callable[[], bool], duration: float) -> bool:
-        """Wait for `duration` [s] or until the condition holds; return whether it did."""
+        """Wait until the condition is true, at most `duration` [s]; return whether it became true."""
         deadline = time.monotonic() + duration
         while not condition():
             if time.monotonic() >= deadline:
@@ -104,11 +104,11 @@ class Actor:
         for figure in played.figures:
             self._report(f"    {figure}")
         if not played.observed:
-            self._report("    [red]This differs from what should have been observed.[/]")
+            self._report("    [red]The expected event was not observed.[/]")
         return played
 
     def _recover(self) -> None:
-        """Go on after the HAL stopped the arm: read the reason, reset, engage again."""
+        """Continue after the HAL stopped the arm: report the reason, reset and engage again."""
         mode, status = self._mode(), self._client.status("hal", timeout=1.0)
         fault = status.facts.get("fault") if status else ""
         reason = f"({mode}). {fault or 'Commands came too late.'}"
@@ -125,4 +125,4 @@ class Actor:
 
     def _mode(self) -> str:
         applied = self._client.applied(timeout=0.5)
-        return "unheard" if applied is None else applied.mode
+        return "unknown" if applied is None else applied.mode

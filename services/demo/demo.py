@@ -28,14 +28,14 @@ from services.process.supervisor import Supervisor, gemuco_command
 from services.show import progress
 
 READY_WITHIN = 180.0
-"""A process has this time [s] to come up on a busy machine."""
+"""A process must be ready within this time [s], also on a busy machine."""
 CLIENT = "remote client"
 LEAST_LINES = 20
 """The remote client must have printed this many estimates to count as observed."""
 
 
 def play(robot: RobotConfig, path: Path, seed: int, out: Path) -> int:
-    """Make a model if there is none, run the processes and play the story; return 0 if everything was observed.
+    """Make a missing model, run the processes and play the story; return 0 if all events were observed.
 
     Args:
         robot: Content of the robot file.
@@ -70,7 +70,7 @@ class Cast:
     Attributes:
         robot: The robot, with the rates that this machine keeps.
         client: Client of the robot.
-        actor: Mover of the robot.
+        actor: Program that moves the robot.
         remote: Output of a client in a process of its own.
     """
 
@@ -84,7 +84,7 @@ class Cast:
 def running(
     robot: RobotConfig, path: Path, seed: int, target: str, out: Path, supervisor: Supervisor, console: Console
 ) -> Iterator[Cast]:
-    """Start the processes; if this machine does not keep their rate, again at half of it, at most twice."""
+    """Start the processes; if this machine does not keep their rate, restart them at half of it, at most twice."""
     rates = robot.rates
     for halvings_left in reversed(range(pace.HALVINGS + 1)):
         recording = out / "story.mcap"
@@ -109,26 +109,26 @@ def running(
 
 
 def too_slow(counts: CycleCounts, halvings_left: int) -> str:
-    """Return sentences on a rate that is not kept and what is done about it."""
+    """Return sentences on a rate that is not kept, and on the consequence."""
     consequence = (
-        f"All of it is started again at {counts.rate / 2:g} Hz."
+        f"All processes are started again at {counts.rate / 2:g} Hz."
         if halvings_left
-        else "The story is played all the same, and the HAL may stop the robot on the way."
+        else "The story is played in spite of this, and the HAL may stop the robot."
     )
     return f"[yellow]This machine does not keep {counts.rate:g} Hz: {counts}. {consequence}[/]"
 
 
 def control_of(robot: RobotConfig) -> ControlConfig:
-    """Return the settings of control for the robot's story.
+    """Return the settings of control for the story.
 
     Raises:
-        ConfigError: The robot file has no control, or there is no story for such a robot.
+        ConfigError: The robot file has no control, or no story fits the robot.
     """
     control = model_config(robot).control
     if not has_tools(robot) and MUSCLE not in robot.signals[robot.command.signal].elements:
         raise ConfigError(
-            f"There is no story for '{robot.robot}': it has neither conditions with a signal that a camera sees, nor a "
-            f"muscle {MUSCLE} to cut."
+            f"There is no story for '{robot.robot}': it needs conditions and a signal that a camera sees, or a muscle "
+            f"{MUSCLE} to cut."
         )
     if control is None:
         raise ConfigError(
@@ -145,16 +145,16 @@ def has_tools(robot: RobotConfig) -> bool:
 def perform(
     robot: RobotConfig, client: Client, target: str, seed: int, actor: Actor, picture: Path, console: Console
 ) -> list[Stage]:
-    """Play the story that fits the robot, about its tools if it has some, and draw it."""
+    """Play and draw the story that fits the robot: tools, or a sensor and a muscle."""
     sizes = robot.signals[target].size, robot.signals[robot.command.signal].size
     if has_tools(robot):
         from services.demo import tool_plot
 
         schema = load_model(robot, artifacts.model_folder(robot.robot))
         with Timeline(client, target, *sizes, robot.seen) as timeline:
-            marks_of_tools = ToolStory(robot, client, timeline, seed, actor, console.print, schema).play()
-        tool_plot.plot(robot, target, schema, timeline, marks_of_tools, picture)
-        return marks_of_tools.stages
+            tool_marks = ToolStory(robot, client, timeline, seed, actor, console.print, schema).play()
+        tool_plot.plot(robot, target, schema, timeline, tool_marks, picture)
+        return tool_marks.stages
     from services.demo import story_plot
 
     with Timeline(client, target, *sizes, [target]) as timeline:
@@ -164,12 +164,12 @@ def perform(
 
 
 def make_model(robot: RobotConfig, console: Console) -> None:
-    """Collect and train if there is no model that fits the robot file."""
+    """Collect data and train a model if there is none that fits the robot file."""
     folder = artifacts.model_folder(robot.robot)
     if trainer.fits(robot, folder):
         console.print(f"Using the model in {folder}.")
         return
-    console.print("No model yet: the designer's model moves at random, and the body schema is learned from it.")
+    console.print("No model yet: the body schema is learned from random motion of the designer's model.")
     with progress("collecting") as report:
         collection = collector.collect_direct(robot, None, 0, progress=report)
     console.print(f"{len(collection.dataset)} samples, {collection.speed:.0f} times faster than real time.")
@@ -189,11 +189,11 @@ def start(
     client: Client,
     console: Console,
 ) -> None:
-    """Start the processes one after another, each when the one before is ready; the last one watches `target`.
+    """Start the processes, each after the previous one is ready; the last one prints estimates of `target`.
 
     Raises:
         ChildDied: A process ended.
-        NotReady: A process did not come up in time.
+        NotReady: A process was not ready in time.
     """
     commands = {
         "simulator": ("simulate", str(path), "--variant", "actual", "--seed", str(seed)),
@@ -222,13 +222,13 @@ class RemoteClient:
     """Output of the remote client's process."""
 
     def __init__(self, sign: str, log: Path, console: Console) -> None:
-        """`sign` marks a line that is an estimate."""
+        """Count the lines that contain `sign` as estimates."""
         self._sign, self._log, self._console = sign, log, console
         self._read = 0
         self.lines = 0
-        """Number of estimates that it printed."""
+        """Number of printed estimates."""
         self.estimated = 0
-        """Number of those that were not measured."""
+        """Number of printed estimates that were not measured."""
 
     def print_new(self) -> None:
         """Print the new complete lines."""
@@ -246,21 +246,21 @@ class RemoteClient:
 
 
 def summary(stages: list[Stage], stops: int, remote: RemoteClient, out: Path, console: Console) -> bool:
-    """Print a table of the stages; return whether every stage was really observed."""
+    """Print a table of the stages; return whether all events were observed."""
     table = Table(title="What happened", title_justify="left", show_lines=True)
     table.add_column("stage")
     table.add_column("measured")
     table.add_column("observed", justify="center")
     for stage in stages:
         table.add_row(stage.name, "\n".join(stage.figures), _yes(stage.observed))
-    heard = remote.lines >= LEAST_LINES and remote.estimated > 0
-    text = f"{remote.lines} estimates printed by a process of its own, {remote.estimated} of them not measured"
-    table.add_row(CLIENT, text, _yes(heard))
+    is_observed = remote.lines >= LEAST_LINES and remote.estimated > 0
+    text = f"{remote.lines} estimates printed by a separate process, {remote.estimated} of them not measured"
+    table.add_row(CLIENT, text, _yes(is_observed))
     console.print(table)
     if stops:
         console.print(f"The HAL stopped the arm {stops} times by itself, see above.")
     console.print(f"Plot: {out / 'story.png'}   recording: {out / 'story.mcap'}   logs: {out}/*.log")
-    return heard and all(stage.observed for stage in stages)
+    return is_observed and all(stage.observed for stage in stages)
 
 
 def _yes(observed: bool) -> str:

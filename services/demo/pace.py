@@ -1,4 +1,4 @@
-"""Check that this machine keeps the rate of a robot file, and a robot file at half the rate if it does not."""
+"""Check that this machine keeps the rate of a robot file; otherwise make a robot file with half the rate."""
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -15,24 +15,24 @@ from services.errors import ServiceError
 from services.wire.messages import Status
 
 LOOK = 4.0
-"""The HAL is watched for this long [s]; it reports its counts once a second."""
+"""The cycles are counted for this long [s]; the HAL reports its counts once a second."""
 MOST_SKIPPED, MOST_INCOMPLETE = 0.02, 0.05
-"""At most these shares of the cycles may be skipped, or lack an answer, at a rate that is kept: drives and sensors
-survive a missed cycle now and then, and a machine that is fast enough misses none."""
+"""A machine keeps a rate if at most these shares of the cycles are skipped or lack an answer. Drives and sensors
+tolerate a few missed cycles; a machine that is fast enough misses none."""
 HALVINGS = 2
-"""The rate is halved at most this often: a quarter of 200 Hz is the slowest rate of commands."""
+"""The rate is halved at most this often: commands need at least a quarter of 200 Hz."""
 
 
 @dataclass(frozen=True, slots=True)
 class CycleCounts:
-    """Cycles of the HAL during a while.
+    """Cycles of the HAL during a time.
 
     Attributes:
         rate: Rate of the robot file [Hz].
-        cycles: Number of cycles done.
+        cycles: Number of completed cycles.
         skipped: Number of cycles skipped for lack of time.
         incomplete: Number of cycles in which a device did not answer in time.
-        late: 99 of 100 cycles began at most this late [s].
+        late: 99th percentile of the cycles' lateness [s].
     """
 
     rate: float
@@ -92,7 +92,7 @@ def _newest(client: Client) -> Status:
 
 
 def halved(rates: RatesConfig) -> RatesConfig:
-    """Return half the rates for loops that follow the HAL's cycle; slower loops keep theirs, up to the HAL's."""
+    """Return half the rates for loops in step with the HAL; slower loops keep their rate, but at most the HAL's."""
     hal = rates.hal / 2
     return RatesConfig(
         hal=hal,
@@ -105,10 +105,10 @@ def halved(rates: RatesConfig) -> RatesConfig:
 
 @contextmanager
 def at_rates(path: Path, robot: RobotConfig, rates: RatesConfig) -> Iterator[Path]:
-    """Yield the path of the robot file at other rates, a file beside it while the context lasts.
+    """Yield the path of a robot file with other rates, which is beside the original until the context ends.
 
-    Signals of the HAL stay valid for as many cycles as before. The model stays the same, since rates are no part of the
-    robot's fingerprint.
+    Signals of the HAL stay valid for the same number of cycles. The model stays the same, since the robot's fingerprint
+    does not include rates.
 
     Raises:
         ServiceError: The file cannot be written.
@@ -123,10 +123,10 @@ def at_rates(path: Path, robot: RobotConfig, rates: RatesConfig) -> Iterator[Pat
             described["signals"][name] = described["signals"][name] | {
                 "stale_after": signal.stale_after * robot.rates.hal / rates.hal
             }
-    with ExitStack() as kept:
+    with ExitStack() as stack:
         try:  # names with a dot in the stem are not listed as robot files
             name = f"{path.stem}.{rates.hal:g}_hz."
-            file = kept.enter_context(NamedTemporaryFile("w", prefix=name, suffix=path.suffix, dir=path.parent))
+            file = stack.enter_context(NamedTemporaryFile("w", prefix=name, suffix=path.suffix, dir=path.parent))
             yaml.safe_dump(described, file)
             file.flush()
         except OSError as error:

@@ -1,4 +1,4 @@
-"""Story of the demo: an arm moves, loses a sensor, learns its body, loses a muscle."""
+"""Story of the demo: an arm moves, loses a sensor, learns its body and loses a muscle."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -15,15 +15,15 @@ from services.wire.messages import Anomaly
 POSE_TIME = 2.5
 """The arm has this time for one pose [s]."""
 POSES = 6
-"""The model is measured at this many fresh poses, before and after the update; it does not learn from them."""
+"""The model's error is measured at this many test poses before and after the update, which does not use them."""
 LEARNING_POSES = 8
 LEARNING_TIME = 2.0
 LEARNED = 80
-"""The online update takes this many samples before it is stopped; eight poses bring about a hundred."""
+"""The online update takes this many samples before it is stopped; eight poses give about a hundred samples."""
 NORMAL = 100
-"""The statistics of normal errors are learned from this many samples; six fresh poses bring about 150."""
+"""The statistics of normal errors are learned from this many samples; six test poses give about 150."""
 MOST_POSES = 24
-"""After this many more poses the samples must suffice, because a machine may be slow."""
+"""At most this many further poses are used to collect samples, because a machine may be slow."""
 CALM_TIME = 2.0
 """No anomaly may be reported for this long [s] before the muscle is cut."""
 CALM_TRIES = 3
@@ -31,7 +31,7 @@ CALM_TRIES = 3
 SILENT_POSES = 3
 CUT_POSES = 3
 INSIDE = 0.15
-"""Targets keep this share of the range as a distance from the limits."""
+"""The distance of targets from the limits is at least this share of the range."""
 ENCODER, SILENT_ELEMENT = "shoulder_roll_encoder", "shoulder_roll"
 MUSCLE = "deltoid_side"
 
@@ -51,13 +51,13 @@ class Marks:
 
 
 class Story:
-    """Stages of the demo, played through a client as by any remote program."""
+    """Stages of the demo, played by a client."""
 
     def __init__(
         self, robot: RobotConfig, client: Client, timeline: Timeline, seed: int, actor: Actor,
         report: Callable[[str], None],
     ) -> None:  # fmt: skip
-        """`report` is called with a line of text per event."""
+        """Call `report` with a line of text per event."""
         self._client, self._timeline, self._actor, self._report = client, timeline, actor, report
         self._signal = "joint_position"
         self._elements = robot.signals[self._signal].elements
@@ -91,8 +91,8 @@ class Story:
         return Stage("moves to targets", start, self._timeline.now(), figures, reached < 0.5 and span > 0.3)
 
     def lose_sensor(self) -> Stage:
-        """Play (b): an encoder falls silent; the arm goes on with an estimate."""
-        self._report(f"[bold](b)[/] The node of {ENCODER} falls silent. The arm goes on with an estimate.")
+        """Play (b): an encoder falls silent; the arm continues with an estimate."""
+        self._report(f"[bold](b)[/] The node of {ENCODER} falls silent. The arm continues with an estimate.")
         index = self._elements.index(SILENT_ELEMENT)
         start = self._timeline.now()
         self._client.fault(f"sensor_silent {ENCODER}")
@@ -117,7 +117,7 @@ class Story:
         return Stage("loses an encoder", start, self._timeline.now(), figures, noticed and returned and mean < 0.5)
 
     def learn(self) -> Stage:
-        """Play (c): the model learns online while the arm moves, and is measured at fresh poses."""
+        """Play (c): the model learns online while the arm moves, and its error is measured at test poses."""
         self._report("[bold](c)[/] The online update learns from the arm's own motion.")
         start = self._timeline.now()
         self._client.adapt(True)
@@ -132,7 +132,7 @@ class Story:
         before, after = self.marks.error_before, self.marks.error_after
         figures = (
             f"learned for {self.marks.learning[1] - start:.0f} s from {window} samples",
-            f"estimate on {POSES} fresh poses with all encoders hidden: {before:.3f} rad before, {after:.3f} rad after",
+            f"estimate at {POSES} test poses with all encoders hidden: {before:.3f} rad before, {after:.3f} rad after",
             f"distance from the targets now {_mean_norm(misses):.3f} rad",
             f"statistics of normal errors learned anew from {normal} samples",
         )
@@ -167,7 +167,7 @@ class Story:
         return Stage("loses a muscle", start, end, figures, alarmed and right and not calm.any())
 
     def _gather(self, samples: int) -> int:
-        """Go to more poses until the model's window holds this many samples; return its number of samples."""
+        """Go to more poses until the update's window has this many samples; return its number of samples."""
         for _ in range(MOST_POSES):
             if self._window() >= samples:
                 break
@@ -184,7 +184,7 @@ class Story:
         return int(self._client.ask("model", "normal")["samples"])
 
     def _become_calm(self) -> None:
-        """Wait until no anomaly is reported for the whole arm; if one is, learn normal errors from more motion."""
+        """Wait until the whole arm has no anomaly; if it has one, learn normal errors from more motion."""
         for tries_left in reversed(range(CALM_TRIES)):
             start = self._timeline.now()
             self._actor.wait(lambda: False, CALM_TIME)
@@ -206,7 +206,7 @@ class Story:
         return self._muscles[int(np.argmax(total))] if anomalies else ""
 
     def _measure_poses(self) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """Return, for every fresh pose, target minus truth and estimate with hidden encoders minus truth [rad]."""
+        """Return, for every test pose, target minus truth and estimate with hidden encoders minus truth [rad]."""
         misses, errors = [], []
         for pose in self._poses:
             self._go(pose, POSE_TIME)
@@ -215,7 +215,7 @@ class Story:
         return misses, errors
 
     def _hidden_error(self) -> np.ndarray:
-        """Return estimate with hidden encoders minus truth [rad]; queried again while a muscle's sensor is late."""
+        """Return estimate with hidden encoders minus truth [rad]; query again while a muscle's sensor is late."""
         errors: list[np.ndarray] = []
 
         def is_complete() -> bool:

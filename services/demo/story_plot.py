@@ -55,7 +55,7 @@ def _hidden_error(axis: Axes, timeline: Timeline, marks: Marks) -> None:
     axis.axvspan(*marks.learning, color="tab:green", alpha=0.15, label="online update")
     axis.plot(time[:rows], error[:rows], color=GREY, linewidth=1, label="error of the estimate, all encoders hidden")
     first, last = marks.stages[0], marks.stages[min(2, len(marks.stages) - 1)]
-    label = "mean on fresh poses"
+    label = "mean at test poses"
     axis.hlines(marks.error_before, first.start, first.end, color=RED, linewidth=2, label=f"{label} before")
     axis.hlines(marks.error_after, marks.learning[1], last.end, color=GREEN, linewidth=2, label=f"{label} after")
     axis.set_ylabel("norm of 5 joints [rad]")

@@ -15,9 +15,9 @@ from services.errors import ServiceError
 from services.wire.messages import Anomaly, Update
 
 EVERY = 0.05
-"""Rows have this distance in time [s]."""
+"""A row is sampled at this interval [s]."""
 HIDDEN_EVERY = 4
-"""Every this many rows, the model is queried for the signal as if it were not measured."""
+"""Once in this many rows the model estimates the signal as if it were not measured."""
 
 
 class Timeline:
@@ -32,7 +32,7 @@ class Timeline:
     def __init__(self, client: Client, signal: str, size: int, commands: int, hide: Sequence[str]) -> None:
         """Prepare for a signal of `size` elements, and for queries of the model with the signals `hide` hidden."""
         self._client, self._signal, self._hide = client, signal, hide
-        self._nothing, self._no_command = np.full(size, np.nan), np.full(commands, np.nan)
+        self._no_value, self._no_command = np.full(size, np.nan), np.full(commands, np.nan)
         self._columns: dict[str, list[object]] = defaultdict(list)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="timeline", daemon=True)
@@ -40,7 +40,7 @@ class Timeline:
         self.anomalies: list[tuple[float, Anomaly]] = []
         """Time [s] and message of every row that was an anomaly."""
         self.updates: list[tuple[float, Update]] = []
-        """Time [s] and message of every report of the online update."""
+        """Time [s] and message of every state of the online update."""
 
     def __enter__(self) -> "Timeline":
         self._start = time.monotonic()
@@ -76,10 +76,10 @@ class Timeline:
     def _sample(self) -> None:
         truth, estimate = self._client.truth(), self._client.estimate()
         anomaly, applied = self._client.anomaly(), self._client.applied()
-        add = {
-            "truth": self._nothing if truth is None else truth.values[self._signal],
-            "value": self._nothing if estimate is None else estimate.values[self._signal],
-            "estimated": self._nothing if estimate is None else estimate.estimated[self._signal].astype(float),
+        row = {
+            "truth": self._no_value if truth is None else truth.values[self._signal],
+            "value": self._no_value if estimate is None else estimate.values[self._signal],
+            "estimated": self._no_value if estimate is None else estimate.estimated[self._signal].astype(float),
             "source": "" if estimate is None else f"{estimate.method[self._signal]} {estimate.mask[self._signal]}",
             "applied": self._no_command if applied is None else applied.values,
             "score": math.nan if anomaly is None else anomaly.score,
@@ -92,7 +92,7 @@ class Timeline:
             self.updates.append((self.now(), update))
         if anomaly is not None and anomaly.is_anomaly:
             self.anomalies.append((self.now(), anomaly))
-        for name, value in add.items():
+        for name, value in row.items():
             self._columns[name].append(value)
         self._columns["time"].append(self.now())
 
@@ -100,13 +100,13 @@ class Timeline:
         try:
             error = hidden_error(self._client, self._signal, self._hide)
         except (ServiceError, SchemaError, HalError):
-            error = self._nothing
+            error = self._no_value
         self._columns["hidden_error"].append(float(np.linalg.norm(error)))
         self._columns["hidden_time"].append(self.now())
 
 
 def hidden_error(client: Client, signal: str, hide: Sequence[str]) -> np.ndarray:
-    """Return the estimate of a signal with some signals hidden minus the truth [unit], shape (n,); NaN if unknown."""
+    """Return a signal's estimate with some signals hidden, minus the truth [unit], shape (n,); NaN if unknown."""
     answer = client.infer(signal, hide=hide)
     truth = client.truth()
     value = np.asarray(answer["values"], float)

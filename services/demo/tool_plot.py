@@ -18,7 +18,7 @@ GREY, RED, GREEN, BLUE = "0.45", "tab:red", "tab:green", "tab:blue"
 def plot(robot: RobotConfig, signal: str, schema: BodySchema, timeline: Timeline, marks: ToolMarks, path: Path) -> None:
     """Draw the whole story of a signal into a PNG."""
     old, new = marks.conditions
-    title = f"{robot.robot}: a covered camera, and {new} put into the hand in place of {old}"
+    title = f"{robot.robot}: the camera is covered, and {new} replaces {old} in the hand"
     with picture(path, title, rows=5, figsize=(13, 15), sharex=True) as axes:
         _tip(axes[0], robot.signals[signal].elements, timeline, marks)
         _miss(axes[1], timeline, marks)
@@ -68,7 +68,7 @@ def _miss(axis: Axes, timeline: Timeline, marks: ToolMarks) -> None:
         away[later] = 1e3 * np.linalg.norm(truth[:rows][later] - target, axis=1)
     axis.plot(time[:rows], away, color="0.75", linewidth=1, label="tip to target")
     moments, errors = np.array(marks.reached).reshape(-1, 2).T
-    axis.plot(moments, 1e3 * errors, "o", color=BLUE, label="measured at the end of each")
+    axis.plot(moments, 1e3 * errors, "o", color=BLUE, label="measured at the end of each move")
     for stage in marks.stages:
         inside = (moments >= stage.start) & (moments <= stage.end)
         if inside.any():

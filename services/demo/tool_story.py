@@ -1,4 +1,4 @@
-"""Story of a robot that holds tools: it moves, its camera is covered, its tool is changed, and it notices."""
+"""Story of a robot with tools: it moves, its camera is covered, its tool is changed, and the update detects this."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -19,19 +19,19 @@ from services.model.model_config import model_config
 from services.wire.messages import Update
 
 TARGETS = 4
-"""The tip's error is measured at this many targets: with the first tool, with the other one, and when it is known."""
+"""The tip's error is measured at this many targets: with the first tool, with the other tool, and after learning."""
 LEARNING_TARGETS = 4
 """The model learns between this many targets."""
 LEARNING_TIME = 7.0
 """The model learns for at least this time [s]."""
 SETTLE = 1.5
 """The tip rests this long [s] at a measured target."""
-HURRY = 0.4
+SHORT_REST = 0.4
 """The tip rests this long [s] at a target that is not measured."""
 BETTER = 0.5
-"""Knowing the tool must at least halve the tip's error."""
+"""After the tool is recognised, the tip's error must be at most this share of the error before."""
 FOLLOWS = 0.05
-"""A working model brings the tip this near to a target [m]."""
+"""The tip's mean error [m] is smaller than this with a correct model."""
 
 
 @dataclass(slots=True)
@@ -45,22 +45,22 @@ class ToolMarks:
     targets: list[tuple[float, np.ndarray]] = field(default_factory=list)
     """Time and value of every target."""
     reached: list[tuple[float, float]] = field(default_factory=list)
-    """Time of every measurement at a target, and the tip's distance from it."""
+    """Time of every measurement at a target, and distance of the tip from the target."""
     stages: list[Stage] = field(default_factory=list)
 
 
 class ToolStory:
-    """Stages of the demo, played through a client as by any remote program."""
+    """Stages of the demo, played by a client."""
 
     def __init__(
         self, robot: RobotConfig, client: Client, timeline: Timeline, seed: int, actor: Actor,
         report: Callable[[str], None], schema: BodySchema,
     ) -> None:  # fmt: skip
-        """`report` is called with a line of text per event; of the schema only the p of the trained conditions is read.
+        """Call `report` with a line of text per event; `schema` gives the p of the trained conditions.
 
         Raises:
             ConfigError: The robot file has no control or no forecast.
-            NowhereToGo: The first and the last of the robot's conditions have too few reachable places in common.
+            NowhereToGo: The robot reaches too few targets under both its first and its last condition.
         """
         control = model_config(robot).control
         assert control is not None
@@ -71,7 +71,7 @@ class ToolStory:
         count = LEARNING_TARGETS + TARGETS
         targets, _ = common_targets(robot, self._signal, self.marks.conditions, count, seed)
         self._learning, self._measured = targets[:LEARNING_TARGETS], targets[LEARNING_TARGETS:]
-        self._before = self._without = float("nan")
+        self._first_error = self._new_error = float("nan")
 
     def play(self) -> ToolMarks:
         """Play all stages, less than a minute."""
@@ -84,17 +84,17 @@ class ToolStory:
         self._report(f"[bold](a)[/] The model recognises the tool in the hand, and its tip moves to {TARGETS} targets.")
         start = self._timeline.now()
         self._actor.engage()
-        known = self._adapt(self.marks.conditions[0])
-        self._before = self._measure()
+        _, sentences = self._adapt(self.marks.conditions[0])
+        self._first_error = self._measure()
         for target in self._learning:
-            self._go(target, HURRY)
+            self._go(target, SHORT_REST)
         normal = self._client.ask("model", "normal")
         figures = (
-            *known[1],
-            f"{TARGETS} targets, tip {1e3 * self._before:.0f} mm away from them on average",
+            *sentences,
+            f"{TARGETS} targets, tip {1e3 * self._first_error:.0f} mm away from them on average",
             f"statistics of normal errors learned anew from {normal['samples']} samples",
         )
-        return self._stage("moves a tool to targets", start, figures, self._before < FOLLOWS)
+        return self._stage("moves a tool to targets", start, figures, self._first_error < FOLLOWS)
 
     def lose_sight(self) -> Stage:
         """Play (b): the camera is covered; the tip is estimated and marked as estimated."""
@@ -106,7 +106,7 @@ class ToolStory:
         noticed = self._actor.wait(lambda: self._is_estimated(True), NOTICED_WITHIN)
         delay = self._timeline.now() - start
         for target in self._learning[::-1]:
-            self._go(target, HURRY)
+            self._go(target, SHORT_REST)
         end = self._timeline.now()
         self._client.fault("camera_back", "vision")
         returned = self._actor.wait(lambda: self._is_estimated(False), NOTICED_WITHIN)
@@ -134,41 +134,43 @@ class ToolStory:
         self._report(f"[bold](c)[/] The tool is changed, {old} for {new}, without a message to the model.")
         start = self.marks.changed = self._timeline.now()
         self._client.fault(f"tool_changed {new}")
-        self._without = self._measure()
+        self._new_error = self._measure()
         end = self._timeline.now()
         verdict, share = self._verdict(start)
         score, limit = (self._timeline.between(name, start, end) for name in ("score", "threshold"))
         figures = (
-            f"the same targets: tip {1e3 * self._before:.0f} mm away before, {1e3 * self._without:.0f} mm now",
+            f"the same targets: tip {1e3 * self._first_error:.0f} mm away before, {1e3 * self._new_error:.0f} mm now",
             f"anomaly score {np.nanmedian(score):.1f}, threshold {np.nanmedian(limit):.1f}",
             f"verdict: {verdict} ({share:.0%} of the time)",
         )
-        # The verdict depends on how near this body is to its designer's; that something is new must be reported.
+        # Either verdict counts: it depends on the difference between this body and the designer's.
         noticed = verdict in ("environment", "anomaly")
-        return self._stage("its tool is changed", start, figures, noticed and self._without > self._before / BETTER)
+        return self._stage(
+            "its tool is changed", start, figures, noticed and self._new_error > self._first_error / BETTER
+        )
 
     def recognise(self) -> Stage:
         """Play (d): the update recognises the tool."""
         self._report("[bold](d)[/] The online update recognises the tool.")
         start = self._timeline.now()
-        known, sentences = self._adapt(self.marks.conditions[1])
+        is_recognised, sentences = self._adapt(self.marks.conditions[1])
         after = self._measure()
         self._client.disengage()
         figures = (
             *sentences,
-            f"the same targets: tip {1e3 * self._without:.0f} mm away before, {1e3 * after:.0f} mm now",
+            f"the same targets: tip {1e3 * self._new_error:.0f} mm away before, {1e3 * after:.0f} mm now",
             f"verdict now: {self._verdict(self._timeline.now() - 1.0)[0]}",
         )
-        return self._stage("recognises the tool", start, figures, known and after < BETTER * self._without)
+        return self._stage("recognises the tool", start, figures, is_recognised and after < BETTER * self._new_error)
 
     def _adapt(self, condition: str) -> tuple[bool, list[str]]:
-        """Update while the tip moves; return whether the condition was recognised, and sentences on it."""
+        """Update while the tip moves; return whether the condition was recognised, and sentences on the result."""
         start = self._timeline.now()
         self._client.adapt(True)
         for target in cycle(self._learning):
             if self._timeline.now() > start + LEARNING_TIME:
                 break
-            self._go(target, HURRY)
+            self._go(target, SHORT_REST)
         self._client.adapt(False)
         end = self._timeline.now()
         self.marks.adapting.append((start, end))
@@ -182,10 +184,10 @@ class ToolStory:
         when = "p did not settle there"
         if np.isfinite(at):
             first = next(update for moment, update in updates if moment >= at)
-            when = f"p settled there after {at - start:.1f} s, with sample {_seen(first)}"
+            when = f"p settled there after {at - start:.1f} s, with sample {_sample_count(first)}"
         figures = [
             f"known tool nearest to p: {nearest} ({away.min():.2f} standard deviations away); in the hand: {condition}",
-            f"{when}; {_seen(last)} samples in {end - start:.0f} s",
+            f"{when}; {_sample_count(last)} samples in {end - start:.0f} s",
         ]
         return nearest == condition and bool(last.settled) and bool(np.isfinite(at)), figures
 
@@ -193,7 +195,7 @@ class ToolStory:
         """Return the time at which p first settled nearest to a condition; NaN if it did not."""
         index = self._names.index(condition)
         for at, update in self._active(start, np.inf):
-            if _seen(update) and update.settled and int(np.argmin(self._distances(update))) == index:
+            if _sample_count(update) and update.settled and int(np.argmin(self._distances(update))) == index:
                 return at
         return float("nan")
 
@@ -233,6 +235,6 @@ class ToolStory:
         return Stage(name, start, self._timeline.now(), figures, observed)
 
 
-def _seen(update: Update) -> int:
+def _sample_count(update: Update) -> int:
     """Return the number of samples since the update began; the window may have dropped some."""
     return update.window + update.dropped

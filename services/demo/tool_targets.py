@@ -1,4 +1,4 @@
-"""Targets that a robot reaches with either of two tools, by its designer's model."""
+"""Targets that a robot reaches with both of two tools, by its designer's model."""
 
 import numpy as np
 
@@ -11,13 +11,13 @@ from services.model.model_config import collect_config
 DRAWN = 30_000
 """This many random postures are drawn per tool."""
 INSIDE = 0.1
-"""Postures keep this share of the range as a distance from the limits."""
+"""The distance of postures from the limits is at least this share of the range."""
 TRIED = 3000
 """At most this many postures are tried as a target."""
 CLOSE = 0.02
-"""A posture with the other tool must come this near to a target [unit of the target]."""
+"""A posture with the other tool must reach a target with at most this error [unit of the target]."""
 APART = (0.08, 0.25)
-"""One target has at least and at most this distance from the next [unit of the target]."""
+"""The distance of a target from the next is at least and at most this [unit of the target]."""
 
 
 def common_targets(
@@ -33,7 +33,7 @@ def common_targets(
         seed: Seed of the draws.
 
     Returns:
-        Targets [unit of the signal], shape (count, n), each near the one before; and the postures that reach them
+        Targets [unit of the signal], shape (count, n), each near the previous target; and the postures that reach them
         under the first condition [unit of the commanded signal], shape (count, k).
 
     Raises:
@@ -50,7 +50,7 @@ def common_targets(
 
 
 def _next(order: np.ndarray, first: np.ndarray, second: np.ndarray, chosen: list[int]) -> int:
-    """Return the first index in an order that is new, near the last chosen one, and reached by the second tool too."""
+    """Return the first index in `order` that is new, near the last chosen target, and reached by both tools."""
     least, largest = APART
     for index in order:
         away = np.linalg.norm(first[chosen] - first[index], axis=1)

@@ -19,7 +19,7 @@ from services.wire import keys
 from services.wire.records import Sample
 
 PAUSE = 1.0
-"""A gap between samples that count [s] after which a new episode begins."""
+"""After a gap of this length [s] between usable samples a new episode begins."""
 
 
 @dataclass(slots=True)
@@ -28,9 +28,10 @@ class Selection:
 
     Attributes:
         dataset: The episodes.
-        seen: Number of samples that were due at the rate of collecting.
-        incomplete: Number of those in which a device did not answer.
-        outside: Element -> number of samples in which it was the first that was not measured or beyond its limits.
+        seen: Number of samples examined, at the rate of collecting.
+        incomplete: Number of examined samples in which a device did not answer.
+        outside: Element -> number of samples that were left out because this element was not measured or beyond its
+            limits; only the first such element of a sample counts.
     """
 
     dataset: Dataset
@@ -39,14 +40,14 @@ class Selection:
     outside: Counter[str]
 
     def sentence(self) -> str:
-        """Return one sentence on what was taken and what was left out."""
+        """Return one sentence on the used samples and the samples left out."""
         text = f"{len(self.dataset)} of {self.seen} samples are used"
-        left = [f"{self.incomplete} were incomplete"] if self.incomplete else []
+        omissions = [f"{self.incomplete} were incomplete"] if self.incomplete else []
         if self.outside:
             element, count = self.outside.most_common(1)[0]
             worst = f"most often {element}, {count}"
-            left.append(f"in {self.outside.total()} a value was not measured or beyond its limits ({worst})")
-        return f"{text}; {', '.join(left)}." if left else f"{text}."
+            omissions.append(f"in {self.outside.total()} a value was not measured or beyond its limits ({worst})")
+        return f"{text}; {', '.join(omissions)}." if omissions else f"{text}."
 
 
 def is_recording(path: Path) -> bool:
@@ -64,12 +65,12 @@ def select(robot: RobotConfig, paths: Iterable[Path], condition: str | None = No
 
     Raises:
         RecordingError: The files cannot be read.
-        DatasetError: They are of another robot or in other units, lack the condition, or hold no usable sample.
+        DatasetError: Another robot, other units, an unknown condition, or no usable sample.
     """
     files = facts_of(list(paths))
     recorded = one_robot(files)
     if recorded != robot.robot:
-        raise DatasetError(f"These are recordings of '{recorded}', and the robot file is that of '{robot.robot}'.")
+        raise DatasetError(f"These are recordings of '{recorded}', but the robot file is of '{robot.robot}'.")
     layout = layout_of(robot)
     selector = _Selector(robot, layout)
     for file in files:
@@ -79,7 +80,7 @@ def select(robot: RobotConfig, paths: Iterable[Path], condition: str | None = No
         selector.take(own, condition or _condition(robot, own))
     selection = selector.selection()
     if not selection.dataset.episodes:
-        raise DatasetError(f"These recordings hold nothing to train from: {selection.sentence()}")
+        raise DatasetError(f"These recordings hold no sample to train from: {selection.sentence()}")
     return selection
 
 
@@ -107,13 +108,12 @@ def _check_signals(file: FileFacts, layout: Layout) -> None:
 
 
 class _Selector:
-    """Collector of episodes from the samples of recordings."""
+    """Selection of episodes from the samples of recordings."""
 
     def __init__(self, robot: RobotConfig, layout: Layout) -> None:
         self._robot, self._layout = robot, layout
         self._limits = SampleLimits(robot, layout)
         self._rate = (collect_config(robot) if robot.collect else CollectConfig()).rate
-        self._stale = {name: robot.signals[name].stale_after for name in robot.seen}
         self._episodes: list[Episode] = []
         self._seen = self._incomplete = 0
         self._outside: Counter[str] = Counter()
@@ -168,10 +168,11 @@ class _Selector:
                 self._outside[self._layout.element(int(np.argmin(usable)))] += 1
 
     def _values(self, sample: Sample, now_ns: int, seen: tuple[int, Sample] | None) -> dict[str, np.ndarray]:
+        """Return the fresh values of a sample of the HAL and the last one of the camera; stale values are NaN."""
         values: dict[str, np.ndarray] = {}
         for name in self._layout.names:
             source, waited = sample, 0.0
-            if name in self._stale:
+            if name in self._robot.seen:
                 if seen is None:
                     continue
                 source, waited = seen[1], (now_ns - seen[0]) * 1e-9

@@ -1,6 +1,6 @@
 """Export of recordings as tables: one table per key, one row per message, one column per element with its unit.
 
-Messages are written as they are read, so a recording may be larger than the memory.
+Messages are written while they are read, so a recording may be larger than the memory.
 """
 
 import csv
@@ -91,7 +91,7 @@ def run_export(paths: Paths, out: Path, form: str) -> None:
 
     Args:
         paths: Recordings of one robot, in any order.
-        out: Folder for the tables; existing ones are refused.
+        out: Folder for the tables; existing tables are never replaced.
         form: `csv` or `parquet`.
 
     Raises:
@@ -102,7 +102,7 @@ def run_export(paths: Paths, out: Path, form: str) -> None:
 
 
 def export(paths: Paths, out: Path, form: str) -> dict[Path, int]:
-    """Write recordings as tables; see `run_export`.
+    """Write recordings as tables, like `run_export`.
 
     Returns:
         Table -> number of its rows.
@@ -110,7 +110,7 @@ def export(paths: Paths, out: Path, form: str) -> dict[Path, int]:
     files = facts_of(paths)
     one_robot(files)
     make = _maker(form)
-    tables: dict[tuple[str, str], _TableFilling] = {}
+    tables: dict[tuple[str, str], _OpenTable] = {}
     try:
         out.mkdir(parents=True, exist_ok=True)
         for recorded in read([file.path for file in files]):
@@ -118,12 +118,14 @@ def export(paths: Paths, out: Path, form: str) -> dict[Path, int]:
             identity = (recorded.key, json.dumps(signals))
             if identity not in tables:
                 number = 1 + sum(key == recorded.key for key, _ in tables)
-                tables[identity] = _TableFilling(recorded, out / _name(recorded.key, number), make)
+                tables[identity] = _OpenTable(recorded, out / _name(recorded.key, number), make)
             tables[identity].add(recorded)
         for table in tables.values():
             table.close()
     except FileExistsError:
-        raise RecordingError(f"There are tables in '{out}' already; none is replaced. Name another folder.") from None
+        raise RecordingError(
+            f"There are tables in '{out}' already, and they are not replaced. Name another folder."
+        ) from None
     except OSError as error:
         raise RecordingError(f"The tables in '{out}' cannot be written: {error.strerror or error}.") from None
     if not tables:
@@ -146,13 +148,13 @@ def _maker(form: str) -> Callable[[Path, list[str], list[Any]], Table]:
 
 
 def _name(key: str, number: int) -> str:
-    """Return `hal.sample`; `hal.sample-2` after a new description of the robot, `model.target-2` of another signal."""
+    """Return `hal.sample`; then `hal.sample-2` (new robot description) or `model.target-2` (other signal)."""
     _, service, rest = keys.parse(key)
     return f"{service}.{rest.replace('/', '.')}" + (f"-{number}" if number > 1 else "")
 
 
-class _TableFilling:
-    """Table that is being filled."""
+class _OpenTable:
+    """Table with rows that wait to be written."""
 
     def __init__(self, first: Recorded, path: Path, make: Callable[[Path, list[str], list[Any]], Table]) -> None:
         self.rows = 0
@@ -178,7 +180,7 @@ class _TableFilling:
 
 
 def _cells(recorded: Recorded, typed: bool = False) -> Iterator[tuple[str, Any]]:
-    """Yield name and value of every column, in an order that depends on the form alone.
+    """Yield name and value of every column; the order depends only on the form.
 
     Args:
         recorded: A recorded message.

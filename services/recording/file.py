@@ -1,7 +1,7 @@
-"""File of a recording: MCAP of which every written part is whole, whatever happens next.
+"""MCAP file of a recording, which stays readable after every failure.
 
-Added messages wait in memory and are written by `commit`, all or none: on a full disk, or at a limit on the size of
-files, the file is cut back to its former size, so readers never see half a record.
+Added messages wait in memory. `commit` writes all of them or none: if the disk is full or the file too large, the file
+is cut back to its former size, so readers never see a part of a record.
 """
 
 import json
@@ -20,7 +20,7 @@ from services.errors import RecordingError
 LIBRARY = f"gemuco; mcap {mcap.__version__}"
 PROFILE = "gemuco"
 CHUNK = 1 << 20
-"""At most this many bytes of messages are compressed together; `commit` may come earlier."""
+"""At most this many bytes of messages are compressed together, or fewer at a `commit`."""
 DIGITS = 6
 
 
@@ -49,7 +49,7 @@ class RecordingFile:
         return self._stream.written
 
     def channel(self, topic: str, encoding: str, name: str = "", schema: Mapping[str, Any] | None = None) -> int:
-        """Return the channel for messages of an encoding and schema on a topic; it is made at the first call."""
+        """Return the channel for a topic, encoding and schema; the first call makes the channel."""
         number = 0
         if schema is not None:
             data = json.dumps(schema, ensure_ascii=False).encode()
@@ -72,10 +72,10 @@ class RecordingFile:
         self._writer.add_metadata(name, dict(facts))
 
     def commit(self) -> None:
-        """Write the waiting messages and ask the disk to keep them.
+        """Write the waiting messages, and start to flush them to the disk.
 
         Raises:
-            OSError: They could not be written; the file stays as it was after the last commit.
+            OSError: The write failed; the file stays as it was after the last commit.
         """
         self._writer.flush()
         self._commit()
@@ -84,7 +84,7 @@ class RecordingFile:
         """Write the waiting messages and the index, and close.
 
         Raises:
-            OSError: As `commit`; the file is closed, and has no index.
+            OSError: The write failed; the file is closed without an index.
         """
         try:
             self._writer.finish()
@@ -104,7 +104,7 @@ class RecordingFile:
 
 
 class _CommittedStream:
-    """Stream for mcap's writer: bytes wait until `commit`, which writes all of them or none."""
+    """Stream for the MCAP writer, with bytes that wait until `commit` writes all of them or none."""
 
     def __init__(self, path: Path) -> None:
         self.written = 0
@@ -112,7 +112,7 @@ class _CommittedStream:
         self._failure: OSError | None = None
         self._requested, self._ending = threading.Event(), False
         if path.exists():
-            raise RecordingError(f"There is a file '{path}' already; a recording never replaces one.")
+            raise RecordingError(f"The file '{path}' exists already; a recording never replaces a file.")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
@@ -129,7 +129,7 @@ class _CommittedStream:
         return self.written + len(self._waiting)
 
     def flush(self) -> None:
-        """Do nothing; mcap's writer calls this, and `commit` comes after it."""
+        """Do nothing: the MCAP writer calls this, and `commit` writes later."""
 
     def commit(self) -> None:
         if self._failure is not None:
@@ -155,7 +155,7 @@ class _CommittedStream:
             self._file = -1
 
     def _sync(self) -> None:
-        """Ask the disk to keep what was written; this may take long, and writing goes on meanwhile."""
+        """Flush written data to the disk; this may take long, and does not block writing."""
         while True:
             self._requested.wait()
             self._requested.clear()
@@ -169,15 +169,15 @@ class _CommittedStream:
 
 
 def next_path(path: Path, is_one_of_many: bool) -> Path:
-    """Return the next file of a recording: the path itself, or a numbered one if there may be many or it exists.
+    """Return the next file of a recording: `path`, or a numbered file if there may be many files or `path` exists.
 
     The seventh file of `walk.mcap` is `walk-000007.mcap`, so that names sort in the order of writing. Numbers continue
     from the highest existing one, so a killed recorder can be started again with the same arguments.
     """
     if not is_one_of_many and not path.exists():
         return path
-    shape = re.compile(re.escape(path.stem) + rf"-(\d{{{DIGITS},}})" + re.escape(path.suffix))
-    numbers = [int(match[1]) for other in path.parent.glob("*") if (match := shape.fullmatch(other.name))]
-    least = 0 if is_one_of_many else 1  # the path itself is the first
-    number = max(numbers, default=least) + 1
+    pattern = re.compile(re.escape(path.stem) + rf"-(\d{{{DIGITS},}})" + re.escape(path.suffix))
+    numbers = [int(match[1]) for other in path.parent.glob("*") if (match := pattern.fullmatch(other.name))]
+    last = max(numbers, default=0 if is_one_of_many else 1)  # without limits `path` is the first file
+    number = last + 1
     return path.with_name(f"{path.stem}-{number:0{DIGITS}d}{path.suffix}")

@@ -1,4 +1,4 @@
-"""Losses of a recording: counted per key, written into the file as facts and, with the time, as lines of its log."""
+"""Losses of a recording, counted per key; the file has the counts as facts, and each loss with its time in its log."""
 
 import json
 from collections import Counter
@@ -9,12 +9,12 @@ INFO, WARNING, ERROR = 2, 3, 4
 """These are the levels of foxglove.Log."""
 LOG = "foxglove.Log"
 OTHERS = "other keys"
-FURTHEST = 1_000_000_000
-"""A sender that is further ahead [messages] is ignored; this is two months at 200 Hz."""
+LARGEST_JUMP = 1_000_000_000
+"""A jump of a sequence number by more than this [messages] is ignored; this is two months at 200 Hz."""
 SENDERS = 8
-"""At most this many senders of one key are counted separately; of more, the first is forgotten."""
+"""At most this many senders of one key are counted separately; a further sender replaces the first."""
 MOST_KEYS = 1000
-"""Dropped messages are counted separately for at most this many keys, because any client may invent more."""
+"""Dropped messages are counted separately for at most this many keys, because any client may make new keys."""
 _TIME = {"type": "object", "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}}}
 LOG_SCHEMA: dict[str, Any] = {
     "$schema": "https://json-schema.org/draft/2020-12/schema",
@@ -38,9 +38,9 @@ LOG_SCHEMA: dict[str, Any] = {
     "required": ["timestamp", "level", "message", "name", "kind"],
 }
 _SENTENCES = {
-    "dropped": "{count} messages came, and could not be written.",
-    "missed": "{count} messages never came: their numbers are missing.",
-    "malformed": "{count} messages were not what this key carries; their bytes are kept.",
+    "dropped": "{count} messages arrived but could not be written.",
+    "missed": "{count} messages never arrived: their sequence numbers are missing.",
+    "malformed": "{count} messages were not of the type of their key; their bytes are kept.",
 }
 
 
@@ -49,29 +49,29 @@ class Losses:
 
     def __init__(self) -> None:
         self.dropped: Counter[str] = Counter()
-        """Messages that came and could not be written: too many at once, or no space."""
+        """Messages that arrived but could not be written: too many at once, or no space."""
         self.missed: Counter[str] = Counter()
         """Messages that never came, known from gaps in the sequence numbers."""
         self.malformed: Counter[str] = Counter()
-        """Messages of another kind than their key carries; their bytes are in the recording."""
+        """Messages that are not of the type of their key; their bytes are in the recording."""
         self._reported = {kind: Counter[str]() for kind in _SENTENCES}
         self._last: dict[str, dict[int, int]] = {}
 
     def arrived(self, key: str, boot: int, seq: int) -> None:
-        """Take a sender's sequence number, and count the messages that are missing before it."""
+        """Store a sender's sequence number, and count the messages missing before this one."""
         senders = self._last.setdefault(key, {})
-        before = senders.get(boot)
-        if before is None:
+        last = senders.get(boot)
+        if last is None:
             if len(senders) >= SENDERS:
                 del senders[next(iter(senders))]
-        elif seq <= before or seq - before > FURTHEST:
+        elif seq <= last or seq - last > LARGEST_JUMP:
             return
-        elif seq > before + 1:
-            self.missed[key] += seq - before - 1
+        elif seq > last + 1:
+            self.missed[key] += seq - last - 1
         senders[boot] = seq
 
     def drop(self, key: str, count: int = 1) -> None:
-        """Count messages of a key that could not be written; the gap that they leave is not counted as missed."""
+        """Count messages of a key that could not be written; they do not also count as missed."""
         self.dropped[key if key in self.dropped or len(self.dropped) < MOST_KEYS else OTHERS] += count
         self._last.pop(key, None)
 

@@ -1,4 +1,4 @@
-"""Reader of recordings: several files as one recording, in any order, also files whose writer was killed."""
+"""Reader of recordings: several files, in any order, as one recording; the writer of a file may have been killed."""
 
 import heapq
 import json
@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 
 Paths = str | Path | Iterable[str | Path]
 KINDS = ("dropped", "missed", "malformed")
-"""A message may be missing in one of these ways."""
+"""A message may be missing for one of these reasons."""
 _BY_TITLE = {f"gemuco.{record.__name__}": record for record in RECORDS.values()}
 
 
@@ -35,7 +35,7 @@ class Recorded:
         key: Key on which it was published.
         received_ns: Arrival at the recorder [ns since 1970, the recorder's clock].
         message: The published message.
-        form: Its form in the file, with units and elements of the signals.
+        form: Form of the message in the file, with units and elements of the signals.
     """
 
     key: str
@@ -52,14 +52,14 @@ class FileFacts:
         path: The file.
         robot: Name of the recorded robot.
         recording: Random name that all files of one recording share.
-        part: Its number among them.
+        part: Number of the file among them.
         condition: Condition of the body; empty if not given.
-        described: Description that the HAL gave of itself, at least `signals`.
-        losses: Messages that are missing from the recording up to here: `dropped`, `missed`, `malformed`.
+        described: The HAL's answer to `describe`, at least `signals`.
+        losses: Numbers of missing messages up to the end of this file: `dropped`, `missed`, `malformed`.
         keys: Keys that carry messages of gemuco.
         begin_ns: First arrival [ns since 1970]; 0 in an empty file.
         end_ns: Last arrival [ns since 1970].
-        is_whole: Whether it was finished; an unfinished file is readable up to where its writer was killed.
+        is_whole: Whether the file was finished; an unfinished file is readable up to the end of its writer.
     """
 
     path: Path
@@ -76,7 +76,7 @@ class FileFacts:
 
     @property
     def catalogue(self) -> Catalogue:
-        """Signals of the robot, as it described them last."""
+        """Signals of the robot, from its last description."""
         return Catalogue.of_description(self.described)
 
 
@@ -84,7 +84,7 @@ def facts_of(paths: Paths) -> list[FileFacts]:
     """Return the facts of files, in the order of their first arrival.
 
     Raises:
-        RecordingError: No file is given, or a file is missing, damaged at its beginning, or not written by gemuco.
+        RecordingError: No file was named, or a file is missing, damaged at its beginning, or not written by gemuco.
     """
     files = sorted((_facts_of(path) for path in _listed(paths)), key=lambda file: (file.begin_ns, file.part))
     if not files:
@@ -100,12 +100,14 @@ def one_robot(files: Iterable[FileFacts]) -> str:
     """
     robots = sorted({file.robot for file in files})
     if len(robots) != 1:
-        raise RecordingError(f"These files are recordings of several robots: {', '.join(robots)}. Take those of one.")
+        raise RecordingError(
+            f"These files are recordings of several robots: {', '.join(robots)}. Name files of one robot only."
+        )
     return robots[0]
 
 
 def losses(paths: Paths) -> dict[str, int]:
-    """Return the number of missing messages by kind: `dropped`, `missed`, `malformed`, from the last file of each.
+    """Return the numbers of `dropped`, `missed` and `malformed` messages, from the last file of each recording.
 
     Raises:
         RecordingError: As `facts_of`.
@@ -131,9 +133,9 @@ def read(paths: Paths, only: Iterable[str] = ()) -> Iterator[Recorded]:
 
 
 def _timed(file: FileFacts, only: frozenset[str]) -> Iterator[tuple[int, Recorded | None]]:
-    """Yield arrival [ns] and message of a file, after an entry without a message.
+    """Yield first the begin [ns] of a file without a message, then arrival [ns] and message of its messages.
 
-    The file is opened after that entry, at its time: a long recording has more files than a process may open.
+    The file is opened only after the first entry, because a long recording has more files than a process may open.
     """
     yield file.begin_ns, None
     for recorded in _messages(file.path, only):
@@ -142,8 +144,8 @@ def _timed(file: FileFacts, only: frozenset[str]) -> Iterator[tuple[int, Recorde
 
 def _listed(paths: Paths) -> list[Path]:
     """Return each file once."""
-    several = [paths] if isinstance(paths, str | Path) else paths
-    return list(dict.fromkeys(Path(path) for path in several))
+    entries = [paths] if isinstance(paths, str | Path) else paths
+    return list(dict.fromkeys(Path(path) for path in entries))
 
 
 def _messages(path: Path, only: frozenset[str]) -> Iterator[Recorded]:
@@ -151,11 +153,11 @@ def _messages(path: Path, only: frozenset[str]) -> Iterator[Recorded]:
     channels: dict[int, tuple[str, Form]] = {}
     for record in _records(path):
         if isinstance(record, McapMessage):
-            known = channels.get(record.channel_id)
-            if known is None or (only and known[0] not in only):
+            key, form = channels.get(record.channel_id, ("", None))
+            if form is None or (only and key not in only):
                 continue
             try:
-                yield Recorded(known[0], record.log_time, known[1].read(record.data), known[1])
+                yield Recorded(key, record.log_time, form.read(record.data), form)
             except MessageError as error:
                 raise RecordingError(f"'{path}' is damaged: {error}") from None
         elif isinstance(record, Schema) and record.name in _BY_TITLE:
@@ -181,7 +183,9 @@ def _facts_of(path: Path) -> FileFacts:
     try:
         own, lost = facts[FACTS], facts.get(LOSSES, {})
         if own["format"] != FORMAT:
-            raise RecordingError(f"'{path}' is a recording in format {own['format']}; this reads {FORMAT}.")
+            raise RecordingError(
+                f"'{path}' is a recording in format {own['format']}; this program reads format {FORMAT}."
+            )
         return FileFacts(
             path=path,
             robot=own["robot"],
@@ -212,25 +216,25 @@ def _keys(records: Iterable[object]) -> frozenset[str]:
 
 
 def _records(path: Path, whole_chunks: bool = False) -> Iterator[object]:
-    """Yield all records up to the end of the file, or up to where its writer was killed, without damaged chunks."""
+    """Yield all records without damaged chunks, up to the end of the file or the last whole record."""
     try:
         stream = path.open("rb")
     except OSError as error:
         raise RecordingError(f"The recording '{path}' cannot be read: {error.strerror}.") from None
-    begun = False
+    has_record = False
     with stream:
         records = StreamReader(stream, emit_chunks=True).records
         while True:
             try:
                 record = next(records, None)
             except Exception as error:  # mcap's reader raises various errors for a cut or damaged file
-                if not begun:
+                if not has_record:
                     reason = str(error) or type(error).__name__
                     raise RecordingError(f"'{path}' is not a recording, or only its first bytes: {reason}.") from None
                 return
             if record is None:
                 return
-            begun = True
+            has_record = True
             if isinstance(record, Chunk) and not whole_chunks:
                 yield from _unpacked(path, record)
             else:
@@ -240,6 +244,6 @@ def _records(path: Path, whole_chunks: bool = False) -> Iterator[object]:
 def _unpacked(path: Path, chunk: Chunk) -> list[Any]:
     try:
         return list(breakup_chunk(chunk, validate_crc=True))
-    except Exception as error:  # of mcap, of zstd
+    except Exception as error:  # mcap and zstd raise various errors
         log.warning("'%s' is damaged; %d bytes are left out: %s", path, len(chunk.data), error)
         return []

@@ -1,7 +1,7 @@
 """Process that records everything that a robot's services publish, in files that Foxglove opens.
 
-A message received more than a second ago survives kill -9 and, if the disk keeps its word, a power cut. Losses are
-counted and written into the file. The recorder never blocks zenoh and its memory is bounded.
+After one second a message is safe against kill -9, and against a power cut if the disk flushes as requested. Losses are
+counted and written into the file. The recorder never blocks zenoh, and its memory is bounded.
 """
 
 import contextlib
@@ -27,21 +27,21 @@ from services.wire.messages import Status
 log = logging.getLogger(__name__)
 
 MOST = 8192
-"""At most this many messages wait to be written: eight seconds of a stalled disk at five streams of 200 Hz."""
+"""At most this many messages wait to be written: five streams of 200 Hz while the disk stops for eight seconds."""
 MOST_BYTES = 32 << 20
 """At most this many bytes wait to be written."""
 TAKE_EVERY = 0.05
 COMMIT_EVERY = 0.4
-"""Messages are made safe at this interval [s]; with the time to write them this stays under a second."""
+"""Messages are written at this interval [s], so that each is safe within a second."""
 DESCRIBED_WITHIN = 0.5
 """Without a robot file, writing waits at most this long [s] for the HAL to name its signals."""
 ASK_WITHIN = 1.0
-STEPPED = 500_000_000
+LEAST_STEP = 500_000_000
 """A jump of the wall clock by at least this [ns] is reported."""
 
 
 class Entry(NamedTuple):
-    """Event to record: a `message`, a service that came (`alive`) or went (`gone`), or a description of the `robot`."""
+    """Event to record: a `message`, a service that started (`alive`) or ended (`gone`), or a description (`robot`)."""
 
     kind: str
     key: str
@@ -52,7 +52,7 @@ class Entry(NamedTuple):
 
 
 class EntryQueue:
-    """Entries that are not written yet, bounded in number and bytes."""
+    """Entries that wait to be written, bounded in number and bytes."""
 
     def __init__(self, limit: int, limit_bytes: int) -> None:
         self._limit, self._limit_bytes = limit, limit_bytes
@@ -68,7 +68,7 @@ class EntryQueue:
         """Add an entry, or count it as dropped; never blocks for long."""
         with self._lock:
             if len(self._items) >= self._limit or self._bytes + len(item.payload) > self._limit_bytes:
-                # There is no limit on the number of keys, so not every dropped key can be kept.
+                # Clients may make any number of keys, so not every dropped key is stored.
                 self._dropped[item.key if len(self._dropped) < self._limit else ""] += 1
                 return
             self._items.append(item)
@@ -77,29 +77,29 @@ class EntryQueue:
     def take(self) -> tuple[list[Entry], Counter[str]]:
         """Return and remove all entries in order, and the number dropped since the last call, by key."""
         with self._lock:
-            content = self._items, self._dropped
+            items, dropped = self._items, self._dropped
             self._items, self._bytes, self._dropped = [], 0, Counter()
-        return content
+        return items, dropped
 
 
 class SteadyClock:
-    """Clock that starts at wall-clock time and then is never set: arrivals never go back in time."""
+    """Clock that starts at wall-clock time and is never set afterwards, so that arrivals never go back in time."""
 
     def __init__(self) -> None:
-        self._ahead = time.time_ns() - time.monotonic_ns()
-        self._stepped = 0
+        self._offset_ns = time.time_ns() - time.monotonic_ns()
+        self._reported_ns = 0
 
     def now_ns(self) -> int:
-        """Return the time [ns since 1970], by the wall clock as it was at the start."""
-        return self._ahead + time.monotonic_ns()
+        """Return the time [ns since 1970] by the wall clock at the start."""
+        return self._offset_ns + time.monotonic_ns()
 
     def step(self) -> float:
-        """Return by how much [s] the wall clock was set since the last call."""
-        apart = time.time_ns() - self.now_ns()
-        step = apart - self._stepped
-        if abs(step) < STEPPED:
+        """Return the step of the wall clock since the last call [s]; 0 for a step below `LEAST_STEP`."""
+        difference = time.time_ns() - self.now_ns()
+        step = difference - self._reported_ns
+        if abs(step) < LEAST_STEP:
             return 0.0
-        self._stepped = apart
+        self._reported_ns = difference
         return step * 1e-9
 
 
@@ -110,7 +110,7 @@ class Recorder:
         session: An open session; it must outlive the recorder.
         robot: The robot's name.
         writer: Writer of the files.
-        is_described: Whether the writer knows the robot's signals; if not, the HAL is asked first.
+        is_described: Whether the writer has the robot's signals; if not, the HAL is queried first.
         limit: At most this many messages wait to be written; more are dropped and counted.
     """
 
@@ -124,10 +124,10 @@ class Recorder:
         self._waiting = EntryQueue(limit, MOST_BYTES)
         self._clock = SteadyClock()
         self._stop = threading.Event()
-        self._hal_came = threading.Event()
-        self._known = threading.Event()
+        self._has_new_hal = threading.Event()
+        self._is_described = threading.Event()
         if is_described:
-            self._known.set()
+            self._is_described.set()
 
     def __enter__(self) -> Self:
         self.writer.open(self._clock.now_ns())
@@ -137,7 +137,9 @@ class Recorder:
         self._asking.start()
         session, robot = self._session, self._robot
         self._subscriber = session.declare_subscriber(keys.everything(robot), self._receive)
-        self._tokens = session.liveliness().declare_subscriber(keys.alive(robot, "*"), self._came_or_went, history=True)
+        self._tokens = session.liveliness().declare_subscriber(
+            keys.alive(robot, "*"), self._receive_token, history=True
+        )
         return self
 
     def __exit__(
@@ -146,7 +148,7 @@ class Recorder:
         self._subscriber.undeclare()
         self._tokens.undeclare()
         self._stop.set()
-        self._hal_came.set()
+        self._has_new_hal.set()
         self._writing.join()
         self._asking.join()
 
@@ -169,27 +171,27 @@ class Recorder:
         now = self._clock.now_ns()
         self._waiting.put(Entry("message", str(sample.key_expr), now, sample.payload.to_bytes(), str(sample.encoding)))
 
-    def _came_or_went(self, sample: zenoh.Sample) -> None:
-        came = sample.kind == zenoh.SampleKind.PUT
+    def _receive_token(self, sample: zenoh.Sample) -> None:
+        is_alive = sample.kind == zenoh.SampleKind.PUT
         key = str(sample.key_expr)
-        self._waiting.put(Entry("alive" if came else "gone", key, self._clock.now_ns()))
-        if came and key == keys.alive(self._robot, "hal"):
-            self._hal_came.set()
+        self._waiting.put(Entry("alive" if is_alive else "gone", key, self._clock.now_ns()))
+        if is_alive and key == keys.alive(self._robot, "hal"):
+            self._has_new_hal.set()
 
     def _describe(self) -> None:
-        """Query every HAL that comes for its signals."""
-        while self._hal_came.wait() and not self._stop.is_set():
-            self._hal_came.clear()
-            with contextlib.suppress(ServiceError):  # not allowed, or gone again: then signals have numbers for names
+        """Query every HAL that starts for its signals."""
+        while self._has_new_hal.wait() and not self._stop.is_set():
+            self._has_new_hal.clear()
+            with contextlib.suppress(ServiceError):  # not allowed, or ended again: then signals have numbers for names
                 description = query.ask(self._session, keys.verb(self._robot, "hal", "describe"), timeout=ASK_WITHIN)
                 self._waiting.put(Entry("robot", "", self._clock.now_ns(), description=description))
-            self._known.set()
+            self._is_described.set()
 
     def _write(self) -> None:
-        self._known.wait(DESCRIBED_WITHIN)
+        self._is_described.wait(DESCRIBED_WITHIN)
         try:
             self._write_until_stopped()
-        except Exception as error:  # of any kind: later messages count as dropped, and the failure is reported
+        except Exception as error:  # later messages count as dropped, and the failure is reported
             self.failure = f"The recording ended early: {type(error).__name__}: {error}."
             log.exception("%s", self.failure)
             while not self._stop.wait(TAKE_EVERY):
@@ -198,18 +200,15 @@ class Recorder:
 
     def _write_until_stopped(self) -> None:
         due = time.monotonic() + COMMIT_EVERY
-        while not (is_last := self._stop.wait(TAKE_EVERY)):
+        while not self._stop.wait(TAKE_EVERY):
             self._take()
             if time.monotonic() >= due:
                 if step := self._clock.step():
-                    text = (
-                        f"The wall clock of the recorder's machine was set by {step:+.3f} s; arrivals go on as before."
-                    )
+                    text = f"The wall clock of the recorder's machine was set by {step:+.3f} s; arrivals have no step."
                     self.writer.note(self._clock.now_ns(), WARNING, "clock", text)
                 self.writer.commit(self._clock.now_ns())
                 due = time.monotonic() + COMMIT_EVERY
-        if is_last:
-            self._take()
+        self._take()
         self.writer.finish(self._clock.now_ns())
 
     def _take(self) -> None:
@@ -217,7 +216,7 @@ class Recorder:
         # Descriptions come before the messages that waited for them.
         for item in sorted(items, key=lambda item: item.kind != "robot"):
             self._add(item)
-        for key, count in dropped.items():  # they came after the queued ones
+        for key, count in dropped.items():  # they arrived after the queued messages
             self.writer.losses.drop(key, count)
 
     def _add(self, item: Entry) -> None:
@@ -227,7 +226,7 @@ class Recorder:
             self.writer.describe(item.received_ns, item.description)
         else:
             service = keys.parse(item.key)[1]
-            text = f"The '{service}' service {'came' if item.kind == 'alive' else 'went'}."
+            text = f"The '{service}' service {'started' if item.kind == 'alive' else 'ended'}."
             level = INFO if item.kind == "alive" else WARNING
             self.writer.note(item.received_ns, level, item.kind, text, key=item.key)
 
@@ -247,15 +246,15 @@ def recording(
     condition: str = "",
     limits: Limits | None = None,
 ) -> Iterator[Recorder]:
-    """Record a robot while the context lasts.
+    """Record a robot until the context ends.
 
     Args:
         session: An open session.
         robot: The robot's name.
         path: The file; numbered names are derived from it.
-        catalogue: The robot's signals; its HAL is asked if not given.
-        condition: Condition of the body meanwhile.
-        limits: When to begin a new file.
+        catalogue: The robot's signals; the HAL is queried if None.
+        condition: Condition of the body during the recording.
+        limits: Limits at which a new file begins.
 
     Raises:
         RecordingError: The first file cannot be written.
@@ -279,13 +278,13 @@ def run_recorder(
 
     Args:
         robot: The robot's name.
-        path: The file to write; if it exists, or if there may be many, numbered files beside it are written, so a
-            killed recorder can be started again with the same arguments.
+        path: The file to write. If `path` exists, or if there may be many files, numbered files are written beside it,
+            so a killed recorder can be started again with the same arguments.
         connect: Endpoints, such as a router's, and role files.
-        stop: Ends the recording in place of the signals.
-        catalogue: The robot's signals; its HAL is asked if not given.
-        condition: Condition of the body meanwhile.
-        limits: When to begin a new file.
+        stop: Event that ends the recording, in place of SIGTERM and SIGINT.
+        catalogue: The robot's signals; the HAL is queried if None.
+        condition: Condition of the body during the recording.
+        limits: Limits at which a new file begins.
 
     Returns:
         Exit code of the process; 1 if a message could not be written.
@@ -297,7 +296,7 @@ def run_recorder(
     """
     path = Path(path)
     if path.suffix != ".mcap":
-        raise RecordingError(f"A recording's name ends in .mcap, unlike '{path}'.")
+        raise RecordingError(f"A recording's name ends in .mcap; '{path}' does not.")
     began = time.monotonic()
     with (
         until_stopped(stop) as stopped,
@@ -312,13 +311,13 @@ def run_recorder(
 
 
 def summary(recorder: Recorder, seconds: float) -> str:
-    """Return sentences on what was recorded and what is missing."""
+    """Return sentences on the recorded and the missing messages."""
     counters = recorder.counters()
     files = recorder.writer.paths
-    where = (
+    place = (
         f"{files[0]}" + (f" to {files[-1].name} ({len(files)} files)" if len(files) > 1 else "") if files else "no file"
     )
-    text = f"{counters['written']} messages, {seconds:.1f} s, {counters['bytes'] / 1e6:.2f} MB in {where}."
+    text = f"{counters['written']} messages, {seconds:.1f} s, {counters['bytes'] / 1e6:.2f} MB in {place}."
     return f"{text} {missing(counters)} {counters['failure']}".rstrip()
 
 
@@ -327,10 +326,10 @@ def missing(counters: Mapping[str, Any]) -> str:
     reasons = {
         "dropped": "could not be written",
         "missed": "never arrived here",
-        "malformed": "were not what their key carries (kept as bytes)",
+        "malformed": "were not of the type of their key (kept as bytes)",
     }
     parts = [f"{counters[kind]} {text}" for kind, text in reasons.items() if counters[kind]]
-    return f"Of its messages {', '.join(parts)}." if parts else "Nothing is missing."
+    return f"Of the messages, {', '.join(parts)}." if parts else "Nothing is missing."
 
 
 def _status(recorder: Recorder) -> Status:

@@ -1,7 +1,7 @@
 """Process that plays a recording on its own clock, in place of the HAL and the camera.
 
-Its messages have the recorded content, new stamps, a new `boot` for each recorded one, and the source `replay`, so no
-client can take it for a robot. Commands are never played. It has no motors, so every verb that would move is refused.
+The messages have the recorded content, new stamps, a new `boot` for each recorded `boot`, and the source `replay`, so
+that no client mistakes them for a robot's. Commands are never played. Every verb that moves a robot is refused.
 """
 
 import contextlib
@@ -29,11 +29,11 @@ log = logging.getLogger(__name__)
 
 SOURCE = "replay"
 MEASURED = ("hal/sample", "hal/applied", "vision/sample")
-THOUGHT = ("model/estimate", "model/anomaly", "model/update")
+INFERRED = ("model/estimate", "model/anomaly", "model/update")
 LATE = 0.005
 """A message that is published more than this [s] after its time counts as late."""
 LONGEST_PAUSE = 10.0
-"""A longer pause in the recordings [s] is cut to one second."""
+"""A pause in the recordings that is longer than this [s] is cut to one second."""
 MOST_STEPS = 100_000
 MOVES = ("enable", "disable", "home", "tare", "reset", "stop", "estop", "lease", "release")
 """A replay refuses these verbs of a HAL."""
@@ -46,10 +46,10 @@ class ReplayCounts:
     Attributes:
         messages: Published messages.
         samples: Published samples of the HAL.
-        reached: Time of the recordings that lies behind [s].
+        reached: Played time of the recordings [s].
         late: Messages published more than `LATE` after their time.
         latest: Largest lateness [s].
-        pauses: Pauses that were cut short.
+        pauses: Pauses that were cut to one second.
     """
 
     messages: int = 0
@@ -71,8 +71,8 @@ class TimedSchedule:
         self._elapsed = 0.0
 
     def wait(self, received_ns: int) -> bool:
-        """Wait until a message of this arrival is due; return False if the replay was stopped."""
-        self._pass(received_ns)
+        """Wait until the message with this arrival is due; return False if the replay was stopped."""
+        self._advance(received_ns)
         wait = self._begun + self._elapsed / self._speed - time.monotonic()
         if wait > 0.0 and self._stop.wait(wait):
             return False
@@ -82,11 +82,11 @@ class TimedSchedule:
         return not self._stop.is_set()
 
     def stamp_ns(self, recorded_ns: int, received_ns: int) -> int:
-        """Return the new stamp of a message [ns]: as long before its due time as it was recorded before its arrival."""
-        on_the_way = (received_ns - recorded_ns) / self._speed
-        return self._begun_ns + round(1e9 * self._elapsed / self._speed - on_the_way)
+        """Return the new stamp of a message [ns]; its transit, divided by the speed, stays the same."""
+        transit_ns = (received_ns - recorded_ns) / self._speed
+        return self._begun_ns + round(1e9 * self._elapsed / self._speed - transit_ns)
 
-    def _pass(self, received_ns: int) -> None:
+    def _advance(self, received_ns: int) -> None:
         if self._last_ns is not None:
             step = max(received_ns - self._last_ns, 0) * 1e-9
             if step > LONGEST_PAUSE:
@@ -98,7 +98,7 @@ class TimedSchedule:
 
 
 class SteppedSchedule:
-    """Schedule by request: a number of samples of the HAL, and all messages between them."""
+    """Schedule on request: each request plays a number of the HAL's samples and all messages between them."""
 
     def __init__(self, stop: threading.Event, counts: ReplayCounts) -> None:
         self._stop, self._counts = stop, counts
@@ -111,20 +111,20 @@ class SteppedSchedule:
         with self._changed:
             self._allowed = self._counts.samples + count
             self._changed.notify_all()
-            self._changed.wait_for(lambda: self._is_done() or self._stop.is_set(), within)
+            self._changed.wait_for(lambda: self._is_waiting() or self._stop.is_set(), within)
 
     def wait(self, received_ns: int) -> bool:
         """Wait until the next message may be published; return False if the replay was stopped."""
         with self._changed:
             self._changed.notify_all()
-            while self._is_done() and not self._stop.is_set():
+            while self._is_waiting() and not self._stop.is_set():
                 self._changed.wait(0.1)
         first = self._first_ns = self._first_ns or received_ns
         self._counts.reached = (received_ns - first) * 1e-9
         return not self._stop.is_set()
 
     def stamp_ns(self, recorded_ns: int, received_ns: int) -> int:
-        """Return the new stamp of a message [ns]: now."""
+        """Return the present time as the new stamp of a message [ns]."""
         return time.time_ns()
 
     def end(self) -> None:
@@ -132,19 +132,19 @@ class SteppedSchedule:
         with self._changed:
             self._changed.notify_all()
 
-    def _is_done(self) -> bool:
+    def _is_waiting(self) -> bool:
         return self._counts.samples >= self._allowed
 
 
 class Replay:
-    """Replay of recordings on the sessions of the services that it replaces.
+    """Replay of recordings on the sessions of the replaced services.
 
     Args:
         services: Services by name; `hal` is among them.
         files: Facts of the played files.
         messages: Messages of the files in order.
         speed: Multiple of the recorded speed; 0 plays only on request by `hal/do/step`.
-        stop: Ends the replay; it is set when there is nothing left to play.
+        stop: Event that ends the replay; the replay sets it after the last message.
     """
 
     def __init__(
@@ -186,11 +186,11 @@ class Replay:
             raise RecordingError(self._failure)
 
     def summary(self) -> str:
-        """Return one sentence on what was played."""
+        """Return one sentence on the played messages."""
         counts = self.counts
         text = f"{counts.messages} messages of {counts.reached:.1f} s were played"
         if counts.late:
-            text += f", {counts.late} of them late by more than {1e3 * LATE:g} ms, {1e3 * counts.latest:.0f} at most"
+            text += f", {counts.late} of them more than {1e3 * LATE:g} ms late, at most {1e3 * counts.latest:.0f} ms"
         return text + (f"; {counts.pauses} long pauses were cut to 1 s." if counts.pauses else ".")
 
     def _play(self) -> None:
@@ -226,11 +226,11 @@ class Replay:
         self.counts.messages += 1
         self.counts.samples += noun == MEASURED[0]
 
-    def _step(self, given: dict[str, Any]) -> dict[str, Any]:
+    def _step(self, arguments: dict[str, Any]) -> dict[str, Any]:
         assert self._steps is not None
-        count = given.get("count", 1)
+        count = arguments.get("count", 1)
         is_number = isinstance(count, int) and not isinstance(count, bool)
-        if set(given) - {"count"} or not is_number or not 1 <= count <= MOST_STEPS:
+        if set(arguments) - {"count"} or not is_number or not 1 <= count <= MOST_STEPS:
             raise BadArguments(f"step takes {{count: 1 to {MOST_STEPS}}}, the number of samples to play.")
         self._steps.allow(count, within=1.0)
         return {"samples": self.counts.samples, "reached": self.counts.reached, "ended": self._stop.is_set()}
@@ -265,15 +265,15 @@ def run_replay(
     connect: Iterable[str] = (),
     stop: threading.Event | None = None,
 ) -> int:
-    """Play recordings in place of a robot's HAL, and of its camera if it has one, until their end.
+    """Play recordings to their end, in place of a robot's HAL and camera.
 
     Args:
         paths: Recordings of one robot, in any order.
-        robot: Name to play under; the recorded robot's if None.
+        robot: Name of the robot in the replay; the recorded name if None.
         speed: Multiple of the recorded speed; 0 plays only on request by `hal/do/step`.
-        with_model: Play also the messages of the model, in its place.
+        with_model: Play also the messages of the model service, in place of it.
         connect: Endpoints, such as a router's, and role files.
-        stop: Ends the replay in place of the signals.
+        stop: Event that ends the replay, in place of SIGTERM and SIGINT.
 
     Returns:
         Exit code of the process.
@@ -285,15 +285,15 @@ def run_replay(
     """
     if not (math.isfinite(speed) and speed >= 0.0):
         raise RecordingError(
-            f"A recording cannot be played at {speed:g} times its speed; 1 is as recorded, 0 by steps."
+            f"A recording cannot be played at {speed:g} times its speed; 1 is the recorded speed, 0 plays step by step."
         )
     files = facts_of(paths)
     recorded = one_robot(files)
-    playable = [keys.robot_key(recorded, noun) for noun in (*MEASURED, *(THOUGHT if with_model else ()))]
-    held = _held(files, playable)
-    if not held:
-        raise RecordingError(f"There is nothing of robot '{recorded}' to play: no {', '.join(playable[:3])}.")
-    names = ["hal", *sorted({noun.partition("/")[0] for noun in map(_noun, held)} - {"hal"})]
+    playable = [keys.robot_key(recorded, noun) for noun in (*MEASURED, *(INFERRED if with_model else ()))]
+    recorded_keys = _held(files, playable)
+    if not recorded_keys:
+        raise RecordingError(f"There are no messages of robot '{recorded}' to play: no {', '.join(playable[:3])}.")
+    names = ["hal", *sorted({noun.partition("/")[0] for noun in map(_noun, recorded_keys)} - {"hal"})]
     with until_stopped(stop) as stopped, contextlib.ExitStack() as stack:
         services = {
             name: stack.enter_context(Service(robot or recorded, name, connect, lambda: _describe(files)))
@@ -308,7 +308,7 @@ def run_replay(
 
 
 def _held(files: Sequence[FileFacts], candidates: Iterable[str]) -> set[str]:
-    """Return those of some keys that the files hold."""
+    """Return the candidate keys that the files hold."""
     return set().union(*(file.keys for file in files)) & set(candidates)
 
 
@@ -327,7 +327,7 @@ def _refuse(verb: str) -> Callable[[dict[str, Any]], Any]:
     def refuse(_: dict[str, Any]) -> Any:
         text = f"This is a replay of a recording: it has no motors and cannot '{verb}'."
         if verb in ("stop", "estop", "disable"):
-            text += " If a robot moves, it is not this program that moves it: cut its power."
+            text += " If a robot moves, another program moves it: cut its power."
         raise CommandRefused(text)
 
     return refuse

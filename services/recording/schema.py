@@ -1,8 +1,8 @@
 """Form of messages in a recording: JSON, and a JSON Schema that names every element and its unit.
 
-A number that was not measured is absent. JSON has no NaN, and Foxglove's reader of schemas knows neither null nor a
-union of types, so absence is the only truthful form, and every viewer draws it as a gap. Read back, an absent number is
-NaN again, and an absent age is infinite: never measured. All other numbers are read back bit by bit.
+A number that was not measured is absent, and viewers draw a gap: JSON has no NaN, and Foxglove's schema reader supports
+neither null nor a union of types. When a file is read, an absent number becomes NaN again, and an absent age infinite
+(never measured). All other numbers are read exactly.
 """
 
 import inspect
@@ -35,8 +35,8 @@ class OtherLayout(MessageError):
     """A signal of a message is not in the catalogue, or has another size there.
 
     Attributes:
-        signal: Its name.
-        size: Number of its elements in the message.
+        signal: Name of the signal.
+        size: Number of the signal's elements in the message.
     """
 
     def __init__(self, signal: str, size: int) -> None:
@@ -92,7 +92,7 @@ class Catalogue:
         return {name: {"unit": s.unit, "elements": list(s.elements)} for name, s in self.signals.items()}
 
     def with_unknown(self, signal: str, size: int) -> "Catalogue":
-        """Return the catalogue with one more signal, of which only the number of elements is known."""
+        """Return the catalogue with one more signal, whose elements have numbers for names."""
         elements = tuple(f"element_{number}" for number in range(1, size + 1))
         return Catalogue({**self.signals, signal: CatalogueSignal("", elements)})
 
@@ -106,7 +106,7 @@ class Form:
     Attributes:
         schema: The JSON Schema.
         hints: Field of the record -> its type.
-        by_signal: Whether the record has one signal, to which its arrays belong.
+        by_signal: Whether the record has one signal, which all its arrays describe.
     """
 
     def __init__(self, record: type[Message], catalogue: Catalogue) -> None:
@@ -124,11 +124,11 @@ class Form:
         self.schema = self._schema()
 
     def write(self, payload: bytes) -> tuple[bytes, dict[str, Any]]:
-        """Return a message of the wire as JSON, and its content.
+        """Return the JSON and the content of a message in wire form.
 
         Raises:
             OtherLayout: The catalogue lacks one of its signals.
-            MessageError: The bytes are not such a message, or JSON cannot hold it.
+            MessageError: The bytes are not such a message, or JSON cannot hold its values.
         """
         try:
             body = msgspec.msgpack.decode(payload)
@@ -143,7 +143,7 @@ class Form:
                     body[name] = converted
                 else:
                     body.pop(name, None)
-            body.pop("elements", None)  # every element stands beside its name
+            body.pop("elements", None)  # JSON names every element
             return _encoder.encode(body), body
         except MessageError:
             raise
@@ -152,23 +152,23 @@ class Form:
             raise MessageError(f"It is not a {self.record.TYPE} message: {error or type(error).__name__}.") from None
 
     def read(self, data: bytes) -> Message:
-        """Return the message of its JSON.
+        """Return the message from its JSON.
 
         Raises:
             MessageError: The JSON was not made by `write`.
         """
         try:
             body = _decoder.decode(data)
-            present = (item.name for item in self._fields if self._is_there(item.name, body))
+            present = (item.name for item in self._fields if self._is_present(item.name, body))
             return self.record(**{name: self._read(name, body) for name in present})
         except (ValueError, TypeError, LookupError, AttributeError) as error:
             raise MessageError(f"It is not a recorded {self.record.TYPE} message: {error}.") from None
 
-    def _is_there(self, name: str, body: dict[str, Any]) -> bool:
+    def _is_present(self, name: str, body: dict[str, Any]) -> bool:
         return name in body or (self.hints[name] is float and name in self._required)
 
     def _writer(self, name: str, hint: Any) -> Convert:
-        """Return the function that converts a field of the wire to JSON; its result None means an absent field."""
+        """Return the function that converts a field from its wire form to JSON; it returns None for an absent field."""
         if hint in (Numbers, Truths):
             return self._of_numbers if hint is Numbers else self._of_truths
         if hint == Array:
@@ -199,7 +199,7 @@ class Form:
     def _check(self, body: dict[str, Any]) -> None:
         """Check that all parts of a message have the same signals, and that the catalogue holds them.
 
-        Sizes are checked first, so that the size in `OtherLayout` is the size that really came.
+        Sizes are checked first, so that `OtherLayout` has the real size.
         """
         elements = Elements.of(_checked(dict, body["elements"]))
         record: Any = self.record
@@ -212,7 +212,7 @@ class Form:
                 raise OtherLayout(signal, count)
         for name in record.BY_SIGNAL:
             if body[name].keys() != elements.counts.keys():
-                raise MessageError(f"A {self.record.TYPE} message names other signals in '{name}' than in 'elements'.")
+                raise MessageError(f"A {self.record.TYPE} message has other signals in '{name}' than in 'elements'.")
 
     def _of_numbers(self, data: bytes, body: dict[str, Any]) -> dict[str, dict[str, float]]:
         return self._split(struct.unpack(f"<{len(data) // 8}d", data), body, _named)
@@ -285,8 +285,9 @@ class Form:
         if origin is list:
             return {"type": "array", "items": {"type": TYPES[inner]}}
         if origin is dict:
-            known = {signal: {"type": TYPES[inner]} for signal in self.catalogue.signals} if inner in TYPES else {}
-            return _object(known)
+            return _object(
+                {signal: {"type": TYPES[inner]} for signal in self.catalogue.signals} if inner in TYPES else {}
+            )
         return {"type": TYPES[hint]} | ({"unit": UNITS[name]} if name in UNITS else {})
 
     def _elements(self, name: str, listed: CatalogueSignal) -> dict[str, Any]:
@@ -327,7 +328,7 @@ def _map_of_numbers(value: Any, body: dict[str, Any]) -> dict[str, float]:
 def _list_of_numbers(value: Any, _: dict[str, Any]) -> list[float]:
     numbers: list[float] = np.frombuffer(value, "<f8").tolist()
     if not all(map(math.isfinite, numbers)):
-        raise MessageError("A list without names cannot have a gap.")
+        raise MessageError("A list without element names must have only finite numbers.")
     return numbers
 
 
@@ -338,7 +339,7 @@ def _checked(kind: type, value: Any) -> Any:
 
 
 def _descriptions(record: type[Message]) -> dict[str, str]:
-    """Return attribute -> its sentence in the docstrings of a record and of `Message`."""
+    """Return the sentence on each attribute from the docstrings of a record and of `Message`."""
     text = "\n".join(inspect.getdoc(kind) or "" for kind in (Message, record))
     entries = re.findall(r"^    (\w+): (.+(?:\n {8}.+)*)", text, re.MULTILINE)
     return {name: " ".join(sentence.split()) for name, sentence in entries}

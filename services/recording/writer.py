@@ -1,4 +1,4 @@
-"""Writer of arriving messages into the files of a recording, one after the other; it leaves space on the disk."""
+"""Writer of arriving messages into successive files of a recording, which leaves space on the disk."""
 
 import json
 import logging
@@ -25,9 +25,9 @@ log = logging.getLogger(__name__)
 
 FORMAT = "2"
 FACTS, ROBOT, LOSSES = "gemuco", "gemuco.robot", "gemuco.losses"
-"""These names of metadata hold facts of the recording, the robot's description, and the losses."""
+"""MCAP metadata with these names hold the facts of the recording, the robot's description, and the losses."""
 UNREADABLE = "#unreadable"
-"""This is added to the topic of messages of another kind than their key carries; no zenoh key has a `#`."""
+"""The topic of messages that are not of the type of their key has this suffix; no zenoh key has a `#`."""
 CARRIED: dict[str, type[Message]] = {
     "hal/sample": Sample, "vision/sample": Sample, "simulator/truth": Sample, "hal/applied": Applied,
     "hal/command": Command, "hal/holder": Holder, "model/estimate": Estimates, "model/anomaly": Anomaly,
@@ -35,7 +35,7 @@ CARRIED: dict[str, type[Message]] = {
 }  # fmt: skip
 """Key after the robot's name -> type of the messages on it."""
 LEAST_FREE = 64 << 20
-"""A file is finished when the disk has less space left [bytes], so that the robot's other processes can go on."""
+"""A file ends when the disk has less free space [bytes], so that the robot's other processes can continue."""
 TRY_AGAIN = 1.0
 """The next file is tried this long [s] after one could not be written."""
 MOST_TOPICS = 1000
@@ -43,7 +43,7 @@ MOST_TOPICS = 1000
 MOST_UNKNOWN = 64
 """At most this many signals are recorded that are not in the robot's description."""
 LONGEST = 3600.0
-"""A file covers at most this time [s], because its index stays in memory, 11 MB an hour (stack/soak.py)."""
+"""A file covers at most this time [s], because its index stays in memory, 11 MB per hour (stack/soak.py)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +53,7 @@ class Limits:
     Attributes:
         max_bytes: Size of a file [bytes]; no limit if None.
         max_seconds: Time that a file covers [s]; `LONGEST` if None.
-        least_free: Space that the disk keeps [bytes]; below it nothing is recorded until there is twice as much.
+        least_free: Least free space on the disk [bytes]; with less, recording stops until twice this space is free.
     """
 
     max_bytes: int | None = None
@@ -67,12 +67,12 @@ class Limits:
 
 
 class RecordingWriter:
-    """Writer of messages into one file after the other; used by one thread.
+    """Writer of messages into successive files, for one thread.
 
     Args:
         path: The file; numbered names are derived from it.
         robot: The robot's name.
-        catalogue: Its signals, as far as known.
+        catalogue: The robot's signals, as far as known.
         condition: Condition of the body while it is recorded; empty if not known.
         limits: Limits of one file.
     """
@@ -82,9 +82,9 @@ class RecordingWriter:
     ) -> None:
         self.losses = Losses()
         self.written = 0
-        """Number of messages that are safe in files."""
+        """Number of messages that are safely in files."""
         self.foreign = 0
-        """Number of those on keys that are not gemuco's."""
+        """Number of messages on keys that are not of gemuco."""
         self.name, self.rate, self.done = "writer", 1.0, 0
         """For health checks: number of commits without a failure."""
         self.failure = ""
@@ -105,7 +105,7 @@ class RecordingWriter:
         self._until_ns = 0
         self._reported: dict[str, str] = {}
         self._holder: str | None = None
-        self._again = 0.0
+        self._retry_at = 0.0
         self._file: RecordingFile | None = None
 
     @property
@@ -117,17 +117,17 @@ class RecordingWriter:
         """Begin the first file.
 
         Raises:
-            RecordingError: The file cannot be written; a full disk is not an error, the writer waits for space.
+            RecordingError: The file cannot be written; on a full disk the writer waits for space instead.
         """
         if self._has_room(self._limits.least_free):
             self._begin(received_ns)
 
     def describe(self, received_ns: int, description: Mapping[str, Any]) -> None:
-        """Take names and units from the HAL's description, from now on."""
+        """Use the names and units of the HAL's description from now on."""
         try:
             catalogue = Catalogue.of_description(description)
         except MessageError as error:
-            log.warning("The HAL of robot '%s' describes itself badly: %s", self._robot, error)
+            log.warning("The HAL of robot '%s' gives no valid description: %s", self._robot, error)
             return
         self._described = msgspec.json.encode(
             {k: v for k, v in description.items() if k not in ("pid", "host")}
@@ -169,7 +169,7 @@ class RecordingWriter:
         return self.failure
 
     def commit(self, received_ns: int) -> None:
-        """Make added messages safe, report losses, and end the file at a limit."""
+        """Write added messages to the disk, report losses, and end the file at a limit."""
         self.done += not self.failure
         if self._file is None:
             return
@@ -185,12 +185,12 @@ class RecordingWriter:
             self._end()
 
     def finish(self, received_ns: int) -> None:
-        """Make everything safe and end the last file."""
+        """Write all messages to the disk and end the last file."""
         self.commit(received_ns)
         self._end()
 
     def _written(self, carried: type[Message], payload: bytes) -> tuple[Form, bytes, dict[str, Any]]:
-        """Return form, JSON and content of a message; elements of undescribed signals are numbered instead of named."""
+        """Return form, JSON and content of a message; elements of unknown signals get numbers as names."""
         while True:
             form = self._forms.get(carried)
             if form is None:
@@ -205,7 +205,7 @@ class RecordingWriter:
                 self._forms.clear()
 
     def _channel(self, key: str, form: Form) -> int:
-        """Return the channel of a key in the current file; a look-up by its schema would take long."""
+        """Return the channel of a key in the current file; a search by schema would take long."""
         if (key, form) not in self._channels:
             assert self._file is not None
             self._channels[key, form] = self._file.channel(key, "json", form.schema["title"], form.schema)
@@ -238,12 +238,12 @@ class RecordingWriter:
             self.note(received_ns, INFO, "holder", text)
 
     def _is_open(self, received_ns: int) -> bool:
-        """Whether there is a file for a message of this time; a new file is begun at a limit."""
+        """Whether a file is open for a message of this time; at a limit a new file begins."""
         if self._file is not None and 0 < self._until_ns <= received_ns:
             self.commit(received_ns)
             self._end()
-        if self._file is None and time.monotonic() >= self._again:
-            self._again = time.monotonic() + TRY_AGAIN
+        if self._file is None and time.monotonic() >= self._retry_at:
+            self._retry_at = time.monotonic() + TRY_AGAIN
             room = self._limits.least_free * (2 if self.failure else 1)
             if self._has_room(room):
                 try:
@@ -266,11 +266,11 @@ class RecordingWriter:
         self.note(received_ns, INFO, "file", f"File {part} of recording {self._identity} begins.")
         if self.failure:
             self.note(received_ns, ERROR, "file", f"Before this file: {self.failure}")
-            log.warning("Recording goes on in '%s'.", path)
+            log.warning("The recording continues in '%s'.", path)
             self.failure = ""
 
     def _end(self) -> None:
-        """Write the index and close; a file without an index, for lack of space, stays readable."""
+        """Write the index and close the file; if the disk has no space for the index, the file is still readable."""
         if self._file is None:
             return
         try:
@@ -281,7 +281,7 @@ class RecordingWriter:
         else:
             self.bytes += self._file.size
         self._file = None
-        self._again = 0.0
+        self._retry_at = 0.0
 
     def _fail(self, error: OSError) -> None:
         assert self._file is not None
@@ -291,8 +291,8 @@ class RecordingWriter:
         self.losses.dropped.update(self._waiting)
         self._waiting.clear()
         self.bytes += self._file.size
-        self._again = time.monotonic() + TRY_AGAIN
-        self._report(f"Nothing is recorded: '{self._file.path}' could not be written on: {error.strerror}.")
+        self._retry_at = time.monotonic() + TRY_AGAIN
+        self._report(f"Nothing is recorded: '{self._file.path}' could not be written any more: {error.strerror}.")
         self._file = None
 
     def _count_written(self) -> None:
@@ -300,14 +300,14 @@ class RecordingWriter:
         self._waiting.clear()
 
     def _has_room(self, needed: int) -> bool:
-        """Whether the disk has this many bytes left; a lack is reported."""
+        """Whether the disk has this many free bytes; if not, report it."""
         folder = next(parent for parent in self._path.absolute().parents if parent.is_dir())
         disk = os.statvfs(folder)
         free = disk.f_bavail * disk.f_frsize
         if free < needed:
             self._report(
-                f"Nothing is recorded: the disk of '{folder}' has {free / 1e6:.0f} MB left. It goes on when there are "
-                f"{2 * self._limits.least_free / 1e6:.0f} MB."
+                f"Nothing is recorded: the disk of '{folder}' has {free / 1e6:.0f} MB left. Recording "
+                f"continues with {2 * self._limits.least_free / 1e6:.0f} MB."
             )
         return free >= needed
 

@@ -1,7 +1,7 @@
-"""Access control of zenoh, made from the table of roles: the messages that a node accepts from the other end of a link.
+"""Access control of zenoh, made from the table of roles: the messages that a node accepts on a link.
 
-Every exchange needs both directions: a subscriber's declaration in, and the samples out. A rule matches only keys that
-it includes, so neither a subscription nor a put may be wider than what is allowed.
+Every exchange needs both directions: a subscriber's declaration comes in, and the samples go out. A rule matches only
+keys that the rule includes, so a subscription or a put on more keys than allowed is refused.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -11,7 +11,7 @@ from services.wire import keys
 from services.wire.roles import ASKED, COMPUTING, RATES, ROLES, SIZES, Role
 
 Rule = tuple[str, tuple[str, ...], tuple[str, ...]]
-"""A rule is a flow, the messages in that flow, and the keys that they may have."""
+"""A rule is a flow, the allowed messages in this flow, and the allowed keys."""
 _OPPOSITE = {"ingress": "egress", "egress": "ingress"}
 _ALL = (f"{keys.ROOT}/**",)
 _EVERY_MESSAGE = (
@@ -23,16 +23,16 @@ THROUGH: tuple[Rule, ...] = (("ingress", _EVERY_MESSAGE, _ALL), ("egress", _EVER
 
 
 def rules_of(role: Role, robots: Iterable[str]) -> list[Rule]:
-    """Return what a role may do with these robots (`*`: all), as seen by the node that it is linked to."""
+    """Return the rules of a role for these robots (`*`: all), for the node at the other end of its link."""
     names = tuple(robots)
 
     def of(nouns: Iterable[str]) -> tuple[str, ...]:
         return tuple(keys.robot_key(robot, noun) for robot in names for noun in nouns)
 
-    sees = of(["*/alive"])
+    tokens = of(["*/alive"])
     rules: list[Rule] = [
-        ("ingress", ("declare_liveliness_subscriber", "liveliness_query"), sees),
-        ("egress", ("liveliness_token",), sees),
+        ("ingress", ("declare_liveliness_subscriber", "liveliness_query"), tokens),
+        ("egress", ("liveliness_token",), tokens),
         ("ingress", ("put",), of(role.publishes)),
         ("egress", ("declare_subscriber",), _ALL if role.publishes else ()),
         ("ingress", ("declare_subscriber",), of(role.subscribes)),
@@ -47,7 +47,7 @@ def rules_of(role: Role, robots: Iterable[str]) -> list[Rule]:
 
 
 def mirrored(rules: Iterable[Rule]) -> list[Rule]:
-    """Return the same rules as seen from the other end of the link."""
+    """Return the same rules for the other end of the link."""
     return [(_OPPOSITE[flow], messages, names) for flow, messages, names in rules]
 
 
@@ -55,7 +55,7 @@ def access_control(subjects: Mapping[str, tuple[Mapping[str, Sequence[str]], Ite
     """Return zenoh's section `access_control`.
 
     Args:
-        subjects: Name -> certificate and user by which zenoh identifies it, and its rules.
+        subjects: Name -> certificate and user that identify the subject, and its rules.
     """
     rules, policies = [], []
     for name, (_, allowed) in subjects.items():
@@ -81,12 +81,12 @@ def access_control(subjects: Mapping[str, tuple[Mapping[str, Sequence[str]], Ite
 
 
 def identity_of(name: str, dials: bool) -> dict[str, list[str]]:
-    """Return how a node identifies the other end: by certificate, and also by user if the other end dialled."""
+    """Return the identity of the other end of a link: its certificate, and also its user if it opened the link."""
     return {"cert_common_names": [name]} | ({"usernames": [name]} if dials else {})
 
 
 def limits(robots: Iterable[str]) -> dict[str, Any]:
-    """Return rate and size limits of a router; a rule about rates is one budget, so each key has its own rule."""
+    """Return rate and size limits of a router; all keys of a rate rule share its rate, so each key has its own rule."""
     names = list(robots)
     published = [(keys.robot_key(robot, noun), rate) for robot in names for noun, rate in RATES.items()]
     asked = [
@@ -101,9 +101,9 @@ def limits(robots: Iterable[str]) -> dict[str, Any]:
             {
                 "flows": ["ingress"],
                 "messages": [message],
-                "rules": [{"key_expr": key, "freq": rate} for key, rate in of],
+                "rules": [{"key_expr": key, "freq": rate} for key, rate in rates],
             }
-            for message, of in (("put", published), ("query", asked))
+            for message, rates in (("put", published), ("query", asked))
         ],
         "low_pass_filter": [
             {

@@ -1,4 +1,4 @@
-"""Attacks on a secured installation, one function per subject; each yields what was refused and what was not."""
+"""Attacks on a secured installation, one function per subject; each yields the attempts and their results."""
 
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -20,8 +20,8 @@ REPEATS = 5
 FLOOD = 0.5
 """A flood lasts this long [s]."""
 LISTENS = 0.3
-"""After the permitted receivers have heard a message, the check listens this long [s] for the others."""
-NEVER_HEARD = b"gemuco security check, forged"
+"""After the permitted receivers got a message, the check waits this long [s] for other receivers."""
+FORGED = b"gemuco security check, forged"
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +39,7 @@ def refused(what: str, is_refused: bool, text: str = "") -> Attempt:
 
 
 def allowed(what: str, works: bool, text: str = "") -> Attempt:
-    """Return the result of a permitted use; without it a refusal would prove nothing."""
+    """Return the result of a permitted use; a refusal proves nothing unless permitted uses work."""
     return Attempt(what, "works" if works else "DOES NOT WORK", text)
 
 
@@ -51,7 +51,7 @@ def people(plan: InstallationPlan) -> tuple[str, str, str]:
 
 
 def entering(sessions: CheckSessions, name: str, where: str = "", at: str = "the router") -> Iterator[Attempt]:
-    """Try to connect without one of the things that a connection needs."""
+    """Try to connect without one part of what a connection needs."""
     sessions.member(name, where)
     yield allowed(f"{name} connects to {at}", True)
 
@@ -85,11 +85,11 @@ def at_the_hal(sessions: CheckSessions, operator: str, viewer: str) -> Iterator[
     recorder = sessions.member(f"recorder.{sessions.robot}", sessions.hal)
     model = sessions.member(f"model.{sessions.robot}", sessions.hal)
     for _ in range(REPEATS):
-        recorder.put(sessions.key("hal", "command"), NEVER_HEARD)
+        recorder.put(sessions.key("hal", "command"), FORGED)
         time.sleep(PAUSE)
     works = until(lambda: model.put(sessions.key("hal", "command"), PAYLOAD) is None and heard.count(PAYLOAD))
     yield allowed("model commands at the HAL", works)
-    yield refused("recorder commands at the HAL", not heard.count(NEVER_HEARD))
+    yield refused("recorder commands at the HAL", not heard.count(FORGED))
 
 
 class Inside:
@@ -120,7 +120,7 @@ class Inside:
         yield from self.limits()
 
     def allowed(self) -> Iterator[Attempt]:
-        """Check what must work, since otherwise the rest would prove nothing."""
+        """Check permitted uses; unless they work, a refusal proves nothing."""
         sessions = self.sessions
         yield allowed("operator commands", self.settled())
         status = sessions.key("hal", "status")
@@ -134,13 +134,13 @@ class Inside:
         yield allowed("viewer sees who is alive", until(lambda: "model" in self._alive(self.viewer)))
 
     def settled(self) -> bool:
-        """Whether a new message of the operator arrives; earlier messages have then arrived too, if they ever do."""
+        """Whether a new message of the operator arrives; all earlier accepted messages have then arrived too."""
         self._number += 1
         mark = PAYLOAD + str(self._number).encode()
         return until(lambda: self.operator.put(self.command, mark) is None and self.heard.count(mark))
 
     def publishing(self) -> Iterator[Attempt]:
-        """Publish as a viewer, who may publish nothing."""
+        """Publish as a viewer, which has no right to publish."""
         sessions, forged = self.sessions, (("hal", "sample"), ("model", "estimate"), ("vision", "sample"))
         attacks = {
             "viewer commands": self.command,
@@ -156,8 +156,8 @@ class Inside:
     def _published(
         self, session: zenoh.Session, attacks: Mapping[str, str], also: Callable[[], object] = lambda: None
     ) -> Iterator[Attempt]:
-        """Put on keys; each attack has its own payload, which identifies it wherever it arrives."""
-        marks = {what: NEVER_HEARD + what.encode() for what in attacks}
+        """Put on keys; each attack has its own payload, which identifies the attack on any key."""
+        marks = {what: FORGED + what.encode() for what in attacks}
         for _ in range(REPEATS):
             for what, key in attacks.items():
                 session.put(key, marks[what])
@@ -169,7 +169,7 @@ class Inside:
             yield refused(what, not self.heard.count(mark))
 
     def foreign_password(self) -> Iterator[Attempt]:
-        """Connect with one member's certificate and another's password, which must give no rights."""
+        """Connect with a certificate and a password of two members, which must give no rights."""
         operator, viewer = self.names
         configured = self.sessions.outside(viewer)
         configured["transport"]["auth"] = self.sessions.outside(operator)["transport"]["auth"]
@@ -191,7 +191,7 @@ class Inside:
         return until(lambda: any(listener.count(mark) for listener in listeners), LISTENS)
 
     def spying(self) -> Iterator[Attempt]:
-        """Subscribe to commands, which only the robot may hear."""
+        """Subscribe to commands, which only the robot may receive."""
         name, patterns = self.names[1], ("**", "gemuco/**", self.sessions.key("**"), self.command)
         spies = {pattern: Listener(self.sessions.member(name), pattern) for pattern in patterns}
         if not (self.settled() and self.settled()):
@@ -201,7 +201,7 @@ class Inside:
             yield refused(f"viewer spies on {pattern}", not spy.anything)
 
     def querying(self) -> Iterator[Attempt]:
-        """Query as a viewer what would change something, and query the router's admin space."""
+        """Query verbs that change something as a viewer, and query the router's admin space."""
         sessions, asked = self.sessions, []
         if not sessions.is_running:
             for service, verb in (("hal", "enable"), ("model", "engage")):
@@ -214,18 +214,17 @@ class Inside:
                     yield refused(f"viewer asks {selector}", not answered(self.viewer, selector, b"done"))
         for name, session in zip(self.names, (self.operator, self.viewer), strict=True):
             replies = [str(r.ok.key_expr) for r in session.get("@/**", timeout=1.0) if r.ok is not None]
-            foreign = [
-                key for key in replies if str(session.zid()) not in key.split("/")[1]
-            ]  # its own space is its own
+            # A session may read its own admin space.
+            foreign = [key for key in replies if str(session.zid()) not in key.split("/")[1]]
             yield refused(f"{name} reads the router's admin space", not foreign)
 
     def answering(self) -> Iterator[Attempt]:
         """Answer and declare liveliness in the place of a service."""
         fake = self.sessions.key("model", "do", "estimate")
-        queryable = answer(self.viewer, fake, NEVER_HEARD)
+        queryable = answer(self.viewer, fake, FORGED)
         token = self.viewer.liveliness().declare_token(self.sessions.key("vision", "alive"))
         self.settled()
-        is_fooled = any(answered(self.operator, fake, NEVER_HEARD) for _ in range(REPEATS))
+        is_fooled = any(answered(self.operator, fake, FORGED) for _ in range(REPEATS))
         yield refused("viewer answers in the model's place", not is_fooled)
         yield refused("viewer pretends that the camera is alive", "vision" not in self._alive(self.operator))
         queryable.undeclare()
@@ -245,14 +244,14 @@ class Inside:
         nouns = ("hal/sample", "model/estimate", "hal/command")
         for _ in range(REPEATS):
             for noun in nouns:
-                self.hal.put(f"gemuco/{other}/{noun}", NEVER_HEARD + noun.encode())
+                self.hal.put(f"gemuco/{other}/{noun}", FORGED + noun.encode())
             time.sleep(PAUSE)
         key = f"gemuco/{other}/hal/status"
         yield allowed(
             f"hal.{other} is heard", until(lambda: theirs.put(key, PAYLOAD) is None and listener.count(PAYLOAD))
         )
         for noun in nouns:
-            is_heard = listener.count(NEVER_HEARD + noun.encode())
+            is_heard = listener.count(FORGED + noun.encode())
             yield refused(f"hal.{sessions.robot} forges {noun} of '{other}'", not is_heard)
         yield from self._published(
             self.hal, {f"hal.{sessions.robot} forges model/estimate": sessions.key("model", "estimate")}

@@ -1,4 +1,4 @@
-"""A private certificate authority, and certificates whose common name is a role."""
+"""Private certificate authority, and certificates whose common name is a role."""
 
 import base64
 import ipaddress
@@ -17,7 +17,7 @@ from services.errors import ServiceError
 AUTHORITY = "gemuco authority"
 AUTHORITY_DAYS = 3650
 BACKDATED = timedelta(days=1)
-"""Certificates begin this long before now, because the clock of a robot that was just switched on may be late."""
+"""Certificates are valid from this long before now, because the clock of a robot that just started may be late."""
 _BOTH = x509.ExtendedKeyUsage([ExtendedKeyUsageOID.CLIENT_AUTH, ExtendedKeyUsageOID.SERVER_AUTH])
 
 
@@ -56,25 +56,25 @@ class Authority:
         """Sign a certificate for a member.
 
         Args:
-            name: The role, as in `hal.musashi_arm`; access control compares this common name.
+            name: Name of the member, such as `hal.musashi_arm`; access control compares this common name.
             hosts: Names and addresses under which others reach the member; empty if it never listens.
             until: End of its validity.
         """
         signer = serialization.load_pem_private_key(self.identity.key, None)
         issuer = x509.load_pem_x509_certificate(self.identity.certificate).subject
         if not isinstance(signer, ec.EllipticCurvePrivateKey):
-            raise ServiceError("The authority's key is not one that `gemuco security init` made.")
+            raise ServiceError("The authority's key was not made by `gemuco security init`.")
         key = ec.generate_private_key(ec.SECP256R1())
         builder = _builder(_name(name), issuer, key.public_key(), until)
         builder = builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
         builder = builder.add_extension(_BOTH, critical=False)
-        if places := [_general_name(host) for host in hosts]:
-            builder = builder.add_extension(x509.SubjectAlternativeName(places), critical=False)
+        if names := [_general_name(host) for host in hosts]:
+            builder = builder.add_extension(x509.SubjectAlternativeName(names), critical=False)
         return Identity(_pem(builder.sign(signer, hashes.SHA256())), _key_pem(key))
 
 
 def encoded(pem: bytes) -> str:
-    """Return PEM as zenoh's configuration takes it inline."""
+    """Return PEM as inline text for zenoh's configuration."""
     return base64.b64encode(pem).decode()
 
 
@@ -86,14 +86,14 @@ def decoded(text: str) -> bytes:
 def _builder(
     name: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePublicKey, until: datetime
 ) -> x509.CertificateBuilder:
-    begins = min(datetime.now(UTC), until) - BACKDATED
+    begin = min(datetime.now(UTC), until) - BACKDATED
     return (
         x509.CertificateBuilder()
         .subject_name(name)
         .issuer_name(issuer)
         .public_key(key)
         .serial_number(x509.random_serial_number())
-        .not_valid_before(begins)
+        .not_valid_before(begin)
         .not_valid_after(until)
     )
 

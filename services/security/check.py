@@ -15,14 +15,14 @@ _COLOURS = {"refused": typer.colors.GREEN, "works": typer.colors.GREEN, "not tri
 
 
 def run_check(folder: Path, running: str | None = None) -> int:
-    """Make every attempt, print a line for each, return the exit code: 1 if an attack passed or a permitted use failed.
+    """Make all attempts, print a line for each, and return 1 if an attack passed or a permitted use failed.
 
     Args:
-        folder: Made by `gemuco security init`, with all role files.
-        running: The endpoint of a router that runs already; malformed messages then reach the robot, which counts them.
+        folder: Folder of `gemuco security init`, with all role files.
+        running: Endpoint of a running router; malformed messages then reach the robot, which counts them.
 
     Raises:
-        ServiceError: The folder holds nothing to check, or the check cannot be started.
+        ServiceError: The folder has no plan, or the check cannot be started.
     """
     count = {"refused": 0, "works": 0, "not tried": 0, "NOT REFUSED": 0, "DOES NOT WORK": 0}
     for attempt in attempts(folder, running):
@@ -39,7 +39,7 @@ def run_check(folder: Path, running: str | None = None) -> int:
 
 
 def attempts(folder: Path, running: str | None = None, weaken: Weaken | None = None) -> Iterator[Attempt]:
-    """Yield every attempt as it is made.
+    """Make and yield all attempts.
 
     Raises:
         ServiceError: As `run_check`.

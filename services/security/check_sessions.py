@@ -1,4 +1,4 @@
-"""Sessions of a security check: a router, a HAL and a model of the role files, and the sessions that attack them."""
+"""Sessions of a security check: router, HAL and model from their role files, and the sessions that attack them."""
 
 import copy
 import json
@@ -23,9 +23,9 @@ Weaken = Callable[[str, dict[str, Any]], None]
 PAYLOAD = b"gemuco security check"
 """This payload is not a valid message for any receiver."""
 WITHIN = 15.0
-"""A permitted exchange has this long [s] to happen, also on a busy machine."""
+"""A permitted exchange must succeed within this time [s], also on a busy machine."""
 PATIENT = {"unicast": {"open_timeout": 5000, "accept_timeout": 5000}, "link": {"tx": {"lease": 10000}}}
-"""Long limits for links, because the check does not prove how soon a frozen process is noticed."""
+"""These limits for links are long, because the check does not measure how soon a frozen process is detected."""
 PAUSE = 0.02
 ONCE = {"endpoints": [], "timeout_ms": 0, "exit_on_failure": True}
 """With these settings a session makes one attempt to connect."""
@@ -36,32 +36,32 @@ class Listener:
 
     def __init__(self, session: zenoh.Session, *patterns: str) -> None:
         self._lock = threading.Lock()
-        self._heard: list[tuple[str, bytes]] = []
-        self._subscribers = [session.declare_subscriber(pattern, self._hear) for pattern in patterns]
+        self._messages: list[tuple[str, bytes]] = []
+        self._subscribers = [session.declare_subscriber(pattern, self._receive) for pattern in patterns]
 
-    def _hear(self, sample: zenoh.Sample) -> None:
+    def _receive(self, sample: zenoh.Sample) -> None:
         with self._lock:
-            self._heard.append((str(sample.key_expr), sample.payload.to_bytes()))
+            self._messages.append((str(sample.key_expr), sample.payload.to_bytes()))
 
     @property
     def anything(self) -> bool:
-        """Whether anything was heard."""
+        """Whether any message arrived."""
         with self._lock:
-            return bool(self._heard)
+            return bool(self._messages)
 
     def count(self, payload: bytes, key: str = "") -> int:
-        """Return how often a payload was heard, on one key or on all."""
+        """Return how often a payload arrived, on one key or on all keys."""
         with self._lock:
-            return sum(said == payload and (not key or on == key) for on, said in self._heard)
+            return sum(data == payload and (not key or topic == key) for topic, data in self._messages)
 
 
 class CheckSessions:
     """The sessions of one check, as a context manager.
 
     Args:
-        folder: Made by `gemuco security init`.
-        running: Endpoint of a router that runs already; None starts one.
-        weaken: Weakens configurations; for tests of the check.
+        folder: Folder of `gemuco security init`.
+        running: Endpoint of a running router; None starts a router.
+        weaken: Function that weakens configurations, for tests of the check.
 
     Attributes:
         robot: Name of the attacked robot.
@@ -76,7 +76,7 @@ class CheckSessions:
         self.plan, self.folder, self.robot = plan, folder, next(iter(plan.robots))
         self._weaken = weaken or (lambda name, configured: None)
         self._sessions: list[zenoh.Session] = []
-        self._kept: list[Any] = []
+        self._entities: list[Any] = []
         self.is_running = running is not None
         self.router = running or self.another_endpoint()
         self.hal = "" if running else self.another_endpoint()
@@ -110,13 +110,13 @@ class CheckSessions:
         self._weaken("hal", hal)
         self.hal_session, self.model_session = self.open(hal), self.open(model)
         for session, service in ((self.hal_session, "hal"), (self.model_session, "model")):
-            self._kept += [
+            self._entities += [
                 answer(session, self.key(service, "do", "describe"), b"true"),
                 session.liveliness().declare_token(self.key(service, "alive")),
             ]
 
     def another_endpoint(self) -> str:
-        """Return an endpoint of this machine that is free."""
+        """Return a free endpoint of this machine."""
         return f"{self.plan.protocol}/127.0.0.1:{_free_port(self.plan.protocol)}"
 
     def of(self, name: str) -> dict[str, Any]:
@@ -125,16 +125,16 @@ class CheckSessions:
         return copy.deepcopy(role_file(path))
 
     def outside(self, name: str, where: str = "") -> dict[str, Any]:
-        """Return a member's role file as a thief would use it: to connect to the router or elsewhere, without rules."""
-        stolen = self.of(name)
+        """Return a member's role file as an attacker uses it: for a client of the router or `where`, without rules."""
+        copied = self.of(name)
         for part in ("access_control", "downsampling", "low_pass_filter", "listen"):
-            stolen.pop(part, None)
-        stolen["transport"]["auth"]["usrpwd"].pop("dictionary", None)
-        stolen |= {"mode": "client", "connect": ONCE | {"endpoints": [where or self.router]}}
-        return stolen
+            copied.pop(part, None)
+        copied["transport"]["auth"]["usrpwd"].pop("dictionary", None)
+        copied |= {"mode": "client", "connect": ONCE | {"endpoints": [where or self.router]}}
+        return copied
 
     def open(self, configuration: dict[str, Any]) -> zenoh.Session:
-        """Open a session that is closed with the stage.
+        """Open a session that is closed at the end of the check.
 
         Raises:
             zenoh.ZError: The session is refused.
@@ -164,7 +164,7 @@ class CheckSessions:
             return self.open(configured)
         except zenoh.ZError:
             raise ServiceError(
-                f"'{name}' is refused at {where or self.router} with its own role file, so the check proves nothing."
+                f"'{name}' is refused at {where or self.router} with its own role file, so the check is impossible."
             ) from None
 
     def key(self, *parts: str) -> str:
@@ -172,11 +172,11 @@ class CheckSessions:
         return keys.robot_key(self.robot, *parts)
 
 
-def until(happened: Callable[[], object], within: float = WITHIN) -> bool:
-    """Whether a condition becomes true within some time [s]."""
+def until(condition: Callable[[], object], within: float = WITHIN) -> bool:
+    """Whether a condition becomes true within a time [s]."""
     deadline = time.monotonic() + within
     while time.monotonic() < deadline:
-        if happened():
+        if condition():
             return True
         time.sleep(PAUSE)
     return False

@@ -1,4 +1,4 @@
-"""`gemuco security init`: makes the files that a folder lacks, and never replaces a certificate or a password."""
+"""`gemuco security init`: makes missing files in a folder, and never replaces a certificate or a password."""
 
 import json
 import secrets
@@ -17,12 +17,12 @@ from services.wire.connect import role_file
 CA_KEY = "authority.key"
 CA = "authority.pem"
 ALSO_REACHED_AS = ("127.0.0.1", "localhost")
-"""These names are in the certificate of every listening member, so that it can be tried on its own machine."""
+"""The certificate of every listening member has these names too, so that it can be tested on its own machine."""
 
 
 @dataclass(slots=True)
 class Changes:
-    """Names of the files that were made, changed (with the parts that differ) and left alone."""
+    """Names of files that were made, changed (with the changed parts) and left unchanged."""
 
     made: list[str] = field(default_factory=list)
     changed: dict[str, str] = field(default_factory=dict)
@@ -30,7 +30,7 @@ class Changes:
 
 
 def init(folder: Path, plan: InstallationPlan) -> Changes:
-    """Make the authority and the missing role files, and update the others to the plan.
+    """Make the authority and the missing role files, and update existing role files to the plan.
 
     Existing files keep their certificate and password. Entries that depend on other members (passwords, access control)
     are updated.
@@ -51,7 +51,7 @@ def init(folder: Path, plan: InstallationPlan) -> Changes:
                 known[name] = _new(authority, folder, plan, name)
         for name in plan.members():
             configured = configuration(plan, name, known, authority.certificate)
-            _bring(folder / f"{name}.json", json.loads(text_of(configured)), changes)
+            _update(folder / f"{name}.json", json.loads(text_of(configured)), changes)
         if InstallationPlan.read(folder) != plan:
             write(folder / FILE, plan.model_dump_json(indent=1) + "\n", 0o644)
     except OSError as error:
@@ -85,16 +85,15 @@ def planned(
         if getattr(before, name) != getattr(after, name):
             raise ServiceError(
                 f"'{folder}' was made with {name} {_listed(getattr(before, name))}, not "
-                f"{_listed(getattr(after, name))}: "
-                "that is in every role file. Make another folder, or edit plan.json, remove the role files, and run "
-                "`gemuco security init` on it again."
+                f"{_listed(getattr(after, name))}, and every role file has this setting. Make another folder, or edit "
+                "plan.json, remove the role files, and run `gemuco security init` on the folder again."
             )
     for robot, hosts in robots.items():
         if before.robots.get(robot, hosts) != hosts:
-            was = ", ".join(f"{service} at {host}" for service, host in before.robots[robot].items())
+            places = ", ".join(f"{service} at {host}" for service, host in before.robots[robot].items())
             raise ServiceError(
-                f"'{folder}' has robot '{robot}' with {was}. To move it, edit plan.json, remove *.{robot}.json, and "
-                "run `gemuco security init` on it again."
+                f"'{folder}' has robot '{robot}' with {places}. To move it, edit plan.json, remove *.{robot}.json, and "
+                "run `gemuco security init` on the folder again."
             )
     return InstallationPlan.of(
         **after.model_dump() | {"robots": {**before.robots, **{name: dict(hosts) for name, hosts in robots.items()}}}
@@ -102,7 +101,7 @@ def planned(
 
 
 def placed(hal: str, model: str = "", vision: str = "", simulator: str = "") -> dict[str, str]:
-    """Return service -> host; a service without a host of its own runs beside the HAL."""
+    """Return the host of each service; a service without a host of its own runs on the HAL's host."""
     hosts = {"simulator": simulator or hal, "hal": hal, "vision": vision or hal, "model": model or hal}
     return {service: hosts[service] for service in LISTENING}
 
@@ -112,32 +111,32 @@ def _listed(value: str | list[str]) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class _KeptAuthority:
+class _FolderAuthority:
     """Certificate of the authority, and its key if the folder holds it."""
 
     certificate: bytes
     key: bytes | None
 
 
-def _authority(folder: Path, changes: Changes) -> _KeptAuthority:
+def _authority(folder: Path, changes: Changes) -> _FolderAuthority:
     certificate, key = folder / CA, folder / CA_KEY
     if not certificate.exists() and not key.exists():
-        made = Authority.new().identity
-        write(key, made.key.decode())
-        write(certificate, made.certificate.decode(), 0o644)
+        identity = Authority.new().identity
+        write(key, identity.key.decode())
+        write(certificate, identity.certificate.decode(), 0o644)
         changes.made += [CA, CA_KEY]
-        return _KeptAuthority(made.certificate, made.key)
+        return _FolderAuthority(identity.certificate, identity.key)
     if not certificate.exists():
-        raise ServiceError(f"'{folder}' has {CA_KEY} and no {CA}: bring that one back, or make another folder.")
+        raise ServiceError(f"'{folder}' has {CA_KEY} and no {CA}: put {CA} back, or make another folder.")
     changes.left.append(CA)
-    return _KeptAuthority(certificate.read_bytes(), key.read_bytes() if key.exists() else None)
+    return _FolderAuthority(certificate.read_bytes(), key.read_bytes() if key.exists() else None)
 
 
-def _new(authority: _KeptAuthority, folder: Path, plan: InstallationPlan, name: str) -> Secrets:
+def _new(authority: _FolderAuthority, folder: Path, plan: InstallationPlan, name: str) -> Secrets:
     if authority.key is None:
         raise ServiceError(
-            f"{name}.json is missing, and signing a certificate for it needs '{folder / CA_KEY}'. Bring the key "
-            "back from where it is kept, and take it away again afterwards."
+            f"{name}.json is missing, and signing a certificate for it needs '{folder / CA_KEY}'. Put the key "
+            "back from its offline copy, and remove it again afterwards."
         )
     hosts = plan.hosts(name)
     if hosts:
@@ -147,8 +146,8 @@ def _new(authority: _KeptAuthority, folder: Path, plan: InstallationPlan, name: 
     return Secrets(signer.sign(name, hosts, until), secrets.token_urlsafe(24))
 
 
-def _bring(path: Path, configured: dict[str, Any], changes: Changes) -> None:
-    """Write a role file if it is missing or differs in content; formatting does not count."""
+def _update(path: Path, configured: dict[str, Any], changes: Changes) -> None:
+    """Write a role file if it is missing or its content differs, apart from formatting."""
     if not path.exists():
         changes.made.append(path.name)
     else:
@@ -162,7 +161,7 @@ def _bring(path: Path, configured: dict[str, Any], changes: Changes) -> None:
 
 
 def _differing(before: Mapping[str, Any], after: Mapping[str, Any], prefix: str = "") -> list[str]:
-    """Return the names, down to the second level, under which two configurations differ; values stay secret."""
+    """Return the names of differing parts, down to the second level; values stay secret."""
     names = []
     for name in sorted({*before, *after}):
         old, new = before.get(name), after.get(name)

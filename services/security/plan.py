@@ -17,7 +17,7 @@ FILE = "plan.json"
 LISTENING = ("simulator", "hal", "vision", "model")
 """These services accept direct links from other services."""
 LINKS = {"vision": ("simulator",), "model": ("hal", "vision"), "recorder": LISTENING}
-"""Service -> services that it dials directly, in addition to the router; the HAL dials no other service."""
+"""Each service opens links to these services, in addition to the router; the HAL opens no other link."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 _HOST = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]*[A-Za-z0-9])?")
 
@@ -36,7 +36,7 @@ class InstallationPlan(BaseModel):
     Attributes:
         protocol: Protocol of every link.
         days: Validity of a certificate [days].
-        routers: HOST:PORT of each router; services dial the first, people the first that answers.
+        routers: HOST:PORT of each router; services connect to the first, people to the first that answers.
         robots: Robot -> service -> host.
         people: Name -> role and robots.
     """
@@ -55,9 +55,7 @@ class InstallationPlan(BaseModel):
     def _check_names(cls, entries: dict[str, object]) -> dict[str, object]:
         for name in entries:
             if not _NAME.fullmatch(name) or name in ROLES.keys() - set(PEOPLE) or name == ROUTER:
-                raise ValueError(
-                    f"'{name}' cannot be a name here: use letters, digits, _ and -, and no name of a service"
-                )
+                raise ValueError(f"'{name}' cannot be a name here: use letters, digits, _ and -, but no service's name")
         return entries
 
     @field_validator("robots")
@@ -68,7 +66,7 @@ class InstallationPlan(BaseModel):
                 raise ValueError(f"robot '{robot}' needs a host for each of {', '.join(LISTENING)}")
             for host in hosts.values():
                 if not is_host(host):
-                    raise ValueError(f"'{host}' of robot '{robot}' is not a host's name or address; leave out ports")
+                    raise ValueError(f"'{host}' of robot '{robot}' is not a host's name or address without a port")
         return entries
 
     @field_validator("routers")
@@ -113,7 +111,7 @@ class InstallationPlan(BaseModel):
         }
 
     def hosts(self, name: str) -> list[str]:
-        """Return names and addresses under which others reach this member; empty if it never listens."""
+        """Return the names and addresses of a member that listens; empty for other members."""
         if name == ROUTER:
             return [_host(router) for router in self.routers]
         service, _, robot = name.partition(".")
@@ -121,7 +119,7 @@ class InstallationPlan(BaseModel):
 
 
 def with_port(place: str) -> str:
-    """Return `HOST` as `HOST:7447`; a port that is given stays.
+    """Return `HOST` as `HOST:7447`, and `HOST:PORT` unchanged.
 
     Raises:
         ValueError: The text is neither HOST nor HOST:PORT.
@@ -150,9 +148,9 @@ def dialled(host: str, port: str | int) -> str:
 
 
 def listened(host: str, port: str | int) -> str:
-    """Return `ADDRESS:PORT` to listen on for a member that is reached as `host`.
+    """Return `ADDRESS:PORT` to listen on for a member on `host`.
 
-    Every address but on loopback, because a host may have several names.
+    The address is that of all interfaces, because a host may have several names; a loopback host listens on loopback.
     """
     if is_loopback(host):
         return dialled("127.0.0.1" if host == "localhost" else host, port)

@@ -15,10 +15,10 @@ VERBS = {"simulator": "simulate", "hal": "hal", "vision": "vision", "model": "se
 
 
 def report(folder: Path, plan: InstallationPlan, changes: Changes) -> None:
-    """Print what was made and changed, and what to do with it."""
+    """Print the made and changed files, and the next steps."""
     _list("made", changes.made)
     for name, parts in changes.changed.items():
-        typer.echo(f"changed  {name}: {parts}. Copy it again, and restart what uses it.")
+        typer.echo(f"changed  {name}: {parts}. Copy this file again, and restart the programs that use it.")
     _list("left", changes.left)
     known = {f"{name}.json" for name in plan.members()} | {FILE}
     for path in sorted(folder.glob("*.json")):
@@ -31,11 +31,11 @@ def report(folder: Path, plan: InstallationPlan, changes: Changes) -> None:
         typer.secho(line, fg=typer.colors.YELLOW)
     if (folder / CA_KEY).exists():
         typer.secho(
-            f"Keep {folder / CA_KEY} offline: its holder can impersonate every member. It is only needed to add and to "
-            "renew members.",
+            f"Keep {folder / CA_KEY} offline: its holder can impersonate every member. The key is only needed "
+            "to add and renew members.",
             fg=typer.colors.YELLOW,
         )
-    typer.echo(f"Prove it with: gemuco security check {folder}")
+    typer.echo(f"Check with: gemuco security check {folder}")
 
 
 def _list(word: str, names: Iterable[str]) -> None:
@@ -48,17 +48,17 @@ def _destinations(folder: Path, plan: InstallationPlan) -> Iterable[str]:
     for name, member in plan.members().items():
         path = folder / f"{name}.json"
         listens = role_file(path).get("listen", {}).get("endpoints", [])
-        opened = f"   [{plan.hosts(name)[0]}, listens on {', '.join(listens)}]" if listens else ""
+        place = f"   [{plan.hosts(name)[0]}, listens on {', '.join(listens)}]" if listens else ""
         if name == ROUTER:
-            yield f"  gemuco router --connect {path}{opened}"
+            yield f"  gemuco router --connect {path}{place}"
         elif member.role in PEOPLE:
             yield f"  gemuco top ROBOT --connect {path}   [{member.role}]"
         else:
-            yield f"  gemuco {VERBS[member.role]} {member.robots[0]} --connect {path}{opened}"
+            yield f"  gemuco {VERBS[member.role]} {member.robots[0]} --connect {path}{place}"
 
 
 def _expiring(folder: Path, plan: InstallationPlan) -> Iterable[str]:
     for name in plan.members():
         until = certificate_end(role_file(folder / f"{name}.json"))
         if until is not None and until - datetime.now(UTC) < WARN_BEFORE:
-            yield f"{name}.json ends on {until:%Y-%m-%d}: remove it and run this again to renew it."
+            yield f"{name}.json ends on {until:%Y-%m-%d}: remove the file and run this command again to renew it."

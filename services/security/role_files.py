@@ -20,7 +20,7 @@ from services.wire.session import common_settings, port
 ROUTER_SESSIONS = 256
 SERVICE_SESSIONS = 32
 PERSON_OPENS_MS = 2000
-"""A person's session has this long to open [ms], because certificates and passwords take some round trips."""
+"""A person's session has this time [ms] to open, because certificates and passwords need several round trips."""
 ROUTER_ACCEPTS_MS = 3000
 
 
@@ -74,7 +74,7 @@ def configuration(plan: InstallationPlan, name: str, known: Mapping[str, Secrets
 
 
 def write(path: Path, content: str, mode: int = 0o600) -> None:
-    """Write a file whole or not at all, with `mode` from the first byte on."""
+    """Write a whole file or none, with the permissions `mode` from the first byte on."""
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
         with os.fdopen(handle, "w") as file:

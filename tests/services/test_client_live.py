@@ -91,7 +91,7 @@ def test_a_fast_consumer_gets_each_message_once(client: Client, robot: str) -> N
         seen = [next(live).cycle for _ in range(20)]
         model.silence()
         assert seen == sorted(set(seen))
-        with pytest.raises(TooSlow, match=rf"'model' service of robot '{robot}' is there, but no 'anomaly' came"):
+        with pytest.raises(TooSlow, match=rf"'model' service of robot '{robot}' is alive, but no 'anomaly' came"):
             list(client.anomalies(deadline=0.5))
 
 
@@ -171,7 +171,7 @@ def test_health_tells_who_comes_and_goes_and_what_each_says(client: Client, robo
             assert next(live).alive == {"hal", "model"}
         assert next(live).alive == {"model"}
     assert next(live).alive == frozenset()
-    with pytest.raises(ServiceUnavailable, match=rf"Nothing was heard of robot '{robot}' for 0\.2 s"):
+    with pytest.raises(ServiceUnavailable, match=rf"No message of robot '{robot}' arrived for 0\.2 s"):
         list(client.health(deadline=0.2))
 
 

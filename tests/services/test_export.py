@@ -94,10 +94,10 @@ def test_what_cannot_be_exported_is_told(tmp_path: Path, capsys: pytest.CaptureF
         export(files, tmp_path / "out", "xls")
     run_export(files, tmp_path / "out", "csv")
     assert f"10 rows in {tmp_path / 'out' / 'hal.sample.csv'}" in capsys.readouterr().out
-    with pytest.raises(RecordingError, match="none is replaced"):
+    with pytest.raises(RecordingError, match="they are not replaced"):
         export(files, tmp_path / "out", "csv")
     (tmp_path / "file").write_text("")
-    with pytest.raises(RecordingError, match=r"cannot be written|none is replaced"):
+    with pytest.raises(RecordingError, match=r"cannot be written|they are not replaced"):
         export(files, tmp_path / "file" / "out", "csv")
 
 

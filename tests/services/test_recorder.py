@@ -158,8 +158,8 @@ def test_who_comes_goes_and_commands_is_in_the_log(robot: str, session: zenoh.Se
         _eventually(lambda: [line for line in log_lines(path) if line["kind"] == "gone"])
     said = [line["message"] for line in log_lines(path) if line["kind"] in ("alive", "gone", "holder")]
     assert said == [
-        "The 'model' service came.", "anna commands the robot.", "No client commands the robot.",
-        "ben commands the robot.", "The 'model' service went.",
+        "The 'model' service started.", "anna commands the robot.", "No client commands the robot.",
+        "ben commands the robot.", "The 'model' service ended.",
     ]  # fmt: skip
 
 
@@ -224,7 +224,7 @@ def test_losses_are_counted_and_written_into_the_file(robot: str, session: zenoh
     assert losses(path) == {"dropped": 2, "missed": 3, "malformed": 0}
     told = {line["kind"]: (line["key"], line["count"]) for line in log_lines(path) if "count" in line}
     assert told == {"dropped": (keys.update(robot), 2), "missed": (keys.update(robot), 3)}
-    assert recorder.missing(found.counters()) == ("Of its messages 2 could not be written, 3 never arrived here.")
+    assert recorder.missing(found.counters()) == ("Of the messages, 2 could not be written, 3 never arrived here.")
 
 
 def test_senders_of_one_key_are_counted_apart() -> None:
@@ -377,7 +377,7 @@ def test_a_full_disk_ends_the_file_and_a_new_one_begins_when_there_is_space(
         writer.add(keys.update(robot), number, messages.encode(_update(number), seq=number))
         writer.commit(number)
     assert writer.losses.totals()["dropped"] == 4
-    writer._limits, writer._again = Limits(least_free=free // 4), 0.0
+    writer._limits, writer._retry_at = Limits(least_free=free // 4), 0.0
     writer.add(keys.update(robot), 5, messages.encode(_update(5), seq=5))
     writer.finish(6)
     assert writer.failure == ""
@@ -394,7 +394,7 @@ def _limited(robot: str, folder: str) -> None:
     writer.open(0)
     for number in range(900):
         writer.add(keys.update(robot), number, messages.encode(_update(number), seq=number, boot=number % 8 + 1))
-        writer._again = 0.0
+        writer._retry_at = 0.0
         if number % 50 == 0:
             writer.commit(number)
     writer.finish(900)

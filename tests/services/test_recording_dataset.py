@@ -105,7 +105,7 @@ def test_what_a_camera_saw_is_merged_by_age_and_may_be_missing(tmp_path: Path) -
 
 def test_data_that_do_not_fit_are_one_sentence(tmp_path: Path) -> None:
     files = record(tmp_path / "run.mcap", "arm", 100)
-    with pytest.raises(DatasetError, match="recordings of 'arm', and the robot file is that of 'leg'"):
+    with pytest.raises(DatasetError, match="recordings of 'arm', but the robot file is of 'leg'"):
         select(_robot("leg"), files)
     with pytest.raises(DatasetError, match="Give it with --condition; the robot file has duster, none"):
         select(_robot(conditions=["duster", "none"]), files)
@@ -125,7 +125,7 @@ def test_data_that_do_not_fit_are_one_sentence(tmp_path: Path) -> None:
             files,
         )
     still = record(tmp_path / "bad.mcap", "arm", 100, make=lambda number: a_sample(number, complete=False))
-    with pytest.raises(DatasetError, match="These recordings hold nothing to train from: 0 of 20 samples"):
+    with pytest.raises(DatasetError, match="These recordings hold no sample to train from: 0 of 20 samples"):
         select(_robot(), still)
 
 

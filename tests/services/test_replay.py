@@ -166,7 +166,7 @@ def test_a_replay_is_refused_where_a_hal_runs_and_what_cannot_be_played_is_told(
         session.put(keys.command(robot), messages.encode(Command(signal="a", values=np.ones(1), cycle=1, hal_boot=1)))
         _eventually(lambda: recorder.writer.losses.malformed or recorder.writer.written)
     close_session(session)
-    with pytest.raises(RecordingError, match="nothing of robot"):
+    with pytest.raises(RecordingError, match="There are no messages of robot"):
         run_replay(tmp_path / "empty.mcap", stop=threading.Event())
 
 

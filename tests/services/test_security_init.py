@@ -63,7 +63,7 @@ def test_without_the_authoritys_key_nothing_new_is_signed(tmp_path: Path) -> Non
     (folder / CA_KEY).unlink()
     assert again(folder) == (set(), set())
     (folder / "viewer.json").unlink()
-    with pytest.raises(ServiceError, match="Bring the key back from where it is kept"):
+    with pytest.raises(ServiceError, match="Put the key back from its offline copy"):
         again(folder)
 
 
