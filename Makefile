@@ -75,6 +75,7 @@ fuzz: $(STAMP)    ## a hundred thousand bad messages on every key of a running r
 	$(BIN)/python tests/system/fuzz_messages.py --count 100000
 
 mutation: $(STAMP)  ## 300 small changes of drivers, protocols and safety; the share that the fast tests notice, half an hour
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[mutation]'
 	$(BIN)/python -m studies.mutation --count 300
 
 test-network: $(STAMP)  ## HAL and model on a link that is cut, slow or lossy, over TCP and QUIC (docs/network.md); needs root
