@@ -141,7 +141,7 @@ class Processes:
         (200, [200], []),
         (100, [200, 100], ["keep 200 Hz: 100 of 800", "again at 100 Hz"]),
         (50, [200, 100, 50], ["again at 100 Hz", "again at 50 Hz"]),
-        (10, [200, 100, 50], ["again at 50 Hz", "keep 50 Hz", "played all the same"]),
+        (10, [200, 100, 50], ["again at 50 Hz", "keep 50 Hz", "played in spite of this"]),
     ],
 )
 def test_a_machine_that_does_not_keep_the_rate_plays_at_half_of_it(
