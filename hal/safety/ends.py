@@ -71,8 +71,7 @@ class EndsOfEffort(Limit):
         self.needs = "position" if name == "range" else name
         self.feedback = self._source = source
         span = source.high - source.low
-        scale = np.where(np.isfinite(span), span, np.maximum(np.abs(source.low), np.abs(source.high)))
-        self._band = FADE_BAND * np.where(np.isfinite(scale), scale, 1.0)
+        self._band = FADE_BAND * np.where(np.isfinite(span), span, 1.0)  # an open range has no span
 
     @override
     def limit(self, desired: np.ndarray, state: CycleState) -> np.ndarray:
