@@ -23,11 +23,11 @@ from services.show import Progress
 EPISODE = 10.0
 """An episode has this length [s of the robot's time]; held-out data are whole episodes."""
 MARGIN = 0.05
-"""A sample may lie outside of its limits by this share of the range between them."""
+"""A sample may exceed its limits by this share of their range."""
 STARVED = 30.0
-"""Collecting is given up after this robot time [s] without a usable sample."""
+"""Collecting stops after this robot time [s] without a usable sample."""
 BUS = "bus"
-"""Data recorded on a bus get this condition if the robot file has no conditions and none was given."""
+"""Data recorded on a bus have this condition if neither the robot file nor the request names a condition."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,7 @@ class Request:
 
     Attributes:
         conditions: Names of conditions; all of the robot file's if empty.
-        samples: Samples per condition; the robot file's number, or all of the taught postures, if None.
+        samples: Samples per condition; if None, the number of the robot file, or all taught postures.
         postures: A CSV file of taught postures to play in place of random motion.
     """
 
@@ -55,7 +55,7 @@ class Collection:
     Attributes:
         dataset: The episodes.
         robot_time: Time that the robot moved [s].
-        wall_time: Time that this took [s].
+        wall_time: Time that the recording took [s].
     """
 
     dataset: Dataset
@@ -84,17 +84,17 @@ def collect_direct(
     Args:
         robot: The robot file.
         variant: Variant of the simulator; the designer's if None.
-        seed: Chooses the robot among those of the variant, its noise, and the motion.
+        seed: Seed of the robot of this variant, its noise, and the motion.
         request: Conditions, number of samples and postures to record.
         progress: Called with the share done, 0 to 1, and a line of text.
 
     Raises:
-        ConfigError: The robot file names no simulator or no motion; an unknown variant or condition.
+        ConfigError: The robot file names no simulator or no motion, or the variant or a condition is unknown.
         BadPostures, NowhereToGo, CollectionStopped: Too few samples were recorded.
     """
     config, simulator = collect_config(robot), simulator_of(robot)
     variant = variant_of(robot, variant)
-    # Each once: a repeated motion would be held out to measure what was learned from its twin.
+    # Each condition once: otherwise the held-out data could repeat a motion of the training data.
     names = dict.fromkeys(request.conditions or robot.conditions or (None,))
     conditions = [condition_of(robot, name) for name in names]
     motions = [_motion(robot, config, condition, seed, request) for condition in conditions]
@@ -121,7 +121,7 @@ def collect_bus(
     Args:
         robot: The robot file.
         seed: Seed of the motion.
-        request: As for `collect_direct`, with at most one condition, of any name: the body's during the recording.
+        request: As for `collect_direct`, with at most one condition of any name, that of the body during the recording.
         progress: Called with the share done, 0 to 1, and a line of text.
 
     Raises:
@@ -132,17 +132,17 @@ def collect_bus(
     """
     if len(request.conditions) > 1:
         raise CollectionStopped(
-            f"A running robot is under one condition at a time, not {', '.join(request.conditions)}: collect each by "
-            "itself, and change the tool in between."
+            f"A running robot has one condition at a time, not {', '.join(request.conditions)}: collect each condition "
+            "separately, and change the tool between them."
         )
     config = collect_config(robot)
-    given = request.conditions[0] if request.conditions else None
-    condition = condition_of(robot, given if given in robot.conditions else None)
+    name = request.conditions[0] if request.conditions else None
+    condition = condition_of(robot, name if name in robot.conditions else None)
     motion = _motion(robot, config, condition, seed, request)
     with Client(robot.robot) as client, client.lease():
         try:
             place = BusPlayground(robot, client, config.rate)
-            return _gather(robot, place, motion, config, request, given or condition or BUS, progress)
+            return _gather(robot, place, motion, config, request, name or condition or BUS, progress)
         finally:
             client.disable()
 
@@ -187,8 +187,8 @@ def _gather(
 class SampleLimits:
     """Limits of usable values.
 
-    A value of a device must be measured and within the robot file's limits: beyond them, on a mechanical stop or with
-    slack muscles, the signals do not determine the posture. Values of a camera may be missing.
+    A value of a device must be measured and within the robot file's limits. Outside of them (on a mechanical stop, or
+    with slack muscles) the signals do not determine the posture. Values of a camera may be missing.
 
     Attributes:
         low: Least usable value of every element [its unit], shape (layout.size,).
@@ -215,11 +215,11 @@ class _Table:
         self._config, self._condition = config, condition
         self._layout: Layout = layout_of(robot)
         self._limits = SampleLimits(robot, self._layout)
-        self._fed = config.settle
+        self._last_usable = config.settle
         self.rows: list[np.ndarray] = []
 
     def add(self, values: Values, elapsed: float) -> None:
-        """Add a sample of the robot's time [s] if it is usable.
+        """Add a sample if it is usable; `elapsed` is the robot's time [s].
 
         Raises:
             CollectionStopped: No sample was usable for `STARVED`.
@@ -230,17 +230,17 @@ class _Table:
         usable = self._limits.usable(row)
         if usable.all():
             self.rows.append(row)
-            self._fed = elapsed
-        elif elapsed - self._fed > STARVED:
+            self._last_usable = elapsed
+        elif elapsed - self._last_usable > STARVED:
             index, limits = int(np.argmin(usable)), self._limits
             raise CollectionStopped(
                 f"No sample was usable for {STARVED:g} s: {self._layout.element(index)} is {row[index]:.4g}, and must "
-                f"be measured, from {limits.low[index]:.4g} to {limits.high[index]:.4g}. "
-                f"{len(self.rows)} were recorded."
+                f"be measured, from {limits.low[index]:.4g} to {limits.high[index]:.4g}. {len(self.rows)} samples were "
+                "recorded."
             )
 
     def dataset(self, limit: int | None) -> Dataset:
-        """Return at most `limit` rows, in episodes.
+        """Return at most `limit` rows as episodes.
 
         Raises:
             CollectionStopped: The table is empty.

@@ -1,7 +1,7 @@
 """Measured data from text files, described by a YAML file: signal and unit of every column, and settings of training.
 
-A description names files, the columns of every signal, and the same `network`, `structure` and `training` sections as a
-robot file (docs/tutorial.md). A fault of the description or of the data is reported in one sentence.
+A description names files and the columns of every signal, and has the sections `network`, `structure` and `training` of
+a robot file (docs/tutorial.md). A fault in the description or the data is reported in one sentence.
 """
 
 import csv
@@ -37,10 +37,10 @@ CONVERSIONS = {
     "kgf": ("N", 9.80665),
     "N mm": ("N m", 1e-3),
 }
-"""Unit in a file -> SI unit, and the factor to multiply by."""
+"""Each unit in a file has this SI unit and this factor."""
 
 MISSING = {"", "nan", "na", "none", "null"}
-"""A cell with one of these texts, in small letters, was not measured."""
+"""A cell with one of these texts, in lower case, was not measured."""
 
 RANGE = re.compile(r"\{(\d+)\.\.(\d+)\}")
 
@@ -108,15 +108,15 @@ class MeasuredConfig(Section):
     header: bool = True
     """Whether the first line names the columns."""
     cut_to_shortest: bool = False
-    """Whether the files of a folder may end at different rows; only rows that all files have are used."""
+    """Whether the files of a folder may have different numbers of rows; only rows that all files have are used."""
     signals: dict[str, MeasuredSignalConfig] = Field(min_length=1)
     time: TimeConfig | None = None
     """Time column; without it a file is one episode."""
     conditions: dict[str, str] = Field(default_factory=dict)
-    """Pattern of an episode's name -> condition of the body; if empty, all episodes have one condition."""
+    """Condition of the body by pattern of an episode's name; if empty, all episodes have the same condition."""
     together: tuple[tuple[str, ...], ...] = ()
-    """Groups of patterns of episodes' names. Repetitions of one motion become one episode, so that no repetition is
-    held out to measure what was learned from another."""
+    """Groups of patterns of episodes' names. Repetitions of a motion become one episode; otherwise the held-out data
+    could repeat a motion of the training data."""
     network: NetworkConfig = NetworkConfig()
     structure: StructureConfig = StructureConfig()
     training: TrainingConfig = TrainingConfig()
@@ -180,7 +180,7 @@ def read_measured(config: MeasuredConfig, folder: Path) -> Dataset:
     for pattern in config.episodes:
         matches = sorted(folder.glob(pattern), key=_natural)
         if not matches:
-            raise DatasetError(f"Nothing in '{folder}' matches '{pattern}'. Is that the folder of the recording?")
+            raise DatasetError(f"Nothing in '{folder}' matches '{pattern}'. Is this the folder of the recording?")
         places.update(dict.fromkeys(matches))
     episodes = [(place.name, episode) for place in places for episode in _episodes(config, place)]
     return Dataset(config.layout, _together(config, episodes))
@@ -189,16 +189,16 @@ def read_measured(config: MeasuredConfig, folder: Path) -> Dataset:
 def _together(config: MeasuredConfig, episodes: list[tuple[str, Episode]]) -> tuple[Episode, ...]:
     """Return the episodes with every group joined into one."""
     merged: list[Episode] = []
-    left = dict(enumerate(episodes))
+    remaining = dict(enumerate(episodes))
     for group in config.together:
-        chosen = [i for i, (name, _) in left.items() if any(fnmatch(name, pattern) for pattern in group)]
-        parts = [left.pop(index)[1] for index in chosen]
+        chosen = [i for i, (name, _) in remaining.items() if any(fnmatch(name, pattern) for pattern in group)]
+        parts = [remaining.pop(index)[1] for index in chosen]
         if len({part.condition for part in parts}) != 1:
-            fault = "are of several conditions; they must be of one" if parts else "do not exist"
+            fault = "have several conditions; they must have the same one" if parts else "do not exist"
             raise DatasetError(f"together: the episodes that match {', '.join(group)} {fault}.")
         values = {name: np.concatenate([part.values[name] for part in parts]) for name in config.signals}
         merged.append(Episode(parts[0].condition, values))
-    return (*merged, *(episode for _, episode in left.values()))
+    return (*merged, *(episode for _, episode in remaining.values()))
 
 
 def _episodes(config: MeasuredConfig, place: Path) -> Iterator[Episode]:
@@ -241,10 +241,10 @@ def _condition(config: MeasuredConfig, name: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class _Table:
-    """File with the places of its columns and its cells as text."""
+    """File with the index of each column and its cells as text."""
 
     path: Path
-    places: Mapping[str, int]
+    indices: Mapping[str, int]
     cells: list[list[str]]
     first_line: int
 
@@ -272,15 +272,15 @@ class _Table:
     def columns(self, names: tuple[str, ...]) -> np.ndarray:
         """Return numbers, shape (rows, len(names)); NaN where a cell is empty."""
         for name in names:
-            if name not in self.places:
-                known = list(self.places)
+            if name not in self.indices:
+                known = list(self.indices)
                 shown = ", ".join(known[:12]) + (f" and {len(known) - 12} more" if len(known) > 12 else "")
                 raise DatasetError(f"'{self.path}' has no column '{name}'. Columns: {shown}.")
         numbers = np.empty((len(self.cells), len(names)))
         for column, name in enumerate(names):
-            place = self.places[name]
+            index = self.indices[name]
             for row, line in enumerate(self.cells):
-                numbers[row, column] = self._number(line[place], name, row)
+                numbers[row, column] = self._number(line[index], name, row)
         return numbers
 
     def _number(self, cell: str, name: str, row: int) -> float:

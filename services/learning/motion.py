@@ -1,4 +1,4 @@
-"""Motion of a robot while it is recorded: random postures that are safe by the designer's model, and moves to them."""
+"""Motion of a robot during a recording: random postures that are safe by the designer's model, and moves to them."""
 
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
@@ -12,13 +12,13 @@ from services.errors import ServiceError
 from services.model.model_config import CollectConfig
 
 STEP = 0.02
-"""Set-points of a move have this distance in time [s], or the HAL's period if that is longer."""
+"""Set-points of a move are this time [s] apart, or the HAL's period if it is longer."""
 PEAK = 1.875
 """The highest speed of a minimum-jerk move is this multiple of its mean speed."""
 SHORTEST = 0.1
 """A move lasts at least this long [s]."""
 CHECKS = 24
-"""A forecast is made of this many points of a move, besides its end."""
+"""This many points of a move are forecast in addition to its end."""
 BATCH = 64
 """Random postures are drawn and forecast in batches of this size."""
 TRIES = 200
@@ -61,11 +61,11 @@ class Forecast:
             self._bounds[signal] = config.constraints[signal].bounds(size, f"constraints.{signal}")
 
     def outside(self, commands: np.ndarray, no_worse_than: np.ndarray | None = None) -> np.ndarray:
-        """Return which constraints commands violate; a value that cannot be forecast counts as violated.
+        """Return the constraints that commands violate; a value that cannot be forecast violates its constraint.
 
         Args:
             commands: Commands [unit of the commanded signal], shape (n, k).
-            no_worse_than: A command, shape (k,), whose own violation is tolerated.
+            no_worse_than: A command, shape (k,); violations up to those of this command are tolerated.
 
         Returns:
             Booleans, shape (n, constraints).
@@ -86,7 +86,7 @@ class Forecast:
         return violated
 
     def blame(self, violated: np.ndarray) -> str:
-        """Return a text with the share of tries, shape (n, constraints), that each constraint refused."""
+        """Return a text with the share of tries that each constraint refused; `violated` has shape (n, constraints)."""
         shares = violated.mean(axis=0)
         return ", ".join(f"{signal} refused {share:.0%}" for signal, share in zip(self._signals, shares, strict=True))
 
@@ -108,8 +108,8 @@ def minimum_jerk(start: np.ndarray, goal: np.ndarray, speed: float, step: float)
 def random_postures(robot: RobotConfig, config: CollectConfig, condition: str | None, seed: int) -> Motion:
     """Return a motion of random postures within the limits of the commanded signal and smooth moves between them.
 
-    Every posture and every move is forecast to keep the constraints; only the first move may violate them, as much as
-    its start does.
+    By the forecast all postures and moves keep the constraints. Only the first move may violate them, as far as its
+    start does.
 
     Raises:
         ConfigError: The commanded signal has no limits, or the forecast does not fit the constraints.
@@ -143,7 +143,7 @@ def _next_posture(
     start: np.ndarray,
     tolerated: np.ndarray | None,
 ) -> np.ndarray:
-    """Return a posture, shape (k,), that keeps the constraints, as does the straight move to it."""
+    """Return a posture, shape (k,), that keeps the constraints with a straight move to it."""
     shares = np.arange(1, CHECKS + 1)[:, None] / (CHECKS + 1)
     drawn, moves = [], []
     for _ in range(TRIES):
@@ -158,18 +158,18 @@ def _next_posture(
                 break
         if len(moves) >= TRIES:
             break
-    advice = "Widen collect.constraints, or narrow the limits of the commanded signal to where they hold."
+    advice = "Widen collect.constraints, or narrow the limits of the commanded signal to postures that keep them."
     if not moves:
         shares_text = forecast.blame(np.concatenate(drawn))
-        raise NowhereToGo(f"No posture of {TRIES * BATCH} random ones keeps the constraints: {shares_text}. {advice}")
+        raise NowhereToGo(f"All {TRIES * BATCH} random postures violate the constraints: {shares_text}. {advice}")
     shares_text = forecast.blame(np.array([move.any(axis=0) for move in moves]))
     raise NowhereToGo(
-        f"No move of {len(moves)} from the robot's position keeps the constraints: {shares_text}. {advice}"
+        f"All {len(moves)} moves from the robot's position violate the constraints: {shares_text}. {advice}"
     )
 
 
 def speed_of(robot: RobotConfig, config: CollectConfig) -> float:
-    """Return the highest speed of a move [unit/s]; never above the limit's rate, which the drives could not follow."""
+    """Return the highest speed of a move [unit/s], at most the limit's rate, so that the drives can follow."""
     limit = robot.limits.get(robot.command.signal)
     return config.speed if limit is None or limit.rate is None else min(config.speed, float(np.min(limit.rate)))
 

@@ -1,4 +1,4 @@
-"""Robots to record from: simulated without a bus, as fast as it computes, or running, in real time."""
+"""Robots to record from: a simulated robot without a bus, at full speed, or a running robot in real time."""
 
 import time
 from collections.abc import Iterator, Mapping
@@ -23,7 +23,7 @@ Values = Mapping[str, np.ndarray]
 
 
 class CollectionStopped(ServiceError):
-    """The robot stopped before enough was recorded; the text gives the reason."""
+    """The robot stopped before enough samples were recorded; the text gives the reason."""
 
 
 class Playground(Protocol):
@@ -55,10 +55,10 @@ class DirectPlayground(Playground):
         self._next = robot.clock.monotonic()
         self._began = self._next
         self._cycle = 0
-        self.start = self._turn()[robot.config.command.signal].copy()
+        self.start = self._run_cycle()[robot.config.command.signal].copy()
         robot.enable()
         for _ in range(round(ENABLE_WITHIN / robot.period)):
-            self._turn()
+            self._run_cycle()
             if robot.mode in ("hold", "follow"):
                 return
         raise CollectionStopped(f"The drives did not become enabled within {ENABLE_WITHIN:g} s: mode '{robot.mode}'.")
@@ -68,7 +68,7 @@ class DirectPlayground(Playground):
         robot = self._robot
         for _ in range(max(1, round(duration / robot.period))):
             robot.command(command, self._cycle)
-            sample = self._turn()
+            sample = self._run_cycle()
             if robot.mode == "fault":
                 raise CollectionStopped(f"The robot stopped: {robot.fault_text}")
             if self._cycle % self._every == 0:
@@ -78,7 +78,7 @@ class DirectPlayground(Playground):
     def elapsed(self) -> float:
         return self._robot.clock.monotonic() - self._began
 
-    def _turn(self) -> Values:
+    def _run_cycle(self) -> Values:
         sample, _ = self._robot.cycle()
         self._cycle = sample.cycle
         self._next += self._robot.period

@@ -36,11 +36,13 @@ def picture(path: Path, title: str = "", rows: int = 1, columns: int = 1, **opti
 def plot_history(history: History, title: str, path: Path) -> None:
     """Draw the learning curve into a PNG."""
     with picture(path, figsize=(8, 4.5)) as (axis,):
-        axis.semilogy(history.train, color="tab:blue", label="training data, while learned")
+        axis.semilogy(history.train, color="tab:blue", label="training data")
         axis.semilogy(history.held_out, color="tab:orange", label="held-out data")
-        axis.axvline(history.best_epoch, color="0.6", linestyle=":", label=f"kept: {history.best:.4g} held out")
+        axis.axvline(
+            history.best_epoch, color="0.6", linestyle=":", label=f"best epoch: {history.best:.4g} on held-out data"
+        )
         if history.resumed:
-            axis.axvline(history.resumed, color="0.8", label="went on after an interruption")
+            axis.axvline(history.resumed, color="0.8", label="continued after an interruption")
         axis.set_title(title)
         axis.set_xlabel("epoch")
         axis.set_ylabel("loss [standard deviations squared]")

@@ -16,7 +16,7 @@ HOLD = "hold"
 
 
 class BadPostures(ServiceError):
-    """A file of taught postures cannot be played; nothing moved."""
+    """A file of taught postures cannot be played; the robot did not move."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,15 +28,15 @@ class Posture:
 
 
 def load_postures(path: Path, robot: RobotConfig, hold: float) -> list[Posture]:
-    """Read a CSV file: a header of elements of the commanded signal and optionally `hold` [s], then a line per posture.
+    """Read a CSV file: a header with the elements of the commanded signal perhaps `hold` [s], and a line per posture.
 
     Args:
         path: The file.
-        robot: Robot whose limits every posture must keep.
+        robot: Robot file with the limits of all postures.
         hold: Time to hold a posture [s] if the file has none.
 
     Raises:
-        BadPostures: The file has another form, or a posture is outside of the limits; the text names the line.
+        BadPostures: The file has another format, or a posture is outside of the limits; the text names the line.
     """
     try:
         with path.open(newline="") as file:
@@ -64,9 +64,9 @@ def _posture(where: str, header: list[str], cells: list[str], robot: RobotConfig
             values[name] = float(cell)
         except ValueError:
             raise BadPostures(f"{where}: {name} is '{cell}', which is not a number.") from None
-    stay = values.pop(HOLD, hold)
-    if not 0.0 <= stay < np.inf:
-        raise BadPostures(f"{where}: {HOLD} is {stay:g}; it must be a time in seconds.")
+    duration = values.pop(HOLD, hold)
+    if not 0.0 <= duration < np.inf:
+        raise BadPostures(f"{where}: {HOLD} is {duration:g}; it must be a time in seconds.")
     signal = robot.command.signal
     names = robot.signals[signal].elements
     command = np.array([values[name] for name in names])
@@ -74,9 +74,9 @@ def _posture(where: str, header: list[str], cells: list[str], robot: RobotConfig
     for index in np.flatnonzero(~((command >= low) & (command <= high))):
         raise BadPostures(
             f"{where}: {names[index]} of {command[index]:g} {robot.signals[signal].unit} is outside of its limits, "
-            f"{low[index]:g} to {high[index]:g}. Nothing was moved."
+            f"{low[index]:g} to {high[index]:g}. The robot did not move."
         )
-    return Posture(command, stay)
+    return Posture(command, duration)
 
 
 def taught(robot: RobotConfig, config: CollectConfig, postures: list[Posture]) -> Motion:

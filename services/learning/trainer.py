@@ -26,17 +26,17 @@ from services.show import Progress
 if TYPE_CHECKING:
     from gemuco.structure.determination import Structure
 
-GENTLER = 1.0 / 3.0
-"""The peak learning rate of fine-tuning is this share of the robot file's."""
+FINE_TUNING_RATE = 1.0 / 3.0
+"""The peak learning rate of fine-tuning is this share of the rate in the robot file."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrainingResult:
-    """A model and facts of its training.
+    """A model and facts about its training.
 
     Attributes:
         schema: The body schema, with the robot file's fingerprint in its manifest.
-        structure: The determined structure; None if an older model's was kept.
+        structure: The determined structure; None after fine-tuning, which keeps the structure of the model.
         history: History of the training.
         samples: Number of samples.
         seconds: Time of structure determination and training [s].
@@ -85,7 +85,7 @@ def learn(
         dataset: Episodes of one body.
         seed: Seed of everything random.
         progress: Called with the share done, 0 to 1, and a line of text.
-        drafts: A folder that keeps unfinished trainings, so that an interrupted one can go on; optional.
+        drafts: Folder for unfinished trainings, from which an interrupted training continues; optional.
         facts: Facts for the model's manifest.
 
     Raises:
@@ -130,12 +130,12 @@ def tune(
     drafts: Path | None = None,
     **facts: str,
 ) -> TrainingResult:
-    """Train a model further on few samples of the real body; network and masks stay those of the model.
+    """Continue the training of a model on few samples of the real body; network and masks stay the same.
 
     Args:
-        base: The model to begin from, such as one trained in simulation.
-        config: Settings of training; the learning rate is a third of theirs.
-        dataset: Episodes of the body as it is.
+        base: The first model, for example from simulation.
+        config: Settings of training; the learning rate is a third of the rate there.
+        dataset: Episodes of the real body.
         seed: Seed of everything random.
         progress: Called with the share done, 0 to 1, and a line of text.
         drafts: As for `learn`.
@@ -148,16 +148,16 @@ def tune(
     from gemuco.learning.train import fine_tune
 
     started = time.monotonic()
-    gentle = train_config(config, config.training.epochs, seed)
-    gentle = replace(gentle, rate=GENTLER * gentle.rate)
+    settings = train_config(config, config.training.epochs, seed)
+    settings = replace(settings, rate=FINE_TUNING_RATE * settings.rate)
     resume = None if drafts is None else drafts / "training.safetensors"
-    schema, history = fine_tune(base, dataset, gentle, progress, resume=resume)
+    schema, history = fine_tune(base, dataset, settings, progress, resume=resume)
     schema = schema.with_manifest(**facts, samples=len(dataset), held_out_loss=history.best)
     return TrainingResult(schema, None, history, len(dataset), time.monotonic() - started)
 
 
 def fits(robot: RobotConfig, folder: Path) -> bool:
-    """Whether the folder holds a sound model that was made for this robot file."""
+    """Whether the folder holds an undamaged model for this robot file."""
     try:
         return checkpoint.load(folder).manifest.get("fingerprint") == fingerprint(robot)
     except CheckpointError:
@@ -180,18 +180,18 @@ def drafts_of(folder: Path) -> Path:
     """Return the folder of unfinished trainings of the model in a folder.
 
     Raises:
-        NotWritten: The folder is a file; this is reported before the training rather than after.
+        NotWritten: The folder is a file; checked before the training, which may take long.
     """
     if folder.exists() and not folder.is_dir():
-        raise NotWritten(f"'{folder}' is a file; a model is kept in a folder. Name another place.")
+        raise NotWritten(f"'{folder}' is a file, but a model needs a folder. Name another folder.")
     return folder.with_name(folder.name + ".draft")
 
 
 def show(trained: TrainingResult, console: Console) -> None:
-    """Print the structure, and the error of each signal under each mask in its own unit."""
+    """Print the structure, and the error of each signal under each mask in the signal's unit."""
     if trained.structure is not None:
         console.print(trained.structure.report(), highlight=False)
-    table = Table(title="Error on held-out data, by what it is estimated from", title_justify="left")
+    table = Table(title="Error on held-out data, by the signals of the estimate", title_justify="left")
     table.add_column("estimated from")
     table.add_column("signal")
     table.add_column("error (rms)", justify="right")
@@ -205,10 +205,10 @@ def show(trained: TrainingResult, console: Console) -> None:
 
 
 def remarks(history: History) -> list[str]:
-    """Return sentences on faults of the data and on the training."""
+    """Return sentences on faults in the data and on the training."""
     sentences = list(history.notes)
     if history.resumed:
-        sentences.append(f"An interrupted training went on at epoch {history.resumed + 1}.")
+        sentences.append(f"An interrupted training continued at epoch {history.resumed + 1}.")
     if history.dead:
         sentences.append(
             f"Never varied or never measured: {', '.join(history.dead)}. Their values have no effect on the model. "
@@ -225,7 +225,7 @@ def remarks(history: History) -> list[str]:
 
 
 def train_config(config: ModelConfig, epochs: int, seed: int) -> TrainConfig:
-    """Return the robot file's settings of training, for a number of epochs."""
+    """Return the training settings of the robot file for a number of epochs."""
     return TrainConfig(
         hidden=config.network.hidden,
         latent=config.network.latent,

@@ -182,7 +182,7 @@ def test_without_a_hold_column_the_robot_files_hold_counts(tmp_path: Path) -> No
         ("shoulder,elbow\n0.1,nan\n", "elbow of nan rad is outside of its limits"),
         (
             "shoulder,elbow\n0.1,0.2\n0.1,1.6\n",
-            "line 3: elbow of 1.6 rad is outside of its limits, -1.5 to 1.5. Nothing",
+            "line 3: elbow of 1.6 rad is outside of its limits, -1.5 to 1.5. The robot did not move",
         ),
         ("shoulder,elbow,hold\n0.1,0.2,-1\n", "hold is -1; it must be a time"),
     ],

@@ -86,7 +86,7 @@ def test_bad_rows_are_one_sentence(tmp_path, lines, sentence):
 
 def test_missing_columns_and_files_are_one_sentence(tmp_path):
     config = load_measured(describe(tmp_path))
-    with pytest.raises(DatasetError, match=r"Nothing in '.*' matches '\*\.csv'\. Is that the folder"):
+    with pytest.raises(DatasetError, match=r"Nothing in '.*' matches '\*\.csv'\. Is this the folder"):
         read_measured(config, tmp_path)
     (tmp_path / "one.csv").write_text("a0,a1\n1,2\n")
     with pytest.raises(DatasetError, match=r"no column 'load'\. Columns: a0, a1"):

@@ -68,7 +68,7 @@ def test_goes_on_after_an_interruption(robot, dataset, straight, tmp_path, share
     assert (folder / "training.png").read_bytes().startswith(b"\x89PNG")
     console = Console(record=True, width=120)
     trainer.show(again, console)
-    assert ("went on at epoch" in console.export_text()) == (share > 0.5)
+    assert ("continued at epoch" in console.export_text()) == (share > 0.5)
 
 
 def test_data_in_another_unit_are_refused(robot, dataset):
@@ -82,7 +82,7 @@ def test_data_in_another_unit_are_refused(robot, dataset):
 
 def test_a_file_where_the_model_shall_be_is_told_before_training(tmp_path):
     (tmp_path / "model").write_text("x")
-    with pytest.raises(NotWritten, match="a model is kept in a folder"):
+    with pytest.raises(NotWritten, match="a model needs a folder"):
         trainer.drafts_of(tmp_path / "model")
 
 
