@@ -1,12 +1,12 @@
 """Gradient descent that tries many step sizes at once (paper, II-G), and the entry to the compiled searches.
 
-The descent depends on no loss and no robot. From the present point it takes the gradient, makes one candidate per step
-size in [0, gamma_max], evaluates all of them as a batch, and goes on from the best. The step size 0 is among them, so
-the loss never rises; where it wins, every other step was too long, and the next ones are spread between 0 and the
-shortest of them. A single candidate is plain descent with the constant step gamma_max.
+Each iteration computes the gradient at the current point, makes one candidate per step size in [0, gamma_max],
+evaluates all candidates as a batch, and continues from the best one. The step size 0 is included, so the loss never
+rises. If it is the best, all other steps were too long, and the next step sizes lie between 0 and the shortest of them.
+With a single candidate this is gradient descent with the constant step gamma_max.
 
-A constraint is met at every candidate, not weighed against the loss: steps go along it, and Newton steps correct the
-deviation.
+A constraint is satisfied at every candidate and has no weight: steps are tangential to it, and Newton steps correct the
+remaining deviation.
 """
 
 import math
@@ -27,13 +27,13 @@ Constraint = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 (candidates, k, n)."""
 
 RETURNS = 3
-"""This many Newton steps follow every step, back to the constraint."""
+"""After every step, this many Newton steps lead back to the constraint."""
 LAST_RETURNS = 10
-"""This many Newton steps follow the last step."""
+"""After the last step, this many Newton steps lead back to the constraint."""
 BREACH = 100.0
-"""A constraint that stays violated costs this loss per unit, so that such a candidate does not win."""
+"""A candidate that still violates the constraint gets this loss per unit, so that it is not selected."""
 DAMPING = 1e-6
-"""This is added to the diagonal of J J^T, which may be singular."""
+"""The diagonal of J J^T, which may be singular, is increased by this."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ class NewtonConfig:
 
     Attributes:
         iterations: Maximum number of steps.
-        tolerance: The search ends when two steps in a row lower the loss by less than this share of it.
+        tolerance: The search ends when two successive steps each lower the loss by less than this share.
     """
 
     iterations: int = 30
@@ -84,9 +84,9 @@ class Descent:
 
     Attributes:
         point: The best point, shape (n,).
-        loss: Its loss.
+        loss: Loss of this point.
         losses: Loss at the start and after every iteration.
-        is_late: Whether the deadline ended it.
+        is_late: Whether the deadline ended the search.
     """
 
     point: np.ndarray
@@ -107,9 +107,9 @@ def descend(
 
     Args:
         objective: Losses and gradients of points.
-        start: First point, shape (n,), or several of which the best is taken, shape (starts, n).
+        start: First point, shape (n,), or several points from which the best is chosen, shape (starts, n).
         config: Step sizes and iterations.
-        low: Lower bounds of a point, shape (n,); candidates are moved inside.
+        low: Lower bounds of a point, shape (n,); candidates outside are clipped.
         high: Upper bounds of a point, shape (n,).
         constraint: Values that must be zero.
     """
@@ -121,10 +121,10 @@ def descend(
     history: list[float] = []
     best_point, best_loss = points[0], np.inf
     for iteration in range(config.iterations + 1):
-        points = _inside(points, low, high)
+        points = _clipped(points, low, high)
         breach: np.ndarray | float = 0.0
         if constraint is not None:
-            points = _back(constraint, points, RETURNS, low, high)
+            points = _to_constraint(constraint, points, RETURNS, low, high)
             deviation, jacobian = constraint(points)
             breach = BREACH * np.abs(deviation).sum(axis=1)
         losses = objective(points, False)[0] + breach
@@ -138,10 +138,10 @@ def descend(
                 gammas = gammas / np.float32(config.candidates - 1)
             gradient = objective(points[best : best + 1], True)[1][0]
             if constraint is not None:
-                gradient = gradient - _least(jacobian[best : best + 1], jacobian[best : best + 1] @ gradient)[0]
+                gradient = gradient - _shortest_step(jacobian[best : best + 1], jacobian[best : best + 1] @ gradient)[0]
             points = points[best] - gammas * gradient
     if constraint is not None:
-        last = _back(constraint, best_point[None], LAST_RETURNS, low, high)
+        last = _to_constraint(constraint, best_point[None], LAST_RETURNS, low, high)
         best_point, best_loss = last[0], float(objective(last, False)[0][0])
     return Descent(best_point, best_loss, tuple(history))
 
@@ -168,22 +168,22 @@ def minimise(
     return Descent(point, float(loss), tuple(history), bool(is_late))
 
 
-def _inside(points: np.ndarray, low: np.ndarray | None, high: np.ndarray | None) -> np.ndarray:
+def _clipped(points: np.ndarray, low: np.ndarray | None, high: np.ndarray | None) -> np.ndarray:
     return points if low is None and high is None else np.clip(points, low, high)
 
 
-def _back(
+def _to_constraint(
     constraint: Constraint, points: np.ndarray, steps: int, low: np.ndarray | None, high: np.ndarray | None
 ) -> np.ndarray:
-    """Take Newton steps of least length towards the constraint."""
+    """Take the shortest Newton steps towards the constraint."""
     for _ in range(steps):
         deviation, jacobian = constraint(points)
-        points = _inside(points - _least(jacobian, deviation), low, high)
+        points = _clipped(points - _shortest_step(jacobian, deviation), low, high)
     return points
 
 
-def _least(jacobian: np.ndarray, change: np.ndarray) -> np.ndarray:
-    """Return the shortest step with a given change of the constraint: J^T (J J^T)^-1 change, shape (candidates, n)."""
+def _shortest_step(jacobian: np.ndarray, change: np.ndarray) -> np.ndarray:
+    """Return the shortest step that changes the constraint as given: J^T (J J^T)^-1 change, shape (candidates, n)."""
     square = jacobian @ jacobian.transpose(0, 2, 1)
     square = square + DAMPING * np.eye(square.shape[1], dtype=square.dtype)
     step = jacobian.transpose(0, 2, 1) @ np.linalg.solve(square, change[:, :, None])

@@ -1,9 +1,9 @@
 """The problem that compiled searches solve (`gemuco.compiled.problem`), folded from a route and its terms.
 
-Every term but the caller's own is a norm of something linear in the prediction, and a prediction is linear in the last
-layer of the network and in the searched point. So the terms are multiplied into the last layer and the given values
-into the first, and the search evaluates differences only. References and given values are numbers in a few rows of
-that: a controller folds the problem once and writes those rows before every solve.
+Every term, except a user's own, is a norm of a linear function of the prediction. The prediction is linear in the
+output of the last hidden layer and in the searched point. So the terms are multiplied into the last layer and the fixed
+inputs into the first, and the search evaluates only the differences of the terms. References and fixed inputs change a
+few rows of the result: a controller folds a problem once and writes these rows before every search.
 """
 
 from collections.abc import Sequence
@@ -21,15 +21,15 @@ from gemuco.search.torque import TorqueNorm
 
 
 class Lines(NamedTuple):
-    """A route as linear parts and a net of the point p: x = direct^T p + constant, but x[outputs] = net(p).
+    """A route as a linear part and a network of the point p: x = direct^T p + constants, but x[outputs] = network(p).
 
-    The given values lie in `known` and in the offset of the net's first layer, and may change from solve to solve.
+    The fixed inputs are in `constants` and in the offset of the first layer, and may change from search to search.
 
     Attributes:
-        chain: The net, from p to `outputs`.
-        outputs: Elements of the layout that the net infers.
-        free: Elements of the layout that make up p, in its order; empty where p is not a signal (z).
-        known: Every given element of the layout [standard deviations], shape (size,); 0 elsewhere.
+        chain: The network, from p to `outputs`.
+        outputs: Elements of the layout that the network infers.
+        free: Elements of the layout that make up p, in its order; empty if p is z.
+        constants: Fixed inputs of the layout [standard deviations], shape (size,); 0 elsewhere.
         low: Lower bounds of p, shape (n,).
         high: Upper bounds of p, shape (n,).
     """
@@ -37,7 +37,7 @@ class Lines(NamedTuple):
     chain: Chain
     outputs: np.ndarray
     free: np.ndarray
-    known: np.ndarray
+    constants: np.ndarray
     low: np.ndarray
     high: np.ndarray
 
@@ -55,19 +55,19 @@ def input_lines(
     columns: np.ndarray,
     free: np.ndarray,
     inferred: np.ndarray,
-    known: np.ndarray,
+    constants: np.ndarray,
     low: np.ndarray,
     high: np.ndarray,
 ) -> Lines:
-    """Return the lines of usage (f): p is some inputs of the network, and the network infers x_out.
+    """Return the lines of usage (f): p is a part of the network input, and the network infers x_out.
 
     Args:
         schema: The body schema.
-        base: Input of the network where p is 0, shape (inputs,).
+        base: Network input, in which p is replaced, shape (inputs,).
         columns: Positions of p in the input, shape (n,).
         free: Positions of p in the layout, shape (n,).
         inferred: Whether the network infers each element of x_out, shape (out_size,).
-        known: Every given element of the layout [standard deviations], shape (size,).
+        constants: Fixed inputs of the layout [standard deviations], shape (size,).
         low: Lower bounds of p, shape (n,).
         high: Upper bounds of p, shape (n,).
     """
@@ -75,43 +75,42 @@ def input_lines(
     begin, end = chain[0], chain[-1]
     first = Layer(begin.matrix[columns], np.empty_like(begin.offset), begin.activation)
     last = Layer(end.matrix[:, inferred], end.offset[inferred], end.activation)
-    lines = Lines((first, *chain[1:-1], last), outputs, free, np.zeros(len(known)), low, high)
-    give(lines, begin, base, columns, known)
+    lines = Lines((first, *chain[1:-1], last), outputs, free, np.zeros(len(constants)), low, high)
+    set_inputs(lines, begin, base, columns, constants)
     return lines
 
 
-def give(lines: Lines, begin: Layer, base: np.ndarray, columns: np.ndarray, known: np.ndarray) -> None:
-    """Write given values into the lines of usage (f).
+def set_inputs(lines: Lines, begin: Layer, base: np.ndarray, columns: np.ndarray, constants: np.ndarray) -> None:
+    """Write fixed inputs into the lines of usage (f).
 
     Args:
         lines: The result of `input_lines`.
         begin: First layer of the network.
         base: See `input_lines`.
         columns: See `input_lines`.
-        known: See `input_lines`.
+        constants: See `input_lines`.
     """
-    constant = base.astype(begin.matrix.dtype)
-    constant[columns] = 0.0
-    np.add(begin.offset, constant @ begin.matrix, out=lines.chain[0].offset)
-    lines.known[:] = known
-    lines.known[lines.free] = 0.0
-    lines.known[lines.outputs] = 0.0
+    fixed = base.astype(begin.matrix.dtype)
+    fixed[columns] = 0.0
+    np.add(begin.offset, fixed @ begin.matrix, out=lines.chain[0].offset)
+    lines.constants[:] = constants
+    lines.constants[lines.free] = 0.0
+    lines.constants[lines.outputs] = 0.0
 
 
 def fitting(lines: Lines, data: np.ndarray) -> Problem:
-    """Return the problem of fitting x to data, shape (size,) [standard deviations]; NaN where there is none."""
-    given = np.flatnonzero(np.isfinite(data))
-    rows = np.eye(len(data))[given]
-    none = no_balance()
-    return _problem(lines, rows, data[given], np.array([0, len(given)]), np.ones(1), none, 0)
+    """Return the problem of fitting x to data, shape (size,) [standard deviations]; NaN where unknown."""
+    measured = np.flatnonzero(np.isfinite(data))
+    rows = np.eye(len(data))[measured]
+    return _problem(lines, rows, data[measured], np.array([0, len(measured)]), np.ones(1), _no_balance(), 0)
 
 
 class FoldedProblem:
-    """The problem of a route and its terms, folded once; `fill` writes the numbers of a solve into it.
+    """The problem of a route and its terms, folded once; `fill` writes the numbers of a search into it.
 
     Attributes:
         problem: Argument of `gemuco.search.descent.minimise`.
-        moving: The torque balance at the predicted posture; None if there is none.
+        moving: The term that balances torque at the predicted posture; None if there is none.
     """
 
     def __init__(self, lines: Lines, bounds: Sequence[Bound], held: np.ndarray) -> None:
@@ -120,11 +119,11 @@ class FoldedProblem:
         self._norms = [bound for bound in bounds if isinstance(bound, Norm)]
         self._torque = next((bound for bound in bounds if isinstance(bound, TorqueNorm)), None)
         self.moving = self._torque if self._torque is not None and self._torque.posture is None else None
-        size = len(lines.known)
+        size = len(lines.constants)
         rows = [norm.difference.rows(size)[0] for norm in self._norms]
         ends = np.cumsum([0, *map(len, rows)])
         weights = np.array([norm.weight for norm in self._norms], float)
-        balance = no_balance()
+        balance = _no_balance()
         if (bound := self._torque) is not None:
             spans = [bound.f] if bound.posture is not None else [bound.f, bound.theta]
             first = int(ends[-1])
@@ -142,30 +141,32 @@ class FoldedProblem:
         self.fill(held)
 
     def fill(self, held: np.ndarray) -> None:
-        """Write the given values, references and held values of a solve; the same elements as before.
+        """Write fixed inputs, references and held values into the problem, for the same elements as before.
 
         Args:
-            held: Values that predictions must equal [standard deviations], shape (size,); NaN where free.
+            held: Values of the constraints [standard deviations], shape (size,); NaN where free.
         """
         for slot, norm in zip(self._slots, self._norms, strict=True):
             difference = norm.difference
             self._reference[slot] = difference.reference[difference.counts]
         if len(self._index):
             self._reference[-len(self._index) :] = held[self._index]
-        np.subtract(self._rows @ self._lines.known, self._reference, out=self.problem.direct[-1], casting="same_kind")
-        if len(self._lines.chain) > 1:  # else the only layer holds the terms
+        np.subtract(
+            self._rows @ self._lines.constants, self._reference, out=self.problem.direct[-1], casting="same_kind"
+        )
+        if len(self._lines.chain) > 1:  # a single layer contains the terms
             self._offset[:] = self._lines.chain[0].offset
         if self._torque is not None and self._torque.posture is not None:
             _set_posture(self.problem.balance, self._torque, self._torque.posture)
 
 
 def fold(lines: Lines, bounds: Sequence[Bound], held: np.ndarray) -> FoldedProblem | None:
-    """Fold a route and its terms; None if a term is the caller's own, or two of them balance torques.
+    """Fold a route and its terms; None if a term is a user's own, or if two terms balance torque.
 
     Args:
         lines: The route.
         bounds: The terms.
-        held: Values that predictions must equal [standard deviations], shape (size,); NaN where free.
+        held: Values of the constraints [standard deviations], shape (size,); NaN where free.
     """
     balances = [bound for bound in bounds if isinstance(bound, TorqueNorm)]
     if len(balances) > 1 or not all(isinstance(bound, Norm | TorqueNorm) for bound in bounds):
@@ -189,16 +190,16 @@ def _problem(
     direct = np.zeros((len(lines.low) + 1, len(rows)), dtype)
     if len(lines.free):
         direct[:-1] = rows[:, lines.free].T
-    direct[-1] = rows @ lines.known - reference
+    direct[-1] = rows @ lines.constants - reference
     limits = np.stack([lines.low, lines.high]).astype(dtype)
     return Problem(pack(chain), direct, ends, weights, balance, held, limits)
 
 
-def no_balance() -> Balance:
+def _no_balance() -> Balance:
     """Return a torque balance without joints."""
-    none = np.zeros((0, 3), np.float32)
+    empty = np.zeros((0, 3), np.float32)
     chain = Packed(np.zeros(0, np.float32), np.zeros((0, 5), np.int64))
-    return Balance(chain, chain.flat, none, none, (-1, -1), 0.0)
+    return Balance(chain, chain.flat, empty, empty, (-1, -1), 0.0)
 
 
 def _balance(bound: TorqueNorm, rows: tuple[int, int]) -> Balance:
@@ -213,13 +214,13 @@ def _balance(bound: TorqueNorm, rows: tuple[int, int]) -> Balance:
 
 
 def _set_posture(balance: Balance, bound: TorqueNorm, posture: np.ndarray) -> None:
-    """Write the posture [rad], shape (joints,), at which torque is balanced."""
+    """Write the posture at which torque is balanced [rad], shape (joints,)."""
     balance.joints[:, POSTURE] = (posture - bound.mean) / bound.std
     balance.joints[:, TORQUE] = bound.torques(posture[None])[0]
 
 
-def around(problem: Problem, bound: TorqueNorm, x: np.ndarray) -> Problem:
-    """Return the problem with its torque linearised at a prediction, shape (size,) [standard deviations]."""
+def linearised(problem: Problem, bound: TorqueNorm, x: np.ndarray) -> Problem:
+    """Return the problem with torque linearised at a prediction, shape (size,) [standard deviations]."""
     posture = (x[bound.theta] * bound.std + bound.mean)[None]
     torque = bound.torques(posture)
     joints = problem.balance.joints.copy()

@@ -1,14 +1,14 @@
 """Terms that add up to a loss of predictions (paper, II-H, II-I and III).
 
-A term such as `Match("joint_position")` states an aim. Bound to a body schema, the references of this solve and the
-present values, it is a function of predictions: every signal of the layout in standard deviations, shape
-(candidates, size), to losses (candidates,) and their gradients (candidates, size). A new term is a class with
-`signals` and `bind`.
+A term such as `Match("joint_position")` is one aim. `bind` combines it with a body schema, the references of a search
+and the present values. The result is a function of predictions: it maps every signal of the layout [standard
+deviations], shape (candidates, size), to losses (candidates,) and their gradients (candidates, size). A new term is a
+class with `signals` and `bind`.
 
 Units: the paper adds metres, radians and newtons and does not say how. Here `Match`, `StayNear` and `StaySmall` measure
-in standard deviations of the training data (`unit="std"`), so that one weight means the same for every signal, or in
-the signal's own unit (`unit="si"`). `StaySmall` measures from the physical zero, not from the mean. `TorqueBalance` (in
-`gemuco.search.torque`) measures in N m. `Hold` has no weight: it is met exactly.
+in standard deviations of the training data (`unit="std"`), so that a weight means the same for every signal, or in the
+signal's own unit (`unit="si"`). `StaySmall` measures from the physical zero, not from the mean. `TorqueBalance` (in
+`gemuco.search.torque`) measures in N m. `Hold` has no weight: it is satisfied exactly.
 """
 
 from collections.abc import Mapping
@@ -34,11 +34,11 @@ class Term(Protocol):
         ...
 
     def bind(self, schema: BodySchema, target: Values, now: Values) -> Bound:
-        """Return the loss as a function of predictions.
+        """Return the loss as a function of predictions, see `Bound`.
 
         Args:
             schema: The schema that predicts.
-            target: Signal -> reference of this solve [its unit].
+            target: Signal -> reference [its unit].
             now: Signal -> measured value [its unit]; NaN where nothing was measured.
         """
         ...
@@ -46,10 +46,10 @@ class Term(Protocol):
 
 @runtime_checkable
 class LastingTerm(Term, Protocol):
-    """A term whose bound form stays the same but for the numbers of references and present values."""
+    """A term whose bound form can be used again with other references and present values."""
 
     def renew(self, bound: Bound, schema: BodySchema, target: Values, now: Values) -> None:
-        """Write other references and present values into the result of `bind`; raises the same errors."""
+        """Write other references and present values into the result of `bind`, which raises the same errors."""
         ...
 
 
@@ -73,7 +73,7 @@ class Match(_OneSignal):
         signal: The predicted signal.
         weight: Loss per unit of the norm.
         matrix: Rows of A, which acts on the signal in its own unit; the identity if not given.
-        value: A constant reference, such as (0, 0) for the center of gravity; else the target's.
+        value: A constant reference, such as (0, 0) for the center of gravity; the target if not given.
         unit: `std`: every row of A x in its own standard deviation; `si`: in the unit of A x.
     """
 
@@ -102,11 +102,11 @@ class Match(_OneSignal):
         return _numbers(self.signal, target[self.signal])
 
     def bind(self, schema: BodySchema, target: Values, now: Values) -> Norm:
-        """Bind the term; see `Term.bind`. An element whose reference is NaN does not count."""
+        """Bind the term; see `Term.bind`. Elements whose reference is NaN have no loss."""
         return Norm(self.difference(schema, target), self.weight)
 
     def renew(self, bound: Norm, schema: BodySchema, target: Values, now: Values) -> None:
-        """Take other references; see `LastingTerm.renew`."""
+        """Use other references; see `LastingTerm.renew`."""
         if self.value is None:
             bound.difference.take(self.reference(target))
 
@@ -120,9 +120,9 @@ class StayNear(_OneSignal):
     """weight * ||x - near||: keep a signal near a posture, such as 0.3 ||theta - theta_orig||.
 
     Attributes:
-        signal: The signal that stays near.
+        signal: The predicted signal.
         weight: Loss per unit of the norm.
-        value: The posture; if not given, the reference of this solve, and without one the present value.
+        value: The posture. If not given, it is the target of the signal; without a target, the present value.
         unit: `std` or `si`.
     """
 
@@ -136,17 +136,17 @@ class StayNear(_OneSignal):
         _freeze_value(self)
 
     def bind(self, schema: BodySchema, target: Values, now: Values) -> Norm:
-        """Bind the term; see `Term.bind`. An element without a known value to stay near does not count."""
+        """Bind the term; see `Term.bind`. Elements whose posture is unknown have no loss."""
         near = Difference.of(schema, self.signal, None, self.unit)
         return Norm(near.take(self.reference(schema, target, now)), self.weight)
 
     def renew(self, bound: Norm, schema: BodySchema, target: Values, now: Values) -> None:
-        """Take other references; see `LastingTerm.renew`."""
+        """Use other references; see `LastingTerm.renew`."""
         if self.value is None:
             bound.difference.take(self.reference(schema, target, now))
 
     def reference(self, schema: BodySchema, target: Values, now: Values) -> np.ndarray:
-        """Return the value to stay near [its unit], shape (n,); NaN where it is not known."""
+        """Return the posture [unit of the signal], shape (n,); NaN where unknown."""
         if self.value is not None:
             return np.asarray(self.value, float)
         unknown = np.full(schema.layout.signal(self.signal).size, np.nan)
@@ -170,19 +170,19 @@ class StaySmall(_OneSignal):
         return Norm(Difference.of(schema, self.signal, None, self.unit).take(zero), self.weight)
 
     def renew(self, bound: Norm, schema: BodySchema, target: Values, now: Values) -> None:
-        """Change nothing; zero stays zero."""
+        """Do nothing: the reference is always zero."""
 
 
 @dataclass(frozen=True, slots=True)
 class Hold:
-    """A constraint: every prediction has this value of a signal, whatever the other terms weigh.
+    """A constraint: a signal has this value in every prediction, whatever the weights of the terms.
 
-    A signal in the route's mask is given to the network and not searched; for a predicted signal the search moves only
-    along predictions that meet it.
+    A signal in the route's mask is given to the network and not searched. For a predicted signal the search considers
+    only points whose prediction has this value.
 
     Attributes:
         signal: The held signal.
-        value: Its value, NaN for free elements; the reference of this solve if not given.
+        value: Value [its unit], NaN for free elements; the target of the signal if not given.
     """
 
     signal: str

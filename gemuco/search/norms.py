@@ -1,4 +1,4 @@
-"""Bound terms (`gemuco.search.losses`): losses of predictions, most of them a norm of something linear in them."""
+"""Bound terms (`gemuco.search.losses`): losses of predictions. Most are norms of a linear function of a prediction."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,30 +13,30 @@ TINY = 1e-9
 
 
 class Bound(Protocol):
-    """A term bound to a schema, references and the present: a function of predictions."""
+    """A term bound to a schema, references and present values: a function of predictions."""
 
     def __call__(self, x: np.ndarray, slope: bool = True) -> tuple[np.ndarray, np.ndarray]:
-        """Losses, shape (candidates,), and their gradients, shape (candidates, size).
+        """Return losses, shape (candidates,), and their gradients, shape (candidates, size).
 
         Args:
             x: Predictions [standard deviations], shape (candidates, size).
-            slope: Whether gradients are needed; without, they may be anything.
+            slope: Whether gradients are needed; if not, their values are undefined.
         """
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """M x - w of one signal's prediction [standard deviations]: scaled, and zero in rows that do not count.
+    """Scaled difference M x - w between a signal's prediction and its reference; 0 in rows without a reference.
 
     Attributes:
-        what: The beginning of the message about a reference of another size.
-        span: Place of the signal in the layout.
+        what: First words of the message about a reference of the wrong size.
+        span: Slice of the signal in the layout.
         matrix: M, shape (rows, n); None for the identity.
         middle: Reference at which w is 0 [unit of A x], shape (rows,).
         scale: Change of the reference that changes w by 1 [unit of A x], shape (rows,).
         reference: w, shape (rows,).
-        counts: Whether each row counts, shape (rows,).
+        counts: Whether each row has a reference, shape (rows,).
     """
 
     what: str
@@ -49,7 +49,7 @@ class Difference:
 
     @classmethod
     def of(cls, schema: BodySchema, signal: str, matrix: Sequence[Sequence[float]] | None, unit: str) -> "Difference":
-        """Make the difference of a signal; no row counts yet.
+        """Make the difference of a signal, without a reference.
 
         Raises:
             UnknownSignal: The signal is not in the layout.
@@ -60,7 +60,7 @@ class Difference:
         if matrix is None:
             what = f"Signal '{signal}' has {len(std)} elements, but the array"
             scale = std if unit == "std" else np.ones_like(std)
-            return cls(what, span, None if unit == "std" else np.diag(std), mean, scale, *_nothing(len(std)))
+            return cls(what, span, None if unit == "std" else np.diag(std), mean, scale, *_no_reference(len(std)))
         try:
             rows = np.array(matrix, float)
         except ValueError:
@@ -69,13 +69,13 @@ class Difference:
             raise WrongSize(f"The matrix of '{signal}' needs {len(std)} columns in every row.")
         scale = np.maximum(np.sqrt(rows**2 @ std**2), TINY) if unit == "std" else np.ones(len(rows))
         what = f"The matrix of '{signal}' has {len(rows)} rows, but its reference"
-        return cls(what, span, rows * std / scale[:, None], rows @ mean, scale, *_nothing(len(rows)))
+        return cls(what, span, rows * std / scale[:, None], rows @ mean, scale, *_no_reference(len(rows)))
 
     def take(self, reference: np.ndarray) -> "Difference":
-        """Take another reference [unit of A x], shape (rows,); a row does not count where it is NaN.
+        """Use another reference [unit of A x], shape (rows,); NaN for rows without a reference.
 
         Raises:
-            WrongSize: It does not have as many elements as there are rows.
+            WrongSize: The reference does not have one element per row.
         """
         if reference.shape != self.reference.shape:
             raise WrongSize(f"{self.what} has shape {reference.shape}.")
@@ -92,19 +92,19 @@ class Difference:
         return ((part if self.matrix is None else part @ self.matrix.T) - self.reference) * self.counts
 
     def rows(self, size: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the counting rows over the whole layout, shape (rows, size), and their references, shape (rows,)."""
+        """Return the rows with a reference, over the whole layout, shape (rows, size), and their w, shape (rows,)."""
         rows = np.zeros((len(self.reference), size))
         rows[:, self.span] = np.eye(len(self.reference)) if self.matrix is None else self.matrix
         return rows[self.counts], self.reference[self.counts]
 
 
-def _nothing(rows: int) -> tuple[np.ndarray, np.ndarray]:
+def _no_reference(rows: int) -> tuple[np.ndarray, np.ndarray]:
     return np.zeros(rows), np.zeros(rows, bool)
 
 
 @dataclass(frozen=True, slots=True)
 class Norm:
-    """weight * ||M x - w|| of a prediction; a `Bound` that compiled searches know (`gemuco.search.fold`)."""
+    """weight * ||M x - w|| of a prediction; a `Bound` that compiled searches support (`gemuco.search.fold`)."""
 
     difference: Difference
     weight: float
@@ -122,7 +122,7 @@ class Norm:
 
 
 def total(bounds: Sequence[Bound], x: np.ndarray, slope: bool = True) -> tuple[np.ndarray, np.ndarray]:
-    """Return the sum of bound terms and its gradient; the sum of no term is 0."""
+    """Return the sum of bound terms and its gradient; 0 without terms."""
     loss, gradient = np.zeros(len(x), x.dtype), np.zeros_like(x)
     for bound in bounds:
         part, slopes = bound(x, slope)

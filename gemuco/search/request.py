@@ -1,4 +1,4 @@
-"""A request: terms bound to one schema, which take the references of every solve."""
+"""A request: terms bound to a schema, with the references of the current search."""
 
 from collections.abc import Mapping, Sequence
 
@@ -12,17 +12,16 @@ from gemuco.search.torque import TorqueNorm
 
 
 class Request:
-    """Terms and a schema. What depends on these alone is made at the first `read` and then kept.
+    """Terms and a schema. The first `read` binds the terms; later ones only write other numbers if that is possible.
 
     Attributes:
         schema: The schema that predicts.
         terms: The terms that have a weight.
-        holds: The terms that are met exactly.
-        needed: The signals of all of them, sorted.
-        bounds: The weighted terms as functions of predictions, as the last `read` left them.
-        held: Values that predictions must equal [standard deviations], shape (size,); NaN where free.
-        is_lasting: Whether nothing but numbers differs from one `read` to the next; a term of the caller's own may
-            differ in any way.
+        holds: The constraints.
+        needed: Signals of all terms and constraints, sorted.
+        bounds: The terms as functions of predictions, after the last `read`.
+        held: Values of the constraints [standard deviations], shape (size,); NaN where free.
+        is_lasting: Whether successive calls of `read` change numbers only; a user's own term may change in any way.
     """
 
     def __init__(self, schema: BodySchema, terms: Sequence[Term | Hold]) -> None:
@@ -36,7 +35,7 @@ class Request:
         self._lasting: list[tuple[LastingTerm, Bound]] = []
 
     def read(self, target: Mapping[str, np.ndarray], now: Mapping[str, np.ndarray]) -> None:
-        """Take the references and the present values of a solve.
+        """Set the references and present values of a search.
 
         Args:
             target: Signal -> reference [its unit], shape (n,).
@@ -60,7 +59,7 @@ class Request:
         self.is_lasting = len(self._lasting) == len(self.terms)
 
     def pattern(self) -> bytes:
-        """Return a key of the rows of the terms and the elements of the layout that have a reference."""
+        """Return a key that depends on which rows of the terms have a reference and which elements are held."""
         norms = [bound.difference.counts.tobytes() for bound in self.bounds if isinstance(bound, Norm)]
         return b"".join([*norms, np.isfinite(self.held).tobytes()])
 
@@ -85,7 +84,7 @@ def signals_of(term: Term | Hold) -> tuple[str, ...]:
 
 
 def merged(schema: BodySchema, parts: Sequence[np.ndarray]) -> np.ndarray:
-    """Merge partly known vectors, later ones first, shape (size,) [standard deviations]; NaN where all are NaN."""
+    """Return the last finite value of each element, shape (size,) [standard deviations]; NaN where all are NaN."""
     merged = np.full(schema.layout.size, np.nan)
     for part in parts:
         merged = np.where(np.isfinite(part), part, merged)

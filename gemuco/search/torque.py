@@ -15,23 +15,23 @@ from gemuco.search.norms import TINY
 
 POSTURES = ("reference", "predicted")
 STEP = 1e-5
-"""The caller's torque is differentiated by this change of a posture [rad]."""
+"""The derivative of the user's torque is a difference over this change of a joint angle [rad]."""
 
 
 @dataclass(frozen=True, slots=True)
 class TorqueBalance:
     """weight * ||tau_ext + G^T f||: muscle tensions that hold a posture.
 
-    G is taken at the predicted tensions, and at the reference posture (control, where the posture is given) or at the
-    predicted one (simulation, where it is searched).
+    G is computed at the predicted tensions and at the reference posture (control, where the posture is given) or the
+    predicted posture (simulation, where the posture is searched).
 
     Attributes:
-        torque: Posture [rad], shape (joints,) -> tau_ext, the joint torque that the muscles must supply [N m], shape
-            (joints,): that of gravity minus that of an external force F, gravity(theta) - J^T F.
+        torque: Posture [rad], shape (joints,) -> tau_ext [N m], shape (joints,), the joint torque that the muscles must
+            supply: gravity(theta) - J^T F, with an external force F.
         weight: Loss per N m.
-        position: theta, rad.
-        tension: f, N.
-        length: l, m.
+        position: Signal of theta [rad].
+        tension: Signal of f [N].
+        length: Signal of l [m].
         at: `reference` or `predicted`.
     """
 
@@ -63,7 +63,7 @@ class TorqueBalance:
         return bound
 
     def renew(self, bound: "TorqueNorm", schema: BodySchema, target: Values, now: Values) -> None:
-        """Take another reference; see `LastingTerm.renew`. A predicted posture needs none."""
+        """Use another reference; see `LastingTerm.renew`. A predicted posture needs no reference."""
         if bound.posture is None:
             return
         if self.position not in target or not np.isfinite(target[self.position]).all():
@@ -75,17 +75,17 @@ class TorqueBalance:
 
 @dataclass(frozen=True, slots=True)
 class TorqueNorm:
-    """Torque balance bound to a schema; a `Bound` that compiled searches know (`gemuco.search.fold`).
+    """Torque balance bound to a schema; a `Bound` that compiled searches support (`gemuco.search.fold`).
 
     Attributes:
-        muscles: The muscles in the network.
-        theta: Place of the posture in the layout.
-        f: Place of the tension in the layout.
+        muscles: Model of the muscles.
+        theta: Slice of the posture in the layout.
+        f: Slice of the tension in the layout.
         mean: Mean of the posture [rad], shape (joints,).
         std: Standard deviation of the posture [rad], shape (joints,).
         torque: Posture [rad] -> tau_ext [N m].
         weight: Loss per N m.
-        posture: The given posture [rad], shape (joints,); None where it is the predicted one.
+        posture: The reference posture [rad], shape (joints,); None if torque is balanced at the predicted posture.
     """
 
     muscles: "MuscleModel"
@@ -118,7 +118,7 @@ class TorqueNorm:
         return np.stack([np.asarray(self.torque(posture), float) for posture in postures])
 
     def stiffness(self, postures: np.ndarray, torques: np.ndarray) -> np.ndarray:
-        """Return the derivative of tau_ext by the posture [N m/rad], shape (n, joints, joints), by differences."""
+        """Return d tau_ext / d theta [N m/rad], shape (n, joints, joints), by finite differences."""
         stiffness = np.empty((*torques.shape, postures.shape[1]))
         for joint in range(postures.shape[1]):
             moved = postures.copy()
@@ -128,12 +128,12 @@ class TorqueNorm:
 
 
 class MuscleModel:
-    """The part of the network that infers l from theta and f under the mask (position, tension)."""
+    """The part of the network that infers l from theta and f, under the mask (position, tension)."""
 
     __slots__ = ("back", "chain", "f", "f_mean", "f_std", "l_std", "packed", "theta", "theta_std")
 
     def __init__(self, schema: BodySchema, names: TorqueBalance) -> None:
-        """Cut the part out of the network.
+        """Extract the part from the network.
 
         Raises:
             NotObservable: The schema does not infer length from position and tension.
@@ -164,7 +164,7 @@ class MuscleModel:
         self.f_mean = scaler.mean[f].astype(dtype)
 
     def deficit(self, posture: np.ndarray, tension: np.ndarray, torque: np.ndarray) -> "Deficit":
-        """Return the torque that the muscles lack, torque + G^T f.
+        """Return the missing torque, torque + G^T f.
 
         Args:
             posture: theta [standard deviations], shape (candidates, joints).
@@ -172,9 +172,9 @@ class MuscleModel:
             torque: tau_ext [N m], shape (candidates or 1, joints).
         """
         muscles = self._at(posture, tension)
-        rest = torque.astype(self.f_std.dtype) + muscles.gradient[:, self.theta] / self.theta_std
-        norm = np.sqrt(np.einsum("ij,ij->i", rest, rest))
-        return Deficit(norm, rest / np.maximum(norm, TINY)[:, None], self, muscles)
+        missing = torque.astype(self.f_std.dtype) + muscles.gradient[:, self.theta] / self.theta_std
+        norm = np.sqrt(np.einsum("ij,ij->i", missing, missing))
+        return Deficit(norm, missing / np.maximum(norm, TINY)[:, None], self, muscles)
 
     def torque(self, posture: np.ndarray, tension: np.ndarray) -> np.ndarray:
         """Return G^T f [N m], shape (candidates, joints), of postures and tensions [standard deviations]."""
@@ -188,7 +188,7 @@ class MuscleModel:
 
 @lru_cache(maxsize=4)
 def muscle_model(schema: BodySchema, names: TorqueBalance) -> MuscleModel:
-    """Return the muscles of a schema; the newest four are kept, for cutting them out takes longer than a solve.
+    """Return the muscle model of a schema, from a cache: to make a model takes longer than a search.
 
     Raises:
         NotObservable: The schema does not infer length from position and tension.
@@ -198,13 +198,13 @@ def muscle_model(schema: BodySchema, names: TorqueBalance) -> MuscleModel:
 
 @dataclass(frozen=True, slots=True)
 class Deficit:
-    """Torque that the muscles lack to hold a posture.
+    """Torque that is missing to hold a posture.
 
     Attributes:
         norm: ||torque + G^T f|| [N m], shape (candidates,).
-        gradient: Its gradient with respect to torque, shape (candidates, joints).
-        model: The muscles.
-        at: Derivatives of their network at the candidates.
+        gradient: Gradient of the norm with respect to torque, shape (candidates, joints).
+        model: Model of the muscles.
+        at: Derivatives of the model's network at the candidates.
     """
 
     norm: np.ndarray
@@ -222,5 +222,5 @@ class Deficit:
 
 
 def _columns(index: np.ndarray, span: slice) -> np.ndarray:
-    """Return the positions, within an index, of the elements of a span of the layout."""
+    """Return the positions in an index at which the elements of a slice of the layout are."""
     return np.flatnonzero((index >= span.start) & (index < span.stop))

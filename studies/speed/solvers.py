@@ -57,7 +57,7 @@ class Ours:
     def fold(self) -> Problem:
         """Return the problem as at the beginning of every solve."""
         self.request.read(TARGET, {})
-        self.route.give(self.given)
+        self.route.set_inputs(self.given)
         self.folded.fill(self.request.held)
         return self.folded.problem
 

@@ -17,7 +17,7 @@ from gemuco.compiled.learning import SQUARED, gradients, loss
 from gemuco.layers import ACTIVATIONS, Layer
 from gemuco.learning.network import Network
 from gemuco.search.descent import DescentConfig, NewtonConfig, descend, minimise
-from gemuco.search.fold import Lines, around, fold
+from gemuco.search.fold import Lines, fold, linearised
 from gemuco.search.losses import Match, StayNear, StaySmall
 from gemuco.search.norms import total
 from gemuco.search.routes import InputRoute, LatentRoute
@@ -107,7 +107,7 @@ def test_every_term_is_what_it_is_in_numpy(schema, route, name):
         way_down = back(slope.astype(np.float32))[0]
         there = total(bounds, way.predict((point - np.float32(1e-3) * way_down)[None])[0].astype(float))[0][0]
         if name == "torque of the prediction":
-            problem = around(problem, bounds[0], x[0])
+            problem = linearised(problem, bounds[0], x[0])
         begun, after = once(problem, point)
         assert begun == pytest.approx(loss[0], rel=1e-5)
         assert after == pytest.approx(there, rel=1e-5, abs=1e-6)
