@@ -252,6 +252,12 @@ def test_an_encoder_maps_speed_where_it_is_wanted():
         assert not any("03 60" in request[3:8] for request in puppet.requests), "the preset is never touched"
 
 
+def test_a_speed_divider_of_0_divides_by_nothing():
+    elements = {"position": "joint_position.elbow", "velocity": "joint_velocity.elbow"}
+    with encoder({**ENCODER, "6031:3": "00 00", "6031:4": "00 00"}, elements) as (device, puppet):
+        assert told(device, puppet, "00 08 00 00 00 00 00 04")[1] == pytest.approx(TURN / 4)
+
+
 @pytest.mark.parametrize(("data", "counts"), [("FE 7F", 32766), ("FF 7F", None), ("02 80", -32766), ("01 80", None)])
 def test_a_speed_at_the_end_of_its_range_is_not_known(data, counts):
     """INTEGER16: 32767 and below -32766 may be a speed that does not fit."""

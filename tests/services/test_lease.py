@@ -47,6 +47,8 @@ def test_it_runs_out_and_the_next_one_may_take_it(case: Case) -> None:
     case.clock.advance(0.001)
     assert case.lease.tenure is None
     assert case.lease.left() == 0.0
+    case.clock.advance(0.5)
+    assert case.lease.left() == 0.0
     case.lease.take(BERT, 1.0)
     with pytest.raises(CommandHeld, match="bert"):
         case.lease.check(ANNA)
