@@ -70,7 +70,7 @@ def pdo(direction: str, number: int, cob: int, mapping: tuple[int, ...] = (), tr
         Entry("Event timer", U16, "rw"),
     ]
     filled = (*mapping, *(0,) * (8 - len(mapping)))
-    entries = [Entry(f"MappedObject object {sub}", U32, "rw", value) for sub, value in enumerate(filled, 1)]
+    entries = [Entry(f"Mapped object {sub}", U32, "rw", value) for sub, value in enumerate(filled, 1)]
     return [
         record(base + number, f"{label} {number + 1} communication", *timing[: 5 if direction == TPDO else 2]),
         Object(
