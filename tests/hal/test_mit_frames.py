@@ -1,0 +1,524 @@
+"""Drives in MIT mode frame by frame: requests until an answer, powering on and off, faults, and registers of Damiao.
+
+DM4310: 12.5 rad, 30 rad/s, 10 N m. AK80-9: 12.5 rad, 50 rad/s, 18 N m. Zero is 7FFFh in 16 bits and 7FFh in 12 bits.
+"""
+
+import itertools
+import math
+import struct
+
+import numpy as np
+import pytest
+
+from hal.clock import SystemClock
+from hal.config import BusConfig
+from hal.device import DeviceState
+from hal.drivers.can_device import Place
+from hal.drivers.mit.drive import MitDrive
+from hal.errors import ConfigError, DeviceRefused, DeviceSilent, WrongDevice
+from hal.protocols.mit import Register
+from hal.wire.bus import Bus
+
+DAMIAO = {"motor": "DM4310", "stiffness": 40.0, "damping": 2.0, "ramp": 0.0}
+T_MOTOR = {"motor": "AK80-9", "stiffness": 40.0, "damping": 2.0, "ramp": 0.0, "allow_no_watchdog": True}
+QUANTITIES = ("position", "velocity", "effort", "temperature", "temperature_driver")
+REST = "7F FF 7F F0 00 00 07 FF"
+BRAKE = "7F FF 7F F0 00 66 67 FF"
+"""Damping 2 of 5 N m s/rad: 1638 of 4095, 666h."""
+CLEAR, ENTER, EXIT = (f"FF FF FF FF FF FF FF {code}" for code in ("FB", "FC", "FD"))
+ENABLED, DISABLED, TOO_HOT = 0x10, 0x00, 0xC0
+"""State in the upper four bits of a Damiao answer."""
+REGISTERS = {
+    9: (3000).to_bytes(4, "little"),  # 0.15 s in units of 50 us
+    10: (1).to_bytes(4, "little"),
+    15: bytes.fromhex("78 56 34 12"),
+    21: struct.pack("<f", 12.5),
+    22: struct.pack("<f", 30.0),
+    23: struct.pack("<f", 10.0),
+}
+_numbers = itertools.count()
+
+
+class Wire:
+    """A drive on a bus that is never opened, the frames that it gets, and a device that answers them."""
+
+    def __init__(self, settings=DAMIAO, node=1, bus=None, quantities=None, rate=200.0, **changes):
+        self.bus = bus or Bus(
+            f"can{next(_numbers)}", BusConfig(interface="virtual", channel="mit_frames"), SystemClock()
+        )
+        parsed = MitDrive.Settings.model_validate({**settings, **changes})
+        count = 5 if settings["motor"].startswith("DM") else 4
+        elements = {name: f"{name}.elbow" for name in quantities or QUANTITIES[:count]}
+        place = Place("elbow", elements, self.bus, node, None, rate, bounds=(-1.0, 1.0))
+        self.device = MitDrive(place, parsed)
+        self.sent, self.state, self.answers_after = [], DISABLED, 1
+        self.registers = dict(REGISTERS)
+        self.bus.send = self._send
+
+    def _send(self, frame):
+        data = bytes(frame.data)
+        self.sent.append(data.hex(" ").upper() if frame.arbitration_id != 0x7FF else data)
+        if frame.arbitration_id == 0x7FF:
+            if data[3] in self.registers:
+                if data[2] == 0x55:
+                    self.registers[data[3]] = data[4:]
+                self.hear(data[:4] + self.registers[data[3]])
+        elif len(self.sent) >= self.answers_after:
+            self.answer()
+        return True
+
+    def hear(self, data, received=1.0):
+        self.bus.subscriber(self.device._reply_id)(bytearray(data), received)
+
+    def answer(self, position=0x7FFF, velocity=0x7FF, effort=0x7FF, last=None, received=1.0):
+        last = last or ((0x41, 0x00) if self.device._registers is None else (0x28, 0x1E))
+        bits = (position << 24 | velocity << 12 | effort).to_bytes(5, "big")
+        first = self.device.node & 0xFF if self.device._registers is None else self.state | self.device.node & 0x0F
+        self.hear(bytes((first,)) + bits + bytes(last), received)
+
+    def frames(self):
+        sent, self.sent = self.sent, []
+        return sent
+
+    def ready(self):
+        """Commissioned and heard, without power."""
+        self.device.is_commissioned, self.device.missed = True, 0
+        self.device._is_closed = False
+        self.answer()
+        return self
+
+
+def test_numbers_of_nodes():
+    for settings, highest in ((T_MOTOR, 0xFF), (DAMIAO, 0x7FE)):
+        for node in (1, highest):
+            Wire(settings, node, master_id=0x20)
+        for node in (0, highest + 1):
+            with pytest.raises(ConfigError, match=f"between 1 and {highest}"):
+                Wire(settings, node, master_id=0x20)
+
+
+def test_identifiers_of_answers():
+    assert Wire(DAMIAO, 5).device._reply_id == 21
+    assert Wire(T_MOTOR, 5).device._reply_id == 0
+    assert Wire(T_MOTOR, 5, master_id=7).device._reply_id == 7
+    assert Wire(DAMIAO, 5, master_id=0).device._reply_id == 0
+
+
+def test_drives_under_one_identifier_are_distinguished_by_their_first_byte():
+    """A Damiao drive sends four bits of its id, one of T-Motor eight."""
+    bus = Wire(T_MOTOR, 0x02).bus
+    other = Wire(T_MOTOR, 0x12, bus)
+    other.ready()
+    other.answer(position=0xBFFF)
+    assert other.device.read().values[0] == pytest.approx(6.25, abs=1e-3)
+    unknown = bus.counters["unknown"]
+    other.hear(bytes((0x13, *range(7))))
+    other.hear(b"")
+    assert bus.counters["unknown"] == unknown + 2
+    bus = Wire(DAMIAO, 0x02, master_id=0x40).bus
+    with pytest.raises(ConfigError, match="answer under 040h with the id 2h"):
+        Wire(DAMIAO, 0x12, bus, master_id=0x40)
+    with pytest.raises(ConfigError, match="identifier 040h"):
+        Wire(T_MOTOR, 0x03, bus, master_id=0x40)
+
+
+def test_quantities_and_traffic():
+    cheetah = {**T_MOTOR, "motor": "mini-cheetah"}
+    for settings, count, size in ((DAMIAO, 5, 8), (T_MOTOR, 4, 8), (cheetah, 2, 7)):
+        parsed = MitDrive.Settings.model_validate(settings)
+        assert MitDrive.quantities(parsed) == QUANTITIES[:count]
+        assert MitDrive.traffic(parsed, 200.0) == ((8, 200.0), (size, 200.0))
+    effort = MitDrive.Settings.model_validate({**T_MOTOR, "mode": "effort"})
+    assert MitDrive.quantities(effort) == ("effort", "position", "velocity", "temperature")
+
+
+@pytest.mark.parametrize(("answers_after", "frames"), [(1, 1), (2, 2), (4, 4), (5, 4)])
+def test_a_drive_is_requested_to_power_off_four_times(answers_after, frames):
+    wire = Wire(T_MOTOR)
+    wire.answers_after = answers_after
+    if frames < answers_after:
+        with pytest.raises(DeviceSilent, match="does not answer under 000h"):
+            wire.device._knock()
+    else:
+        wire.device._knock()
+    assert wire.frames() == [EXIT] * frames
+
+
+@pytest.mark.parametrize(
+    ("serial", "identity"),
+    [
+        ("78 56 34 12", "damiao:12345678"),
+        ("01 00 00 00", "damiao:00000001"),
+        ("00 00 00 00", None),
+        ("FF FF FF FF", None),
+    ],
+)
+def test_the_serial_number_is_the_identity(serial, identity):
+    wire = Wire(DAMIAO)
+    wire.registers[15] = bytes.fromhex(serial)
+    assert wire.device._identify() == (identity or f"mit:{wire.bus.name}:1:DM4310")
+    assert wire.frames()[:2] == [REST, EXIT]
+
+
+def test_a_drive_without_registers_is_known_by_its_place():
+    wire = Wire(T_MOTOR, 3)
+    assert wire.device._identify() == f"mit:{wire.bus.name}:3:AK80-9"
+    wire.bus.needs_sync = True
+    with pytest.raises(DeviceRefused, match="identifier 0"):
+        wire.device._identify()
+    wire = Wire(T_MOTOR, 3, master_id=4)
+    wire.bus.needs_sync = True
+    wire.device._identify()
+
+
+def test_commissioning_of_a_damiao_drive():
+    """Ranges are read and compared; MIT mode (1) and 3000 * 50 us are written to registers 10 and 9 and read back."""
+    wire = Wire(DAMIAO)
+    wire.registers |= {9: bytes(4), 10: bytes(4)}
+    wire.device.missed = 5
+    wire.device.enable()
+    wire.device._commission()
+    assert (wire.device.missed, wire.device._enable_requested) == (0, False)
+    assert [frame.hex(" ") if isinstance(frame, bytes) else frame for frame in wire.frames()] == [
+        *[EXIT] * 6,
+        "01 00 33 15 00 00 00 00",
+        "01 00 33 16 00 00 00 00",
+        "01 00 33 17 00 00 00 00",
+        "01 00 55 0a 01 00 00 00",
+        "01 00 33 0a 00 00 00 00",
+        "01 00 55 09 b8 0b 00 00",
+        "01 00 33 09 00 00 00 00",
+    ]
+
+
+@pytest.mark.parametrize(("register", "name"), [(21, "position"), (22, "velocity"), (23, "effort")])
+def test_another_range_is_another_motor(register, name):
+    wire = Wire(DAMIAO)
+    (value,) = struct.unpack("<f", REGISTERS[register])
+    for factor, is_same in ((1.0005, True), (0.9995, True), (1.002, False), (0.998, False)):
+        wire.registers[register] = struct.pack("<f", value * factor)
+        if is_same:
+            wire.device._commission()
+        else:
+            with pytest.raises(WrongDevice, match=f"has a {name} range of"):
+                wire.device._commission()
+        checks = {check.what: check.is_good for check in wire.device.inspect()}
+        assert checks == {"watchdog": True, "control mode": True} | {
+            f"{one} range": one != name or is_same for one in ("position", "velocity", "effort")
+        }
+
+
+@pytest.mark.parametrize(("register", "what"), [(9, "watchdog"), (10, "control mode")])
+def test_inspection_compares_mode_and_watchdog(register, what):
+    wire = Wire(DAMIAO)
+    for value in (int.from_bytes(REGISTERS[register], "little") + change for change in (-1, 1)):
+        wire.registers[register] = value.to_bytes(4, "little")
+        assert [check.what for check in wire.device.inspect() if not check.is_good] == [what]
+    assert "after 0.15005 s" in wire.device.inspect()[0].text or register == 10
+
+
+def test_a_register_that_keeps_its_value_is_refused():
+    wire = Wire(DAMIAO)
+    client = wire.device._registers
+    send = wire.bus.send
+    wire.bus.send = lambda frame: send(frame) if frame.data[2] != 0x55 else wire.hear(frame.data)
+    with pytest.raises(DeviceRefused, match="TIMEOUT reads back 3000 after writing 7"):
+        client.write(Register.TIMEOUT, 7)
+
+
+def test_a_register_is_requested_four_times():
+    wire = Wire(DAMIAO)
+    del wire.registers[15]
+    with pytest.raises(DeviceSilent, match="register SERIAL"):
+        wire.device._registers.read(Register.SERIAL)
+    assert wire.frames() == [bytes.fromhex("01 00 33 0F 00 00 00 00")] * 4
+    assert wire.device._registers.pending is None
+
+
+def test_the_answer_to_another_register_is_not_taken():
+    wire = Wire(DAMIAO)
+    client = wire.device._registers
+    wire.registers = {}
+    client.ask(Register.TIMEOUT)
+    assert client.is_watching is None
+    wire.hear(bytes.fromhex("01 00 33 0A B8 0B 00 00"))
+    assert client.is_watching is None
+    wire.hear(bytes.fromhex("01 00 33 09 B7 0B 00 00"))
+    assert client.is_watching is False
+    client.ask(Register.TIMEOUT)
+    wire.hear(bytes.fromhex("01 00 33 09 B8 0B 00 00"))
+    assert client.is_watching is True
+
+
+@pytest.mark.parametrize(("watch_time", "is_enough"), [(0.03, True), (0.0299, False)])
+def test_a_watchdog_outlasts_two_lost_frames(watch_time, is_enough):
+    if is_enough:
+        Wire(DAMIAO, rate=100.0, watch_time=watch_time)
+    else:
+        with pytest.raises(ConfigError, match="one lost frame would stop it"):
+            Wire(DAMIAO, rate=100.0, watch_time=watch_time)
+
+
+def test_a_drive_that_stays_enabled_is_not_opened():
+    wire = Wire(DAMIAO)
+    wire.state = ENABLED
+    with pytest.raises(DeviceRefused, match="stays enabled"):
+        wire.device._commission()
+
+
+def test_closing_powers_off_and_then_switches_the_watchdog_off():
+    wire = Wire(DAMIAO)
+    wire.device._release()
+    assert wire.frames()[:7] == [REST, *[EXIT] * 6]
+    assert wire.registers[9] == bytes(4)
+    wire.registers[9] = REGISTERS[9]
+    wire.state = ENABLED
+    wire.device._release()
+    assert wire.registers[9] == REGISTERS[9]  # it keeps the motor that does not let go from going on for ever
+    silent = Wire(T_MOTOR)
+    silent.answers_after = 99
+    silent.device._release()
+    assert silent.frames() == [REST, *[EXIT] * 4]
+
+
+def test_measured_values_in_si():
+    wire = Wire(DAMIAO).ready()
+    wire.answer(0xBFFF, 0x400, 0xC00, (0x28, 0x1E), received=3.0)
+    reading = wire.device.read()
+    expected = [0xBFFF / 65535 * 25 - 12.5, 0x400 / 4095 * 60 - 30, 0xC00 / 4095 * 20 - 10, 0x1E, 0x28]
+    assert reading.values == pytest.approx(expected)  # rad, rad/s, N m, rotor and driver [degrees Celsius]
+    assert reading.received.tolist() == [3.0] * 5
+    motor = Wire(T_MOTOR).ready()
+    motor.answer(0xBFFF, 0x400, 0xC00, (0x41, 0x00))
+    expected = [0xBFFF / 65535 * 25 - 12.5, 0x400 / 4095 * 100 - 50, 0xC00 / 4095 * 36 - 18, 0x41 - 40]
+    assert motor.device.read().values == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("place", [1, 2])
+@pytest.mark.parametrize(("counts", "is_known"), [(0, False), (1, True), (4094, True), (4095, False)])
+def test_velocities_and_efforts_at_the_ends_are_not_known(place, counts, is_known):
+    wire = Wire(DAMIAO).ready()
+    wire.answer(**{("velocity", "effort")[place - 1]: counts})
+    assert math.isfinite(wire.device.read().values[place]) is is_known
+
+
+@pytest.mark.parametrize(("counts", "is_known"), [(0, False), (1, True), (65534, True), (65535, False)])
+def test_positions_at_the_ends_are_not_known(counts, is_known):
+    wire = Wire(DAMIAO)
+    wire.device.is_commissioned, wire.device.missed = True, 0
+    wire.answer(counts)
+    assert math.isfinite(wire.device.read().values[0]) is is_known
+
+
+@pytest.mark.parametrize(("first", "second", "is_wrapped"), [(1, 32768, False), (1, 32769, True), (60000, 20000, True)])
+def test_a_jump_by_half_of_the_range_is_the_other_end(first, second, is_wrapped):
+    wire = Wire(DAMIAO)
+    wire.device.is_commissioned, wire.device.missed = True, 0
+    wire.answer(first)
+    assert wire.device.health().counters["wrapped"] == 0
+    wire.answer(second)
+    assert wire.device.health().counters["wrapped"] == int(is_wrapped)
+    assert math.isnan(wire.device.read().values[0]) is is_wrapped
+    assert ("turned beyond 12.5 rad" in wire.device._fault()) is is_wrapped
+    wire.device.reset()
+    assert wire.device._fault() == ""
+
+
+def test_answers_of_a_wrong_length_and_frames_of_another_sender_are_counted():
+    for settings, wrong in ((DAMIAO, (6, 7)), (T_MOTOR, (5, 7)), ({**T_MOTOR, "motor": "mini-cheetah"}, (5, 8))):
+        wire = Wire(settings, quantities=("position", "velocity"))
+        for count, size in enumerate(wrong, 1):
+            wire.hear(bytes((1, *range(1, size))))
+            assert wire.device.health().counters["malformed"] == count
+    wire.bus.subscriber(1)(bytearray(8), 1.0)
+    assert wire.device.health().counters["foreign"] == 1
+
+
+def test_an_answer_without_a_temperature():
+    """Older firmware of T-Motor."""
+    wire = Wire(T_MOTOR).ready()
+    wire.hear(bytes.fromhex("01 BF FF 7F F7 FF"))
+    assert wire.device.read().values[0] == pytest.approx(6.25, abs=1e-3)
+    assert math.isnan(wire.device.read().values[3])
+    assert wire.device._fault() == ""
+
+
+@pytest.mark.parametrize(("settings", "error"), [(DAMIAO, 0xC), (T_MOTOR, 1)])
+def test_an_error_stays_until_it_is_reset(settings, error):
+    wire = Wire(settings).ready()
+
+    def report(number):
+        wire.state = number << 4
+        wire.answer(last=(0x28, number))
+
+    assert wire.device._fault() == ""
+    report(error)
+    assert "too hot" in wire.device._fault()
+    assert wire.device.health().state is DeviceState.FAULT
+    report(0)
+    assert "too hot" in wire.device._fault()
+    wire.device.reset()
+    assert wire.device._fault() == ""
+    report(error)  # it is being cleared
+    assert "too hot" in wire.device._fault()
+    report(0)
+    assert wire.device._fault() == ""
+
+
+def test_damiao_states():
+    wire = Wire(DAMIAO).ready()
+    assert wire.device.can_damp
+    assert (wire.device.health().state, wire.device.health().text) == (DeviceState.READY, "")
+    for state, is_powered, is_fault in ((0, False, False), (1, True, False), (2, False, True), (8, False, True)):
+        wire.device.reset()
+        wire.state = state << 4
+        wire.answer()
+        assert (wire.device._drives(), bool(wire.device._fault())) == (is_powered, is_fault)
+
+
+def test_a_fault_of_damiao_is_cleared_in_at_most_40_cycles():
+    wire = Wire(DAMIAO).ready()
+    wire.state = TOO_HOT
+    wire.answer()
+    wire.device.reset()
+    for _ in range(45):
+        wire.device.idle()
+    assert wire.frames() == [CLEAR] * 40 + [EXIT] * 5
+    wire.device.reset()
+    wire.state = DISABLED
+    wire.answer()
+    wire.device.idle()
+    wire.state = TOO_HOT
+    wire.answer()
+    wire.device.idle()  # a reset does not clear the next fault
+    assert wire.frames() == [EXIT] * 2
+
+
+def test_a_fault_of_t_motor_is_cleared_by_powering_on_for_two_frames():
+    wire = Wire(T_MOTOR).ready()
+    wire.answers_after = 999
+    wire.answer(last=(0x28, 1))
+    wire.device.reset()
+    wire.device.idle()
+    assert wire.frames() == [ENTER, REST, EXIT]
+
+
+def test_a_quick_stop_brakes_for_03_s_and_powers_off():
+    wire = Wire(DAMIAO).ready()
+    wire.device.quick_stop()  # without power there is nothing to brake
+    wire.device.idle()
+    assert wire.frames() == [EXIT]
+    wire.state = ENABLED
+    wire.answer()
+    wire.device.quick_stop()
+    for _ in range(62):
+        wire.device.idle()
+    assert wire.frames() == [BRAKE] * 60 + [REST, EXIT]
+    wire.device.quick_stop()
+    wire.device.disable()
+    wire.device.idle()
+    wire.device.idle()
+    assert wire.frames() == [EXIT, EXIT]
+
+
+def test_a_drive_that_is_not_commissioned_gets_nothing():
+    wire = Wire(DAMIAO)
+    wire.device.idle()
+    wire.device.apply(np.array([0.5]))
+    wire.device.damp()
+    assert wire.frames() == []
+
+
+def test_power_on_of_damiao():
+    """The watchdog is read, then there is no torque before and after the request of power."""
+    wire = Wire(DAMIAO).ready()
+    device = wire.device
+    device.apply(np.array([0.5]))
+    assert wire.frames() == [EXIT]
+    device.enable()
+    ask = bytes.fromhex("01 00 33 09 00 00 00 00")
+    device.apply(np.array([0.5]))
+    assert wire.frames() == [ask, REST]
+    wire.state = ENABLED
+    device.apply(np.array([0.5]))
+    assert wire.frames() == [ENTER, REST]
+    device.apply(np.array([0.5]))
+    # 0.5 rad: 34078 of 65535; stiffness 40 of 500: 328 of 4095; damping 2 of 5
+    assert wire.frames() == ["85 1E 7F F1 48 66 67 FF"]
+    assert device.health().state is DeviceState.ENABLED
+    device.damp()
+    assert wire.frames() == [BRAKE]
+    wire.state = DISABLED
+    wire.answer()
+    device.apply(np.array([0.5]))
+    assert wire.frames() == [EXIT]
+    assert "powered off by itself" in device.health().text
+
+
+def test_a_drive_that_forgot_its_watchdog_is_not_powered_on():
+    wire = Wire(DAMIAO).ready()
+    wire.registers[9] = bytes(4)
+    wire.device.enable()
+    for _ in range(3):
+        wire.device.apply(np.array([0.5]))
+    assert ENTER not in wire.frames()
+    assert "lost its watchdog setting" in wire.device.health().text
+    assert not wire.device._enable_requested
+
+
+def test_t_motor_has_power_after_six_answers():
+    """It does not report its state."""
+    wire = Wire(T_MOTOR).ready()
+    device = wire.device
+    for _ in range(7):
+        device.idle()
+    wire.frames()
+    device.enable()
+    device.apply(np.array([0.5]))
+    assert wire.frames() == [REST]
+    device.apply(np.array([0.5]))
+    assert wire.frames() == [ENTER, REST]
+    assert not device._drives()
+    while not device._drives():
+        device.apply(np.array([0.5]))
+        assert set(wire.frames()) <= {ENTER, REST}
+    assert device.health().state is DeviceState.ENABLED
+    assert "has no watchdog" in device.health().text
+    device.apply(np.array([0.5]))
+    device.disable()
+    wire.frames()
+    wire.answers_after = 999
+    device.idle()
+    device.idle()
+    assert wire.frames() == [REST, EXIT]
+    assert device.health().state is DeviceState.ENABLED
+    for answers in range(1, 7):
+        wire.answer()
+        assert device._drives() is (answers < 6)
+
+
+@pytest.mark.parametrize("reason", ["_latched", "_is_wrapped"])
+def test_a_fault_ends_the_wish_to_move(reason):
+    wire = Wire(DAMIAO).ready()
+    wire.device.enable()
+    setattr(wire.device, reason, 0xC)
+    wire.device.apply(np.array([0.5]))
+    assert not wire.device._enable_requested
+    assert wire.frames() == [EXIT]
+
+
+@pytest.mark.parametrize(("missed", "is_lost"), [(30, False), (31, True)])
+def test_a_drive_that_was_silent_is_commissioned_again(missed, is_lost):
+    """0.15 s are 30 cycles."""
+    wire = Wire(DAMIAO).ready()
+    wire.device.enable()
+    wire.device.missed = missed
+    wire.answer()
+    assert wire.device.is_commissioned is not is_lost
+    assert wire.device._enable_requested is not is_lost
+    assert ("was silent and answers again" in wire.device.health().text) is is_lost
+
+
+def test_inspection_of_a_drive_without_registers():
+    checks = Wire(T_MOTOR).device.inspect()
+    assert [(check.what, check.is_good) for check in checks] == [("watchdog", False), ("ranges", True)]
