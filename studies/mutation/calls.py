@@ -1,4 +1,6 @@
-"""A pytest plugin that records the duration [s] and the called functions of this project, for each test that passes."""
+"""A pytest plugin that records the duration [s] of each test that passes, and the functions of this project that it
+calls if `TRACE` is in the environment.
+"""
 
 import json
 import os
@@ -24,11 +26,12 @@ def _note(frame: FrameType, event: str, argument: Any) -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
-    """Record the calls of one test, in all threads."""
+    """Record the duration of one test, and its calls in all threads."""
     _calls.clear()
     started = time.perf_counter()
-    threading.settrace(_note)
-    sys.settrace(_note)
+    if os.environ["TRACE"]:
+        threading.settrace(_note)
+        sys.settrace(_note)
     result = yield
     sys.settrace(None)
     duration = time.perf_counter() - started
