@@ -41,6 +41,7 @@ class Wire:
         device._bus.send = self._send
 
     def _send(self, frame):
+        assert not frame.is_extended_id
         self.sent.append((frame.arbitration_id, frame.data.hex(" ").upper()))
         answer = self.answers.get(self.sent[-1]) or self.answers.get(frame.arbitration_id)
         if answer:

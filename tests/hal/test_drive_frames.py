@@ -34,8 +34,12 @@ class Joint:
     def __init__(self, device, puppet):
         self.device, self.puppet = device, puppet
         self.sent = []
-        device._bus.send = lambda frame: self.sent.append((frame.arbitration_id, frame.data.hex(" ").upper()))
+        device._bus.send = self._send
         device.missed = 0
+
+    def _send(self, frame):
+        assert not frame.is_extended_id
+        self.sent.append((frame.arbitration_id, frame.data.hex(" ").upper()))
 
     def report(self, *numbers, cob_id=TPDO, received=5.0):
         """Hear a frame of (number, bytes), low byte first."""

@@ -56,6 +56,7 @@ class Wire:
         self.bus.send = self._send
 
     def _send(self, frame):
+        assert not frame.is_extended_id
         data = bytes(frame.data)
         self.sent.append(data.hex(" ").upper() if frame.arbitration_id != 0x7FF else data)
         if frame.arbitration_id == 0x7FF:
