@@ -3,7 +3,7 @@
 import math
 
 import pytest
-from drive_bench import ELBOW, SETTINGS, joint_description
+from drive_bench import ELBOW, HOMING, SETTINGS, joint_description
 
 from hal.config import RobotConfig
 from hal.drivers.cia402.drive import Cia402Drive
@@ -67,6 +67,26 @@ def test_traffic_is_that_of_the_quantities_which_the_file_names():
     (all_of_them,) = budget.budgets(RobotConfig.model_validate(joint_description()))
     assert all_of_them.bits > one.bits
     assert set(ELBOW) == set(settings.quantities)
+
+
+def objects(pdos):
+    return [" ".join(str(item) for item in pdo.objects) for pdo in pdos]
+
+
+def test_slow_objects_come_with_every_20th_sync_or_by_the_event_timer():
+    """CiA 301, table 31: 254 is the event timer of the maker; its entry is in sub-index 5."""
+    for timing, transmission, event_time in (({}, 20, 0.0), ({"every": 5}, 5, 0.0), ({"event_time": 0.1}, 254, 0.1)):
+        temperature = {"object": "2200h:1", **timing}
+        settings = DriveSettings.model_validate({**SETTINGS, "temperature": temperature, "homing": HOMING})
+        pdos = settings.pdos(("position", "temperature"))
+        assert objects(pdos.sends) == ["6041h:0 6064h:0", "2200h:1 6061h:0"]
+        assert [pdo.number for pdo in pdos.sends] == [1, 2]
+        assert (pdos.sends[1].transmission, pdos.sends[1].event_time) == (transmission, event_time)
+        assert objects(pdos.receives) == ["6040h:0 6060h:0 607Ah:0"]
+    settings = DriveSettings.model_validate({**SETTINGS, "homing": HOMING})
+    sends = settings.pdos(("velocity",)).sends
+    assert objects(sends) == ["6041h:0 6064h:0", "606Ch:0", "6061h:0"]  # a position drive starts from its position
+    assert [(pdo.number, pdo.transmission) for pdo in sends] == [(1, 1), (2, 1), (3, 20)]
 
 
 def test_a_set_point_stays_until_it_is_acknowledged_and_the_newest_is_next():

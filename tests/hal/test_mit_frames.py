@@ -454,6 +454,10 @@ def test_power_on_of_damiao():
     device.apply(np.array([0.5]))
     assert wire.frames() == [EXIT]
     assert "powered off by itself" in device.health().text
+    device.enable()
+    device.disable()
+    device.apply(np.array([0.5]))
+    assert wire.frames() == [EXIT]
 
 
 def test_a_drive_that_forgot_its_watchdog_is_not_powered_on():

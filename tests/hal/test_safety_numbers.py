@@ -9,7 +9,7 @@ from hal_bench import description as muscles
 from safety_bench import PERIOD, SafetyBench, description
 
 from hal.clock import ManualClock, SystemClock
-from hal.config import RobotConfig
+from hal.config import BusConfig, RobotConfig
 from hal.device import DeviceState
 from hal.errors import CommandRefused
 from hal.fleet import build
@@ -19,6 +19,7 @@ from hal.safety.limit import fastest
 from hal.safety.limiter import Limiter
 from hal.safety.start import Start
 from hal.safety.watchdog import CommandWatchdog, CycleWatchdog, checked
+from hal.wire.bus import Bus
 
 
 def limiter(quantity, stale_after=0.05, **limits):
@@ -123,7 +124,7 @@ def test_an_acceleration_and_a_rate_of_a_position():
 
 @pytest.mark.parametrize(
     ("distance", "speed"),
-    [(1e-5, 0.002), (2.5e-5, 0.005), (1e-4, 1e-4 / 0.015 + 0.005), (0.0, 0.0), (-1.0, 0.0)],
+    [(1e-5, 0.002), (2.4e-5, 0.0048), (2.5e-5, 0.005), (1e-4, 1e-4 / 0.015 + 0.005), (0.0, 0.0), (-1.0, 0.0)],
 )
 def test_the_fastest_speed_within_a_distance(distance, speed):
     """1 unit/s2 in cycles of 5 ms: a loss of 5 mm/s per cycle; 0.1 mm takes three cycles."""
@@ -411,6 +412,37 @@ def test_requests_run_at_once_and_one_per_name():
     assert not requests._threads["stuck"].is_alive()
     requests.start("broken", lambda: 1 / 0)
     requests.join(1.0)
+
+
+@pytest.mark.parametrize("is_silent", [False, True])
+def test_on_a_bus_only_a_measurement_after_the_request_shows_that_a_drive_has_stopped(is_silent):
+    def turn(joints, cycles):
+        cycles[0] += 1
+        for joint in joints:
+            joint.state, joint.is_silent = DeviceState.READY, is_silent
+
+    bus = Bus("can0", BusConfig(interface="virtual", channel="estop"), SystemClock())
+    result, _, duration = stop(turn, buses=[bus])
+    assert result.is_complete is not is_silent
+    assert (duration > 0.9) is is_silent
+
+
+def test_a_drive_that_did_not_stop_is_logged_as_critical(caplog):
+    def turn(joints, cycles):
+        cycles[0] += 1
+        joints[0].state = DeviceState.READY
+
+    stop(turn)
+    assert [entry.levelname for entry in caplog.records] == ["WARNING", "CRITICAL"]
+
+
+@pytest.mark.parametrize("quantity", ["position", "velocity"])
+def test_a_limit_that_cannot_act_names_its_measurement(quantity):
+    limits = limiter("effort")
+    name = {"position": "range", "velocity": "velocity"}[quantity]
+    text = f"The {name} limit cannot act without a valid {quantity} of shoulder."
+    assert limits.blind(measured(**{quantity: math.nan})) == text
+    assert limits.blind(measured()) == ""
 
 
 def test_drives_on_a_bus_that_is_gone():

@@ -6,7 +6,7 @@ from pydantic import ValidationError
 from hal.drivers.canopen.analog import InputSettings
 from hal.drivers.canopen.cia406 import Cia406Encoder
 from hal.drivers.cia402.settings import DriveSettings
-from hal.drivers.dbc.settings import DbcSettings, FrameConfig, QuantityConfig, UntilConfig
+from hal.drivers.dbc.settings import DbcSettings, FrameConfig, QuantityConfig, ServoSettings, UntilConfig
 from hal.drivers.mit.settings import MitSettings
 from hal.drivers.odrive import OdriveSettings
 
@@ -119,6 +119,39 @@ def test_ends(kind, given, name, low, high, beyond):
 def test_defaults(kind, given, defaults):
     settings = kind.model_validate(given)
     assert {name: getattr(settings, name) for name in defaults} == defaults
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "quantities",
+        "periods",
+        "enable",
+        "disable",
+        "state.enabled",
+        "state.ready",
+        "watchdog.fed_by",
+        "identity.signals",
+    ],
+)
+def test_lists_that_must_not_be_empty(name):
+    step = {"send": "Go"}
+    given = {
+        **DBC,
+        "quantities": {"effort": {"signal": "A.B"}},
+        "command": {"quantity": "effort", "send": "Go", "signal": "X"},
+        "state": {"signal": "A.S", "ready": ["OFF"], "enabled": ["ON"]},
+        "enable": [step],
+        "disable": [step],
+        "watchdog": {"timeout": 1.0, "fed_by": ["Go"]},
+        "identity": {"signals": ["A.B"]},
+    }
+    ServoSettings.model_validate(given)
+    section, _, key = name.rpartition(".")
+    empty = {} if name in ("quantities", "periods") else []
+    changed = {section: {**given[section], key: empty}} if section else {key: empty}
+    with pytest.raises(ValidationError, match=key):
+        ServoSettings.model_validate({**given, **changed})
 
 
 def test_defaults_of_sections():
