@@ -171,7 +171,10 @@ def test_records_replace_those_of_their_device_and_of_their_identity(config):
     assert not path.with_name(path.name + store.KEPT).exists()  # there was no file before
     store.save(config, record(config, "biceps_cell", "canopen:2"))
     store.save(config, record(config, "triceps_cell", ""))
-    assert list(yaml.safe_load(path.read_text())) == ["canopen:1", "canopen:2", "unknown:triceps_cell"]
+    saved = yaml.safe_load(path.read_text())
+    assert list(saved) == ["canopen:1", "canopen:2", "unknown:triceps_cell"]
+    assert list(saved["canopen:1"])[:4] == ["device", "identity", "settings", "measured_with"]  # as a person reads it
+    assert path.read_text().startswith("# What `gemuco calibrate` measured")
     store.save(config, record(config, "biceps_drive", "canopen:1"))  # this very device is elsewhere now
     assert {one.device: one.identity for one in store.records(config)} == {
         "biceps_cell": "canopen:2",

@@ -183,6 +183,19 @@ def test_power_in_a_fault_is_that_of_the_drive(fault, drives, expected):
     assert device.has_power is (expected or not fault)
 
 
+def test_a_sensor_commands_nothing_and_has_no_motor():
+    bus = Bus("can0", BusConfig(interface="virtual", channel="can_device"), SystemClock())
+    device = CanDevice(Place("cell", {"force": "cell.force"}, bus, 4, None, 200.0), DeviceSettings())
+    assert (device.commands, device.command_quantity) == ((), "")
+    device.is_commissioned, device.missed, device._fault = True, 0, lambda: "hot"
+    assert device.health().state is DeviceState.FAULT
+    assert not device.has_power
+    assert str(device._place) == "'cell' (node 4 on can0)"
+    for hook in (device._identify, device._commission):
+        with pytest.raises(NotImplementedError):
+            hook()
+
+
 def test_an_answer_ends_the_wait_of_the_cycle():
     device = gripper()
     device.open()

@@ -533,6 +533,13 @@ def test_a_motor_is_damped_against_its_velocity(open_wire):
     wire.frames()
     device.idle()
     assert wire.frames()[0] == (513 + 4 * NODE, "50 00")  # no effort
+    undamped = open_wire(DbcServo, given, "effort", "velocity")
+    undamped.device.is_commissioned, undamped.device.missed = True, 0
+    undamped.device._enable_requested = undamped.device._enable_succeeded = True
+    undamped.hear(STATUS, ON)
+    undamped.device._values[:] = 1.0
+    undamped.device.damp()
+    assert undamped.frames() == [(513 + 4 * NODE, "50 00")]
     with pytest.raises(ConfigError, match="damping needs the velocity"):
         open_wire(DbcServo, given, "effort", damping=2.0)
     assert not open_wire(DbcServo, SERVO).device.can_damp

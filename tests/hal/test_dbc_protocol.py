@@ -269,6 +269,8 @@ def test_many_names_are_not_all_listed():
         file.message("Nothing of the kind")
     assert str(caught.value).count("Message") == 40
     assert "and 2 more" in str(caught.value)
+    with pytest.raises(ConfigError, match=r"Did you mean \w+ or \w+ or \w+\? It has"):
+        file.message("Message")
 
 
 def test_bits_without_a_name():

@@ -74,6 +74,7 @@ def test_the_first_reason_to_give_up_stays():
 
 def test_cycles_without_an_acknowledgement_are_counted():
     handshake = SetPointHandshake()
+    assert handshake.waited == 0
     handshake.start(5)
     assert handshake.step(6, 0x0237) == (0x30, 6)
     for waited in range(1, 4):

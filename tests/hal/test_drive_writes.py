@@ -13,8 +13,9 @@ from hal_bench import ROBOTS
 
 from hal.drivers.canopen.node import data_sheet
 from hal.drivers.cia402.settings import DriveSettings, drive_units
-from hal.drivers.cia402.writes import check_objects, drive_writes
+from hal.drivers.cia402.writes import ERROR_BEHAVIOUR, check_objects, drive_writes
 from hal.errors import ConfigError
+from hal.protocols.cia301 import mapped
 from hal.protocols.cia402 import VELOCITY_UNITS
 
 ANYWHERE = (-math.inf, math.inf)
@@ -29,6 +30,7 @@ def writes(bounds=ANYWHERE, unit="counts/s", period=0.005, **settings):
 
 
 def test_what_every_drive_gets():
+    assert mapped("1029h:1", "uint8") == ERROR_BEHAVIOUR
     assert writes() == {
         "6060h:0": 8,
         "60C2h:1": 5,

@@ -117,6 +117,8 @@ def test_drives_under_one_identifier_are_distinguished_by_their_first_byte():
     other.hear(b"")
     assert bus.counters["unknown"] == unknown + 2
     bus = Wire(DAMIAO, 0x02, master_id=0x40).bus
+    Wire(DAMIAO, 0x03, bus, master_id=0x40)
+    Wire(DAMIAO, 0x0A, bus, master_id=0x40)
     with pytest.raises(ConfigError, match="answer under 040h with the id 2h"):
         Wire(DAMIAO, 0x12, bus, master_id=0x40)
     with pytest.raises(ConfigError, match="identifier 040h"):
@@ -424,6 +426,8 @@ def test_a_quick_stop_brakes_for_03_s_and_powers_off():
 
 def test_a_drive_that_is_not_commissioned_gets_nothing():
     wire = Wire(DAMIAO)
+    assert not wire.device._drives()
+    assert wire.device._fault() == ""
     wire.device.idle()
     wire.device.apply(np.array([0.5]))
     wire.device.damp()

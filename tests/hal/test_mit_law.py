@@ -150,6 +150,9 @@ def test_ranges_of_the_table_and_of_ones_own():
         return layout.value, found.position, found.velocity, found.effort, found.stiffness, found.damping
 
     assert ranges() == ("damiao", 12.5, 30.0, 10.0, 500.0, 5.0)
+    own_layout = {**base, "ranges": {"layout": "t_motor"}, "allow_no_watchdog": True}
+    assert MitSettings.model_validate(own_layout).actuator[0].value == "t_motor"
+    assert MitSettings.model_validate(own_layout).actuator[1].effort == 10.0
     assert ranges(**own) == ("damiao", 1.0, 2.0, 3.0, 500.0, 5.0)
     assert ranges(**own, stiffness=50.0, damping=2.0) == ("damiao", 1.0, 2.0, 3.0, 50.0, 2.0)
     for place, name in enumerate(("position", "velocity", "effort", "stiffness", "damping"), 1):

@@ -263,6 +263,12 @@ def test_paying_out_ends_at_the_end_of_the_range(before, step):
     assert one(limit, 0.0, before, f=200.0) == pytest.approx(before + step)
 
 
+@pytest.mark.parametrize(("effort", "sign"), [(0.75, -1.0), (-0.75, 1.0)])
+def test_a_small_load_gives_way_in_its_own_direction(effort, sign):
+    small = load(soft=0.5, hard=1.0, is_signed=True)
+    assert one(SoftEffortOfVelocity(small, np.array([0.2])), 0.0, f=effort) == pytest.approx(sign * 0.1)
+
+
 @pytest.mark.parametrize(("effort", "sign"), [(150.0, -1.0), (-150.0, 1.0)])
 def test_a_loaded_joint_gives_way_against_its_effort(effort, sign):
     limit = SoftEffort(load(is_signed=True), np.array([0.2]), np.array([LOW]), np.array([HIGH]), PERIOD)

@@ -2,6 +2,7 @@
 
 import math
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -289,8 +290,10 @@ def test_a_request_waits_half_a_second_for_the_cycle():
     held.wait(5.0)
     with lock.within(0.01) as is_free:
         assert not is_free
+    begun = time.monotonic()
     with pytest.raises(CommandRefused, match="stuck"), lock.request():
         raise AssertionError
+    assert 0.49 < time.monotonic() - begun < 1.4
     release.set()
     thread.join()
     for _ in range(2):  # it was released each time

@@ -265,6 +265,13 @@ def test_units_and_digits_of_a_cell():
         raise AssertionError
 
 
+def test_a_status_that_cannot_be_mapped_is_left_out():
+    """By the data sheet 6150h:5 exists and cannot be mapped."""
+    with cell(channels=[5], value="7130h:1 int16", digits=0, unit="N") as (device, puppet):
+        assert [str(item) for item in device.pdos.sends[0].objects] == ["7130h:1"]
+        assert told(device, puppet, "07 00") == [7.0]
+
+
 def test_a_tare_is_restored_when_the_cell_is_commissioned_again():
     with cell(objects={**CELL, "6124:1": "00 00 C0 BF"}) as (device, puppet):
         device.tare()
@@ -339,6 +346,8 @@ def test_angles_around_a_center(around, counts, turns):
 def test_faults_of_an_encoder_in_words():
     quantities = ("position", "velocity")
     with encoder(quantities=quantities) as (device, _):
+        device.missed = 0
+        assert device.health().text == ""
         hear(device, bytes.fromhex("00 08 00 00 00 00 00 04"))
         device.missed = 0
         assert device.health().text == ""

@@ -3,6 +3,7 @@
 import math
 import time
 from collections.abc import Iterator, Mapping
+from dataclasses import FrozenInstanceError
 from typing import Any
 
 import numpy as np
@@ -48,6 +49,9 @@ def test_times_of_a_lease(case: Case) -> None:
 
 def test_a_new_lease_is_nobodys() -> None:
     assert Tenure() == Tenure(UNKNOWN, -math.inf, 0, 0)
+    assert not hasattr(Tenure(), "__dict__")
+    with pytest.raises(FrozenInstanceError):
+        Tenure().number = 1  # type: ignore[misc]
     lease = Lease(ManualClock())
     assert lease.tenure is None
     assert lease.left() == 0.0
