@@ -28,6 +28,8 @@ LISTED = 40
 
 _INTEGERS = {8: "b", 16: "h", 32: "i", 64: "q"}
 _FLOATS = {16: "e", 32: "f", 64: "d"}
+_LARGEST_FLOATS = {16: 65504.0, 32: 3.4e38}
+"""Values that fit into a float of this number of bits; a larger one could not be packed."""
 
 
 class Dbc:
@@ -123,15 +125,15 @@ def describe(signal: Signal, raw: float, is_bits: bool = False) -> str:
 
 def raw_bounds(signal: Signal) -> tuple[float, float]:
     """Return the smallest and the largest raw value that the signal can hold and the file allows."""
-    low, high = -math.inf, math.inf
-    if not signal.is_float:
+    if signal.is_float:
+        high = _LARGEST_FLOATS.get(signal.length, math.inf)
+        low = -high
+    else:
         low, high = (
             (-(1 << signal.length - 1), (1 << signal.length - 1) - 1)
             if signal.is_signed
             else (0, (1 << signal.length) - 1)
         )
-    elif signal.length == 32:
-        low, high = -3.4e38, 3.4e38
     stated = [(bound - signal.offset) / signal.scale for bound in (signal.minimum, signal.maximum) if bound is not None]
     return (max(low, min(stated)), min(high, max(stated))) if len(stated) == 2 else (low, high)
 

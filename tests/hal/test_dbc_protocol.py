@@ -42,10 +42,20 @@ BO_ 8 Seven: 7 A
  SG_ Low : 36|8@1+ (1,0) [0|0] "" B
  SG_ Last : 50|6@1+ (1,0) [0|0] "" B
 
+BO_ 9 Floats: 8 A
+ SG_ Half : 0|16@1- (1,0) [0|0] "" B
+ SG_ Single : 16|32@1- (1,0) [0|0] "" B
+
+BO_ 10 Double: 8 A
+ SG_ Value : 7|64@0- (1,0) [0|0] "" B
+
 BO_ 2147483655 Wide: 8 A
  SG_ Count : 0|64@1+ (1,0) [0|0] "" B
 
 SIG_VALTYPE_ 1 Real : 1;
+SIG_VALTYPE_ 9 Half : 1;
+SIG_VALTYPE_ 9 Single : 1;
+SIG_VALTYPE_ 10 Value : 2;
 VAL_ 6 Mode 0 "OFF" 2 "RUN" ;
 """
 )
@@ -102,7 +112,9 @@ def test_writes_what_cantools_reads_back(mixed):
                     raw = chance.randrange(2)
                 writer.write(raw)
                 assert len(writer.data) == message.length
-                assert reader.read(writer.data)[0] == pytest.approx(raw, abs=0 if signal.is_float else 0.5, rel=1e-6)
+                accuracy = 1e-3 if signal.is_float and signal.length == 16 else 1e-6
+                expected = pytest.approx(raw, abs=0 if signal.is_float else 0.5, rel=accuracy)
+                assert reader.read(writer.data)[0] == expected
 
 
 def test_what_does_not_fit_is_held_at_the_nearest(mixed):
@@ -112,6 +124,9 @@ def test_what_does_not_fit_is_held_at_the_nearest(mixed):
     assert writer.data == bytes.fromhex("E8 03 02 00")  # 100 rpm, as the file allows, in tenths
     writer.write(-1e12)
     assert writer.data == bytes.fromhex("18 FC 02 00")
+    half = dbc.Writer(mixed, mixed.message("Floats"), {}, "Half")
+    half.write(1e6)
+    assert half.data[:2] == bytes.fromhex("FF 7B")  # 65504, the largest of 16 bits
     real = dbc.load(FILES / "odrive_cansimple.dbc")
     writer = dbc.Writer(real, real.message("Set_Input_Pos"), {}, "Input_Pos")
     writer.write(1e300)
@@ -129,6 +144,8 @@ def test_whole_bytes_and_whole_numbers_need_no_cantools(mixed):
         ("Muxed", ["Speed"], False),
         ("Words", ["First", "Second"], True),
         ("Wide", ["Count"], True),
+        ("Floats", ["Half", "Single"], True),
+        ("Double", ["Value"], True),
     ):
         assert dbc.SignalReader(mixed.message(name), signals).is_compiled is is_compiled, (name, signals)
 
@@ -186,6 +203,8 @@ def test_raw_values_in_words():
         ("Bounded.Speed", -1000, 1000),
         ("Bounded.Mode", 0, 255),
         ("Wide.Count", 0, 2**64 - 1),
+        ("Floats.Half", -65504, 65504),
+        ("Double.Value", -math.inf, math.inf),
     ],
 )
 def test_the_smallest_and_largest_raw_value(mixed, name, low, high):
@@ -240,6 +259,8 @@ def test_a_value_that_does_not_fit(mixed, name, value):
         ("Words", "FF FE 00 00 00 00 01 02", {"First": -2, "Second": 0x0102}),
         ("Seven", "00 00 00 00 50 0A FC", {"Low": 0xA5, "Last": 63}),
         ("Wide", "01 00 00 00 00 00 00 80", {"Count": 2**63 + 1}),
+        ("Floats", "00 3E 00 00 20 C1 00 00", {"Half": 1.5, "Single": -10.0}),  # IEEE 754
+        ("Double", "C0 24 00 00 00 00 00 00", {"Value": -10.0}),
     ],
 )
 def test_frames_written_out_by_hand(mixed, message, data, values):
