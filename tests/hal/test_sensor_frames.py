@@ -2,9 +2,10 @@
 
 import contextlib
 import math
+import time
 
 import pytest
-from puppet import NODE, driven, told
+from puppet import NODE, ROBOTS, driven, told
 
 from hal.device import DeviceState
 from hal.drivers.canopen import analog as channels
@@ -296,6 +297,28 @@ def test_a_tare_is_restored_when_the_cell_is_commissioned_again():
 def encoder(objects=ENCODER, quantities=("position",), **settings):
     elements = {quantity: f"joint_{quantity}.elbow" for quantity in quantities}
     return driven(Cia406Encoder, elements, {"eds": "eds/joint_encoder.eds", **settings}, objects)
+
+
+def test_a_node_that_does_not_become_operational_is_refused_after_half_a_second():
+    with driven(Cia404Cell, {"force": "f.a"}, {"eds": "eds/load_cell.eds"}, CELL, is_open=False) as (device, puppet):
+        reply = puppet._reply
+        puppet._reply = lambda cob_id, data: reply(cob_id, data) if cob_id != HEARTBEAT else None
+        begun = time.monotonic()
+        with pytest.raises(DeviceRefused, match="does not become operational"):
+            device.open()
+        assert 0.49 < time.monotonic() - begun < 1.4
+
+
+@pytest.mark.parametrize(
+    ("fixed", "objects"),
+    [((), ["6004h:0", "6503h:0", "6505h:0"]), (("6505",), ["6004h:0", "6503h:0"]), (("6503", "6505"), ["6004h:0"])],
+)
+def test_alarms_and_warnings_that_cannot_be_mapped_are_left_out(tmp_path, fixed, objects):
+    sections = (ROBOTS / "eds" / "joint_encoder.eds").read_text().split("\n[")
+    changed = [text.replace("PDOMapping=1", "PDOMapping=0") if text[:4] in fixed else text for text in sections]
+    (tmp_path / "encoder.eds").write_text("\n[".join(changed))
+    with encoder(eds=str(tmp_path / "encoder.eds")) as (device, _):
+        assert [str(item) for item in device.pdos.sends[0].objects] == objects
 
 
 @pytest.mark.parametrize(
