@@ -12,10 +12,12 @@ from hal.config import RobotConfig, load_robot
 from hal.errors import ConfigError
 from services import show
 from services.learning import trainer
+from services.learning.interruption import key_of_training, marked
 from services.learning.trainer import TrainingResult
 from services.measured import description, reading
 from services.measured.table_files import is_table
 from services.model import artifacts
+from services.model.model_config import model_config
 from services.recording.dataset import is_recording, select
 
 
@@ -41,10 +43,10 @@ def run_training(
         raise ConfigError(f"'{file}' holds data. `gemuco describe {file}` drafts a description to train from.")
     if description.is_description(file):
         described = description.load_measured(file)
-        name, dataset = described.recording, _measured(described, _only(data) or file.parent)
+        name, dataset, settings = described.recording, _measured(described, _only(data) or file.parent), described.model
     else:
         robot = load_robot(file)
-        name, dataset = robot.robot, _data(robot, data, condition)
+        name, dataset, settings = robot.robot, _data(robot, data, condition), model_config(robot)
     folder = out or artifacts.model_folder(name)
     drafts = trainer.drafts_of(folder)
 
@@ -55,11 +57,12 @@ def run_training(
             return trainer.tune(known, described.model, dataset, seed, progress, drafts, recording=name)
         return trainer.learn(described.model, dataset, seed, progress, drafts, recording=name)
 
-    if drafts.exists():
-        typer.echo(f"A training of {folder} was interrupted. It continues if data and settings are the same.")
     try:
-        with show.progress("training") as progress:
-            result = train(progress)
+        with marked(drafts, key_of_training(dataset, settings, seed, base)) as was_interrupted:
+            if was_interrupted:
+                typer.echo(f"The training of {folder} was interrupted. It continues.")
+            with show.progress("training") as progress:
+                result = train(progress)
     except KeyboardInterrupt:
         typer.echo("Interrupted. The same command continues from here.", err=True)
         raise
