@@ -27,6 +27,9 @@ RANGE = re.compile(r"\{(\d+)\.\.(\d+)\}")
 SEPARATORS = {"tab": "\t", "\\t": "\t", "space": " ", "comma": ",", "semicolon": ";"}
 """A separator may be given by one of these words."""
 
+EXAMPLES = {"signals": "{joint: {unit: rad, columns: q}}", "conditions": '{"run_1*": light, "run_2*": heavy}'}
+"""These keys hold mappings such as these."""
+
 
 def _text(value: object) -> object:
     """Return a number of YAML as the text it was written as."""
@@ -71,6 +74,13 @@ class MeasuredSignalConfig(ColumnsConfig):
     unit: Text
     written_in: Text | None = None
     """Unit of the numbers in the file, if different from `unit`."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _has_unit(cls, value: object) -> object:
+        if isinstance(value, str | int) or (isinstance(value, dict) and value.get("unit") is None):
+            raise ValueError("a signal needs a unit, such as {unit: rad, columns: q}; a number without one has unit: 1")
+        return value
 
     @model_validator(mode="after")
     def _units_fit(self) -> "MeasuredSignalConfig":
@@ -146,6 +156,12 @@ class MeasuredConfig(Section):
     def _short_forms(cls, value: object) -> object:
         if not isinstance(value, dict):
             return value
+        for key in ("recording", "episodes", "signals"):
+            if key not in value:
+                raise ValueError(f"'{key}' is missing; a description needs recording, episodes and signals")
+        for key in ("signals", "conditions"):
+            if not isinstance(value.get(key, {}), dict):
+                raise ValueError(f"'{key}' is a mapping, such as {EXAMPLES[key]}")
         episodes, separator = value.get("episodes"), value.get("separator")
         short = {"episodes": (episodes,)} if isinstance(episodes, str) else {}
         return {**value, **short, **({"separator": SEPARATORS[separator]} if separator in SEPARATORS else {})}

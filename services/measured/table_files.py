@@ -1,6 +1,8 @@
 """Tables of numbers from files: text with separators, NumPy archives, Parquet."""
 
+import csv
 import zipfile
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
@@ -56,6 +58,8 @@ def read_table(path: Path, style: TextStyle, wanted: Sequence[str] | None, stamp
         if kind == ".parquet":
             return _chosen(path, _parquet(path), wanted)
         return TextTable(path, style).table(wanted, frozenset(stamps))
+    except csv.Error as error:
+        raise DatasetError(f"'{path}' is not a text file of separated values ({error}).") from None
     except IsADirectoryError:
         raise DatasetError(f"'{path}' is a folder; name the file in it of every signal with `file:`.") from None
     except NotADirectoryError:
@@ -72,7 +76,12 @@ def _chosen(path: Path, columns: Mapping[str, np.ndarray], wanted: Sequence[str]
     if not names:
         raise DatasetError(f"'{path}' holds no column of numbers.")
     if wanted is None:
-        return Table(path, names, columns)
+        usual = Counter(map(len, columns.values())).most_common(1)[0][0]
+        others = [name for name in names if len(columns[name]) != usual]
+        notes = (
+            [f"'{path}': {', '.join(others)} left out, because the other columns have {usual} rows."] if others else []
+        )
+        return Table(path, names, {name: columns[name] for name in names if name not in others}, tuple(notes))
     return Table(path, names, {name: columns[names[place_of(path, name, names)]] for name in wanted})
 
 
@@ -98,7 +107,9 @@ def _archive(path: Path) -> dict[str, np.ndarray]:
 
 
 def _split(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the columns of an array, shape (rows,) or (rows, n)."""
+    """Return the columns of an array, shape (rows,), (1, rows) as MATLAB writes it, or (rows, n)."""
+    if values.ndim == 2 and len(values) == 1:
+        values = values[0]
     if values.ndim == 1:
         return {name or "0": values.astype(float)}
     return {f"{name}_{k}" if name else str(k): values[:, k].astype(float) for k in range(values.shape[1])}

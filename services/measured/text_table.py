@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,8 @@ import numpy as np
 from gemuco.errors import DatasetError
 from services.measured.table import Table, counted, place_of, shown
 
+SAMPLE = 1000
+"""Header and number of columns are judged by this many lines."""
 BROKEN = 0.01
 """A file may have this share of broken rows, and always one; a last line that was cut off does not count."""
 
@@ -49,44 +52,46 @@ class TextTable:
 
     def __init__(self, path: Path, style: TextStyle) -> None:
         self.path, self.style = path, style
-        try:
-            self._read()
-        except csv.Error as error:
-            raise DatasetError(f"'{path}' is not a text file of separated values ({error}).") from None
+        self._text = decoded(path)
+        lines = list(islice(lines_of(self._text, style.separator), SAMPLE))
+        head = self._head(lines)
+        if not lines:
+            raise DatasetError(f"'{path}' is empty: it holds no row of data.")
+        self._start, self.count, self._last = lines[0][0], 0, 0
+        size = Counter(len(cells) for _, cells in lines).most_common(1)[0][0]
+        names = tuple(name.strip().strip("\"'") for name in head) if style.header else tuple(map(str, range(size)))
+        self.names = names if any(names[size:]) else names[:size]
+        if (len(self.names) > 1 and size == 1) or len(self.names) < size:
+            self._refuse_header(lines, size)
 
-    def _read(self) -> None:
-        lines = list(lines_of(decoded(self.path), self.style.separator))
+    def _head(self, lines: list[tuple[int, list[str]]]) -> list[str]:
+        """Take the lines before the data from the first lines, and return the cells of the header."""
         comment: list[str] | None = None
-        while lines and lines[0][1][0].lstrip().startswith("#"):
+        while lines and _is_comment(lines[0][1]):
             comment = lines.pop(0)[1]
-        named = (
-            comment is not None and len(lines) > 0 and not self._is_numeric(comment) and self._is_numeric(lines[0][1])
-        )
-        if not self.style.header:
-            head = [str(index) for index in range(len(lines[0][1]))] if lines else []
-        elif named and comment is not None:  # the header is a comment, as numpy.savetxt writes it
-            head = [comment[0].lstrip().lstrip("#"), *comment[1:]]
-            head = [cell for cell in head if cell.strip()] if self.style.separator == " " else head
-        else:
-            head = lines.pop(0)[1] if lines else []
-        self.lines = [line for line in lines if not line[1][0].lstrip().startswith("#")]
-        self.names = tuple(name.strip().strip("\"'") for name in head)
-        if not self.lines:
-            raise DatasetError(f"'{self.path}' is empty: it holds no row of data.")
-        size = Counter(len(cells) for _, cells in self.lines).most_common(1)[0][0]
-        if not any(self.names[size:]):
-            self.names = self.names[:size]
-        if (len(self.names) > 1 and size == 1) or (len(self.names) < size and self.style.header):
-            self._refuse_header(size)
+        if not lines or not self.style.header:
+            return []
+        if comment is None or self._is_numeric(comment) or not self._is_numeric(lines[0][1]):
+            return lines.pop(0)[1]
+        head = [comment[0].lstrip().lstrip("#"), *comment[1:]]  # the header is a comment, as numpy.savetxt writes it
+        return [cell for cell in head if cell.strip()] if self.style.separator == " " else head
 
-    def _refuse_header(self, size: int) -> None:
+    def _refuse_header(self, lines: list[tuple[int, list[str]]], size: int) -> None:
         """Refuse a first line that does not fit the rows, unless these have empty cells at the end."""
-        usual = Counter(len(_trimmed(cells)) for _, cells in self.lines).most_common(1)[0][0]
+        usual = Counter(len(_trimmed(cells)) for _, cells in lines).most_common(1)[0][0]
         if usual > len(self.names) or size == 1:
             raise DatasetError(
                 f"'{self.path}': the first line names {counted(len(self.names), 'column')}, but the rows have {size}. "
                 "Is it the header? Begin the lines above the header with #; without a header write header: false."
             )
+
+    def _lines(self) -> Iterator[tuple[int, list[str]]]:
+        """Yield number and cells of the lines of data, and count them."""
+        self.count = 0
+        for number, cells in lines_of(self._text, self.style.separator):
+            if number >= self._start and not _is_comment(cells):
+                self.count, self._last = self.count + 1, number
+                yield number, cells
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -107,17 +112,28 @@ class TextTable:
         readers = [stamp_of if name in stamps or wanted is None else number_of for name in chosen]
         numbers, texts = array("d"), dict.fromkeys(chosen, 0)
         faults: list[tuple[int, str]] = []
-        for line, cells in self.lines:
+        for line, cells in self._lines():
             try:
-                row = self._row(cells, chosen, places, readers, texts if wanted is None else None)
+                row = self._plain(cells, places) or self._row(
+                    cells, chosen, places, readers, texts if wanted is None else None
+                )
             except ValueError as fault:
                 faults.append((line, str(fault)))
                 row = [math.nan] * len(chosen)
             numbers.extend(row)
-        values = np.frombuffer(numbers, float).reshape(len(self.lines), len(chosen))
+        values = np.frombuffer(numbers, float).reshape(self.count, len(chosen))
         notes = self._judge(faults)
         columns = {name: values[:, index].copy() for index, name in enumerate(chosen)}
         return Table(self.path, self.names, columns, notes, texts if wanted is None else {})
+
+    def _plain(self, cells: list[str], places: Sequence[int]) -> list[float] | None:
+        """Return the numbers of a line, fast; None if it needs a closer look."""
+        if self.style.decimal != "." or len(cells) != len(self.names):
+            return None
+        try:
+            return [float(cells[place]) for place in places]
+        except ValueError:
+            return None
 
     def _row(
         self,
@@ -151,23 +167,23 @@ class TextTable:
         """
         notes: list[str] = []
         middle = list(faults)
-        is_cut = bool(faults) and faults[-1][0] == self.lines[-1][0] and len(self.lines) > 1
+        is_cut = bool(faults) and faults[-1][0] == self._last and self.count > 1
         if is_cut:
             line, fault = middle.pop()
             notes.append(f"'{self.path}': the last line was cut off and is left out (line {line}: {fault}).")
-        if len(middle) > max(1, BROKEN * len(self.lines)) or len(middle) == len(self.lines) - is_cut:
+        if len(middle) > max(1, BROKEN * self.count) or len(middle) == self.count - is_cut:
             raise DatasetError(self._refusal(middle))
         if middle:
             line, fault = middle[0]
             notes.append(
-                f"'{self.path}': {len(middle)} of {len(self.lines)} rows {'is' if len(middle) == 1 else 'are'} broken "
+                f"'{self.path}': {len(middle)} of {self.count} rows {'is' if len(middle) == 1 else 'are'} broken "
                 f"and left out (first in line {line}: {fault})."
             )
         return tuple(notes)
 
     def _refusal(self, faults: list[tuple[int, str]]) -> str:
         line, fault = faults[0]
-        count = f" {len(faults)} of {len(self.lines)} rows are broken; at most {BROKEN:.0%} may be."
+        count = f" {len(faults)} of {self.count} rows are broken; at most {BROKEN:.0%} may be."
         if fault.startswith("has "):
             return (
                 f"'{self.path}' line {line} {fault}. Is the separator '{shown(self.style.separator)}', and was the "
@@ -214,6 +230,10 @@ def lines_of(text: str, separator: str) -> Iterator[tuple[int, list[str]]]:
         cells = next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])
         if len(cells) > 1 or (cells and cells[0].strip()):
             yield number, cells
+
+
+def _is_comment(cells: list[str]) -> bool:
+    return cells[0].lstrip().startswith("#")
 
 
 def _trimmed(cells: list[str]) -> list[str]:

@@ -47,6 +47,11 @@ def run_training(
     else:
         robot = load_robot(file)
         name, dataset, settings = robot.robot, _data(robot, data, condition), model_config(robot)
+    if known is not None and not len(known.bias) and len(dataset.conditions) > 1:
+        typer.echo(
+            f"The conditions of the data ({', '.join(dataset.conditions)}) are not distinguished: the model in {base} "
+            "has no p. Train a new one without --from."
+        )
     folder = out or artifacts.model_folder(name)
     drafts = trainer.drafts_of(folder)
 

@@ -170,6 +170,8 @@ def test_an_archive_gives_episodes_and_a_long_recording_is_thinned_out(tmp_path)
         path,
         trial=np.repeat(np.arange(5), 10_000),
         joint_position=random.normal(size=(50_000, 3)),
+        load=random.normal(size=(1, 50_000)),
+        gains=np.array([1.0, 2.0]),
         p=np.zeros((2, 2, 2)),
     )
     result = draft([path])
@@ -177,7 +179,10 @@ def test_an_archive_gives_episodes_and_a_long_recording_is_thinned_out(tmp_path)
     data = read_measured(load_measured(tmp_path / "day.yaml"), tmp_path)
     assert len(data.episodes) == 5
     assert len(data) == 25_000
-    assert data.layout.signal("joint_position").unit == "rad"
+    assert [(s.name, s.size, s.unit) for s in data.layout.signals] == [("joint_position", 3, "rad"), ("load", 1, "1")]
+    assert [note.partition(": ")[2] for note in result.recording.notes] == [
+        "gains left out, because the other columns have 50000 rows."
+    ]
 
 
 def test_parquet_is_read(tmp_path):
