@@ -10,7 +10,8 @@ TYPE_CHECKING = False
 
 _ROOMS = {
     "services.client.client": ("Client",),
-    "services.learning.measured": ("load_measured", "read_measured"),
+    "services.measured.description": ("load_measured",),
+    "services.measured.reading": ("read_measured",),
     "services.process.service": ("Service",),
     "services.wire.records": ("Sample",),
     "services.errors": (
@@ -35,8 +36,8 @@ if TYPE_CHECKING:
     from services.errors import ServiceUnavailable as ServiceUnavailable
     from services.errors import TooSlow as TooSlow
     from services.errors import WrongVersion as WrongVersion
-    from services.learning.measured import load_measured as load_measured
-    from services.learning.measured import read_measured as read_measured
+    from services.measured.description import load_measured as load_measured
+    from services.measured.reading import read_measured as read_measured
     from services.process.service import Service as Service
     from services.wire.records import Sample as Sample
 else:

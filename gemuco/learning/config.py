@@ -5,6 +5,9 @@ from dataclasses import dataclass
 from gemuco.errors import SchemaError, check_kind, whole_number
 from gemuco.layers import check_activation
 
+MOST_BIAS = 3
+"""A length of p that follows the data is at most this."""
+
 
 @dataclass(frozen=True, slots=True)
 class TrainConfig:
@@ -14,7 +17,7 @@ class TrainConfig:
         hidden: Widths of the encoder's layers; the decoder mirrors them.
         latent: Length of z.
         activation: Activation of the hidden layers: tanh, relu, sigmoid, elu or softplus.
-        bias_size: Length of p, one p per condition; 0 without parametric bias.
+        bias_size: Length of p, one p per condition; 0 without parametric bias, None if it follows the data.
         epochs: Largest number of passes over the data.
         batch: Samples per step.
         rate: Peak of the one-cycle learning rate of W (Adam).
@@ -30,7 +33,7 @@ class TrainConfig:
     hidden: tuple[int, ...] = (200, 30)
     latent: int = 15
     activation: str = "tanh"
-    bias_size: int = 0
+    bias_size: int | None = None
     epochs: int = 150
     batch: int = 500
     rate: float = 1e-2
@@ -45,8 +48,10 @@ class TrainConfig:
         check_activation(self.activation)
         check_kind("Training: hidden", self.hidden, (tuple, list), "a tuple of widths, such as (200, 30)")
         object.__setattr__(self, "hidden", tuple(self.hidden))
-        for name, least in (("latent", 1), ("bias_size", 0), ("epochs", 1), ("batch", 1), ("patience", 1), ("seed", 0)):
+        for name, least in (("latent", 1), ("epochs", 1), ("batch", 1), ("patience", 1), ("seed", 0)):
             whole_number(f"Training: {name}", getattr(self, name), least)
+        if self.bias_size is not None:
+            whole_number("Training: bias_size", self.bias_size, 0)
         for width in self.hidden:
             if width < 1:
                 raise SchemaError(f"Training: a hidden layer of {width} is impossible; leave it out or make it wider.")
@@ -58,3 +63,10 @@ class TrainConfig:
             raise SchemaError(f"Training: held_out is {self.held_out}; it is a share between 0 and 1.")
         if not self.outliers > 0.0:
             raise SchemaError(f"Training: outliers is {self.outliers}; use infinity to reject nothing.")
+
+    def bias_for(self, conditions: int) -> int:
+        """Return the length of p for a number of conditions.
+
+        Without a `bias_size` p spans the conditions, one dimension less than there are, up to `MOST_BIAS`.
+        """
+        return min(conditions - 1, MOST_BIAS) if self.bias_size is None else self.bias_size

@@ -69,16 +69,13 @@ def fit(
     material = _material(task, scaler, train_data, conditions)
     held = _material(task, scaler, held_data, conditions)
     frozen = np.full(len(conditions), len(conditions) == 1)
-    if config.bias_size and frozen.all():
-        notes.append(
-            f"All data are of one condition ('{conditions[0]}'), so the parametric bias has nothing to distinguish: p "
-            "stays 0 and has no effect. Collect other conditions, or set `bias: 0`."
-        )
+    bias_size = config.bias_for(len(conditions))
+    notes += _bias_notes(config, conditions)
     torch.manual_seed(config.seed)
-    size = len(task.in_index) + len(task.x_in) + config.bias_size
+    size = len(task.in_index) + len(task.x_in) + bias_size
     weights = Network(size, len(task.out_index), config.hidden, config.latent, config.activation).weights()
-    _mute(weights, task, scaler.dead, config.bias_size if frozen.all() else 0)
-    biases = np.zeros((len(conditions), config.bias_size), np.float32)
+    _mute(weights, task, scaler.dead, bias_size if frozen.all() else 0)
+    biases = np.zeros((len(conditions), bias_size), np.float32)
     learner = Learner(config, weights, biases, frozen, material, held)
     learner.run(progress, title, Draft(resume, _key(config, task, dataset)))
     schema = _assess(_schema(learner, scaler, conditions), learner, conditions)
@@ -145,6 +142,24 @@ def _task(dataset: Dataset, masks: tuple[Mask, ...], x_out: tuple[str, ...]) -> 
     if not usable or not outputs:
         raise NotEnoughData(f"Nothing can be learned: {', '.join(silent)} was never measured; check what was recorded.")
     return Task(layout, usable, outputs), notes
+
+
+def _bias_notes(config: TrainConfig, conditions: tuple[str, ...]) -> list[str]:
+    """Return a remark on the length of p, if it was not set or does not fit the conditions."""
+    size, names = config.bias_for(len(conditions)), ", ".join(conditions)
+    if len(conditions) == 1:
+        return [
+            f"All data are of one condition ('{names}'), so the parametric bias has nothing to distinguish: p "
+            "stays 0 and has no effect. Collect other conditions, or set `bias: 0`."
+        ] * bool(size)
+    if config.bias_size is None:
+        return [f"p has length {size}, because the data are of {len(conditions)} conditions ({names})."]
+    if size:
+        return []
+    return [
+        f"The {len(conditions)} conditions of the data ({names}) are not distinguished, because the length of p was "
+        "set to 0: the model is of their mean."
+    ]
 
 
 def _material(

@@ -207,7 +207,7 @@ def show(trained: TrainingResult, console: Console) -> None:
 def remarks(history: History) -> list[str]:
     """Return sentences on faults in the data and on the training."""
     sentences = list(history.notes)
-    if history.resumed:
+    if 0 < history.resumed < len(history.train):
         sentences.append(f"An interrupted training continued at epoch {history.resumed + 1}.")
     if history.dead:
         sentences.append(

@@ -20,8 +20,9 @@ class NetworkConfig(Section):
     hidden: tuple[Count, ...] = DEFAULT.hidden
     latent: Count = DEFAULT.latent
     activation: Literal["tanh", "relu", "sigmoid", "elu", "softplus"] = "tanh"
-    bias: Annotated[int, Field(ge=0)] = DEFAULT.bias_size
-    """This is the length of the parametric bias p, one p per condition; 0 without p."""
+    bias: Annotated[int, Field(ge=0)] | None = DEFAULT.bias_size
+    """This is the length of the parametric bias p, one p per condition; 0 without p. By default it follows the data:
+    one less than the data have conditions, at most 3."""
 
 
 Threshold = Annotated[float, Field(gt=0, le=1)]

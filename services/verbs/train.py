@@ -9,10 +9,15 @@ from gemuco import checkpoint
 from gemuco.dataset import Dataset
 from gemuco.errors import DatasetError
 from hal.config import RobotConfig, load_robot
+from hal.errors import ConfigError
 from services import show
-from services.learning import measured, trainer
+from services.learning import trainer
+from services.learning.interruption import key_of_training, marked
 from services.learning.trainer import TrainingResult
+from services.measured import description, reading
+from services.measured.table_files import is_table
 from services.model import artifacts
+from services.model.model_config import model_config
 from services.recording.dataset import is_recording, select
 
 
@@ -34,34 +39,48 @@ def run_training(
         RecordingError: A recording cannot be read.
     """
     known = None if base is None else checkpoint.load(base)
-    if measured.is_description(file):
-        described = measured.load_measured(file)
-        folder_of_files = _only(data) or file.parent
-        name, dataset = described.recording, measured.read_measured(described, folder_of_files)
+    if is_table(file):
+        raise ConfigError(f"'{file}' holds data. `gemuco describe {file}` drafts a description to train from.")
+    if description.is_description(file):
+        described = description.load_measured(file)
+        name, dataset, settings = described.recording, _measured(described, _only(data) or file.parent), described.model
     else:
         robot = load_robot(file)
-        name, dataset = robot.robot, _data(robot, data, condition)
+        name, dataset, settings = robot.robot, _data(robot, data, condition), model_config(robot)
+    if known is not None and not len(known.bias) and len(dataset.conditions) > 1:
+        typer.echo(
+            f"The conditions of the data ({', '.join(dataset.conditions)}) are not distinguished: the model in {base} "
+            "has no p. Train a new one without --from."
+        )
     folder = out or artifacts.model_folder(name)
     drafts = trainer.drafts_of(folder)
 
     def train(progress: show.Progress) -> TrainingResult:
-        if not measured.is_description(file):
+        if not description.is_description(file):
             return trainer.train(robot, dataset, seed, progress, drafts, known)
         if known is not None:
             return trainer.tune(known, described.model, dataset, seed, progress, drafts, recording=name)
         return trainer.learn(described.model, dataset, seed, progress, drafts, recording=name)
 
-    if drafts.exists():
-        typer.echo(f"A training of {folder} was interrupted. It continues if data and settings are the same.")
     try:
-        with show.progress("training") as progress:
-            result = train(progress)
+        with marked(drafts, key_of_training(dataset, settings, seed, base)) as was_interrupted:
+            if was_interrupted:
+                typer.echo(f"The training of {folder} was interrupted. It continues.")
+            with show.progress("training") as progress:
+                result = train(progress)
     except KeyboardInterrupt:
         typer.echo("Interrupted. The same command continues from here.", err=True)
         raise
     trainer.show(result, show.console())
     trainer.save(result, folder)
     typer.echo(f"Saved in {folder}, with plots of the training.")
+
+
+def _measured(config: description.MeasuredConfig, place: Path) -> Dataset:
+    """Return the data that a description names in a folder, or in one file in place of those it names."""
+    if place.is_file():
+        config, place = config.model_copy(update={"episodes": (place.name,)}), place.parent
+    return reading.read_measured(config, place, typer.echo)
 
 
 def _data(robot: RobotConfig, data: Sequence[Path], condition: str | None) -> Dataset:

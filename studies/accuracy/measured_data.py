@@ -19,8 +19,9 @@ from gemuco.learning.train import fit
 from gemuco.schema import BodySchema
 from gemuco.structure.determination import Judge, Thresholds, determine
 from gemuco.structure.mask_errors import train_masks
-from services.learning.measured import MeasuredConfig, load_measured, read_measured
 from services.learning.trainer import train_config
+from services.measured.description import MeasuredConfig, load_measured
+from services.measured.reading import read_measured
 
 ROOT = Path(__file__).parents[2]
 BOARDS = tuple(f"board_{i}" for i in range(4))

@@ -169,6 +169,26 @@ def test_one_condition_leaves_p_without_effect(arm):
     np.testing.assert_array_equal(moved.infer(x, schema.masks[0]), schema.infer(x, schema.masks[0]))
 
 
+@pytest.mark.parametrize(
+    ("bias_size", "length", "note"),
+    [
+        (None, 1, "p has length 1, because the data are of 2 conditions (new, worn)."),
+        (0, 0, "The 2 conditions of the data (new, worn) are not distinguished, because the length of p was set to 0"),
+        (2, 2, None),
+    ],
+)
+def test_p_follows_the_conditions_unless_its_length_is_set(arm, bias_size, length, note):
+    parts = [Episode(n, arm.sample(30, s)) for s in range(5) for n in ("new", "worn")]
+    schema, history = fit(Dataset(LAYOUT, tuple(parts)), replace(SMALL, epochs=2, bias_size=bias_size), MASKS)
+    assert len(schema.bias) == length
+    assert set(schema.biases) == ({"new", "worn"} if length else set())
+    assert [text[: len(note or "")] for text in history.notes] == ([note] if note else [])
+
+
+def test_p_that_follows_one_condition_is_of_length_0_and_of_many_of_length_3():
+    assert [TrainConfig().bias_for(count) for count in (1, 2, 3, 4, 9)] == [0, 1, 2, 3, 3]
+
+
 def test_errors_are_measured_under_each_p(arm):
     soft = type(arm)(softness=3.0)
     parts = [Episode(n, b.sample(150, s)) for s in range(5) for n, b in (("new", arm), ("worn", soft))]

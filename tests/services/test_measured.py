@@ -7,7 +7,8 @@ import pytest
 from gemuco.errors import DatasetError
 from hal.config import load_robot
 from hal.errors import ConfigError
-from services.learning.measured import is_description, load_measured, read_measured
+from services.measured.description import is_description, load_measured
+from services.measured.reading import read_measured
 
 ROOT = Path(__file__).parents[2]
 DATA = Path(os.environ.get("GEMUCO_DATA", ROOT.parent / "shared" / "data"))
@@ -74,7 +75,10 @@ def test_repetitions_become_one_episode(tmp_path):
     ("lines", "sentence"),
     [
         ((), r"one\.csv' is empty"),
-        (("1,2,3,0", "1,2"), r"line 3 has 2 columns; the first has 4\. Is the separator"),
+        (
+            ("1,2,3,0", "1,2", "1", "1,2,3,0"),
+            r"line 3 has 2 columns; the header has 4\. Is the separator ','.*2 of 4 rows",
+        ),
         (("1,2,many,0",), r"line 2, column 'load': 'many' is not a number\. An empty cell means"),
     ],
 )
@@ -91,7 +95,7 @@ def test_missing_columns_and_files_are_one_sentence(tmp_path):
     (tmp_path / "one.csv").write_text("a0,a1\n1,2\n")
     with pytest.raises(DatasetError, match=r"no column 'load'\. Columns: a0, a1"):
         read_measured(config, tmp_path)
-    (tmp_path / "one.csv").write_bytes(b"\xff\xfe\x00\x00")
+    (tmp_path / "one.csv").write_bytes(b"PK\x03\x04\x00\x00\x01")
     with pytest.raises(DatasetError, match="is not a text file"):
         read_measured(config, tmp_path)
 
@@ -100,9 +104,14 @@ def test_missing_columns_and_files_are_one_sentence(tmp_path):
     ("text", "sentence"),
     [
         (HEAD + "signals: {a: {unit: deg, columns: x}}", "'deg' is not the unit of the model; write unit: rad and"),
-        (HEAD + "signals: {a: {unit: N, written_in: deg, columns: x}}", "'deg' cannot be converted to 'N'. Known: deg"),
+        (
+            HEAD + "signals: {a: {unit: N, written_in: deg, columns: x}}",
+            "'deg' cannot be converted to 'N'; to 'N' can be converted: mN, kN",
+        ),
         (HEAD + "signals: {a: {unit: N, colums: x}}", "unknown key 'signals.a.colums'. Known keys there: columns"),
-        (HEAD, "signals: Field required"),
+        (HEAD, "'signals' is missing; a description needs recording, episodes and signals"),
+        (HEAD + "signals: {a: x}", "signals.a: a signal needs a unit, such as {unit: rad, columns: q}"),
+        (HEAD + SIGNALS + "conditions: [light]", "'conditions' is a mapping, such as {\"run_1*\": light"),
         ("nothing", "is not a description of data"),
         ("a: [", "is not YAML"),
     ],

@@ -1,0 +1,213 @@
+"""Measured data from the files that a description names: episodes of the rows that were measured."""
+
+import logging
+import re
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from fnmatch import fnmatch
+from pathlib import Path
+
+import numpy as np
+
+from gemuco.dataset import Dataset, Episode
+from gemuco.errors import DatasetError
+from services.measured.description import ColumnsConfig, MeasuredConfig
+from services.measured.table import Table, counted
+from services.measured.table_files import read_table
+
+logger = logging.getLogger(__name__)
+
+
+def read_measured(config: MeasuredConfig, folder: Path, note: Callable[[str], None] = logger.warning) -> Dataset:
+    """Read all episodes that a description names.
+
+    Args:
+        config: The description.
+        folder: Folder in which its patterns are searched.
+        note: Called with each sentence on rows that were left out; logged as a warning if not given.
+
+    Raises:
+        DatasetError: No file matches, or a file differs from the description.
+    """
+    folder = Path(folder)
+    places = _places(config, folder)
+    reader = _Reader(config, note)
+    episodes = [(place, episode) for place in places for episode in reader.episodes(place, reader.condition(place))]
+    reader.check()
+    return Dataset(config.layout, _together(config, episodes))
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """File or folder of an episode, and its name for patterns."""
+
+    path: Path
+    name: str
+
+    def fits(self, pattern: str) -> bool:
+        """Whether the pattern is of the name with or without its folders."""
+        return fnmatch(self.path.name, pattern) or fnmatch(self.name, pattern)
+
+
+def _places(config: MeasuredConfig, folder: Path) -> list[_Place]:
+    places: dict[Path, None] = {}
+    in_folders = any(part.file for part in config.signals.values())
+    for pattern in config.episodes:
+        try:
+            matches = sorted(folder.glob(pattern), key=_natural)
+        except (NotImplementedError, ValueError):
+            raise DatasetError(
+                f"episodes: '{pattern}' must be a pattern below the folder of the data, such as '*.csv'; "
+                "name the folder with --data."
+            ) from None
+        if not matches:
+            raise DatasetError(_unmatched(folder, pattern))
+        places.update(dict.fromkeys(path for path in matches if path.is_dir() == in_folders or len(matches) == 1))
+    return [_Place(path, path.relative_to(folder).as_posix()) for path in places]
+
+
+def _unmatched(folder: Path, pattern: str) -> str:
+    if not folder.is_dir():
+        return f"There is no folder '{folder}'; name the folder of the data with --data."
+    names = sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
+    holds = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+    return (
+        f"Nothing in '{folder}' matches '{pattern}'. Is this the folder of the recording? It holds "
+        f"{holds or 'no file'}; name another with --data."
+    )
+
+
+def _together(config: MeasuredConfig, episodes: list[tuple[_Place, Episode]]) -> tuple[Episode, ...]:
+    """Return the episodes with every group joined into one."""
+    merged: list[Episode] = []
+    remaining = dict(enumerate(episodes))
+    for group in config.together:
+        chosen = [i for i, (place, _) in remaining.items() if any(place.fits(pattern) for pattern in group)]
+        parts = [remaining.pop(index)[1] for index in chosen]
+        if len({part.condition for part in parts}) != 1:
+            fault = "have several conditions; they must have the same one" if parts else "do not exist"
+            raise DatasetError(f"together: the episodes that match {', '.join(group)} {fault}.")
+        values = {name: np.concatenate([part.values[name] for part in parts]) for name in config.signals}
+        merged.append(Episode(parts[0].condition, values))
+    return (*merged, *(episode for _, episode in remaining.values()))
+
+
+@dataclass(slots=True)
+class _Reader:
+    """Episodes of the files of a description.
+
+    Attributes:
+        config: The description.
+        note: Called with sentences on rows that were left out.
+        used: Patterns of conditions that some file matches.
+        seen: Number of rows of data; `kept` is the number after thinning out.
+    """
+
+    config: MeasuredConfig
+    note: Callable[[str], None]
+    used: set[str] = field(default_factory=set)
+    seen: int = 0
+    kept: int = 0
+
+    def condition(self, place: _Place) -> str:
+        """Return the condition of a file or folder."""
+        conditions = self.config.conditions
+        for pattern, condition in conditions.items():
+            if place.fits(pattern):
+                self.used.add(pattern)
+                return condition
+        if conditions:
+            raise DatasetError(
+                f"No condition is given for '{place.name}'. Patterns: {', '.join(conditions)}; '*' is for all others."
+            )
+        return self.config.recording
+
+    def check(self) -> None:
+        """Note what was without effect in the description, or thinned out."""
+        for pattern in self.config.conditions:
+            if pattern not in self.used:
+                self.note(f"conditions: '{pattern}' is of no episode, or an earlier pattern has them all.")
+        if self.kept < self.seen:
+            self.note(f"Thinned out: {self.kept} of {self.seen} rows are used.")
+        elif self.config.rate is not None:
+            self.note(f"rate: {self.config.rate:g} Hz is not below the rate of the data; every row is used.")
+
+    def episodes(self, place: _Place, condition: str) -> Iterator[Episode]:
+        """Yield the episodes of one file or folder."""
+        values, stamps, numbers = self._columns(place)
+        known = np.any([np.isfinite(array).any(axis=1) for array in values.values()], axis=0)
+        if stamps is not None:
+            lost = int((known & ~np.isfinite(stamps)).sum())
+            if lost:
+                self.note(f"'{place.path}': {counted(lost, 'row')} without a stamp left out.")
+            known &= np.isfinite(stamps)
+        rows = np.flatnonzero(known)
+        if not len(rows):
+            raise DatasetError(
+                f"'{place.path}' holds no row with a measured value{' and a stamp' * (stamps is not None)}."
+            )
+        starts = np.zeros(len(rows) - 1, bool)
+        if stamps is not None and self.config.time is not None:
+            steps = np.diff(stamps[rows])
+            starts |= (steps > self.config.time.pause(steps)) | (steps < 0.0)
+        if numbers is not None:
+            starts |= np.diff(numbers[rows]) != 0.0
+        for part in np.split(rows, np.flatnonzero(starts) + 1):
+            chosen = part[self._thinned(len(part), None if stamps is None else stamps[part])]
+            self.seen, self.kept = self.seen + len(part), self.kept + len(chosen)
+            yield Episode(condition, {name: array[chosen] for name, array in values.items()})
+
+    def _thinned(self, count: int, stamps: np.ndarray | None) -> np.ndarray:
+        """Return the indices of the rows of an episode that are used."""
+        if self.config.rate is None or stamps is None:
+            return np.arange(0, count, self.config.every)
+        ticks = np.floor((stamps - stamps[0]) * self.config.rate + 1e-3)
+        return np.flatnonzero(np.diff(ticks, prepend=-1.0) > 0.0)
+
+    def _columns(self, place: _Place) -> tuple[dict[str, np.ndarray], np.ndarray | None, np.ndarray | None]:
+        """Return values of every signal [its unit], shape (rows, n), stamps [s], shape (rows,), and episode numbers."""
+        config, tables = self.config, self._tables(place)
+        arrays = {name: self._of(tables, part) for name, part in config.signals.items()}
+        stamps = None if config.time is None else self._of(tables, config.time)[0]
+        numbers = None if config.episode is None else self._of(tables, config.episode)[0]
+        others = [array for array in (stamps, numbers) if array is not None]
+        lengths = {len(column) for columns in (*arrays.values(), others) for column in columns}
+        if len(lengths) > 1 and not config.cut_to_shortest:
+            rows_of = ", ".join(f"{file or place.path.name} {table.rows}" for file, table in tables.items())
+            raise DatasetError(
+                f"The columns of '{place.path}' have different numbers of rows: {rows_of}. To use only rows that "
+                "all have, write cut_to_shortest: true."
+            )
+        rows = min(lengths)
+        values = {
+            name: np.stack([column[:rows] for column in columns], axis=1) * config.signals[name].scale
+            for name, columns in arrays.items()
+        }
+        if stamps is not None and config.time is not None:
+            stamps = config.time.seconds(stamps[:rows])
+        return values, stamps, None if numbers is None else numbers[:rows]
+
+    def _tables(self, place: _Place) -> dict[str | None, Table]:
+        """Return the tables of a file or folder with the columns that the description names."""
+        config = self.config
+        extra = [part for part in (config.time, config.episode) if part is not None]
+        wanted: dict[str | None, dict[str, None]] = {}
+        for part in (*config.signals.values(), *extra):
+            wanted.setdefault(part.file, {}).update(dict.fromkeys(part.expanded()))
+        tables: dict[str | None, Table] = {}
+        for file, columns in wanted.items():
+            stamps = config.time.expanded() if config.time and config.time.file == file else ()
+            path = place.path / file if file else place.path
+            tables[file] = read_table(path, config.style, tuple(columns), stamps)
+            for sentence in tables[file].notes:
+                self.note(sentence)
+        return tables
+
+    @staticmethod
+    def _of(tables: Mapping[str | None, Table], part: ColumnsConfig) -> list[np.ndarray]:
+        return [tables[part.file].columns[name] for name in part.expanded()]
+
+
+def _natural(path: Path) -> list[tuple[int, str]]:
+    """Return a sort key that puts `measurement_2` before `measurement_10`."""
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name)]

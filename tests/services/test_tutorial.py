@@ -1,0 +1,35 @@
+"""The tutorial can be followed: its blocks run one after the other in an empty folder."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+TEXT = (ROOT / "docs" / "tutorial.md").read_text()
+BLOCKS = re.findall(r"^```(sh|python)\n(.*?)^```$", TEXT, re.MULTILINE | re.DOTALL)
+
+
+@pytest.mark.long
+def test_blocks_run_in_an_empty_folder(tmp_path):
+    program = f'gemuco() {{ "{sys.executable}" -m services.cli "$@"; }}\n'
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    outputs = []
+    for kind, block in BLOCKS:
+        words = [sys.executable, "-c", block] if kind == "python" else ["bash", "-e", "-c", program + block]
+        done = subprocess.run(
+            words, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300, check=False
+        )
+        assert done.returncode == 0, f"{block}\n{done.stdout}{done.stderr}"
+        outputs.append(done.stdout)
+    draft = re.search(r"^```yaml\n(.*?)^```$", TEXT, re.MULTILINE | re.DOTALL)
+    assert draft is not None
+    assert draft[1] in (tmp_path / "arm.yaml").read_text()
+    values = [[float(cell) for cell in line.split("[")[1].split("]")[0].split()] for line in outputs[4].splitlines()]
+    measured, lost, few, other = values[:4]
+    assert max(abs(a - b) for a, b in zip(measured, lost, strict=True)) < 0.03
+    assert max(abs(a - b) for a, b in zip(measured, few, strict=True)) < 0.12
+    assert max(abs(a - b) for a, b in zip(measured, other, strict=True)) > 0.3
