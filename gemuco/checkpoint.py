@@ -14,6 +14,7 @@ from safetensors.numpy import save as save_tensors
 
 from gemuco.errors import CheckpointError, SchemaError
 from gemuco.layers import LINEAR, Chain, Layer, Weights, check_activation
+from gemuco.linear import LinearPath
 from gemuco.masks import label
 from gemuco.normal import Normal
 from gemuco.scaler import Scaler
@@ -22,7 +23,9 @@ from gemuco.signals import Layout, Signal
 from gemuco.writing import writing
 
 FORMAT = "gemuco.body_schema"
-VERSION = 2
+VERSION = 3
+READABLE = (2, 3)
+"""Versions that can be read; version 2 has no linear path."""
 TENSORS = "model.safetensors"
 MANIFEST = "manifest.json"
 SCALES = ("mean", "std", "low", "high", "dead")
@@ -52,6 +55,8 @@ def save(schema: BodySchema, folder: str | Path) -> None:
         "network": {
             "encoder": [layer.activation for layer in schema.weights.encoder],
             "decoder": [layer.activation for layer in schema.weights.decoder],
+            "straight": [layer.straight for layer in schema.weights.whole],
+            "ridge": schema.path.ridge,
         },
         "errors": [[method, label(mask, schema.layout.names)] for method, mask in schema.errors],
         "conditions": list(schema.biases),
@@ -92,6 +97,7 @@ def _tensors(schema: BodySchema) -> dict[str, np.ndarray]:
         tensors[f"errors.{index}"] = array
     for index, array in enumerate(schema.biases.values()):
         tensors[f"biases.{index}"] = array
+    tensors["linear.moments"], tensors["linear.cross"] = schema.path.moments, schema.path.cross
     tensors["bias"] = schema.bias
     tensors["anchors"] = schema.anchors
     tensors["anchor_conditions"] = schema.anchor_conditions
@@ -140,7 +146,7 @@ def _manifest(folder: Path) -> dict[str, Any]:
         kind = head.get("format") if isinstance(head, dict) else type(head).__name__
         raise CheckpointError(f"'{path}' does not describe a body schema but {kind!r}.")
     version = head.get("version")
-    if version != VERSION:
+    if version not in READABLE:
         newer = isinstance(version, int) and version > VERSION
         advice = "use a newer gemuco" if newer else "train it again"
         raise CheckpointError(
@@ -165,7 +171,7 @@ def _schema(head: Mapping[str, Any], tensors: Mapping[str, np.ndarray]) -> BodyS
         x_out=tuple(head["x_out"]),
         masks=tuple(frozenset(text.split("+")) for text in head["masks"]),
         scaler=Scaler(*(tensors[f"scaler.{name}"] for name in SCALES)),
-        weights=Weights(_chain(head, tensors, "encoder"), _chain(head, tensors, "decoder")),
+        weights=_weights(head, tensors),
         errors={
             (method, frozenset(text.split("+")) if text else frozenset()): tensors[f"errors.{index}"]
             for index, (method, text) in enumerate(head["errors"])
@@ -176,13 +182,25 @@ def _schema(head: Mapping[str, Any], tensors: Mapping[str, np.ndarray]) -> BodyS
         bias=tensors["bias"],
         biases={condition: tensors[f"biases.{index}"] for index, condition in enumerate(head["conditions"])},
         manifest=head["facts"],
+        linear=LinearPath(tensors["linear.moments"], tensors["linear.cross"], float(head["network"]["ridge"]))
+        if head["version"] > 2
+        else None,
     )
 
 
-def _chain(head: Mapping[str, Any], tensors: Mapping[str, np.ndarray], part: str) -> Chain:
+def _weights(head: Mapping[str, Any], tensors: Mapping[str, np.ndarray]) -> Weights:
+    network = head["network"]
+    count = len(network["encoder"])
+    straight = network["straight"] if head["version"] > 2 else [0] * (count + len(network["decoder"]))
+    return Weights(
+        _chain(network, tensors, "encoder", straight[:count]), _chain(network, tensors, "decoder", straight[count:])
+    )
+
+
+def _chain(network: Mapping[str, Any], tensors: Mapping[str, np.ndarray], part: str, straight: list[int]) -> Chain:
     return tuple(
-        Layer(tensors[f"{part}.{index}.matrix"], tensors[f"{part}.{index}.offset"], _activation(name))
-        for index, name in enumerate(head["network"][part])
+        Layer(tensors[f"{part}.{index}.matrix"], tensors[f"{part}.{index}.offset"], _activation(name), columns)
+        for index, (name, columns) in enumerate(zip(network[part], straight, strict=True))
     )
 
 
@@ -204,6 +222,8 @@ def _check_arrays(schema: BodySchema) -> None:
             (f"error of {method}", array, (size if method == "input" else outputs,))
             for (method, _), array in schema.errors.items()
         ),
+        ("linear.moments", schema.path.moments, (len(schema.in_index) + 1,) * 2),
+        ("linear.cross", schema.path.cross, (len(schema.in_index) + 1, schema.path.width)),
         ("anchor_conditions", schema.anchor_conditions, (len(schema.anchors) if schema.biases else 0,)),
     ]
     if len(schema.anchors):

@@ -247,7 +247,7 @@ def input_search(schema: BodySchema, x: np.ndarray, available: Mask) -> np.ndarr
     mask = max(covered_by(schema.masks, available | missing), key=lambda m: (len(m & missing), len(m)))
     full = np.where(np.isfinite(x), x, 0.0)
     base = schema.network_input(full, mask)
-    through, _ = schema.gate(mask)
+    through = schema.gate(mask).through
     free = schema.layout.indices(mask - available)
     free = free[~np.isfinite(x[free])]
     columns = np.flatnonzero(np.isin(schema.in_index, free) & (through > 0))
@@ -257,11 +257,11 @@ def input_search(schema: BodySchema, x: np.ndarray, available: Mask) -> np.ndarr
     inferred = np.ones(len(schema.out_index), bool)
     anchors = schema.anchors[:STARTS]
     starts = anchors[:, free] if len(anchors) else np.zeros((1, len(free)))
-    lines = input_lines(schema, base, columns, np.zeros(0, int), inferred, np.zeros(len(x)), -far, far)
+    lines = input_lines(schema, mask, base, columns, np.zeros(0, int), inferred, np.zeros(len(x)), -far, far)
     solution = minimise(fitting(lines, data), starts, SEARCH).point
     result = np.full(schema.layout.size, np.nan)
     base[columns] = solution
-    result[schema.out_index] = run(schema.weights.whole, base)
+    result[schema.out_index] = run(schema.chain(mask), base)
     hidden = free[~np.isin(free, schema.out_index)]
     result[hidden] = solution[np.isin(free, hidden)]
     return result

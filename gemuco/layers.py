@@ -1,8 +1,10 @@
 """Forward and backward passes of the network on plain numpy arrays; no torch, no state.
 
 A chain of layers is y = W_n(... a(x W_1 + b_1) ...) + b_n, with a the activation of each layer. The latent state and
-the output are linear, so the encoder, the decoder and the whole network are chains. Rows are samples. `pull` propagates
-a gradient from the output to the input (reverse mode), `push` a change of the input to the output (forward mode).
+the output are linear, so the encoder, the decoder and the whole network are chains. The last columns of a hidden layer
+may have no activation: they carry the linear path (`gemuco.linear`) past the others. Rows are samples. `pull`
+propagates a gradient from the output to the input (reverse mode), `push` a change of the input to the output (forward
+mode).
 """
 
 from collections.abc import Callable
@@ -77,11 +79,44 @@ def check_activation(name: str) -> str:
 
 
 class Layer(NamedTuple):
-    """An affine map, matrix (n_in, n_out) and offset (n_out,), and the name of the activation after it."""
+    """An affine map and the activation after it.
+
+    Attributes:
+        matrix: Shape (n_in, n_out).
+        offset: Shape (n_out,).
+        activation: Name of the activation.
+        straight: Number of columns at the end of the output that have no activation.
+    """
 
     matrix: np.ndarray
     offset: np.ndarray
     activation: str
+    straight: int = 0
+
+    @property
+    def bent(self) -> int:
+        """Number of columns of the output that have the activation; they come first."""
+        return 0 if self.activation == LINEAR else len(self.offset) - self.straight
+
+    def activate(self, x: np.ndarray) -> None:
+        """Add the offset and apply the activation, shape (..., n_out), in place."""
+        x += self.offset
+        if self.bent:
+            ACTIVATIONS[self.activation].apply(x[..., : self.bent])
+
+    def slope(self, value: np.ndarray) -> np.ndarray:
+        """Return da/dx at values after the layer, shape (samples, n_out)."""
+        return self._filled(ACTIVATIONS[self.activation].slope(value[:, : self.bent]), value, 1.0)
+
+    def bend(self, value: np.ndarray, slope: np.ndarray) -> np.ndarray:
+        """Return d2a/dx2 at values after the layer and their slope, shapes (samples, n_out)."""
+        part = ACTIVATIONS[self.activation].bend(value[:, : self.bent], slope[:, : self.bent])
+        return self._filled(part, value, 0.0)
+
+    def _filled(self, part: np.ndarray, value: np.ndarray, rest: float) -> np.ndarray:
+        whole = np.full(value.shape, rest, value.dtype)
+        whole[:, : self.bent] = part
+        return whole
 
 
 Chain = tuple[Layer, ...]
@@ -107,7 +142,8 @@ class Weights:
 
     def replaced(self, arrays: list[np.ndarray]) -> "Weights":
         """Return the same network with other matrices and offsets, in the order of `arrays`."""
-        layers = tuple(Layer(arrays[2 * i], arrays[2 * i + 1], layer.activation) for i, layer in enumerate(self.whole))
+        pairs = zip(self.whole, arrays[::2], arrays[1::2], strict=True)
+        layers = tuple(layer._replace(matrix=matrix, offset=offset) for layer, matrix, offset in pairs)
         return Weights(layers[: len(self.encoder)], layers[len(self.encoder) :])
 
     def astype(self, dtype: type) -> "Weights":
@@ -117,41 +153,37 @@ class Weights:
 
 def run(chain: Chain, x: np.ndarray) -> np.ndarray:
     """Run forward, shape (n_in,) or (samples, n_in) -> (n_out,) or (samples, n_out)."""
-    for matrix, offset, activation in chain:
-        x = x @ matrix
-        x += offset
-        if activation != LINEAR:
-            ACTIVATIONS[activation].apply(x)
+    for layer in chain:
+        x = x @ layer.matrix
+        layer.activate(x)
     return x
 
 
 def trace(chain: Chain, x: np.ndarray) -> Trace:
     """Run forward and return the values that the other passes need."""
     values = [x]
-    for matrix, offset, activation in chain:
-        x = x @ matrix
-        x += offset
-        if activation != LINEAR:
-            ACTIVATIONS[activation].apply(x)
+    for layer in chain:
+        x = x @ layer.matrix
+        layer.activate(x)
         values.append(x)
     return values
 
 
 def pull(chain: Chain, values: Trace, gradient: np.ndarray) -> np.ndarray:
     """Propagate the gradient of a scalar from the output to the input, shapes (samples, n)."""
-    for (matrix, _, activation), value in zip(reversed(chain), reversed(values), strict=False):
-        if activation != LINEAR:
-            gradient = gradient * ACTIVATIONS[activation].slope(value)
-        gradient = gradient @ matrix.T
+    for layer, value in zip(reversed(chain), reversed(values), strict=False):
+        if layer.bent:
+            gradient = gradient * layer.slope(value)
+        gradient = gradient @ layer.matrix.T
     return gradient
 
 
 def push(chain: Chain, values: Trace, tangent: np.ndarray) -> np.ndarray:
     """Propagate a change of the input to the output, to first order, shapes (samples, n)."""
-    for (matrix, _, activation), value in zip(chain, values[1:], strict=True):
-        tangent = tangent @ matrix
-        if activation != LINEAR:
-            tangent *= ACTIVATIONS[activation].slope(value)
+    for layer, value in zip(chain, values[1:], strict=True):
+        tangent = tangent @ layer.matrix
+        if layer.bent:
+            tangent *= layer.slope(value)
     return tangent
 
 
@@ -171,11 +203,11 @@ class Curvature:
         self._slopes: list[np.ndarray | None] = []
         self._gradients: list[np.ndarray] = []
         gradient = w
-        for (matrix, _, activation), value in zip(reversed(chain), reversed(self._values), strict=False):
-            slope = None if activation == LINEAR else ACTIVATIONS[activation].slope(value)
+        for layer, value in zip(reversed(chain), reversed(self._values), strict=False):
+            slope = layer.slope(value) if layer.bent else None
             self._slopes.append(slope)
             self._gradients.append(gradient)
-            gradient = (gradient if slope is None else gradient * slope) @ matrix.T
+            gradient = (gradient if slope is None else gradient * slope) @ layer.matrix.T
         self._slopes.reverse()
         self._gradients.reverse()
         self.gradient = gradient
@@ -183,8 +215,8 @@ class Curvature:
     def mixed(self, tangent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return dy/dx u, shape (samples, n_out), and d(u . g)/dx, shape (samples, n_in), for a tangent u."""
         tangents: list[np.ndarray] = []
-        for (matrix, _, _), slope in zip(self._chain, self._slopes, strict=True):
-            tangent = tangent @ matrix
+        for layer, slope in zip(self._chain, self._slopes, strict=True):
+            tangent = tangent @ layer.matrix
             tangents.append(tangent)
             if slope is not None:
                 tangent = tangent * slope
@@ -192,7 +224,7 @@ class Curvature:
         for index in range(len(self._chain) - 1, -1, -1):
             slope = self._slopes[index]
             if slope is not None:
-                bend = ACTIVATIONS[self._chain[index].activation].bend(self._values[index + 1], slope)
+                bend = self._chain[index].bend(self._values[index + 1], slope)
                 bend = bend * tangents[index] * self._gradients[index]
                 second = bend if second is None else second * slope + bend
             if second is not None:

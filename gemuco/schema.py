@@ -4,9 +4,9 @@ A schema never changes. Learning makes another schema (`with_weights`, `with_nor
 while another thread makes the next.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -14,7 +14,8 @@ from gemuco.compiled.chain import pack
 from gemuco.compiled.inference import Parts, Predictor
 from gemuco.derived import ByPattern
 from gemuco.errors import NotFinite, UnknownCondition, UnknownSignal, WrongSize, check_kind
-from gemuco.layers import Weights, run
+from gemuco.layers import Chain, Weights, run
+from gemuco.linear import LinearPath
 from gemuco.masks import Mask, bits, label
 from gemuco.normal import Normal
 from gemuco.scaler import CLIP, Scaler
@@ -25,6 +26,20 @@ T = TypeVar("T")
 ErrorTable = Mapping[tuple[str, Mask], np.ndarray]
 """The table maps (method, given signals) to the expected error of every x_out element [unit], shape (out_size,). The
 method `input` also estimates signals outside x_out, so its errors are those of the whole layout, shape (size,)."""
+
+
+class Gate(NamedTuple):
+    """What a mask lets through, float32.
+
+    Attributes:
+        through: 0 or 1 for every element of x_in, shape (in_size,).
+        line: Regression of the code l of the linear path, shape (in_size + 1, width).
+        tail: m and p, shape (signals of x_in + bias_size,).
+    """
+
+    through: np.ndarray
+    line: np.ndarray
+    tail: np.ndarray
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -45,6 +60,7 @@ class BodySchema:
         bias: The parametric bias p of the present condition, shape (bias_size,).
         biases: Condition -> its p.
         manifest: Further facts that are stored with the schema (JSON values).
+        linear: The linear path; of width 0 without one, which is the default.
         out_layout: The layout of x_out alone.
         in_index: Positions of the elements of x_in in the layout, shape (in_size,).
         out_index: Positions of the elements of x_out in the layout, shape (out_size,).
@@ -63,10 +79,12 @@ class BodySchema:
     bias: np.ndarray = field(default_factory=lambda: np.zeros(0, np.float32))
     biases: Mapping[str, np.ndarray] = field(default_factory=dict)
     manifest: Mapping[str, Any] = field(default_factory=dict)
+    linear: LinearPath | None = None
     out_layout: Layout = field(init=False)
     in_index: np.ndarray = field(init=False)
     out_index: np.ndarray = field(init=False)
-    _gates: dict[Mask, tuple[np.ndarray, np.ndarray]] = field(init=False)
+    _gates: dict[Mask, Gate] = field(init=False)
+    _folded: dict[Mask, Chain] = field(init=False)
     _ranked: dict[str, tuple[Mask, ...]] = field(init=False)
     _derived: dict[Callable[..., Any], Any] = field(init=False)
 
@@ -75,13 +93,16 @@ class BodySchema:
         set_field(self, "out_layout", self.layout.subset(self.x_out))
         set_field(self, "in_index", self.layout.indices(self.x_in))
         set_field(self, "out_index", self.layout.indices(self.x_out))
-        inputs = len(self.in_index) + len(self.x_in) + len(self.bias)
+        if self.linear is None:
+            set_field(self, "linear", LinearPath.none(len(self.in_index)))
+        inputs = len(self.in_index) + self.path.width + len(self.x_in) + len(self.bias)
         shape = (self.weights.encoder[0].matrix.shape[0], self.weights.decoder[-1].matrix.shape[1])
         if shape != (inputs, len(self.out_index)):
             raise WrongSize(
                 f"The network is {shape[0]} -> {shape[1]}; the layout needs {inputs} -> {len(self.out_index)}."
             )
         set_field(self, "_gates", {})
+        set_field(self, "_folded", {})
         set_field(self, "_ranked", {})
         set_field(self, "_derived", {})
         for mask in self.masks:
@@ -144,17 +165,41 @@ class BodySchema:
         """The network as `gemuco.compiled.inference.infer` takes it."""
         return self.derived(_parts)
 
-    def gate(self, mask: Mask) -> tuple[np.ndarray, np.ndarray]:
-        """Return the gate of a mask, 0 or 1 per x_in element, and the end of the network input, m and p; float32."""
+    @property
+    def path(self) -> LinearPath:
+        """The linear path, of width 0 without one."""
+        assert self.linear is not None
+        return self.linear
+
+    def gate(self, mask: Mask) -> Gate:
+        """Return the gate of a mask."""
         gate = self._gates.get(mask)
         if gate is None:
             for name in sorted(mask - set(self.x_in)):
                 raise UnknownSignal(f"Signal '{name}' is not an input of the network. Inputs: {', '.join(self.x_in)}.")
             m = bits(mask, self.x_in)
             sizes = [self.layout.signal(name).size for name in self.x_in]
-            gate = np.repeat(m, sizes).astype(np.float32), np.concatenate([m, self.bias]).astype(np.float32)
-            self._gates[mask] = gate
+            through = np.repeat(m, sizes).astype(np.float32)
+            tail = np.concatenate([m, self.bias]).astype(np.float32)
+            gate = self._gates[mask] = Gate(through, self.path.map(through), tail)
         return gate
+
+    def chain(self, mask: Mask) -> Chain:
+        """Return the network under a mask with the linear path folded into its first layer.
+
+        Its inputs are those of `network_input`, but the code l has no effect. It is the same function within the limit
+        of the inputs, and its derivatives by x_in are complete.
+        """
+        folded = self._folded.get(mask)
+        if folded is None:
+            first, *others = self.weights.whole
+            size, matrix = len(self.in_index), first.matrix.copy()
+            line, by_code = self.gate(mask).line, first.matrix[size : size + self.path.width]
+            matrix[:size] += line[:-1] @ by_code
+            matrix[size : size + self.path.width] = 0.0
+            begin = first._replace(matrix=matrix, offset=first.offset + line[-1] @ by_code)
+            folded = self._folded[mask] = (begin, *others)
+        return folded
 
     def ranked(self, name: str) -> tuple[Mask, ...]:
         """Return the feasible masks, sorted by the error of a signal of x_out, the smallest first."""
@@ -172,7 +217,7 @@ class BodySchema:
         return float(np.mean(scaled[self.out_layout.slice(name)] ** 2))
 
     def network_input(self, normalised: np.ndarray, mask: Mask, bias: np.ndarray | None = None) -> np.ndarray:
-        """Return the network input: x_in masked and clipped, then m and p.
+        """Return the network input: x_in masked and clipped, the code l of the linear path, then m and p.
 
         Args:
             normalised: Every signal [standard deviations], shape (size,) or (samples, size); signals outside the mask
@@ -180,11 +225,13 @@ class BodySchema:
             mask: The given signals.
             bias: p of every sample, shape (samples, bias_size), or of all samples; the schema's p if not given.
         """
-        through, tail = self.gate(mask)
-        x = np.empty((*normalised.shape[:-1], len(through) + len(tail)), np.float32)
+        through, line, tail = self.gate(mask)
+        size, width = line.shape[0] - 1, line.shape[1]
+        x = np.empty((*normalised.shape[:-1], size + width + len(tail)), np.float32)
         values = np.where(through, normalised[..., self.in_index], 0.0)
-        np.clip(values, -CLIP, CLIP, out=x[..., : len(through)])
-        x[..., len(through) :] = tail
+        np.clip(values, -CLIP, CLIP, out=x[..., :size])
+        x[..., size : size + width] = values @ line[:-1] + line[-1]
+        x[..., size + width :] = tail
         if bias is not None and len(self.bias):
             x[..., -len(self.bias) :] = bias
         return x
@@ -253,6 +300,16 @@ class BodySchema:
     def with_manifest(self, **facts: Any) -> "BodySchema":
         """Return the same body with more facts in its manifest."""
         return replace(self, manifest={**self.manifest, **facts})
+
+
+def stacked(schema: BodySchema, masks: Sequence[Mask]) -> Gate:
+    """Return the gates of several masks, each array with a row per mask."""
+    gates = [schema.gate(mask) for mask in masks]
+    if not gates:
+        size = len(schema.in_index)
+        empty = np.zeros((0, size), np.float32), np.zeros((0, size + 1, schema.path.width), np.float32)
+        return Gate(*empty, np.zeros((0, len(schema.x_in) + len(schema.bias)), np.float32))
+    return Gate(*(np.stack(column) for column in zip(*gates, strict=True)))
 
 
 def check_schema(value: object) -> None:

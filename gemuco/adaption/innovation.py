@@ -7,7 +7,7 @@ import numpy as np
 from gemuco.compiled.innovation import innovations
 from gemuco.layers import run
 from gemuco.masks import Mask
-from gemuco.schema import BodySchema
+from gemuco.schema import BodySchema, stacked
 
 SHRINK = 0.05
 """This share of the covariance is replaced by its diagonal."""
@@ -27,6 +27,7 @@ class Pairs:
         whiten: Matrix that makes errors independent with variance 1, shape (n, n).
         log_volume: Logarithm of the determinant of the errors' covariance.
         through: Gate of each mask, shape (masks, in_size).
+        paths: Regression of the code l under each mask, shape (masks, in_size + 1, width).
         tails: m of each mask, and space for p, shape (masks, x_in signals + bias_size).
     """
 
@@ -35,6 +36,7 @@ class Pairs:
     whiten: np.ndarray
     log_volume: float
     through: np.ndarray
+    paths: np.ndarray
     tails: np.ndarray
 
 
@@ -78,10 +80,9 @@ class Innovations:
         chosen = tuple(masks[:used])
         covariance = self._covariance(chosen)[np.ix_(index, index)] if len(index) else np.zeros((0, 0))
         lower = np.linalg.cholesky(covariance)
-        gates = [schema.gate(m) for m in chosen]
-        through, tails = (np.stack(column) for column in zip(*gates, strict=True)) if gates else [np.zeros((0, 0))] * 2
+        gates = stacked(schema, chosen)
         volume = 2.0 * float(np.log(np.diag(lower)).sum())
-        return Pairs(chosen, index, np.ascontiguousarray(np.linalg.inv(lower)), volume, through, tails)
+        return Pairs(chosen, index, np.ascontiguousarray(np.linalg.inv(lower)), volume, *gates)
 
     def _blind(self, mask: Mask) -> np.ndarray:
         inside = [name in mask for name in self._schema.x_out]
@@ -129,7 +130,7 @@ class Innovations:
         """
         p = np.ascontiguousarray(biases, np.float32)
         x = np.ascontiguousarray(rows, float)
-        return innovations(schema.predictor, x, p, pairs.through, pairs.tails, pairs.index, pairs.whiten)
+        return innovations(schema.predictor, x, p, pairs.through, pairs.paths, pairs.tails, pairs.index, pairs.whiten)
 
 
 def own_bias(schema: BodySchema, count: int) -> np.ndarray:

@@ -9,7 +9,7 @@ from gemuco.compiled.batch import under_masks
 from gemuco.compiled.chain import pack, unpack
 from gemuco.compiled.learning import SQUARED, gradients, loss
 from gemuco.optimiser import Optimiser
-from gemuco.schema import BodySchema
+from gemuco.schema import BodySchema, stacked
 
 JUDGED = 60
 """W is judged by at most this many of the newest held-out samples."""
@@ -210,10 +210,10 @@ def _plain(rows: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(rows, np.float32)
 
 
-def gates(schema: BodySchema) -> tuple[np.ndarray, np.ndarray]:
-    """Return the gate of every mask over x_in, shape (masks, in_size), and m, shape (masks, x_in)."""
-    through, tails = (np.stack(column) for column in zip(*(schema.gate(m) for m in schema.masks), strict=True))
-    return through, np.ascontiguousarray(tails[:, : len(schema.x_in)])
+def gates(schema: BodySchema) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return `through`, `line` and m of every mask; see `Gate`."""
+    through, paths, tails = stacked(schema, schema.masks)
+    return through, paths, np.ascontiguousarray(tails[:, : len(schema.x_in)])
 
 
 def _others(schema: BodySchema) -> tuple[np.ndarray, np.ndarray]:

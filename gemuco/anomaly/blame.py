@@ -106,10 +106,10 @@ class _Case:
     def _predicted(self, mask: frozenset[str], rows: np.ndarray, elements: list[int]) -> np.ndarray:
         """Return derivatives of the prediction under a mask by elements, shape (n, out_size, elements)."""
         schema = self._schema
-        chain = schema.weights.whole
+        chain = schema.chain(mask)
         inputs = schema.network_input(rows, mask)
         values = trace(chain, inputs)
-        through, _ = schema.gate(mask)
+        through = schema.gate(mask).through
         slope = np.zeros((len(rows), schema.out_layout.size, len(elements)))
         for column, element in enumerate(elements):
             position = np.flatnonzero(schema.in_index == element)

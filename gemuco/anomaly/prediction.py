@@ -9,7 +9,7 @@ import numpy as np
 from gemuco.compiled.score import Judges
 from gemuco.derived import ByPattern
 from gemuco.masks import Mask
-from gemuco.schema import BodySchema, check_schema
+from gemuco.schema import BodySchema, check_schema, stacked
 
 
 def judging_masks(schema: BodySchema) -> dict[str, Mask]:
@@ -28,9 +28,8 @@ def judges(schema: BodySchema) -> Judges:
     """Return the judging masks of a schema as arrays for compiled code."""
     by_signal = schema.derived(judging_masks)
     masks = list(dict.fromkeys(by_signal.values()))
-    through, tails = (np.stack(column) for column in zip(*(schema.gate(m) for m in masks), strict=True))
     order = [masks.index(by_signal[s.name]) for s in schema.out_layout.signals for _ in range(s.size)]
-    return Judges(through, tails, np.array(order))
+    return Judges(*stacked(schema, masks), np.array(order))
 
 
 def predict_error(schema: BodySchema, values: Mapping[str, np.ndarray]) -> np.ndarray:

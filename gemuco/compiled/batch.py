@@ -6,13 +6,14 @@ from gemuco.compiled.jit import jit
 
 
 @jit
-def under_masks(rows, biases, through, bits, predictor):
+def under_masks(rows, biases, through, paths, bits, predictor):
     """Return the inputs and target outputs of every mask and every sample that has all elements of the mask.
 
     Args:
         rows: Samples [standard deviations], shape (n, size), float32; NaN where not measured.
         biases: p of every sample, shape (n, bias_size).
         through: 1 for elements of x_in that a mask lets through, else 0, shape (masks, in_size).
+        paths: Regression of the code l under every mask, shape (masks, in_size + 1, width).
         bits: m of every mask, shape (masks, x_in).
         predictor: Positions of x_in and x_out in the layout, and the limit of inputs.
 
@@ -21,7 +22,9 @@ def under_masks(rows, biases, through, bits, predictor):
         They are ordered by mask.
     """
     masks, count = through.shape
-    signals, width = bits.shape[1], count + bits.shape[1] + biases.shape[1]
+    signals, wide = bits.shape[1], paths.shape[2]
+    head = count + wide
+    width = head + signals + biases.shape[1]
     allowed = np.ones((masks, len(rows)), np.bool_)
     for mask in range(masks):
         for row in range(len(rows)):
@@ -37,13 +40,18 @@ def under_masks(rows, biases, through, bits, predictor):
     for mask in range(masks):
         for row in range(len(rows)):
             if allowed[mask, row]:
+                for j in range(wide):
+                    inputs[k, count + j] = paths[mask, count, j]
                 for i in range(count):
                     if through[mask, i] > 0.0:
-                        inputs[k, i] = min(max(rows[row, predictor.inputs[i]], -clip), clip)
+                        x = rows[row, predictor.inputs[i]]
+                        inputs[k, i] = min(max(x, -clip), clip)
+                        for j in range(wide):
+                            inputs[k, count + j] += x * paths[mask, i, j]
                 for i in range(signals):
-                    inputs[k, count + i] = bits[mask, i]
+                    inputs[k, head + i] = bits[mask, i]
                 for i in range(biases.shape[1]):
-                    inputs[k, count + signals + i] = biases[row, i]
+                    inputs[k, head + signals + i] = biases[row, i]
                 for i in range(len(predictor.outputs)):
                     targets[k, i] = rows[row, predictor.outputs[i]]
                 samples[k] = row

@@ -34,15 +34,13 @@ def tanh(x):
 
 
 @jit
-def bend(values, offset, code):
-    """Add the offset and apply the activation in place; shapes (rows, n) and (n,)."""
-    rows, width = values.shape
-    for row in range(rows):
+def bend(values, offset, code, width):
+    """Add the offset and apply the activation to the first `width` columns in place; shapes (rows, n) and (n,)."""
+    for row in range(len(values)):
         line = values[row]
-        if code == 0:
-            for i in range(width):
-                line[i] += offset[i]
-        elif code == 1:
+        for i in range(width, len(line)):
+            line[i] += offset[i]
+        if code == 1:
             for i in range(width):
                 line[i] = tanh(line[i] + offset[i])
         elif code == 2:
@@ -55,40 +53,44 @@ def bend(values, offset, code):
             for i in range(width):
                 x = line[i] + offset[i]
                 line[i] = x if x > 0.0 else math.expm1(x)
-        else:
+        elif code == 5:
             for i in range(width):
                 x = line[i] + offset[i]
                 line[i] = max(x, 0.0) + math.log1p(math.exp(-abs(x)))
 
 
 @jit
-def slopes(values, out, code):
-    """Multiply `out` by da/dx at values y = a(x), shapes (rows, n), or (1, n) for all rows; see `Activation.slope`."""
+def slopes(values, out, code, width):
+    """Multiply the first `width` columns of `out` by da/dx at values y = a(x); see `Activation.slope`.
+
+    Values and `out` have shapes (rows, n), or the values (1, n) for all rows.
+    """
     shared = len(values) == 1
     for row in range(len(out)):
         line, target = values[0 if shared else row], out[row]
         if code == 1:
-            for i in range(len(line)):
+            for i in range(width):
                 target[i] *= ONE - line[i] * line[i]
         elif code == 2:
-            for i in range(len(line)):
+            for i in range(width):
                 target[i] *= line[i] * (ONE - line[i])
         elif code == 3:
-            for i in range(len(line)):
+            for i in range(width):
                 target[i] *= ONE if line[i] > 0.0 else NONE
         elif code == 4:
-            for i in range(len(line)):
+            for i in range(width):
                 target[i] *= min(line[i], NONE) + ONE
         elif code == 5:
-            for i in range(len(line)):
+            for i in range(width):
                 target[i] *= -math.expm1(-line[i])
 
 
 @jit
-def bends(values, factor, out, code):
-    """Write a factor times d2a/dx2 at values y = a(x) into `out`, shapes (1, n); see `Activation.bend`."""
+def bends(values, factor, out, code, width):
+    """Write a factor times d2a/dx2 at values y = a(x) into `out`, shapes (1, n); 0 from column `width` on."""
     line = values[0]
-    for i in range(len(line)):
+    out[0, width:] = NONE
+    for i in range(width):
         y = line[i]
         curve = NONE
         if code == 1:

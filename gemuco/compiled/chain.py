@@ -20,23 +20,23 @@ class Packed(NamedTuple):
     Attributes:
         flat: Matrix (n_in, n_out) and offset (n_out,) of every layer, one after another, float32.
         form: For every layer n_in, n_out, the position of its matrix in `flat`, the sum of all widths before its
-            output, and its activation (`bend.CODES`), shape (layers, 5).
+            output, its activation (`bend.CODES`), and how many columns have it, shape (layers, 6).
     """
 
     flat: np.ndarray
     form: np.ndarray
 
 
-WIDE, NARROW, PLACE, BEFORE, CODE = range(5)
+WIDE, NARROW, PLACE, BEFORE, CODE, BENT = range(6)
 
 
 def pack(chain: Chain) -> Packed:
     """Convert a chain for compiled code."""
-    form, place, before = np.zeros((len(chain), 5), np.int64), 0, 0
+    form, place, before = np.zeros((len(chain), 6), np.int64), 0, 0
     for index, layer in enumerate(chain):
         wide, narrow = layer.matrix.shape
         before += wide
-        form[index] = wide, narrow, place, before, CODES[layer.activation]
+        form[index] = wide, narrow, place, before, CODES[layer.activation], layer.bent
         place += (wide + 1) * narrow
     flat = np.empty(place, np.float32)
     for layer, (wide, narrow, begin, *_) in zip(chain, form, strict=True):
@@ -104,7 +104,7 @@ def forward(chain, values, rows):
     for layer in range(len(chain.form)):
         result = after(chain, values, rows, layer)
         times(value, matrix(chain, layer), result)
-        bend(result, offset(chain, layer), chain.form[layer, CODE])
+        bend(result, offset(chain, layer), chain.form[layer, CODE], chain.form[layer, BENT])
         value = result
     return value
 
@@ -148,7 +148,7 @@ def pull(chain, values, rows, begin, gradient):
     for layer in range(len(chain.form) - 1, -1, -1):
         code = chain.form[layer, CODE]
         if code:
-            slopes(after(chain, values, rows, layer)[begin : begin + some], gradient, code)
+            slopes(after(chain, values, rows, layer)[begin : begin + some], gradient, code, chain.form[layer, BENT])
         below = np.empty((some, chain.form[layer, WIDE]), gradient.dtype)
         times_turned(gradient, matrix(chain, layer), below)
         gradient = below
@@ -162,7 +162,7 @@ def pull_all(chain, back, values, gradient):
     for layer in range(len(chain.form) - 1, -1, -1):
         place, wide, narrow = chain.form[layer, PLACE], chain.form[layer, WIDE], chain.form[layer, NARROW]
         if chain.form[layer, CODE]:
-            slopes(after(chain, values, rows, layer), gradient, chain.form[layer, CODE])
+            slopes(after(chain, values, rows, layer), gradient, chain.form[layer, CODE], chain.form[layer, BENT])
         below = np.empty((rows, wide), gradient.dtype)
         times(gradient, back[place : place + wide * narrow].reshape(narrow, wide), below)
         gradient = below
@@ -174,12 +174,13 @@ def push_all(chain, values, rows, row):
     """Return the derivatives of one row's output by every element of its input, shape (n_in, n_out)."""
     begin = matrix(chain, 0).copy()
     if chain.form[0, CODE]:
-        slopes(after(chain, values, rows, 0)[row : row + 1], begin, chain.form[0, CODE])
+        slopes(after(chain, values, rows, 0)[row : row + 1], begin, chain.form[0, CODE], chain.form[0, BENT])
     for layer in range(1, len(chain.form)):
         above = np.empty((len(begin), chain.form[layer, NARROW]), begin.dtype)
         times(begin, matrix(chain, layer), above)
-        if chain.form[layer, CODE]:
-            slopes(after(chain, values, rows, layer)[row : row + 1], above, chain.form[layer, CODE])
+        code, bent = chain.form[layer, CODE], chain.form[layer, BENT]
+        if code:
+            slopes(after(chain, values, rows, layer)[row : row + 1], above, code, bent)
         begin = above
     return begin
 
@@ -201,11 +202,11 @@ def mixed(chain, values, weights, tangents):
     curves = space(chain, 1)  # a''(x) times the gradient that arrives there
     gradient = weights
     for layer in range(layers - 1, -1, -1):
-        value, code = after(chain, values, 1, layer), chain.form[layer, CODE]
-        bends(value, gradient, after(chain, curves, 1, layer), code)
+        value, code, bent = after(chain, values, 1, layer), chain.form[layer, CODE], chain.form[layer, BENT]
+        bends(value, gradient, after(chain, curves, 1, layer), code, bent)
         below = np.empty((1, chain.form[layer, WIDE]), weights.dtype)
         inner = gradient.copy()
-        slopes(value, inner, code)
+        slopes(value, inner, code, bent)
         times_turned(inner, matrix(chain, layer), below)
         gradient = below
     pushed = space(chain, count)
@@ -213,10 +214,10 @@ def mixed(chain, values, weights, tangents):
         above = after(chain, pushed, count, layer)
         times(tangents, matrix(chain, layer), above)
         tangents = above.copy()
-        slopes(after(chain, values, 1, layer), tangents, chain.form[layer, CODE])
+        slopes(after(chain, values, 1, layer), tangents, chain.form[layer, CODE], chain.form[layer, BENT])
     second = np.zeros((count, chain.form[layers - 1, NARROW]), weights.dtype)
     for layer in range(layers - 1, -1, -1):
-        slopes(after(chain, values, 1, layer), second, chain.form[layer, CODE])
+        slopes(after(chain, values, 1, layer), second, chain.form[layer, CODE], chain.form[layer, BENT])
         moved, curve = after(chain, pushed, count, layer), after(chain, curves, 1, layer)
         for row in range(count):
             for i in range(second.shape[1]):

@@ -35,7 +35,7 @@ class Predictor(NamedTuple):
 
 
 @jit
-def infer(flat, form, inputs, outputs, scale, clip, joined, through, tail, requested, estimate):
+def infer(flat, form, inputs, outputs, scale, clip, joined, through, path, tail, requested, estimate):
     """Predict one sample under a mask.
 
     The predictor is passed in `parts`, because Python passes arrays in half the time of tuples of arrays.
@@ -49,6 +49,7 @@ def infer(flat, form, inputs, outputs, scale, clip, joined, through, tail, reque
         clip: See `Predictor`.
         joined: Every element of the layout [its unit], shape (size,); NaN where masked.
         through: 1 for elements of x_in that the mask lets through, else 0, shape (in_size,).
+        path: Regression of the code l, shape (in_size + 1, width).
         tail: m and p, shape (masks + bias_size,).
         requested: Whether each element is requested, truth values, shape (size,).
         estimate: Result for the requested elements [its unit], shape (size,); NaN for elements that are not in x_out.
@@ -60,15 +61,19 @@ def infer(flat, form, inputs, outputs, scale, clip, joined, through, tail, reque
     chain = Packed(flat, form)
     values = space(chain, 1)
     line = first(chain, values, 1)[0]
-    count = len(inputs)
+    count, width = len(inputs), path.shape[1]
+    for k in range(width):
+        line[count + k] = path[count, k]
     for i in range(count):
         line[i] = 0.0
         if through[i] > 0.0:
             element = inputs[i]
             x = (joined[element] - scale[0, element]) / scale[1, element]
             line[i] = min(max(x, -clip), clip)
+            for k in range(width):
+                line[count + k] += x * path[i, k]
     for i in range(len(tail)):
-        line[count + i] = tail[i]
+        line[count + width + i] = tail[i]
     prediction = forward(chain, values, 1)[0]
     for i in range(len(estimate)):
         if requested[i]:

@@ -4,12 +4,12 @@ import numpy as np
 
 from gemuco.compiled.bend import bend, slopes
 from gemuco.compiled.blas import times, times_turned_double
-from gemuco.compiled.chain import CODE, NARROW, matrix, offset
+from gemuco.compiled.chain import BENT, CODE, NARROW, matrix, offset
 from gemuco.compiled.jit import jit
 
 
 @jit
-def innovations(predictor, rows, biases, through, tails, index, whiten):
+def innovations(predictor, rows, biases, through, paths, tails, index, whiten):
     """Return the whitened errors of samples under several masks, and derivatives: error(p + dp) = error - slope dp.
 
     Args:
@@ -17,6 +17,7 @@ def innovations(predictor, rows, biases, through, tails, index, whiten):
         rows: Samples [standard deviations], shape (rows, size), or (1, size) for all p.
         biases: p of every row, shape (rows, bias_size).
         through: 1 for elements of x_in that each mask lets through, else 0, shape (masks, in_size).
+        paths: Regression of the code l under each mask, shape (masks, in_size + 1, width).
         tails: m of each mask, followed by any p, shape (masks, x_in signals + bias_size).
         index: Positions of the errors in the flattened (masks, out_size) table, shape (n,).
         whiten: Matrix that converts the errors to independent ones of variance 1, shape (n, n).
@@ -27,7 +28,7 @@ def innovations(predictor, rows, biases, through, tails, index, whiten):
     count, size = biases.shape
     masks, outputs = len(through), len(predictor.outputs)
     batch = count * masks
-    prediction = values_and_tangents(predictor, rows, biases, through, tails)
+    prediction = values_and_tangents(predictor, rows, biases, through, paths, tails)
     raw = np.empty((count * (1 + size), len(index)))
     for row in range(count):
         sample = rows[row if len(rows) > 1 else 0]
@@ -48,7 +49,7 @@ def innovations(predictor, rows, biases, through, tails, index, whiten):
 
 
 @jit
-def values_and_tangents(predictor, rows, biases, through, tails):
+def values_and_tangents(predictor, rows, biases, through, paths, tails):
     """Return the network's output for every row under every mask, followed by its derivatives by each element of p.
 
     Both pass a layer in one product, so that each matrix is read once.
@@ -58,21 +59,26 @@ def values_and_tangents(predictor, rows, biases, through, tails):
     """
     chain, (count, size) = predictor.chain, biases.shape
     masks, wide = through.shape
-    batch, width = count * masks, tails.shape[1]
+    batch, width, code = count * masks, tails.shape[1], paths.shape[2]
     begin = matrix(chain, 0)
     inputs = np.empty((batch, len(begin)), begin.dtype)
     for row in range(count):
         sample = rows[row if len(rows) > 1 else 0]
         for m in range(masks):
             line = inputs[row * masks + m]
+            for k in range(code):
+                line[wide + k] = paths[m, wide, k]
             for i in range(wide):
                 line[i] = 0.0
                 if through[m, i] > 0.0:
-                    line[i] = min(max(sample[predictor.inputs[i]], -predictor.clip), predictor.clip)
+                    x = sample[predictor.inputs[i]]
+                    line[i] = min(max(x, -predictor.clip), predictor.clip)
+                    for k in range(code):
+                        line[wide + k] += x * paths[m, i, k]
             for i in range(width - size):
-                line[wide + i] = tails[m, i]
+                line[wide + code + i] = tails[m, i]
             for i in range(size):
-                line[wide + width - size + i] = biases[row, i]
+                line[wide + code + width - size + i] = biases[row, i]
     value = np.empty(((1 + size) * batch, begin.shape[1]), begin.dtype)
     times(inputs, begin, value[:batch])
     for j in range(size):
@@ -84,9 +90,9 @@ def values_and_tangents(predictor, rows, biases, through, tails):
             above = np.empty((len(value), chain.form[layer, NARROW]), value.dtype)
             times(value, matrix(chain, layer), above)
             value = above
-        code = chain.form[layer, CODE]
-        bend(value[:batch], offset(chain, layer), code)
-        if code:
+        kind, bent = chain.form[layer, CODE], chain.form[layer, BENT]
+        bend(value[:batch], offset(chain, layer), kind, bent)
+        if kind:
             for j in range(size):
-                slopes(value[:batch], value[(1 + j) * batch : (2 + j) * batch], code)
+                slopes(value[:batch], value[(1 + j) * batch : (2 + j) * batch], kind, bent)
     return value

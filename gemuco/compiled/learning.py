@@ -4,7 +4,7 @@ import numpy as np
 
 from gemuco.compiled.bend import slopes
 from gemuco.compiled.blas import times_turned, turned_times
-from gemuco.compiled.chain import CODE, NARROW, PLACE, WIDE, after, first, forward, matrix, space
+from gemuco.compiled.chain import BENT, CODE, NARROW, PLACE, WIDE, after, first, forward, matrix, space
 from gemuco.compiled.jit import jit
 
 MOMENTUM = 0.9
@@ -76,7 +76,7 @@ def gradients(chain, inputs, target, bend, by_weights, by_inputs):
     for layer in range(len(chain.form) - 1, -1, -1):
         code = chain.form[layer, CODE]
         if code:
-            slopes(after(chain, values, rows, layer), gradient, code)
+            slopes(after(chain, values, rows, layer), gradient, code, chain.form[layer, BENT])
         wide, narrow = chain.form[layer, WIDE], chain.form[layer, NARROW]
         below = first(chain, values, rows) if layer == 0 else after(chain, values, rows, layer - 1)
         if by_weights:

@@ -1,7 +1,8 @@
 """Squared errors of one network under many masks on the same rows; see `gemuco.structure.mask_errors`.
 
-Elements that a mask removes are left out of the rows and of the first layer's matrix, and the bits of the mask are
-added to the first layer's offset. Rows are processed in blocks whose values stay in the second-level cache.
+Elements that a mask removes are left out of the rows and of the first layer's matrix; the bits of the mask and the
+linear path are folded into its offset and matrix. Rows are processed in blocks whose values stay in the second-level
+cache.
 """
 
 from typing import NamedTuple
@@ -10,7 +11,7 @@ import numpy as np
 
 from gemuco.compiled.bend import bend
 from gemuco.compiled.blas import times
-from gemuco.compiled.chain import CODE, NARROW, matrix, offset
+from gemuco.compiled.chain import BENT, CODE, NARROW, matrix, offset
 from gemuco.compiled.jit import jit
 
 BLOCK = 256
@@ -70,12 +71,13 @@ def make_buffers(chain, columns):
 
 
 @jit
-def begin(chain, gate, bits, buffers):
+def begin(chain, gate, path, bits, buffers):
     """Prepare the first layer under one mask: `columns`, `start` and `shift` of the buffers.
 
     Args:
         chain: The network: elements, bits and p in.
         gate: 1 for elements of the mask's signals, else 0, shape (size,).
+        path: Regression of the code l under the mask, shape (size + 1, width).
         bits: The mask, shape (signals,).
         buffers: Changed in place.
 
@@ -83,19 +85,24 @@ def begin(chain, gate, bits, buffers):
         Number of columns under the mask; `columns` and `start` are undefined beyond it.
     """
     whole, plain, count = matrix(chain, 0), offset(chain, 0), 0
-    size, signals, shift = len(gate), len(bits), buffers.shift
+    size, width, signals, shift = len(gate), path.shape[1], len(bits), buffers.shift
     for k in range(len(shift)):
         shift[k] = plain[k]
+        for j in range(width):
+            shift[k] += path[size, j] * whole[size + j, k]
     for i in range(signals):
         if bits[i] > 0.0:
             for k in range(len(shift)):
-                shift[k] += whole[size + i, k]
+                shift[k] += whole[size + width + i, k]
     for i in range(len(buffers.start)):
         if i >= size or gate[i] > 0.0:
             buffers.columns[count] = i
-            line = i if i < size else i + signals
+            line = i if i < size else i + width + signals
             for k in range(len(shift)):
                 buffers.start[count, k] = whole[line, k]
+                if i < size:
+                    for j in range(width):
+                        buffers.start[count, k] += path[i, j] * whole[size + j, k]
             count += 1
     return count
 
@@ -110,12 +117,12 @@ def predict(chain, rows, first, count, columns, buffers):
             inputs[row, i] = rows.inputs[first + row, buffers.columns[i]]
     value = odd[: count * len(shift)].reshape(count, len(shift))
     times(inputs, buffers.start[:columns], value)
-    bend(value, shift, chain.form[0, CODE])
+    bend(value, shift, chain.form[0, CODE], chain.form[0, BENT])
     for layer in range(1, len(chain.form)):
         width = chain.form[layer, NARROW]
         result = even[: count * width].reshape(count, width)
         times(value, matrix(chain, layer), result)
-        bend(result, offset(chain, layer), chain.form[layer, CODE])
+        bend(result, offset(chain, layer), chain.form[layer, CODE], chain.form[layer, BENT])
         value = result
         even, odd = odd, even
     return value
@@ -131,7 +138,7 @@ def has_signals(rows, row, bits):
 
 
 @jit
-def squared_errors(chain, rows, gates, masks):
+def squared_errors(chain, rows, gates, paths, masks):
     """Return the sum of squared errors over the rows, shape (masks, size).
 
     A row without all signals of the mask adds nothing, nor does an element that does not count.
@@ -140,12 +147,13 @@ def squared_errors(chain, rows, gates, masks):
         chain: The network.
         rows: The samples.
         gates: 1 for elements of a mask's signals, else 0, shape (masks, size).
+        paths: Regression of the code l under every mask, shape (masks, size + 1, width).
         masks: 1 for signals of a mask, else 0, shape (masks, signals).
     """
     total, size = np.zeros(gates.shape), gates.shape[1]
     buffers = make_buffers(chain, rows.inputs.shape[1])
     for mask in range(len(masks)):
-        columns = begin(chain, gates[mask], masks[mask], buffers)
+        columns = begin(chain, gates[mask], paths[mask], masks[mask], buffers)
         for first in range(0, len(rows.inputs), BLOCK):
             count = min(BLOCK, len(rows.inputs) - first)
             outputs = predict(chain, rows, first, count, columns, buffers)

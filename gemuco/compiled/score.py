@@ -13,11 +13,13 @@ class Judges(NamedTuple):
 
     Attributes:
         through: 1 for elements of x_in that a mask lets through, else 0, shape (masks, in_size).
+        paths: Regression of the code l under every mask, shape (masks, in_size + 1, width).
         tails: m and p of every mask, shape (masks, x_in + bias_size).
         mask: Index of the mask that judges each element, shape (out_size,).
     """
 
     through: np.ndarray
+    paths: np.ndarray
     tails: np.ndarray
     mask: np.ndarray
 
@@ -34,8 +36,10 @@ def errors(predictor, judges, joined):
     rows, count = judges.through.shape
     values = space(predictor.chain, rows)
     inputs = first(predictor.chain, values, rows)
-    complete = np.ones(rows, np.bool_)
+    complete, width = np.ones(rows, np.bool_), judges.paths.shape[2]
     for row in range(rows):
+        for k in range(width):
+            inputs[row, count + k] = judges.paths[row, count, k]
         for i in range(count):
             inputs[row, i] = 0.0
             if judges.through[row, i] > 0.0:
@@ -43,10 +47,12 @@ def errors(predictor, judges, joined):
                 x = (joined[element] - predictor.scale[0, element]) / predictor.scale[1, element]
                 if np.isfinite(x):
                     inputs[row, i] = min(max(x, -predictor.clip), predictor.clip)
+                    for k in range(width):
+                        inputs[row, count + k] += x * judges.paths[row, i, k]
                 else:
                     complete[row] = False
         for i in range(judges.tails.shape[1]):
-            inputs[row, count + i] = judges.tails[row, i]
+            inputs[row, count + width + i] = judges.tails[row, i]
     prediction = forward(predictor.chain, values, rows)
     error = np.full(len(judges.mask), np.nan)
     for i in range(len(judges.mask)):

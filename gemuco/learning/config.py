@@ -1,5 +1,6 @@
 """Settings of a training."""
 
+import math
 from dataclasses import dataclass
 
 from gemuco.errors import SchemaError, check_kind, whole_number
@@ -7,6 +8,14 @@ from gemuco.layers import check_activation
 
 MOST_BIAS = 3
 """A length of p that follows the data is at most this."""
+LATENT = 15, 40
+"""A z that follows the data has one element per output, but not less and not more elements than these."""
+BATCH = 50, 500
+"""A batch that follows the data is a tenth of the samples, but not smaller and not larger than these."""
+STEPS = 8000
+"""A number of epochs that follows the data is this many steps."""
+PATIENCE = 0.2
+"""A patience that follows the data is this share of the epochs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -15,15 +24,16 @@ class TrainConfig:
 
     Attributes:
         hidden: Widths of the encoder's layers; the decoder mirrors them.
-        latent: Length of z.
+        latent: Length of z; None if it follows the number of outputs.
         activation: Activation of the hidden layers: tanh, relu, sigmoid, elu or softplus.
         bias_size: Length of p, one p per condition; 0 without parametric bias, None if it follows the data.
-        epochs: Largest number of passes over the data.
-        batch: Samples per step.
-        rate: Peak of the one-cycle learning rate of W (Adam).
+        epochs: Largest number of passes over the data; None if it follows the number of samples.
+        batch: Samples per step; None if it follows the number of samples.
+        rate: Peak of the one-cycle learning rate of W (SOAP).
         bias_rate: Peak of the one-cycle learning rate of p.
         held_out: Share of every condition's episodes (or time blocks) that is held out of the training to measure it.
-        patience: The training stops after this many epochs without a better held-out loss.
+        patience: The training stops after this many epochs without a better held-out loss; None if it follows the
+            number of epochs.
         outliers: A measured signal is rejected while the model, which does not see it, misses it by more than this
             many robust standard deviations of its misses. Infinite: nothing is rejected, and the loss is the square.
         replay: Fine-tuning only: number of old training samples per new sample.
@@ -31,15 +41,15 @@ class TrainConfig:
     """
 
     hidden: tuple[int, ...] = (200, 30)
-    latent: int = 15
+    latent: int | None = None
     activation: str = "tanh"
     bias_size: int | None = None
-    epochs: int = 150
-    batch: int = 500
+    epochs: int | None = None
+    batch: int | None = None
     rate: float = 1e-2
     bias_rate: float = 1e-2
     held_out: float = 0.2
-    patience: int = 40
+    patience: int | None = None
     outliers: float = 6.0
     replay: float = 0.5
     seed: int = 0
@@ -48,10 +58,10 @@ class TrainConfig:
         check_activation(self.activation)
         check_kind("Training: hidden", self.hidden, (tuple, list), "a tuple of widths, such as (200, 30)")
         object.__setattr__(self, "hidden", tuple(self.hidden))
-        for name, least in (("latent", 1), ("epochs", 1), ("batch", 1), ("patience", 1), ("seed", 0)):
-            whole_number(f"Training: {name}", getattr(self, name), least)
-        if self.bias_size is not None:
-            whole_number("Training: bias_size", self.bias_size, 0)
+        whole_number("Training: seed", self.seed, 0)
+        for name, least in (("latent", 1), ("epochs", 1), ("batch", 1), ("patience", 1), ("bias_size", 0)):
+            if getattr(self, name) is not None:
+                whole_number(f"Training: {name}", getattr(self, name), least)
         for width in self.hidden:
             if width < 1:
                 raise SchemaError(f"Training: a hidden layer of {width} is impossible; leave it out or make it wider.")
@@ -63,6 +73,24 @@ class TrainConfig:
             raise SchemaError(f"Training: held_out is {self.held_out}; it is a share between 0 and 1.")
         if not self.outliers > 0.0:
             raise SchemaError(f"Training: outliers is {self.outliers}; use infinity to reject nothing.")
+
+    def latent_for(self, outputs: int) -> int:
+        """Return the length of z for a number of x_out elements."""
+        return min(max(outputs, LATENT[0]), LATENT[1]) if self.latent is None else self.latent
+
+    def batch_for(self, samples: int) -> int:
+        """Return the samples per step for a number of training samples."""
+        return min(max(samples // 10, BATCH[0]), BATCH[1]) if self.batch is None else self.batch
+
+    def epochs_for(self, samples: int) -> int:
+        """Return the largest number of epochs for a number of training samples."""
+        if self.epochs is not None:
+            return self.epochs
+        return max(1, round(STEPS / max(1, math.ceil(samples / self.batch_for(samples)))))
+
+    def patience_for(self, epochs: int) -> int:
+        """Return the patience for a largest number of epochs."""
+        return max(20, round(PATIENCE * epochs)) if self.patience is None else self.patience
 
     def bias_for(self, conditions: int) -> int:
         """Return the length of p for a number of conditions.

@@ -12,7 +12,7 @@ from safetensors.numpy import save_file
 
 from gemuco.writing import writing
 
-FORMAT = "gemuco.draft.2"
+FORMAT = "gemuco.draft.3"
 
 
 def key_of(*parts: Any) -> str:

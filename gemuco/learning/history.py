@@ -10,7 +10,8 @@ class History:
     Attributes:
         train: Loss on the training data during each epoch.
         held_out: Loss on held-out data after each epoch.
-        best_epoch: Epoch whose weights were kept, counted from 0.
+        best: Held-out loss of the kept weights.
+        best_epoch: Epoch whose weights were kept, counted from 0; -1 for those before the first epoch.
         skipped: Number of training samples that no mask fits or that have no measured output.
         rejected: Number of outliers: measured signals of single training samples that were rejected.
         dead: Elements (`signal.element`) that never varied in the training data or were never measured.
@@ -20,14 +21,10 @@ class History:
 
     train: tuple[float, ...]
     held_out: tuple[float, ...]
+    best: float
     best_epoch: int
     skipped: int = 0
     rejected: int = 0
     dead: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     resumed: int = 0
-
-    @property
-    def best(self) -> float:
-        """Held-out loss of the kept weights."""
-        return self.held_out[self.best_epoch]

@@ -13,7 +13,7 @@ class Batch(NamedTuple):
     """Samples of one step.
 
     Attributes:
-        inputs: x_in under the mask of each sample, and m, shape (n, in_size + signals of x_in).
+        inputs: x_in under the mask of each sample, the code l and m, shape (n, in_size + width + signals of x_in).
         condition: Index of the condition whose p belongs to each sample, shape (n,).
         target: x_out, NaN where not measured, shape (n, out_size).
     """
@@ -56,7 +56,7 @@ class Material:
         alive = np.delete(task.signal_of, dead)
         self.granted[:, dead[np.isin(task.signal_of[dead], alive)]] = True
         filled = np.where(self._measured, rows, 0.0)
-        self._x_in = np.clip(filled[:, task.in_index], -CLIP, CLIP).astype(np.float32)
+        self._x_in = filled[:, task.in_index].astype(np.float32)
         self._x_out = filled[:, task.out_index].astype(np.float32)
         self.hide(np.zeros((len(rows), len(task.layout.names)), bool))
 
@@ -102,7 +102,15 @@ class Material:
 
     def take(self, rows: np.ndarray, masks: np.ndarray) -> Batch:
         """Return samples under masks, both by index, as the network needs them."""
-        inputs = np.concatenate([self._x_in[rows] * self.task.through[masks], self.task.tails[masks]], axis=1)
+        task = self.task
+        x = self._x_in[rows] * task.through[masks]
+        code = np.empty((len(rows), task.paths.shape[2]), np.float32)
+        if code.shape[1]:
+            order = np.argsort(masks, kind="stable")
+            for part in np.split(order, np.flatnonzero(np.diff(masks[order])) + 1):
+                path = task.paths[masks[part[0]]] if len(part) else task.paths[0]
+                code[part] = x[part] @ path[:-1] + path[-1]
+        inputs = np.concatenate([np.clip(x, -CLIP, CLIP), code, task.tails[masks]], axis=1)
         return Batch(inputs, self.condition[rows], self._target[rows])
 
     @staticmethod

@@ -1,8 +1,9 @@
-"""The network as torch sees it: z = h_enc(x_in, m, p), x_out = h_dec(z)."""
+"""The network as torch sees it: z = h_enc(x_in, m, p), x_out = h_dec(z); and the first weights of a training."""
 
 from collections.abc import Sequence
 from itertools import pairwise
 
+import numpy as np
 import torch
 from torch import nn
 
@@ -71,3 +72,41 @@ class Network(nn.Module):
             )
 
         return Weights(export(self.encoder), export(self.decoder))
+
+
+def with_linear_path(weights: Weights, mean: np.ndarray, components: np.ndarray, place: int) -> Weights:
+    """Return a network that begins as its linear path: the code l goes to z and from there to the output.
+
+    Args:
+        weights: First weights of a network without linear path.
+        mean: Mean of x_out [standard deviations], shape (out_size,).
+        components: Output per element of the code, shape (width, out_size); at most as many as z has elements.
+        place: Position of the code in the network's input.
+    """
+    width = len(components)
+    chains = []
+    for chain in (weights.encoder, weights.decoder):
+        layers = []
+        for index, layer in enumerate(chain):
+            is_last = index == len(chain) - 1
+            wide, narrow = layer.matrix.shape
+            is_first = index == 0
+            rows = wide + (width if not is_first or chain is weights.encoder else 0)
+            matrix = np.zeros((rows, narrow + (0 if is_last else width)), np.float32)
+            offset = np.zeros(matrix.shape[1], np.float32)
+            own = (
+                np.delete(np.arange(rows), np.arange(place, place + width)) if rows > wide and is_first else slice(wide)
+            )
+            matrix[own, :narrow], offset[:narrow] = layer.matrix, layer.offset
+            begin = (place if chain is weights.encoder else 0) if is_first else wide
+            into = matrix[begin : begin + width]
+            if not is_last:
+                into[:, narrow:] = np.eye(width)
+            elif chain is weights.encoder:
+                into[:, :width] = np.eye(width)
+            else:
+                matrix[:wide], offset[:] = 0.0, mean
+                into[:] = components
+            layers.append(Layer(matrix, offset, layer.activation, 0 if is_last else width))
+        chains.append(tuple(layers))
+    return Weights(*chains)

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from gemuco.linear import LinearPath
 from gemuco.masks import Mask, bits
 from gemuco.scaler import CLIP
 from gemuco.signals import Layout
@@ -17,6 +18,7 @@ class Task:
         layout: Every signal.
         masks: Feasible masks.
         x_out: Signals to infer, in the order of the layout.
+        linear: The linear path; without code if not given.
         x_in: Union of the masks, in the order of the layout.
         in_index: Indices of the elements of x_in in the layout, shape (in_size,).
         out_index: Indices of the elements of x_out in the layout, shape (out_size,).
@@ -24,11 +26,13 @@ class Task:
         needs: 1 for the signals of the layout that a mask contains, else 0, shape (masks, signals), float32.
         tails: m of every mask as the network receives it, shape (masks, signals of x_in), float32.
         through: 1 for the elements of x_in that a mask lets through, else 0, shape (masks, in_size), float32.
+        paths: Regression of the code l under every mask, shape (masks, in_size + 1, width), float32.
     """
 
     layout: Layout
     masks: tuple[Mask, ...]
     x_out: tuple[str, ...]
+    linear: LinearPath | None = None
     x_in: tuple[str, ...] = field(init=False)
     in_index: np.ndarray = field(init=False, repr=False)
     out_index: np.ndarray = field(init=False, repr=False)
@@ -36,6 +40,7 @@ class Task:
     needs: np.ndarray = field(init=False, repr=False)
     tails: np.ndarray = field(init=False, repr=False)
     through: np.ndarray = field(init=False, repr=False)
+    paths: np.ndarray = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         set_field = object.__setattr__
@@ -48,6 +53,8 @@ class Task:
         set_field(self, "needs", np.stack([bits(m, layout.names) for m in self.masks]))
         set_field(self, "tails", np.stack([bits(m, x_in) for m in self.masks]))
         set_field(self, "through", np.repeat(self.tails, [layout.signal(name).size for name in x_in], axis=1))
+        linear = self.linear or LinearPath.none(len(self.in_index))
+        set_field(self, "paths", np.stack([linear.map(through) for through in self.through]))
 
     def any_of(self, elements: np.ndarray) -> np.ndarray:
         """Return whether any element of each signal is true, (samples, layout.size) -> (samples, signals)."""
@@ -64,7 +71,7 @@ class Task:
         return absent @ self.needs.T < 0.5
 
     def inputs(self, x: np.ndarray, index: int, bias: np.ndarray) -> np.ndarray:
-        """Return x_in, m and p under one mask, shape (samples, inputs), float32.
+        """Return x_in, the code l, m and p under one mask, shape (samples, inputs), float32.
 
         Args:
             x: Every signal [standard deviations], shape (samples, layout.size); NaN counts as the mean.
@@ -72,6 +79,7 @@ class Task:
             bias: p of every sample, shape (samples, bias_size).
         """
         through = self.through[index]
-        values = np.clip(np.nan_to_num(np.where(through > 0, x[:, self.in_index], 0.0)), -CLIP, CLIP)
+        values = np.nan_to_num(np.where(through > 0, x[:, self.in_index], 0.0))
+        code = values @ self.paths[index, :-1] + self.paths[index, -1]
         tail = np.broadcast_to(self.tails[index], (len(x), len(self.x_in)))
-        return np.concatenate([values, tail, bias], axis=1, dtype=np.float32)
+        return np.concatenate([np.clip(values, -CLIP, CLIP), code, tail, bias], axis=1, dtype=np.float32)

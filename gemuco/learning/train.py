@@ -1,6 +1,7 @@
 """Training of a body schema from episodes (paper, II-D), and its fine-tuning on a few new episodes."""
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +16,9 @@ from gemuco.learning.draft import Draft, key_of
 from gemuco.learning.history import History
 from gemuco.learning.learner import Learner, Progress
 from gemuco.learning.material import Material
-from gemuco.learning.network import Network
+from gemuco.learning.network import Network, with_linear_path
 from gemuco.learning.task import Task
+from gemuco.linear import LinearPath, basis
 from gemuco.masks import Mask, label, mask
 from gemuco.scaler import Scaler
 from gemuco.schema import BodySchema
@@ -66,6 +68,7 @@ def fit(
     scaler = Scaler.fit(layout, train_data.rows())
     task, notes = _task(dataset, checked, outputs)
     conditions = dataset.conditions
+    task, mean, components = _with_linear_path(task, scaler, train_data, config.latent_for(len(task.out_index)))
     material = _material(task, scaler, train_data, conditions)
     held = _material(task, scaler, held_data, conditions)
     frozen = np.full(len(conditions), len(conditions) == 1)
@@ -73,12 +76,18 @@ def fit(
     notes += _bias_notes(config, conditions)
     torch.manual_seed(config.seed)
     size = len(task.in_index) + len(task.x_in) + bias_size
-    weights = Network(size, len(task.out_index), config.hidden, config.latent, config.activation).weights()
-    _mute(weights, task, scaler.dead, bias_size if frozen.all() else 0)
+    latent = config.latent_for(len(task.out_index))
+    weights = Network(size, len(task.out_index), config.hidden, latent, config.activation).weights()
+    weights = with_linear_path(weights, mean, components, len(task.in_index))
+    unused = bias_size if frozen.all() else 0
+    _mute(weights, task, scaler.dead, unused)
     biases = np.zeros((len(conditions), bias_size), np.float32)
     learner = Learner(config, weights, biases, frozen, material, held)
     learner.run(progress, title, Draft(resume, _key(config, task, dataset)))
-    schema = _assess(_schema(learner, scaler, conditions), learner, conditions)
+    schema = _schema(learner, scaler, conditions)
+    weights = learner.weights
+    _mute(weights, task, scaler.dead, unused)
+    schema = _assess(schema.with_weights(weights), learner, conditions)
     return schema, _history(learner, scaler, notes)
 
 
@@ -113,7 +122,7 @@ def fine_tune(
         NotEnoughData: Too few samples to hold some out, or no sample that fits a mask.
     """
     dataset = dataset.with_layout(schema.layout)
-    task = Task(schema.layout, schema.masks, schema.x_out)
+    task = Task(schema.layout, schema.masks, schema.x_out, schema.linear)
     train_data, held_data = dataset.split(config.held_out, config.seed)
     conditions = dataset.conditions
     old = list(schema.biases.values()) if len(schema.bias) else [schema.bias]
@@ -162,6 +171,24 @@ def _bias_notes(config: TrainConfig, conditions: tuple[str, ...]) -> list[str]:
     ]
 
 
+def _with_linear_path(task: Task, scaler: Scaler, data: Dataset, latent: int) -> tuple[Task, np.ndarray, np.ndarray]:
+    """Return the task with a linear path, and the mean of x_out and its components (`basis`).
+
+    The path is learned from the samples with all inputs and outputs. With less than two of them per input there is no
+    path: the code has length 0.
+    """
+    rows = scaler.normalise(data.rows())
+    rows[:, scaler.dead] = 0.0
+    complete = np.isfinite(rows[:, [*task.in_index, *task.out_index]]).all(axis=1)
+    x, y = rows[np.ix_(complete, task.in_index)], rows[np.ix_(complete, task.out_index)]
+    width = min(latent, y.shape[1])
+    if len(x) < max(10, 2 * x.shape[1]):
+        return task, np.zeros(y.shape[1]), np.zeros((0, y.shape[1]))
+    mean, components = basis(y, width)
+    path = LinearPath.fit(x, (y - mean) @ components.T, task.through)
+    return replace(task, linear=path), mean, components
+
+
 def _material(
     task: Task, scaler: Scaler, data: Dataset, conditions: tuple[str, ...], before: BodySchema | None = None
 ) -> Material:
@@ -186,10 +213,7 @@ def _material(
 
 
 def _mute(weights: Weights, task: Task, dead: np.ndarray, unused: int) -> None:
-    """Set the weights of dead elements and of an unused p to zero; a dead output is then always its mean.
-
-    These inputs are always 0, so their weights get no gradient and stay zero during the training.
-    """
+    """Set the weights of dead elements and of an unused p to zero; a dead output is then always its mean."""
     first, last = weights.encoder[0], weights.decoder[-1]
     first.matrix[np.flatnonzero(np.isin(task.in_index, dead))] = 0.0
     first.matrix[len(first.matrix) - unused :] = 0.0
@@ -229,6 +253,7 @@ def _schema(
         masks=task.masks,
         scaler=scaler,
         weights=learner.weights,
+        linear=task.linear,
         anchors=anchors.astype(np.float32),
         anchor_conditions=owner,
         bias=learned.mean(axis=0),
@@ -251,6 +276,7 @@ def _history(learner: Learner, scaler: Scaler, notes: list[str]) -> History:
     return History(
         train=tuple(course.train),
         held_out=tuple(course.held_out),
+        best=course.least,
         best_epoch=course.best_epoch,
         skipped=material.skipped,
         rejected=int(material.suspected[: material.new].sum()),

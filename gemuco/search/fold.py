@@ -15,6 +15,7 @@ import numpy as np
 from gemuco.compiled.chain import NARROW, PLACE, WIDE, Packed, pack
 from gemuco.compiled.problem import POSTURE, STD, STIFFNESS, TORQUE, Balance, Problem
 from gemuco.layers import Chain, Layer
+from gemuco.masks import Mask
 from gemuco.schema import BodySchema
 from gemuco.search.norms import Bound, Norm
 from gemuco.search.torque import TorqueNorm
@@ -51,6 +52,7 @@ def latent_lines(schema: BodySchema) -> Lines:
 
 def input_lines(
     schema: BodySchema,
+    mask: Mask,
     base: np.ndarray,
     columns: np.ndarray,
     free: np.ndarray,
@@ -63,6 +65,7 @@ def input_lines(
 
     Args:
         schema: The body schema.
+        mask: Signals of the network input.
         base: Network input, in which p is replaced, shape (inputs,).
         columns: Positions of p in the input, shape (n,).
         free: Positions of p in the layout, shape (n,).
@@ -71,10 +74,10 @@ def input_lines(
         low: Lower bounds of p, shape (n,).
         high: Upper bounds of p, shape (n,).
     """
-    chain, outputs = schema.weights.whole, schema.out_index[inferred]
+    chain, outputs = schema.chain(mask), schema.out_index[inferred]
     begin, end = chain[0], chain[-1]
-    first = Layer(begin.matrix[columns], np.empty_like(begin.offset), begin.activation)
-    last = Layer(end.matrix[:, inferred], end.offset[inferred], end.activation)
+    first = begin._replace(matrix=begin.matrix[columns], offset=np.empty_like(begin.offset))
+    last = end._replace(matrix=end.matrix[:, inferred], offset=end.offset[inferred])
     lines = Lines((first, *chain[1:-1], last), outputs, free, np.zeros(len(constants)), low, high)
     set_inputs(lines, begin, base, columns, constants)
     return lines
@@ -186,7 +189,7 @@ def _problem(
     last = lines.chain[-1]
     dtype = np.float32
     out = rows[:, lines.outputs].T.astype(dtype)
-    chain = (*lines.chain[:-1], Layer(last.matrix @ out, last.offset @ out, last.activation))
+    chain = (*lines.chain[:-1], last._replace(matrix=last.matrix @ out, offset=last.offset @ out))
     direct = np.zeros((len(lines.low) + 1, len(rows)), dtype)
     if len(lines.free):
         direct[:-1] = rows[:, lines.free].T
@@ -198,7 +201,7 @@ def _problem(
 def _no_balance() -> Balance:
     """Return a torque balance without joints."""
     empty = np.zeros((0, 3), np.float32)
-    chain = Packed(np.zeros(0, np.float32), np.zeros((0, 5), np.int64))
+    chain = Packed(np.zeros(0, np.float32), np.zeros((0, 6), np.int64))
     return Balance(chain, chain.flat, empty, empty, (-1, -1), 0.0)
 
 

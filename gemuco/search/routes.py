@@ -129,7 +129,8 @@ class InputRoute:
                     f"is not among the inputs {label(mask, schema.layout.names)}."
                 )
         inside = schema.layout.indices(mask)
-        self.mask, self._schema, self._chain = mask, schema, schema.weights.whole
+        self.mask, self._schema, self._chain = mask, schema, schema.chain(mask)
+        self._packed = pack(self._chain)
         self._inside, self._is_fixed = inside, np.isfinite(inputs)
         self.free = inside[~self._is_fixed[inside]]
         self._constants = np.where(self._is_fixed, inputs, 0.0)
@@ -142,7 +143,7 @@ class InputRoute:
         self._runs = any(name not in mask for name in needed)
         low, high = (bound[self.free].astype(self._base.dtype) for bound in bounds_of(schema, limits))
         self.lines = input_lines(
-            schema, self._base, self._columns, self.free, self._inferred, self._constants, low, high
+            schema, mask, self._base, self._columns, self.free, self._inferred, self._constants, low, high
         )
 
     def set_inputs(self, inputs: np.ndarray) -> None:
@@ -175,7 +176,7 @@ class InputRoute:
         inputs = self._base.astype(np.float32)
         inputs[self._columns] = point
         x = np.full(schema.layout.size, np.nan)
-        x[schema.out_index] = output(schema.predictor.chain, inputs)
+        x[schema.out_index] = output(self._packed, inputs)
         x[self._inside] = self._constants[self._inside]
         x[self.free] = point
         return x

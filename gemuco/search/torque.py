@@ -8,7 +8,7 @@ import numpy as np
 
 from gemuco.compiled.chain import pack, turned
 from gemuco.errors import NotFinite, NotObservable, SchemaError
-from gemuco.layers import Curvature, Layer
+from gemuco.layers import Curvature
 from gemuco.schema import BodySchema
 from gemuco.search.losses import Values, check_weight
 from gemuco.search.norms import TINY
@@ -146,7 +146,7 @@ class MuscleModel:
                 f"Torque balance differentiates '{names.length}' by '{names.position}', but this schema does not infer "
                 f"it from '{names.position}' and '{names.tension}'; see its feasible masks."
             )
-        begin, *between, end = schema.weights.whole
+        begin, *between, end = schema.chain(mask)
         dtype = begin.matrix.dtype
         base = schema.network_input(np.zeros(layout.size), mask).astype(dtype)
         joints, muscles, lengths = (
@@ -155,8 +155,8 @@ class MuscleModel:
         )
         inputs = np.concatenate([joints, muscles])
         self.theta, self.f = slice(0, len(joints)), slice(len(joints), len(inputs))
-        first = Layer(begin.matrix[inputs], begin.offset + base @ begin.matrix, begin.activation)
-        last = Layer(np.ascontiguousarray(end.matrix[:, lengths]), end.offset[lengths], end.activation)
+        first = begin._replace(matrix=begin.matrix[inputs], offset=begin.offset + base @ begin.matrix)
+        last = end._replace(matrix=np.ascontiguousarray(end.matrix[:, lengths]), offset=end.offset[lengths])
         self.chain = (first, *between, last)
         self.packed = pack(self.chain)
         self.back = turned(self.packed)

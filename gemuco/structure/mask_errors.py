@@ -19,6 +19,7 @@ from gemuco.learning.learner import Progress
 from gemuco.learning.material import Material
 from gemuco.learning.task import Task
 from gemuco.learning.train import fit
+from gemuco.linear import LinearPath
 from gemuco.masks import Mask, all_masks
 from gemuco.scaler import CLIP, Scaler
 from gemuco.schema import BodySchema
@@ -43,7 +44,9 @@ class MaskErrors:
 
     Attributes:
         layout: The signals.
-        chain: The network. Inputs: all signals, one bit per signal, and p. Outputs: all signals.
+        chain: The network. Inputs: all signals, the code of the linear path, one bit per signal, and p. Outputs: all
+            signals.
+        path: The linear path.
         x: Held-out rows [standard deviations], clipped, gaps filled by zero, shape (rows, size).
         counts: Whether an element is measured and not dead, shape (rows, size).
         whole: Whether a signal is complete, shape (rows, signals).
@@ -53,6 +56,7 @@ class MaskErrors:
 
     layout: Layout
     chain: Chain
+    path: LinearPath
     x: np.ndarray
     counts: np.ndarray
     whole: np.ndarray
@@ -84,7 +88,7 @@ class MaskErrors:
         for element in np.setdiff1d(np.arange(layout.size), scaler.dead):
             liveliness[element] = min(1.0, float(np.nanvar(known[:, element])))
         x = np.clip(np.where(counts, x, 0.0), -CLIP, CLIP).astype(np.float32)
-        return cls(layout, schema.weights.whole, x, counts, whole, p, liveliness)
+        return cls(layout, schema.weights.whole, schema.path, x, counts, whole, p, liveliness)
 
     def thinned(self, most: int) -> "MaskErrors":
         """Return a copy with at most `most` rows, evenly selected."""
@@ -124,7 +128,8 @@ class MaskErrors:
 
         def part(share: np.ndarray) -> np.ndarray:
             gates = np.repeat(share, self.sizes, axis=1).astype(np.float32)
-            return np.asarray(squared_errors(chain, rows, gates, share.astype(np.float32)))
+            paths = np.stack([self.path.map(gate) for gate in gates])
+            return np.asarray(squared_errors(chain, rows, gates, paths, share.astype(np.float32)))
 
         with one_thread(), ThreadPoolExecutor(cores) as pool:
             return np.concatenate(list(pool.map(part, np.array_split(masks, cores))))
