@@ -74,7 +74,7 @@ class MaskErrors:
         p = np.zeros((len(x), len(schema.bias)), np.float32)
         if len(schema.bias):
             p = np.stack([schema.biases[c] for c in held.conditions])[held.condition_of_rows()]
-        task = Task(layout, schema.masks, schema.x_out)
+        task = Task(layout, schema.masks, schema.x_out, schema.linear)
         material = Material(task, x, held.condition_of_rows(), scaler)
         wild = outliers.find(material, schema.weights, p, limit)
         wild[:, wild.mean(axis=0) > RARE] = False

@@ -230,7 +230,7 @@ def test_nothing_measured_at_all():
 
 def test_a_suspicion_is_cleared_once_the_model_bears_the_sample_out(schema, arm):
     rows = schema.scaler.normalise(LAYOUT.join(arm.sample(100, 8)))
-    task = Task(LAYOUT, schema.masks, schema.x_out)
+    task = Task(LAYOUT, schema.masks, schema.x_out, schema.linear)
     material = Material(task, rows, np.zeros(100, int), schema.scaler)
     suspected = np.zeros((100, 3), bool)
     suspected[:40, 1] = True  # tension, which is in every mask: only masks with it can judge it
