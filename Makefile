@@ -78,7 +78,7 @@ mutation: $(STAMP)  ## 300 small changes of drivers, protocols and safety; the s
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[mutation]'
 	$(BIN)/python -m studies.mutation --count 300
 
-peers: $(STAMP)  ## the model beside ridge, Gaussian process, trees, imputers and detectors of scikit-learn, one table
+peers: $(STAMP)  ## the model beside ridge, Gaussian process, trees, imputers and detectors of scikit-learn, one table; two hours, then cached
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[peers]'
 	$(BIN)/python -m studies.peers
 

@@ -93,15 +93,19 @@ class Row:
         return {name: value for name, value in means.items() if np.isfinite(value)}
 
     def record(self) -> dict[str, Any]:
-        """Return the row as plain data."""
-        return {
-            **asdict(self),
-            "bar": str(self.bar),
-            "best": self.best,
-            "limit": self.limit,
-            "ratio": self.ratio,
-            "is_met": self.is_met,
-        }
+        """Return the row as plain data; None where there is no figure."""
+        judged = {"bar": str(self.bar), "best": self.best, "limit": self.limit, "ratio": self.ratio}
+        record: dict[str, Any] = _plain({**asdict(self), **judged, "is_met": self.is_met})
+        return record
+
+
+def _plain(value: Any) -> Any:
+    """Return plain data with None in place of NaN, which JSON does not have."""
+    if isinstance(value, dict):
+        return {key: _plain(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(part) for part in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def verdict(row: Row) -> str:

@@ -83,6 +83,7 @@ def test_a_refusal_is_no_estimate_and_not_met(tmp_path):
     body = Body("noise", {"a": "m", "b": "m"}, noise, [question], settings, "test")
     (row,) = contest.estimates(body, [question], 1, Peers(tmp_path), True)
     assert row.is_met is False and "no estimate" in verdicts([row])
+    assert row.record()["ours"] == {"unit": [None], "std": [None]} and row.record()["ratio"] is None
     assert row.refusal and row.refusal in verdicts([row])
 
 
