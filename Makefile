@@ -15,7 +15,7 @@ wait $$beside || failed=1; cat build/clockless.log; exit $$failed
 endef
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo reproduce test test-all check format faults fuzz mutation bench test-socketcan test-controllers results clean test-compose wheels test-network docs
+.PHONY: help setup demo reproduce test test-all check format faults fuzz mutation peers bench test-socketcan test-controllers results clean test-compose wheels test-network docs
 
 help:            ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 18
@@ -77,6 +77,10 @@ fuzz: $(STAMP)    ## a hundred thousand bad messages on every key of a running r
 mutation: $(STAMP)  ## 300 small changes of drivers, protocols and safety; the share that the fast tests notice, half an hour
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[mutation]'
 	$(BIN)/python -m studies.mutation --count 300
+
+peers: $(STAMP)  ## the model beside ridge, Gaussian process, trees, imputers and detectors of scikit-learn, one table; two hours, then cached
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[peers]'
+	$(BIN)/python -m studies.peers
 
 test-network: $(STAMP)  ## HAL and model on a link that is cut, slow or lossy, over TCP and QUIC (docs/network.md); needs root
 	$(BIN)/python tests/network/campaign.py --json runs/network.json
