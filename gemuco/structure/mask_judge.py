@@ -14,7 +14,8 @@ ROWS = 1000
 QUANTILES = (np.inf, 6.31, 2.92, 2.35, 2.13, 2.02, 1.94, 1.89, 1.86, 1.83)
 """Nine of ten means of n + 1 values are within this many standard errors of the truth (Student's t); 1.8 for more."""
 HALF = 0.5
-"""If no signal is below the threshold, those of which the others explain half are used as poor outputs."""
+"""If no signal is below the threshold, those of which the others explain at least half, even if their standard error is
+added, are used as poor outputs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +98,8 @@ class Judge:
         self.poor = np.zeros(len(self.names), bool)
         if not self.outputs.any():
             squared = np.nan_to_num(mean_of(inference.shares), nan=np.inf)
-            self.poor = (squared < HALF) | (squared == squared.min())
+            margin = np.nan_to_num(_standard_error(inference.shares))
+            self.poor = (squared + margin < HALF) | (squared == squared.min())
             self.outputs = self.poor.copy()
 
     def is_judged(self, masks: np.ndarray) -> np.ndarray:
@@ -146,9 +148,14 @@ class Judge:
 
     def _spread(self, parts: np.ndarray | list[np.ndarray]) -> np.ndarray:
         """Return the standard error of the mean of squared errors by split, in the measure of the thresholds."""
-        values = np.array(parts)
-        known = np.isfinite(values)
-        amounts, mean = known.sum(axis=0), mean_of(values)
-        squares = (np.where(known, values - mean, 0.0) ** 2).sum(axis=0)
-        error = np.where(amounts > 1, np.sqrt(squares / np.maximum(amounts * (amounts - 1), 1)), np.nan)
-        return error if self.thresholds.measure == "mse" else error / np.maximum(2.0 * np.sqrt(mean), 1e-12)
+        error = _standard_error(parts)
+        return error if self.thresholds.measure == "mse" else error / np.maximum(2.0 * np.sqrt(mean_of(parts)), 1e-12)
+
+
+def _standard_error(parts: np.ndarray | list[np.ndarray]) -> np.ndarray:
+    """Return the standard error of the mean over the first axis; NaN with less than two values."""
+    values = np.array(parts)
+    known = np.isfinite(values)
+    amounts, mean = known.sum(axis=0), mean_of(values)
+    squares = (np.where(known, values - mean, 0.0) ** 2).sum(axis=0)
+    return np.where(amounts > 1, np.sqrt(squares / np.maximum(amounts * (amounts - 1), 1)), np.nan)

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from gemuco.dataset import Dataset, Episode
+from gemuco.learning.config import TrainConfig
+from gemuco.learning.train import fit
 from gemuco.signals import Layout, Signal
 from gemuco.splits.division import Division
 from gemuco.splits.repeats import Piece, repeated
@@ -104,6 +106,8 @@ def test_a_split_keeps_repetitions_together():
     (note,) = data.repetitions()
     assert "its 8 episodes are 5 motions (3 and 2 episodes are nearly equal)" in note
     assert episodes(0, 1, 2, 3, 4, 5).repetitions() == ()
+    config = TrainConfig(hidden=(5,), latent=2, epochs=1)
+    assert note in fit(data, config, [{"position"}])[1].notes
 
 
 def test_most_of_the_data_is_never_held_out():
