@@ -77,7 +77,7 @@ class MaskErrors:
         p = np.zeros((len(x), len(schema.bias)), np.float32)
         if len(schema.bias):
             p = np.stack([schema.biases[c] for c in held.conditions])[held.condition_of_rows()]
-        task = Task(layout, schema.masks, schema.x_out)
+        task = Task(layout, schema.masks, schema.x_out, schema.linear)
         material = Material(task, x, held.condition_of_rows(), scaler)
         wild = outliers.find(material, schema.weights, p, limit)
         wild[:, wild.mean(axis=0) > RARE] = False
@@ -154,7 +154,7 @@ class MaskErrors:
             return np.asarray(squared_errors(chain, rows, gates, paths, share.astype(np.float32)))
 
         with one_thread(), ThreadPoolExecutor(cores) as pool:
-            return np.concatenate(list(pool.map(part, np.array_split(masks, cores))))
+            return np.concatenate(list(pool.map(part, np.array_split(masks, min(cores, len(masks))))))
 
     def from_others(self) -> np.ndarray:
         """Return the error of every signal inferred from all others, shape (signals,); NaN if no row allows it."""

@@ -99,7 +99,7 @@ def learn(
     first = train_config(config, part.epochs, seed)
     last = train_config(config, config.training.epochs, seed)
     splits = part.splits or LIKELY_SPLITS
-    share = part.epochs * splits / (part.epochs * splits + last.epochs)
+    share = part.epochs * splits / (part.epochs * splits + (last.epochs or part.epochs))
     thresholds = Thresholds(part.threshold_out, part.threshold_in, part.measure, part.over)
     structure = determine(
         dataset, first, thresholds, lambda done, text: progress(share * done, text), part.splits, drafts

@@ -168,18 +168,20 @@ def test_errors_of_masks_are_those_of_the_network(measured):
     layout, (errors, *_) = measured
     masks = every_mask(layout)
     found = errors.of(masks)
-    for mask, line in zip(masks, found, strict=True):
+    for mask, shares in zip(masks, found, strict=True):
         rows = errors.whole[:, mask].all(axis=1)
         truth, there = errors.x[rows], errors.counts[rows]
         tail = np.broadcast_to(mask.astype(np.float32), (len(truth), len(mask)))
         given = np.repeat(mask, [signal.size for signal in layout.signals])
-        told = run(errors.chain, np.concatenate([truth * given, tail, errors.p[rows]], axis=1))
+        line = errors.path.map(given.astype(float))
+        code = (truth * given) @ line[:-1] + line[-1]
+        told = run(errors.chain, np.concatenate([truth * given, code, tail, errors.p[rows]], axis=1))
         for index, name in enumerate(layout.names):
             span = layout.slice(name)
             missed = np.where(there[:, span], (told - truth)[:, span] ** 2, 0.0).sum(axis=0) / there[:, span].sum(
                 axis=0
             )
-            assert line[index] == pytest.approx(missed.sum() / errors.liveliness[span].sum(), rel=1e-3, abs=1e-6)
+            assert shares[index] == pytest.approx(missed.sum() / errors.liveliness[span].sum(), rel=1e-3, abs=1e-6)
     assert errors.amounts == pytest.approx([errors.liveliness[layout.slice(name)].sum() for name in layout.names])
 
 

@@ -12,6 +12,7 @@ import gemuco
 from gemuco.dataset import Dataset, Episode
 from gemuco.learning.config import TrainConfig
 from gemuco.learning.network import Network
+from gemuco.linear import LinearPath
 from gemuco.signals import Layout, Signal
 from gemuco.structure import determination
 from gemuco.structure.determination import Judge, Thresholds, determine
@@ -58,7 +59,9 @@ def split_with(errors: dict[str, float], rest: float = 1.0) -> Measured:
         table[mask] = line
     chain = Network(6, 3, (4,), 2, "tanh").weights().whole
     ones = np.ones((40, 3), np.float32)
-    made = Measured(LAYOUT, chain, ones, ones > 0, ones > 0, np.zeros((40, 0)), np.ones(3), np.full(3, 2.0))
+    made = Measured(
+        LAYOUT, chain, LinearPath.none(3), ones, ones > 0, ones > 0, np.zeros((40, 0)), np.ones(3), np.full(3, 2.0)
+    )
     object.__setattr__(made, "table", table)
     return made
 
