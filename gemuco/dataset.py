@@ -3,21 +3,18 @@
 import json
 import zipfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from gemuco.errors import DatasetError, NotEnoughData, SchemaError, WrongSize, check_kind, described
 from gemuco.signals import Layout, Signal
+from gemuco.splits.division import Division
 from gemuco.writing import writing
 
 FORMAT = "gemuco.dataset"
 VERSION = 1
-MIN_EPISODES = 5
-"""A condition with fewer episodes than this is split by time blocks instead of episodes."""
-BLOCKS = 10
-"""A split by time blocks cuts an episode into at most this many."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +40,7 @@ class Dataset:
 
     layout: Layout
     episodes: tuple[Episode, ...]
+    _divisions: dict[str, Division] = field(init=False, repr=False, compare=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         check_kind("The layout of a dataset", self.layout, Layout, "a Layout")
@@ -78,48 +76,52 @@ class Dataset:
     def split(self, held_out: float, seed: int = 0) -> tuple["Dataset", "Dataset"]:
         """Split every condition into training and held-out data, by episodes, or by time blocks if there are few.
 
-        A split by random rows would only measure memory, because neighbours in time are nearly equal.
+        A split by random rows would only measure memory, because neighbours in time are nearly equal. For the same
+        reason repetitions of a motion are held out together, and the rows beside a held-out block are left out.
 
         Args:
-            held_out: Share of the episodes or blocks to hold out, 0 to 1; at least one of every condition.
-            seed: Seed of the draw.
+            held_out: Share of the motions to hold out, 0 to 1; at least one of every condition.
+            seed: Seed of the draw. Successive seeds hold out other motions, until each was held out once.
 
         Raises:
             NotEnoughData: A condition has less than two samples, or there is no sample.
         """
-        random = np.random.default_rng(seed)
         training: list[Episode] = []
         held: list[Episode] = []
         for condition in self.conditions:
-            parts = self._parts(condition)
-            if len(parts) < 2:
+            recordings, division = self._recordings(condition), self._division(condition)
+            if len(division.parts) < 2:
                 raise NotEnoughData(
-                    f"Condition '{condition}' has {len(self._of(condition))} samples; they cannot be split into "
+                    f"Condition '{condition}' has {sum(map(len, recordings))} samples; they cannot be split into "
                     "training and held-out data. Collect more of it, or leave it out."
                 )
-            count = min(max(1, round(held_out * len(parts))), len(parts) - 1)
-            held_out_parts = set(random.permutation(len(parts))[:count].tolist())
-            for index, part in enumerate(parts):
-                (held if index in held_out_parts else training).append(part)
+            chosen = division.held(held_out, seed)
+            for parts, episodes in (
+                (division.trained(chosen), training),
+                ([division.parts[index] for index in sorted(chosen)], held),
+            ):
+                for part in parts:
+                    rows = recordings[part.recording][part.start : part.stop]
+                    episodes.append(Episode(condition, self.layout.split(rows)))
         if not training:
             raise NotEnoughData("There are no samples to train from; record some with `gemuco collect`.")
         return Dataset(self.layout, tuple(training)), Dataset(self.layout, tuple(held))
 
-    def _of(self, condition: str) -> np.ndarray:
-        """Return the rows of one condition [unit], shape (samples, layout.size)."""
-        return self.rows()[self.condition_of_rows() == self.conditions.index(condition)]
+    def repetitions(self) -> tuple[str, ...]:
+        """Return sentences on the motions that the episodes repeat; `split` holds repetitions out together."""
+        return tuple(note for condition in self.conditions for note in self._division(condition).notes(condition))
 
-    def _parts(self, condition: str) -> list[Episode]:
-        """Return the parts of a condition that a split does not divide: episodes, or time blocks if there are few."""
-        episodes = [e for e in self.episodes if e.condition == condition and len(self.layout.join(e.values))]
-        if len(episodes) >= MIN_EPISODES:
-            return episodes
-        blocks: list[Episode] = []
-        for episode in episodes:
-            rows = self.layout.join(episode.values)
-            count = min(BLOCKS, max(len(rows) // 2, 2 if len(rows) > 1 and len(episodes) == 1 else 1))
-            blocks += [Episode(condition, self.layout.split(block)) for block in np.array_split(rows, count)]
-        return blocks
+    def _recordings(self, condition: str) -> list[np.ndarray]:
+        """Return the samples of every episode of a condition that has any [unit], shape (samples, layout.size)."""
+        parts = [self.layout.join(episode.values) for episode in self.episodes if episode.condition == condition]
+        return [np.where(np.isfinite(rows), rows, np.nan) for rows in parts if len(rows)]
+
+    def _division(self, condition: str) -> Division:
+        """Return the parts of a condition that a split does not divide."""
+        if condition not in self._divisions:
+            spans = {name: self.layout.slice(name) for name in self.layout.names}
+            self._divisions[condition] = Division.of(self._recordings(condition), spans)
+        return self._divisions[condition]
 
     def with_layout(self, layout: Layout) -> "Dataset":
         """Return the episodes with the signals of another layout, in its order.

@@ -27,6 +27,9 @@ ErrorTable = Mapping[tuple[str, Mask], np.ndarray]
 """The table maps (method, given signals) to the expected error of every x_out element [unit], shape (out_size,). The
 method `input` also estimates signals outside x_out, so its errors are those of the whole layout, shape (size,)."""
 
+ERRORS = "error from mask (% of std)"
+"""This is the head of the table of errors."""
+
 
 class Gate(NamedTuple):
     """What a mask lets through, float32.
@@ -121,20 +124,23 @@ class BodySchema:
         return "\n".join(lines)
 
     def summary(self) -> str:
-        """Return a table of the signals and a table of the root mean square errors of all masks on held-out data."""
+        """Return tables of the signals and of the root mean square errors of all masks on held-out data."""
         width = max(map(len, self.layout.names))
         lines = [f"{'signal':<{width}}  elements  unit   role"]
         for signal in self.layout.signals:
             roles = [role for role, names in (("x_in", self.x_in), ("x_out", self.x_out)) if signal.name in names]
-            role = ", ".join(roles) or "not used"
+            poor = " (poor)" if signal.name in self.manifest.get("poor", ()) else ""
+            role = (", ".join(roles) or "not used") + poor
             lines.append(f"{signal.name:<{width}}  {signal.size:>8}  {signal.unit:<5}  {role}")
         labels = [label(mask, self.layout.names) for mask in self.masks]
-        width, heads = max(map(len, labels)), [f"{s.name} [{s.unit}]" for s in self.out_layout.signals]
-        lines += ["", "  ".join([f"{'error from mask':<{width}}", *heads])]
-        errors = {(mask, name): error for mask, name, _, error in self.error_rows()}
+        width, heads = max(map(len, [ERRORS, *labels])), [f"{s.name} [{s.unit}]" for s in self.out_layout.signals]
+        lines += ["", "  ".join([f"{ERRORS:<{width}}", *heads])]
+        errors = {(row[0], row[1]): f"{row[3]:.3g} ({row[4]:.0f} %)" for row in self.error_rows()}
         for text in labels:
-            row = zip(heads, (errors.get((text, name), np.nan) for name in self.x_out), strict=True)
-            lines.append("  ".join([f"{text:<{width}}", *(f"{error:>{len(head)}.3g}" for head, error in row)]))
+            row = zip(heads, (errors.get((text, name), "") for name in self.x_out), strict=True)
+            lines.append("  ".join([f"{text:<{width}}", *(f"{error:>{len(head)}}" for head, error in row)]))
+        if self.manifest.get("poor"):
+            lines.append(f"POOR: {', '.join(self.manifest['poor'])} is inferred with an error above the threshold.")
         return "\n".join(lines)
 
     def __reduce__(self) -> tuple[type["BodySchema"], tuple[Any, ...]]:
@@ -252,16 +258,22 @@ class BodySchema:
         joined[~np.isfinite(joined)] = np.nan
         return self.scaler.normalise(joined)
 
-    def error_rows(self) -> list[tuple[str, str, str, float]]:
-        """Return (mask, signal, unit, root mean square error over the signal's elements on held-out data) for all."""
-        rows: list[tuple[str, str, str, float]] = []
+    def error_rows(self) -> list[tuple[str, str, str, float, float]]:
+        """Return the errors on held-out data of every signal under every mask.
+
+        Returns:
+            Mask, signal, unit, root mean square error over the signal's elements [unit], and the same in per cent of
+            the standard deviation.
+        """
+        rows: list[tuple[str, str, str, float, float]] = []
         for mask in self.masks:
             errors = self.errors.get(("mask", mask))
             if errors is None:
                 continue
             for name, part in self.out_layout.split(errors).items():
                 rms = float(np.sqrt(np.mean(part**2)))
-                rows.append((label(mask, self.layout.names), name, self.layout.signal(name).unit, rms))
+                percent = 100.0 * float(np.sqrt(self.mask_error(mask, name)))
+                rows.append((label(mask, self.layout.names), name, self.layout.signal(name).unit, rms, percent))
         return rows
 
     def with_weights(self, weights: Weights, errors: ErrorTable | None = None) -> "BodySchema":

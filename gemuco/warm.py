@@ -103,7 +103,8 @@ def learning(schema: BodySchema) -> Iterator[str]:
     schema, rows, size = body(tuple(SIGNALS)), 100, schema.layout.size
     counts, whole = np.ones((rows, size), bool), np.ones((rows, len(SIGNALS)), bool)
     x, p = np.zeros((rows, size), np.float32), np.zeros((rows, len(schema.bias)), np.float32)
-    errors = MaskErrors(schema.layout, schema.weights.whole, schema.path, x, counts, whole, p, np.ones(size))
+    ones = np.ones(size)
+    errors = MaskErrors(schema.layout, schema.weights.whole, schema.path, x, counts, whole, p, ones, ones)
     Judge(schema.layout.names, (errors,), Thresholds()).measure(np.eye(len(SIGNALS), dtype=bool))
 
 

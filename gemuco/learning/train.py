@@ -67,6 +67,7 @@ def fit(
     train_data, held_data = dataset.split(config.held_out, config.seed)
     scaler = Scaler.fit(layout, train_data.rows())
     task, notes = _task(dataset, checked, outputs)
+    notes.extend(dataset.repetitions())
     conditions = dataset.conditions
     task, mean, components = _with_linear_path(task, scaler, train_data, config.latent_for(len(task.out_index)))
     material = _material(task, scaler, train_data, conditions)

@@ -2,27 +2,29 @@
 
 With up to 10 signals all 2^n - 1 masks are measured. With more, the border between masks that are enough and masks that
 are not is searched for (`mask_search`). A mask is feasible only if its own error was measured on all rows and is small
-enough.
+enough. Other data are held out again and again until the errors are on one side of their thresholds.
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import replace
 from itertools import compress
 from pathlib import Path
 
 import numpy as np
 
-from gemuco.dataset import Data, as_dataset
+from gemuco.dataset import Data, Dataset, as_dataset
 from gemuco.errors import NotEnoughData, check_kind
 from gemuco.learning.config import TrainConfig
 from gemuco.learning.learner import Progress
 from gemuco.learning.train import fit
-from gemuco.masks import Mask, all_masks, bits, label
+from gemuco.masks import Mask, all_masks, bits
+from gemuco.scaler import Scaler
 from gemuco.schema import BodySchema
 from gemuco.signals import Layout
-from gemuco.structure.mask_errors import LISTED, train_masks
+from gemuco.structure.mask_errors import LISTED, MaskErrors, train_split
 from gemuco.structure.mask_judge import Judge, Thresholds
 from gemuco.structure.mask_search import choose, find_border
+from gemuco.structure.result import Structure
 
 __all__ = ["Judge", "Structure", "Thresholds", "determine", "learn", "search", "select"]
 
@@ -30,83 +32,12 @@ MOST_MASKS = 64
 """A schema has at most this many masks, because every mask costs time in training and in every estimate."""
 BUDGET = 20_000
 """The search measures about this many masks at most."""
-SHOWN = 40
-"""The report's table has at most this many masks."""
-
-
-@dataclass(frozen=True, slots=True)
-class Structure:
-    """Result of structure determination.
-
-    Attributes:
-        layout: All signals.
-        x_in: Inputs, the union of the masks.
-        x_out: Outputs.
-        masks: Feasible masks for the schema, the best first; at most `MOST_MASKS`.
-        L_i: Signal -> error when inferred from all others; infinite if no held-out sample has it.
-        L_m: Mask -> error of x_out, for every mask that was measured.
-        thresholds: Largest errors of outputs and of feasible masks.
-        is_whole: Whether every mask was measured, or the search ended because nothing was left to measure.
-    """
-
-    layout: Layout
-    x_in: tuple[str, ...]
-    x_out: tuple[str, ...]
-    masks: tuple[Mask, ...]
-    L_i: dict[str, float]
-    L_m: dict[Mask, float]
-    thresholds: Thresholds
-    is_whole: bool = True
-
-    @property
-    def feasible(self) -> tuple[Mask, ...]:
-        """Measured masks below the threshold, the best first."""
-        return tuple(sorted((m for m in self.L_m if self.L_m[m] < self.thresholds.into), key=lambda m: self.L_m[m]))
-
-    @property
-    def listed(self) -> tuple[Mask, ...]:
-        """The masks of the report: those of the smallest errors, at most `SHOWN`."""
-        return tuple(sorted(self.L_m, key=lambda m: self.L_m[m])[:SHOWN])
-
-    @property
-    def remarks(self) -> tuple[str, ...]:
-        """Facts that the tables do not show, one sentence each."""
-        sentences: list[str] = []
-        for name in self.x_out:
-            if all(name in m for m in self.masks):
-                sentences.append(
-                    f"'{name}' is an output, but every feasible mask contains it (without it no mask is below "
-                    "threshold_in): when it is missing it is estimated by descent on z."
-                )
-        for name in self.layout.names:
-            if name not in self.x_in and name not in self.x_out:
-                sentences.append(f"'{name}' is neither input nor output: the model does not use it.")
-        if len(self.masks) < len(self.feasible):
-            sentences.append(
-                f"{len(self.feasible)} of {len(self.L_m)} measured masks are feasible; the {len(self.masks)} that "
-                "serve random sets of available signals best are kept."
-            )
-        if not self.is_whole:
-            sentences.append("The search stopped at its budget: there may be feasible masks that it did not measure.")
-        return tuple(sentences)
-
-    def report(self) -> str:
-        """Return the errors and the result as tables of text."""
-        shown = self.listed
-        width = max([len(label(m, self.layout.names)) for m in shown] + [len(n) for n in self.L_i])
-        unit = "mean squared error" if self.thresholds.measure == "mse" else "root mean square error"
-        lines = [f"Errors on held-out data: {unit} in standard deviations.", ""]
-        lines.append(f"{'inferred from all others':<{width}}  {'L_i':>7}  output if below {self.thresholds.out:g}")
-        for name, value in self.L_i.items():
-            lines.append(f"{name:<{width}}  {value:7.3f}  {'yes' if name in self.x_out else 'no'}")
-        lines += ["", f"{'mask':<{width}}  {'L_m':>7}  feasible if below {self.thresholds.into:g}"]
-        for m in shown:
-            answer = "yes" if self.L_m[m] < self.thresholds.into else "no"
-            lines.append(f"{label(m, self.layout.names):<{width}}  {self.L_m[m]:7.3f}  {answer}")
-        if len(shown) < len(self.L_m):
-            lines.append(f"and {len(self.L_m) - len(shown)} more")
-        lines += ["", f"x_in  = {', '.join(self.x_in)}", f"x_out = {', '.join(self.x_out)}", *self.remarks]
-        return "\n".join(lines)
+FIRST_SPLITS, MOST_SPLITS = 2, 10
+"""If it is not given, the number of splits is between these."""
+BORDER = 0.2
+"""A mask whose error is known to this share of its threshold needs no further split."""
+POOR = 1.2
+"""If no mask is feasible, those with errors up to this multiple of the smallest are kept."""
 
 
 def determine(
@@ -114,49 +45,49 @@ def determine(
     config: TrainConfig | None = None,
     thresholds: Thresholds | None = None,
     progress: Progress | None = None,
-    splits: int = 1,
+    splits: int | None = None,
     drafts: Path | None = None,
     units: Mapping[str, str] | None = None,
 ) -> Structure:
-    """Train once under all masks, measure masks on held-out episodes, and keep those that are feasible.
+    """Train under all masks, measure masks on held-out data, and keep those that are feasible.
+
+    If no signal or no mask is below its threshold, the best are kept and marked as poor (`Structure.poor`).
 
     Args:
         data: Episodes of one body, as a dataset or as plain arrays; see `as_dataset`.
         config: Settings of the training; the defaults if not given.
         thresholds: Largest errors of outputs and of feasible masks; those of the paper if not given.
         progress: Called with the finished share, 0 to 1, and a line of text.
-        splits: Number of trainings, each with other episodes held out; errors are means over all. The paper uses one.
-            Short recordings need more, because their errors depend strongly on the held-out part.
+        splits: Number of trainings, each with other motions held out; errors are means over all. The paper uses one. If
+            not given, there are at least two, and more (at most ten) until every error is on one side of its threshold.
         drafts: A folder in which the trainings are saved, so that interrupted ones can be continued; see `fit`.
         units: Signal -> unit, of plain arrays.
 
     Raises:
-        NotEnoughData: Too few samples or signals, a signal that never varies, or no signal or mask below its threshold.
+        NotEnoughData: Too few samples, or fewer than two signals that vary.
     """
     dataset = as_dataset(data, units)
     config = TrainConfig() if config is None else config
     thresholds = Thresholds() if thresholds is None else thresholds
     check_kind("The settings of a training", config, TrainConfig, "a TrainConfig")
     check_kind("The thresholds", thresholds, Thresholds, "a Thresholds")
-    names = dataset.layout.names
-    if len(names) < 2:
-        raise NotEnoughData(
-            f"There is one signal, '{names[0]}', and nothing to infer it from; structure needs at least two."
-            if names
-            else "There is no signal; structure determination needs at least two."
-        )
-    judge = Judge(names, train_masks(dataset, config, splits, progress, drafts), thresholds)
-    if not judge.outputs.any():
-        least = min(judge.L_i, key=lambda name: judge.L_i[name])
-        raise NotEnoughData(
-            f"No signal can be inferred from the others (smallest L_i {judge.L_i[least]:.3f} of '{least}', "
-            f"threshold_out {thresholds.out:g}); collect more data or raise the threshold."
-        )
-    if len(names) <= LISTED:
-        masks, is_whole = np.array([bits(m, names) > 0 for m in all_masks(names)]), True
+    alive, notes = _alive(dataset)
+    judge = Judge(alive.layout.names, (), thresholds)
+    most, fresh = MOST_SPLITS if splits is None else splits, list[MaskErrors]()
+    for split in range(most):
+        fresh.append(train_split(alive, config, split, _share(progress, split, most), drafts))
+        if split + 1 == most or (splits is None and split + 1 >= FIRST_SPLITS):
+            judge.add(*fresh)
+            fresh.clear()
+            if splits is None and _is_decided(judge):
+                break
+    if progress is not None:
+        progress(1.0, "structure")
+    if len(alive.layout.names) <= LISTED:
+        masks, is_whole = _every(judge.names), True
     else:
         masks, is_whole = search(judge, config.seed)
-    return select(dataset.layout, judge, masks, is_whole, config.seed)
+    return select(dataset.layout, judge, masks, is_whole, config.seed, (*notes, *alive.repetitions()))
 
 
 def learn(
@@ -177,31 +108,33 @@ def learn(
     """
     dataset = as_dataset(data, units)
     config = TrainConfig() if config is None else config
-    if masks is None:
-        structure = determine(dataset, config)
-        masks, x_out = structure.masks, x_out or structure.x_out
-    return fit(dataset, config, masks, x_out=x_out)[0]
+    if masks is not None:
+        return fit(dataset, config, masks, x_out=x_out)[0]
+    structure = determine(dataset, config)
+    return fit(dataset, config, structure.masks, x_out=x_out or structure.x_out)[0].with_manifest(**structure.facts)
 
 
-def select(layout: Layout, judge: Judge, masks: np.ndarray, is_whole: bool, seed: int) -> Structure:
-    """Measure masks, shape (n, signals), and keep at most `MOST_MASKS` of those that are feasible.
+def select(
+    layout: Layout, judge: Judge, masks: np.ndarray, is_whole: bool, seed: int, notes: tuple[str, ...] = ()
+) -> Structure:
+    """Measure masks, shape (n, signals), and keep at most `MOST_MASKS` of those that are feasible, or of the best.
 
     Raises:
-        NotEnoughData: No mask is feasible.
+        NotEnoughData: No held-out sample has the signals of any mask.
     """
-    names, into = layout.names, judge.thresholds.into
+    names, into = judge.names, judge.thresholds.into
     masks = masks[judge.is_judged(masks)]
     L_m, squared = judge.measure(masks)
-    feasible = np.flatnonzero(L_m < into)
-    if not len(feasible):
+    if not np.isfinite(L_m).any():
         raise NotEnoughData(
-            f"No mask is enough to infer x_out ({', '.join(_named(names, judge.outputs))}): smallest L_m "
-            f"{L_m.min():.3f}, threshold_in {into:g}; collect more data or raise the threshold."
+            f"No held-out sample has two of the signals {', '.join(names)} at once; record them together."
         )
+    spread = judge.spread(masks)
+    feasible = np.flatnonzero(L_m < into if (L_m < into).any() else POOR * L_m.min() >= L_m)
     kept = feasible[choose(masks[feasible], squared[feasible], judge.outputs, MOST_MASKS, seed)]
     kept = kept[np.argsort(L_m[kept], kind="stable")]
     sets = [frozenset(_named(names, line)) for line in masks]
-    return Structure(
+    structure = Structure(
         layout=layout,
         x_in=_named(names, masks[kept].any(axis=0)),
         x_out=_named(names, judge.outputs),
@@ -210,7 +143,16 @@ def select(layout: Layout, judge: Judge, masks: np.ndarray, is_whole: bool, seed
         L_m={m: float(value) for m, value in zip(sets, L_m, strict=True)},
         thresholds=judge.thresholds,
         is_whole=is_whole,
+        spread_i=judge.spread_i,
+        spread_m={m: float(value) for m, value in zip(sets, spread, strict=True)},
+        rms_i=judge.rms_i,
+        best={name: frozenset(_named(names, line)) for name, line in zip(names, judge.best, strict=True)},
+        splits=len(judge.splits),
+        open=tuple(_open(judge, sets, L_m, spread)),
+        poor=_named(names, judge.poor),
+        notes=notes,
     )
+    return _with_units(structure, judge)
 
 
 def search(judge: Judge, seed: int) -> tuple[np.ndarray, bool]:
@@ -230,6 +172,74 @@ def search(judge: Judge, seed: int) -> tuple[np.ndarray, bool]:
 
     border = find_border(is_enough, len(judge.names), BUDGET, seed)
     return np.concatenate([border.largest, *enough]), border.is_complete
+
+
+def _alive(dataset: Dataset) -> tuple[Dataset, list[str]]:
+    """Return the dataset without signals that never vary or were never measured, and a sentence on each of these."""
+    layout, rows = dataset.layout, dataset.rows()
+    if not len(rows):
+        raise NotEnoughData("There are no samples to train from; record some with `gemuco collect`.")
+    measured = np.isfinite(rows).any(axis=0)
+    dead = np.isin(np.arange(layout.size), Scaler.fit(layout, rows).dead) if measured.any() else ~measured
+    notes, alive = [], []
+    for name in layout.names:
+        span = layout.slice(name)
+        if dead[span].all():
+            fact = "never varies" if measured[span].any() else "was never measured"
+            notes.append(f"Signal '{name}' {fact}, so nothing can be learned of it; check its sensor, or move it.")
+        else:
+            alive.append(name)
+    if len(alive) < 2:
+        what = f"There is one signal, '{alive[0]}', and nothing to infer it from" if alive else "There is no signal"
+        raise NotEnoughData(" ".join([f"{what}; structure needs at least two that vary.", *notes]))
+    return dataset if len(alive) == len(layout.names) else dataset.with_layout(layout.subset(alive)), notes
+
+
+def _share(progress: Progress | None, split: int, most: int) -> Progress | None:
+    """Return the progress of one split as a share of all."""
+    return None if progress is None else lambda done, text: progress((split + done) / most, text)
+
+
+def _is_decided(judge: Judge) -> bool:
+    """Whether all errors are on one side of their thresholds, or known well enough to say that they are near it.
+
+    With many signals only L_i is considered, because the search for masks is long.
+    """
+    L_i, spread_i = (np.array([part[name] for name in judge.names]) for part in (judge.L_i, judge.spread_i))
+    if judge.is_open(L_i, spread_i, judge.thresholds.out).any():
+        return False
+    if len(judge.names) > LISTED:
+        return True
+    masks = _every(judge.names)
+    masks = masks[judge.is_judged(masks)]
+    spread, into = judge.spread(masks), judge.thresholds.into
+    return not (judge.is_open(judge.measure(masks)[0], spread, into) & ~(spread < BORDER * into)).any()
+
+
+def _open(judge: Judge, sets: list[Mask], L_m: np.ndarray, spread: np.ndarray) -> list[str | Mask]:
+    """Return the signals and masks whose errors may be on either side of the threshold."""
+    if len(judge.splits) < 2:
+        return []
+    L_i, spread_i = (np.array([part[name] for name in judge.names]) for part in (judge.L_i, judge.spread_i))
+    signals = compress(judge.names, judge.is_open(L_i, spread_i, judge.thresholds.out).tolist())
+    return [*signals, *compress(sets, judge.is_open(L_m, spread, judge.thresholds.into).tolist())]
+
+
+def _with_units(structure: Structure, judge: Judge) -> Structure:
+    """Return the structure with the errors of the listed masks in the units of the outputs."""
+    listed = structure.listed
+    rms = judge.rms(np.array([bits(m, judge.names) > 0 for m in listed]))
+    table = {
+        m: {name: float(value) for name, value in zip(judge.names, line, strict=True) if name in structure.x_out}
+        for m, line in zip(listed, rms, strict=True)
+    }
+    lacking = {m: {name: value for name, value in row.items() if name not in m} for m, row in table.items()}
+    return replace(structure, rms_m=lacking)
+
+
+def _every(names: tuple[str, ...]) -> np.ndarray:
+    """Return every mask, truth values, shape (masks, signals)."""
+    return np.array([bits(m, names) > 0 for m in all_masks(names)])
 
 
 def _named(names: tuple[str, ...], chosen: np.ndarray) -> tuple[str, ...]:

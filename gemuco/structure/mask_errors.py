@@ -11,7 +11,6 @@ from gemuco.compiled.blas import one_thread
 from gemuco.compiled.chain import pack
 from gemuco.compiled.masks import Rows, squared_errors
 from gemuco.dataset import Dataset
-from gemuco.errors import NotEnoughData
 from gemuco.layers import Chain
 from gemuco.learning import outliers
 from gemuco.learning.config import TrainConfig
@@ -21,12 +20,14 @@ from gemuco.learning.task import Task
 from gemuco.learning.train import fit
 from gemuco.linear import LinearPath
 from gemuco.masks import Mask, all_masks
-from gemuco.scaler import CLIP, Scaler
+from gemuco.scaler import CLIP
 from gemuco.schema import BodySchema
 from gemuco.signals import Layout
 
 RARE = 0.05
 """If a larger share of a signal's samples are suspected outliers, the model is wrong and all its samples count."""
+STRIPES = 20
+"""Held-out rows are halved by this many stripes of neighbouring rows."""
 LISTED = 10
 """With at most this many signals every mask is measured."""
 TRAINED = 2000
@@ -52,6 +53,7 @@ class MaskErrors:
         whole: Whether a signal is complete, shape (rows, signals).
         p: Parametric bias of every row, shape (rows, bias_size).
         liveliness: Variance of every element in the training data, at most 1 [standard deviations squared], (size,).
+        scale: Standard deviation of every element in the training data [unit], shape (size,).
     """
 
     layout: Layout
@@ -62,6 +64,7 @@ class MaskErrors:
     whole: np.ndarray
     p: np.ndarray
     liveliness: np.ndarray
+    scale: np.ndarray
 
     @classmethod
     def of_schema(cls, schema: BodySchema, train: Dataset, held: Dataset, limit: float) -> "MaskErrors":
@@ -88,7 +91,7 @@ class MaskErrors:
         for element in np.setdiff1d(np.arange(layout.size), scaler.dead):
             liveliness[element] = min(1.0, float(np.nanvar(known[:, element])))
         x = np.clip(np.where(counts, x, 0.0), -CLIP, CLIP).astype(np.float32)
-        return cls(layout, schema.weights.whole, schema.path, x, counts, whole, p, liveliness)
+        return cls(layout, schema.weights.whole, schema.path, x, counts, whole, p, liveliness, scaler.std)
 
     def thinned(self, most: int) -> "MaskErrors":
         """Return a copy with at most `most` rows, evenly selected."""
@@ -100,6 +103,11 @@ class MaskErrors:
         """Return a copy with the rows of these indices, in this order."""
         return replace(self, **{name: getattr(self, name)[index] for name in ("x", "counts", "whole", "p")})
 
+    def halves(self) -> tuple["MaskErrors", "MaskErrors"]:
+        """Return two halves of the rows: every other one of `STRIPES` stripes of neighbouring rows."""
+        stripes = np.array_split(np.arange(len(self.x)), STRIPES)
+        return self.rows(np.concatenate(stripes[0::2])), self.rows(np.concatenate(stripes[1::2]))
+
     def of(self, masks: np.ndarray) -> np.ndarray:
         """Measure masks on all cores.
 
@@ -110,12 +118,26 @@ class MaskErrors:
             Share of the variance of every signal that each mask leaves unexplained, shape (masks, signals), NaN where
             no row has all signals of the mask.
         """
-        squared = self.squared(masks)
+        mean, is_known = self._mean_squares(masks)
+        variance = self.by_signal(np.where(is_known, self.liveliness, 0.0))
+        return np.where(variance > 0, self.by_signal(mean) / np.maximum(variance, 1e-12), np.nan)
+
+    def in_units(self, masks: np.ndarray) -> np.ndarray:
+        """Return the mean square error over the live elements of every signal [unit squared], shape (masks, signals).
+
+        It is NaN where no row has all signals of the mask.
+        """
+        mean, is_known = self._mean_squares(masks)
+        counted = is_known & (self.liveliness > 0.0)
+        amounts = self.by_signal(counted.astype(float))
+        total = self.by_signal(np.where(counted, mean * self.scale**2, 0.0))
+        return np.where(amounts > 0, total / np.maximum(amounts, 1.0), np.nan)
+
+    def _mean_squares(self, masks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the mean squared error of every element [standard deviations squared], and whether it is known."""
         usable = (~self.whole).astype(np.float32) @ masks.T.astype(np.float32) < 0.5  # (rows, masks)
         count = usable.T.astype(np.float32) @ self.counts.astype(np.float32)
-        variance = self.by_signal(np.where(count > 0, self.liveliness, 0.0))
-        error = self.by_signal(squared / np.maximum(count, 1))
-        return np.where(variance > 0, error / np.maximum(variance, 1e-12), np.nan)
+        return self.squared(masks) / np.maximum(count, 1), count > 0
 
     def squared(self, masks: np.ndarray) -> np.ndarray:
         """Return the sum of squared errors of every element over the rows that count, shape (masks, size).
@@ -132,7 +154,7 @@ class MaskErrors:
             return np.asarray(squared_errors(chain, rows, gates, paths, share.astype(np.float32)))
 
         with one_thread(), ThreadPoolExecutor(cores) as pool:
-            return np.concatenate(list(pool.map(part, np.array_split(masks, cores))))
+            return np.concatenate(list(pool.map(part, np.array_split(masks, min(cores, len(masks))))))
 
     def from_others(self) -> np.ndarray:
         """Return the error of every signal inferred from all others, shape (signals,); NaN if no row allows it."""
@@ -182,34 +204,36 @@ def train_masks(
     """Train one network under all masks per split of the data, and return each with its held-out rows.
 
     Raises:
-        NotEnoughData: A signal never varies or was never measured, or there are too few samples.
+        NotEnoughData: There are too few samples.
     """
 
-    def part(split: int) -> MaskErrors:
-        own = replace(config, seed=config.seed + split)
-        train, held = dataset.split(own.held_out, own.seed)
-        _check_alive(train)
-        resume = None if drafts is None else drafts / f"structure_{split}.safetensors"
-        masks = _drawn_masks(dataset.layout.names, own.seed)
-        share = None if progress is None else lambda done, text: progress((split + done) / splits, text)
-        schema, _ = fit(dataset, own, masks, share, title="structure", resume=resume)
-        return MaskErrors.of_schema(schema, train, held, config.outliers)
+    def share(split: int) -> Progress | None:
+        return None if progress is None else lambda done, text: progress((split + done) / splits, text)
 
-    return tuple(part(split) for split in range(splits))
+    return tuple(train_split(dataset, config, split, share(split), drafts) for split in range(splits))
 
 
-def _check_alive(train: Dataset) -> None:
-    """Refuse signals that never vary or were never measured."""
-    rows = train.rows()
-    dead = np.isin(np.arange(train.layout.size), Scaler.fit(train.layout, rows).dead)
-    for name in train.layout.names:
-        span = train.layout.slice(name)
-        if dead[span].all():
-            fact = "never varies" if np.isfinite(rows[:, span]).any() else "was never measured"
-            raise NotEnoughData(
-                f"Signal '{name}' {fact} in the training data, so nothing can be learned of it; collect data in which "
-                "it moves, or leave it out of the model."
-            )
+def train_split(
+    dataset: Dataset, config: TrainConfig, split: int, progress: Progress | None = None, drafts: Path | None = None
+) -> MaskErrors:
+    """Train a network under all masks on one split of the data, and return it with its held-out rows.
+
+    Args:
+        dataset: Episodes of one body.
+        config: Settings of the training.
+        split: Index of the split; successive ones hold out other motions.
+        progress: Called after every epoch.
+        drafts: A folder in which the training is saved; see `fit`.
+
+    Raises:
+        NotEnoughData: There are too few samples.
+    """
+    own = replace(config, seed=config.seed + split)
+    train, held = dataset.split(own.held_out, own.seed)
+    resume = None if drafts is None else drafts / f"structure_{split}.safetensors"
+    masks = _drawn_masks(dataset.layout.names, own.seed)
+    schema, _ = fit(dataset, own, masks, progress, title=f"structure, split {split + 1}", resume=resume)
+    return MaskErrors.of_schema(schema, train, held, config.outliers)
 
 
 def _drawn_masks(names: tuple[str, ...], seed: int) -> tuple[Mask, ...]:

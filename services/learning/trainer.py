@@ -14,7 +14,6 @@ from gemuco.dataset import Dataset
 from gemuco.errors import CheckpointError, DatasetError, NotWritten
 from gemuco.learning.config import TrainConfig
 from gemuco.learning.history import History
-from gemuco.masks import label
 from gemuco.schema import BodySchema
 from gemuco.writing import writing
 from hal.config import RobotConfig
@@ -28,6 +27,8 @@ if TYPE_CHECKING:
 
 FINE_TUNING_RATE = 1.0 / 3.0
 """The peak learning rate of fine-tuning is this share of the rate in the robot file."""
+LIKELY_SPLITS = 3
+"""The progress assumes this many splits if their number is not given."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +98,8 @@ def learn(
     started, part = time.monotonic(), config.structure
     first = train_config(config, part.epochs, seed)
     last = train_config(config, config.training.epochs, seed)
-    share = part.epochs * part.splits / (part.epochs * part.splits + last.epochs)
+    splits = part.splits or LIKELY_SPLITS
+    share = part.epochs * splits / (part.epochs * splits + (last.epochs or part.epochs))
     thresholds = Thresholds(part.threshold_out, part.threshold_in, part.measure, part.over)
     structure = determine(
         dataset, first, thresholds, lambda done, text: progress(share * done, text), part.splits, drafts
@@ -110,13 +112,11 @@ def learn(
         structure.x_out,
         resume=None if drafts is None else drafts / "training.safetensors",
     )
-    names = dataset.layout.names
     schema = schema.with_manifest(
         **facts,
         samples=len(dataset),
         held_out_loss=history.best,
-        L_i=structure.L_i,
-        L_m={label(mask, names): structure.L_m[mask] for mask in structure.listed},
+        **structure.facts,
     )
     return TrainingResult(schema, structure, history, len(dataset), time.monotonic() - started)
 
@@ -190,18 +190,24 @@ def drafts_of(folder: Path) -> Path:
 def show(trained: TrainingResult, console: Console) -> None:
     """Print the structure, and the error of each signal under each mask in the signal's unit."""
     if trained.structure is not None:
-        console.print(trained.structure.report(), highlight=False)
+        console.print(trained.structure.report(), highlight=False, markup=False)
     table = Table(title="Error on held-out data, by the signals of the estimate", title_justify="left")
     table.add_column("estimated from")
     table.add_column("signal")
     table.add_column("error (rms)", justify="right")
-    for mask, name, unit, rms in trained.schema.error_rows():
-        table.add_row(mask, name, f"{rms:.4g} {unit}")
+    table.add_column("% of std", justify="right")
+    for mask, name, unit, rms, percent in trained.schema.error_rows():
+        table.add_row(mask, name, f"{rms:.4g} {unit}", f"{percent:.0f}")
     console.print(table)
     what = "training" if trained.structure is None else "structure and training"
     console.print(f"{trained.samples} samples, {what} in {trained.seconds:.1f} s.")
+    known = () if trained.structure is None else trained.structure.remarks
     for sentence in remarks(trained.history):
-        console.print(sentence, style="yellow", highlight=False)
+        if sentence not in known:
+            console.print(sentence, style="yellow", highlight=False)
+    poor = trained.schema.manifest.get("poor")
+    if poor:
+        console.print(f"POOR: {', '.join(poor)} is above the threshold; see above.", style="red", highlight=False)
 
 
 def remarks(history: History) -> list[str]:

@@ -39,8 +39,9 @@ class StructureConfig(Section):
     """The thresholds apply to the mean squared error or to its root."""
     over: Literal["masked", "all"] = "masked"
     """A mask is judged by the outputs that it does not contain, or by all."""
-    splits: Count = 1
-    """The network is trained and measured this many times, each time with other episodes held out."""
+    splits: Count | None = None
+    """The network is trained and measured this many times, each time with other motions held out. With `null` at least
+    twice, and at most ten times, until every error is on one side of its threshold."""
     epochs: Count = 80
 
 

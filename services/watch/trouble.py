@@ -160,6 +160,11 @@ def _signals(rows: Sequence[SignalRow]) -> Iterator[Trouble]:
 
 
 def _body(snapshot: RobotSnapshot) -> Iterator[Trouble]:
+    manifest = snapshot.model.get("manifest")
+    poor = manifest.get("poor") if isinstance(manifest, dict) else None
+    if poor:
+        names = " and ".join(map(str, poor))
+        yield Trouble(Level.NOTE, "Poor model", f"The error of {names} is above the threshold of the training.")
     judged = verdict(snapshot)
     if judged is None:
         return

@@ -5,7 +5,7 @@
 The folder of the recordings is $GEMUCO_DATA, ../shared/data if that is not set. Settings are those of the descriptions
 in examples/. The joint capsule: structure; then, trained on the first 80 % of the recording and tested on the rest as
 one block, the error of the angles from all four boards and with each board lost, beside ridge regression that is fitted
-anew for the boards that are left. The Schunk arm: structure by held-out trajectories.
+anew for the boards that are left. The Schunk arm: structure; repetitions of a trajectory are held out together.
 """
 
 import argparse
@@ -17,8 +17,7 @@ import numpy as np
 from gemuco.dataset import Dataset, Episode
 from gemuco.learning.train import fit
 from gemuco.schema import BodySchema
-from gemuco.structure.determination import Judge, Thresholds, determine
-from gemuco.structure.mask_errors import train_masks
+from gemuco.structure.determination import Thresholds, determine
 from services.learning.trainer import train_config
 from services.measured.description import MeasuredConfig, load_measured
 from services.measured.reading import read_measured
@@ -73,9 +72,7 @@ def joint_capsule(seeds: range) -> None:
     for seed in seeds:
         settings = config.structure
         thresholds = Thresholds(settings.threshold_out, settings.threshold_in, settings.measure, settings.over)
-        # Splits of other seeds overlap little.
-        training = train_config(config.model, settings.epochs, seed * settings.splits)
-        structure = determine(data, training, thresholds, splits=settings.splits)
+        structure = determine(data, train_config(config.model, settings.epochs, 100 * seed), thresholds)
         print(f"joint capsule, seed {seed}:\n{structure.report()}\n")
         errors.append(lost_boards(config, data, structure.masks, seed))
     mean, spread = np.mean(errors, axis=0), np.std(errors, axis=0)
@@ -87,13 +84,11 @@ def joint_capsule(seeds: range) -> None:
 
 
 def schunk_arm(seeds: range) -> None:
-    """Print how well each signal is inferred from all others."""
+    """Print how well each signal is inferred from the others."""
     config, data = recording("schunk_arm")
-    settings = config.structure
     for seed in seeds:
-        training = train_config(config.model, settings.epochs, seed * settings.splits)
-        judge = Judge(data.layout.names, train_masks(data, training, settings.splits), Thresholds())
-        print(f"Schunk arm, seed {seed}: L_i", {name: round(value, 3) for name, value in judge.L_i.items()})
+        structure = determine(data, train_config(config.model, config.structure.epochs, 100 * seed))
+        print(f"Schunk arm, seed {seed}:\n{structure.report()}\n")
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from gemuco.signals import Layout
 
 FL = frozenset({"muscle_tension", "muscle_length"})
 MASKS = [{"joint_position", "muscle_tension"}, FL]
-CONFIG = TrainConfig(hidden=(40, 20), latent=7, epochs=60, batch=50, rate=1e-2, bias_size=2, patience=99)
+CONFIG = TrainConfig(hidden=(40, 20), latent=7, epochs=60, batch=50, rate=1e-2, bias_size=2, patience=99, seed=1)
 GENTLE = replace(CONFIG, rate=2e-3, epochs=30)
 BODIES = {"light": MuscleArm(softness=1.0), "heavy": MuscleArm(softness=2.0)}
 REAL = MuscleArm(softness=2.5, offset=(0.004, -0.003, 0.002, 0.0, -0.004))

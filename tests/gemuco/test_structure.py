@@ -1,4 +1,5 @@
 import os
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -46,10 +47,6 @@ def test_says_what_is_wrong_with_thresholds(data):
         Thresholds(into=1.2)
     with pytest.raises(SchemaError, match="threshold_out is nan"):
         Thresholds(out=float("nan"))
-    with pytest.raises(NotEnoughData, match="smallest L_i"):
-        determine(data, TINY, Thresholds(out=1e-9))
-    with pytest.raises(NotEnoughData, match="smallest L_m"):
-        determine(data, TINY, Thresholds(out=1.0, into=1e-9))
 
 
 def test_an_output_that_no_mask_infers_is_remarked(data):
@@ -70,10 +67,20 @@ def test_signals_about_which_there_is_nothing_to_say():
     x = np.random.default_rng(0).normal(size=(300, 2))
     with pytest.raises(NotEnoughData, match="There is one signal, 'a', and nothing to infer it from"):
         determine(made_of(a=x), TINY)
-    with pytest.raises(NotEnoughData, match="Signal 'b' never varies"):
+    with pytest.raises(NotEnoughData, match=r"one signal, 'a'.*Signal 'b' never varies"):
         determine(made_of(a=x, b=np.ones((300, 3))), TINY)
-    with pytest.raises(NotEnoughData, match="Signal 'b' was never measured"):
+    with pytest.raises(NotEnoughData, match=r"one signal, 'a'.*Signal 'b' was never measured"):
         determine(made_of(a=x, b=np.full((300, 3), np.nan)), TINY)
+    with pytest.raises(NotEnoughData, match="There are no samples"):
+        determine(Dataset(made_of(a=x, b=x).layout, ()), TINY)
+
+
+def test_a_dead_signal_is_left_out_and_named():
+    x = np.random.default_rng(0).normal(size=(300, 2))
+    found = determine(made_of(a=x, b=x + 0.1, c=np.ones((300, 1))), TINY, Thresholds(1.0, 1.0), splits=1)
+    assert set(found.L_i) == {"a", "b"}
+    assert found.layout.names == ("a", "b", "c")
+    assert "Signal 'c' never varies" in found.report()
 
 
 def test_channels_that_hardly_move_do_not_make_a_signal_look_inferred():
@@ -110,12 +117,16 @@ def test_each_sample_is_judged_under_the_bias_of_its_condition():
 
 
 def test_more_splits_average_over_what_is_held_out(data):
-    one = determine(data, TINY, Thresholds(1.0, 1.0))
-    two = determine(data, TrainConfig(hidden=(20,), latent=5, epochs=3, batch=100, seed=1), Thresholds(1.0, 1.0))
+    one = determine(data, SHORT, Thresholds(1.0, 1.0), splits=1)
+    two = determine(data, replace(SHORT, seed=1), Thresholds(1.0, 1.0), splits=1)
     told = []
-    both = determine(data, TINY, Thresholds(1.0, 1.0), lambda share, _: told.append(share), splits=2)
-    for name, value in both.L_i.items():
-        assert value == pytest.approx((one.L_i[name] + two.L_i[name]) / 2)
+    both = determine(data, SHORT, Thresholds(1.0, 1.0), lambda share, _: told.append(share), splits=2)
+    for mask, value in both.L_m.items():
+        assert value == pytest.approx((one.L_m[mask] + two.L_m[mask]) / 2)
+        assert both.spread_m[mask] == pytest.approx(abs(one.L_m[mask] - two.L_m[mask]) / 2)
+        assert np.isnan(one.spread_m[mask])
+    assert (one.splits, both.splits) == (1, 2)
+    assert "+-" in both.report()
     assert told == sorted(told)
     assert told[-1] == 1.0
 
@@ -157,18 +168,20 @@ def test_errors_of_masks_are_those_of_the_network(measured):
     layout, (errors, *_) = measured
     masks = every_mask(layout)
     found = errors.of(masks)
-    for mask, line in zip(masks, found, strict=True):
+    for mask, shares in zip(masks, found, strict=True):
         rows = errors.whole[:, mask].all(axis=1)
         truth, there = errors.x[rows], errors.counts[rows]
         tail = np.broadcast_to(mask.astype(np.float32), (len(truth), len(mask)))
         given = np.repeat(mask, [signal.size for signal in layout.signals])
-        told = run(errors.chain, np.concatenate([truth * given, tail, errors.p[rows]], axis=1))
+        line = errors.path.map(given.astype(float))
+        code = (truth * given) @ line[:-1] + line[-1]
+        told = run(errors.chain, np.concatenate([truth * given, code, tail, errors.p[rows]], axis=1))
         for index, name in enumerate(layout.names):
             span = layout.slice(name)
             missed = np.where(there[:, span], (told - truth)[:, span] ** 2, 0.0).sum(axis=0) / there[:, span].sum(
                 axis=0
             )
-            assert line[index] == pytest.approx(missed.sum() / errors.liveliness[span].sum(), rel=1e-3, abs=1e-6)
+            assert shares[index] == pytest.approx(missed.sum() / errors.liveliness[span].sum(), rel=1e-3, abs=1e-6)
     assert errors.amounts == pytest.approx([errors.liveliness[layout.slice(name)].sum() for name in layout.names])
 
 

@@ -131,8 +131,19 @@ def test_descriptions_and_robots_are_told_apart():
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason=f"no recordings in {DATA}; name their folder in GEMUCO_DATA")
-@pytest.mark.parametrize(("name", "samples", "episodes"), [("joint_capsule", 1263, 1), ("schunk_arm", 18720, 6)])
+@pytest.mark.parametrize(("name", "samples", "episodes"), [("joint_capsule", 1263, 1), ("schunk_arm", 18720, 20)])
 def test_shipped_descriptions_fit_the_recordings(name, samples, episodes):
     data = read_measured(load_measured(ROOT / "examples" / f"{name}.yaml"), DATA / name)
     assert (len(data), len(data.episodes)) == (samples, episodes)
     assert np.isfinite(data.rows()).all()
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason=f"no recordings in {DATA}; name their folder in GEMUCO_DATA")
+def test_repeated_trajectories_of_a_recording_are_found():
+    notes = {
+        name: " ".join(read_measured(load_measured(ROOT / "examples" / f"{name}.yaml"), DATA / name).repetitions())
+        for name in ("schunk_arm", "joint_capsule")
+    }
+    assert "its 20 episodes are 6 motions (15 episodes are nearly equal)" in notes["schunk_arm"]
+    assert "The path of joint_effort is the same everywhere" in notes["schunk_arm"]
+    assert notes["joint_capsule"] == ""

@@ -41,7 +41,7 @@ def test_samples_are_taken_at_the_rate_of_collecting_in_episodes(tmp_path: Path)
     assert found.sentence() == "240 of 240 samples are used."
     assert select(_robot(), files, "empty").dataset.conditions == ("empty",)
     kept, away = found.dataset.split(0.2)
-    assert len(kept) + len(away) == 240
+    assert 216 <= len(kept) + len(away) < 240  # without the gaps beside held-out blocks
 
 
 def test_what_is_incomplete_invalid_or_beyond_limits_is_left_out_and_told(tmp_path: Path) -> None:

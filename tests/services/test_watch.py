@@ -48,6 +48,14 @@ def test_a_lost_sensor_is_estimated_and_its_sources_are_named():
     assert judged(seen(silent=True)) == Trouble(Level.DEGRADED, "Sensor lost", text)
 
 
+def test_a_poor_model_is_a_note():
+    known = judged(seen(model={"manifest": {"poor": ["joint_effort"]}}))
+    assert known.level is Level.NOTE
+    assert known.title == "Poor model"
+    assert "joint_effort" in known.text
+    assert judged(seen(model={"manifest": {"poor": []}})) is HEALTHY
+
+
 @pytest.mark.parametrize("estimate", [None, Newest(estimates(True), 3.0)])
 def test_without_a_fresh_estimate_a_lost_element_is_masked(estimate):
     row = signal_rows(seen(silent=True, estimate=estimate))[1]
