@@ -2,13 +2,15 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from gemuco.adaption.innovation import Innovations
 from gemuco.adaption.recognise import Prior, solve
 from gemuco.anomaly.blame import suspects
-from gemuco.anomaly.prediction import prediction_errors
+from gemuco.anomaly.neighbours import nearness
+from gemuco.anomaly.prediction import Judgement, all_errors, judgements, with_bias
 from gemuco.schema import BodySchema, check_schema
 from gemuco.signals import check_samples
 
@@ -23,7 +25,8 @@ class Verdict:
     Attributes:
         kind: `normal`; `environment` if another p explains the samples; `anomaly` if none does. Without parametric bias
             every change is an anomaly. Empty if no error can be judged.
-        score: Root mean square over the samples of the anomaly score as a share of its threshold, under the p in use.
+        score: How far the samples are from normal under the p in use, as a share of what as many consecutive samples of
+            a healthy body reach with the probability of a false alarm.
         explained: The same under the p that explains the samples best; equal to `score` if none was searched.
         bias: That p, shape (bias_size,); the one in use if none was searched.
         blamed: `signal.element` that is most likely wrong; empty unless the kind is an anomaly.
@@ -45,8 +48,8 @@ def judge(schema: BodySchema, samples: Iterable[Mapping[str, np.ndarray]]) -> Ve
 
     Args:
         schema: A schema with statistics of prediction errors.
-        samples: The last samples, each signal -> measured array [its unit], shape (n,). All count alike, so they should
-            begin when the score rose.
+        samples: The last samples, oldest first, each signal -> measured array [its unit], shape (n,). All count alike,
+            so they should begin when the score rose, and be about as far apart in time as those of the normal data.
 
     Raises:
         UnknownSignal: A name is not in the layout.
@@ -71,15 +74,60 @@ def judge(schema: BodySchema, samples: Iterable[Mapping[str, np.ndarray]]) -> Ve
 
 
 def window_score(schema: BodySchema, rows: np.ndarray) -> float:
-    """Return the root mean square of score / threshold over samples [standard deviations], shape (n, size)."""
+    """Return how far a window of samples is from normal, as a share of what a window of a healthy body reaches.
+
+    Two means over the window are compared, and the larger share counts: that of the deviations of the samples, and the
+    mean error, which a small and lasting shift changes first.
+
+    Args:
+        schema: A schema with statistics of prediction errors.
+        rows: Consecutive samples [standard deviations], oldest first, shape (n, size), about as far apart in time as
+            those that the normal errors were learned from.
+    """
     normal = schema.normal
     if normal is None or not len(rows):
         return float("nan")
-    errors = prediction_errors(schema, rows)
-    shares = []
-    for pattern in np.unique(np.isfinite(errors), axis=0):
-        same = errors[(np.isfinite(errors) == pattern).all(axis=1)]
-        judged = int((pattern & np.isfinite(normal.mean)).sum())
-        if judged:
-            shares.append(normal.distances(same) / normal.threshold_of(judged))
-    return float(np.sqrt(np.mean(np.concatenate(shares) ** 2))) if shares else float("nan")
+    judged = [window for window in _by_pattern(schema, rows) if len(window.by.judged.place)]
+    if not judged:
+        return float("nan")
+    distances = np.full(len(rows), np.nan)
+    thresholds, deviations = distances.copy(), distances.copy()
+    for window in judged:
+        distances[window.place], thresholds[window.place] = window.distances, window.by.threshold
+        deviations[window.place] = (np.log(np.maximum(window.distances, 1e-9)) - window.by.judged.scale[0]) / max(
+            window.by.judged.scale[1], 1e-9
+        )
+    known = np.isfinite(distances)
+    if normal.windows is None or normal.scale is None:
+        return float(np.sqrt(np.mean((distances[known] / thresholds[known]) ** 2)))
+    share = float(np.exp(normal.scale.std * normal.windows.excess(deviations[known])))
+    if len(judged) == 1 and judged[0].by.is_complete:
+        index, errors = judged[0].by.judged.place, judged[0].errors
+        away = (errors[:, index] - normal.mean[index]) / np.sqrt(np.diag(normal.covariance)[index])
+        share = max(share, float(np.exp(0.5 * normal.windows.shifted(away))))
+    return share
+
+
+class _Window(NamedTuple):
+    """Samples of a window that lack the same elements: their place, judgement, errors and distances."""
+
+    place: np.ndarray
+    by: Judgement
+    errors: np.ndarray
+    distances: np.ndarray
+
+
+def _by_pattern(schema: BodySchema, rows: np.ndarray) -> list[_Window]:
+    finite, windows = np.isfinite(rows), []
+    for pattern in np.unique(finite, axis=0):
+        place = np.flatnonzero((finite == pattern).all(axis=1))
+        by = schema.derived(judgements)(pattern)
+        judged, same = by.judged, with_bias(schema, rows[place])
+        errors = all_errors(schema, judged.reading, same, len(judged.mean))
+        away = errors[:, judged.place] - judged.mean[judged.place]
+        distances = np.sqrt(np.einsum("ij,jk,ik->i", away, judged.precision, away).clip(min=0.0))
+        if judged.scale.weight:
+            near = nearness(judged.near, same)
+            distances = judged.scale.distance(judged.scale.deviations(distances, near))
+        windows.append(_Window(place, by, errors, distances))
+    return windows
