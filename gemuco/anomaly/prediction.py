@@ -11,9 +11,9 @@ from gemuco.anomaly.neighbours import nearness, neighbourhood
 from gemuco.compiled.score import Judges, Near
 from gemuco.derived import ByPattern
 from gemuco.masks import Mask
-from gemuco.normal import Normal, Scale, statistics
+from gemuco.normal.statistics import Normal, Scale, covariance_of
+from gemuco.normal.watch import NO_READING, Reading
 from gemuco.schema import BodySchema, check_schema, stacked
-from gemuco.watch import NO_READING, Reading
 
 
 def judging_masks(schema: BodySchema) -> dict[str, Mask]:
@@ -188,7 +188,7 @@ class Judgement:
             return cls(nothing, float("nan"), False)
         errors = all_errors(schema, reading, rows, len(mean))[:, index]
         spread = np.concatenate([schema.scaler.std[schema.out_index], np.ones(len(mean))])[index]
-        mean[index], precision = statistics(errors, spread)
+        mean[index], precision = errors.mean(axis=0), np.linalg.inv(covariance_of(errors, spread, normal.shrink))
         away = errors - mean[index]
         distances = np.sqrt(np.einsum("ij,jk,ik->i", away, precision, away).clip(min=0.0))
         weight = normal.scale.weight if len(near.elements) else 0.0

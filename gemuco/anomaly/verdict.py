@@ -2,15 +2,13 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
 from gemuco.adaption.innovation import Innovations
 from gemuco.adaption.recognise import Prior, solve
 from gemuco.anomaly.blame import suspects
-from gemuco.anomaly.neighbours import nearness
-from gemuco.anomaly.prediction import Judgement, all_errors, judgements, with_bias
+from gemuco.anomaly.window import window_score
 from gemuco.schema import BodySchema, check_schema
 from gemuco.signals import check_samples
 
@@ -71,63 +69,3 @@ def judge(schema: BodySchema, samples: Iterable[Mapping[str, np.ndarray]]) -> Ve
         if explained <= 1.0 and prior.between(bias, prior.mean) <= PLAUSIBLE:
             return Verdict("environment", score, explained, bias, "")
     return Verdict("anomaly", score, explained, bias, suspects(schema, rows)[0].name)
-
-
-def window_score(schema: BodySchema, rows: np.ndarray) -> float:
-    """Return how far a window of samples is from normal, as a share of what a window of a healthy body reaches.
-
-    Two means over the window are compared, and the larger share counts: that of the deviations of the samples, and the
-    mean error, which a small and lasting shift changes first.
-
-    Args:
-        schema: A schema with statistics of prediction errors.
-        rows: Consecutive samples [standard deviations], oldest first, shape (n, size), about as far apart in time as
-            those that the normal errors were learned from.
-    """
-    normal = schema.normal
-    if normal is None or not len(rows):
-        return float("nan")
-    judged = [window for window in _by_pattern(schema, rows) if len(window.by.judged.place)]
-    if not judged:
-        return float("nan")
-    distances = np.full(len(rows), np.nan)
-    thresholds, deviations = distances.copy(), distances.copy()
-    for window in judged:
-        distances[window.place], thresholds[window.place] = window.distances, window.by.threshold
-        deviations[window.place] = (np.log(np.maximum(window.distances, 1e-9)) - window.by.judged.scale[0]) / max(
-            window.by.judged.scale[1], 1e-9
-        )
-    known = np.isfinite(distances)
-    if normal.windows is None or normal.scale is None:
-        return float(np.sqrt(np.mean((distances[known] / thresholds[known]) ** 2)))
-    share = float(np.exp(normal.scale.std * normal.windows.excess(deviations[known])))
-    if len(judged) == 1 and judged[0].by.is_complete:
-        index, errors = judged[0].by.judged.place, judged[0].errors
-        away = (errors[:, index] - normal.mean[index]) / np.sqrt(np.diag(normal.covariance)[index])
-        share = max(share, float(np.exp(0.5 * normal.windows.shifted(away))))
-    return share
-
-
-class _Window(NamedTuple):
-    """Samples of a window that lack the same elements: their place, judgement, errors and distances."""
-
-    place: np.ndarray
-    by: Judgement
-    errors: np.ndarray
-    distances: np.ndarray
-
-
-def _by_pattern(schema: BodySchema, rows: np.ndarray) -> list[_Window]:
-    finite, windows = np.isfinite(rows), []
-    for pattern in np.unique(finite, axis=0):
-        place = np.flatnonzero((finite == pattern).all(axis=1))
-        by = schema.derived(judgements)(pattern)
-        judged, same = by.judged, with_bias(schema, rows[place])
-        errors = all_errors(schema, judged.reading, same, len(judged.mean))
-        away = errors[:, judged.place] - judged.mean[judged.place]
-        distances = np.sqrt(np.einsum("ij,jk,ik->i", away, judged.precision, away).clip(min=0.0))
-        if judged.scale.weight:
-            near = nearness(judged.near, same)
-            distances = judged.scale.distance(judged.scale.deviations(distances, near))
-        windows.append(_Window(place, by, errors, distances))
-    return windows

@@ -109,7 +109,7 @@ def distance(error, mean, index, precision):
 
 @jit
 def residuals(inputs, clips, pairs, maps, scale, joined, p):
-    """Return the residuals of a watch (`gemuco.watch.Reading`) [standard deviations], shape (residuals,).
+    """Return the residuals of a watch (`gemuco.normal.watch.Reading`) [standard deviations], shape (residuals,).
 
     Args:
         inputs: Positions of the measured inputs, shape (n,).
@@ -195,7 +195,7 @@ def deviation(
         mean: Mean of every error, shape (errors,).
         index: Indices of the judged errors, shape (n,).
         precision: Inverse covariance of the judged errors, shape (n, n).
-        logs: `gemuco.normal.Scale`, shape (5,).
+        logs: `gemuco.normal.statistics.Scale`, shape (5,).
         element: Position in the layout of the element of every error, shape (errors,).
     """
     error = np.full(len(mean), np.nan)

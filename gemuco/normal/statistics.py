@@ -14,14 +14,14 @@ import numpy as np
 from gemuco.compiled import score
 from gemuco.compiled.score import BASE
 from gemuco.errors import NotEnoughData
-from gemuco.watch import Watch
-from gemuco.windows import Windows, at_most, correlation_time
+from gemuco.normal.watch import Watch
+from gemuco.normal.windows import Windows, at_most, correlation_time
 
 SHRINK = 0.7
-"""This share of the covariance is replaced by its diagonal: errors of several predictions of one element are alike, and
-directions in which a few minutes of motion happened to vary little are not those in which a body breaks."""
+"""This share of the covariance is usually replaced by its diagonal: errors of several predictions of one element are
+alike, and directions in which a few minutes of motion happened to vary little are not those in which a body breaks."""
 
-FLOOR = 0.01
+FLOOR = 0.002
 """The standard deviation of an error is at least this share of the signal's own standard deviation."""
 
 PATTERNS = 64
@@ -38,7 +38,7 @@ KEPT = 500
 
 
 WATCHED = ("inputs", "signal", "low", "high", "moments", "penalties")
-WINDOWED = ("sizes", "limits", "variance", "shift")
+WINDOWED = ("sizes", "limits", "stds", "variance", "shift", "shift_stds")
 """Arrays of a watch, and of windows, in the order of their arguments."""
 
 
@@ -103,6 +103,7 @@ class Normal:
         samples: Number of samples that set the threshold.
         bound: The rate of false alarms is at most this with 95 % confidence, from normal samples that were not learned
             from; 1 if unknown.
+        shrink: Share of the covariance that was replaced by its diagonal.
         usual: Number of errors that are judged when no element is missing.
     """
 
@@ -117,6 +118,7 @@ class Normal:
     windows: Windows | None = None
     samples: int = 0
     bound: float = 1.0
+    shrink: float = SHRINK
     usual: int = field(init=False, repr=False)
     _precisions: dict[bytes, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict, init=False, repr=False)
 
@@ -131,6 +133,7 @@ class Normal:
         false_alarm: float = 1e-3,
         near: np.ndarray | None = None,
         weight: float = 0.0,
+        shrink: float = SHRINK,
     ) -> "Normal":
         """Compute the statistics of a healthy body.
 
@@ -140,6 +143,7 @@ class Normal:
             false_alarm: Share of healthy samples that may lie above the threshold.
             near: Distance of every sample from the nearest known samples, shape (samples,).
             weight: Weight of this distance.
+            shrink: Share of the covariance that is replaced by its diagonal.
 
         Raises:
             NotEnoughData: Fewer complete samples than errors, or than `LEAST`.
@@ -156,11 +160,11 @@ class Normal:
         distances = np.empty(len(rows))
         for part in np.array_split(np.arange(len(rows)), FOLDS):
             others = np.delete(rows, part, axis=0)
-            distances[part] = _distances(rows[part] - others.mean(axis=0), _covariance(others, spread[seen]))
+            distances[part] = _distances(rows[part] - others.mean(axis=0), covariance_of(others, spread[seen], shrink))
         scale = Scale.of(distances, near, weight)
         deviations = scale.deviations(distances, near)
         mean, covariance = np.full(len(seen), np.nan), np.diag(np.asarray(spread, float) ** 2)
-        mean[seen], part_of = rows.mean(axis=0), _covariance(rows, spread[seen])
+        mean[seen], part_of = rows.mean(axis=0), covariance_of(rows, spread[seen], shrink)
         covariance[np.ix_(seen, seen)] = part_of
         away = (rows - mean[seen]) / np.sqrt(np.diag(part_of))
         windows = Windows.fit(deviations, away, false_alarm)
@@ -173,6 +177,7 @@ class Normal:
             scale=scale,
             windows=windows,
             samples=len(rows),
+            shrink=shrink,
             bound=at_most(above, len(rows) / correlation_time(deviations)),
         )
 
@@ -194,6 +199,7 @@ class Normal:
             "scale": None if self.scale is None else list(self.scale),
             "samples": self.samples,
             "bound": self.bound,
+            "shrink": self.shrink,
             "count": None if self.watch is None else self.watch.count,
         }
 
@@ -214,8 +220,8 @@ class Normal:
             inputs, signal, low, high, moments, penalties = (arrays[f"watch.{name}"] for name in WATCHED)
             watch = Watch(inputs, signal, low, high, moments, penalties, facts["count"])
         if scale is not None:
-            sizes, limits, variance, shift = (arrays[f"windows.{name}"] for name in WINDOWED)
-            windows = Windows(sizes, limits, variance, shift)
+            sizes, limits, stds, variance, shift, shift_stds = (arrays[f"windows.{name}"] for name in WINDOWED)
+            windows = Windows(sizes, limits, stds, variance, shift, shift_stds)
         return cls(
             arrays["mean"],
             arrays["covariance"],
@@ -228,6 +234,7 @@ class Normal:
             windows,
             facts.get("samples", 0),
             facts.get("bound", 1.0),
+            facts.get("shrink", SHRINK),
         )
 
     def shapes(self, size: int, outputs: int, bias: int) -> list[tuple[str, np.ndarray, tuple[int, ...]]]:
@@ -251,7 +258,9 @@ class Normal:
             "windows.sizes": (levels,),
             "windows.limits": (levels,),
             "windows.variance": (levels, self.usual),
+            "windows.stds": (levels,),
             "windows.shift": (levels,),
+            "windows.shift_stds": (levels,),
         }
         return [(f"normal.{name}", array, right[name]) for name, array in self.arrays().items()]
 
@@ -302,14 +311,10 @@ class Normal:
         return precision
 
 
-def statistics(errors: np.ndarray, spread: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean, shape (n,), and inverse regularised covariance, shape (n, n), of normal errors (samples, n)."""
-    return errors.mean(axis=0), np.linalg.inv(_covariance(errors, spread))
-
-
-def _covariance(errors: np.ndarray, spread: np.ndarray) -> np.ndarray:
+def covariance_of(errors: np.ndarray, spread: np.ndarray, shrink: float) -> np.ndarray:
+    """Return the regularised covariance of normal errors, shape (samples, n) -> (n, n); `spread` as in `fit`."""
     part = np.cov(errors.T).reshape(errors.shape[1], -1)
-    return np.asarray((1.0 - SHRINK) * part + np.diag(SHRINK * np.diag(part) + (FLOOR * spread) ** 2))
+    return np.asarray((1.0 - shrink) * part + np.diag(shrink * np.diag(part) + (FLOOR * spread) ** 2))
 
 
 def _distances(errors: np.ndarray, covariance: np.ndarray) -> np.ndarray:

@@ -81,14 +81,18 @@ class Windows:
     Attributes:
         sizes: Learned n, ascending, shape (levels,).
         limits: Limit of the mean deviation of a window, shape (levels,).
+        stds: Standard deviation of the mean deviation of normal windows, shape (levels,).
         variance: Variance of the mean of every error over a window [its single variance], shape (levels, errors).
         shift: Limit of the logarithm of the mean squared shift, a multiple of this variance, shape (levels,).
+        shift_stds: Standard deviation of this logarithm in normal windows, shape (levels,).
     """
 
     sizes: np.ndarray
     limits: np.ndarray
+    stds: np.ndarray
     variance: np.ndarray
     shift: np.ndarray
+    shift_stds: np.ndarray
 
     @classmethod
     def fit(cls, deviations: np.ndarray, errors: np.ndarray, false_alarm: float) -> "Windows":
@@ -100,7 +104,9 @@ class Windows:
             false_alarm: Share of normal windows that may be above a limit.
         """
         time = correlation_time(deviations)
-        sizes, limits, variance, shift = [], [], [], []
+        sizes, variance = [], []
+        limits: list[tuple[float, float]] = []
+        shifts: list[tuple[float, float]] = []
         count = 1
         while count <= max(1, min(LONGEST, len(deviations) // DISJOINT)):
             independent = len(deviations) / max(time, count)
@@ -108,19 +114,24 @@ class Windows:
             spread = moved.mean(axis=0) + 1e-9
             share = false_alarm if count == 1 else false_alarm / 2.0
             sizes.append(count)
-            limits.append(limit(means(deviations, count), share, independent))
             variance.append(spread)
-            shift.append(limit(np.log((moved / spread).mean(axis=1) + 1e-12), share, independent))
+            for values, known in (
+                (means(deviations, count), limits),
+                (np.log((moved / spread).mean(axis=1) + 1e-12), shifts),
+            ):
+                known.append((limit(values, share, independent), max(float(values.std()), 1e-6)))
             count *= 2
-        return cls(np.array(sizes), np.array(limits), np.array(variance), np.array(shift))
+        above, shifted = np.array(limits), np.array(shifts)
+        return cls(np.array(sizes), above[:, 0], above[:, 1], np.array(variance), shifted[:, 0], shifted[:, 1])
 
     def excess(self, deviations: np.ndarray) -> float:
-        """Return the mean deviation of a window of samples minus its limit, shape (n,)."""
+        """Return how far the mean deviation of a window is above its limit [its standard deviations], shape (n,)."""
         recent = deviations[-int(self.sizes[-1]) :]
-        return float(recent.mean() - self._at(len(recent), self.limits))
+        above = recent.mean() - self._at(len(recent), self.limits)
+        return float(above / self._at(len(recent), self.stds))
 
     def shifted(self, errors: np.ndarray) -> float:
-        """Return the logarithm of the mean squared shift of a window minus its limit, shape (n, errors).
+        """Return how far the shift of a window is above its limit [its standard deviations], shape (n, errors).
 
         A single sample has no shift of its own: negative infinity.
         """
@@ -128,7 +139,8 @@ class Windows:
         if len(recent) < 2 or len(self.sizes) < 2:
             return -math.inf
         ratio = recent.mean(axis=0) ** 2 / self._at(len(recent), self.variance)
-        return float(np.log(ratio.mean() + 1e-12) - self._at(len(recent), self.shift))
+        above = np.log(ratio.mean() + 1e-12) - self._at(len(recent), self.shift)
+        return float(above / self._at(len(recent), self.shift_stds))
 
     def _at(self, count: int, values: np.ndarray) -> np.ndarray:
         """Return values between two learned sizes, linear in the logarithm of the size."""
