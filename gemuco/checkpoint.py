@@ -28,6 +28,8 @@ READABLE = (2, 3)
 """Versions that can be read; version 2 has no linear path."""
 TENSORS = "model.safetensors"
 MANIFEST = "manifest.json"
+GAPS = ("normal.mean", "normal.rows", "normal.cloud")
+"""These arrays are NaN where nothing is known."""
 SCALES = ("mean", "std", "low", "high", "dead")
 
 
@@ -60,9 +62,7 @@ def save(schema: BodySchema, folder: str | Path) -> None:
         },
         "errors": [[method, label(mask, schema.layout.names)] for method, mask in schema.errors],
         "conditions": list(schema.biases),
-        "normal": None
-        if schema.normal is None
-        else {"threshold": schema.normal.threshold, "false_alarm": schema.normal.false_alarm},
+        "normal": None if schema.normal is None else schema.normal.facts(),
         "facts": dict(schema.manifest),
         "tensors": {"file": TENSORS, "sha256": hashlib.sha256(data).hexdigest()},
     }
@@ -102,8 +102,7 @@ def _tensors(schema: BodySchema) -> dict[str, np.ndarray]:
     tensors["anchors"] = schema.anchors
     tensors["anchor_conditions"] = schema.anchor_conditions
     if schema.normal is not None:
-        tensors["normal.mean"] = schema.normal.mean
-        tensors["normal.covariance"] = schema.normal.covariance
+        tensors |= {f"normal.{name}": array for name, array in schema.normal.arrays().items()}
     return tensors
 
 
@@ -160,11 +159,12 @@ def _manifest(folder: Path) -> dict[str, Any]:
 def _schema(head: Mapping[str, Any], tensors: Mapping[str, np.ndarray]) -> BodySchema:
     layout = Layout(tuple(Signal(s["name"], s["size"], s["unit"], tuple(s["elements"])) for s in head["signals"]))
     for name, array in tensors.items():
-        if name != "normal.mean" and not name.startswith("errors.") and not np.isfinite(array).all():
+        if name not in GAPS and not name.startswith("errors.") and not np.isfinite(array).all():
             raise ValueError(f"array {name} holds NaN or infinity")
     normal = None
     if head["normal"] is not None:
-        normal = Normal(tensors["normal.mean"], tensors["normal.covariance"], **head["normal"])
+        parts = {name.removeprefix("normal."): array for name, array in tensors.items() if name.startswith("normal.")}
+        normal = Normal.of(parts, head["normal"])
     return BodySchema(
         layout=layout,
         x_in=tuple(head["x_in"]),
@@ -229,8 +229,7 @@ def _check_arrays(schema: BodySchema) -> None:
     if len(schema.anchors):
         shapes.append(("anchors", schema.anchors, (len(schema.anchors), size)))
     if schema.normal is not None:
-        shapes.append(("normal.mean", schema.normal.mean, (outputs,)))
-        shapes.append(("normal.covariance", schema.normal.covariance, (outputs, outputs)))
+        shapes += schema.normal.shapes(size, outputs, p)
     for before, layer in pairwise(schema.weights.whole):
         shapes.append(("layer", layer.matrix, (len(before.offset), len(layer.offset))))
     for name, array, shape in shapes:

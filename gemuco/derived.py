@@ -32,6 +32,11 @@ class ByPattern(Generic[T]):
             self._values[key] = value
         return value
 
+    def is_ready(self, finite: np.ndarray) -> bool:
+        """Whether the value for these finite elements is known; it is then the one that `follow` computes."""
+        self._last = finite.tobytes()
+        return self._last in self._values
+
     def follow(self, other: "ByPattern[T]") -> None:
         """Compute the value for the last pattern of another cache."""
         if other._last is not None:

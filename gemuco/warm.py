@@ -15,13 +15,13 @@ import numpy as np
 from gemuco.adaption.config import UpdateConfig
 from gemuco.adaption.relearn import mean_error
 from gemuco.adaption.update import adapt
+from gemuco.anomaly.healthy import learn_normal
 from gemuco.anomaly.score import score
 from gemuco.compiled.jit import FOLDER, let_compiler_go
 from gemuco.compiled.usable import usable
 from gemuco.controller import Controller
 from gemuco.estimation import estimate
 from gemuco.layers import Layer, Weights
-from gemuco.normal import Normal
 from gemuco.scaler import Scaler
 from gemuco.schema import BodySchema
 from gemuco.search.descent import DescentConfig
@@ -74,8 +74,8 @@ def running(schema: BodySchema) -> Iterator[str]:
     yield "estimation by descent"
     estimate(schema, {"length": whole["length"]})
     yield "anomaly"
-    size = schema.out_layout.size
-    score(schema.with_normal(Normal(np.zeros(size), np.eye(size), 1.0, 1e-3)), whole)
+    samples = np.random.default_rng(0).normal(size=(200, schema.layout.size))
+    score(schema.with_normal(learn_normal(schema, samples)), whole)
     target = {"position": np.full(1, 0.1)}
     terms = (Match("position"), TorqueBalance(np.sin, 1.0, "position", "tension", "length"))
     yield "control"

@@ -14,9 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gemuco.anomaly.prediction import judging_masks, prediction_errors
+from gemuco.anomaly.prediction import Judgement, all_errors, judgements, judging_masks, with_bias
 from gemuco.layers import push, trace
-from gemuco.normal import Normal
 from gemuco.schema import BodySchema
 
 ANYTHING = 3.0
@@ -49,14 +48,14 @@ def suspects(schema: BodySchema, rows: np.ndarray) -> list[Suspect]:
         schema: A schema with statistics of prediction errors.
         rows: Samples [standard deviations], shape (n, size). Only those as complete as the most complete one count.
     """
-    normal = schema.normal
-    if normal is None or not len(rows):
+    if schema.normal is None or not len(rows):
         return []
-    known = np.isfinite(prediction_errors(schema, rows)) & np.isfinite(normal.mean)
-    pattern = known[int(np.argmax(known.sum(axis=1)))]
-    if not pattern.any():
+    finite = np.isfinite(rows)
+    count = {pattern.tobytes(): len(schema.derived(judgements)(pattern).judged.place) for pattern in finite}
+    pattern = max(finite, key=lambda measured: count[measured.tobytes()])
+    if not count[pattern.tobytes()]:
         return []
-    case = _Case(schema, normal, rows[(known == pattern).all(axis=1)], np.flatnonzero(pattern))
+    case = _Case(schema, schema.derived(judgements)(pattern), rows[(finite == pattern).all(axis=1)])
     single = _ranked(case, [(index,) for index in case.movable])
     shared = _ranked(case, parts(schema, case.movable))
     candidates = [Suspect(schema.layout.element(s[0]), s, left) for s, left in single.items()]
@@ -79,19 +78,20 @@ def parts(schema: BodySchema, movable: list[int]) -> list[tuple[int, ...]]:
 class _Case:
     """Samples that lack the same elements, and the derivatives of their errors by every element."""
 
-    def __init__(self, schema: BodySchema, normal: Normal, rows: np.ndarray, judged: np.ndarray) -> None:
-        self._schema, self._rows, self._judged = schema, rows, judged
-        self._mean = normal.mean[judged]
-        covariance = normal.covariance[np.ix_(judged, judged)]
-        self._whiten = np.linalg.inv(np.linalg.cholesky(covariance))
+    def __init__(self, schema: BodySchema, by: Judgement, rows: np.ndarray) -> None:
+        self._schema, self._rows, self._by = schema, rows, by.judged
+        self._mean = by.judged.mean[by.judged.place]
+        self._whiten = np.linalg.cholesky(by.judged.precision).T
         self.movable = np.flatnonzero(np.isfinite(rows).all(axis=0)).tolist()
         self._error, self._slope = self._at(rows, self.movable)
 
     def _at(self, rows: np.ndarray, elements: list[int]) -> tuple[np.ndarray, np.ndarray]:
         """Return whitened errors (n, judged) and their derivatives by elements (n, judged, elements)."""
-        schema = self._schema
-        error = prediction_errors(schema, rows)[:, self._judged] - self._mean
-        slope = np.zeros((len(rows), schema.out_layout.size, len(elements)))
+        schema, reading, index = self._schema, self._by.reading, self._by.place
+        whole = with_bias(schema, rows)
+        error = all_errors(schema, reading, whole, len(self._by.mean))[:, index] - self._mean
+        outputs = schema.out_layout.size
+        slope = np.zeros((len(rows), len(self._by.mean), len(elements)))
         masks = schema.derived(judging_masks)
         predicted = {mask: self._predicted(mask, rows, elements) for mask in set(masks.values())}
         for name, mask in masks.items():
@@ -100,8 +100,9 @@ class _Case:
             for column, element in enumerate(elements):
                 if span.start <= element < span.stop:
                     slope[:, out.start + element - span.start, column] += 1.0
-        slope *= schema.scaler.std[schema.out_index][:, None]
-        return error @ self._whiten.T, np.einsum("ij,njk->nik", self._whiten, slope[:, self._judged])
+        slope[:, :outputs] *= schema.scaler.std[schema.out_index][:, None]
+        slope[:, outputs + reading.kind] = reading.slopes(whole, elements)
+        return error @ self._whiten.T, np.einsum("ij,njk->nik", self._whiten, slope[:, index])
 
     def _predicted(self, mask: frozenset[str], rows: np.ndarray, elements: list[int]) -> np.ndarray:
         """Return derivatives of the prediction under a mask by elements, shape (n, out_size, elements)."""

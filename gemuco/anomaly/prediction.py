@@ -1,14 +1,18 @@
-"""Prediction errors of samples: the masks that predict, the errors, and the judged elements (paper, II-K)."""
+"""Prediction errors of samples: network and watch, the masks that predict, and the judged elements (paper, II-K)."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
-from gemuco.compiled.score import Judges
+from gemuco.anomaly.neighbours import nearness, neighbourhood
+from gemuco.compiled.score import Judges, Near
 from gemuco.derived import ByPattern
 from gemuco.masks import Mask
+from gemuco.normal.statistics import Normal, Scale, covariance_of
+from gemuco.normal.watch import NO_READING, Reading
 from gemuco.schema import BodySchema, check_schema, stacked
 
 
@@ -42,7 +46,7 @@ def predict_error(schema: BodySchema, values: Mapping[str, np.ndarray]) -> np.nd
 
 
 def prediction_errors(schema: BodySchema, x: np.ndarray) -> np.ndarray:
-    """Return measured minus predicted [unit], shape (..., out_size).
+    """Return the network's errors, measured minus predicted [unit], shape (..., out_size).
 
     Args:
         schema: The body schema.
@@ -63,19 +67,82 @@ def prediction_errors(schema: BodySchema, x: np.ndarray) -> np.ndarray:
     return error
 
 
+def with_bias(schema: BodySchema, x: np.ndarray, bias: np.ndarray | None = None) -> np.ndarray:
+    """Return samples [standard deviations], shape (n, size), followed by p: (n, size + bias_size)."""
+    p = np.broadcast_to(schema.bias if bias is None else bias, (len(x), len(schema.bias)))
+    return np.concatenate([x, p], axis=1)
+
+
+def all_errors(schema: BodySchema, reading: Reading, rows: np.ndarray, count: int) -> np.ndarray:
+    """Return the errors of the network [unit], then of the watch [standard deviations], shape (n, count).
+
+    Args:
+        schema: The body schema.
+        reading: The watch of the elements that are measured in every sample.
+        rows: Samples [standard deviations] and their p, shape (n, size + bias_size).
+        count: Number of errors.
+    """
+    size, outputs = schema.layout.size, schema.out_layout.size
+    errors = np.full((len(rows), count), np.nan)
+    biases, owner = np.unique(rows[:, size:], axis=0, return_inverse=True)
+    for number, bias in enumerate(biases):
+        of = owner.reshape(-1) == number
+        under = schema if np.array_equal(bias, schema.bias) else schema.with_bias(bias)
+        errors[of, :outputs] = prediction_errors(under, rows[of, :size])
+    if len(reading.kind):
+        errors[:, outputs + reading.kind] = reading.residuals(rows)
+    return errors
+
+
+class Judged(NamedTuple):
+    """Statistics for samples that lack the same elements.
+
+    Attributes:
+        reading: Closed-form prediction from the measured elements.
+        near: Known samples; empty if their distance is not used.
+        mean: Mean of every error, shape (errors,).
+        place: Indices of the judged errors, shape (n,).
+        precision: Inverse covariance of the judged errors, shape (n, n).
+        scale: Logarithms of the distances of normal samples.
+        element: Position in the layout of the element of every error, shape (errors,).
+    """
+
+    reading: Reading
+    near: Near
+    mean: np.ndarray
+    place: np.ndarray
+    precision: np.ndarray
+    scale: Scale
+    element: np.ndarray
+
+    @property
+    def parts(self) -> tuple[np.ndarray, ...]:
+        """The arrays one by one, as `compiled.score.deviation` takes them: Python passes them faster than tuples."""
+        reading = self.reading
+        return (
+            reading.inputs, reading.clips, reading.pairs, reading.maps, reading.kind, *self.near, self.mean, self.place,
+            self.precision, np.array(self.scale, float), self.element,
+        )  # fmt: skip
+
+
 @dataclass(frozen=True, slots=True)
 class Judgement:
     """Judgement of samples that lack the same elements.
 
     Attributes:
-        index: Positions of the judged elements in x_out, shape (n,).
-        precision: The inverse covariance of their errors, shape (n, n).
-        threshold: Score above which such a sample is an anomaly; NaN if no element is judged.
+        judged: The statistics.
+        parts: Their arrays.
+        threshold: Score above which such a sample is an anomaly; NaN if no error is judged.
+        is_complete: Whether every error is judged that is judged when no element is missing.
     """
 
-    index: np.ndarray
-    precision: np.ndarray
+    judged: Judged
     threshold: float
+    is_complete: bool
+    parts: tuple[np.ndarray, ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "parts", self.judged.parts)
 
     @classmethod
     def of(cls, schema: BodySchema, finite: np.ndarray) -> "Judgement":
@@ -83,13 +150,72 @@ class Judgement:
 
         A schema without statistics of prediction errors judges no element.
         """
-        if schema.normal is None:
-            return cls(np.zeros(0, int), np.zeros((0, 0)), float("nan"))
-        by = schema.derived(judges)
-        complete = np.array([finite[schema.in_index[through > 0]].all() for through in by.through])
-        judged = finite[schema.out_index] & complete[by.mask] & np.isfinite(schema.normal.mean)
-        index, precision = schema.normal.precision(judged)
-        return cls(index, precision, float(schema.normal.threshold_of(len(index))))
+        normal = schema.normal
+        if normal is None:
+            mean, element = np.zeros(schema.out_layout.size), schema.out_index
+            empty = Judged(NO_READING, _NO_NEAR, mean, *_NO_PRECISION, Scale(0.0, 1.0), element)
+            return cls(empty, float("nan"), False)
+        columns = np.concatenate([finite, np.ones(len(schema.bias), bool)])
+        reading = NO_READING if normal.watch is None else normal.watch.reading(columns)
+        element = schema.out_index
+        if normal.watch is not None:
+            element = np.concatenate([element, normal.watch.reading(None).target])
+        usable = _usable(schema, normal, reading, finite)
+        near = _near(normal, finite)
+        index = np.flatnonzero(usable)
+        if normal.scale is None or not len(normal.rows):
+            index, precision = normal.precision(usable)
+            scale = Scale(0.0, 1.0) if normal.scale is None else normal.scale._replace(weight=0.0)
+            judged = Judged(reading, near, normal.mean, index, precision, scale, element)
+            return cls(judged, float(normal.threshold_of(len(index))), len(index) == normal.usual)
+        if len(index) == normal.usual:
+            index, precision = normal.precision(usable)
+            judged = Judged(reading, near, normal.mean, index, precision, normal.scale, element)
+            return cls(judged, normal.threshold, True)
+        return cls._of_part(schema, normal, reading, near, index, finite, element)
+
+    @classmethod
+    def _of_part(
+        cls, schema: BodySchema, normal: Normal, reading: Reading, near: Near, index: np.ndarray, finite: np.ndarray,
+        element: np.ndarray,
+    ) -> "Judgement":  # fmt: skip
+        """Measure the normal samples that were kept as if they lacked the same elements."""
+        assert normal.scale is not None and normal.windows is not None
+        rows, mean = normal.rows.astype(float), np.full(len(normal.mean), np.nan)
+        rows[:, : len(finite)][:, ~finite] = np.nan
+        if not len(index):
+            nothing = Judged(reading, near, mean, *_NO_PRECISION, Scale(0.0, 1.0), element)
+            return cls(nothing, float("nan"), False)
+        errors = all_errors(schema, reading, rows, len(mean))[:, index]
+        spread = np.concatenate([schema.scaler.std[schema.out_index], np.ones(len(mean))])[index]
+        mean[index], precision = errors.mean(axis=0), np.linalg.inv(covariance_of(errors, spread, normal.shrink))
+        away = errors - mean[index]
+        distances = np.sqrt(np.einsum("ij,jk,ik->i", away, precision, away).clip(min=0.0))
+        weight = normal.scale.weight if len(near.elements) else 0.0
+        scale = Scale.of(distances, nearness(near, rows) if weight else np.ones(len(rows)), weight)
+        threshold = float(scale.distance(normal.windows.limits[0]))
+        return cls(Judged(reading, near, mean, index, precision, scale, element), threshold, False)
+
+
+def _usable(schema: BodySchema, normal: Normal, reading: Reading, finite: np.ndarray) -> np.ndarray:
+    """Return the errors that can be computed from the finite elements and are known, truth values, shape (errors,)."""
+    by = schema.derived(judges)
+    complete = np.array([finite[schema.in_index[through > 0]].all() for through in by.through])
+    usable = np.zeros(len(normal.mean), bool)
+    usable[: len(by.mask)] = finite[schema.out_index] & complete[by.mask]
+    usable[len(by.mask) + reading.kind] = True
+    return usable & np.isfinite(normal.mean)
+
+
+def _near(normal: Normal, finite: np.ndarray) -> Near:
+    """Return the known samples for a distance by the finite elements."""
+    if normal.scale is None or not normal.scale.weight:
+        return _NO_NEAR
+    return neighbourhood(normal.cloud, np.flatnonzero(finite & np.isfinite(normal.cloud).all(axis=0)))
+
+
+_NO_NEAR = Near(np.zeros((0, 0)), np.zeros(0), np.zeros(0, int))
+_NO_PRECISION = (np.zeros(0, int), np.zeros((0, 0)))
 
 
 def judgements(schema: BodySchema) -> ByPattern[Judgement]:

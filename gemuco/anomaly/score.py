@@ -18,7 +18,8 @@ class AnomalyScore:
     Attributes:
         score: Mahalanobis distance; NaN without statistics of prediction errors or without any error to judge.
         threshold: Score above which a sample is an anomaly.
-        contribution: Signal of x_out -> drop of score^2 without an element, shape (n,); NaN if unknown.
+        contribution: Signal -> drop of the squared distance without the error of an element that contributes most,
+            shape (n,); NaN where no error is judged.
         blamed: `signal.element` that is most likely wrong if the score is above the threshold (a window of samples is
             more reliable: `judge`), else the one that contributes most; empty if the score is NaN.
     """
@@ -50,7 +51,7 @@ def score(schema: BodySchema, values: Mapping[str, np.ndarray], blame: bool = Tr
     blamed = deviation.largest(schema)
     if blame and deviation.distance > deviation.threshold:
         blamed = suspects(schema, schema.normalise_one(values)[None])[0].name
-    contribution = schema.out_layout.split(deviation.contribution)
+    contribution = schema.layout.split(deviation.contribution)
     return AnomalyScore(deviation.distance, deviation.threshold, contribution, blamed)
 
 
@@ -61,7 +62,7 @@ class Deviation:
     Attributes:
         distance: Mahalanobis distance.
         threshold: Distance above which a sample is an anomaly.
-        contribution: Contribution of every element of x_out, shape (out_size,).
+        contribution: Contribution of every element, shape (size,).
     """
 
     distance: float
@@ -72,15 +73,15 @@ class Deviation:
         """Return the `signal.element` that contributes most; empty if no element was judged."""
         if np.isnan(self.distance):
             return ""
-        return schema.out_layout.element(int(np.fmax(self.contribution, -1.0).argmax()))
+        return schema.layout.element(int(np.fmax(self.contribution, -1.0).argmax()))
 
 
 def deviation_of(schema: BodySchema, joined: np.ndarray) -> Deviation:
     """Return the deviation of a sample in one read-only array, as `gemuco.estimation.fill` takes it."""
     by = schema.derived(judgements)(np.isfinite(joined))
-    if schema.normal is None or not len(by.index):
-        return Deviation(float("nan"), float("nan"), np.full(schema.out_layout.size, np.nan))
-    distance, contribution = compiled.deviation(
-        schema.predictor, schema.derived(judges), joined, schema.normal.mean, by.index, by.precision
-    )
+    if not len(by.judged.place):
+        return Deviation(float("nan"), float("nan"), np.full(schema.layout.size, np.nan))
+    predictor = schema.predictor
+    network = compiled.errors(predictor, schema.derived(judges), joined)
+    distance, contribution = compiled.deviation(network, joined, schema.bias, predictor.scale, *by.parts)
     return Deviation(distance, by.threshold, contribution)

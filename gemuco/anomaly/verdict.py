@@ -8,7 +8,7 @@ import numpy as np
 from gemuco.adaption.innovation import Innovations
 from gemuco.adaption.recognise import Prior, solve
 from gemuco.anomaly.blame import suspects
-from gemuco.anomaly.prediction import prediction_errors
+from gemuco.anomaly.window import window_score
 from gemuco.schema import BodySchema, check_schema
 from gemuco.signals import check_samples
 
@@ -23,7 +23,8 @@ class Verdict:
     Attributes:
         kind: `normal`; `environment` if another p explains the samples; `anomaly` if none does. Without parametric bias
             every change is an anomaly. Empty if no error can be judged.
-        score: Root mean square over the samples of the anomaly score as a share of its threshold, under the p in use.
+        score: How far the samples are from normal under the p in use, as a share of what as many consecutive samples of
+            a healthy body reach with the probability of a false alarm.
         explained: The same under the p that explains the samples best; equal to `score` if none was searched.
         bias: That p, shape (bias_size,); the one in use if none was searched.
         blamed: `signal.element` that is most likely wrong; empty unless the kind is an anomaly.
@@ -45,8 +46,8 @@ def judge(schema: BodySchema, samples: Iterable[Mapping[str, np.ndarray]]) -> Ve
 
     Args:
         schema: A schema with statistics of prediction errors.
-        samples: The last samples, each signal -> measured array [its unit], shape (n,). All count alike, so they should
-            begin when the score rose.
+        samples: The last samples, oldest first, each signal -> measured array [its unit], shape (n,). All count alike,
+            so they should begin when the score rose, and be about as far apart in time as those of the normal data.
 
     Raises:
         UnknownSignal: A name is not in the layout.
@@ -68,18 +69,3 @@ def judge(schema: BodySchema, samples: Iterable[Mapping[str, np.ndarray]]) -> Ve
         if explained <= 1.0 and prior.between(bias, prior.mean) <= PLAUSIBLE:
             return Verdict("environment", score, explained, bias, "")
     return Verdict("anomaly", score, explained, bias, suspects(schema, rows)[0].name)
-
-
-def window_score(schema: BodySchema, rows: np.ndarray) -> float:
-    """Return the root mean square of score / threshold over samples [standard deviations], shape (n, size)."""
-    normal = schema.normal
-    if normal is None or not len(rows):
-        return float("nan")
-    errors = prediction_errors(schema, rows)
-    shares = []
-    for pattern in np.unique(np.isfinite(errors), axis=0):
-        same = errors[(np.isfinite(errors) == pattern).all(axis=1)]
-        judged = int((pattern & np.isfinite(normal.mean)).sum())
-        if judged:
-            shares.append(normal.distances(same) / normal.threshold_of(judged))
-    return float(np.sqrt(np.mean(np.concatenate(shares) ** 2))) if shares else float("nan")

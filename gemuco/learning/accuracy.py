@@ -4,12 +4,11 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from gemuco.anomaly.prediction import predict_error
+from gemuco.anomaly.healthy import learn_normal
 from gemuco.errors import NotEnoughData
 from gemuco.estimation import input_search, latent_search
 from gemuco.layers import run
 from gemuco.masks import Mask, all_masks, covered_by
-from gemuco.normal import Normal
 from gemuco.schema import BodySchema
 from gemuco.search.routes import STARTS
 
@@ -23,20 +22,25 @@ MOST_SEARCHED = 4
 """Up to this number of signals the input search is measured from every set of signals; above, from all but one."""
 
 
-def assess(schema: BodySchema, rows: np.ndarray, conditions: np.ndarray) -> BodySchema:
+def assess(
+    schema: BodySchema,
+    rows: np.ndarray,
+    conditions: np.ndarray,
+    training: tuple[np.ndarray, np.ndarray] | None = None,
+) -> BodySchema:
     """Return the schema with its held-out errors and the statistics of its normal errors.
 
     Args:
         schema: The body schema.
         rows: Held-out samples [unit], oldest first, shape (samples, layout.size), NaN where not measured.
         conditions: Index into `schema.biases` of every row, shape (samples,); ignored without parametric bias.
+        training: Samples that were learned from, and their conditions, from which every signal's relation to the others
+            is learned; the held-out samples if not given.
     """
     schema = schema.with_weights(schema.weights, measure_errors(schema, rows, conditions))
-    errors = np.full((len(rows), len(schema.out_index)), np.nan)
-    for variant, samples in _by_condition(schema, conditions):
-        errors[samples] = predict_error(variant, schema.layout.split(rows[samples]))
+    learned = None if training is None else (training[0], bias_of(schema, training[1]))
     try:
-        return schema.with_normal(Normal.fit(errors, schema.scaler.std[schema.out_index]))
+        return schema.with_normal(learn_normal(schema, rows, bias_of(schema, conditions), training=learned))
     except NotEnoughData:
         return schema.with_normal(None)
 

@@ -264,11 +264,14 @@ def _schema(
 
 def _assess(schema: BodySchema, learner: Learner, conditions: tuple[str, ...]) -> BodySchema:
     """Return the schema with errors and normal statistics of the held-out data without its outliers."""
-    held = learner.held
-    rows = schema.scaler.restore(np.where(held.suspected[:, held.task.signal_of], np.nan, held.rows))
     names = list(schema.biases)
     owners = np.array([names.index(c) for c in conditions] if names else [0] * len(conditions), int)
-    return assess(schema, rows, owners[held.condition])
+
+    def usable(part: Material) -> tuple[np.ndarray, np.ndarray]:
+        rows = np.where(part.suspected[:, part.task.signal_of], np.nan, part.rows)[: part.new]
+        return schema.scaler.restore(rows), owners[part.condition[: part.new]]
+
+    return assess(schema, *usable(learner.held), training=usable(learner.material))
 
 
 def _history(learner: Learner, scaler: Scaler, notes: list[str]) -> History:

@@ -145,6 +145,7 @@ class Story:
         start = self._timeline.now()
         calm = self._timeline.between("is_anomaly", start - CALM_TIME, start)
         score = float(np.nanmedian(self._timeline.between("score", start - CALM_TIME, start)))
+        alarms = float(np.mean(self._timeline.between("is_anomaly", 0.0, start)))
         self._client.fault(f"muscle_cut {MUSCLE}")
         self.marks.cut = start
         alarmed = self._actor.wait(self._is_alarmed, NOTICED_WITHIN)
@@ -161,6 +162,7 @@ class Story:
             f"anomaly score {score:.1f} before the cut, {after:.1f} after it, threshold {limit:.1f}",
             f"reported after {1e3 * (self.marks.alarm - start):.0f} ms; blamed element {element or 'none'}",
             f"muscle with the largest part in the score: {self.marks.blamed or 'none'}",
+            f"before the cut an anomaly was reported {alarms:.1%} of the time",
         )
         right = self.marks.blamed == MUSCLE
         self._client.disengage()

@@ -17,6 +17,7 @@ from hal.clock import SystemClock
 from hal.config import RobotConfig
 from services.command.intake import Intake
 from services.command.permission import Permission
+from services.model.acquaintance import Acquaintance
 from services.model.anomaly_loop import VERDICT_RATE, AnomalyWatch
 from services.model.control_config import ControlConfig, controller_of
 from services.model.control_loop import Control
@@ -121,12 +122,14 @@ class GemucoService:
         self.history = HistoryRing({s.name: s.size for s in schema.layout.signals}, robot.rates.estimation)
         self._estimates = service.publisher(keys.estimate(robot.robot), Estimates)
         self.estimation = Estimation(self.freshness, self._schema, self._publish, self.clock)
+        self.acquaintance = Acquaintance()
         self.anomaly = AnomalyWatch(
             self.freshness,
             self._schema,
             self.config.anomaly.after,
             service.publisher(keys.anomaly(robot.robot), Anomaly).put,
             self.clock,
+            self.acquaintance,
         )
         self.update = OnlineUpdate(
             self.freshness,
@@ -137,6 +140,7 @@ class GemucoService:
             service.publisher(keys.update(robot.robot), Update).put,
             self.clock,
             self._others_keep_time,
+            self.acquaintance.learned,
         )
         self._solver: ModelSolver | None = None
         self.control, self.no_control = self._make_control(self.config)

@@ -193,7 +193,10 @@ class ModelVerbs:
         _only(arguments)
         samples = self._service.update.learn_normal()
         normal = self._service.living.schema.normal
-        return {"samples": samples, "threshold": None if normal is None else normal.threshold}
+        if normal is None:
+            return {"samples": samples, "threshold": None}
+        facts = {"threshold": normal.threshold, "false_alarm": normal.false_alarm, "at_most": normal.bound}
+        return {"samples": samples, **facts, "text": normal.trust}
 
     def _control(self) -> Control:
         if self._service.control is None:

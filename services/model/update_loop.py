@@ -1,5 +1,6 @@
 """The update loop: it learns p and W online from a bounded window, and replaces the whole model after each step."""
 
+import logging
 import math
 import threading
 from collections import deque
@@ -9,9 +10,8 @@ from typing import Any, Protocol
 import numpy as np
 from msgspec.structs import replace
 
-from gemuco.anomaly.prediction import predict_error
+from gemuco.anomaly.healthy import learn_normal
 from gemuco.errors import NotEnoughData
-from gemuco.normal import Normal
 from gemuco.schema import BodySchema
 from hal.clock import Clock
 from services.model.estimation import Freshness
@@ -19,10 +19,15 @@ from services.model.living_model import LivingModel
 from services.model.model_config import UpdateConfig
 from services.wire.messages import Update
 
+log = logging.getLogger(__name__)
+
 SPREAD = 0.1
 """A sample joins the learner's window when an element moved this far since the last one [standard deviations]. A robot
 at rest would otherwise fill the window with one posture."""
 
+
+NORMAL_AFTER = 200
+"""After an update of W normal errors are learned anew as soon as this number of samples came, or the window is full."""
 
 Values = Mapping[str, np.ndarray]
 """Signal -> value [its unit], shape (n,)."""
@@ -59,6 +64,7 @@ class OnlineUpdate:
         publish: Callable[[Update], None],
         clock: Clock,
         may_learn: Callable[[], bool] = lambda: True,
+        learned: Callable[[BodySchema], None] = lambda schema: None,
     ) -> None:
         """Prepare.
 
@@ -71,8 +77,10 @@ class OnlineUpdate:
             publish: Publishes the state.
             clock: Source of time.
             may_learn: Whether learning is allowed in this tick; if not, samples are only collected.
+            learned: Called with a model whose normal errors were learned from this body.
         """
-        self._may_learn = may_learn
+        self._may_learn, self._learned = may_learn, learned
+        self._awaits_normal = False
         self.waited = 0
         """This is the number of ticks in which learning was not allowed."""
         self._freshness, self._living, self._config = freshness, living, config
@@ -100,13 +108,16 @@ class OnlineUpdate:
                 # One sample may determine p, even of a robot at rest.
                 self._awaits_first = len(self._living.schema.bias) > 0
             elif not active:
+                before = self._living.before
+                if self._learner is not None and before is not None:
+                    self._awaits_normal |= before.weights is not self._living.schema.weights
                 self._learner, self._awaits_first = None, False
                 self._since_change.clear()
 
     def rollback(self) -> int:
         """Stop, and restore the model before adaption began; return the model's version."""
         with self._lock:
-            self._learner, self._awaits_first = None, False
+            self._learner, self._awaits_first, self._awaits_normal = None, False, False
             self._since_change.clear()
             return self._living.rollback()
 
@@ -117,17 +128,22 @@ class OnlineUpdate:
             NotEnoughData: The robot moved too little.
         """
         with self._lock:
-            samples = list(self._since_change)
-            schema = self._living.schema
-            try:
-                if not samples:
-                    raise NotEnoughData("No complete sample of the moving robot came since the model last changed.")
-                rows = {name: np.stack([sample[name] for sample in samples]) for name in samples[0]}
-                normal = Normal.fit(predict_error(schema, rows), schema.scaler.std[schema.out_index])
-            except NotEnoughData as error:
-                raise NotEnoughData(f"{error} Let the robot move for a while with the update stopped.") from None
-            self._living.swap(schema.with_normal(normal))
-            return len(samples)
+            return self._learn_normal()
+
+    def _learn_normal(self) -> int:
+        samples = list(self._since_change)
+        schema = self._living.schema
+        try:
+            if not samples:
+                raise NotEnoughData("No complete sample of the moving robot came since the model last changed.")
+            normal = learn_normal(schema, np.array([schema.layout.join_one(sample) for sample in samples]))
+        except NotEnoughData as error:
+            raise NotEnoughData(f"{error} Let the robot move for a while with the update stopped.") from None
+        schema = schema.with_normal(normal)
+        self._living.swap(schema)
+        self._learned(schema)
+        self._awaits_normal = False
+        return len(samples)
 
     def tick(self) -> None:
         """Add the newest sample if the robot moves or is engaged, and learn if active."""
@@ -141,6 +157,8 @@ class OnlineUpdate:
                     self._learner.add(sample)
                 self._state = replace(self._state, stamp_ns=self._clock.now_ns(), active=True)
             elif self._learner is None:
+                if self._awaits_normal and len(self._since_change) >= min(NORMAL_AFTER, self._config.window):
+                    self._try_normal()
                 self._state = Update(
                     stamp_ns=self._clock.now_ns(),
                     active=False,
@@ -155,6 +173,14 @@ class OnlineUpdate:
                 self._state = self._learn(self._learner, sample if moved else None)
             state = self._state
         self._publish(state)
+
+    def _try_normal(self) -> None:
+        """Learn the normal errors after an update of W, or log why that is not possible."""
+        try:
+            log.info("Learned what is normal from %d samples after the update", self._learn_normal())
+        except NotEnoughData as error:
+            log.warning("Normal errors were not learned after the update: %s", error)
+            self._awaits_normal = False
 
     def _newest(self) -> tuple[Values | None, bool]:
         """Return the newest sample, and whether it is far enough in motion and time from the last to be learned from.

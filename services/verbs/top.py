@@ -163,8 +163,10 @@ def _anomaly(snapshot: RobotSnapshot) -> Text:
     judged = verdict(snapshot)
     if judged is None or not math.isfinite(judged.score):
         return Text("anomaly: not judged")
-    level = Level.ANOMALY if judged.is_anomaly else Level.NOTE if judged.kind == "environment" else Level.GOOD
-    return Text(f"anomaly: score {judged.score:.1f}, threshold {judged.threshold:.1f}", style=STYLES[level])
+    level = Level.NOTE if judged.kind in ("environment", "unknown") else Level.GOOD
+    level = Level.ANOMALY if judged.is_anomaly else level
+    state = "; normal is not known on this body yet" if judged.kind == "unknown" else ""
+    return Text(f"anomaly: score {judged.score:.1f}, threshold {judged.threshold:.1f}{state}", style=STYLES[level])
 
 
 def _update(update: Update | None) -> Text:

@@ -127,8 +127,9 @@ def anomaly_html(snapshot: RobotSnapshot) -> str:
     if judged is None or not math.isfinite(judged.score):
         text = "Not judged: no score arrives, or the model has no normal data."
         return page(f'<div style="min-height:30px" class="dim">{text}</div>')
-    kind = {"anomaly": "lost", "environment": "poor"}.get(judged.kind, "good")
-    word = {"": "nothing to judge", "environment": "environment changed"}.get(judged.kind, judged.kind)
+    kind = {"anomaly": "lost", "environment": "poor", "unknown": "dim"}.get(judged.kind, "good")
+    words = {"": "nothing to judge", "environment": "environment changed", "unknown": "normal not known on this body"}
+    word = words.get(judged.kind, judged.kind)
     blamed = f"{'most likely wrong' if judged.is_anomaly else 'contributes most'}: {judged.blamed or '–'}"
     score = f'score <b>{judged.score:.1f}</b> <span class="dim">threshold</span> {judged.threshold:.1f}'
     return page(

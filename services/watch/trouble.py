@@ -14,6 +14,13 @@ NAMED = 3
 TITLES = {"hal": "HAL", "model": "Model", "vision": "Camera", "simulator": "Simulator", "recorder": "Recorder"}
 
 
+LEARNING = (
+    "The body is not the one whose normal errors the model knows. If it is healthy, let it move, then run "
+    "`gemuco query ROBOT normal`."
+)
+"""This explains a body on which nothing can be called an anomaly yet."""
+
+
 @dataclass(frozen=True, slots=True)
 class Trouble:
     """One thing that is wrong: a title of a few words and an explanation."""
@@ -34,7 +41,8 @@ class AnomalyVerdict:
     """Anomaly verdict of the model.
 
     Attributes:
-        kind: `normal`, `environment`, `anomaly`, or empty while there is nothing to judge.
+        kind: `normal`, `environment`, `anomaly`, `unknown` while what is normal was not learned on this body, or empty
+            while there is nothing to judge.
         score: Anomaly score; NaN if it is not known.
         threshold: Score above which the body is not normal; NaN if it is not known.
         is_anomaly: Whether the score has been above the threshold for as long as the robot file requires.
@@ -169,7 +177,9 @@ def _body(snapshot: RobotSnapshot) -> Iterator[Trouble]:
     if judged is None:
         return
     score = f" Score {judged.score:.1f}, threshold {judged.threshold:.1f}." if math.isfinite(judged.score) else ""
-    if judged.kind == "environment":
+    if judged.kind == "unknown":
+        yield Trouble(Level.NOTE, "Normal not known", f"{LEARNING}{score}")
+    elif judged.kind == "environment":
         text = f"Another condition of the body explains what is measured.{score}"
         yield Trouble(Level.NOTE, "Environment changed", text)
     elif judged.is_anomaly:

@@ -251,9 +251,10 @@ class Anomaly(OfSignals, frozen=True, kw_only=True):
         is_anomaly: Whether the score was above the threshold for as long as the robot file requires, and the cause is
             not a change of environment.
         blamed: `signal.element` that is most likely wrong in the samples above the threshold; below the threshold, the
-            one that contributes most.
+            one that contributes most; empty while the verdict is `unknown`.
         verdict: `normal`, `environment` (another condition of the body explains the samples above the threshold),
-            `anomaly` (no condition does), or empty before a verdict.
+            `anomaly` (no condition does), `unknown` (what is normal was not learned on this body yet), or empty before
+            a verdict.
         contribution: Signal -> each element's part of score^2, shape (n,).
     """
 

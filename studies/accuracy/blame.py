@@ -18,8 +18,8 @@ from rich.table import Table
 from gemuco.adaption.config import UpdateConfig
 from gemuco.adaption.update import Updater
 from gemuco.anomaly.blame import suspects
-from gemuco.anomaly.prediction import predict_error, prediction_errors
-from gemuco.normal import Normal
+from gemuco.anomaly.healthy import learn_normal
+from gemuco.anomaly.window import scores
 from gemuco.schema import BodySchema
 from hal.config import RobotConfig, load_robot
 from services.model.model_config import model_config
@@ -40,7 +40,7 @@ def learn(robot: RobotConfig, schema: BodySchema, arm: int) -> BodySchema:
         updater.add({name: values[index] for name, values in lived.items()})
         updater.step()
     schema = updater.schema
-    return schema.with_normal(Normal.fit(predict_error(schema, fresh), schema.scaler.std[schema.out_index]))
+    return schema.with_normal(learn_normal(schema, schema.layout.join(fresh)))
 
 
 def judge(schema: BodySchema, rows: dict[str, np.ndarray], right: str) -> tuple[float, float] | None:
@@ -50,7 +50,7 @@ def judge(schema: BodySchema, rows: dict[str, np.ndarray], right: str) -> tuple[
     """
     x = schema.normalise(rows)
     assert schema.normal is not None
-    odd = x[schema.normal.distances(prediction_errors(schema, x)) > schema.normal.threshold][:WINDOW]
+    odd = x[scores(schema, x) > schema.normal.threshold][:WINDOW]
     if len(odd) < 3:
         return None
     single = [suspects(schema, row[None])[0].name.endswith(f".{right}") for row in odd]

@@ -1,8 +1,11 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from gemuco.anomaly.prediction import judges, prediction_errors
-from gemuco.anomaly.score import score
+from gemuco.anomaly.neighbours import nearness
+from gemuco.anomaly.prediction import all_errors, judgements, judges, prediction_errors
+from gemuco.anomaly.score import deviation_of, score
 from gemuco.compiled.score import errors
 from gemuco.errors import NotEnoughData
 from gemuco.normal import Normal
@@ -54,21 +57,31 @@ def test_contribution_is_the_drop_without_the_element():
 
 
 @pytest.mark.parametrize("missing", [None, ("muscle_tension", 2), ("muscle_length", 0), ("joint_position", 1)])
-def test_compiled_errors_and_distance_are_those_of_numpy(schema, arm, missing):
+@pytest.mark.parametrize("weight", [0.0, 1.0])
+def test_compiled_errors_and_distance_are_those_of_numpy(schema, arm, missing, weight):
+    if weight:
+        near = schema.normal.scale._replace(near_std=0.3, weight=weight)
+        schema = schema.with_normal(replace(schema.normal, scale=near, cloud=schema.anchors[:200]))
     for row in rows(arm.sample(20, 6)):
         if missing is not None:
             row[missing[0]][missing[1]] = np.nan
-        joined = schema.layout.join_one(row)
-        found = errors(schema.predictor, schema.derived(judges), joined)
-        expected = prediction_errors(schema, schema.normalise_one(row))
-        np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-5 * schema.scaler.std[schema.out_index].max())
-        judged = np.isfinite(expected)
-        distance, _, count = schema.normal.distance(found)
-        assert count == judged.sum()
-        if count:
-            away = (expected - schema.normal.mean)[judged]
-            square = away @ np.linalg.solve(schema.normal.covariance[np.ix_(judged, judged)], away)
-            assert distance == pytest.approx(np.sqrt(square), rel=1e-3)
+        joined, x = schema.layout.join_one(row), schema.normalise_one(row)
+        joined.setflags(write=False)
+        network = errors(schema.predictor, schema.derived(judges), joined)
+        expected = prediction_errors(schema, x)
+        np.testing.assert_allclose(network, expected, rtol=1e-3, atol=1e-5 * schema.scaler.std[schema.out_index].max())
+        by = schema.derived(judgements)(np.isfinite(joined))
+        deviation = deviation_of(schema, joined)
+        if not len(by.judged.place):
+            assert np.isnan(deviation.distance)
+            continue
+        whole = all_errors(schema, by.judged.reading, x[None], len(by.judged.mean))[0, by.judged.place]
+        away = whole - by.judged.mean[by.judged.place]
+        distance = np.sqrt(away @ by.judged.precision @ away)
+        near = nearness(by.judged.near, x[None]) if weight else np.ones(1)
+        expected = by.judged.scale.distance(by.judged.scale.deviations(np.array([distance]), near))[0]
+        assert deviation.distance == pytest.approx(expected if weight else distance, rel=1e-3)
+        assert np.isfinite(deviation.contribution).sum() == len(set(by.judged.element[by.judged.place]))
 
 
 def test_judges_by_what_is_there(schema, arm):
@@ -79,6 +92,8 @@ def test_judges_by_what_is_there(schema, arm):
     assert np.isnan(found.contribution["joint_position"][0])
     assert found.threshold < schema.normal.threshold
     row["muscle_tension"][:] = np.nan
+    assert np.isfinite(score(schema, row).score)  # length and position still judge each other
+    row["muscle_length"][:] = np.nan
     silent = score(schema, row)
     assert np.isnan(silent.score)
     assert silent.blamed == ""
@@ -93,7 +108,7 @@ def test_without_normal_data_there_is_no_score(schema, arm):
 
 
 def test_normal_needs_enough_samples():
-    with pytest.raises(NotEnoughData, match="need 12 complete samples; there are 5"):
+    with pytest.raises(NotEnoughData, match="need 30 complete samples; there are 5"):
         Normal.fit(np.zeros((5, 4)), np.ones(4))
 
 

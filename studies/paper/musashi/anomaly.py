@@ -4,9 +4,10 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from gemuco.anomaly.prediction import predict_error
+from gemuco.anomaly import window
+from gemuco.anomaly.healthy import learn_normal
 from gemuco.dataset import Dataset, Episode
-from gemuco.normal import Normal
+from gemuco.normal.windows import area
 from gemuco.schema import BodySchema
 from studies.paper.musashi.model import arrays
 from studies.paper.musashi.motion import RATE
@@ -19,23 +20,14 @@ SETTLED = 1.0
 
 def with_normal(schema: BodySchema, recording: Dataset) -> BodySchema:
     """Return the schema with the normal errors of a healthy, unloaded arm."""
-    errors = predict_error(schema, arrays(recording, schema))
-    return schema.with_normal(Normal.fit(errors, schema.scaler.std[schema.out_index]))
+    return schema.with_normal(learn_normal(schema, schema.layout.join(arrays(recording, schema))))
 
 
 def scores(schema: BodySchema, recording: Dataset) -> np.ndarray:
-    """Return the Mahalanobis distance of every sample, shape (n,)."""
+    """Return the score of every sample, shape (n,)."""
     if schema.normal is None:
         raise ValueError("This schema has no normal errors. Call `with_normal` first.")
-    return schema.normal.distances(predict_error(schema, arrays(recording, schema)))
-
-
-def area(ill: np.ndarray, well: np.ndarray) -> float:
-    """Return the area under the ROC curve: how often a score of an ill body exceeds that of a healthy one."""
-    ordered = np.sort(well)
-    below = np.searchsorted(ordered, ill, side="left")
-    not_above = np.searchsorted(ordered, ill, side="right")
-    return float(np.mean(below + not_above) / (2.0 * len(ordered)))
+    return window.scores(schema, schema.normalise(arrays(recording, schema)))
 
 
 def since_cut(recording: Dataset) -> Dataset:

@@ -1,0 +1,150 @@
+"""Statistics of windows of consecutive normal samples: how far the mean of n samples of a healthy body may be off.
+
+Neighbouring samples are alike: the mean of n of them varies more than that of n independent ones. So the statistics of
+every n come from windows of n consecutive samples that were not learned from.
+"""
+
+import math
+from dataclasses import dataclass
+from statistics import NormalDist
+
+import numpy as np
+
+LONGEST = 256
+"""Windows of at most this number of samples are learned; a longer one is judged by its last samples."""
+
+DISJOINT = 12
+"""A length of window needs at least this number of disjoint windows in the normal data."""
+
+CERTAIN = 0.9
+"""The promised rate of false alarms is kept with this probability, as far as logarithms of distances are normal."""
+
+FEWEST = 8.0
+"""Fewer independent samples than this count as this many; the tolerance has no finite value below 5."""
+
+
+def tolerance(false_alarm: float, independent: float) -> float:
+    """Return how many sample standard deviations above the sample mean a normal limit lies.
+
+    Natrella's formula for the one-sided tolerance limit: with the probability `CERTAIN` at most a share `false_alarm`
+    of the population lies above, if mean and standard deviation come from `independent` samples.
+    """
+    count = max(FEWEST, independent)
+    z, c = NormalDist().inv_cdf(1.0 - false_alarm), NormalDist().inv_cdf(CERTAIN)
+    a, b = 1.0 - c**2 / (2.0 * (count - 1.0)), z**2 - c**2 / count
+    return (z + math.sqrt(max(0.0, z**2 - a * b))) / a
+
+
+def limit(values: np.ndarray, false_alarm: float, independent: float) -> float:
+    """Return the limit that values exceed with the probability `false_alarm`, the larger of two.
+
+    One is the tolerance limit of a normal distribution; the other is the observed quantile, for heavy tails.
+    """
+    normal = values.mean() + tolerance(false_alarm, independent) * values.std()
+    return max(float(np.quantile(values, 1.0 - false_alarm)), float(normal))
+
+
+def at_most(share: float, independent: float) -> float:
+    """Return the rate that is not exceeded with 95 % confidence, from an observed share (Wilson's score interval)."""
+    c, n = NormalDist().inv_cdf(0.95), max(1.0, independent)
+    middle, half = share + c**2 / (2.0 * n), c * math.sqrt(share * (1.0 - share) / n + c**2 / (4.0 * n**2))
+    return min(1.0, (middle + half) / (1.0 + c**2 / n))
+
+
+def area(ill: np.ndarray, well: np.ndarray) -> float:
+    """Return the area under the ROC curve: how often a value of an ill body exceeds that of a healthy one."""
+    ordered = np.sort(well)
+    below = np.searchsorted(ordered, ill, side="left")
+    not_above = np.searchsorted(ordered, ill, side="right")
+    return float(np.mean(below + not_above) / (2.0 * len(ordered)))
+
+
+def means(values: np.ndarray, count: int) -> np.ndarray:
+    """Return the means of all windows of `count` consecutive rows, shape (n, ...) -> (n - count + 1, ...)."""
+    summed = np.cumsum(np.concatenate([np.zeros_like(values[:1]), values]), axis=0)
+    return np.asarray((summed[count:] - summed[:-count]) / count)
+
+
+def correlation_time(values: np.ndarray) -> float:
+    """Return the number of consecutive samples that are worth one independent sample, shape (n,) -> at least 1."""
+    time, count = 1.0, 2
+    while count <= len(values) // DISJOINT:
+        time = max(time, count * float(means(values, count).var()) / max(float(values.var()), 1e-12))
+        count *= 2
+    return time
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Windows:
+    """Limits of windows of n samples of a healthy body.
+
+    Attributes:
+        sizes: Learned n, ascending, shape (levels,).
+        limits: Limit of the mean deviation of a window, shape (levels,).
+        stds: Standard deviation of the mean deviation of normal windows, shape (levels,).
+        variance: Variance of the mean of every error over a window [its single variance], shape (levels, errors).
+        shift: Limit of the logarithm of the mean squared shift, a multiple of this variance, shape (levels,).
+        shift_stds: Standard deviation of this logarithm in normal windows, shape (levels,).
+    """
+
+    sizes: np.ndarray
+    limits: np.ndarray
+    stds: np.ndarray
+    variance: np.ndarray
+    shift: np.ndarray
+    shift_stds: np.ndarray
+
+    @classmethod
+    def fit(cls, deviations: np.ndarray, errors: np.ndarray, false_alarm: float) -> "Windows":
+        """Learn from consecutive normal samples.
+
+        Args:
+            deviations: Deviation of every sample, shape (n,).
+            errors: Its errors [their standard deviations], mean zero, shape (n, errors).
+            false_alarm: Share of normal windows that may be above a limit.
+        """
+        time = correlation_time(deviations)
+        sizes, variance = [], []
+        limits: list[tuple[float, float]] = []
+        shifts: list[tuple[float, float]] = []
+        count = 1
+        while count <= max(1, min(LONGEST, len(deviations) // DISJOINT)):
+            independent = len(deviations) / max(time, count)
+            moved = means(errors, count) ** 2
+            spread = moved.mean(axis=0) + 1e-9
+            share = false_alarm if count == 1 else false_alarm / 2.0
+            sizes.append(count)
+            variance.append(spread)
+            for values, known in (
+                (means(deviations, count), limits),
+                (np.log((moved / spread).mean(axis=1) + 1e-12), shifts),
+            ):
+                known.append((limit(values, share, independent), max(float(values.std()), 1e-6)))
+            count *= 2
+        above, shifted = np.array(limits), np.array(shifts)
+        return cls(np.array(sizes), above[:, 0], above[:, 1], np.array(variance), shifted[:, 0], shifted[:, 1])
+
+    def excess(self, deviations: np.ndarray) -> float:
+        """Return how far the mean deviation of a window is above its limit [its standard deviations], shape (n,)."""
+        recent = deviations[-int(self.sizes[-1]) :]
+        above = recent.mean() - self._at(len(recent), self.limits)
+        return float(above / self._at(len(recent), self.stds))
+
+    def shifted(self, errors: np.ndarray) -> float:
+        """Return how far the shift of a window is above its limit [its standard deviations], shape (n, errors).
+
+        A single sample has no shift of its own: negative infinity.
+        """
+        recent = errors[-int(self.sizes[-1]) :]
+        if len(recent) < 2 or len(self.sizes) < 2:
+            return -math.inf
+        ratio = recent.mean(axis=0) ** 2 / self._at(len(recent), self.variance)
+        above = np.log(ratio.mean() + 1e-12) - self._at(len(recent), self.shift)
+        return float(above / self._at(len(recent), self.shift_stds))
+
+    def _at(self, count: int, values: np.ndarray) -> np.ndarray:
+        """Return values between two learned sizes, linear in the logarithm of the size."""
+        place = np.log2(min(count, int(self.sizes[-1])))
+        low = int(place)
+        high = min(low + 1, len(values) - 1)
+        return np.asarray(values[low] + (place - low) * (values[high] - values[low]))
