@@ -1,7 +1,7 @@
 """Linear path of the network: what is linear in a body is learned as linear, in closed form.
 
-Ridge regression predicts the main components of x_out, the code l, from the signals of a mask. The network receives l as
-a further input, carries it past its activations to z and to the output, and learns the rest. So a linear body is as
+Ridge regression predicts the main components of x_out, the code l, from the signals of a mask. The network receives l
+as a further input, carries it past its activations to z and to the output, and learns the rest. So a linear body is as
 exact as ridge regression, and outside of the training data the estimate goes on along the line.
 
 The second moments of the training data are kept instead of one matrix per mask: they determine the regression of every

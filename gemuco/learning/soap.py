@@ -1,8 +1,8 @@
 """Optimiser of a training: Adam in the eigenbasis of the gradients' second moments (SOAP; Vyas et al., 2024).
 
-In a layer of n_in inputs and n_out outputs, the second moments of the gradient by its inputs and by its outputs give two
-rotations. Adam in the rotated coordinates follows narrow valleys that Adam crosses from side to side: at the same
-duration the error on data without noise is three to eight times smaller.
+The second moments of a layer's gradient by its inputs and by its outputs give two rotations. Adam in the rotated
+coordinates follows narrow valleys that Adam alone crosses from side to side. On data without noise the error after the
+same time is several times smaller.
 """
 
 import math
@@ -11,14 +11,82 @@ import numpy as np
 
 from gemuco.compiled.chain import NARROW, PLACE, WIDE, Packed
 
-SLOW, SQUARE = 0.95, 0.95
-"""Share of the past in the mean of the gradients, and in the means of their squares and second moments."""
+KEEP = 0.95
+"""Share of the past in the means of the gradients, of their squares and of their second moments."""
 TURNS = 10
 """The rotations are improved after this many steps."""
 TINY = 3e-5
-"""An element whose gradients are smaller than this share of the largest does not move: they are rounding errors."""
+"""An element with gradients below this share of the largest hardly moves, because they are rounding errors."""
 WIDEST = 1024
 """A side of a matrix with more elements is not rotated."""
+
+
+class _Side:
+    """Rotation of one side of a layer's matrix; empty if the side is too wide."""
+
+    def __init__(self, size: int) -> None:
+        size = size if size <= WIDEST else 0
+        self.moments = np.zeros((size, size), np.float32)
+        self.rotation = np.eye(size, dtype=np.float32)
+
+    def see(self, gradient: np.ndarray, is_first: bool) -> None:
+        """Add a gradient, shape (size, n), to the second moments."""
+        if len(self.moments):
+            _mix(self.moments, gradient @ gradient.T)
+            if is_first:
+                self.rotation[...] = np.linalg.eigh(self.moments)[1]
+
+    def turned(self, matrix: np.ndarray) -> np.ndarray:
+        """Return a matrix, shape (size, n), in rotated coordinates."""
+        return self.rotation.T @ matrix if len(self.rotation) else matrix
+
+    def back(self, matrix: np.ndarray) -> np.ndarray:
+        """Return a matrix, shape (size, n), in plain coordinates."""
+        return self.rotation @ matrix if len(self.rotation) else matrix
+
+    def improve(self, square: np.ndarray) -> np.ndarray:
+        """Take one step of the power iteration, and return the squares, shape (size, n), in the new order."""
+        if not len(self.rotation):
+            return square
+        product = self.moments @ self.rotation
+        order = np.argsort(-np.einsum("ij,ij->j", self.rotation, product), kind="stable")
+        self.rotation[...] = np.linalg.qr(product[:, order])[0]
+        return square[order]
+
+
+class _Matrix:
+    """State of one layer; its offset is the last row of its matrix."""
+
+    def __init__(self, form: np.ndarray) -> None:
+        wide, narrow, place = int(form[WIDE]) + 1, int(form[NARROW]), int(form[PLACE])
+        self.part, self.shape = slice(place, place + wide * narrow), (wide, narrow)
+        self.slow, self.square = np.zeros((2, wide, narrow), np.float32)
+        self.left, self.right = _Side(wide), _Side(narrow)
+
+    def step(self, gradient: np.ndarray, time: int) -> np.ndarray:
+        """Return the direction of step number `time`, shape (n_in + 1, n_out)."""
+        _mix(self.slow, gradient)
+        self.left.see(gradient, time == 1)
+        self.right.see(gradient.T, time == 1)
+        turned = self._turned(gradient)
+        _mix(self.square, turned * turned)
+        size = np.sqrt(self.square)
+        direction = self._turned(self.slow) / (size + np.float32(TINY * size.max() + 1e-20))
+        result = self.right.back(self.left.back(direction).T).T
+        if time % TURNS == 0:
+            self.square[...] = self.right.improve(self.left.improve(self.square).T).T
+        return result
+
+    def _turned(self, matrix: np.ndarray) -> np.ndarray:
+        return self.right.turned(self.left.turned(matrix).T).T
+
+    @property
+    def arrays(self) -> dict[str, np.ndarray]:
+        """All arrays that change."""
+        sides = {"left": self.left, "right": self.right}
+        state = {f"{name}.moments": side.moments for name, side in sides.items()}
+        state |= {f"{name}.rotation": side.rotation for name, side in sides.items()}
+        return {"slow": self.slow, "square": self.square, **state}
 
 
 class Soap:
@@ -33,65 +101,22 @@ class Soap:
 
     def __init__(self, chain: Packed) -> None:
         self.time = 0
-        self._layers = []
-        self._state: dict[str, np.ndarray] = {}
-        for index, form in enumerate(chain.form):
-            wide, narrow, place = form[WIDE] + 1, form[NARROW], form[PLACE]  # the offset is the last row
-            shape = slice(place, place + wide * narrow), (wide, narrow)
-            arrays = [np.zeros((wide, narrow), np.float32) for _ in range(2)]
-            for side in (wide, narrow):
-                size = side if side <= WIDEST else 0
-                arrays += [np.zeros((size, size), np.float32), np.eye(size, dtype=np.float32)]
-            self._layers.append((*shape, *arrays))
-            names = ("slow", "square", "left", "rotation_left", "right", "rotation_right")
-            self._state |= {f"{name}.{index}": array for name, array in zip(names, arrays, strict=True)}
+        self._matrices = [_Matrix(form) for form in chain.form]
 
     def move(self, numbers: np.ndarray, gradient: np.ndarray, rate: float) -> None:
         """Take one step; both arrays have shape (size,), float32."""
         self.time += 1
-        gain = rate * math.sqrt(1.0 - SQUARE**self.time) / (1.0 - SLOW**self.time)
-        for place, shape, slow, square, left, turn_left, right, turn_right in self._layers:
-            g = gradient[place].reshape(shape)
-            _mix(slow, g, SLOW)
-            for moments, product in ((left, (g, g.T)), (right, (g.T, g))):
-                if len(moments):
-                    _mix(moments, product[0] @ product[1], SQUARE)
-            if self.time == 1:
-                for moments, rotation in ((left, turn_left), (right, turn_right)):
-                    rotation[...] = np.linalg.eigh(moments)[1]
-            turned = _turned(g, turn_left, turn_right)
-            _mix(square, turned * turned, SQUARE)
-            step = _turned(slow, turn_left, turn_right)
-            size = np.sqrt(square)
-            step /= size + np.float32(TINY * size.max() + 1e-20)
-            numbers[place].reshape(shape)[...] -= np.float32(gain) * _turned(step, turn_left.T, turn_right.T)
-            if self.time % TURNS == 0:
-                if len(left):
-                    square[...] = square[_improve(left, turn_left)]
-                if len(right):
-                    square[...] = square[:, _improve(right, turn_right)]
+        gain = np.float32(rate * math.sqrt(1.0 - KEEP**self.time) / (1.0 - KEEP**self.time))
+        for matrix in self._matrices:
+            step = matrix.step(gradient[matrix.part].reshape(matrix.shape), self.time)
+            numbers[matrix.part] -= gain * step.ravel()
 
     def state(self) -> dict[str, np.ndarray]:
         """Return the internal arrays; a resumed training writes its stored values into them."""
-        return self._state
+        return {f"{name}.{i}": array for i, m in enumerate(self._matrices) for name, array in m.arrays.items()}
 
 
-def _mix(mean: np.ndarray, new: np.ndarray, keep: float) -> None:
+def _mix(mean: np.ndarray, new: np.ndarray) -> None:
     """Update a running mean in place."""
-    mean *= np.float32(keep)
-    mean += np.float32(1.0 - keep) * new
-
-
-def _turned(matrix: np.ndarray, left: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Return left^T matrix right; an empty rotation changes nothing."""
-    if len(left):
-        matrix = left.T @ matrix
-    return matrix @ right if len(right) else matrix.copy()
-
-
-def _improve(moments: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-    """Take one step of the power iteration towards the eigenvectors, in place; return their new order."""
-    product = moments @ rotation
-    order = np.argsort(-np.einsum("ij,ij->j", rotation, product), kind="stable")
-    rotation[...] = np.linalg.qr(product[:, order])[0]
-    return order
+    mean *= np.float32(KEEP)
+    mean += np.float32(1.0 - KEEP) * new

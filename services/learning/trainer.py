@@ -230,8 +230,8 @@ def remarks(history: History) -> list[str]:
     return sentences
 
 
-def train_config(config: ModelConfig, epochs: int, seed: int) -> TrainConfig:
-    """Return the training settings of the robot file for a number of epochs."""
+def train_config(config: ModelConfig, epochs: int | None, seed: int) -> TrainConfig:
+    """Return the training settings of the robot file for a number of epochs; None if it follows the data."""
     return TrainConfig(
         hidden=config.network.hidden,
         latent=config.network.latent,
@@ -242,7 +242,7 @@ def train_config(config: ModelConfig, epochs: int, seed: int) -> TrainConfig:
         rate=config.training.rate,
         bias_rate=config.training.bias_rate,
         held_out=config.training.held_out,
-        patience=config.training.patience or epochs,
+        patience=config.training.patience,
         outliers=config.training.outliers,
         seed=seed,
     )

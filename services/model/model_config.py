@@ -18,7 +18,8 @@ class NetworkConfig(Section):
     """Shape of the encoder; the decoder mirrors it."""
 
     hidden: tuple[Count, ...] = DEFAULT.hidden
-    latent: Count = DEFAULT.latent
+    latent: Count | None = DEFAULT.latent
+    """This is the length of z. By default it follows the data: one per element of the outputs, 15 to 40."""
     activation: Literal["tanh", "relu", "sigmoid", "elu", "softplus"] = "tanh"
     bias: Annotated[int, Field(ge=0)] | None = DEFAULT.bias_size
     """This is the length of the parametric bias p, one p per condition; 0 without p. By default it follows the data:
@@ -48,8 +49,10 @@ class StructureConfig(Section):
 class TrainingConfig(Section):
     """The training of the network after structure determination."""
 
-    epochs: Count = DEFAULT.epochs
-    batch: Count = DEFAULT.batch
+    epochs: Count | None = DEFAULT.epochs
+    """By default the epochs follow the number of samples: about 8000 steps."""
+    batch: Count | None = DEFAULT.batch
+    """By default a step takes a tenth of the samples, 50 to 500."""
     rate: Positive = DEFAULT.rate
     """This is the peak learning rate of the one-cycle schedule."""
     bias_rate: Positive = DEFAULT.bias_rate
@@ -57,7 +60,7 @@ class TrainingConfig(Section):
     held_out: Annotated[float, Field(gt=0, lt=1)] = DEFAULT.held_out
     """This share of every condition's data is held out from training and measures the loss."""
     patience: Count | None = DEFAULT.patience
-    """Training stops after this many epochs without a better held-out loss; with `null` it runs all epochs."""
+    """Training stops after this many epochs without a better held-out loss; with `null` after a fifth of the epochs."""
     outliers: Positive = DEFAULT.outliers
     """A signal that the others contradict by this many robust standard deviations is rejected; `.inf`: none."""
 

@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from gemuco import TrainConfig
-from services.learning.measured import MeasuredConfig, load_measured, read_measured
 from services.learning.trainer import train_config
+from services.measured.description import MeasuredConfig, load_measured
+from services.measured.reading import read_measured
 from studies.peers.question import Bar, Body, MissingData, Question, Rows, Trial
 
 ROOT = Path(__file__).parents[2]

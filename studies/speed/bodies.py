@@ -66,7 +66,7 @@ def modules(schema: BodySchema) -> tuple[nn.Sequential, nn.Sequential]:
 def module(chain: Chain) -> nn.Sequential:
     """Return a chain of layers in torch."""
     parts: list[nn.Module] = []
-    for matrix, offset, activation in chain:
+    for matrix, offset, activation, _ in chain:
         linear = nn.Linear(*matrix.shape)
         linear.weight.data, linear.bias.data = torch.from_numpy(matrix.T.copy()), torch.from_numpy(offset.copy())
         parts += [linear] if activation == "linear" else [linear, nn.Tanh()]

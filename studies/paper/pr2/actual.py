@@ -96,7 +96,9 @@ def split(data: Dataset, share: float) -> tuple[Dataset, Dataset]:
 
 def _tune(run: Run, simulated: BodySchema, learned: Dataset, progress: Progress) -> BodySchema:
     model = model_config(run.robot)
-    config = replace(train_config(model, round(EPOCHS * model.training.epochs), run.seed), rate=RATE, replay=0.0)
+    config = replace(
+        train_config(model, round(EPOCHS * (model.training.epochs or 300)), run.seed), rate=RATE, replay=0.0
+    )
     schema, _ = fine_tune(simulated, learned, config, lambda done, text: progress(0.2 + 0.4 * done, text))
     return schema
 
