@@ -32,7 +32,7 @@ ERRORS = "error from mask (% of std)"
 
 
 class Gate(NamedTuple):
-    """What a mask lets through, float32.
+    """Share of the network input that a mask determines, float32.
 
     Attributes:
         through: 0 or 1 for every element of x_in, shape (in_size,).

@@ -12,7 +12,7 @@ LATENT = 15, 40
 """A z that follows the data has one element per output, but not less and not more elements than these."""
 BATCH = 50, 500
 """A batch that follows the data is a tenth of the samples, but not smaller and not larger than these."""
-STEPS = 8000
+STEPS = 4000
 """A number of epochs that follows the data is this many steps."""
 PATIENCE = 0.2
 """A patience that follows the data is this share of the epochs."""

@@ -50,7 +50,7 @@ class TrainingConfig(Section):
     """The training of the network after structure determination."""
 
     epochs: Count | None = DEFAULT.epochs
-    """By default the epochs follow the number of samples: about 8000 steps."""
+    """By default the epochs follow the number of samples: about 4000 steps."""
     batch: Count | None = DEFAULT.batch
     """By default a step takes a tenth of the samples, 50 to 500."""
     rate: Positive = DEFAULT.rate

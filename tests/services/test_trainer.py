@@ -87,7 +87,7 @@ def test_a_file_where_the_model_shall_be_is_told_before_training(tmp_path):
 
 
 def test_what_a_person_should_know_is_said():
-    history = History((1.0,), (1.0,), 0, 3, 5, ("arm.elbow",), ("All data are of one condition.",))
+    history = History((1.0,), (1.0,), 1.0, 0, 3, 5, ("arm.elbow",), ("All data are of one condition.",))
     said = " ".join(trainer.remarks(history))
     for part in ("one condition", "arm.elbow", "3 training samples were skipped", "5 measured signals"):
         assert part in said
