@@ -91,7 +91,7 @@ def test_what_a_person_should_know_is_said():
     said = " ".join(trainer.remarks(history))
     for part in ("one condition", "arm.elbow", "3 training samples were skipped", "5 measured signals"):
         assert part in said
-    assert trainer.remarks(History((1.0,), (1.0,), 0)) == []
+    assert trainer.remarks(History((1.0,), (1.0,), 1.0, 0)) == []
 
 
 def test_a_model_is_fine_tuned_on_few_samples_of_another_body(robot, dataset, straight, tmp_path):
