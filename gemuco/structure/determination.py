@@ -68,7 +68,7 @@ def determine(
     """
     dataset = as_dataset(data, units)
     config = TrainConfig() if config is None else config
-    if config.epochs is None:  # enough to tell masks apart
+    if config.epochs is None:  # enough to rank masks
         config = replace(config, epochs=max(1, config.epochs_for(len(dataset)) // 4))
     thresholds = Thresholds() if thresholds is None else thresholds
     check_kind("The settings of a training", config, TrainConfig, "a TrainConfig")
