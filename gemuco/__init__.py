@@ -31,7 +31,8 @@ _ROOMS = {
     ),
     "gemuco.estimation": ("Estimate", "estimate"),
     "gemuco.learning.config": ("TrainConfig",),
-    "gemuco.learning.train": ("fine_tune", "fit"),
+    "gemuco.learning.train": ("fit",),
+    "gemuco.learning.tune": ("fine_tune",),
     "gemuco.schema": ("BodySchema",),
     "gemuco.search.descent": ("DescentConfig", "NewtonConfig"),
     "gemuco.search.losses": ("Hold", "Match", "StayNear", "StaySmall"),
@@ -74,8 +75,8 @@ if TYPE_CHECKING:
     from gemuco.estimation import Estimate as Estimate
     from gemuco.estimation import estimate as estimate
     from gemuco.learning.config import TrainConfig as TrainConfig
-    from gemuco.learning.train import fine_tune as fine_tune
     from gemuco.learning.train import fit as fit
+    from gemuco.learning.tune import fine_tune as fine_tune
     from gemuco.schema import BodySchema as BodySchema
     from gemuco.search.descent import DescentConfig as DescentConfig
     from gemuco.search.descent import NewtonConfig as NewtonConfig

@@ -8,7 +8,8 @@ from muscle_arm import LAYOUT, MuscleArm
 
 from gemuco.dataset import Dataset, Episode
 from gemuco.errors import DatasetError, NotEnoughData
-from gemuco.learning.train import TrainConfig, fine_tune, fit
+from gemuco.learning.train import TrainConfig, fit
+from gemuco.learning.tune import fine_tune
 from gemuco.signals import Layout
 
 FL = frozenset({"muscle_tension", "muscle_length"})

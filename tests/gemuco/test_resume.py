@@ -12,7 +12,8 @@ from muscle_arm import LAYOUT, MuscleArm
 
 from gemuco.dataset import Dataset, Episode
 from gemuco.learning.draft import Draft
-from gemuco.learning.train import TrainConfig, fine_tune, fit
+from gemuco.learning.train import TrainConfig, fit
+from gemuco.learning.tune import fine_tune
 
 MASKS = [{"joint_position", "muscle_tension"}, {"muscle_tension", "muscle_length"}]
 CONFIG = TrainConfig(hidden=(16,), latent=5, epochs=20, batch=100, bias_size=1, patience=99)
