@@ -12,6 +12,7 @@ from gemuco.errors import NotEnoughData, check_kind
 from gemuco.layers import Weights
 from gemuco.learning.accuracy import assess
 from gemuco.learning.config import TrainConfig
+from gemuco.learning.cross_fit import doubted
 from gemuco.learning.draft import Draft, key_of
 from gemuco.learning.history import History
 from gemuco.learning.learner import Learner, Progress
@@ -88,7 +89,7 @@ def fit(
     schema = schema_of(learner, scaler, conditions)
     weights = learner.weights
     _mute(weights, task, scaler.dead, unused)
-    schema = assessed(schema.with_weights(weights), learner, conditions)
+    schema = doubted(assessed(schema.with_weights(weights), learner, conditions), dataset)
     return schema, history_of(learner, scaler, notes)
 
 

@@ -123,7 +123,7 @@ def test_fine_tuning_goes_on_too(whole, tmp_path):
     straight = fine_tune(whole[0], real, config)
     path = tmp_path / "draft"
     with pytest.raises(Stopped):
-        fine_tune(whole[0], real, config, stop_at(0.5), resume=path)
+        fine_tune(whole[0], real, config, stop_at(0.5 / 6), resume=path)  # five more trainings measure its errors
     again = fine_tune(whole[0], real, config, resume=path)
     same(again, straight)
     assert again[1].resumed == 9
