@@ -9,8 +9,9 @@ from importlib import import_module
 TYPE_CHECKING = False
 
 _ROOMS = {
+    "gemuco.adaption.adapt": ("adapt",),
     "gemuco.adaption.config": ("UpdateConfig",),
-    "gemuco.adaption.update": ("Updater", "adapt"),
+    "gemuco.adaption.update": ("Updater",),
     "gemuco.anomaly.score": ("AnomalyScore", "score"),
     "gemuco.anomaly.verdict": ("Verdict", "judge"),
     "gemuco.checkpoint": ("load", "save"),
@@ -46,9 +47,9 @@ _ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
 __all__ = sorted(_ROOM_OF)
 
 if TYPE_CHECKING:
+    from gemuco.adaption.adapt import adapt as adapt
     from gemuco.adaption.config import UpdateConfig as UpdateConfig
     from gemuco.adaption.update import Updater as Updater
-    from gemuco.adaption.update import adapt as adapt
     from gemuco.anomaly.score import AnomalyScore as AnomalyScore
     from gemuco.anomaly.score import score as score
     from gemuco.anomaly.verdict import Verdict as Verdict

@@ -161,7 +161,8 @@ def test_both_at_once(grips):
 
 
 def test_w_goes_back_when_it_does_harm(grips):
-    updater = Updater(grips.under(LONG), UpdateConfig(what="weights", optimiser="sgd", rate=0.5, replay=0, minimum=5))
+    config = UpdateConfig(what="weights", optimiser="sgd", rate=0.5, replay=0, minimum=5, repeats=1)
+    updater = Updater(grips.under(LONG), config)
     results = live(updater, TOOLS[LONG], 60)
     assert results[-1].rolled_back > 0
     assert np.isfinite(results[-1].held_out)
@@ -302,3 +303,17 @@ def test_beliefs_that_share_a_linearisation_find_the_same(grips):
         one, other = shared.see(grips, row), alone.see(grips, row)
         assert Prior.of(grips).between(one.bias, other.bias) < 0.02
         assert abs(one.since - other.since) <= 1
+
+
+def test_errors_follow_a_body_of_which_only_p_is_updated(grips):
+    """The tool bends the joints as no trained one did: p alone cannot explain it, and the errors say so."""
+    strange = ToolArm(0.4, 0.4, 0.8, bend=0.15)
+    updater = Updater(grips.under(LONG), UpdateConfig(what="bias"))
+    values = strange.sample(60, 5)
+    for index in range(60):
+        updater.add({name: array[index] for name, array in values.items()})
+        updater.step()
+    span = grips.out_layout.slice("tool_tip_position")
+    claimed = float(np.linalg.norm(updater.schema.errors["mask", THETA][span]))
+    assert tip_error(updater.schema, strange) > 0.03  # m
+    assert claimed == pytest.approx(tip_error(updater.schema, strange), rel=0.5)
