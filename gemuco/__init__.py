@@ -9,8 +9,9 @@ from importlib import import_module
 TYPE_CHECKING = False
 
 _ROOMS = {
+    "gemuco.adaption.adapt": ("adapt",),
     "gemuco.adaption.config": ("UpdateConfig",),
-    "gemuco.adaption.update": ("Updater", "adapt"),
+    "gemuco.adaption.update": ("Updater",),
     "gemuco.anomaly.score": ("AnomalyScore", "score"),
     "gemuco.anomaly.verdict": ("Verdict", "judge"),
     "gemuco.checkpoint": ("load", "save"),
@@ -31,7 +32,8 @@ _ROOMS = {
     ),
     "gemuco.estimation": ("Estimate", "estimate"),
     "gemuco.learning.config": ("TrainConfig",),
-    "gemuco.learning.train": ("fine_tune", "fit"),
+    "gemuco.learning.train": ("fit",),
+    "gemuco.learning.tune": ("fine_tune",),
     "gemuco.schema": ("BodySchema",),
     "gemuco.search.descent": ("DescentConfig", "NewtonConfig"),
     "gemuco.search.losses": ("Hold", "Match", "StayNear", "StaySmall"),
@@ -45,9 +47,9 @@ _ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
 __all__ = sorted(_ROOM_OF)
 
 if TYPE_CHECKING:
+    from gemuco.adaption.adapt import adapt as adapt
     from gemuco.adaption.config import UpdateConfig as UpdateConfig
     from gemuco.adaption.update import Updater as Updater
-    from gemuco.adaption.update import adapt as adapt
     from gemuco.anomaly.score import AnomalyScore as AnomalyScore
     from gemuco.anomaly.score import score as score
     from gemuco.anomaly.verdict import Verdict as Verdict
@@ -74,8 +76,8 @@ if TYPE_CHECKING:
     from gemuco.estimation import Estimate as Estimate
     from gemuco.estimation import estimate as estimate
     from gemuco.learning.config import TrainConfig as TrainConfig
-    from gemuco.learning.train import fine_tune as fine_tune
     from gemuco.learning.train import fit as fit
+    from gemuco.learning.tune import fine_tune as fine_tune
     from gemuco.schema import BodySchema as BodySchema
     from gemuco.search.descent import DescentConfig as DescentConfig
     from gemuco.search.descent import NewtonConfig as NewtonConfig

@@ -7,14 +7,14 @@ seconds. To compile everything, all functions that a service uses are called onc
 """
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from itertools import chain, pairwise
 
 import numpy as np
 
 from gemuco.adaption.config import UpdateConfig
-from gemuco.adaption.relearn import mean_error
-from gemuco.adaption.update import adapt
+from gemuco.adaption.gradient import mean_error
+from gemuco.adaption.update import Updater
 from gemuco.anomaly.healthy import learn_normal
 from gemuco.anomaly.score import score
 from gemuco.compiled.jit import FOLDER, let_compiler_go
@@ -82,13 +82,20 @@ def running(schema: BodySchema) -> Iterator[str]:
     Controller(schema, terms, "tension").solve(target, whole)
     yield "recognition of p"
     for method in ("ekf", "gauss_newton"):
-        adapt(schema, [whole] * 2, UpdateConfig(what="bias", bias_method=method))
+        follow(schema, whole, UpdateConfig(what="bias", bias_method=method))
     for optimiser in ("adam", "sgd"):
         yield f"update of W and p by {optimiser}"
-        config = UpdateConfig(what="both", optimiser=optimiser, minimum=1, batch=4, steps=1)
-        adapt(schema, [whole] * 2, config)
+        follow(schema, whole, UpdateConfig(what="both", optimiser=optimiser, minimum=1, batch=4, repeats=1))
     yield "judging an update"
     mean_error(schema, np.zeros((1, schema.layout.size), np.float32))
+
+
+def follow(schema: BodySchema, values: Mapping[str, np.ndarray], config: UpdateConfig) -> None:
+    """Update a schema by one sample, twice."""
+    updater = Updater(schema, config)
+    for _ in range(2):
+        updater.add(values)
+        updater.step()
 
 
 def learning(schema: BodySchema) -> Iterator[str]:

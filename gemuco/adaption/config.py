@@ -20,7 +20,8 @@ class UpdateConfig:
         window: Maximum number of samples kept; the oldest are dropped.
         minimum: Samples needed before the first gradient step.
         batch: Samples per gradient step, drawn from window, constraints and replay; each under every mask it covers.
-        steps: Gradient steps per `Updater.step`.
+        steps: Gradient steps for each new sample.
+        repeats: In a window of few samples a new sample is followed by up to this many times `steps`; 1: never by more.
         rate: Learning rate of W.
         bias_rate: Learning rate of p, for `gradient` and `both`.
         optimiser: `adam` or `sgd` (with momentum 0.9), for W and p.
@@ -37,6 +38,7 @@ class UpdateConfig:
     minimum: int = 10
     batch: int = 100
     steps: int = 3
+    repeats: int = 30
     rate: float = 1e-4
     bias_rate: float = 0.02
     optimiser: str = "adam"
@@ -48,7 +50,8 @@ class UpdateConfig:
         for name, known in (("what", WHAT), ("bias_method", METHODS), ("optimiser", OPTIMISERS)):
             if getattr(self, name) not in known:
                 raise SchemaError(f"{name} '{getattr(self, name)}' is not known. Known: {', '.join(known)}.")
-        for name, least in (("window", 1), ("minimum", 1), ("batch", 1), ("steps", 0), ("replay", 0), ("held_out", 0)):
+        for name in ("window", "minimum", "batch", "repeats", "steps", "replay", "held_out"):
+            least = 0 if name in ("steps", "replay", "held_out") else 1
             whole_number(f"Update: {name}", getattr(self, name), least)
         whole_number("Update: seed", self.seed, 0)
         for name in ("rate", "bias_rate"):

@@ -233,4 +233,12 @@ def solve(
     return best, np.linalg.inv(curvature)
 
 
+def recognise(schema: BodySchema, rows: np.ndarray, method: str) -> np.ndarray:
+    """Return the p recognised from samples [standard deviations], oldest first, shape (n, size)."""
+    recogniser, bias = RECOGNISERS[method](schema), schema.bias
+    for row in rows.astype(float):
+        bias = recogniser.see(schema.with_bias(bias), row).bias
+    return bias
+
+
 RECOGNISERS: dict[str, Callable[[BodySchema], Recogniser]] = {"ekf": Kalman, "gauss_newton": GaussNewton}

@@ -6,7 +6,7 @@ of the other conditions under their own p, and goes back when its error on held-
 methods are the other choices.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,12 +14,15 @@ import numpy as np
 from gemuco.adaption.config import UpdateConfig
 from gemuco.adaption.recognise import RECOGNISERS, Prior, Recogniser
 from gemuco.adaption.relearn import Relearner
+from gemuco.adaption.seen import SeenErrors
 from gemuco.errors import SchemaError, check_kind
 from gemuco.schema import BodySchema, check_schema
-from gemuco.signals import check_samples
 
-FORGET = 0.01
-"""Each new sample moves the running mean of the model's errors by this share."""
+SPREAD = 0.1
+"""A sample is new when an element moved this far since the last new one [standard deviations]. No steps are owed for
+other samples: a robot at rest would otherwise pull W towards one posture."""
+YOUNG = 1500
+"""A window of fewer samples than this gets more steps for a new sample, in inverse proportion to its samples."""
 ANOTHER = 0.3
 """The body has changed when p is this far from the p in use [standard deviations of the trained p]."""
 STEADY = 0.02
@@ -31,6 +34,7 @@ class UpdateResult:
     """Result of one step.
 
     Attributes:
+        steps: Number of gradient steps taken.
         loss: Mean squared error of the first batch before the step [standard deviations squared]; NaN if no gradient
             step was taken, infinite if a step led to an infinite number and was undone.
         window: Number of samples in the window.
@@ -43,6 +47,7 @@ class UpdateResult:
         rolled_back: Number of times W went back.
     """
 
+    steps: int
     loss: float
     window: int
     dropped: int
@@ -104,10 +109,9 @@ class Updater:
         self._since = self._relearner.window.added
         self._bias_std = np.full(len(schema.bias), np.nan)
         self._is_settled = not self._has_bias
-        scale = schema.scaler.std[schema.out_index]
-        self._errors = {
-            m: (schema.errors[key] / scale) ** 2 for m in schema.masks if (key := ("mask", m)) in schema.errors
-        }
+        self._errors = SeenErrors(schema)
+        self._owed = 0.0
+        self._last_new: np.ndarray | None = None
         self._relearner.restart(schema)
 
     def add(self, values: Mapping[str, np.ndarray]) -> bool:
@@ -128,38 +132,64 @@ class Updater:
             return False
         self._relearner.window.add(x)
         self._pending.append(x)
-        self._measure(x)
+        self._errors.see(self.schema, x)
+        if self._is_new(x):
+            self._last_new = x
+            self._owed = min(self._owed + self._steps_of_a_sample(), float(YOUNG * self.config.steps))
         return True
 
     def _is_usable(self, x: np.ndarray) -> bool:
         whole = self.schema.layout.whole(np.isfinite(x))
         return any(m <= whole for m in self.schema.masks) and bool(np.isfinite(x[self.schema.out_index]).any())
 
-    def _measure(self, x: np.ndarray) -> None:
-        whole = self.schema.layout.whole(np.isfinite(x))
-        data = x[self.schema.out_index]
-        for m in self.schema.masks:
-            if m <= whole:
-                squared = (self.schema.infer(x, m) - data) ** 2
-                known = self._errors.setdefault(m, squared)
-                self._errors[m] = np.where(np.isfinite(squared), known + FORGET * (squared - known), known)
+    def _is_new(self, x: np.ndarray) -> bool:
+        if self._last_new is None:
+            return True
+        distance = np.abs(x - self._last_new)
+        return not np.isfinite(distance).any() or float(np.nanmax(distance)) >= SPREAD
 
-    def step(self) -> UpdateResult:
-        """Recognise p from the samples since the last step, then take gradient steps; `schema` is the result."""
+    def _steps_of_a_sample(self) -> float:
+        """Return the number of gradient steps for a new sample; 0 before the window has its minimum of samples."""
+        count = len(self._relearner.window)
+        if count < self.config.minimum:
+            return 0.0
+        return self.config.steps * min(max(1.0, YOUNG / count), float(self.config.repeats))
+
+    @property
+    def samples(self) -> np.ndarray:
+        """Samples of the window [standard deviations], oldest first, shape (n, size)."""
+        return self._relearner.window.rows()
+
+    @property
+    def owed(self) -> int:
+        """Number of gradient steps still to be taken for the samples so far."""
+        return round(self._owed)
+
+    def step(self, most: int | None = None) -> UpdateResult:
+        """Recognise p from the samples since the last step, then take gradient steps; `schema` is the result.
+
+        Args:
+            most: Maximum number of gradient steps; the others are taken at later calls. Without it all that are owed.
+        """
+        has_seen = bool(self._pending)
         has_changed = self._recognise()
         config, relearner = self.config, self._relearner
         moves_weights = config.what in ("weights", "both") or (config.what == "bias_then_weights" and self._is_settled)
         moves_bias = self._has_bias and self._recogniser is None
-        loss = float("nan")
-        if len(relearner.window) >= config.minimum and (moves_weights or moves_bias):
-            before = self.schema.bias
-            schema, loss = relearner.step(self.schema, moves_weights, moves_bias)
+        loss, taken = float("nan"), 0
+        count = self.owed if moves_weights else config.steps
+        count = count if most is None else min(count, most)
+        if count and len(relearner.window) >= config.minimum and (moves_weights or moves_bias):
+            before, went_back = self.schema.bias, relearner.rolled_back
+            schema, loss, taken = relearner.step(self.schema, count, moves_weights, moves_bias)
+            self._owed = 0.0 if relearner.rolled_back > went_back else max(0.0, self._owed - taken)
             if moves_bias:
                 self._is_settled = self._prior.between(before, schema.bias) < STEADY
-            scale = schema.scaler.std[schema.out_index]
-            errors = dict(schema.errors) | {("mask", m): np.sqrt(e) * scale for m, e in self._errors.items()}
-            self.schema = schema.with_weights(schema.weights, errors)
+            self.schema = schema
+        if has_seen:
+            self.schema = self.schema.with_weights(self.schema.weights, self._errors.table())
         return UpdateResult(
+            steps=taken,
             loss=loss,
             window=len(relearner.window),
             dropped=relearner.window.dropped,
@@ -189,28 +219,10 @@ class Updater:
             self.schema = self.schema.with_bias(recognition.bias)
         if has_changed:
             self._relearner.restart(self.schema)
+            self._errors, self._owed = SeenErrors(self._first), 0.0
         return has_changed
 
     def rollback(self) -> BodySchema:
         """Go back to the first schema; the window is kept."""
         self._begin(self._first)
         return self.schema
-
-
-def adapt(
-    schema: BodySchema, samples: Iterable[Mapping[str, np.ndarray]], config: UpdateConfig | None = None
-) -> BodySchema:
-    """Return the schema after the online update on samples, one step each; `Updater` takes them singly.
-
-    Args:
-        schema: The schema to begin with.
-        samples: Signal -> value [its unit], shape (n,), oldest first.
-        config: Settings of the update.
-    """
-    check_schema(schema)
-    check_samples(samples)
-    updater = Updater(schema, config)
-    for values in samples:
-        updater.add(values)
-        updater.step()
-    return updater.schema

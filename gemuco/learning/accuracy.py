@@ -22,6 +22,11 @@ MOST_SEARCHED = 4
 """Up to this number of signals the input search is measured from every set of signals; above, from all but one."""
 
 
+ErrorRows = dict[tuple[str, Mask], np.ndarray]
+"""(method, given signals) -> errors of single samples [standard deviations], shape (samples, elements), NaN where not
+measured. The elements are those of x_out; for the method `input` those of the layout."""
+
+
 def assess(
     schema: BodySchema,
     rows: np.ndarray,
@@ -58,17 +63,28 @@ def measure_errors(schema: BodySchema, rows: np.ndarray, conditions: np.ndarray)
         every element of the layout, shape (size,). The error of an element that was never measured is its standard
         deviation.
     """
+    errors = error_rows(schema, rows, conditions)
+    return {key: rms(part) * scale_of(schema, key) for key, part in errors.items()}
+
+
+def scale_of(schema: BodySchema, key: tuple[str, Mask]) -> np.ndarray:
+    """Return the standard deviations of the elements whose errors a key of the error table has [unit]."""
+    return schema.scaler.std if key[0] == "input" else schema.scaler.std[schema.out_index]
+
+
+def error_rows(schema: BodySchema, rows: np.ndarray, conditions: np.ndarray) -> ErrorRows:
+    """Return the errors of single samples for every way to estimate; see `measure_errors`."""
     thinned = np.linspace(0, len(rows) - 1, min(len(rows), MOST_PAIRS // len(schema.masks) + 1)).astype(int)
     rows, conditions = rows[thinned], conditions[thinned]
     x = schema.scaler.normalise(rows)
-    truth, scale = x[:, schema.out_index], schema.scaler.std[schema.out_index]
+    truth = x[:, schema.out_index]
     p = bias_of(schema, conditions)
-    errors: dict[tuple[str, Mask], np.ndarray] = {}
+    errors: ErrorRows = {}
     for m in schema.masks:
         usable = np.isfinite(x[:, schema.layout.indices(m)]).all(axis=1)
         if usable.any():
             prediction = run(schema.weights.whole, schema.network_input(x[usable], m, p[usable]))
-            errors["mask", m] = _rms(prediction - truth[usable]) * scale
+            errors["mask", m] = prediction - truth[usable]
     complete = np.flatnonzero(np.isfinite(x).all(axis=1))
     if not len(complete):
         return errors
@@ -79,13 +95,13 @@ def measure_errors(schema: BodySchema, rows: np.ndarray, conditions: np.ndarray)
         solutions = np.empty((len(tests), len(schema.out_index)))
         for variant, samples in variants:
             solutions[samples] = [latent_search(variant, row) for row in hidden[samples]]
-        errors["latent", given] = _rms(solutions - truth[tests]) * scale
+        errors["latent", given] = solutions - truth[tests]
     for given in _input_sets(schema):
         hidden = _only(schema, x[tests], given)
         solutions = np.empty_like(hidden)
         for variant, samples in variants:
             solutions[samples] = [input_search(variant, row, given) for row in hidden[samples]]
-        errors["input", given] = _rms(solutions - x[tests]) * schema.scaler.std
+        errors["input", given] = solutions - x[tests]
     return errors
 
 
@@ -131,7 +147,7 @@ def _input_sets(schema: BodySchema) -> Iterable[Mask]:
     ]
 
 
-def _rms(errors: np.ndarray) -> np.ndarray:
+def rms(errors: np.ndarray) -> np.ndarray:
     """Return the root mean square over the samples, shape (out_size,); 1 where no sample was measured."""
     measured = np.isfinite(errors)
     count = measured.sum(axis=0)

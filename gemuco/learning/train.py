@@ -1,4 +1,4 @@
-"""Training of a body schema from episodes (paper, II-D), and its fine-tuning on a few new episodes."""
+"""Training of a body schema from episodes (paper, II-D)."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
@@ -12,6 +12,7 @@ from gemuco.errors import NotEnoughData, check_kind
 from gemuco.layers import Weights
 from gemuco.learning.accuracy import assess
 from gemuco.learning.config import TrainConfig
+from gemuco.learning.cross_fit import doubted
 from gemuco.learning.draft import Draft, key_of
 from gemuco.learning.history import History
 from gemuco.learning.learner import Learner, Progress
@@ -70,8 +71,8 @@ def fit(
     notes.extend(dataset.repetitions())
     conditions = dataset.conditions
     task, mean, components = _with_linear_path(task, scaler, train_data, config.latent_for(len(task.out_index)))
-    material = _material(task, scaler, train_data, conditions)
-    held = _material(task, scaler, held_data, conditions)
+    material = material_of(task, scaler, train_data, conditions)
+    held = material_of(task, scaler, held_data, conditions)
     frozen = np.full(len(conditions), len(conditions) == 1)
     bias_size = config.bias_for(len(conditions))
     notes += _bias_notes(config, conditions)
@@ -84,58 +85,12 @@ def fit(
     _mute(weights, task, scaler.dead, unused)
     biases = np.zeros((len(conditions), bias_size), np.float32)
     learner = Learner(config, weights, biases, frozen, material, held)
-    learner.run(progress, title, Draft(resume, _key(config, task, dataset)))
-    schema = _schema(learner, scaler, conditions)
+    learner.run(progress, title, Draft(resume, draft_key(config, task, dataset)))
+    schema = schema_of(learner, scaler, conditions)
     weights = learner.weights
     _mute(weights, task, scaler.dead, unused)
-    schema = _assess(schema.with_weights(weights), learner, conditions)
-    return schema, _history(learner, scaler, notes)
-
-
-def fine_tune(
-    schema: BodySchema,
-    dataset: Dataset,
-    config: TrainConfig,
-    progress: Progress | None = None,
-    title: str = "fine-tuning",
-    resume: str | Path | None = None,
-) -> tuple[BodySchema, History]:
-    """Train a schema further on few samples of a similar body, such as a simulated and then the real robot.
-
-    Training starts from the schema's W and from the p of every condition that the schema contains; the p of a new
-    condition starts from the p in use. Scale, network shape and masks stay. The schema's anchors are replayed under
-    their own p, which does not change: the schema does not forget postures that the new samples do not show.
-
-    Args:
-        schema: The schema to start from.
-        dataset: Episodes of the present body, with the signals of the schema.
-        config: Settings; `rate` is the peak, smaller than in training.
-        progress: Called after every epoch.
-        title: First words of the progress text.
-        resume: As in `fit`.
-
-    Returns:
-        The schema with the p of all conditions, old and new, and errors and normal statistics of the new data, and the
-        record of the training.
-
-    Raises:
-        DatasetError: A signal is missing, or has other elements or another unit.
-        NotEnoughData: Too few samples to hold some out, or no sample that fits a mask.
-    """
-    dataset = dataset.with_layout(schema.layout)
-    task = Task(schema.layout, schema.masks, schema.x_out, schema.linear)
-    train_data, held_data = dataset.split(config.held_out, config.seed)
-    conditions = dataset.conditions
-    old = list(schema.biases.values()) if len(schema.bias) else [schema.bias]
-    start = np.stack([*(schema.biases.get(c, schema.bias) for c in conditions), *old])
-    frozen = np.arange(len(start)) >= len(conditions)
-    material = _material(task, schema.scaler, train_data, conditions, schema)
-    held = _material(task, schema.scaler, held_data, conditions)
-    key = _key(config, task, dataset, *schema.weights.arrays(), start, schema.anchors, schema.scaler.std)
-    learner = Learner(config, schema.weights, start, frozen, material, held)
-    learner.run(progress, title, Draft(resume, key))
-    result = _assess(_schema(learner, schema.scaler, conditions, schema), learner, conditions)
-    return result, _history(learner, Scaler.fit(schema.layout, train_data.rows()), [])
+    schema = doubted(assessed(schema.with_weights(weights), learner, conditions), dataset)
+    return schema, history_of(learner, scaler, notes)
 
 
 def _task(dataset: Dataset, masks: tuple[Mask, ...], x_out: tuple[str, ...]) -> tuple[Task, list[str]]:
@@ -190,7 +145,7 @@ def _with_linear_path(task: Task, scaler: Scaler, data: Dataset, latent: int) ->
     return replace(task, linear=path), mean, components
 
 
-def _material(
+def material_of(
     task: Task, scaler: Scaler, data: Dataset, conditions: tuple[str, ...], before: BodySchema | None = None
 ) -> Material:
     """Return the samples of a dataset, followed by the anchors of the previous schema.
@@ -223,13 +178,13 @@ def _mute(weights: Weights, task: Task, dead: np.ndarray, unused: int) -> None:
     last.offset[outputs] = 0.0
 
 
-def _key(config: TrainConfig, task: Task, dataset: Dataset, *arrays: np.ndarray) -> str:
+def draft_key(config: TrainConfig, task: Task, dataset: Dataset, *arrays: np.ndarray) -> str:
     """Return the key of a training for its draft."""
     masks = [label(m, task.layout.names) for m in task.masks]
     return key_of(config, task.layout, masks, task.x_out, dataset.conditions, dataset.rows(), *arrays)
 
 
-def _schema(
+def schema_of(
     learner: Learner, scaler: Scaler, conditions: tuple[str, ...], before: BodySchema | None = None
 ) -> BodySchema:
     """Build the schema from the learned weights, without errors and normal statistics."""
@@ -262,7 +217,7 @@ def _schema(
     )
 
 
-def _assess(schema: BodySchema, learner: Learner, conditions: tuple[str, ...]) -> BodySchema:
+def assessed(schema: BodySchema, learner: Learner, conditions: tuple[str, ...]) -> BodySchema:
     """Return the schema with errors and normal statistics of the held-out data without its outliers."""
     names = list(schema.biases)
     owners = np.array([names.index(c) for c in conditions] if names else [0] * len(conditions), int)
@@ -274,7 +229,8 @@ def _assess(schema: BodySchema, learner: Learner, conditions: tuple[str, ...]) -
     return assess(schema, *usable(learner.held), training=usable(learner.material))
 
 
-def _history(learner: Learner, scaler: Scaler, notes: list[str]) -> History:
+def history_of(learner: Learner, scaler: Scaler, notes: list[str]) -> History:
+    """Return the record of a finished training."""
     course, material = learner.course, learner.material
     dead = tuple(material.task.layout.element(int(index)) for index in scaler.dead)
     return History(

@@ -145,7 +145,7 @@ def tune(
         DatasetError: The data lack a signal of the model, or are in other units.
         NotEnoughData: The samples are too few.
     """
-    from gemuco.learning.train import fine_tune
+    from gemuco.learning.tune import fine_tune
 
     started = time.monotonic()
     settings = train_config(config, config.training.epochs, seed)

@@ -141,6 +141,7 @@ class GemucoService:
             self.clock,
             self._others_keep_time,
             self.acquaintance.learned,
+            1.0 / robot.rates.update,
         )
         self._solver: ModelSolver | None = None
         self.control, self.no_control = self._make_control(self.config)

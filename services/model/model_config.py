@@ -78,7 +78,9 @@ class UpdateConfig(Section):
     interval: Positive = 0.1
     """Samples of the window are at least this far apart [s], so that it spans some motion."""
     steps: Count = 3
-    """Each tick of the update loop makes this many gradient steps."""
+    """Each new sample is followed by this many gradient steps."""
+    repeats: Count = 30
+    """In a window of few samples a new sample is followed by up to this many times `steps`; 1: never by more."""
     rate: Positive = 1e-4
     """This is the learning rate of W."""
     bias_rate: Positive = 0.02

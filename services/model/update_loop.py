@@ -10,6 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 from msgspec.structs import replace
 
+from gemuco.adaption.update import SPREAD
 from gemuco.anomaly.healthy import learn_normal
 from gemuco.errors import NotEnoughData
 from gemuco.schema import BodySchema
@@ -21,11 +22,14 @@ from services.wire.messages import Update
 
 log = logging.getLogger(__name__)
 
-SPREAD = 0.1
-"""A sample joins the learner's window when an element moved this far since the last one [standard deviations]. A robot
-at rest would otherwise fill the window with one posture."""
-
-
+BUDGET = 0.25
+"""Gradient steps take at most about this share of a tick's period; the rest are taken in the next ticks."""
+STEP_COST = 2e-3
+"""A gradient step takes this time [s] until it was measured."""
+LEAST_COST = 1e-4
+"""A gradient step takes at least this time [s]."""
+COST_MEMORY = 0.2
+"""Each tick moves the measured time of a gradient step by this share."""
 NORMAL_AFTER = 200
 """After an update of W normal errors are learned anew as soon as this number of samples came, or the window is full."""
 
@@ -42,8 +46,8 @@ class BodyUpdater(Protocol):
         """Add one complete sample [unit]."""
         ...
 
-    def step(self) -> Any:
-        """Make some learning steps; return a `gemuco.adaption.update.UpdateResult`."""
+    def step(self, most: int) -> Any:
+        """Make at most this many gradient steps; return a `gemuco.adaption.update.UpdateResult`."""
         ...
 
 
@@ -65,6 +69,7 @@ class OnlineUpdate:
         clock: Clock,
         may_learn: Callable[[], bool] = lambda: True,
         learned: Callable[[BodySchema], None] = lambda schema: None,
+        period: float = 0.1,
     ) -> None:
         """Prepare.
 
@@ -78,11 +83,13 @@ class OnlineUpdate:
             clock: Source of time.
             may_learn: Whether learning is allowed in this tick; if not, samples are only collected.
             learned: Called with a model whose normal errors were learned from this body.
+            period: Time between two ticks [s].
         """
         self._may_learn, self._learned = may_learn, learned
         self._awaits_normal = False
         self.waited = 0
         """This is the number of ticks in which learning was not allowed."""
+        self._period, self._cost = period, STEP_COST
         self._freshness, self._living, self._config = freshness, living, config
         self._is_engaged = is_engaged
         self._make_learner, self._publish, self._clock = learner, publish, clock
@@ -208,7 +215,11 @@ class OnlineUpdate:
     def _learn(self, learner: BodyUpdater, sample: Values | None) -> Update:
         if sample is not None:
             learner.add(sample)
-        result = learner.step()
+        started = self._clock.monotonic()
+        result = learner.step(max(1, int(BUDGET * self._period / self._cost)))
+        if result.steps:
+            cost = (self._clock.monotonic() - started) / result.steps
+            self._cost = max(LEAST_COST, self._cost + COST_MEMORY * (cost - self._cost))
         if learner.schema is not self._living.schema and result.window:
             self._living.swap(learner.schema)
             self._since_change.clear()

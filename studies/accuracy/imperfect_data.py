@@ -15,7 +15,8 @@ from rich.console import Console
 from rich.table import Table
 
 from gemuco.dataset import Dataset, Episode
-from gemuco.learning.train import fine_tune, fit
+from gemuco.learning.train import fit
+from gemuco.learning.tune import fine_tune
 from gemuco.schema import BodySchema
 from hal.config import load_robot
 from services.learning.collector import Request, collect_direct

@@ -77,7 +77,7 @@ def by_window() -> dict[str, list[float]]:
         updater = Updater(schema, config)
         for _ in range(batch):
             updater.add(schema.layout.split(random.standard_normal(schema.layout.size)))
-        times["W update, 3 masks"].append(median(partial(updater._relearner.step, schema, True, False), 15))
+        times["W update, 3 masks"].append(median(partial(updater._relearner.step, schema, 1, True, False), 15))
     return times
 
 

@@ -85,7 +85,7 @@ def step_on_weights() -> Row:
     return faster(
         f"W update, {SAMPLES} samples x 3 masks, hidden 200",
         "torch eager with Adam",
-        lambda: updater._relearner.step(schema, True, False),
+        lambda: updater._relearner.step(schema, 1, True, False),
         torch_step(network, gates, tails, torch.from_numpy(lived.astype(np.float32)), random),
         1.7,
         "the time includes drawing, masking and the check of W",

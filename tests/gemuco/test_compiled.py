@@ -198,7 +198,7 @@ ALL_WAYS = """
 import numpy as np
 from gemuco import warm
 from gemuco.adaption.config import UpdateConfig
-from gemuco.adaption.update import adapt
+from gemuco.adaption.adapt import adapt
 from gemuco.anomaly import score as anomaly
 from gemuco.estimation import estimate
 from gemuco.compiled import bank, batch, chain, descent, inference, innovation, learning, newton, score

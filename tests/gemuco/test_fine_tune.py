@@ -8,7 +8,8 @@ from muscle_arm import LAYOUT, MuscleArm
 
 from gemuco.dataset import Dataset, Episode
 from gemuco.errors import DatasetError, NotEnoughData
-from gemuco.learning.train import TrainConfig, fine_tune, fit
+from gemuco.learning.train import TrainConfig, fit
+from gemuco.learning.tune import fine_tune
 from gemuco.signals import Layout
 
 FL = frozenset({"muscle_tension", "muscle_length"})
@@ -98,3 +99,32 @@ def test_says_what_is_wrong(simulated):
     values["muscle_tension"][:, 2] = np.nan
     with pytest.raises(NotEnoughData, match="No sample has all signals of any mask"):
         fine_tune(simulated, Dataset(LAYOUT, (Episode("heavy", values),)), GENTLE)
+
+
+def slow(body, count, seed):
+    """Samples of a motion whose neighbours resemble each other over a dozen samples."""
+    values = body.sample(count // 12 + 3, seed)
+    at = np.arange(count) / 12
+    low, share = at.astype(int), (at % 1.0)[:, None]
+    mixed = {name: (1.0 - share) * rows[low] + share * rows[low + 1] for name, rows in values.items()}
+    return mixed | {"muscle_length": body.length(mixed["joint_position"], mixed["muscle_tension"])}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("motion", [MuscleArm.sample, slow])
+def test_two_standard_deviations_cover_fresh_samples_after_100_rows(simulated, motion):
+    shares = []
+    for seed in range(5):
+        schema, _ = fine_tune(simulated, Dataset(LAYOUT, (Episode("heavy", motion(REAL, 100, 40 + seed)),)), GENTLE)
+        x = schema.normalise(REAL.sample(400, 999))
+        miss = np.abs(schema.infer(x, FL) - x)[:, :2] * schema.scaler.std[:2]  # [rad]
+        shares.append(np.mean(miss <= 2.0 * schema.errors["mask", FL][:2]))
+    assert 0.9 <= np.mean(shares) <= 0.98
+
+
+def test_rows_of_a_condition_that_cannot_be_divided_are_measured_once(simulated):
+    data = recorded({"heavy": REAL}, 24, 100)
+    alone = Dataset(LAYOUT, (*data.episodes, Episode("worn", REAL.sample(3, 1))))
+    schema, _ = fine_tune(simulated, alone, replace(GENTLE, epochs=3))
+    assert set(schema.biases) == {"light", "heavy", "worn"}
+    assert np.isfinite(schema.errors["mask", FL]).all()

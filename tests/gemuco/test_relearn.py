@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from gemuco.adaption.relearn import gates, mean_error
+from gemuco.adaption.gradient import gates, mean_error
 from gemuco.anomaly.score import score
 from gemuco.compiled.batch import under_masks
 from gemuco.estimation import estimate

@@ -12,7 +12,8 @@ from muscle_arm import LAYOUT, MuscleArm
 
 from gemuco.dataset import Dataset, Episode
 from gemuco.learning.draft import Draft
-from gemuco.learning.train import TrainConfig, fine_tune, fit
+from gemuco.learning.train import TrainConfig, fit
+from gemuco.learning.tune import fine_tune
 
 MASKS = [{"joint_position", "muscle_tension"}, {"muscle_tension", "muscle_length"}]
 CONFIG = TrainConfig(hidden=(16,), latent=5, epochs=20, batch=100, bias_size=1, patience=99)
@@ -122,7 +123,7 @@ def test_fine_tuning_goes_on_too(whole, tmp_path):
     straight = fine_tune(whole[0], real, config)
     path = tmp_path / "draft"
     with pytest.raises(Stopped):
-        fine_tune(whole[0], real, config, stop_at(0.5), resume=path)
+        fine_tune(whole[0], real, config, stop_at(0.5 / 6), resume=path)  # five more trainings measure its errors
     again = fine_tune(whole[0], real, config, resume=path)
     same(again, straight)
     assert again[1].resumed == 9

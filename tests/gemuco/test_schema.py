@@ -4,7 +4,7 @@ import pickle
 
 import numpy as np
 
-from gemuco.adaption.update import adapt
+from gemuco.adaption.adapt import adapt
 from gemuco.anomaly.score import score
 from gemuco.checkpoint import load, save
 from gemuco.controller import control

@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gemuco.adaption.update import adapt
+from gemuco.adaption.adapt import adapt
 from gemuco.anomaly.score import score
 from gemuco.controller import control
 from gemuco.errors import SchemaError, UnknownSignal, WrongSize

@@ -58,7 +58,7 @@ def test_waits_for_enough_and_drops_the_oldest(schema):
     updater = Updater(schema, UpdateConfig(window=20, minimum=10, batch=5, steps=1, replay=5))
     result = live(updater, WORN, 9)
     assert np.isnan(result.loss)
-    assert updater.schema is schema
+    assert updater.schema.weights is schema.weights
     result = live(updater, WORN, 21, seed=1)
     assert (result.window, result.dropped) == (20, 10)
     assert np.isfinite(result.loss)
@@ -127,3 +127,46 @@ def test_a_step_out_of_the_numbers_is_not_taken(schema):
     assert result.loss == np.inf
     assert all(np.isfinite(array).all() for array in updater.schema.weights.arrays())
     assert np.isfinite(joint_error(updater.schema, WORN))
+
+
+@pytest.mark.long
+def test_rare_samples_are_gone_through_more_often(schema):
+    rare = Updater(schema, UpdateConfig(rate=1e-3))
+    once = Updater(schema, UpdateConfig(rate=1e-3, repeats=1))
+    live(rare, WORN, 60)
+    live(once, WORN, 60)
+    assert joint_error(schema, WORN) > 0.2  # rad
+    assert joint_error(rare.schema, WORN) < 0.17  # rad
+    assert joint_error(rare.schema, WORN) < 0.9 * joint_error(once.schema, WORN)
+
+
+def test_steps_are_owed_and_paid_later(schema):
+    updater = Updater(schema, UpdateConfig(minimum=5, steps=2))
+    values = WORN.sample(6, 4)
+    rows = [{name: array[index] for name, array in values.items()} for index in range(6)]
+    for row in rows[:4]:
+        updater.add(row)
+    assert updater.owed == 0
+    updater.add(rows[4])
+    assert updater.owed == 2 * 30
+    assert updater.step(most=25).steps == 25
+    assert updater.owed == 35
+    assert updater.step().steps == 35
+    assert updater.step().steps == 0
+    settled = updater.schema
+    for _ in range(20):
+        updater.add(rows[4])
+        assert updater.step().steps == 0
+    assert updater.schema.weights is settled.weights, "a robot at rest does not pull W"
+
+
+def test_the_errors_of_a_short_change_are_seen_soon(schema):
+    """Without a gradient step W is that of the training, and its error on the worn arm is known after 30 samples."""
+    updater = Updater(schema, UpdateConfig(steps=0))
+    live(updater, WORN, 30)
+    claimed = updater.schema.errors["mask", FL][updater.schema.out_layout.slice("joint_position")]
+    assert np.linalg.norm(claimed) == pytest.approx(joint_error(schema, WORN), rel=0.35)
+    grown = {key: error for key, error in updater.schema.errors.items() if key[0] == "latent"}
+    assert grown
+    for key, error in grown.items():
+        assert error.mean() > schema.errors[key].mean()

@@ -3,7 +3,7 @@ import pytest
 from arm_model import MASKS, arm, fresh, small_model, states
 
 from gemuco.adaption.config import UpdateConfig as Learning
-from gemuco.adaption.update import Updater
+from gemuco.adaption.update import Updater, UpdateResult
 from gemuco.dataset import Dataset, Episode
 from gemuco.errors import NotEnoughData
 from gemuco.learning.train import TrainConfig, fit
@@ -154,3 +154,38 @@ def test_learning_gives_way_and_goes_on() -> None:
     told = bench.turn(20)
     assert told.window == window + 6
     assert bench.living.version > version
+
+
+class SlowLearner:
+    """A learner that owes steps of a known duration [s]."""
+
+    def __init__(self, schema: BodySchema, clock: ManualClock, duration: float, owed: int) -> None:
+        self.schema, self.owed, self.taken = schema, owed, []
+        self._clock, self._duration = clock, duration
+
+    def add(self, values: object) -> None:
+        self.owed += 1
+
+    def step(self, most: int) -> UpdateResult:
+        steps = min(most, self.owed)
+        self.owed -= steps
+        self.taken.append(steps)
+        self._clock.advance(steps * self._duration)
+        nothing = np.zeros(0)
+        return UpdateResult(steps, 0.1, 10, 0, nothing, nothing, True, False, 0.1, 0)
+
+
+@pytest.mark.parametrize("duration", [0.5e-3, 5e-3])
+def test_steps_for_rare_samples_leave_most_of_a_tick_free(duration: float) -> None:
+    bench = Bench()
+    learner = SlowLearner(bench.living.schema, bench.clock, duration, round(1.6 / duration))
+    bench.update._make_learner = lambda schema: learner
+    bench.turn(0)
+    bench.update.adapt(True)
+    for index in range(1, 100):
+        bench.turn(index)
+    late = learner.taken[15:50]
+    assert max(late) * duration <= 0.026  # [s], a quarter of the period
+    assert min(late) * duration >= 0.015
+    assert learner.owed == 0
+    assert learner.taken[-1] == 1, "what is new is still learned from at once"

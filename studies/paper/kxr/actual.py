@@ -7,7 +7,7 @@ from itertools import product
 import numpy as np
 
 from gemuco.dataset import Dataset, Episode
-from gemuco.learning.train import fine_tune
+from gemuco.learning.tune import fine_tune
 from gemuco.schema import BodySchema
 from hal.config import RobotConfig
 from services.learning.trainer import train_config

@@ -79,7 +79,12 @@ def recording_layout(robot: RobotConfig) -> Layout:
 
 
 def record(
-    robot: RobotConfig, arm: int, seed: int, duration: float, parts: Sequence[tuple[float, str]] = ()
+    robot: RobotConfig,
+    arm: int,
+    seed: int,
+    duration: float,
+    parts: Sequence[tuple[float, str]] = (),
+    rate: float = RATE,
 ) -> Dataset:
     """Record random motion of one arm.
 
@@ -89,13 +94,14 @@ def record(
         seed: Of the motion.
         duration: How long [s of the arm's time].
         parts: (time [s], part that breaks then), the earliest first.
+        rate: Rate of the samples [Hz].
 
     Returns:
         One episode; shorter than asked if a broken arm was stopped by its limits.
     """
     rows: list[dict[str, np.ndarray]] = []
     left = list(parts)
-    with ActualArm(robot, arm) as body:
+    with ActualArm(robot, arm, rate) as body:
         for command, hold in registry.load_object(robot.collect["motion"])(robot, seed):
             while left and body.elapsed() >= left[0][0]:
                 body.break_part(left.pop(0)[1])

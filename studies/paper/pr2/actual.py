@@ -8,7 +8,7 @@ import numpy as np
 from gemuco.adaption.config import UpdateConfig
 from gemuco.adaption.update import Updater
 from gemuco.dataset import Dataset, Episode
-from gemuco.learning.train import fine_tune
+from gemuco.learning.tune import fine_tune
 from gemuco.schema import BodySchema
 from hal.config import RobotConfig
 from services.hardware.stand_in import simulator_of

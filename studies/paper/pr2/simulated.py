@@ -44,7 +44,7 @@ UPDATES: Mapping[str, UpdateConfig | None] = {
     "p, then W (default)": UpdateConfig(),
     "p": UpdateConfig(what="bias"),
     "p by gradient": RECOGNISERS["gradient"],
-    "W": UpdateConfig(what="weights", optimiser="sgd", rate=0.01, replay=0, held_out=0, minimum=1),
+    "W": UpdateConfig(what="weights", optimiser="sgd", rate=0.01, replay=0, held_out=0, minimum=1, repeats=1),
     KNOWN: None,
 }
 """Updates while another grasp is held. W alone is as in the paper: without replay, by gradient descent with momentum
