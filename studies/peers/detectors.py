@@ -10,10 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from sklearn.covariance import LedoitWolf
 from sklearn.ensemble import HistGradientBoostingRegressor, IsolationForest
-from sklearn.linear_model import Ridge
 from sklearn.neighbors import LocalOutlierFactor, NearestNeighbors
 
-from studies.peers.estimators import scales
+from studies.peers.estimators import ALPHAS, scales, solve
 
 VERSION = 1
 """Number of this version of the detectors; results of another version are not taken from the cache."""
@@ -77,8 +76,12 @@ def residual(data: Healthy, fit: Fit) -> np.ndarray:
 
 
 def linear(x: np.ndarray, y: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """Fit ridge regression."""
-    return Ridge(alpha=1.0).fit(x, y).predict
+    """Fit ridge regression; its weight is chosen by two of ten blocks of time."""
+    held = np.isin(np.arange(len(x)) * 10 // len(x), (3, 8))
+    tried = solve(x[~held], y[~held], ALPHAS)
+    misses = [np.mean((x[held] @ weights + offset - y[held]) ** 2) for weights, offset in tried]
+    ((weights, offset),) = solve(x, y, ALPHAS[[int(np.argmin(misses))]])
+    return lambda query: query @ weights + offset
 
 
 def boosted(seed: int) -> Fit:

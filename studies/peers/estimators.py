@@ -28,6 +28,11 @@ FEATURES = 2500
 """With more polynomial features than this the degree is lowered."""
 GP_ROWS, GP_SEARCH_ROWS = 1500, 300
 """Largest numbers of rows of a Gaussian process, and of the search for its kernel."""
+GP_STEPS = 80
+GP_STARTS = ((1.0, 1e-2), (3.0, 1e-1), (0.5, 1e-3))
+"""Starts of the search: length per root of the number of inputs, and variance of the noise."""
+GP_NOISE = -1.3
+"""A logarithmic likelihood per row below this is hardly better than that of pure noise, -1.42."""
 IMPUTER_ROWS = 5000
 """Largest number of rows that an imputer keeps."""
 TREES, BOOSTS = 200, 400
@@ -140,12 +145,12 @@ def ridge(problem: Problem, degree: int = 1) -> np.ndarray:
     x, query = (x - mean) / std, (query - mean) / std
     held = problem.held_out()
     if 0 < held.sum() < len(held):
-        tried = _solve(x[~held], problem.y[~held], ALPHAS)
+        tried = solve(x[~held], problem.y[~held], ALPHAS)
         misses = [np.mean((x[held] @ weights + offset - problem.y[held]) ** 2) for weights, offset in tried]
         alpha = ALPHAS[int(np.argmin(misses))]
     else:
         alpha = 1e-3
-    ((weights, offset),) = _solve(x, problem.y, np.array([alpha]))
+    ((weights, offset),) = solve(x, problem.y, np.array([alpha]))
     return np.asarray(query @ weights + offset)
 
 
@@ -154,7 +159,7 @@ def _size(inputs: int, degree: int) -> int:
     return int(np.prod([inputs + k for k in range(1, degree + 1)]) // np.prod(range(1, degree + 1))) - 1
 
 
-def _solve(x: np.ndarray, y: np.ndarray, alphas: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+def solve(x: np.ndarray, y: np.ndarray, alphas: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return weights, shape (d, k), and offset, shape (k,), for every alpha."""
     centre, offset = x.mean(axis=0), y.mean(axis=0)
     x, y = x - centre, y - offset
@@ -168,44 +173,44 @@ def _solve(x: np.ndarray, y: np.ndarray, alphas: np.ndarray) -> list[tuple[np.nd
     return [(matrix, offset - centre @ matrix) for matrix in weights]
 
 
-class GaussianProcess:
-    """Gaussian process per element: radial kernel with a length per input, and noise.
-
-    The kernel is searched on the first condition, and a little further on each other one.
-    """
-
-    def __init__(self) -> None:
-        self._kernels: dict[int, Kernel] = {}
-
-    def __call__(self, problem: Problem) -> np.ndarray:
-        """Fit one condition, and predict."""
-        rows, search = problem.at_most(GP_ROWS), problem.at_most(GP_SEARCH_ROWS)
-        prediction = np.empty((len(problem.query), problem.y.shape[1]))
-        for k in range(problem.y.shape[1]):
-            start, steps = self._kernels.get(k, _kernel(problem.x.shape[1])), 10 if k in self._kernels else 80
-            kernel = self._kernels[k] = _search(start, search.x, search.y[:, k], steps)
-            model = GaussianProcessRegressor(kernel, optimizer=None).fit(rows.x, rows.y[:, k])
-            prediction[:, k] = model.predict(problem.query)
-        return prediction
+def gaussian_process(problem: Problem) -> np.ndarray:
+    """Fit a Gaussian process per element: radial kernel with a length per input, and noise."""
+    rows, search = problem.at_most(GP_ROWS), problem.at_most(GP_SEARCH_ROWS)
+    prediction = np.empty((len(problem.query), problem.y.shape[1]))
+    for k in range(problem.y.shape[1]):
+        kernel = _best_kernel(search.x, search.y[:, k])
+        model = GaussianProcessRegressor(kernel, optimizer=None).fit(rows.x, rows.y[:, k])
+        prediction[:, k] = model.predict(problem.query)
+    return prediction
 
 
-def _kernel(inputs: int) -> Kernel:
-    lengths = RBF(np.full(inputs, np.sqrt(inputs)), (1e-2, 1e5))
-    return ConstantKernel(1.0, (1e-3, 1e6)) * lengths + WhiteKernel(1e-2)
+def _best_kernel(x: np.ndarray, y: np.ndarray) -> Kernel:
+    """Search from one start, and from others if it ends where the kernel explains nothing: all is noise."""
+    best: tuple[float, Kernel] | None = None
+    for length, noise in GP_STARTS:
+        lengths = RBF(np.full(x.shape[1], length * np.sqrt(x.shape[1])), (1e-2, 1e5))
+        model = _search(ConstantKernel(1.0, (1e-3, 1e6)) * lengths + WhiteKernel(noise), x, y)
+        likelihood = model.log_marginal_likelihood_value_
+        if best is None or likelihood > best[0]:
+            best = likelihood, model.kernel_
+        if best[0] > GP_NOISE * len(y):
+            break
+    assert best is not None
+    return best[1]
 
 
-def _search(kernel: Kernel, x: np.ndarray, y: np.ndarray, steps: int) -> Kernel:
-    """Maximise the likelihood of a kernel by at most this number of steps of L-BFGS-B."""
+def _search(kernel: Kernel, x: np.ndarray, y: np.ndarray) -> GaussianProcessRegressor:
+    """Maximise the likelihood of a kernel by at most `GP_STEPS` steps of L-BFGS-B."""
 
     def descend(
         loss: Callable[[np.ndarray], tuple[float, np.ndarray]], start: np.ndarray, bounds: np.ndarray
     ) -> tuple[np.ndarray, float]:
-        end = minimize(loss, start, method="L-BFGS-B", jac=True, bounds=bounds, options={"maxiter": steps})
+        end = minimize(loss, start, method="L-BFGS-B", jac=True, bounds=bounds, options={"maxiter": GP_STEPS})
         return end.x, end.fun
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)  # a length at its bound: an input without effect
-        return GaussianProcessRegressor(kernel, optimizer=descend).fit(x, y).kernel_
+        return GaussianProcessRegressor(kernel, optimizer=descend).fit(x, y)
 
 
 def boosted_trees(problem: Problem) -> np.ndarray:
@@ -274,7 +279,7 @@ def knn_imputer(problem: Problem) -> np.ndarray:
 METHODS: dict[str, Method] = {
     "ridge": partial(by_condition, ridge),
     "cubic_ridge": partial(by_condition, partial(ridge, degree=3)),
-    "gaussian_process": lambda problem: by_condition(GaussianProcess(), problem),
+    "gaussian_process": partial(by_condition, gaussian_process),
     "boosted_trees": partial(one_hot, boosted_trees),
     "extra_trees": partial(one_hot, extra_trees),
     "iterative_imputer": partial(by_condition, iterative_imputer),

@@ -136,8 +136,18 @@ def test_peers_know_the_condition(tmp_path):
 def test_ridge_solves_more_inputs_than_rows():
     random = np.random.default_rng(1)
     x = random.normal(size=(30, 60))
-    (weights, offset), *_ = estimators._solve(x, x[:, :1] + 2.0, np.array([1e-8]))
+    (weights, offset), *_ = estimators.solve(x, x[:, :1] + 2.0, np.array([1e-8]))
     assert np.abs(x @ weights + offset - x[:, :1] - 2.0).max() < 1e-3
+
+
+def test_the_gaussian_process_does_not_end_in_pure_noise():
+    random = np.random.default_rng(4)
+    x = random.normal(size=(200, 7))
+    y = np.sin(x[:, :1]) + 0.3 * x[:, 1:2] * x[:, 2:3]
+    none = np.zeros(200, int)
+    problem = estimators.Problem(x, y, np.zeros((200, 0)), none, none, x[:50] * 0.9, none[:50], 0)
+    truth = np.sin(problem.query[:, :1]) + 0.3 * problem.query[:, 1:2] * problem.query[:, 2:3]
+    assert np.abs(estimators.METHODS["gaussian_process"](problem) - truth).mean() < 0.05
 
 
 def test_an_anomaly_is_scored_by_every_detector(tmp_path):
