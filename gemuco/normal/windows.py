@@ -19,6 +19,10 @@ DISJOINT = 12
 CERTAIN = 0.9
 """The promised rate of false alarms is kept with this probability, as far as logarithms of distances are normal."""
 
+SYSTEMATIC = 0.1
+"""A mean over a window varies by at least this share of the variance of one sample: under another p, or in another part
+of the motion, even a good model is off by a part of its noise."""
+
 FEWEST = 8.0
 """Fewer independent samples than this count as this many; the tolerance has no finite value below 5."""
 
@@ -35,12 +39,13 @@ def tolerance(false_alarm: float, independent: float) -> float:
     return (z + math.sqrt(max(0.0, z**2 - a * b))) / a
 
 
-def limit(values: np.ndarray, false_alarm: float, independent: float) -> float:
+def limit(values: np.ndarray, false_alarm: float, independent: float, least: float = 0.0) -> float:
     """Return the limit that values exceed with the probability `false_alarm`, the larger of two.
 
-    One is the tolerance limit of a normal distribution; the other is the observed quantile, for heavy tails.
+    One is the tolerance limit of a normal distribution whose standard deviation is not below `least`; the other is the
+    observed quantile, for heavy tails.
     """
-    normal = values.mean() + tolerance(false_alarm, independent) * values.std()
+    normal = values.mean() + tolerance(false_alarm, independent) * max(float(values.std()), least)
     return max(float(np.quantile(values, 1.0 - false_alarm)), float(normal))
 
 
@@ -114,12 +119,12 @@ class Windows:
             spread = moved.mean(axis=0) + 1e-9
             share = false_alarm if count == 1 else false_alarm / 2.0
             sizes.append(count)
-            variance.append(spread)
-            for values, known in (
-                (means(deviations, count), limits),
-                (np.log((moved / spread).mean(axis=1) + 1e-12), shifts),
+            variance.append(np.maximum(spread, SYSTEMATIC))
+            for values, least, known in (
+                (means(deviations, count), math.sqrt(SYSTEMATIC) * float(deviations.std()), limits),
+                (np.log((moved / spread).mean(axis=1) + 1e-12), 1e-6, shifts),
             ):
-                known.append((limit(values, share, independent), max(float(values.std()), 1e-6)))
+                known.append((limit(values, share, independent, least), max(float(values.std()), least)))
             count *= 2
         above, shifted = np.array(limits), np.array(shifts)
         return cls(np.array(sizes), above[:, 0], above[:, 1], np.array(variance), shifted[:, 0], shifted[:, 1])

@@ -77,7 +77,7 @@ def train(robot: RobotConfig, lived: Dataset, seed: int) -> BodySchema:
     rows, layout = rows_of(robot, lived), layout_of(robot)
     parts = np.split(np.arange(len(rows)), range(EPISODE, len(rows), EPISODE))
     data = Dataset(layout, tuple(Episode("actual", layout.split(rows[part])) for part in parts))
-    return fit(data, TrainConfig(epochs=60, batch=100, seed=seed), MASKS)[0]
+    return fit(data, TrainConfig(seed=seed), MASKS)[0]
 
 
 def shares(schema: BodySchema, rows: np.ndarray) -> dict[int, np.ndarray]:
@@ -111,7 +111,7 @@ def run_seed(run: Run, report: Progress) -> Outcome:
     muscles = robot.signals[TENSION].elements
     cuts = {muscle: recorded(f"cut_{muscle}", 710 + index, CUT, muscle) for index, muscle in enumerate(muscles)}
     report(0.5, "training")
-    schema = run.cached("model", lambda: train(robot, lived, seed))
+    schema = run.cached("schema", lambda: train(robot, lived, seed))
     rows = rows_of(robot, normal)
     learned = learn_normal(schema, rows, training=(rows_of(robot, lived), np.zeros((len(rows_of(robot, lived)), 0))))
     schema = schema.with_normal(learned)
