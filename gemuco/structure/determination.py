@@ -68,11 +68,11 @@ def determine(
     """
     dataset = as_dataset(data, units)
     config = TrainConfig() if config is None else config
-    if config.epochs is None:  # enough to rank masks
-        config = replace(config, epochs=max(1, config.epochs_for(len(dataset)) // 4))
     thresholds = Thresholds() if thresholds is None else thresholds
     check_kind("The settings of a training", config, TrainConfig, "a TrainConfig")
     check_kind("The thresholds", thresholds, Thresholds, "a Thresholds")
+    if config.epochs is None:  # enough to rank masks
+        config = replace(config, epochs=max(1, config.epochs_for(len(dataset)) // 4))
     alive, notes = _alive(dataset)
     judge = Judge(alive.layout.names, (), thresholds)
     most, fresh = MOST_SPLITS if splits is None else splits, list[MaskErrors]()
