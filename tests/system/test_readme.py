@@ -22,7 +22,8 @@ def test_the_first_program_prints_what_the_page_shows() -> None:
     )
     assert done.returncode == 0, done.stderr
     number = r"\d\.\d+"
-    assert re.sub(number, "#", done.stdout) == re.sub(number, "#", shown)
+    padded = number + " *"  # numpy pads a number whose last digit is 0
+    assert re.sub(padded, "# ", done.stdout) == re.sub(padded, "# ", shown)
     printed, expected = ([float(text) for text in re.findall(number, line)] for line in (done.stdout, shown))
     assert printed == pytest.approx(expected, abs=0.02)  # rad; the last digit differs between processors
     assert len([line for line in program.splitlines() if line]) == 12
