@@ -31,6 +31,7 @@ MANIFEST = "manifest.json"
 GAPS = ("normal.mean", "normal.rows", "normal.cloud")
 """These arrays are NaN where nothing is known."""
 SCALES = ("mean", "std", "low", "high", "dead")
+PATH = ("moments", "cross")
 
 
 def save(schema: BodySchema, folder: str | Path) -> None:
@@ -58,7 +59,6 @@ def save(schema: BodySchema, folder: str | Path) -> None:
             "encoder": [layer.activation for layer in schema.weights.encoder],
             "decoder": [layer.activation for layer in schema.weights.decoder],
             "straight": [layer.straight for layer in schema.weights.whole],
-            "ridge": schema.path.ridge,
         },
         "errors": [[method, label(mask, schema.layout.names)] for method, mask in schema.errors],
         "conditions": list(schema.biases),
@@ -97,7 +97,8 @@ def _tensors(schema: BodySchema) -> dict[str, np.ndarray]:
         tensors[f"errors.{index}"] = array
     for index, array in enumerate(schema.biases.values()):
         tensors[f"biases.{index}"] = array
-    tensors["linear.moments"], tensors["linear.cross"] = schema.path.moments, schema.path.cross
+    for name in PATH:
+        tensors[f"linear.{name}"] = getattr(schema.path, name)
     tensors["bias"] = schema.bias
     tensors["anchors"] = schema.anchors
     tensors["anchor_conditions"] = schema.anchor_conditions
@@ -182,9 +183,7 @@ def _schema(head: Mapping[str, Any], tensors: Mapping[str, np.ndarray]) -> BodyS
         bias=tensors["bias"],
         biases={condition: tensors[f"biases.{index}"] for index, condition in enumerate(head["conditions"])},
         manifest=head["facts"],
-        linear=LinearPath(tensors["linear.moments"], tensors["linear.cross"], float(head["network"]["ridge"]))
-        if head["version"] > 2
-        else None,
+        linear=LinearPath(*(tensors[f"linear.{name}"] for name in PATH)) if head["version"] > 2 else None,
     )
 
 
@@ -215,6 +214,7 @@ def _check_arrays(schema: BodySchema) -> None:
         ValueError: An array has the wrong shape or an impossible value.
     """
     size, outputs, p = schema.layout.size, len(schema.out_index), len(schema.bias)
+    parts = len(schema.path.moments)
     shapes: list[tuple[str, np.ndarray, tuple[int, ...]]] = [
         *((f"scaler.{name}", getattr(schema.scaler, name), (size,)) for name in SCALES[:-1]),
         *((f"p of '{condition}'", array, (p,)) for condition, array in schema.biases.items()),
@@ -222,8 +222,8 @@ def _check_arrays(schema: BodySchema) -> None:
             (f"error of {method}", array, (size if method == "input" else outputs,))
             for (method, _), array in schema.errors.items()
         ),
-        ("linear.moments", schema.path.moments, (len(schema.in_index) + 1,) * 2),
-        ("linear.cross", schema.path.cross, (len(schema.in_index) + 1, schema.path.width)),
+        ("linear.moments", schema.path.moments, (parts, *(len(schema.in_index) + 1,) * 2)),
+        ("linear.cross", schema.path.cross, (parts, len(schema.in_index) + 1, schema.path.width)),
         ("anchor_conditions", schema.anchor_conditions, (len(schema.anchors) if schema.biases else 0,)),
     ]
     if len(schema.anchors):

@@ -8,95 +8,108 @@ The second moments of the training data are kept instead of one matrix per mask:
 mask.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
-RIDGES = tuple(10.0**power for power in range(-9, 1))
-"""Candidate strengths of the regularisation, as shares of an element's variance."""
+RIDGES = 10.0 ** np.arange(-9.0, 1.0)
+"""Candidate strengths of the regularisation, as shares of the variance of an element."""
 FOLDS = 5
 """The strength is chosen on this many contiguous parts of the data, each predicted from the others."""
-MOST_MASKS = 16
-"""At most this many masks decide about the strength."""
+STILL = 1e-8
+"""Nothing is predicted from an element whose variance is below this [standard deviations squared]."""
 ROBUST = 3.0
 """The weight of a row falls when its error is above this many robust standard deviations."""
 PASSES = 3
 """Number of regressions, each with the weights that follow from the errors of the one before."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class LinearPath:
     """Ridge regression of the code l from the elements of x_in, under any mask.
 
     Attributes:
-        moments: Mean of the products of x_in and 1 [standard deviations squared], shape (in_size + 1, in_size + 1).
-        cross: Mean of the products of x_in and 1 with the code, shape (in_size + 1, width).
-        ridge: Strength of the regularisation.
+        moments: Sums of the products of x_in and 1 over each part of the data [standard deviations squared], shape
+            (parts, in_size + 1, in_size + 1).
+        cross: Sums of the products of x_in and 1 with the code, shape (parts, in_size + 1, width).
     """
 
     moments: np.ndarray
     cross: np.ndarray
-    ridge: float
+    _maps: dict[bytes, np.ndarray] = field(default_factory=dict, init=False, repr=False)
 
     @classmethod
     def none(cls, in_size: int) -> "LinearPath":
         """Return a path without code, as in a network without linear path."""
-        return cls(np.zeros((in_size + 1, in_size + 1)), np.zeros((in_size + 1, 0)), 1.0)
+        return cls(np.zeros((1, in_size + 1, in_size + 1)), np.zeros((1, in_size + 1, 0)))
 
     @classmethod
-    def fit(cls, x: np.ndarray, code: np.ndarray, gates: np.ndarray) -> "LinearPath":
+    def fit(cls, x: np.ndarray, code: np.ndarray) -> "LinearPath":
         """Learn from samples, oldest first.
 
         Args:
             x: x_in [standard deviations], shape (samples, in_size), complete.
             code: The code of each sample, shape (samples, width).
-            gates: 1 for the elements of x_in that each mask contains, else 0, shape (masks, in_size).
         """
         rows = np.concatenate([x, np.ones((len(x), 1))], axis=1)
-        gates = gates[np.linspace(0, len(gates) - 1, min(MOST_MASKS, len(gates))).astype(int)]
-        widest = gates[gates.sum(axis=1).argmax()]
-        weight = np.ones(len(rows))
+        parts = np.array_split(np.arange(len(rows)), FOLDS)
+        weight, whole = np.ones(len(rows)), np.ones(x.shape[1])
         for _ in range(PASSES):
-            path = cls._of(rows, code, weight, gates)
-            error = np.linalg.norm(code - rows @ path.map(widest), axis=1)
+            weighted = rows * weight[:, None]
+            path = cls(
+                np.stack([weighted[part].T @ rows[part] for part in parts]),
+                np.stack([weighted[part].T @ code[part] for part in parts]),
+            )
+            error = np.linalg.norm(code - rows @ path.map(whole), axis=1)
             limit = ROBUST * np.median(error)
             weight = np.minimum(1.0, limit / np.maximum(error, 1e-12)) if limit > 0.0 else np.ones(len(rows))
         return path
 
-    @classmethod
-    def _of(cls, rows: np.ndarray, code: np.ndarray, weight: np.ndarray, gates: np.ndarray) -> "LinearPath":
-        weighted, parts = rows * weight[:, None], np.array_split(np.arange(len(rows)), FOLDS)
-        moments = [weighted[part].T @ rows[part] for part in parts]
-        cross = [weighted[part].T @ code[part] for part in parts]
-        whole, total, count = np.sum(moments, axis=0), np.sum(cross, axis=0), weight.sum()
-        losses = np.zeros(len(RIDGES))
-        for index, ridge in enumerate(RIDGES):
-            for part, product in zip(moments, cross, strict=True):
-                rest = cls((whole - part) / count, (total - product) / count, ridge)
-                for gate in gates:
-                    line = rest.map(gate)
-                    losses[index] += np.sum(line * (part @ line)) - 2.0 * np.sum(line * product)
-        return cls(whole / count, total / count, RIDGES[int(losses.argmin())])
-
     @property
     def width(self) -> int:
         """Length of the code."""
-        return self.cross.shape[1]
+        return self.cross.shape[2]
 
     def map(self, gate: np.ndarray) -> np.ndarray:
         """Return the regression under a mask: l = (x_in, 1) map, shape (in_size + 1, width), float32.
 
+        Every element of the code has the strength that predicts the parts of the data best from the other parts.
+
         Args:
             gate: 1 for the elements of x_in that the mask contains, else 0, shape (in_size,).
         """
-        result = np.zeros(self.cross.shape, np.float32)
-        known = np.append(np.flatnonzero(gate), len(gate))
-        if self.width:
-            system = self.moments[np.ix_(known, known)].copy()
-            system[np.diag_indices(len(known) - 1)] += self.ridge * np.diag(system)[:-1] + 1e-10
-            system[-1, -1] += 1e-12
-            result[known] = np.linalg.solve(system, self.cross[known])
+        key = np.asarray(gate > 0).tobytes()
+        result = self._maps.get(key)
+        if result is None:
+            result = self._maps[key] = self._map(np.append(np.flatnonzero(gate), len(gate)))
         return result
+
+    def _map(self, known: np.ndarray) -> np.ndarray:
+        result = np.zeros(self.cross.shape[1:], np.float32)
+        if not self.width:
+            return result
+        moments, cross = self.moments[:, known[:, None], known], self.cross[:, known]
+        whole, total = moments.sum(axis=0), cross.sum(axis=0)
+        losses = np.zeros((len(RIDGES), self.width))
+        for part, product in zip(moments, cross, strict=True):
+            lines = _regressions(whole - part, total - product)
+            losses += np.einsum("ruw,ruw->rw", lines, part @ lines - 2.0 * product)
+        best = losses.argmin(axis=0)
+        result[known] = _regressions(whole, total)[best, :, np.arange(self.width)].T
+        return result
+
+
+def _regressions(moments: np.ndarray, cross: np.ndarray) -> np.ndarray:
+    """Return the regressions of all strengths, shape (strengths, n + 1, width); the last row is the constant."""
+    count = moments[-1, -1]
+    mean, center = moments[-1, :-1] / count, cross[-1] / count
+    covariance = moments[:-1, :-1] / count - np.outer(mean, mean)
+    is_alive = np.diag(covariance) > STILL
+    weight = np.where(is_alive, 1.0 / np.sqrt(np.where(is_alive, np.diag(covariance), 1.0)), 0.0)
+    values, turns = np.linalg.eigh(covariance * np.outer(weight, weight))
+    along = turns.T @ ((cross[:-1] / count - np.outer(mean, center)) * weight[:, None])
+    lines = turns @ (along / (np.maximum(values, 0.0) + RIDGES[:, None])[:, :, None]) * weight[:, None]
+    return np.concatenate([lines, (center - mean @ lines)[:, None]], axis=1)
 
 
 def basis(x_out: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:

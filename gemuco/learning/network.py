@@ -103,6 +103,7 @@ def with_linear_path(weights: Weights, mean: np.ndarray, components: np.ndarray,
             if not is_last:
                 into[:, narrow:] = np.eye(width)
             elif chain is weights.encoder:
+                matrix[:wide, :width], offset[:width] = 0.0, 0.0
                 into[:, :width] = np.eye(width)
             else:
                 matrix[:wide], offset[:] = 0.0, mean

@@ -141,7 +141,7 @@ def _with_linear_path(task: Task, scaler: Scaler, data: Dataset, latent: int) ->
     if len(x) < max(10, 2 * x.shape[1]):
         return task, np.zeros(y.shape[1]), np.zeros((0, y.shape[1]))
     mean, components = basis(y, width)
-    path = LinearPath.fit(x, (y - mean) @ components.T, task.through)
+    path = LinearPath.fit(x, (y - mean) @ components.T)
     return replace(task, linear=path), mean, components
 
 

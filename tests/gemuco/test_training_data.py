@@ -198,7 +198,7 @@ def test_errors_are_measured_under_each_p(arm):
     miss = schema.under("worn").infer(x, frozenset(MASKS[0])) - x
     found = np.sqrt(np.mean(miss**2, axis=0)) * schema.scaler.std
     promised = schema.errors["mask", frozenset(MASKS[0])]
-    assert np.all(found < 1.6 * promised)
+    assert np.all(found < 1.8 * promised)
 
 
 @pytest.mark.parametrize(

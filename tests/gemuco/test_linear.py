@@ -1,0 +1,104 @@
+import numpy as np
+import pytest
+
+from gemuco import TrainConfig, estimate, fit
+from gemuco.checkpoint import load, save
+from gemuco.compiled.chain import first as inputs_of
+from gemuco.compiled.chain import forward, pack, push_all, space
+from gemuco.layers import pull, push, run, trace
+from gemuco.learning.soap import Soap
+from gemuco.linear import LinearPath, basis
+
+SMALL = TrainConfig(hidden=(20,), latent=6, epochs=30, batch=50)
+UNITS = {"motor": "rad", "joint": "rad"}
+GEAR = np.array([[0.5, 0.1], [-0.2, 0.8]])
+
+
+def encoders(count: int, seed: int, reach: float = 1.0) -> dict[str, np.ndarray]:
+    """A body that is linear: a joint encoder behind a coupled gear."""
+    motor = np.random.default_rng(seed).uniform(-reach, reach, (count, 2))
+    return {"motor": motor, "joint": motor @ GEAR + 0.3}
+
+
+@pytest.fixture(scope="module")
+def schema():
+    episodes = [encoders(100, seed) for seed in range(6)]
+    return fit(episodes, SMALL, [{"motor"}, {"joint"}, {"motor", "joint"}], units=UNITS)[0]
+
+
+def test_a_linear_body_goes_on_along_the_line(schema):
+    inside, outside = encoders(50, 100), encoders(50, 101, reach=10.0)
+    for values, tolerance in ((inside, 0.002), (outside, 0.05)):  # rad
+        found = estimate(schema, {"motor": values["motor"]})["joint"]
+        assert np.abs(found.value - values["joint"]).max() < tolerance
+
+
+def test_a_stored_path_is_the_same(schema, tmp_path):
+    save(schema, tmp_path / "model")
+    again, values = load(tmp_path / "model"), encoders(5, 7)
+    given = {"joint": values["joint"]}
+    np.testing.assert_array_equal(estimate(again, given)["motor"].value, estimate(schema, given)["motor"].value)
+
+
+def test_the_folded_chain_is_the_network_and_has_its_derivatives(schema):
+    mask = frozenset({"motor"})
+    x = schema.normalise(encoders(1, 3))
+    inputs, chain = schema.network_input(x, mask), schema.chain(mask)
+    np.testing.assert_allclose(run(chain, inputs), run(schema.weights.whole, inputs), atol=1e-5)
+    assert any(layer.straight for layer in chain)
+    exact = tuple(
+        layer._replace(matrix=layer.matrix.astype(float), offset=layer.offset.astype(float)) for layer in chain
+    )
+    point, step = inputs.astype(float), 1e-5
+    moves = step * np.eye(inputs.shape[1])
+    slope = np.stack([(run(exact, point + move) - run(exact, point - move))[0] / (2.0 * step) for move in moves])
+    values = trace(exact, point)
+    np.testing.assert_allclose(
+        np.stack([push(exact, values, move[None] / step)[0] for move in moves]), slope, atol=1e-8
+    )
+    pulled = [pull(exact, values, row[None])[0] for row in np.eye(slope.shape[1])]
+    np.testing.assert_allclose(np.stack(pulled, axis=1), slope, atol=1e-8)
+    packed = pack(chain)
+    memory = space(packed, 1)
+    inputs_of(packed, memory, 1)[:] = inputs
+    forward(packed, memory, 1)
+    np.testing.assert_allclose(push_all(packed, memory, 1, 0), slope, atol=1e-5)
+
+
+def test_every_mask_has_its_own_regression():
+    random = np.random.default_rng(0)
+    x = random.standard_normal((400, 3))
+    code = x @ np.array([[1.0, 0.0], [0.0, 2.0], [0.0, 0.0]]) + 0.1
+    path = LinearPath.fit(x, code)
+    whole, part = path.map(np.ones(3)), path.map(np.array([1.0, 0.0, 1.0]))
+    np.testing.assert_allclose(whole, [[1.0, 0.0], [0.0, 2.0], [0.0, 0.0], [0.1, 0.1]], atol=1e-3)
+    np.testing.assert_allclose(part[0], [1.0, 0.0], atol=0.3)
+    assert not part[1].any()
+
+
+def test_single_wrong_rows_do_not_turn_the_line():
+    random = np.random.default_rng(1)
+    x = random.standard_normal((400, 1))
+    code = 2.0 * x + 0.01 * random.standard_normal((400, 1))
+    code[::50] += 30.0
+    path = LinearPath.fit(x, code)
+    np.testing.assert_allclose(path.map(np.ones(1))[:, 0], [2.0, 0.0], atol=0.02)
+
+
+def test_the_basis_restores_what_has_few_components():
+    random = np.random.default_rng(2)
+    y = random.standard_normal((200, 2)) @ random.standard_normal((2, 5)) + 1.0
+    mean, components = basis(y, 2)
+    np.testing.assert_allclose((y - mean) @ components.T @ components + mean, y, atol=1e-9)
+
+
+def test_soap_crosses_a_narrow_valley(schema):
+    chain = pack(schema.weights.whole)
+    goal = chain.flat.copy()
+    numbers, scale = np.zeros_like(goal), np.geomspace(1.0, 1e-2, len(goal)).astype(np.float32)
+    optimiser = Soap(chain)
+    for _ in range(300):
+        optimiser.move(numbers, scale * (numbers - goal), 0.02)
+    assert np.abs(numbers - goal).mean() < 0.1 * np.abs(goal).mean()
+    assert optimiser.time == 300
+    assert all(np.isfinite(array).all() for array in optimiser.state().values())
