@@ -16,6 +16,8 @@ RIDGES = 10.0 ** np.arange(-9.0, 1.0)
 """Candidate strengths of the regularisation, as shares of the variance of an element."""
 FOLDS = 5
 """The strength is chosen on this many contiguous parts of the data, each predicted from the others."""
+CACHED = 256
+"""At most this many regressions are cached."""
 STILL = 1e-8
 """Nothing is predicted from an element whose variance is below this [standard deviations squared]."""
 ROBUST = 3.0
@@ -81,6 +83,8 @@ class LinearPath:
         key = np.asarray(gate > 0).tobytes()
         result = self._maps.get(key)
         if result is None:
+            if len(self._maps) >= CACHED:
+                self._maps.clear()
             result = self._maps[key] = self._map(np.append(np.flatnonzero(gate), len(gate)))
         return result
 

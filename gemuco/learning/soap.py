@@ -106,7 +106,7 @@ class Soap:
     def move(self, numbers: np.ndarray, gradient: np.ndarray, rate: float) -> None:
         """Take one step; both arrays have shape (size,), float32."""
         self.time += 1
-        gain = np.float32(rate * math.sqrt(1.0 - KEEP**self.time) / (1.0 - KEEP**self.time))
+        gain = np.float32(rate / math.sqrt(1.0 - KEEP**self.time))  # Adam's, with equal shares
         for matrix in self._matrices:
             step = matrix.step(gradient[matrix.part].reshape(matrix.shape), self.time)
             numbers[matrix.part] -= gain * step.ravel()

@@ -121,7 +121,9 @@ class Search:
             starts = route.starts(start(), is_only_start)
         end = self._minimise(setup, request, starts, until) if setup.size else Descent(starts[0], math.nan, ())
         x = route.final(end.point)
-        if len(setup.held):
+        if len(_missed(request, x, setup.held)):  # a singular start, such as a straight arm, has no way to the value
+            end = self._minimise(setup, request, route.starts(start()), until)
+            x = route.final(end.point)
             _check_held(request, x, setup.held)
         self._warm, self._last = end.point, key
         loss = end.loss if setup.size else float(total(request.bounds, np.nan_to_num(x)[None], False)[0][0])
@@ -175,13 +177,18 @@ class Search:
         return end
 
 
+def _missed(request: Request, x: np.ndarray, held: np.ndarray) -> np.ndarray:
+    """Return the held elements that a prediction, shape (size,) [standard deviations], does not hold, shape (n,)."""
+    return held[np.abs(x[held] - request.held[held]) > HOLD_TOLERANCE]
+
+
 def _check_held(request: Request, x: np.ndarray, held: np.ndarray) -> None:
     """Refuse a result that does not satisfy a constraint.
 
     Raises:
         NotObservable: An element cannot be held at its value.
     """
-    for element in held[np.abs(x[held] - request.held[held]) > HOLD_TOLERANCE]:
+    for element in _missed(request, x, held):
         nearest, value = (request.schema.scaler.restore(vector)[element] for vector in (x, request.held))
         raise NotObservable(
             f"'{request.schema.layout.element(int(element))}' cannot be held at {value:.4g}: the nearest solution is "

@@ -14,7 +14,7 @@ from gemuco.signals import Layout
 
 FL = frozenset({"muscle_tension", "muscle_length"})
 MASKS = [{"joint_position", "muscle_tension"}, FL]
-CONFIG = TrainConfig(hidden=(40, 20), latent=7, epochs=60, batch=50, rate=1e-2, bias_size=2, patience=99, seed=1)
+CONFIG = TrainConfig(hidden=(40, 20), latent=7, epochs=60, batch=50, rate=1e-2, bias_size=2, patience=99)
 GENTLE = replace(CONFIG, rate=2e-3, epochs=30)
 BODIES = {"light": MuscleArm(softness=1.0), "heavy": MuscleArm(softness=2.0)}
 REAL = MuscleArm(softness=2.5, offset=(0.004, -0.003, 0.002, 0.0, -0.004))
@@ -49,7 +49,7 @@ def test_few_samples_are_enough(simulated, tuned):
     after = joint_error(schema.under("heavy"), REAL)
     alone = fit(recorded({"heavy": REAL}, 24, 100), CONFIG, MASKS)[0]
     assert after < 0.8 * before
-    assert after < 1.2 * joint_error(alone, REAL)
+    assert after < joint_error(alone, REAL)
     assert after < 0.15  # [rad]
     assert history.held_out[history.best_epoch] < history.held_out[0]
 

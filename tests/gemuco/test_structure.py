@@ -119,16 +119,16 @@ def test_each_sample_is_judged_under_the_bias_of_its_condition():
 def test_more_splits_average_over_what_is_held_out(data):
     one = determine(data, SHORT, Thresholds(1.0, 1.0), splits=1)
     two = determine(data, replace(SHORT, seed=1), Thresholds(1.0, 1.0), splits=1)
-    told = []
-    both = determine(data, SHORT, Thresholds(1.0, 1.0), lambda share, _: told.append(share), splits=2)
+    shares = []
+    both = determine(data, SHORT, Thresholds(1.0, 1.0), lambda share, _: shares.append(share), splits=2)
     for mask, value in both.L_m.items():
         assert value == pytest.approx((one.L_m[mask] + two.L_m[mask]) / 2)
         assert both.spread_m[mask] == pytest.approx(abs(one.L_m[mask] - two.L_m[mask]) / 2)
         assert np.isnan(one.spread_m[mask])
     assert (one.splits, both.splits) == (1, 2)
     assert "+-" in both.report()
-    assert told == sorted(told)
-    assert told[-1] == 1.0
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
 
 
 QUICK = TrainConfig(hidden=(40,), latent=8, epochs=12, batch=100, rate=2e-2, bias_size=1)
@@ -175,10 +175,10 @@ def test_errors_of_masks_are_those_of_the_network(measured):
         given = np.repeat(mask, [signal.size for signal in layout.signals])
         line = errors.path.map(given.astype(float))
         code = (truth * given) @ line[:-1] + line[-1]
-        told = run(errors.chain, np.concatenate([truth * given, code, tail, errors.p[rows]], axis=1))
+        prediction = run(errors.chain, np.concatenate([truth * given, code, tail, errors.p[rows]], axis=1))
         for index, name in enumerate(layout.names):
             span = layout.slice(name)
-            missed = np.where(there[:, span], (told - truth)[:, span] ** 2, 0.0).sum(axis=0) / there[:, span].sum(
+            missed = np.where(there[:, span], (prediction - truth)[:, span] ** 2, 0.0).sum(axis=0) / there[:, span].sum(
                 axis=0
             )
             assert shares[index] == pytest.approx(missed.sum() / errors.liveliness[span].sum(), rel=1e-3, abs=1e-6)

@@ -191,14 +191,14 @@ def test_p_that_follows_one_condition_is_of_length_0_and_of_many_of_length_3():
 
 def test_errors_are_measured_under_each_p(arm):
     soft = type(arm)(softness=3.0)
-    parts = [Episode(n, b.sample(150, s)) for s in range(5) for n, b in (("new", arm), ("worn", soft))]
+    parts = [Episode(n, b.sample(400, s)) for s in range(5) for n, b in (("new", arm), ("worn", soft))]
     schema, _ = fit(Dataset(LAYOUT, tuple(parts)), replace(SMALL, bias_size=1), MASKS)
     values = soft.sample(400, 50)
     x = schema.normalise(values)
     miss = schema.under("worn").infer(x, frozenset(MASKS[0])) - x
     found = np.sqrt(np.mean(miss**2, axis=0)) * schema.scaler.std
     promised = schema.errors["mask", frozenset(MASKS[0])]
-    assert np.all(found < 1.8 * promised)
+    assert np.all(found < 1.6 * promised)
 
 
 @pytest.mark.parametrize(
