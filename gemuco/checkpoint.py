@@ -23,15 +23,15 @@ from gemuco.signals import Layout, Signal
 from gemuco.writing import writing
 
 FORMAT = "gemuco.body_schema"
-VERSION = 3
-READABLE = (2, 3)
-"""Versions that can be read; version 2 has no linear path."""
+VERSION = 4
+READABLE = (2, 3, 4)
+"""Versions that can be read; version 2 has no linear path, version 3 has it within the network only."""
 TENSORS = "model.safetensors"
 MANIFEST = "manifest.json"
 GAPS = ("normal.mean", "normal.rows", "normal.cloud")
 """These arrays are NaN where nothing is known."""
 SCALES = ("mean", "std", "low", "high", "dead")
-PATH = ("moments", "cross")
+PATH = ("moments", "cross", "outputs")
 
 
 def save(schema: BodySchema, folder: str | Path) -> None:
@@ -99,6 +99,8 @@ def _tensors(schema: BodySchema) -> dict[str, np.ndarray]:
         tensors[f"biases.{index}"] = array
     for name in PATH:
         tensors[f"linear.{name}"] = getattr(schema.path, name)
+    for index, mask in enumerate(schema.masks):
+        tensors[f"shares.{index}"] = schema.shares.get(mask, np.ones(len(schema.out_index)))
     tensors["bias"] = schema.bias
     tensors["anchors"] = schema.anchors
     tensors["anchor_conditions"] = schema.anchor_conditions
@@ -166,11 +168,12 @@ def _schema(head: Mapping[str, Any], tensors: Mapping[str, np.ndarray]) -> BodyS
     if head["normal"] is not None:
         parts = {name.removeprefix("normal."): array for name, array in tensors.items() if name.startswith("normal.")}
         normal = Normal.of(parts, head["normal"])
+    masks = tuple(frozenset(text.split("+")) for text in head["masks"])
     return BodySchema(
         layout=layout,
         x_in=tuple(head["x_in"]),
         x_out=tuple(head["x_out"]),
-        masks=tuple(frozenset(text.split("+")) for text in head["masks"]),
+        masks=masks,
         scaler=Scaler(*(tensors[f"scaler.{name}"] for name in SCALES)),
         weights=_weights(head, tensors),
         errors={
@@ -183,8 +186,15 @@ def _schema(head: Mapping[str, Any], tensors: Mapping[str, np.ndarray]) -> BodyS
         bias=tensors["bias"],
         biases={condition: tensors[f"biases.{index}"] for index, condition in enumerate(head["conditions"])},
         manifest=head["facts"],
-        linear=LinearPath(*(tensors[f"linear.{name}"] for name in PATH)) if head["version"] > 2 else None,
+        linear=_path(tensors, layout.subset(tuple(head["x_out"])).size) if head["version"] > 2 else None,
+        shares={mask: tensors[f"shares.{i}"] for i, mask in enumerate(masks)} if head["version"] > 3 else {},
     )
+
+
+def _path(tensors: Mapping[str, np.ndarray], outputs: int) -> LinearPath:
+    """Return the linear path; version 3 does not have its outputs, and does not need them."""
+    moments, cross = tensors["linear.moments"], tensors["linear.cross"]
+    return LinearPath(moments, cross, tensors.get("linear.outputs", np.zeros((cross.shape[2] + 1, outputs))))
 
 
 def _weights(head: Mapping[str, Any], tensors: Mapping[str, np.ndarray]) -> Weights:
@@ -224,6 +234,8 @@ def _check_arrays(schema: BodySchema) -> None:
         ),
         ("linear.moments", schema.path.moments, (parts, *(len(schema.in_index) + 1,) * 2)),
         ("linear.cross", schema.path.cross, (parts, len(schema.in_index) + 1, schema.path.width)),
+        ("linear.outputs", schema.path.outputs, (schema.path.width + 1, outputs)),
+        *(("shares", share, (outputs,)) for share in schema.shares.values()),
         ("anchor_conditions", schema.anchor_conditions, (len(schema.anchors) if schema.biases else 0,)),
     ]
     if len(schema.anchors):
