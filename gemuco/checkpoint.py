@@ -1,7 +1,12 @@
-"""A body schema on disk: model.safetensors for the arrays, manifest.json for everything else."""
+"""A body schema on disk: a safetensors file for the arrays, manifest.json for everything else.
+
+The manifest names the file of its arrays, so the replacement of the manifest replaces the model in one step. The model
+before is kept: its manifest has the suffix `KEPT`.
+"""
 
 import hashlib
 import json
+import re
 from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path
@@ -20,14 +25,17 @@ from gemuco.normal import Normal
 from gemuco.scaler import Scaler
 from gemuco.schema import BodySchema, check_schema
 from gemuco.signals import Layout, Signal
-from gemuco.writing import writing
+from gemuco.writing import replace, replacing, writing
 
 FORMAT = "gemuco.body_schema"
 VERSION = 3
 READABLE = (2, 3)
 """Versions that can be read; version 2 has no linear path."""
-TENSORS = "model.safetensors"
+TENSORS = re.compile(r"model(-[0-9a-f]+)?\.safetensors")
+"""Names of files of arrays; models of the format before have no hash in this name."""
 MANIFEST = "manifest.json"
+KEPT = MANIFEST + ".before"
+"""Manifest of the model before the last save; move it to `MANIFEST` to go back to that model."""
 GAPS = ("normal.mean", "normal.rows", "normal.cloud")
 """These arrays are NaN where nothing is known."""
 SCALES = ("mean", "std", "low", "high", "dead")
@@ -35,9 +43,10 @@ PATH = ("moments", "cross")
 
 
 def save(schema: BodySchema, folder: str | Path) -> None:
-    """Write model.safetensors and manifest.json into a folder.
+    """Write a model into a folder in one step; a process that is killed meanwhile leaves the former model.
 
-    The manifest is written last. It contains a hash of the arrays and a hash of itself, so that `load` detects damage.
+    The former model is kept beside it (`KEPT`), and older ones are removed. The manifest has a hash of the arrays and a
+    hash of itself, so that `load` detects damage.
 
     Raises:
         NotWritten: The disk is full, or the folder may not be written to.
@@ -45,7 +54,37 @@ def save(schema: BodySchema, folder: str | Path) -> None:
     check_schema(schema)
     folder = Path(folder)
     data = save_tensors({name: np.ascontiguousarray(array) for name, array in _tensors(schema).items()})
-    head = {
+    digest = hashlib.sha256(data).hexdigest()
+    name = f"model-{digest[:12]}.safetensors"
+    text = json.dumps(signed(_head(schema) | {"tensors": {"file": name, "sha256": digest}}), indent=2).encode()
+    with writing("The model", folder), replacing(folder / MANIFEST) as manifest:
+        kept = _keep(folder, text)
+        replace(folder / name, data)
+        for old in folder.glob("model*.safetensors*"):
+            if old.name not in (name, *kept):
+                old.unlink()
+        manifest.write(text)
+
+
+def _keep(folder: Path, text: bytes) -> list[str]:
+    """Keep the present model if it is whole and another one; return the files of arrays that are still needed."""
+    files = []
+    for path in (folder / KEPT, folder / MANIFEST):
+        try:
+            present = path.read_bytes()
+            head = _manifest(path)
+            _data(folder, head)
+        except (OSError, CheckpointError, KeyError, TypeError):
+            continue  # it is missing or damaged
+        files.append(head["tensors"]["file"])
+        if path.name == MANIFEST and present != text:
+            replace(folder / KEPT, present)
+    return files
+
+
+def _head(schema: BodySchema) -> dict[str, Any]:
+    """Return the manifest without the entry on arrays and without its hash."""
+    return {
         "format": FORMAT,
         "version": VERSION,
         "signals": [
@@ -64,12 +103,7 @@ def save(schema: BodySchema, folder: str | Path) -> None:
         "conditions": list(schema.biases),
         "normal": None if schema.normal is None else schema.normal.facts(),
         "facts": dict(schema.manifest),
-        "tensors": {"file": TENSORS, "sha256": hashlib.sha256(data).hexdigest()},
     }
-    with writing("The model", folder):
-        folder.mkdir(parents=True, exist_ok=True)
-        _replace(folder / TENSORS, data)
-        _replace(folder / MANIFEST, json.dumps(signed(head), indent=2).encode())
 
 
 def signed(head: Mapping[str, Any]) -> dict[str, Any]:
@@ -77,12 +111,6 @@ def signed(head: Mapping[str, Any]) -> dict[str, Any]:
     entries = {name: value for name, value in head.items() if name != "sha256"}
     text = json.dumps(entries, sort_keys=True)
     return {**entries, "sha256": hashlib.sha256(text.encode()).hexdigest()}
-
-
-def _replace(path: Path, data: bytes) -> None:
-    draft = path.with_name(path.name + ".draft")
-    draft.write_bytes(data)
-    draft.replace(path)
 
 
 def _tensors(schema: BodySchema) -> dict[str, np.ndarray]:
@@ -114,15 +142,9 @@ def load(folder: str | Path) -> BodySchema:
         CheckpointError: The model is missing, damaged, not a body schema, or of another version.
     """
     folder = Path(folder)
-    head = _manifest(folder)
+    head = _manifest(folder / MANIFEST)
     try:
-        data = (folder / TENSORS).read_bytes()
-    except OSError:
-        raise CheckpointError(f"The model in '{folder}' has no {TENSORS}; train it again.") from None
-    try:
-        if hashlib.sha256(data).hexdigest() != head["tensors"]["sha256"]:
-            raise CheckpointError(f"{TENSORS} in '{folder}' does not match its manifest; train the model again.")
-        schema = _schema(head, load_tensors(data))
+        schema = _schema(head, load_tensors(_data(folder, head)))
         _check_arrays(schema)
         return schema
     except CheckpointError:
@@ -130,18 +152,37 @@ def load(folder: str | Path) -> BodySchema:
     except (KeyError, TypeError, ValueError, AttributeError, IndexError, SafetensorError, SchemaError) as error:
         reason = str(error).strip("'\"").rstrip(".")
         raise CheckpointError(
-            f"The model in '{folder}' is damaged ({type(error).__name__}: {reason}); train it again."
+            f"The model in '{folder}' is damaged ({type(error).__name__}: {reason}); {_advice(folder)}."
         ) from None
 
 
-def _manifest(folder: Path) -> dict[str, Any]:
-    path = folder / MANIFEST
+def _data(folder: Path, head: Mapping[str, Any]) -> bytes:
+    """Return the arrays of a manifest as they are in the file, checked against the hash in the manifest."""
+    name, digest = head["tensors"]["file"], head["tensors"]["sha256"]
+    if not TENSORS.fullmatch(name):
+        raise CheckpointError(f"The manifest in '{folder}' names {name!r} in place of a file of arrays beside it.")
+    try:
+        data = (folder / name).read_bytes()
+    except OSError:
+        raise CheckpointError(f"The model in '{folder}' has no {name}; {_advice(folder)}.") from None
+    if hashlib.sha256(data).hexdigest() != digest:
+        raise CheckpointError(f"{name} in '{folder}' does not match its manifest; {_advice(folder)}.")
+    return data
+
+
+def _advice(folder: Path) -> str:
+    again = "train the model again"
+    return f"{again}, or go back to the model before ({KEPT})" if (folder / KEPT).exists() else again
+
+
+def _manifest(path: Path) -> dict[str, Any]:
+    folder = path.parent
     try:
         head = json.loads(path.read_bytes())
     except OSError:
         raise CheckpointError(f"There is no model in '{folder}': {MANIFEST} is missing. Run `gemuco train`.") from None
-    except ValueError:
-        raise CheckpointError(f"'{path}' is damaged: it is not JSON; train the model again.") from None
+    except (ValueError, RecursionError):
+        raise CheckpointError(f"'{path}' is damaged: it is not JSON; {_advice(folder)}.") from None
     if not isinstance(head, dict) or head.get("format") != FORMAT:
         kind = head.get("format") if isinstance(head, dict) else type(head).__name__
         raise CheckpointError(f"'{path}' does not describe a body schema but {kind!r}.")
@@ -153,7 +194,7 @@ def _manifest(folder: Path) -> dict[str, Any]:
             f"The model in '{folder}' has version {version!r}; this gemuco reads {VERSION}: {advice}."
         )
     if signed(head) != head:
-        raise CheckpointError(f"'{path}' is damaged: it was changed after it was written; train the model again.")
+        raise CheckpointError(f"'{path}' is damaged: it was changed after it was written; {_advice(folder)}.")
     return head
 
 

@@ -1,13 +1,12 @@
 """Role files: one self-contained zenoh configuration per role, with certificate, key and password inside."""
 
 import json
-import os
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from gemuco.writing import replacing
 from services.errors import ServiceError
 from services.security import access
 from services.security.authority import Identity, decoded, encoded
@@ -74,16 +73,9 @@ def configuration(plan: InstallationPlan, name: str, known: Mapping[str, Secrets
 
 
 def write(path: Path, content: str, mode: int = 0o600) -> None:
-    """Write a whole file or none, with the permissions `mode` from the first byte on."""
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "w") as file:
-            os.fchmod(handle, mode)
-            file.write(content)
-        Path(name).replace(path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
+    """Write a file in one step, with the permissions `mode` from the first byte on."""
+    with replacing(path, mode) as file:
+        file.write(content.encode())
 
 
 def text_of(content: Mapping[str, Any]) -> str:
