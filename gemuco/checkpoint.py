@@ -7,7 +7,7 @@ before is kept: its manifest has the suffix `KEPT`.
 import hashlib
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,8 @@ from gemuco.layers import LINEAR, Chain, Layer, Weights, check_activation
 from gemuco.linear import LinearPath
 from gemuco.masks import label
 from gemuco.normal import Normal
-from gemuco.scaler import Scaler
+from gemuco.normal.soundness import check_normal
+from gemuco.scaler import FLOOR, Scaler
 from gemuco.schema import BodySchema, check_schema
 from gemuco.signals import Layout, Signal
 from gemuco.writing import replace, replacing, writing
@@ -38,8 +39,12 @@ KEPT = MANIFEST + ".before"
 """Manifest of the model before the last save; move it to `MANIFEST` to go back to that model."""
 GAPS = ("normal.mean", "normal.rows", "normal.cloud")
 """These arrays are NaN where nothing is known."""
+SIGNATURE = "signature"
+"""Entry of the manifest; it is not part of what is signed."""
 SCALES = ("mean", "std", "low", "high", "dead")
 PATH = ("moments", "cross")
+NARROWEST = 1e-5
+"""The standard deviation of an element is at least this share of its range: it left its mean in one of 1e10 samples."""
 
 
 def save(schema: BodySchema, folder: str | Path) -> None:
@@ -50,9 +55,14 @@ def save(schema: BodySchema, folder: str | Path) -> None:
 
     Raises:
         NotWritten: The disk is full, or the folder may not be written to.
+        CheckpointError: `load` would refuse it, so the former model stays.
     """
     check_schema(schema)
     folder = Path(folder)
+    try:
+        _check_arrays(schema)
+    except ValueError as error:
+        raise CheckpointError(f"The model is not saved in '{folder}', because it is not sound: {error}.") from None
     data = save_tensors({name: np.ascontiguousarray(array) for name, array in _tensors(schema).items()})
     digest = hashlib.sha256(data).hexdigest()
     name = f"model-{digest[:12]}.safetensors"
@@ -107,10 +117,33 @@ def _head(schema: BodySchema) -> dict[str, Any]:
 
 
 def signed(head: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the manifest with the hash of all its other entries."""
-    entries = {name: value for name, value in head.items() if name != "sha256"}
-    text = json.dumps(entries, sort_keys=True)
-    return {**entries, "sha256": hashlib.sha256(text.encode()).hexdigest()}
+    """Return the manifest with the hash of all its other entries but its signature."""
+    own = {name: value for name, value in head.items() if name != "sha256"}
+    text = json.dumps({name: value for name, value in own.items() if name != SIGNATURE}, sort_keys=True)
+    return {**own, "sha256": hashlib.sha256(text.encode()).hexdigest()}
+
+
+def sign(folder: str | Path, signer: Callable[[bytes], str]) -> None:
+    """Write a signature into the manifest of a saved model, in one step.
+
+    Args:
+        folder: The model.
+        signer: Returns the signature of the digest of the whole model.
+
+    Raises:
+        CheckpointError: The model cannot be loaded.
+        NotWritten: The folder may not be written to.
+    """
+    folder = Path(folder)
+    load(folder)
+    with writing("The signature", folder), replacing(folder / MANIFEST) as manifest:
+        head = _manifest(folder / MANIFEST)
+        manifest.write(json.dumps(head | {SIGNATURE: signer(_digest(head))}, indent=2).encode())
+
+
+def _digest(head: Mapping[str, Any]) -> bytes:
+    """Return a digest that covers manifest and arrays, and is no digest of anything else."""
+    return f"{FORMAT} {head['sha256']}".encode()
 
 
 def _tensors(schema: BodySchema) -> dict[str, np.ndarray]:
@@ -135,14 +168,21 @@ def _tensors(schema: BodySchema) -> dict[str, np.ndarray]:
     return tensors
 
 
-def load(folder: str | Path) -> BodySchema:
+def load(folder: str | Path, verify: Callable[[bytes, str], None] | None = None) -> BodySchema:
     """Read a schema that `save` wrote.
+
+    Args:
+        folder: The model.
+        verify: Called with the digest of the whole model and its signature, which is empty without one; it raises an
+            error if the model may not be used.
 
     Raises:
         CheckpointError: The model is missing, damaged, not a body schema, or of another version.
     """
     folder = Path(folder)
     head = _manifest(folder / MANIFEST)
+    if verify is not None:
+        verify(_digest(head), str(head.get(SIGNATURE, "")))
     try:
         schema = _schema(head, load_tensors(_data(folder, head)))
         _check_arrays(schema)
@@ -249,7 +289,7 @@ def _activation(name: Any) -> str:
 
 
 def _check_arrays(schema: BodySchema) -> None:
-    """Check that the arrays of a schema fit each other.
+    """Check that the arrays of a schema fit each other and mean something.
 
     Raises:
         ValueError: An array has the wrong shape or an impossible value.
@@ -282,5 +322,30 @@ def _check_arrays(schema: BodySchema) -> None:
     ):
         if len(index) and not (index.min() >= 0 and index.max() < count):
             raise ValueError(f"array {name} points beyond {count} entries")
-    if (schema.scaler.std <= 0).any():
-        raise ValueError("array scaler.std is not positive")
+    _check_scale(schema)
+    for (method, _), array in schema.errors.items():
+        if (array < 0.0).any():
+            raise ValueError(f"an error of {method} is negative")
+    if schema.normal is not None:
+        check_normal(schema.normal, schema.scaler.std[schema.out_index], size + p)
+
+
+def _check_scale(schema: BodySchema) -> None:
+    """Check the scale: samples of a signal that vary by its range have a standard deviation of that order.
+
+    Raises:
+        ValueError: No training data have such a scale.
+    """
+    scaler = schema.scaler
+    moving = np.ones(schema.layout.size, bool)
+    moving[scaler.dead] = False
+    for name in schema.layout.names:
+        part = schema.layout.slice(name)
+        std, widths = scaler.std[part], (scaler.high - scaler.low)[part]
+        largest = float(widths[moving[part]].max(initial=0.0)) or 1.0  # 1 unit if the whole signal is dead
+        if (std <= 0.0).any() or (widths < 0.0).any():
+            raise ValueError(f"array scaler.std of {name} is not positive, or its range is not")
+        if std.max() > largest or (std < NARROWEST * widths).any() or std.min() < 0.9 * FLOOR * std.max():
+            raise ValueError(
+                f"array scaler.std of {name}, {std.min():.3g} to {std.max():.3g}, does not fit a range of {largest:.3g}"
+            )

@@ -21,7 +21,7 @@ def runtime_folder() -> Path:
         raise ServiceError(f"The folder for locks, '{error.filename}', cannot be made: {error.strerror}.") from None
 
 
-def open_file(path: Path, flags: int) -> int:
+def open_file(path: str, flags: int) -> int:
     """Open a file of the runtime folder for this user alone, and follow no link; an `opener` of `open`."""
     return os.open(path, flags | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
 

@@ -5,7 +5,7 @@ import fcntl
 import logging
 import os
 from collections.abc import Iterable, Iterator
-from typing import TextIO
+from typing import IO
 
 import zenoh
 
@@ -30,7 +30,7 @@ class ServiceLock:
 
     def __init__(self, robot: str, service: str) -> None:
         self.robot, self.service = robot, service
-        self._file: TextIO | None = None
+        self._file: IO[str] | None = None
 
     def acquire(self) -> None:
         """Take the lock.

@@ -70,6 +70,10 @@ class Authority:
             builder = builder.add_extension(x509.SubjectAlternativeName(names), critical=False)
         return Identity(_pem(builder.sign(signer, hashes.SHA256())), _key_pem(key))
 
+    def signature(self, data: bytes) -> str:
+        """Return a signature of data, which `services.wire.signature` checks with the certificate."""
+        return base64.b64encode(_private(self.identity.key).sign(data, ec.ECDSA(hashes.SHA256()))).decode()
+
 
 def encoded(pem: bytes) -> str:
     """Return PEM as inline text for zenoh's configuration."""

@@ -124,6 +124,12 @@ class CheckSessions:
         path = self.folder / f"{name}.json"
         return copy.deepcopy(role_file(path))
 
+    def weakened(self, name: str, called: str) -> dict[str, Any]:
+        """Return a fresh copy of a member's role file; a test of the check may have weakened it."""
+        configured = self.of(name)
+        self._weaken(called, configured)
+        return configured
+
     def outside(self, name: str, where: str = "") -> dict[str, Any]:
         """Return a member's role file as an attacker uses it: for a client of the router or `where`, without rules."""
         copied = self.of(name)
