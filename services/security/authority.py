@@ -19,6 +19,7 @@ AUTHORITY_DAYS = 3650
 BACKDATED = timedelta(days=1)
 """Certificates are valid from this long before now, because the clock of a robot that just started may be late."""
 _BOTH = x509.ExtendedKeyUsage([ExtendedKeyUsageOID.CLIENT_AUTH, ExtendedKeyUsageOID.SERVER_AUTH])
+_CLIENT = x509.ExtendedKeyUsage([ExtendedKeyUsageOID.CLIENT_AUTH])
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,8 +66,9 @@ class Authority:
         key = ec.generate_private_key(ec.SECP256R1())
         builder = _builder(_name(name), issuer, key.public_key(), until)
         builder = builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
-        builder = builder.add_extension(_BOTH, critical=False)
-        if names := [_general_name(host) for host in hosts]:
+        names = [_general_name(host) for host in hosts]
+        builder = builder.add_extension(_BOTH if names else _CLIENT, critical=False)
+        if names:
             builder = builder.add_extension(x509.SubjectAlternativeName(names), critical=False)
         return Identity(_pem(builder.sign(signer, hashes.SHA256())), _key_pem(key))
 
