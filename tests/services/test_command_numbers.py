@@ -40,7 +40,7 @@ def test_times_of_a_lease(case: Case) -> None:
     assert [SHORTEST, LONGEST, STREAM] == [0.2, 60.0, 1.0]
     assert [WITHIN, HEARD_WITHIN, NEWS_FOR, LOG_EVERY, DEPTH] == [1.0, 2.5, 5.0, 1.0, 8]
     for seconds in (0.2, 60.0, 1):
-        case.lease.take(ANNA, seconds)
+        case.lease.take(ANNA, seconds, 7)
         assert case.lease.left() == pytest.approx(seconds)
     for wrong in (0.199, 60.001, True):
         with pytest.raises(BadArguments):
@@ -57,7 +57,7 @@ def test_a_new_lease_is_nobodys() -> None:
     assert lease.left() == 0.0
     lease.check(UNKNOWN)
     lease.end_stream()
-    lease.give_back(UNKNOWN)
+    lease.give_back(UNKNOWN, 0)
     assert lease.tenure is None
 
 
@@ -66,7 +66,7 @@ def test_the_holder_takes_its_lease_again_under_the_same_number(case: Case) -> N
     assert (first.caller, first.through, first.number > 0) == (ANNA, 0, True)
     case.lease.delegate(Caller("anna", 11, through=99))
     case.clock.advance(0.5)
-    again = case.lease.take(ANNA, 5.0)
+    again = case.lease.take(ANNA, 5.0, first.number)
     assert (again.number, again.through) == (first.number, 99)
     assert case.lease.left() == pytest.approx(5.0)
     case.clock.advance(5.0)
@@ -98,7 +98,7 @@ def test_renewing(case: Case) -> None:
     for number in (held.number - 1, held.number + 1, None):
         with pytest.raises(LeaseLost):
             case.lease.renew(ANNA, 1.0, number)
-    case.lease.give_back(ANNA)
+    case.lease.give_back(ANNA, held.number)
     with pytest.raises(LeaseLost):
         case.lease.renew(ANNA, 1.0, held.number)
 
@@ -145,15 +145,16 @@ def test_only_a_stream_is_ended_with_the_mode(case: Case) -> None:
         case.lease.end_stream()
     assert case.lease.tenure == held
     case.lease.end_stream()
-    case.lease.take(ANNA, 1.0)  # no call keeps the lock
+    case.lease.take(ANNA, 1.0, held.number)  # no call keeps the lock
 
 
 def test_giving_back_what_another_client_has(case: Case) -> None:
     held = case.lease.take(ANNA, 2.0)
     for other in (BERT, UNKNOWN, Caller("anna", 10)):
-        case.lease.give_back(other)
+        with pytest.raises(CommandHeld):
+            case.lease.give_back(other, held.number)
         assert case.lease.tenure == held
-    case.lease.give_back(ANNA)
+    case.lease.give_back(ANNA, held.number)
     assert case.lease.tenure is None
     assert case.lease._tenure.caller == ANNA  # whose lease ended is still known
 
@@ -436,15 +437,15 @@ class Link:
         self.asked.append((service, verb, arguments))
         if self.error is not None:
             raise self.error
-        return {"number": 5}
+        return {}
 
 
 def test_a_lease_is_asked_of_the_hal_and_ends_a_length_after_the_request(monkeypatch: pytest.MonkeyPatch) -> None:
     link, now = Link(), [50.0]
     monkeypatch.setattr("services.command.client_lease.time.monotonic", lambda: now[0])
     with ClientLease(link, 30.0) as lease:
-        assert link.asked == [("hal", "lease", {"seconds": 30.0})]
-        assert (lease._number, lease._end, link.held_lease) == (5, 80.0, lease)
+        assert link.asked == [("hal", "lease", {"seconds": 30.0, "number": lease._number, "new": True})]
+        assert (lease._number > 0, lease._end, link.held_lease) == (True, 80.0, lease)
         now[0] = 79.9
         lease.check()
         now[0] = 80.0
@@ -453,7 +454,7 @@ def test_a_lease_is_asked_of_the_hal_and_ends_a_length_after_the_request(monkeyp
         now[0] = 60.0
         with pytest.raises(LeaseLost):  # a lost lease stays lost
             lease.check()
-    assert link.asked[-1] == ("hal", "release", None)
+    assert link.asked[-1] == ("hal", "release", {"number": lease._number})
     assert link.held_lease is None
 
 
@@ -468,7 +469,7 @@ def test_errors_that_end_a_lease_at_once_and_those_that_do_not(error: Exception,
         time.sleep(0.25)
         assert (lease.text != "") is is_lost
         assert lease._renewal_fault == ("" if is_lost else str(error))
-        assert link.asked[1][2] == {"seconds": 0.6, "number": 5}
+        assert link.asked[1][2] == {"seconds": 0.6, "number": lease._number}
         link.error = None
         if not is_lost:
             time.sleep(0.25)
