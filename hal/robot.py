@@ -76,7 +76,7 @@ class Robot:
         self._nothing.flags.writeable = False
         self._desired: tuple[np.ndarray, float] | None = None
         self._measured = self._heard = self._assembler.nothing
-        self._number = self._incomplete = 0
+        self._number = self._incomplete = self._answered = 0
         self._is_open = False
         self._stop_reason = ""
 
@@ -235,8 +235,8 @@ class Robot:
             cycle: Number of the sample from which they were computed.
 
         Raises:
-            CommandRefused: The size is wrong, a value is not finite, the robot is not enabled, or the cycle is unknown
-                or too old.
+            CommandRefused: The size is wrong, a value is not finite, the robot is not enabled, the cycle is unknown or
+                too old, or a command that answers a later cycle was taken before.
         """
         signal = self.config.command.signal
         desired = checked(desired, signal, self.config.signals[signal].elements)
@@ -247,6 +247,12 @@ class Robot:
                     f"The robot is in mode '{self.mode}' and takes commands in 'hold' and 'follow'. "
                     f"{self.fault_text or 'Is it enabled?'}"
                 )
+            if cycle < self._answered:
+                raise CommandRefused(
+                    f"The command answers cycle {cycle}, but one that answers cycle {self._answered} came before it. "
+                    "Does the network change the order, or do two programs command?"
+                )
+            self._answered = cycle
             self._desired = (desired, expires)
 
     def cycle(self) -> tuple[Sample, Applied]:
