@@ -305,7 +305,7 @@ class Robot:
         limited = self._move(act, desired)
         sent = limiter.set_point if act in _TRACKED else None
         self._following.note(sent)
-        self._assembler.plausibility.command(sent, now)
+        self._assembler.plausibility.command(sent)
         return Applied(
             self._number,
             stamp,

@@ -52,6 +52,7 @@ class Following:
         ]
         self._lag = config.command.following_lag
         self._recent = np.full((max(2, round(self._lag * config.rates.hal)), size), np.nan)
+        self._newest = self._recent[0]
         self._place = 0
         self._is_active = False
         self._since = np.full(size, np.inf)
@@ -66,7 +67,7 @@ class Following:
             self._is_active = True
             self._recent[:] = set_point
             self._since[:] = np.inf
-        self._recent[self._place] = set_point
+        self._recent[self._place] = self._newest = set_point
         self._place = (self._place + 1) % len(self._recent)
 
     def problem(self, measured: Arrays, now: float) -> str:
@@ -79,6 +80,9 @@ class Following:
         if not self._is_active:
             return ""
         values = measured[self._signal]
+        if (np.abs(values - self._newest) <= self._tolerance).all():
+            self._since[:] = np.inf
+            return ""
         low, high = self._recent.min(axis=0), self._recent.max(axis=0)
         distance = np.maximum(low - values, values - high)
         beyond = distance > self._tolerance

@@ -19,6 +19,8 @@ MOVED = 0.02
 ALL_MOVED = 0.05
 """An element of another name must change when the set-points of half of the commanded elements have moved by this part
 of their ranges."""
+LOOK_EVERY = 0.02
+"""Frozen values are searched for at this interval [s]."""
 JUMP_BACK = 0.1
 """A value that jumps back to where it was within this time [s] is measured again at once: it was a single error."""
 STAYS = 5.0
@@ -63,7 +65,7 @@ class Plausibility:
         self._stays = np.where(is_confirmed, 0.0, STAYS)
         self._longest = np.where(is_confirmed, period, np.inf)
         self._jumped_from = np.full(size, np.nan)
-        self._stillness = Stillness(bounds, span)
+        self._stillness = Stillness(bounds, span, period)
         self._state = np.full(size, OK)
         self._is_reset = False
 
@@ -118,14 +120,14 @@ class Plausibility:
         """
         self._is_reset = True
 
-    def command(self, set_point: np.ndarray | None, now: float) -> None:
-        """Note the set-points sent at `now` [monotonic s], shape (k,); None if none were sent.
+    def command(self, set_point: np.ndarray | None) -> None:
+        """Note the set-points that were sent in this cycle, shape (k,); None if none were sent.
 
         An effort says nothing about the motion, so with effort commands no value is called frozen.
         """
         if set_point is not None and self._quantity == "velocity":
             self._way = set_point = self._way + set_point * self._period
-        self._stillness.command(None if self._quantity == "effort" else set_point, now)
+        self._stillness.command(None if self._quantity == "effort" else set_point)
 
     def _doubt(
         self, values: np.ndarray, received: np.ndarray, fresh: np.ndarray, inside: np.ndarray, jumped: np.ndarray
@@ -173,8 +175,8 @@ class Plausibility:
 class Stillness:
     """Check for values of which no bit changes while the robot is commanded to move."""
 
-    def __init__(self, bounds: Possible, span: np.ndarray) -> None:
-        """Begin without a set-point; `span` as for `Plausibility`."""
+    def __init__(self, bounds: Possible, span: np.ndarray, period: float) -> None:
+        """Begin without a set-point; `span` and `period` as for `Plausibility`."""
         self._after, self._unloaded = bounds.frozen_after, bounds.unloaded
         self._has_own = bounds.own >= 0
         self._own = np.where(self._has_own, bounds.own, 0)
@@ -185,31 +187,25 @@ class Stillness:
         self._start = np.full((size, len(span)), np.nan)
         """Set-points at the last change of a bit of each element."""
         self._moved_at = np.full(size, np.inf)
+        self._has_changed = np.zeros(size, bool)
         self._is_frozen = np.zeros(size, bool)
+        self._is_any_frozen = False
         self._rows = np.arange(size)
         self._is_watching = bool(np.isfinite(self._after).any())
         self._set_point: np.ndarray | None = None
+        self._every = max(1, round(LOOK_EVERY / period))
+        self._count = 0
 
-    def command(self, set_point: np.ndarray | None, now: float) -> None:
-        """Note the set-points of this cycle at monotonic time `now` [s]; see `Plausibility.command`."""
-        if not self._is_watching:
-            return
-        if set_point is None:
-            if self._set_point is not None:
-                self._start[:] = np.nan
-                self._moved_at[:] = np.inf
-        else:
-            np.copyto(self._start, set_point, where=np.isnan(self._start))
-            way = np.abs(set_point - self._start)
-            moved = self._has_own & (way[self._rows, self._own] > self._own_way)
-            if self._others.size:
-                moved[self._others] = 2 * np.count_nonzero(way[self._others] > self._way, axis=1) >= way.shape[1]
-            np.copyto(self._moved_at, now, where=moved & np.isinf(self._moved_at))
+    def command(self, set_point: np.ndarray | None) -> None:
+        """Note the set-points of this cycle; see `Plausibility.command`."""
+        if set_point is None and self._set_point is not None:
+            self._start[:] = np.nan
+            self._moved_at[:] = np.inf
         self._set_point = set_point
 
     def reset(self) -> None:
         """Begin again, without a frozen element."""
-        self._is_frozen = np.zeros_like(self._is_frozen)
+        self._is_frozen, self._is_any_frozen = np.zeros_like(self._is_frozen), False
         self._moved_at[:] = np.inf
         self._start[:] = np.nan
 
@@ -217,11 +213,27 @@ class Stillness:
         """Return whether each element is frozen, shape (n,), given the newest values and whether a bit changed."""
         if not self._is_watching:
             return self._is_frozen
-        if changed.any():
-            self._moved_at[changed] = np.inf
-            self._start[changed] = np.nan if self._set_point is None else self._set_point
+        self._has_changed |= changed
+        if self._is_any_frozen:
             self._is_frozen = self._is_frozen & ~changed
-        still = (received - self._moved_at > self._after) & (np.abs(values) > self._unloaded)
-        if still.any():
-            self._is_frozen = self._is_frozen | still
+        self._count += 1
+        if self._count % self._every == 0:
+            self._look(values, received)
         return self._is_frozen
+
+    def _look(self, values: np.ndarray, received: np.ndarray) -> None:
+        """Compare the way of the set-points since the last change of each element with what should change it."""
+        set_point, start, changed = self._set_point, self._start, self._has_changed
+        self._moved_at[changed] = np.inf
+        start[changed] = np.nan if set_point is None else set_point
+        changed[:] = False
+        if set_point is not None:
+            np.copyto(start, set_point, where=np.isnan(start))
+            way = np.abs(set_point - start)
+            moved = self._has_own & (way[self._rows, self._own] > self._own_way)
+            if self._others.size:
+                moved[self._others] = 2 * np.count_nonzero(way[self._others] > self._way, axis=1) >= way.shape[1]
+            np.copyto(self._moved_at, received, where=moved & np.isinf(self._moved_at))
+        still = (received - self._moved_at > self._after) & (np.abs(values) > self._unloaded)
+        self._is_frozen = self._is_frozen | still
+        self._is_any_frozen = bool(self._is_frozen.any())

@@ -66,7 +66,7 @@ class Watched:
         flicker = np.copysign([1e-6, 1e-3, 1e-6], (-1) ** round(self.now / PERIOD))
         given = [np.nan if value is None else value for value in (joint, cell, far)]
         self.values = np.where(np.isnan(given), self.values + flicker, given)
-        self.check.command(None if set_point is None else np.array([set_point]), self.now)
+        self.check.command(None if set_point is None else np.array([set_point]))
         return self.check.check(self.values, np.full(3, self.now), np.ones(3, bool)).tolist()
 
     def cycles_until_trusted(self, index, most=2000, **values):
