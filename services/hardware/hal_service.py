@@ -226,6 +226,10 @@ def _problem(health: dict[str, Any]) -> str:
         name, device = faulty[0]
         more = f" (and {len(faulty) - 1} more devices)" if len(faulty) > 1 else ""
         return f"{name}: {device['text']}{more}"
+    implausible = list(health["implausible"].values())
+    if implausible:
+        more = f" (and {len(implausible) - 1} more elements)" if len(implausible) > 1 else ""
+        return f"{implausible[0]}{more} {health['limits']}".rstrip()
     return str(health["limits"])
 
 
