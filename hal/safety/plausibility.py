@@ -66,6 +66,8 @@ class Plausibility:
         self._longest = np.where(is_confirmed, period, np.inf)
         self._jumped_from = np.full(size, np.nan)
         self._stillness = Stillness(bounds, span, period)
+        self._reason = np.full(size, OK)  # for which trust was lost, and the value that was wrong
+        self._wrong = np.full(size, np.nan)
         self._state = np.full(size, OK)
         self._is_reset = False
 
@@ -107,9 +109,7 @@ class Plausibility:
         np.copyto(self._received, received, where=fresh)
         frozen = self._stillness.note(values, received, changed)
         usable: np.ndarray = valid & self._is_trusted & ~frozen
-        trusted_state = np.where(frozen, FROZEN, OK)
-        doubted_state = np.where(fresh, np.where(inside, JUMP, RANGE), self._state)
-        self._state = np.where(self._is_trusted, trusted_state, doubted_state)
+        self._state = np.where(self._is_trusted, np.where(frozen, FROZEN, OK), self._reason)
         self.count += int(np.count_nonzero(fresh & ~usable))
         return usable
 
@@ -144,6 +144,9 @@ class Plausibility:
         after = np.where(self._jumps == 1, self._stays, bounds.return_after)
         returned = fresh & inside & ~jumped & (calm >= after)
         np.copyto(self._jumped_from, self._good, where=jumped & trusted)
+        np.copyto(self._wrong, values, where=jumped | outside)
+        np.copyto(self._reason, JUMP, where=jumped)
+        np.copyto(self._reason, RANGE, where=outside)
         np.copyto(self._calm_since, received, where=jumped | outside)
         self._is_trusted = np.where(outside | (jumped & ~back), False, trusted | back | returned)
 
@@ -152,15 +155,15 @@ class Plausibility:
         state, bounds = self._state.copy(), self._bounds
         texts = {}
         for index in np.flatnonzero(state != OK).tolist():
-            name, value = bounds.names[index], self._before[index]
+            name, value, wrong = bounds.names[index], self._before[index], self._wrong[index]
             if state[index] == RANGE:
                 reason = (
-                    f"reads {value:.4g}, possible is {bounds.low[index]:.4g} to {bounds.high[index]:.4g}. "
+                    f"read {wrong:.4g}, possible is {bounds.low[index]:.4g} to {bounds.high[index]:.4g}. "
                     "Is the sensor broken, its wire loose, its scale right?"
                 )
             elif state[index] == JUMP:
                 reason = (
-                    f"jumped from {self._jumped_from[index]:.4g} to {value:.4g}; possible is a change of "
+                    f"jumped from {self._jumped_from[index]:.4g} to {wrong:.4g}; possible is a change of "
                     f"{bounds.rate[index] * self._period:.3g} per cycle. Does the sensor slip or its wire break?"
                 )
             else:
@@ -168,7 +171,7 @@ class Plausibility:
                     f"reads {value:.6g} without a change of any bit while the robot is commanded to move. "
                     "Is the sensor frozen, or at an end of its range?"
                 )
-            texts[name] = f"{name} {reason}"
+            texts[name] = f"'{name}' {reason}"
         return texts
 
 
