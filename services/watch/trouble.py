@@ -90,6 +90,8 @@ def _troubles(snapshot: RobotSnapshot, rows: Sequence[SignalRow]) -> Iterator[Tr
         return
     for text in snapshot.refused:
         yield Trouble(Level.TROUBLE, "Unreadable message", f"{text} Update the older of both programs.")
+    for text in snapshot.disordered:
+        yield Trouble(Level.NOTE, "Messages out of order", text)
     is_heard = any(newest.is_fresh for newest in (snapshot.sample, *snapshot.statuses.values()) if newest is not None)
     if not snapshot.alive and not is_heard:
         yield _gone(snapshot)

@@ -87,6 +87,7 @@ ENDED = {"hal": Newest(Status(service="hal", state="running"), 9.0)}
         (RobotSnapshot(robot="arm"), Level.GONE, "No robot"),
         (seen(linked=False, link_text="No answer."), Level.GONE, "Router gone"),
         (seen(refused=(NEW_PROGRAM,)), Level.TROUBLE, "Unreadable message"),
+        (seen(disordered=("A sample came twice.",)), Level.NOTE, "Messages out of order"),
         (seen(statuses=FAULT), Level.TROUBLE, "HAL fault"),
         (seen(statuses=statuses(text="A command was refused.")), Level.NOTE, "HAL running"),
         (seen(statuses=statuses(age=9.0)), Level.TROUBLE, "HAL service silent"),
