@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from gemuco.adaption.renewal import Renewal
 from gemuco.masks import Mask
 from gemuco.schema import BodySchema, ErrorTable
 
@@ -29,6 +30,7 @@ class SeenErrors:
         self._first = schema
         self._squares = expected_squares(schema)
         self._count = 0
+        self._renewal = Renewal(schema)
 
     def see(self, schema: BodySchema, x: np.ndarray) -> None:
         """Measure the prediction of a sample [standard deviations], shape (size,), under all masks that it covers."""
@@ -40,6 +42,21 @@ class SeenErrors:
                 squared = (schema.infer(x, m) - data) ** 2
                 known = self._squares.setdefault(m, squared)
                 self._squares[m] = np.where(np.isfinite(squared), known + share * (squared - known), known)
+                self._renewal.see(schema, x, m, squared, share)
+
+    def renewed(self, schema: BodySchema) -> BodySchema:
+        """Return a schema with the expected errors and the certainty as they are now.
+
+        The errors were measured with its p, so the uncertainty of p counts less with every sample.
+        """
+        schema = schema.with_weights(schema.weights, self.table())
+        certainty = self._renewal.certainty()
+        if certainty is None or schema.certainty is None:
+            return schema
+        covariance = schema.certainty.covariance
+        if covariance is not None:
+            covariance = covariance * (TRUST / (TRUST + self._count))
+        return schema.with_certainty(certainty.at(covariance, schema.certainty.unseen))
 
     def table(self) -> ErrorTable:
         """Return the table of expected errors as it is now."""

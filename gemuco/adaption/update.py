@@ -187,7 +187,7 @@ class Updater:
                 self._is_settled = self._prior.between(before, schema.bias) < STEADY
             self.schema = schema
         if has_seen:
-            self.schema = self.schema.with_weights(self.schema.weights, self._errors.table())
+            self.schema = self._errors.renewed(self.schema)
         return UpdateResult(
             steps=taken,
             loss=loss,
@@ -216,7 +216,7 @@ class Updater:
                 self._since, has_changed = since, True
             self._is_settled = recognition.is_settled
             self._bias_std = np.sqrt(np.diag(recognition.covariance))
-            self.schema = self.schema.with_bias(recognition.bias)
+            self.schema = self.schema.with_bias(recognition.bias, recognition.covariance)
         if has_changed:
             self._relearner.restart(self.schema)
             self._errors, self._owed = SeenErrors(self._first), 0.0

@@ -179,7 +179,7 @@ class Estimation:
 
 
 def _estimates(schema: BodySchema, values: Numbers, stamp_ns: int, cycle: int) -> Estimates:
-    value, residual, recipe = fill(schema, values.flat)
+    value, std, residual, sureness, recipe = fill(schema, values.flat)
     elements = values.elements
     return Estimates(
         stamp_ns=stamp_ns,
@@ -187,8 +187,10 @@ def _estimates(schema: BodySchema, values: Numbers, stamp_ns: int, cycle: int) -
         elements=elements,
         values=Numbers(value, elements),
         estimated=Truths(recipe.estimated, elements),
-        std=Numbers(recipe.std, elements),
+        std=Numbers(std, elements),
         method=dict(recipe.method),
         mask=dict(recipe.label),
         residual=residual,
+        state={name: sure.state for name, sure in sureness.items()},
+        reason={name: sure.reason for name, sure in sureness.items() if sure.reason},
     )
