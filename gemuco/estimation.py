@@ -9,7 +9,7 @@ import numpy as np
 
 from gemuco.compiled.inference import infer
 from gemuco.derived import ByPattern
-from gemuco.intervals.sureness import KNOWN, SURE, UNKNOWN, Judge, RangeJudge, Sureness
+from gemuco.intervals.sureness import KNOWN, SURE, UNKNOWN, Judge, RangeJudge, Sureness, since_change
 from gemuco.layers import run
 from gemuco.masks import Mask, covered_by, label
 from gemuco.schema import BodySchema, check_schema
@@ -60,6 +60,7 @@ class Recipe:
     Attributes:
         steps: Each step: method, mask, the elements to estimate as truth values, shape (size,), and their signals.
         judges: The judge of each step's std and state; None where nothing is estimated.
+        unseen: The state of an estimate that nothing else speaks against: `SURE` unless the body changed.
         std: Expected error of every element [unit], shape (size,), before a sample is known; see `Estimate`.
         estimated: Whether each element is estimated, shape (size,).
         method: Signal -> method.
@@ -69,6 +70,7 @@ class Recipe:
 
     steps: tuple[tuple[str, Mask, np.ndarray, tuple[str, ...]], ...]
     judges: tuple[Judge | RangeJudge | None, ...]
+    unseen: Sureness
     std: np.ndarray
     estimated: np.ndarray
     method: Mapping[str, str]
@@ -99,7 +101,16 @@ class Recipe:
         masks = {name: sources[name][1] for name in slices}
         labels = {name: label(mask, schema.layout.names) for name, mask in masks.items()}
         judges = tuple(_judge(schema, (method, mask), finite) for method, mask, _, _ in steps)
-        return cls(tuple(steps), judges, std, estimated, {name: sources[name][0] for name in slices}, masks, labels)
+        return cls(
+            tuple(steps),
+            judges,
+            since_change(schema, ~finite),
+            std,
+            estimated,
+            {name: sources[name][0] for name in slices},
+            masks,
+            labels,
+        )
 
 
 class Completion(NamedTuple):
@@ -171,12 +182,13 @@ def _batch(schema: BodySchema, samples: list[Completion]) -> dict[str, Estimate]
     return estimates
 
 
-def fill(schema: BodySchema, joined: np.ndarray) -> Completion:
+def fill(schema: BodySchema, joined: np.ndarray, recipe: Recipe | None = None) -> Completion:
     """Complete a sample in one array [unit of each element], shape (size,), NaN where missing; see `estimate`.
 
-    The array must be read-only, as in a service: the code is compiled for read-only arrays.
+    The array must be read-only, as in a service: the code is compiled for read-only arrays. The recipe is that of its
+    finite elements; the schema's if not given.
     """
-    recipe = schema.derived(recipes)(np.isfinite(joined))
+    recipe = recipe or schema.derived(recipes)(np.isfinite(joined))
     value, residual, std = joined.copy(), dict.fromkeys(recipe.method, 0.0), recipe.std
     sureness = dict.fromkeys(recipe.method, SURE)
     if recipe.steps:
@@ -189,6 +201,8 @@ def fill(schema: BodySchema, joined: np.ndarray) -> Completion:
             prediction, error = _search(schema, method, mask, joined)
             np.copyto(value, prediction, where=missing)
         sure = _OF_NOTHING if judge is None else judge.judge(joined, own, missing, std)
+        if sure is SURE:
+            sure = recipe.unseen
         for name in names:
             residual[name], sureness[name] = error, sure
     return Completion(value, std, residual, sureness, recipe)

@@ -44,10 +44,14 @@ class SeenErrors:
                 self._squares[m] = np.where(np.isfinite(squared), known + share * (squared - known), known)
                 self._renewal.see(schema, x, m, squared, share)
 
-    def renewed(self, schema: BodySchema) -> BodySchema:
+    def renewed(self, schema: BodySchema, unseen: np.ndarray | None = None) -> BodySchema:
         """Return a schema with the expected errors and the certainty as they are now.
 
         The errors were measured with its p, so the uncertainty of p counts less with every sample.
+
+        Args:
+            schema: The schema.
+            unseen: Whether each element was not measured since the body changed, shape (size,).
         """
         schema = schema.with_weights(schema.weights, self.table())
         certainty = self._renewal.certainty()
@@ -56,7 +60,7 @@ class SeenErrors:
         covariance = schema.certainty.covariance
         if covariance is not None:
             covariance = covariance * (TRUST / (TRUST + self._count))
-        return schema.with_certainty(certainty.at(covariance, schema.certainty.unseen))
+        return schema.with_certainty(certainty.at(covariance, unseen))
 
     def table(self) -> ErrorTable:
         """Return the table of expected errors as it is now."""

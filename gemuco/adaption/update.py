@@ -110,6 +110,7 @@ class Updater:
         self._bias_std = np.full(len(schema.bias), np.nan)
         self._is_settled = not self._has_bias
         self._errors = SeenErrors(schema)
+        self._unseen: np.ndarray | None = None
         self._owed = 0.0
         self._last_new: np.ndarray | None = None
         self._relearner.restart(schema)
@@ -133,6 +134,8 @@ class Updater:
         self._relearner.window.add(x)
         self._pending.append(x)
         self._errors.see(self.schema, x)
+        if self._unseen is not None:
+            self._unseen = self._unseen & ~np.isfinite(x)
         if self._is_new(x):
             self._last_new = x
             self._owed = min(self._owed + self._steps_of_a_sample(), float(YOUNG * self.config.steps))
@@ -187,7 +190,7 @@ class Updater:
                 self._is_settled = self._prior.between(before, schema.bias) < STEADY
             self.schema = schema
         if has_seen:
-            self.schema = self._errors.renewed(self.schema)
+            self.schema = self._errors.renewed(self.schema, self._unseen)
         return UpdateResult(
             steps=taken,
             loss=loss,
@@ -220,6 +223,7 @@ class Updater:
         if has_changed:
             self._relearner.restart(self.schema)
             self._errors, self._owed = SeenErrors(self._first), 0.0
+            self._unseen = ~np.isfinite(rows[-1])
         return has_changed
 
     def rollback(self) -> BodySchema:

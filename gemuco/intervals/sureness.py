@@ -55,6 +55,15 @@ def worse(one: Sureness, other: Sureness) -> Sureness:
     return one if STATES.index(one.state) >= STATES.index(other.state) else other
 
 
+def since_change(schema: BodySchema, missing: np.ndarray) -> Sureness:
+    """Return the state of an estimate of missing elements, truth values, shape (size,), on a body that changed."""
+    unseen = None if schema.certainty is None else schema.certainty.unseen
+    if unseen is None or not (unseen & missing).any():
+        return SURE
+    name = schema.layout.element(int(np.flatnonzero(unseen & missing)[0]))
+    return Sureness(DOUBTFUL, f"the body changed, and {name} was not measured since")
+
+
 class Judge:
     """The std and the state of estimates in one way, for samples with the same given elements.
 

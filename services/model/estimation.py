@@ -9,6 +9,7 @@ from msgspec.structs import replace
 
 from gemuco.compiled.usable import usable
 from gemuco.estimation import fill
+from gemuco.intervals.sureness import DOUBTFUL, SURE, Sureness
 from gemuco.schema import BodySchema
 from hal.by_signal import Elements, Numbers, Truths
 from hal.clock import Clock
@@ -16,6 +17,9 @@ from hal.config import RobotConfig
 from services.model.living_model import layout_of
 from services.wire.messages import Estimates, Sample
 from services.wire.streams import Arrival
+
+WRONG = 3.0
+"""An estimate is doubtful if the errors of its element were this many times as large as learned, while it was seen."""
 
 SampleSource = Callable[[], Arrival[Sample] | None]
 """A function of this type returns the newest sample, of any age."""
@@ -134,6 +138,23 @@ def in_order(schema: BodySchema, values: Numbers) -> Numbers:
     return ordered
 
 
+def _widened(
+    schema: BodySchema, sureness: dict[str, Sureness], estimated: np.ndarray, factor: np.ndarray
+) -> dict[str, Sureness]:
+    """Return the states; a signal that was predicted badly while it was measured is doubtful."""
+    if not (bad := estimated & (factor > WRONG)).any():
+        return sureness
+    states = dict(sureness)
+    for name, span in schema.layout.slices.items():
+        if bad[span].any() and states[name] is SURE:
+            worst = schema.layout.element(span.start + int(np.argmax(factor[span] * bad[span])))
+            text = (
+                f"while it was measured, the errors of {worst} were {factor[span].max():.1f} times as large as learned"
+            )
+            states[name] = Sureness(DOUBTFUL, text)
+    return states
+
+
 class Estimation:
     """The source of one `Estimates` per tick, from the newest sample."""
 
@@ -143,11 +164,21 @@ class Estimation:
         schema: Callable[[], BodySchema],
         publish: Callable[[Estimates], None],
         clock: Clock,
+        factor: Callable[[], np.ndarray | None] = lambda: None,
     ) -> None:
-        """Prepare; `schema` returns the body schema in use."""
+        """Prepare.
+
+        Args:
+            freshness: Source of samples.
+            schema: Returns the body schema in use.
+            publish: Publishes the estimates.
+            clock: Source of time.
+            factor: Returns the factors on the std of the schema's elements, shape (size,), if there are any.
+        """
         self._freshness, self._schema, self._publish, self._clock = freshness, schema, publish, clock
-        self._source: tuple[BodySchema, Numbers] | None = None
-        """This holds the schema and the values of `latest`."""
+        self._factor = factor
+        self._source: tuple[BodySchema, Numbers, np.ndarray | None] | None = None
+        """This holds the schema, the values and the factors of `latest`."""
         self._newest: Sample | None = None
         self._waited: float | None = None
         self.latest: Estimates | None = None
@@ -160,11 +191,13 @@ class Estimation:
         self._newest = None if fresh is None else fresh.message
         schema, stamp_ns = self._schema(), self._clock.now_ns()
         cycle = -1 if fresh is None else fresh.message.cycle
-        source = self._source
-        if self.latest is not None and source is not None and source[0] is schema and source[1] is values:
+        source, factor = self._source, self._factor()
+        is_same = source is not None and source[0] is schema and source[1] is values and source[2] is factor
+        if self.latest is not None and is_same:
             self.latest = replace(self.latest, stamp_ns=stamp_ns, cycle=cycle)
         else:
-            self.latest, self._source = _estimates(schema, in_order(schema, values), stamp_ns, cycle), (schema, values)
+            self.latest = _estimates(schema, in_order(schema, values), factor, stamp_ns, cycle)
+            self._source = schema, values, factor
         self._publish(self.latest)
 
     def waited(self) -> float | None:
@@ -178,8 +211,10 @@ class Estimation:
         return {"measured": measured, "estimated": len(methods) - measured - none, "none": none}
 
 
-def _estimates(schema: BodySchema, values: Numbers, stamp_ns: int, cycle: int) -> Estimates:
+def _estimates(schema: BodySchema, values: Numbers, factor: np.ndarray | None, stamp_ns: int, cycle: int) -> Estimates:
     value, std, residual, sureness, recipe = fill(schema, values.flat)
+    if factor is not None and recipe.steps:
+        std, sureness = std * factor, _widened(schema, sureness, recipe.estimated, factor)
     elements = values.elements
     return Estimates(
         stamp_ns=stamp_ns,

@@ -22,6 +22,7 @@ from services.model.anomaly_loop import VERDICT_RATE, AnomalyWatch
 from services.model.control_config import ControlConfig, controller_of
 from services.model.control_loop import Control
 from services.model.estimation import Estimation, Freshness
+from services.model.hindsight import Hindsight
 from services.model.living_model import LivingModel
 from services.model.model_config import ModelConfig, model_config
 from services.model.update_loop import OnlineUpdate
@@ -121,7 +122,10 @@ class GemucoService:
         )
         self.history = HistoryRing({s.name: s.size for s in schema.layout.signals}, robot.rates.estimation)
         self._estimates = service.publisher(keys.estimate(robot.robot), Estimates)
-        self.estimation = Estimation(self.freshness, self._schema, self._publish, self.clock)
+        self.hindsight = Hindsight(self.freshness, self._schema, self.clock)
+        self.estimation = Estimation(
+            self.freshness, self._schema, self._publish, self.clock, lambda: self.hindsight.factor
+        )
         self.acquaintance = Acquaintance()
         self.anomaly = AnomalyWatch(
             self.freshness,
@@ -163,7 +167,7 @@ class GemucoService:
             loop("control", rates.control, self._control_tick),
             loop("anomaly", rates.anomaly, anomaly.tick),
             loop("update", rates.update, self.update.tick),
-            loop("verdict", VERDICT_RATE, anomaly.judge),
+            loop("verdict", VERDICT_RATE, self._look_back),
         ]
 
     def enable_hal(self) -> dict[str, Any]:
@@ -276,6 +280,11 @@ class GemucoService:
         """Return the numbers of messages that came `repeated` or `late`, and were not used."""
         orders = [reader.order.counters for reader in self._readers()]
         return {name: sum(counters[name] for counters in orders) for name in ("repeated", "late")}
+
+    def _look_back(self) -> None:
+        """Judge the last samples, and measure the errors of the model on them."""
+        self.anomaly.judge()
+        self.hindsight.look()
 
     def _readers(self) -> list[Reader[Any]]:
         readers: list[Reader[Any] | None] = [self._samples, self._seen, self._applied]
