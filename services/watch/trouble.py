@@ -162,6 +162,11 @@ def _signals(rows: Sequence[SignalRow]) -> Iterator[Trouble]:
         sources = " and ".join(dict.fromkeys(row.source for row in estimated if row.source))
         origin = f" from {sources}" if sources else ""
         yield Trouble(Level.DEGRADED, "Sensor lost", f"{_names(estimated)} {_is(estimated)} estimated{origin}.")
+    for state, level in (("unknown", Level.DEGRADED), ("doubtful", Level.NOTE)):
+        bad = [row for row in estimated if row.state == state]
+        if bad:
+            reasons = "; ".join(dict.fromkeys(row.reason for row in bad if row.reason))
+            yield Trouble(level, f"Estimate {state}", f"{_names(bad)}: {reasons or 'no reason was given'}.")
     if masked:
         text = f"{_names(masked)} {_is(masked)} neither measured nor estimated."
         yield Trouble(Level.DEGRADED, "Not measured", text)
