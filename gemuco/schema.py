@@ -325,7 +325,7 @@ class BodySchema:
             raise NotFinite(f"p is {p.tolist()}; every element needs a finite number.")
         certainty = self.certainty
         if certainty is not None and (covariance is not None or certainty.covariance is not None):
-            certainty = certainty.at(covariance, certainty.unseen)
+            certainty = certainty.at(covariance, certainty.unseen, certainty.excess)
         return replace(self, bias=p, certainty=certainty)
 
     def under(self, condition: str) -> "BodySchema":

@@ -64,6 +64,7 @@ class Certainty:
             deviations squared], shape (ways, `KNOTS`, size).
         covariance: Covariance of p if it was recognised, shape (b, b); None if it is unknown.
         unseen: Whether each element was not measured since the body changed, shape (size,); None: none.
+        excess: Errors seen with the present p, as a share of those learned.
     """
 
     ways: tuple[Way, ...]
@@ -77,6 +78,7 @@ class Certainty:
     growth: np.ndarray
     covariance: np.ndarray | None = None
     unseen: np.ndarray | None = None
+    excess: float = 1.0
     known: dict[Any, Any] = field(default_factory=dict, repr=False)
     """This holds results that depend on no p; the copies of a certainty share it."""
 
@@ -84,9 +86,9 @@ class Certainty:
         """Return the index of a way; None if it was not calibrated."""
         return self.ways.index(way) if way in self.ways else None
 
-    def at(self, covariance: np.ndarray | None, unseen: np.ndarray | None) -> "Certainty":
-        """Return the same calibration with another covariance of p, and other elements that were not seen."""
-        return replace(self, covariance=covariance, unseen=unseen)
+    def at(self, covariance: np.ndarray | None, unseen: np.ndarray | None, excess: float = 1.0) -> "Certainty":
+        """Return the same calibration with other facts of the present p; see the attributes."""
+        return replace(self, covariance=covariance, unseen=unseen, excess=excess)
 
     def reach(self, anchors: np.ndarray, elements: np.ndarray) -> Reach:
         """Return the learned part of some elements.

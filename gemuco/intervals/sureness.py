@@ -8,6 +8,7 @@ import numpy as np
 from gemuco.adaption.innovation import own_bias
 from gemuco.adaption.recognise import NARROW, Prior
 from gemuco.adaption.renewal import given_elements, standard_p
+from gemuco.adaption.seen import EXPLAINED
 from gemuco.certainty.certainty import Certainty, Way
 from gemuco.compiled.certainty import spread
 from gemuco.masks import Mask
@@ -170,44 +171,47 @@ def _offsets(schema: BodySchema) -> np.ndarray:
 def about_p(schema: BodySchema) -> Sureness:
     """Return the state of the present p: whether it is like a trained one.
 
-    A p that was recognised from samples may lie between the trained ones; beyond them it is doubtful. One that was not
-    recognised, such as the mean of the trained ones, is doubtful, or unknown beyond them.
+    A p that was recognised from samples may lie between the trained ones. Beyond them it is doubtful, and unknown if it
+    does not explain the samples either. One that was not recognised, such as the mean of the trained ones, is doubtful,
+    or unknown beyond them.
     """
     if len(schema.biases) < 2 or not len(schema.bias):
         return SURE
     prior, p = Prior.of(schema), schema.bias.astype(float)
+    certainty = schema.certainty
     distances = [prior.between(p, known) for known in prior.known]
     nearest = int(np.argmin(distances))
+    is_beyond = distances[nearest] > max(OTHER_P, prior.gap)
+    if certainty is not None and certainty.covariance is not None:
+        is_wrong = certainty.excess > EXPLAINED
+        if is_beyond:
+            return _of_no_condition(schema, nearest, distances[nearest], UNKNOWN if is_wrong else DOUBTFUL)
+        text = f"no p explains what is seen: the errors are {certainty.excess:.1f} times as large as learned"
+        return Sureness(DOUBTFUL, text) if is_wrong else SURE
     if distances[nearest] <= OTHER_P:
         return SURE
-    if schema.certainty is not None and schema.certainty.covariance is not None:
-        return SURE if distances[nearest] <= _gap(prior) else _of_no_condition(schema, nearest, distances[nearest])
-    state = UNKNOWN if distances[nearest] > _gap(prior) else DOUBTFUL
-    return _of_no_condition(schema, nearest, distances[nearest], state)
+    return _of_no_condition(schema, nearest, distances[nearest], UNKNOWN if is_beyond else DOUBTFUL)
 
 
-def _of_no_condition(schema: BodySchema, nearest: int, distance: float, state: str = DOUBTFUL) -> Sureness:
+def _of_no_condition(schema: BodySchema, nearest: int, distance: float, state: str) -> Sureness:
     name = list(schema.biases)[nearest]
     text = f"p is of no known condition; the nearest, '{name}', is {distance:.1f} standard deviations away"
     return Sureness(state, text)
 
 
-def _gap(prior: Prior) -> float:
-    """Return the largest distance of a trained p from its nearest other one [standard deviations of the trained p]."""
-    return max(min(prior.between(a, b) for b in np.delete(prior.known, i, axis=0)) for i, a in enumerate(prior.known))
-
-
 def _variance_of_p(schema: BodySchema, certainty: Certainty, way: Way) -> np.ndarray:
     """Return the variance of every element that comes from an uncertain p [unit squared], shape (size,).
 
-    A p that was not recognised is as uncertain as it is far from the nearest trained one.
+    A p that was not recognised is as uncertain as it is far from the nearest trained one; one that was, as it is beyond
+    the trained ones.
     """
     variance = np.zeros(schema.layout.size)
     if len(schema.biases) < 2 or not len(schema.bias) or not schema.masks:
         return variance
-    covariance = certainty.covariance
-    if covariance is None:
-        prior, p = Prior.of(schema), schema.bias.astype(float)
+    covariance, prior, p = certainty.covariance, Prior.of(schema), schema.bias.astype(float)
+    if covariance is not None:  # beyond the trained ones the network is wrong even with the best p
+        covariance = covariance + prior.beyond(p) ** 2 * prior.covariance
+    else:
         away = min(prior.between(p, known) for known in prior.known)
         if away <= NARROW:
             return variance

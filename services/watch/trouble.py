@@ -15,8 +15,8 @@ TITLES = {"hal": "HAL", "model": "Model", "vision": "Camera", "simulator": "Simu
 
 
 LEARNING = (
-    "The body is not the one whose normal errors the model knows. If it is healthy, let it move, then run "
-    "`gemuco query ROBOT normal`."
+    "The body is not the one whose normal errors the model knows, or its tool is beyond the trained ones. If it is "
+    "healthy, let it move, then run `gemuco query ROBOT normal`; a new tool needs data of its own."
 )
 """This explains a body on which nothing can be called an anomaly yet."""
 

@@ -259,8 +259,8 @@ class Anomaly(OfSignals, frozen=True, kw_only=True):
         blamed: `signal.element` that is most likely wrong in the samples above the threshold; below the threshold, the
             one that contributes most; empty while the verdict is `unknown`.
         verdict: `normal`, `environment` (another condition of the body explains the samples above the threshold),
-            `anomaly` (no condition does), `unknown` (what is normal was not learned on this body yet), or empty before
-            a verdict.
+            `anomaly` (no condition does), `unknown` (what is normal was not learned on this body yet, or p is beyond
+            the trained conditions), or empty before a verdict.
         contribution: Signal -> each element's part of score^2, shape (n,).
     """
 
@@ -285,7 +285,7 @@ class Update(Message, frozen=True, kw_only=True):
         dropped: Number of samples dropped from it so far, oldest first.
         loss: Mean squared error over the window, in standard deviations of the training data.
         bias: The parametric bias p in use, shape (n,); empty without.
-        settled: Whether p is well known, so that W may be updated.
+        settled: Whether p is well known and explains what is seen.
         rolled_back: Number of times W was restored because its error on held-out samples grew.
     """
 
