@@ -10,7 +10,10 @@ import numpy as np
 from msgspec.structs import replace
 
 from gemuco.adaption import update as adapt
+from gemuco.certainty import Certainty
 from gemuco.errors import SchemaError
+from gemuco.intervals.region import Region
+from gemuco.intervals.sureness import Sureness
 from gemuco.schema import BodySchema
 from gemuco.search.descent import NewtonConfig
 from hal.clock import SystemClock
@@ -77,9 +80,17 @@ class ModelSolver:
         self._has_converged = False
         self._command = np.full(len(low), np.nan)
         self._target = config.target
+        self._region: tuple[np.ndarray, Certainty | None, Region] | None = None
         self._within = SHARE / robot.rates.control
         self.late = 0
         """This is the number of solves that ran out of time."""
+
+    def judge(self, reference: np.ndarray) -> Sureness:
+        """Return whether the body is known at a reference [unit of the target], shape (n,)."""
+        schema, known = self._living.schema, self._region
+        if known is None or known[0] is not schema.anchors or known[1] is not schema.certainty:
+            known = self._region = schema.anchors, schema.certainty, Region(schema, self._target)
+        return known[2].judge(reference)
 
     def __call__(self, target: Mapping[str, np.ndarray], now: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return the command [its unit], shape (n,), that reaches a target."""
@@ -271,7 +282,7 @@ class GemucoService:
         return (
             Control(
                 self.robot, config.control, self._samples.last, self._newest_applied, self.estimation, solver,
-                lambda command: commands.put(replace(command, name=self.permission.name)), self.clock,
+                lambda command: commands.put(replace(command, name=self.permission.name)), self.clock, solver.judge,
             ),
             "",
         )  # fmt: skip

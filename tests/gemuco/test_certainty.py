@@ -2,6 +2,7 @@
 
 import json
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from gemuco.compiled.certainty import grown
 from gemuco.dataset import Dataset, Episode
 from gemuco.estimation import estimate
 from gemuco.intervals.calibration import fitted
+from gemuco.intervals.region import Region
 from gemuco.learning.train import TrainConfig, fit
 
 FL = [{"joint_position", "muscle_tension"}, {"muscle_tension", "muscle_length"}]
@@ -168,6 +170,22 @@ def test_the_factor_is_one_where_errors_have_one_size_and_grows_where_they_grow(
     np.testing.assert_allclose(even, 0.0, atol=0.03)
     uneven = fitted(np.abs(0.1 * np.exp(0.5 * z[:, 0]) * random.normal(size=len(z))), z, 0.1)
     np.testing.assert_allclose(uneven, [0.0, 0.5, 0.0], atol=0.03)
+
+
+def test_a_region_knows_its_edges_and_its_holes(schema, arm):
+    region = Region(schema, "joint_position")
+    states = [region.judge(theta).state for theta in arm.sample(300, 12)["joint_position"]]
+    assert states.count("unknown") <= 6
+    outside = region.judge(np.array([0.0, 2.0]))
+    assert outside.reason.startswith("outside of the range of joint_position.elbow: 2 rad, learned to 1.")
+    learned = arm.sample(3000, 13)["joint_position"]
+    ring = np.linalg.norm((learned - (LOW + HIGH) / 2) / (HIGH - LOW), axis=1) > 0.25
+    x = (learned[ring] - schema.scaler.mean[:2]) / schema.scaler.std[:2]
+    hollow = replace(schema, anchors=np.concatenate([x, np.zeros((len(x), 10))], axis=1).astype(np.float32)[:1000])
+    assert (
+        Region(hollow, "joint_position").judge((LOW + HIGH) / 2).reason
+        == "this joint_position is far from all learned ones"
+    )
 
 
 def test_growth_is_interpolated_and_rises_with_the_square_behind_its_end():
