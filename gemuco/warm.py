@@ -66,12 +66,13 @@ def body(outputs: tuple[str, ...] = OUTPUTS) -> BodySchema:
 
 def running(schema: BodySchema) -> Iterator[str]:
     """Call all functions that a service uses; yield the name of each step before it."""
+    schema = sure(schema)
     whole = {name: np.zeros(size) for name, (size, _) in SIGNALS.items()}
     yield "samples"
     received = np.frombuffer(bytes(8), "<f8"), np.frombuffer(bytes(1), bool), np.frombuffer(bytes(8), "<f8")
     usable(*received, np.zeros(1, int), np.zeros(1, int), np.ones(1), np.empty(1))
     yield "estimation by mask"
-    estimate(sure(schema), {name: whole[name] for name in ("position", "tension")})
+    estimate(schema, {name: whole[name] for name in ("position", "tension")})
     yield "estimation by descent"
     estimate(schema, {"length": whole["length"]})
     yield "anomaly"

@@ -92,8 +92,8 @@ class Judge:
             knots, growth = np.ones(1), np.zeros((1, schema.layout.size))
             self._limits = np.full(2, np.inf)
         else:
-            logs, slopes = certainty.logs[place], certainty.slopes[place]
-            knots, growth = certainty.knots[place], certainty.growth[place] * std**2
+            logs, slopes = certainty.logs[place].copy(), certainty.slopes[place].copy()  # those of a file are read-only
+            knots, growth = certainty.knots[place].copy(), certainty.growth[place] * std**2
             self._limits = certainty.limits[place]
         self._ranges = np.ascontiguousarray(ranges[:, elements])
         self._parts = (

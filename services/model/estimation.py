@@ -14,6 +14,7 @@ from gemuco.schema import BodySchema
 from hal.by_signal import Elements, Numbers, Truths
 from hal.clock import Clock
 from hal.config import RobotConfig
+from services.model.fusion import Fusion
 from services.model.living_model import layout_of
 from services.wire.messages import Estimates, Sample
 from services.wire.streams import Arrival
@@ -165,6 +166,7 @@ class Estimation:
         publish: Callable[[Estimates], None],
         clock: Clock,
         factor: Callable[[], np.ndarray | None] = lambda: None,
+        fusion: Fusion | None = None,
     ) -> None:
         """Prepare.
 
@@ -174,9 +176,10 @@ class Estimation:
             publish: Publishes the estimates.
             clock: Source of time.
             factor: Returns the factors on the std of the schema's elements, shape (size,), if there are any.
+            fusion: Combines measurements with estimates; without it they are published as measured.
         """
         self._freshness, self._schema, self._publish, self._clock = freshness, schema, publish, clock
-        self._factor = factor
+        self._factor, self._fusion = factor, fusion
         self._source: tuple[BodySchema, Numbers, np.ndarray | None] | None = None
         """This holds the schema, the values and the factors of `latest`."""
         self._newest: Sample | None = None
@@ -196,7 +199,7 @@ class Estimation:
         if self.latest is not None and is_same:
             self.latest = replace(self.latest, stamp_ns=stamp_ns, cycle=cycle)
         else:
-            self.latest = _estimates(schema, in_order(schema, values), factor, stamp_ns, cycle)
+            self.latest = _estimates(schema, in_order(schema, values), factor, self._fusion, stamp_ns, cycle)
             self._source = schema, values, factor
         self._publish(self.latest)
 
@@ -207,14 +210,22 @@ class Estimation:
     def counts(self) -> dict[str, int]:
         """Count the signals that were `measured`, `estimated`, or neither (`none`) in the last tick."""
         methods = list(self.latest.method.values()) if self.latest is not None else []
-        measured, none = methods.count("measured"), methods.count("none")
+        measured, none = methods.count("measured") + methods.count("fused"), methods.count("none")
         return {"measured": measured, "estimated": len(methods) - measured - none, "none": none}
 
 
-def _estimates(schema: BodySchema, values: Numbers, factor: np.ndarray | None, stamp_ns: int, cycle: int) -> Estimates:
+def _estimates(
+    schema: BodySchema, values: Numbers, factor: np.ndarray | None, fusion: Fusion | None, stamp_ns: int, cycle: int
+) -> Estimates:
     value, std, residual, sureness, recipe = fill(schema, values.flat)
     if factor is not None and recipe.steps:
         std, sureness = std * factor, _widened(schema, sureness, recipe.estimated, factor)
+    method = dict(recipe.method)
+    if fusion is not None:
+        value, std, is_fused = fusion.fuse(schema, values.flat, value, std, factor)
+        for name, span in schema.layout.slices.items():
+            if method[name] == "measured" and is_fused[span].any():
+                method[name] = "fused"
     elements = values.elements
     return Estimates(
         stamp_ns=stamp_ns,
@@ -223,7 +234,7 @@ def _estimates(schema: BodySchema, values: Numbers, factor: np.ndarray | None, s
         values=Numbers(value, elements),
         estimated=Truths(recipe.estimated, elements),
         std=Numbers(std, elements),
-        method=dict(recipe.method),
+        method=method,
         mask=dict(recipe.label),
         residual=residual,
         state={name: sure.state for name, sure in sureness.items()},

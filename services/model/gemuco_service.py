@@ -25,6 +25,7 @@ from services.model.anomaly_loop import VERDICT_RATE, AnomalyWatch
 from services.model.control_config import ControlConfig, controller_of
 from services.model.control_loop import Control
 from services.model.estimation import Estimation, Freshness
+from services.model.fusion import Fusion
 from services.model.hindsight import Hindsight
 from services.model.living_model import LivingModel
 from services.model.model_config import ModelConfig, model_config
@@ -135,8 +136,9 @@ class GemucoService:
         self._estimates = service.publisher(keys.estimate(robot.robot), Estimates)
         self.hindsight = Hindsight(self.freshness, self._schema, self.clock)
         self.estimation = Estimation(
-            self.freshness, self._schema, self._publish, self.clock, lambda: self.hindsight.factor
-        )
+            self.freshness, self._schema, self._publish, self.clock, lambda: self.hindsight.factor,
+            Fusion(schema.layout.size) if self.config.fuse else None,
+        )  # fmt: skip
         self.acquaintance = Acquaintance()
         self.anomaly = AnomalyWatch(
             self.freshness,

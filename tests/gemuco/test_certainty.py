@@ -11,9 +11,10 @@ from tool_arm import MASKS, ToolArm, tools
 from tool_arm import dataset as tool_data
 
 from gemuco import checkpoint
+from gemuco.adaption.update import Updater
 from gemuco.certainty.certainty import NINETY
 from gemuco.checkpoint import load, save
-from gemuco.compiled.certainty import grown
+from gemuco.compiled.certainty import grown, novelties, spread
 from gemuco.dataset import Dataset, Episode
 from gemuco.estimation import estimate
 from gemuco.intervals.calibration import fitted
@@ -192,3 +193,16 @@ def test_growth_is_interpolated_and_rises_with_the_square_behind_its_end():
     knots, growth = np.array([1.0, 2.0, 4.0]), np.array([[0.1], [0.4], [1.0]])
     told = [grown(knots, growth, 0, distance) for distance in (0.5, 1.0, 3.0, 4.0, 8.0)]
     np.testing.assert_allclose(told, [0.05, 0.1, 0.7, 1.0, 4.0])
+
+
+def test_a_model_from_a_file_and_an_updated_one_need_no_other_compiled_code(schema, arm, tmp_path):
+    save(schema, tmp_path)
+    values = row(arm.sample(1, 8), 0)
+    updater = Updater(load(tmp_path))
+    updater.add(values)
+    updater.step(0)
+    before = len(spread.signatures), len(novelties.signatures)
+    for body in (schema, load(tmp_path), updater.schema):
+        estimate(body, hidden(values, "joint_position"))
+        estimate(body, {"muscle_length": values["muscle_length"]})
+    assert (len(spread.signatures), len(novelties.signatures)) == before == (1, 1)
