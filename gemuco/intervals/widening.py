@@ -19,6 +19,15 @@ PATIENCE = 20.0
 LEAST, MOST = 0.2, 1e3
 """A factor stays between these bounds."""
 
+MEMORY = 600
+"""This many of the newest errors of every element count."""
+LOST_SHARE = 0.93
+"""This share of them is within the interval of a signal that is then lost: it moves on to postures not seen lately."""
+FIRST = 20
+"""The errors of the training count as this many."""
+NARROWEST = 0.5
+"""The std of a lost signal is at least this share of the one from training."""
+
 
 class Widening:
     """A factor on the std of every element.
@@ -56,3 +65,47 @@ class Widening:
         """Begin anew, as after a change of the body."""
         self.factor[:] = 1.0
         self.seen[:] = 0
+
+
+class RecentErrors:
+    """A factor on the std of every element of a signal that is lost: the quantile of its errors while it was measured.
+
+    `Widening` follows the errors of the moment, which is right while truth comes late. A lost signal moves on, so all
+    recent errors count.
+
+    Args:
+        size: Number of elements.
+
+    Attributes:
+        factor: Present factors, shape (size,); never written to again.
+    """
+
+    def __init__(self, size: int) -> None:
+        normal = np.abs(np.random.default_rng(0).standard_normal(100 * FIRST))
+        first = np.quantile(normal, (np.arange(FIRST) + 0.5) / FIRST) / NINETY
+        self._ratios = np.full((size, FIRST + MEMORY), np.nan)
+        self._ratios[:, :FIRST] = first
+        self._count = np.zeros(size, int)
+        self.factor = np.ones(size)
+
+    def see(self, missed: np.ndarray, std: np.ndarray) -> None:
+        """Take the errors of one sample.
+
+        Args:
+            missed: Truth minus estimate [unit of each element], shape (size,); NaN where the truth is not known.
+            std: The std of the estimates, without a factor [the same units], shape (size,).
+        """
+        known = np.flatnonzero(np.isfinite(missed) & np.isfinite(std) & (std > 0.0))
+        self._ratios[known, FIRST + self._count[known] % MEMORY] = np.abs(missed[known]) / (NINETY * std[known])
+        self._count[known] += 1
+        ordered = np.sort(self._ratios[known], axis=1)  # NaN come last
+        place = LOST_SHARE * (FIRST + np.minimum(self._count[known], MEMORY) - 1)
+        factor = self.factor.copy()
+        factor[known] = np.clip(ordered[np.arange(len(known)), np.ceil(place).astype(int)], NARROWEST, MOST)
+        self.factor = factor
+
+    def forget(self) -> None:
+        """Begin anew, as after a change of the body."""
+        self._ratios[:, FIRST:] = np.nan
+        self._count[:] = 0
+        self.factor = np.ones(len(self.factor))

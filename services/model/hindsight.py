@@ -9,18 +9,13 @@ from gemuco.adaption.recognise import Prior
 from gemuco.adaption.update import ANOTHER, SPREAD
 from gemuco.derived import ByPattern
 from gemuco.estimation import Recipe, fill
-from gemuco.intervals.widening import Widening
+from gemuco.intervals.widening import RecentErrors
 from gemuco.schema import BodySchema
 from hal.clock import Clock
 from services.model.estimation import Freshness, in_order
 
 APART = 0.1
 """Errors are looked at once in this time [s] at most, and only if the robot moved: errors at rest are all the same."""
-STEP = 0.2
-"""Step of the widening; see `gemuco.intervals.widening.STEP`. A lost signal keeps its factor while the robot moves on,
-so the factor is a mean over more samples than with truth that is only late."""
-LEAST = 0.5
-"""The std is at least this share of the one from training: a short motion shows little of a body."""
 
 
 class Hindsight:
@@ -32,19 +27,20 @@ class Hindsight:
         freshness: Source of samples.
         schema: Returns the body schema in use.
         clock: Source of time.
-
-    Attributes:
-        factor: Factor of every element of the layout, shape (size,); never written to again.
     """
 
     def __init__(self, freshness: Freshness, schema: Callable[[], BodySchema], clock: Clock) -> None:
         self._freshness, self._schema, self._clock = freshness, schema, clock
         size = schema().layout.size
-        self._widening = Widening(size, STEP, LEAST)
+        self._errors = RecentErrors(size)
         self._last, self._looked_at = np.full(size, np.nan), -np.inf
         self._bias = schema().bias
         self._recipes: tuple[BodySchema, ByPattern[Recipe]] | None = None
-        self.factor = np.ones(size)
+
+    @property
+    def factor(self) -> np.ndarray:
+        """Factor of every element of the layout, shape (size,); the same array until `look` sees another error."""
+        return self._errors.factor
 
     def look(self) -> None:
         """Predict every measured output from the other signals, if the robot moved since the last time."""
@@ -61,8 +57,8 @@ class Hindsight:
         missed, std = np.full(len(joined), np.nan), np.full(len(joined), np.nan)
         for name in schema.x_out:
             self._predict(schema, joined, schema.layout.slice(name), missed, std)
-        self._widening.see(missed, std * self.factor)
-        self.factor = self._widening.factor.copy()
+        if np.isfinite(missed).any():
+            self._errors.see(missed, std)
 
     def _predict(
         self, schema: BodySchema, joined: np.ndarray, span: slice, missed: np.ndarray, std: np.ndarray
@@ -88,5 +84,5 @@ class Hindsight:
     def _forget_another_body(self, schema: BodySchema) -> None:
         """Begin anew if p is that of another body."""
         if len(schema.bias) and Prior.of(schema).between(self._bias, schema.bias.astype(float)) > ANOTHER:
-            self._widening.forget()
-            self.factor, self._bias = self._widening.factor.copy(), schema.bias
+            self._errors.forget()
+            self._bias = schema.bias

@@ -7,10 +7,15 @@ the share of errors within 1.645 std; beside it are that of the expected error o
 that covers 90 % of the held-out errors (split conformal), and of ridge regression's relative variance (leverage),
 calibrated in the same way. Outside are states with a joint in the half of its range that was not learned, another
 trajectory, or the last part of a recording. Recordings are those of `studies.peers` (GEMUCO_DATA).
+
+The last table is of actual muscle-driven arms with the model of the designer's arm: `alone` is the coverage of the
+model's std; `lost` that of the next 10 s, with the factor that a running service has when the sensor is lost; `late` is
+the coverage in windows of 300 samples (30 s) with truth one second late.
 """
 
 import argparse
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -24,12 +29,14 @@ from gemuco.certainty.certainty import NINETY, features
 from gemuco.dataset import Dataset, Episode
 from gemuco.estimation import fill
 from gemuco.intervals.sureness import UNKNOWN
+from gemuco.intervals.widening import RecentErrors, Widening
 from gemuco.layers import run
 from gemuco.learning.accuracy import bias_of
 from gemuco.learning.train import fit
 from gemuco.masks import Mask
 from gemuco.schema import BodySchema
 from gemuco.signals import Layout, Signal
+from studies.accuracy.actual_arms import record
 from studies.peers import recordings, robots
 from studies.peers.question import MissingData, Trial
 
@@ -291,8 +298,57 @@ def _lines(name: str, tallies: Sequence[Tally]) -> Iterator[list[str]]:
         yield [name, "by condition", f"{min(inner):.3f} to {max(inner):.3f}", *[""] * 8]
 
 
+ACTUAL = "musashi_arm, actual arms"
+RATE, LASTS, LATE, AHEAD, WINDOW = 10.0, 120.0, 10, 100, 300
+"""Samples per second, length of a recording [s], lateness of the truth, and lengths of the future and of a window."""
+
+
+def actual(seeds: int) -> Iterator[list[str]]:
+    """Yield the rows of the last table."""
+    case = next(case for case in cases() if case.name == "musashi_arm, all")
+    schema, _ = train(case, case.trial(0), 0)
+    robot = robots.robot_of("musashi_arm")
+    for arm in range(1, seeds + 1):
+        recording = record(robot, arm, arm, RATE, LASTS)
+        rows = np.concatenate([recording[name] for name in schema.layout.names], axis=1)
+        for name in (robots.JOINTS, robots.LENGTH):
+            span, missed, std = schema.layout.slice(name), [], []
+            for row in rows:
+                hidden = row.copy()
+                hidden[span] = np.nan
+                hidden.setflags(write=False)
+                completion = fill(schema, hidden)
+                missed.append(completion.value[span] - row[span])
+                std.append(completion.std[span])
+            yield [f"arm {arm}, {name}", *_of_actual(np.array(missed), np.array(std))]
+
+
+def _of_actual(missed: np.ndarray, std: np.ndarray) -> list[str]:
+    """Return the coverage alone, after a loss, and with late truth, from errors and std, shape (samples, n)."""
+    ahead, late = [], []
+    recent, widening, pending = RecentErrors(missed.shape[1]), Widening(missed.shape[1]), deque[np.ndarray]()
+    for index, (error, own) in enumerate(zip(missed, std, strict=True)):
+        if index >= WINDOW and index % (AHEAD // 2) == 0 and index + AHEAD <= len(missed):
+            after = slice(index, index + AHEAD)
+            ahead.append(np.mean(np.abs(missed[after]) <= NINETY * recent.factor * std[after]))
+        recent.see(error, own)
+        promised = widening.factor * own
+        late.append(np.abs(error) <= NINETY * promised)
+        pending.append(promised)
+        if len(pending) > LATE:
+            widening.see(missed[index - LATE], pending.popleft(), LATE)
+    sums = np.cumsum(np.array(late), axis=0)
+    windows = (sums[WINDOW:] - sums[:-WINDOW]) / WINDOW
+    alone = float(np.mean(np.abs(missed) <= NINETY * std))
+    within = float(np.mean(np.abs(windows - 0.9) <= 0.03 + 1e-9))
+    return [
+        f"{alone:.3f}", f"{np.mean(ahead):.3f}", f"{np.min(ahead):.2f}", f"{windows.min():.2f} to {windows.max():.2f}",
+        f"{within:.0%}",
+    ]  # fmt: skip
+
+
 def main() -> None:
-    """Print the table."""
+    """Print the tables."""
     parser = argparse.ArgumentParser(description="Coverage of the intervals of estimates")
     parser.add_argument("--seeds", type=int, default=5, help="number of seeds")
     parser.add_argument("--rows", default="", help="only bodies whose name contains this")
@@ -313,6 +369,11 @@ def main() -> None:
             table.add_row(*line)
             console.print("  ".join(line), style="dim")
     console.print(table)
+    if options.rows in ACTUAL:
+        last = Table(ACTUAL, "alone", "lost, mean", "lost, worst", "late, windows", "late, in 0.90 +- 0.03")
+        for cells in actual(options.seeds):
+            last.add_row(*cells)
+        console.print(last)
     console.print(f"{time.monotonic() - begin:.0f} s")
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gemuco.certainty.certainty import NINETY
-from gemuco.intervals.widening import LEAST, Widening
+from gemuco.intervals.widening import FIRST, LEAST, MEMORY, NARROWEST, RecentErrors, Widening
 
 
 def covered(errors: np.ndarray, late: int) -> np.ndarray:
@@ -58,3 +58,27 @@ def test_factors_have_bounds_and_begin_anew():
     assert widening.factor.tolist() == [LEAST, 1e3]
     widening.forget()
     assert widening.factor.tolist() == [1.0, 1.0]
+
+
+def test_a_lost_signal_keeps_an_interval_that_held_before():
+    random, recent = np.random.default_rng(0), RecentErrors(2)
+    for scale in np.exp(0.5 * np.sin(0.05 * np.arange(600))):
+        recent.see(5.0 * scale * random.standard_normal(2), np.array([1.0, np.nan]))
+    assert recent.factor[1] == 1.0
+    later = [5.0 * scale * random.standard_normal() for scale in np.exp(0.5 * np.sin(0.05 * np.arange(3000)))]
+    assert 0.88 < np.mean(np.abs(later) <= NINETY * recent.factor[0]) < 0.97
+
+
+def test_few_errors_count_little_and_old_ones_leave():
+    recent = RecentErrors(1)
+    recent.see(np.array([1e6]), np.ones(1))
+    assert 1.0 <= recent.factor[0] < 2.0
+    for _ in range(FIRST):
+        recent.see(np.array([10.0]), np.ones(1))
+    assert recent.factor[0] == pytest.approx(10.0 / NINETY)
+    for _ in range(MEMORY):
+        recent.see(np.array([1e-3]), np.ones(1))
+    assert recent.factor[0] == NARROWEST
+    kept = recent.factor
+    recent.forget()
+    assert recent.factor.tolist() == [1.0] and kept.tolist() == [NARROWEST]
