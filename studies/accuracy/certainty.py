@@ -30,7 +30,6 @@ from gemuco.dataset import Dataset, Episode
 from gemuco.estimation import fill
 from gemuco.intervals.sureness import UNKNOWN
 from gemuco.intervals.widening import RecentErrors, Widening
-from gemuco.layers import run
 from gemuco.learning.accuracy import bias_of
 from gemuco.learning.train import fit
 from gemuco.masks import Mask
@@ -190,8 +189,7 @@ def _held_errors(schema: BodySchema, mask: Mask, held: Dataset) -> tuple[np.ndar
     own = np.array([names.index(name) if names else 0 for name in held.conditions])[held.condition_of_rows()]
     whole = np.isfinite(x).all(axis=1)
     x, p = x[whole], bias_of(schema, own[whole])
-    prediction = run(schema.weights.whole, schema.network_input(x, mask, p))
-    return prediction - x[:, schema.out_index], x
+    return schema.infer(x, mask, p) - x[:, schema.out_index], x
 
 
 def _leverage(known: np.ndarray, x: np.ndarray) -> np.ndarray:
