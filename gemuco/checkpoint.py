@@ -354,6 +354,8 @@ def _check_arrays(schema: BodySchema) -> None:
     for (method, _), array in schema.errors.items():
         if (array < 0.0).any():
             raise ValueError(f"an error of {method} is negative")
+    if schema.certainty is not None:
+        schema.certainty.check()
     if schema.normal is not None:
         check_normal(schema.normal, schema.scaler.std[schema.out_index], size + p)
 

@@ -25,6 +25,9 @@ KNOTS = 12
 RIDGE = 1e-3
 """The regularisation of the leverage, as a share of the mean square of a feature."""
 
+MOST = 1e3
+"""No limit, and no slope of a logarithm, is as large as this."""
+
 Way = tuple[str, Mask]
 """A way to estimate is a method and the signals that it is given."""
 ARRAYS = ("low", "high", "moments", "logs", "limits", "slopes", "knots", "growth")
@@ -112,6 +115,24 @@ class Certainty:
         """Return the certainty of these ways and arrays."""
         low, high, moments, logs, limits, slopes, knots, growth = (arrays[name] for name in ARRAYS)
         return cls(ways, low, high, moments, logs, limits, slopes, knots, growth)
+
+    def check(self) -> None:
+        """Refuse numbers that no calibration gives, with which every estimate would look sure, or none.
+
+        Raises:
+            ValueError: A number is impossible.
+        """
+        possible = {
+            "low": self.low <= self.high,
+            "logs": (self.logs[..., 1] > 0.0) & (self.logs[..., 2] <= self.logs[..., 3]),
+            "limits": (self.limits >= 0.0) & (self.limits < MOST),
+            "slopes": np.abs(self.slopes) < MOST,
+            "knots": self.knots > 0.0,
+            "growth": self.growth >= 0.0,
+        }
+        for name, is_possible in possible.items():
+            if not is_possible.all():
+                raise ValueError(f"array certainty.{name} holds a number that no training gives")
 
     def shapes(self, size: int) -> list[tuple[str, np.ndarray, tuple[int, ...]]]:
         """List (name, array, right shape) for a body with this size of the layout."""

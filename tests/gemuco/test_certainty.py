@@ -12,10 +12,11 @@ from tool_arm import dataset as tool_data
 
 from gemuco import checkpoint
 from gemuco.adaption.update import Updater
-from gemuco.certainty.certainty import NINETY
+from gemuco.certainty.certainty import NINETY, Certainty
 from gemuco.checkpoint import load, save
 from gemuco.compiled.certainty import grown, novelties, spread
 from gemuco.dataset import Dataset, Episode
+from gemuco.errors import SchemaError
 from gemuco.estimation import estimate
 from gemuco.intervals.calibration import fitted
 from gemuco.intervals.region import Region
@@ -145,6 +146,16 @@ def test_certainty_is_saved_and_a_model_without_it_says_what_it_can(schema, arm,
     older = estimate(old, hidden(values, "muscle_length"))["muscle_length"]
     np.testing.assert_array_equal(older.std, old.errors["mask", older.mask][old.out_layout.slice("muscle_length")])
     assert older.state == "unknown" and "outside of the range of joint_position.elbow" in older.reason
+
+
+@pytest.mark.parametrize(("name", "value"), [("slopes", -1e6), ("limits", 1e300), ("logs", 0.0), ("growth", -1.0)])
+def test_a_model_that_would_be_sure_of_everything_is_refused(schema, tmp_path, name, value):
+    arrays = schema.certainty.arrays()
+    arrays[name] = np.full_like(arrays[name], value)
+    forged = schema.with_certainty(Certainty.of(schema.certainty.ways, arrays))
+    with pytest.raises(SchemaError, match=f"certainty.{name} holds a number that no training gives"):
+        save(forged, tmp_path)
+        load(tmp_path)
 
 
 def test_an_estimate_with_its_interval_is_cheap(schema, arm):
