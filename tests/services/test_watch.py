@@ -1,12 +1,15 @@
 """The one judge of trouble, from all messages of a robot and from its statuses alone."""
 
 import math
+from dataclasses import replace
 
 import pytest
+from msgspec.structs import replace as msgspec_replace
 from rich.console import Console
 from talking_robot import BOTH, anomaly, estimates, sample, seen
 
 from services.verbs import top
+from services.view.markup import signals_html
 from services.watch.service_rows import Level, service_rows
 from services.watch.signal_rows import Kind, signal_rows
 from services.watch.snapshot import Newest, RobotSnapshot
@@ -46,6 +49,21 @@ def test_a_lost_sensor_is_estimated_and_its_sources_are_named():
     assert (row.kind, row.value, row.std, row.source) == (Kind.ESTIMATED, -0.48, 0.02, "muscle_tension")
     text = "joint_position (elbow) is estimated from muscle_tension."
     assert judged(seen(silent=True)) == Trouble(Level.DEGRADED, "Sensor lost", text)
+
+
+def test_an_estimate_outside_of_what_was_learned_is_said():
+    told = msgspec_replace(estimates(True), state={"joint_position": "unknown"}, reason={"joint_position": "too far"})
+    moment = replace(seen(silent=True), estimate=Newest(told, 0.01))
+    row = signal_rows(moment)[1]
+    assert (row.state, row.reason) == ("unknown", "too far")
+    assert Trouble(Level.DEGRADED, "Estimate unknown", "joint_position (elbow): too far.") in troubles(
+        moment, signal_rows(moment)
+    )
+    console = Console(width=160)
+    with console.capture() as shown:
+        console.print(top.view(moment))
+    assert "mask, unknown" in shown.get()
+    assert ' <span class="lost" title="too far">unknown</span>' in signals_html(signal_rows(moment))
 
 
 def test_a_poor_model_is_a_note():
