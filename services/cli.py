@@ -77,9 +77,13 @@ def hal(robot: RobotFile, connect: Connect = None) -> int:
 
     The motors are off at the start; a client enables them.
     """
-    from services.hardware.hal_service import run_hal
+    from services.process.realtime import starting
 
-    return run_hal(load(robot), connect or ())
+    with starting():
+        from services.hardware.hal_service import run_hal
+
+        config = load(robot)
+    return run_hal(config, connect or ())
 
 
 @app.command()
@@ -103,10 +107,13 @@ def serve(
     connect: Connect = None,
 ) -> None:
     """Run the model until Ctrl-C: estimation, control, anomaly detection, online update."""
-    from services.model import artifacts
-    from services.model.serve import serve as run_model
+    from services.process.realtime import starting
 
-    config = load(robot)
+    with starting():
+        from services.model import artifacts
+        from services.model.serve import serve as run_model
+
+        config = load(robot)
     run_model(config, model or artifacts.model_folder(config.robot), connect or ())
 
 

@@ -11,7 +11,7 @@ from hal.config import RobotConfig
 from services.model.gemuco_service import GemucoService
 from services.model.living_model import load_model
 from services.model.model_verbs import ModelVerbs
-from services.process.realtime import prepare_process
+from services.process.realtime import prepare_process, starting
 from services.process.service import Service, until_stopped
 
 log = logging.getLogger(__name__)
@@ -36,8 +36,9 @@ def serve(robot: RobotConfig, folder: Path, connect: Iterable[str] = (), stop: t
     """
     prepare_process()
     items = tuple(connect)
-    schema = load_model(robot, folder, items)
-    make_ready()
+    with starting():
+        schema = load_model(robot, folder, items)
+        make_ready()
     with until_stopped(stop) as stopped, Service(robot.robot, "model", items) as service:
         model = GemucoService(robot, schema, service)
         ModelVerbs(model).serve(service)
@@ -52,6 +53,10 @@ def make_ready() -> None:
         nonlocal reported
         if time.monotonic() - reported > PATIENCE:
             reported = time.monotonic()
-            log.warning("Compiling for this machine, once: %d %% done, now %s", round(100 * done), part)
+            log.warning(
+                "Compiled code: %d %% is ready, now %s. It is compiled once; later only a busy machine is slow.",
+                round(100 * done),
+                part,
+            )
 
     warm(report, is_service=True)

@@ -1,4 +1,6 @@
+import os
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -7,6 +9,7 @@ from hypothesis import strategies as st
 
 from hal.clock import ManualClock
 from services.model.gemuco_service import OFFSETS
+from services.process import realtime
 from services.process.lateness import GROWTH, RESOLUTION, Lateness
 from services.process.loop import Grid, Loop
 from services.process.realtime import prepare_thread, promote
@@ -127,6 +130,44 @@ def test_loop_survives_a_tick_that_raises(caplog: pytest.LogCaptureFixture) -> N
     assert len([record for record in caplog.records if "failed" in record.message]) == 1
     clock.advance(60.0)
     assert loop.error == ""
+
+
+def _scheduling() -> int:
+    return os.sched_getscheduler(threading.get_native_id()) & ~os.SCHED_RESET_ON_FORK
+
+
+@pytest.mark.parametrize("is_slow", [False, True])
+def test_a_start_runs_before_normal_programs_and_not_for_long(is_slow: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(realtime, "STARTS_WITHIN", 0.05)
+    seen: list[int] = []
+
+    def start() -> None:
+        with realtime.starting():
+            seen.append(_scheduling())
+            inner = threading.Thread(target=lambda: seen.append(_scheduling()))
+            inner.start()
+            inner.join()
+            deadline = time.monotonic() + 10.0
+            while is_slow and _scheduling() != os.SCHED_OTHER and time.monotonic() < deadline:
+                time.sleep(0.01)
+            seen.append(_scheduling() if is_slow else os.SCHED_OTHER)
+        seen.append(_scheduling())
+
+    thread = threading.Thread(target=start)
+    thread.start()
+    thread.join()
+    first, inner, after_a_while, afterwards = seen
+    assert first in (os.SCHED_FIFO, os.SCHED_OTHER)  # as the system allows
+    assert (inner, after_a_while, afterwards) == (os.SCHED_OTHER,) * 3
+
+
+def test_a_start_without_permission_is_a_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise PermissionError
+
+    monkeypatch.setattr(realtime.os, "sched_setscheduler", refuse)
+    with realtime.starting():
+        assert _scheduling() == os.SCHED_OTHER
 
 
 def test_real_time_is_tried_and_a_refusal_is_no_error() -> None:

@@ -1,0 +1,80 @@
+"""Pause of the estimates at a remote client after `kill -9` of the model service, on a machine with other work.
+
+    python -m studies.speed.pauses --times 8
+
+Router, simulator, HAL and model of a light robot run as processes. The model is killed at random times and started
+again at once. Each line has the pause until the next estimate that is based on measurements, the processor time that
+the new process took for it, and the load of the machine.
+"""
+
+import argparse
+import os
+import random
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import numpy as np
+import zenoh
+
+from hal.config import load_robot
+from services.process.supervisor import Supervisor, gemuco_command
+from services.wire import keys
+from studies.stack import light_model, light_robot
+from studies.stack.processes import cpu
+from studies.stack.soak import RATE, _client, free_port, start
+
+LONGEST = 60.0
+"""A pause that is longer than this [s] ends the study."""
+
+
+class Newest:
+    """Time of the newest estimate [monotonic s] that is based on measurements."""
+
+    def __init__(self) -> None:
+        self.at = 0.0
+
+    def take(self, sample: zenoh.Sample) -> None:
+        """Look at a message of the model."""
+        message: dict[str, Any] = msgpack.unpackb(sample.payload.to_bytes())
+        if set(message["method"].values()) != {"none"}:
+            self.at = time.monotonic()
+
+
+def run(times: int, folder: Path) -> list[float]:
+    """Print a line per kill, and return the pauses [s]."""
+    file, model = light_robot.write(folder, f"pauses_{os.getpid()}", RATE, True), folder / "model"
+    light_model.make(file, model)
+    robot, router = load_robot(file).robot, f"tcp/127.0.0.1:{free_port()}"
+    command = gemuco_command("serve", str(file), "--model", str(model), "--connect", router)
+    newest, chance, pauses = Newest(), random.Random(1), []
+    with Supervisor(folder) as supervisor:
+        supervisor.start("router", gemuco_command("router", "--listen", router))
+        with _client(robot, router) as client:
+            start(supervisor, client, file, model, router, folder)
+            subscriber = client.session.declare_subscriber(keys.estimate(robot), newest.take)
+            for _ in range(times):
+                time.sleep(chance.uniform(0.5, 1.5))
+                supervisor.kill("model")
+                killed = time.monotonic()
+                supervisor.start("model", command)
+                while newest.at < killed + 0.05:
+                    if time.monotonic() - killed > LONGEST:
+                        raise TimeoutError(f"No estimate within {LONGEST:g} s.")
+                    time.sleep(0.005)
+                pauses.append(newest.at - killed)
+                spent = cpu(supervisor.children["model"].process.pid)
+                print(f"{pauses[-1]:6.2f} s, processor {spent:.2f} s, load {os.getloadavg()[0]:.1f}", flush=True)
+            subscriber.undeclare()
+    return pauses
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--times", type=int, default=8)
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        seconds = run(options.times, Path(name))
+    print(f"median {np.median(seconds):.2f} s, worst {max(seconds):.2f} s on {os.cpu_count()} cores")
