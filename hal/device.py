@@ -94,6 +94,8 @@ class Device(abc.ABC):
     """Identity of this very device, as `canopen:<vendor>-<product>-<serial>`; empty before `open`, or if unknown."""
     long_request: Callable[[], None] | None = None
     """Request that takes longer than a cycle; the caretaker runs it in a thread."""
+    origin: int = 0
+    """Number that changes when its measurements begin anew, because it was opened or homed."""
     compliance: float = 0.0
     """Distance from its set-point at which a healthy drive pushes with its largest effort [unit of the command]."""
     can_damp: bool = False

@@ -112,6 +112,8 @@ class Assembler:
         signals = [name for name, signal in config.signals.items() if name in direct or signal.computed is not None]
         self._elements = Elements.of({name: config.signals[name].size for name in signals})
         self.plausibility = Plausibility.of(config, direct, devices)
+        self._origins = [device.origin for device in self._devices]
+        self._places_of = [np.array([names.index(one) for one in device.measures]) for device in self._devices]
         self.heard = self.nothing
         places = self._elements.places
         self._direct = np.concatenate([np.r_[places[name]] for name in direct] or [np.zeros(0, int)])
@@ -142,6 +144,9 @@ class Assembler:
         age = np.maximum(now - received, 0.0)
         fresh = (age <= self._stale_after) & np.isfinite(values)
         np.copyto(values, np.nan, where=~fresh)
+        origins = [device.origin for device in self._devices]
+        if origins != self._origins:
+            self._renew(origins)
         valid = self.plausibility.check(values, received, fresh)
         heard, doubted = values, None
         if valid is not fresh:
@@ -155,6 +160,13 @@ class Assembler:
             self.heard = Numbers(values.copy(), self._elements)
             self.heard.flat[self._direct[doubted]] = heard[doubted]
         return numbers, Numbers(age, self._elements), Truths(valid, self._elements)
+
+    def _renew(self, origins: list[int]) -> None:
+        """Let the elements of devices that were opened or homed begin anew."""
+        for new, old, places in zip(origins, self._origins, self._places_of, strict=True):
+            if new != old:
+                self.plausibility.renew(places)
+        self._origins = origins
 
     def _with_computed(self, values: np.ndarray, age: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return values, ages [s] and validity of all signals, measured and computed, in the order of a sample."""

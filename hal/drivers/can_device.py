@@ -178,6 +178,7 @@ class CanDevice(Device):
         if not self._counters["commissioned"]:
             self.missed = 1
         self._counters["commissioned"] += 1
+        self.origin += 1
         self.is_commissioned = True
 
     def _check_calibration(self) -> None:

@@ -116,6 +116,12 @@ class Plausibility:
         self.count += int(np.count_nonzero(fresh & ~usable))
         return usable
 
+    def renew(self, places: np.ndarray) -> None:
+        """Begin anew with some elements, given by their indices, because their device was opened or homed."""
+        self._before[places], self._received[places] = np.nan, LONG_AGO
+        self._is_trusted[places], self._jumps[places] = True, 0
+        self._has_doubts = not self._is_trusted.all()
+
     def reset(self) -> None:
         """Call no element frozen from the next check on; for any thread.
 
@@ -242,7 +248,7 @@ class Stillness:
             moved = self._has_own & (way[self._rows, self._own] > self._own_way)
             if self._others.size:
                 moved[self._others] = 2 * np.count_nonzero(way[self._others] > self._way, axis=1) >= way.shape[1]
-            np.copyto(self._moved_at, received, where=moved & np.isinf(self._moved_at))
+            np.copyto(self._moved_at, received, where=moved & np.isinf(self._moved_at) & (received > LONG_AGO))
         still = (received - self._moved_at > self._after) & (np.abs(values) > self._unloaded)
         self._is_frozen = self._is_frozen | still
         self.is_any_frozen = bool(self._is_frozen.any())

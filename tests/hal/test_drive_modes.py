@@ -311,6 +311,22 @@ def test_homing_finds_the_zero(joint, method, home):
     assert bench.value("position") == pytest.approx(bench.world.position - found, abs=1e-3)
 
 
+def test_what_it_measures_begins_anew_after_homing(joint):
+    """The position leaps to the new zero, which is no lie."""
+    settings = {"method": 37, "speed": 1.0, "slow_speed": 0.1}
+    bench = joint("csp", homing=settings, zero=-0.9)
+    bench.cycle(5)
+    before = bench.sample.values["joint_position"][0]
+    bench.robot._assembler.plausibility._bounds.rate[:] = 8.0
+    bench.robot.home("elbow")
+    bench.until(lambda: bench.device("elbow")["counters"]["homed"], "homing", 400)
+    bench.until(lambda: bench.robot.mode == "off", "off", 20)
+    bench.cycle(3)
+    assert abs(bench.sample.values["joint_position"][0] - before) > 0.4
+    assert not bench.robot.health()["implausible"]
+    bench.enable()
+
+
 def test_homing_offset_moves_the_zero(joint):
     settings = {"method": 37, "speed": 1.0, "slow_speed": 0.1, "offset": 0.25}
     bench = joint("csp", homing=settings, zero=0.0)

@@ -185,6 +185,21 @@ def test_reset_forgets_what_was_frozen_but_not_a_jump(watched):
     assert watched.feed(cell=50.0) == [False, True, True]
 
 
+def test_a_device_that_was_opened_or_homed_begins_anew():
+    bench = SafetyBench("position")
+    bench.cycle(3)
+    bench.joints[0].position = 1.5
+    bench.cycle(3)
+    assert bench.sample.valid["joint_position"].tolist() == [False, True]
+    bench.joints[0].origin += 1
+    bench.cycle()
+    assert bench.sample.valid["joint_position"].all()
+    assert not bench.robot.health()["implausible"]
+    bench.joints[0].position = 0.5
+    bench.cycle()
+    assert not bench.sample.valid["joint_position"][0]
+
+
 def test_the_robot_file_has_the_last_word():
     free = {"low": -np.inf, "high": np.inf, "rate": np.inf, "frozen_after": np.inf}
     watched = Watched(joint_position=free, cell={"low": 5.0, "frozen_after": 1.0})

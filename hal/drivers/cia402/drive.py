@@ -406,6 +406,7 @@ class Cia402Drive(CanopenNode):
         self._text = f"{self._place}: homing {homing.problem}." if homing.problem else ""
         if not homing.problem:
             self._counters["homed"] += 1
+            self.origin += 1
 
     def _homing_mode(self) -> OperationMode:
         return self._mode if self._homing is None else OperationMode.HOMING
