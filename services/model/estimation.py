@@ -139,7 +139,7 @@ def in_order(schema: BodySchema, values: Numbers) -> Numbers:
     return ordered
 
 
-def _widened(
+def widened(
     schema: BodySchema, sureness: dict[str, Sureness], estimated: np.ndarray, factor: np.ndarray
 ) -> dict[str, Sureness]:
     """Return the states; a signal that was predicted badly while it was measured is doubtful."""
@@ -219,7 +219,7 @@ def _estimates(
 ) -> Estimates:
     value, std, residual, sureness, recipe = fill(schema, values.flat)
     if factor is not None and recipe.steps:
-        std, sureness = std * factor, _widened(schema, sureness, recipe.estimated, factor)
+        std, sureness = std * factor, widened(schema, sureness, recipe.estimated, factor)
     method = dict(recipe.method)
     if fusion is not None:
         value, std, is_fused = fusion.fuse(schema, values.flat, value, std, factor)

@@ -12,6 +12,7 @@ from gemuco.schema import BodySchema
 from services.errors import BadArguments, NotEngaged
 from services.model.control_config import controller_of, simulator_of
 from services.model.control_loop import Control
+from services.model.estimation import widened
 from services.model.gemuco_service import GemucoService
 from services.process.service import Service
 from services.wire.caller import Caller
@@ -83,10 +84,11 @@ class ModelVerbs:
             raise BadArguments(f"'signal' must be a name. Known signals: {', '.join(schema.layout.names)}.")
         values, cycle = self._values(arguments)
         facts = {"cycle": cycle, "model_version": self._service.living.version}
+        factor = self._service.hindsight.factor
         if "signal" in arguments:
             signal = schema.layout.signal(arguments["signal"])
-            return _estimates(schema, values)[signal.name] | facts
-        return {"signals": _estimates(schema, values)} | facts
+            return _estimates(schema, values, factor)[signal.name] | facts
+        return {"signals": _estimates(schema, values, factor)} | facts
 
     def solve(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Return the command for a target by the robot file's loss; the robot does not move."""
@@ -220,10 +222,11 @@ class ModelVerbs:
         return values, cycle
 
 
-def _estimates(schema: BodySchema, values: Mapping[str, np.ndarray]) -> dict[str, dict[str, Any]]:
+def _estimates(schema: BodySchema, values: Mapping[str, np.ndarray], factor: np.ndarray) -> dict[str, dict[str, Any]]:
     joined = schema.layout.join_one(values)
     joined.setflags(write=False)
     completion, expected, residual, sureness, recipe = fill(schema, joined)
+    expected, sureness = expected * factor, widened(schema, sureness, recipe.estimated, factor)
     value, std, estimated = completion.tolist(), expected.tolist(), recipe.estimated.tolist()
     return {
         signal.name: {

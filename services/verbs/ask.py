@@ -80,7 +80,8 @@ def estimate_line(reply: dict[str, Any]) -> str:
     spread = float(np.sqrt(np.mean(std[np.asarray(reply["estimated"], bool)] ** 2)))
     source = reply["mask"].replace("+", ", ") or "single elements"
     error = f"{spread:.3f} {reply['unit']}" if np.isfinite(spread) else "unknown"
-    return f"{start}  {values}  * estimated from {source}, expected error {error}"
+    state = f"; {reply['state']}: {reply['reason']}" if reply.get("reason") else ""
+    return f"{start}  {values}  * estimated from {source}, expected error {error}{state}"
 
 
 def _estimate(client: Client, signal: str, hide: Sequence[str]) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from services.model.control_config import controller_of, simulator_of
 from services.model.gemuco_service import GemucoService
 from services.model.model_verbs import ModelVerbs
 from services.process.service import Service
-from services.verbs.ask import ask_robot
+from services.verbs.ask import ask_robot, estimate_line
 
 
 @pytest.fixture
@@ -127,3 +127,29 @@ def test_history_holds_what_was_estimated(client: Client, model: GemucoService) 
         np.testing.assert_array_equal(found.estimated[name][-1], latest.estimated[name])
     with pytest.raises(BadArguments, match="Known arguments: seconds, signals, begin, end"):
         client.ask("model", "history", {"minutes": 1})
+
+
+def test_an_estimate_that_is_not_known_says_why_in_its_line() -> None:
+    reply = {
+        "signal": "joint_position", "unit": "rad", "elements": ["elbow"], "values": [0.3], "std": [0.2],
+        "estimated": [True], "method": "mask", "mask": "muscle_length", "state": "unknown", "reason": "too far",
+    }  # fmt: skip
+    line = "joint_position [rad]  elbow +0.300*  * estimated from muscle_length, expected error 0.200 rad"
+    assert estimate_line(reply) == f"{line}; unknown: too far"
+    assert estimate_line(reply | {"state": "known", "reason": ""}) == line
+
+
+def test_the_std_is_widened_by_the_errors_seen(
+    client: Client, model: GemucoService, sample: dict[str, np.ndarray]
+) -> None:
+    before = client.estimate(sample, hide=["joint_position"])
+    joints = slice(0, 5)
+    for _ in range(40):
+        missed = np.full(25, np.nan)
+        missed[joints] = 1.0  # rad
+        model.hindsight._errors.see(missed, np.full(25, 0.1))
+    after = client.estimate(sample, hide=["joint_position"])
+    assert before is not None and after is not None
+    ratio = after.std["joint_position"] / before.std["joint_position"]
+    np.testing.assert_allclose(ratio, 1.0 / 0.16449, rtol=1e-3)
+    assert after.state["joint_position"] in ("doubtful", "unknown")
