@@ -2,13 +2,14 @@
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator, model_validator
 
 from hal.errors import ConfigError
+from hal.units import check_robot_unit, check_units, factor
 
 
 class Section(BaseModel):
@@ -35,7 +36,33 @@ def per_element(value: float | tuple[float, ...] | None, size: int, where: str, 
     return np.broadcast_to(array, (size,)).copy()
 
 
-class RangeConfig(Section):
+class NumbersConfig(Section):
+    """Numbers of one signal, in its unit unless the section declares another one."""
+
+    written_in: str | None = None
+    """Unit of the numbers of this section, if it differs from that of the signal; rates are in this unit per second."""
+
+    def in_unit(self, unit: str, where: str) -> Self:
+        """Return these numbers in `unit`, that of their signal; `where` is their place in the robot file.
+
+        Raises:
+            ValueError: `written_in` cannot be converted to it.
+        """
+        if self.written_in is None:
+            return self
+        try:
+            check_units(unit, self.written_in)
+        except ValueError as error:
+            raise ValueError(f"{where}: {error}") from None
+        scale = factor(unit, self.written_in)
+        numbers = ((name, value) for name, value in self if isinstance(value, int | float | tuple))
+        scaled = {
+            n: tuple(scale * v for v in value) if isinstance(value, tuple) else scale * value for n, value in numbers
+        }
+        return self.model_copy(update={**scaled, "written_in": None})
+
+
+class RangeConfig(NumbersConfig):
     """Range of one signal, per element or one for all."""
 
     low: Finite | tuple[Finite, ...] | None = None
@@ -108,7 +135,7 @@ class CommandConfig(Section):
     """The last applied command is held for this time [s] before the robot stops; a stop holds or damps as long."""
 
 
-class StopConfig(Section):
+class StopConfig(NumbersConfig):
     """Behaviour of the robot when it is asked to stop, or when commands end."""
 
     behaviour: Literal["hold", "damp", "park", "off"] = "hold"
@@ -144,6 +171,7 @@ class SignalConfig(Section):
     """A named vector of sensor or control values."""
 
     unit: str
+    """SI unit of its values, one of `hal.units.ROBOT_UNITS`."""
     elements: tuple[str, ...] = Field(min_length=1)
     stale_after: Positive = 0.02
     """An element is valid up to this age [s]."""
@@ -151,6 +179,13 @@ class SignalConfig(Section):
     """Publisher of the signal: the HAL, or the process of a camera."""
     computed: ComputedConfig | None = None
     """Computation by the HAL; None for a signal that devices measure."""
+
+    @field_validator("unit", mode="before")
+    @classmethod
+    def _is_unit(cls, unit: object) -> str:
+        text = str(unit or "")  # `unit: 1` is a number in YAML
+        check_robot_unit(text)
+        return text
 
     @property
     def is_measured(self) -> bool:
@@ -242,6 +277,18 @@ class RobotConfig(Section):
     """Settings of random safe motion; the collector checks this section itself."""
     folder: Path = Path()
     """Folder of the robot file; paths in the file are relative to it."""
+
+    @field_validator("limits")
+    @classmethod
+    def _limits_in_unit(cls, limits: dict[str, LimitConfig], info: ValidationInfo) -> dict[str, LimitConfig]:
+        signals = info.data.get("signals", {})
+        return {n: limit.in_unit(signals[n].unit, n) if n in signals else limit for n, limit in limits.items()}
+
+    @field_validator("stop")
+    @classmethod
+    def _stop_in_unit(cls, stop: StopConfig, info: ValidationInfo) -> StopConfig:
+        name, signals = getattr(info.data.get("command"), "signal", ""), info.data.get("signals", {})
+        return stop.in_unit(signals[name].unit, name) if name in signals else stop
 
     @model_validator(mode="after")
     def _names_fit(self) -> "RobotConfig":

@@ -146,6 +146,7 @@ class Cia402Drive(CanopenNode):
         super().__init__(place, settings, cia402.PROFILE, settings.pdos(tuple(place.elements)))
         check_objects(settings, "effort" in place.elements, self._sheet, str(place))
         self.can_damp = settings.damping is not None
+        self.fastest = settings.max_velocity or math.inf
         self._mode = MODES[settings.mode]
         self._is_watched = self._sdo.has(cia301.CONSUMER_HEARTBEAT, 1)
         self._handshake = SetPointHandshake()
@@ -376,7 +377,15 @@ class Cia402Drive(CanopenNode):
         if self._units is None:  # not opened yet
             self._calibrate()
         checks = drive_checks(self._sdo, self._mode, self._is_watched, str(self._place))
+        self.fastest = self._motor_speed()
         return (*super().inspect(), *checks)
+
+    def _motor_speed(self) -> float:
+        """Return the highest speed of the motor (6080h) at the output [unit/s]; infinite if the drive has none."""
+        turns = self._sdo.read(cia402.MAX_MOTOR_SPEED.index, 0) if self._sdo.has(cia402.MAX_MOTOR_SPEED.index) else 0
+        if not turns or self._units is None:
+            return self._settings.max_velocity or math.inf
+        return turns / 60.0 * self._units.motor_turn
 
     def _leads_to_enabled(self, rest: int) -> bool:
         """Return whether the drive takes set-points; if not, send the command of this cycle instead.

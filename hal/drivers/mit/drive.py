@@ -107,6 +107,7 @@ class MitDrive(CanDevice):
         node = place.node
         self._model = settings.motor
         self._layout, self._ranges = settings.actuator
+        self.fastest = self._ranges.velocity * abs(settings.scale)
         self._sizes = mit.SIZES[self._layout]
         self._law = Law(place, settings)
         damiao = self._layout is Layout.DAMIAO
