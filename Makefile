@@ -15,14 +15,14 @@ wait $$beside || failed=1; cat build/clockless.log; exit $$failed
 endef
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo reproduce test test-all check format faults fuzz mutation peers bench test-socketcan test-controllers results clean test-compose wheels test-network docs
+.PHONY: help setup demo reproduce test test-all check format faults fuzz mutation peers bench test-socketcan test-controllers results clean test-compose wheel wheels test-network docs
 
 help:            ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 18
 
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[sim,dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[all,dev]'
 	$(BIN)/python -m gemuco.warm
 	@touch $(STAMP)
 
@@ -64,8 +64,13 @@ test-controllers: $(STAMP)  ## drivers on two CAN controllers at 1 Mbit/s: can0 
 test-compose: $(STAMP)  ## the simulated stack in containers: up, a client, each container killed once, down; needs Docker
 	$(BIN)/python tests/system/compose_check.py
 
+wheel: $(STAMP)  ## the package as one file in build/wheel
+	rm -rf build/lib build/bdist.*  # a build takes what an earlier one left there
+	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir build/wheel .
+	@ls build/wheel/*.whl
+
 wheels: $(STAMP)  ## fill wheels/, from which the images are then built without a network
-	$(BIN)/python deploy/requirements.py +sim +studies | $(BIN)/python -m pip download --quiet --dest wheels --constraint constraints.txt --requirement /dev/stdin setuptools
+	$(BIN)/python deploy/requirements.py +train +sim +studies | $(BIN)/python -m pip download --quiet --dest wheels --constraint constraints.txt --requirement /dev/stdin setuptools
 
 faults: $(STAMP)  ## the robot broken in every way with many seeds (docs/safety.md), and a million random frames
 	$(BIN)/python tests/hal/campaign.py --seeds 7 --json runs/faults.json

@@ -4,12 +4,12 @@
 set -eu
 site=$(/opt/gemuco/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')
 target=""
-if [ "$1" = --target ]; then target=$2; shift 2; fi
+if [ "${1:-}" = --target ]; then target=$2; shift 2; fi
 folder=${target:-$site}
 pip="python -m pip --python /opt/gemuco/bin/python install --quiet --constraint constraints.txt --find-links wheels"
 [ -z "$target" ] || pip="$pip --no-compile --target $target" # trained with once, so not worth the space
 
-if [ "$1" = . ]; then
+if [ "${1:-}" = . ]; then
     $pip --no-deps --no-index . 2>/tmp/offline.log || $pip --no-deps .
 else
     python deploy/requirements.py "$@" >/tmp/wanted.txt

@@ -101,7 +101,14 @@ else:
         """Import an exported name from its room."""
         if name not in _ROOM_OF:
             raise AttributeError(f"module 'gemuco' has no attribute '{name}'")
-        globals()[name] = value = getattr(import_module(_ROOM_OF[name]), name)
+        try:
+            room = import_module(_ROOM_OF[name])
+        except ModuleNotFoundError as error:
+            if error.name != "torch":
+                raise
+            text = f"gemuco.{name} needs the package 'torch', not installed here: pip install 'gemuco[train]'."
+            raise ModuleNotFoundError(text, name="torch") from None
+        globals()[name] = value = getattr(room, name)
         return value
 
 

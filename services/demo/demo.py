@@ -19,12 +19,15 @@ from services.demo.pace import CycleCounts
 from services.demo.story import MUSCLE, Story
 from services.demo.timeline import Timeline
 from services.demo.tool_story import ToolStory
+from services.errors import AlreadyRunning
+from services.extras import require
 from services.learning import collector, trainer
 from services.model import artifacts
 from services.model.control_config import ControlConfig
 from services.model.living_model import load_model
 from services.model.model_config import model_config
 from services.process.supervisor import Supervisor, gemuco_command
+from services.runtime import services_here
 from services.show import progress
 
 READY_WITHIN = 180.0
@@ -46,6 +49,7 @@ def play(robot: RobotConfig, path: Path, seed: int, out: Path) -> int:
     console = Console()
     started = time.monotonic()
     target = control_of(robot).target
+    check_start(robot)
     make_model(robot, console)
     with progress("compiling") as report:  # otherwise each process would wait for it
         warm(report)
@@ -161,6 +165,22 @@ def perform(
         marks = Story(robot, client, timeline, seed, actor, console.print).play()
     story_plot.plot(robot, timeline, marks, picture)
     return marks.stages
+
+
+def check_start(robot: RobotConfig) -> None:
+    """Check, before work that takes minutes, that nothing is missing and no service of this robot runs here.
+
+    Raises:
+        MissingExtra: A package for simulation or training is not installed.
+        AlreadyRunning: A service of a robot with this name runs on this machine.
+    """
+    require("torch", "matplotlib", "pybullet")
+    running = [service for name, service in services_here() if name == robot.robot]
+    if running:
+        raise AlreadyRunning(
+            f"Services of a robot '{robot.robot}' run on this machine: {', '.join(running)}. The demo starts its own; "
+            "stop them first, or give the robot in the file another name."
+        )
 
 
 def make_model(robot: RobotConfig, console: Console) -> None:

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from services.errors import ServiceError
+from services.extras import require
 from services.wire.session import is_loopback
 
 if TYPE_CHECKING:
@@ -16,7 +17,6 @@ if TYPE_CHECKING:
 
 LOOPBACK_PAGES = re.compile(r"http://(127\.\d+\.\d+\.\d+|localhost|\[::1\])(:\d+)?")
 """Only pages of these origins may connect to a server on loopback; other pages in the same browser may not."""
-MISSING = "The live page needs two more packages: pip install 'gemuco[view]' (viser and yourdfpy)."
 
 
 def open_site(host: str, port: int, title: str) -> "viser.ViserServer":
@@ -30,12 +30,11 @@ def open_site(host: str, port: int, title: str) -> "viser.ViserServer":
     Raises:
         ServiceError: The packages are not installed, the port is taken, or this machine does not have the address.
     """
-    try:
-        import rich
-        import viser
-        from viser import _messages
-    except ImportError:
-        raise ServiceError(MISSING) from None
+    require("viser", "yourdfpy")
+    import rich
+    import viser
+    from viser import _messages
+
     _check_free(host, port)
     rich.get_console().quiet = True  # viser prints a table to stdout
     for name in ("websockets", "websockets.server"):  # else one traceback per browser that disconnects

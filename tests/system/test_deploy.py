@@ -144,7 +144,7 @@ def test_what_the_small_image_lacks_is_told_in_a_sentence(
     with pytest.raises(typer.Exit) as ended:
         report_errors(lambda: __import__("torch"))()
     assert ended.value.exit_code == 1
-    assert "needs the package 'torch'" in capsys.readouterr().err
+    assert "needs the package 'torch', not installed here: pip install 'gemuco[train]'." in capsys.readouterr().err
     with pytest.raises(ModuleNotFoundError):
         report_errors(lambda: __import__("services.no_such_file"))()
 
@@ -155,10 +155,11 @@ def requirements(*words: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_requirements_of_an_image() -> None:
-    small = requirements("-torch", "-matplotlib").stdout
+    small = requirements().stdout
     assert "numpy" in small
-    assert "torch" not in small
-    assert requirements("=torch", "+sim", "=pybullet").stdout.split() == ["torch>=2.6", "pybullet>=3.2.7"]
+    assert not any(name in small for name in HEAVY)
+    assert "numpy" not in requirements("-numpy").stdout
+    assert requirements("+train", "=torch", "+sim", "=pybullet").stdout.split() == ["torch>=2.6", "pybullet>=3.2.7"]
     assert "does not ask for tensorflow" in requirements("-tensorflow").stderr
 
 
