@@ -269,6 +269,8 @@ class RobotConfig(Section):
     """`module:name` of the simulator that replaces the hardware."""
     urdf: Path | None = None
     """URDF file for the live page, relative to the robot file."""
+    tip: str | None = None
+    """Link of the URDF whose place the camera of a simulator made from it sees."""
     conditions: tuple[str, ...] = ()
     """Known conditions of the body, such as the tools that it may hold; the first is the default."""
     model: dict[str, Any] = Field(default_factory=dict)
