@@ -98,7 +98,9 @@ if TYPE_CHECKING:
 else:
 
     def __getattr__(name: str) -> object:
-        """Import an exported name from its room."""
+        """Import an exported name from its room, or the room `plot`."""
+        if name == "plot":
+            return import_module("gemuco.plot")
         if name not in _ROOM_OF:
             raise AttributeError(f"module 'gemuco' has no attribute '{name}'")
         try:

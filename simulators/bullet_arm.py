@@ -75,15 +75,14 @@ class BulletArm:
             pybullet.resetJointState(self._body, index, angle, 0.0, **self._options)
         self.position[:] = position
 
-    def step(self, targets: np.ndarray, count: int) -> None:
-        """Advance by `count` steps of `STEP` while the servos follow targets [rad], shape (n,)."""
+    def step(self, targets: np.ndarray) -> None:
+        """Advance by `STEP` while the servos follow targets [rad], shape (n,)."""
         client = self._options
         pybullet.setJointMotorControlArray(
             self._body, self._joints, pybullet.POSITION_CONTROL, targetPositions=targets.tolist(),
             targetVelocities=self._still, forces=self._efforts, positionGains=self._gains, **client,
         )  # fmt: skip
-        for _ in range(count):
-            pybullet.stepSimulation(**client)
+        pybullet.stepSimulation(**client)
         states = pybullet.getJointStates(self._body, self._joints, **client)
         self.position[:] = [state[0] for state in states]
         self.effort[:] = [state[3] for state in states]

@@ -167,7 +167,7 @@ def test_a_motor_carries_what_hangs_on_it(arm):
     assert torque[0] == pytest.approx(0.0, abs=1e-9)
     assert (inertia > 0.0).all()
     for _ in range(400):
-        body.step(np.zeros(3), 1)
+        body.step(np.zeros(3))
     np.testing.assert_allclose(body.effort, torque, atol=0.02)
     np.testing.assert_allclose(body.position, 0.0, atol=1e-3)
     body.close()
@@ -185,8 +185,8 @@ def test_an_arm_stops_at_the_floor(arm):
         assert body.touches(down) is False
         assert body.touches(low) is not is_free
         body.place(np.zeros(3))
-        for _ in range(400):
-            body.step(low, 2)
+        for _ in range(800):
+            body.step(low)
         stopped_short = abs(body.position[1] - low[1]) > 0.05
         assert stopped_short is not is_free
         body.close()
@@ -274,6 +274,23 @@ def test_the_world_follows_its_motors_and_twists_its_gears(robot):
     world.drive("motor_position.elbow", 9.0, False)  # the brake holds
     world.step(0.5)
     np.testing.assert_allclose(world.truth()["joint_position"][1], after["joint_position"][1], atol=2e-3)
+    world.close()
+
+
+def test_a_moving_arm_needs_the_torques_of_its_motion_and_no_others(robot):
+    """A sine of 0.3 rad at 0.5 Hz: gravity, and the inertia times the acceleration; the sensor lags by 0.1 s."""
+    world = simulator.world(robot, "nominal", 0)
+    middle, efforts, expected = world.truth()["motor_position"], [], []
+    for number in range(400):  # 4 s
+        wanted = middle + np.array([0.0, 0.3 * np.sin(np.pi * number * 0.01), 0.0])
+        world.drive("motor_position.elbow", wanted[1], True)
+        world.step(0.01)
+        efforts.append(world.truth()["joint_effort"][1])
+        torque, inertia = world._bullet.torques(world.truth()["joint_position"])
+        expected.append(torque[1] - 0.3 * np.pi**2 * np.sin(np.pi * (number * 0.01 - 0.05)) * inertia[1])
+    late = 10  # cycles of the sensor's lag
+    difference = np.array(efforts)[100:] - np.array(expected)[100 - late : -late]
+    assert np.abs(difference).max() < 0.15 * np.ptp(expected)
     world.close()
 
 

@@ -1,5 +1,6 @@
 """An arm from a URDF as a World: gravity, contact, elastic gears, encoders on both sides of them, and a camera."""
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -18,8 +19,8 @@ TWIST = 0.01
 """A gear twists by this angle [rad] under the largest torque that its joint needs."""
 FILTER = 0.1
 """Torques are measured with this time constant [s]."""
-MANY = 8
-"""At most this many steps of the physics use one set of servo targets."""
+SMOOTH = 0.03
+"""Servos smooth the steps between set-points with this time constant [s]."""
 
 
 class ArmWorld(World):
@@ -47,7 +48,7 @@ class ArmWorld(World):
         self._effort = self._bullet.torques(middle)[0]
         self._servos = {f"{MOTOR}.{name}": index for index, name in enumerate(arm.names)}
         self._target = middle + self._twist * self._effort
-        self._held = middle.copy()
+        self._held, self._reference = middle.copy(), middle.copy()
         self._follows = np.zeros(middle.size, bool)
         self._left = 0.0
         self._camera = TipCamera(arm.reach, body, seed)
@@ -57,12 +58,13 @@ class ArmWorld(World):
     def step(self, duration: float) -> None:
         self.time += duration
         self._left += duration
-        while (count := min(MANY, int(self._left / STEP + 1e-6))) > 0:
+        smooth, share = (-math.expm1(-STEP / time) for time in (SMOOTH, FILTER))
+        for _ in range(int(self._left / STEP + 1e-6)):
             wanted = np.where(self._follows, self._target - self._twist * self._effort, self._held)
-            self._bullet.step(wanted, count)
-            share = -np.expm1(-count * STEP / FILTER)
-            self._effort = self._effort + share * (self._bullet.effort - self._effort)
-            self._left -= count * STEP
+            self._reference += smooth * (wanted - self._reference)
+            self._bullet.step(self._reference)
+            self._effort += share * (self._bullet.effort - self._effort)
+            self._left -= STEP
 
     @override
     def measure(self) -> Mapping[str, np.ndarray]:
