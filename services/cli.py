@@ -203,6 +203,8 @@ def query(
 
     [bold]engage[/], [bold]disengage[/] let the model move the robot or not    [bold]adapt on|off[/] online update
 
+    [bold]move SIGNAL V1 V2 ...[/] move once, with or without a model, and let go
+
     [bold]control SIGNAL V1 V2 ...[/] command for a target    [bold]simulate V1 V2 ...[/] state after a command
 
     [bold]anomaly[/] anomaly score    [bold]rollback[/] restore the model before the update

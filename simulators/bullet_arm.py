@@ -59,7 +59,7 @@ class BulletArm:
         self.position, self.effort = np.array(position, float), np.zeros(len(joints))
         for index in range(-1, self._count):
             pybullet.changeDynamics(
-                self._body, index, linearDamping=0.0, angularDamping=0.0, jointDamping=0.1, **client
+                self._body, index, linearDamping=0.0, angularDamping=0.0, jointDamping=0.0, **client
             )
         self.place(self.position)
         self.pairs = self._allow_contacts()

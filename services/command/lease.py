@@ -47,6 +47,8 @@ class Lease:
         self._clock = clock or SystemClock()
         self._lock = threading.Lock()
         self._tenure = Tenure()
+        self._shared = 0
+        """`boot` of the service that commands for any client, because its client had no lease; 0 without one."""
 
     @property
     def tenure(self) -> Tenure | None:
@@ -61,6 +63,8 @@ class Lease:
     def take(self, caller: Caller, seconds: Any) -> Tenure:
         """Give the caller the lease for this time [s] from now; the holder may take its lease again.
 
+        A service that was let command by a client without a lease commands for any client, so it gives way.
+
         Raises:
             CommandHeld: Another client has the lease.
             BadArguments: The time is not allowed, or the caller has no boot.
@@ -70,9 +74,10 @@ class Lease:
             raise BadArguments("A client that takes the lease must send a `boot`, a random number, with its query.")
         with self._lock:
             tenure, until = self.tenure, self._clock.monotonic() + duration
-            if tenure is not None and tenure.caller.boot != caller.boot:
+            gives_way = tenure is not None and not tenure.number and tenure.caller.boot == self._shared
+            if tenure is not None and tenure.caller.boot != caller.boot and not gives_way:
                 raise self._refusal(tenure)
-            through, number = (0, 0) if tenure is None else (tenure.through, tenure.number)
+            through, number = (0, 0) if tenure is None or gives_way else (tenure.through, tenure.number)
             self._tenure = Tenure(caller, until, through, number or secrets.randbits(53) or 1)
             return self._tenure
 
@@ -124,7 +129,7 @@ class Lease:
             self.check(caller)
             tenure = self.tenure
             if tenure is None:
-                self._tenure = Tenure()
+                self._tenure, self._shared = Tenure(), caller.through
             elif tenure.caller.boot == caller.boot:
                 self._tenure = replace(tenure, through=caller.through)
 

@@ -49,7 +49,7 @@ def make_body(variant: str, size: int, seed: int) -> Body:
         return Body(np.zeros(size), np.ones(size), np.zeros(3))
     random = np.random.default_rng([seed, 7])
     return Body(
-        zeros=random.normal(0.0, 0.003, size),
+        zeros=random.normal(0.0, 0.001, size),
         weights=random.normal(1.0, 0.05, size),
         camera_shift=random.normal(0.0, 0.002, 3),
     )

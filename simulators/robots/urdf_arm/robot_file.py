@@ -127,7 +127,7 @@ def draft(path: Path, tip: str | None, name: str | None, folder: Path) -> Draft:
         devices=_devices(arm, ranges),
         tip=_quoted(arm.tip),
         samples=SAMPLES,
-        speed=0.5 * float(ranges.rate.min()),
+        speed=0.4 * float(ranges.rate.min()),
     )
     sheets = tuple(EDS_FOLDER / f"{kind}.eds" for kind in ("servo_drive", "joint_encoder"))
     return Draft(robot, text, sheets, summary, notes)

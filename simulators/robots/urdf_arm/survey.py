@@ -10,8 +10,9 @@ from simulators.robots.urdf_arm.body_file import physics_urdf
 from simulators.robots.urdf_arm.choice import Arm
 from simulators.robots.urdf_arm.tree import Joint
 
-HALF = 0.6
-"""A joint moves at most this far to either side of the middle posture [rad], so that few samples suffice."""
+HALF, ALL = 0.6, 3.6
+"""A joint moves at most this far to either side of the middle posture [rad], and all joints together by the second
+number, so that few samples suffice: the more joints, the more postures there are."""
 FASTEST = 1.5
 """A joint moves at most this fast [rad/s]."""
 ACCELERATION = 8.0
@@ -101,7 +102,7 @@ def _free_range(arm: Arm, body: BulletArm) -> tuple[np.ndarray, np.ndarray, floa
     """Return lowest and highest positions [rad], shapes (n,), and the share of postures there that touch nothing."""
     random = np.random.default_rng(0)
     lowest, highest = (np.array([getattr(joint, end) for joint in arm.joints]) for end in ("low", "high"))
-    half = np.minimum(HALF, 0.5 * (highest - lowest))
+    half = np.minimum(min(HALF, ALL / len(arm.joints)), 0.5 * (highest - lowest))
     middle, best = np.clip(neutral(arm), lowest + half, highest - half), (0.0, np.zeros(0))
     for _ in range(CANDIDATES):
         postures = random.uniform(middle - half, middle + half, (POSTURES, half.size))
