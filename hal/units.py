@@ -68,6 +68,13 @@ ROBOT_UNITS = (*sorted(PLAIN - {*CONVERSIONS}, key=str.lower), *OTHERS)
 """A signal of a robot has one of these units."""
 
 
+def axis_units(is_linear: bool) -> dict[str, str]:
+    """Return the unit of every quantity of a drive that winds a wire or, if it is not linear, turns a joint."""
+    length, force = ("m", "N") if is_linear else ("rad", "N m")
+    motion = {"position": length, "following_error": length, "velocity": f"{length}/s", "effort": force}
+    return motion | {"temperature": "degC", "temperature_driver": "degC"}
+
+
 def check_units(unit: str, written_in: str | None) -> None:
     """Refuse a unit that the model does not use, or that the numbers of a file cannot be converted to.
 

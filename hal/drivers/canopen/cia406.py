@@ -13,6 +13,7 @@ from hal.drivers.canopen.node import HEARTBEAT, CanopenNode, NodeSettings, PdoHa
 from hal.errors import DeviceRefused
 from hal.protocols import cia406
 from hal.protocols.cia301 import PDO_SIZE, MappedObject
+from hal.units import axis_units
 
 _SPEED_END = 2**15 - 1
 
@@ -40,6 +41,11 @@ class Cia406Encoder(CanopenNode):
     @override
     def quantities(cls, settings: EncoderSettings) -> tuple[str, ...]:
         return ("position", "velocity")
+
+    @classmethod
+    @override
+    def unit_of(cls, settings: EncoderSettings, quantity: str) -> str | None:
+        return axis_units(False).get(quantity)
 
     @classmethod
     @override

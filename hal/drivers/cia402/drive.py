@@ -21,6 +21,7 @@ from hal.errors import CommandRefused, ConfigError, DeviceRefused
 from hal.protocols import cia301, cia402
 from hal.protocols.cia301 import MappedObject
 from hal.protocols.cia402 import OperationMode, State, VelocityUnit
+from hal.units import axis_units
 from hal.wire.bus import Bus
 
 UNWATCHED = "{} does not detect the loss of the HAL (no 1016h)."
@@ -122,6 +123,11 @@ class Cia402Drive(CanopenNode):
     @override
     def commanded(cls, settings: DriveSettings) -> str:
         return settings.commanded
+
+    @classmethod
+    @override
+    def unit_of(cls, settings: DriveSettings, quantity: str) -> str | None:
+        return axis_units(settings.spool_radius is not None).get(quantity)
 
     @classmethod
     @override
@@ -382,10 +388,14 @@ class Cia402Drive(CanopenNode):
 
     def _motor_speed(self) -> float:
         """Return the highest speed of the motor (6080h) at the output [unit/s]; infinite if the drive has none."""
-        turns = self._sdo.read(cia402.MAX_MOTOR_SPEED.index, 0) if self._sdo.has(cia402.MAX_MOTOR_SPEED.index) else 0
-        if not turns or self._units is None:
-            return self._settings.max_velocity or math.inf
-        return turns / 60.0 * self._units.motor_turn
+        known = self._settings.max_velocity or math.inf
+        if self._units is None or not self._sdo.has(cia402.MAX_MOTOR_SPEED.index):
+            return known
+        try:
+            turns = self._sdo.read(cia402.MAX_MOTOR_SPEED.index, 0)
+        except DeviceRefused:  # some data sheets list objects that the drive does not have
+            return known
+        return turns / 60.0 * self._units.motor_turn if turns else known
 
     def _leads_to_enabled(self, rest: int) -> bool:
         """Return whether the drive takes set-points; if not, send the command of this cycle instead.

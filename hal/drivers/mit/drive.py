@@ -19,6 +19,7 @@ from hal.drivers.mit.settings import MitSettings
 from hal.errors import ConfigError, DeviceRefused, DeviceSilent
 from hal.protocols import mit
 from hal.protocols.mit import Command, Layout, Register, Special
+from hal.units import axis_units
 from hal.wire.bus import Bus, Handler
 
 
@@ -96,6 +97,11 @@ class MitDrive(CanDevice):
     @override
     def commanded(cls, settings: MitSettings) -> str:
         return settings.mode
+
+    @classmethod
+    @override
+    def unit_of(cls, settings: MitSettings, quantity: str) -> str | None:
+        return axis_units(settings.spool_radius is not None).get(quantity)
 
     @classmethod
     @override
