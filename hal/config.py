@@ -267,6 +267,8 @@ class RobotConfig(Section):
     devices: dict[str, DeviceConfig] = Field(default_factory=dict)
     simulator: str | None = None
     """`module:name` of the simulator that replaces the hardware."""
+    physics: Literal["bullet", "mujoco"] | None = None
+    """Engine of that simulator; by default PyBullet if it is installed, else MuJoCo."""
     urdf: Path | None = None
     """URDF file for the live page, relative to the robot file."""
     tip: str | None = None

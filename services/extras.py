@@ -8,6 +8,7 @@ EXTRAS = {
     "torch": "train",
     "matplotlib": "train",
     "pybullet": "sim",
+    "mujoco": "sim",
     "viser": "view",
     "yourdfpy": "view",
     "pyarrow": "parquet",
@@ -26,9 +27,22 @@ def require(*packages: str) -> None:
     Raises:
         MissingExtra: One is not installed.
     """
-    missing = [name for name in packages if importlib.util.find_spec(name) is None]
+    missing = [name for name in packages if is_missing(name)]
     if missing:
         raise MissingExtra(sentence(*missing))
+
+
+def engine_of(physics: str | None) -> str:
+    """Return the package of rigid bodies that a robot file names; else MuJoCo if only this one is installed."""
+    if physics is None:
+        has_only_mujoco = is_missing("pybullet") and not is_missing("mujoco")
+        return "mujoco" if has_only_mujoco else "pybullet"
+    return {"bullet": "pybullet"}.get(physics, physics)
+
+
+def is_missing(package: str) -> bool:
+    """Whether a package is not installed."""
+    return importlib.util.find_spec(package) is None
 
 
 def sentence(*missing: str) -> str:

@@ -21,7 +21,7 @@ from services.demo.story import MUSCLE, Story
 from services.demo.timeline import Timeline
 from services.demo.tool_story import ToolStory
 from services.errors import AlreadyRunning
-from services.extras import require
+from services.extras import engine_of, require
 from services.learning import collector, trainer
 from services.model import artifacts
 from services.model.control_config import ControlConfig
@@ -179,7 +179,7 @@ def check_start(robot: RobotConfig) -> None:
         MissingExtra: A package for simulation or training is not installed.
         AlreadyRunning: A service of a robot with this name runs on this machine.
     """
-    require("torch", "matplotlib", "pybullet")
+    require("torch", "matplotlib", engine_of(robot.physics))
     running = [service for name, service in services_here() if name == robot.robot]
     if running:
         raise AlreadyRunning(

@@ -9,7 +9,7 @@ from hal.config import load_robot
 from hal.errors import ConfigError
 from hal.finding.doctor import Severity, check_file
 from simulators.bullet import pybullet
-from simulators.bullet_arm import BulletArm
+from simulators.physics.bullet_arm import BulletArm
 from simulators.robots.urdf_arm import describe, simulator
 from simulators.robots.urdf_arm.body_file import find_mesh, physics_urdf, possible
 from simulators.robots.urdf_arm.choice import arm_of, choose_arm
@@ -252,7 +252,7 @@ def test_postures_and_moves_touch_nothing(robot):
     for _ in range(5):
         posture = next(postures)
         assert ((posture >= low) & (posture <= high)).all()
-        assert not body._bullet.touches(posture)
+        assert not body._physics.touches(posture)
     postures.close()
     body.close()
 
@@ -286,7 +286,7 @@ def test_a_moving_arm_needs_the_torques_of_its_motion_and_no_others(robot):
         world.drive("motor_position.elbow", wanted[1], True)
         world.step(0.01)
         efforts.append(world.truth()["joint_effort"][1])
-        torque, inertia = world._bullet.torques(world.truth()["joint_position"])
+        torque, inertia = world._physics.torques(world.truth()["joint_position"])
         expected.append(torque[1] - 0.3 * np.pi**2 * np.sin(np.pi * (number * 0.01 - 0.05)) * inertia[1])
     late = 10  # cycles of the sensor's lag
     difference = np.array(efforts)[100:] - np.array(expected)[100 - late : -late]

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from simulators.faults import check_condition
+from simulators.physics.choice import using
 from simulators.robots.urdf_arm.body import JOINT, VARIANTS, Body, arm_in, make_body
 
 if TYPE_CHECKING:
@@ -37,7 +38,8 @@ class UrdfArm:
         from simulators.robots.urdf_arm.world import ArmWorld
 
         check_condition(condition, self.conditions)
-        return ArmWorld(config, self._body(config, variant, seed), seed)
+        with using(config.physics):
+            return ArmWorld(config, self._body(config, variant, seed), seed)
 
     def rig(self, config: RobotConfig, variant: str, seed: int, condition: str | None = None) -> Rig:
         """Return the arm behind simulated nodes on the robot file's buses."""

@@ -6,7 +6,7 @@ import numpy as np
 
 from hal.config import RobotConfig
 from hal.errors import ConfigError
-from simulators.bullet_arm import BulletArm
+from simulators.physics.choice import ServoArm, make_arm, using
 from simulators.robots.urdf_arm.body import MOTOR, arm_in
 from simulators.robots.urdf_arm.body_file import physics_urdf
 from simulators.robots.urdf_arm.survey import FASTEST, neutral
@@ -52,7 +52,8 @@ def free_postures(config: RobotConfig, seed: int) -> Iterator[np.ndarray]:
     arm, random = arm_in(config), np.random.default_rng(seed)
     low, high = config.bounds(MOTOR)
     text, _ = physics_urdf(arm)
-    body = BulletArm(text, arm.names, neutral(arm), np.ones(low.size))
+    with using(config.physics):
+        body = make_arm(text, arm.names, neutral(arm), np.ones(low.size))
     try:
         position = 0.5 * (low + high)
         yield position
@@ -64,7 +65,7 @@ def free_postures(config: RobotConfig, seed: int) -> Iterator[np.ndarray]:
 
 
 def _next(
-    body: BulletArm, random: np.random.Generator, position: np.ndarray, low: np.ndarray, high: np.ndarray
+    body: ServoArm, random: np.random.Generator, position: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> np.ndarray:
     for _ in range(TRIES):
         goal = random.uniform(low, high)

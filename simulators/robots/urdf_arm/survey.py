@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hal.errors import ConfigError
-from simulators.bullet_arm import BulletArm
+from simulators.physics.choice import ServoArm, make_arm
 from simulators.robots.urdf_arm.body_file import physics_urdf
 from simulators.robots.urdf_arm.choice import Arm
 from simulators.robots.urdf_arm.tree import Joint
@@ -65,7 +65,7 @@ def survey(arm: Arm) -> Survey:
         ConfigError: The arm touches itself or the floor almost everywhere.
     """
     text, notes = physics_urdf(arm)
-    body = BulletArm(text, arm.names, neutral(arm), np.ones(len(arm.joints)))
+    body = make_arm(text, arm.names, neutral(arm), np.ones(len(arm.joints)))
     try:
         low, high, share = _free_range(arm, body)
         if share < LEAST:
@@ -98,7 +98,7 @@ def _is_narrower(joint: Joint, low: float, high: float) -> bool:
     return high - low < joint.high - joint.low - 1e-6
 
 
-def _free_range(arm: Arm, body: BulletArm) -> tuple[np.ndarray, np.ndarray, float]:
+def _free_range(arm: Arm, body: ServoArm) -> tuple[np.ndarray, np.ndarray, float]:
     """Return lowest and highest positions [rad], shapes (n,), and the share of postures there that touch nothing."""
     random = np.random.default_rng(0)
     lowest, highest = (np.array([getattr(joint, end) for joint in arm.joints]) for end in ("low", "high"))
@@ -116,7 +116,7 @@ def _free_range(arm: Arm, body: BulletArm) -> tuple[np.ndarray, np.ndarray, floa
     return middle - half, middle + half, float(share)
 
 
-def needs(body: BulletArm, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+def needs(body: ServoArm, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """Return the torque that every motor needs between two postures [N m], shape (n,), for gravity and acceleration."""
     random = np.random.default_rng(1)
     largest = np.full(low.size, SMALLEST)

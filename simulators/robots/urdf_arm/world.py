@@ -7,8 +7,8 @@ import numpy as np
 from typing_extensions import override
 
 from hal.config import RobotConfig
-from simulators.bullet_arm import STEP, BulletArm
 from simulators.faults import UnknownPart
+from simulators.physics.choice import STEP, make_arm
 from simulators.robots.urdf_arm.body import EFFORT, JOINT, MOTOR, TIP, Body, arm_in
 from simulators.robots.urdf_arm.body_file import physics_urdf
 from simulators.robots.urdf_arm.camera import TipCamera
@@ -40,12 +40,12 @@ class ArmWorld(World):
         low, high = config.bounds(MOTOR)
         middle = 0.5 * (low + high)
         text, _ = physics_urdf(arm, dict(zip(arm.names, body.weights, strict=True)))
-        self._bullet = BulletArm(text, arm.names, neutral(arm), np.full(middle.size, np.inf))
-        self._needed = needs(self._bullet, low, high)
-        self._bullet.limit(2.0 * self._needed)
-        self._bullet.place(middle)
+        self._physics = make_arm(text, arm.names, neutral(arm), np.full(middle.size, np.inf))
+        self._needed = needs(self._physics, low, high)
+        self._physics.limit(2.0 * self._needed)
+        self._physics.place(middle)
         self._twist = TWIST / self._needed
-        self._effort = self._bullet.torques(middle)[0]
+        self._effort = self._physics.torques(middle)[0]
         self._servos = {f"{MOTOR}.{name}": index for index, name in enumerate(arm.names)}
         self._target = middle + self._twist * self._effort
         self._held, self._reference = middle.copy(), middle.copy()
@@ -62,8 +62,8 @@ class ArmWorld(World):
         for _ in range(int(self._left / STEP + 1e-6)):
             wanted = np.where(self._follows, self._target - self._twist * self._effort, self._held)
             self._reference += smooth * (wanted - self._reference)
-            self._bullet.step(self._reference)
-            self._effort += share * (self._bullet.effort - self._effort)
+            self._physics.step(self._reference)
+            self._effort += share * (self._physics.effort - self._effort)
             self._left -= STEP
 
     @override
@@ -82,7 +82,7 @@ class ArmWorld(World):
 
     @override
     def truth(self) -> dict[str, np.ndarray]:
-        position = self._bullet.position
+        position = self._physics.position
         values = {
             MOTOR: position + self._twist * self._effort,
             JOINT: position.copy(),
@@ -97,7 +97,7 @@ class ArmWorld(World):
         index = servo_index(self._servos, element, target)
         self._target[index] = target
         if self._follows[index] and not enabled:
-            self._held[index] = self._bullet.position[index]
+            self._held[index] = self._physics.position[index]
         self._follows[index] = enabled
 
     @override
@@ -110,4 +110,4 @@ class ArmWorld(World):
 
     @override
     def close(self) -> None:
-        self._bullet.close()
+        self._physics.close()

@@ -10,13 +10,10 @@ import numpy as np
 
 from simulators.bullet import pybullet, without_output
 from simulators.chain import GRAVITY
+from simulators.physics.choice import FLOOR, STEP
 
-STEP = 0.0025
-"""The physics advances in steps of this duration [s]."""
 GAIN = 0.12
 """A servo removes this share of its position error in one step; 0.02 s is the time constant."""
-APART = 0.02
-"""The floor is this far below what stands still [m]."""
 
 
 class BulletArm:
@@ -130,7 +127,7 @@ class BulletArm:
         low, _ = pybullet.getAABB(self._body, -1, **self._options)
         half = [50.0, 50.0, 0.5]
         box = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half, **self._options)
-        place = [0.0, 0.0, float(low[2]) - APART - half[2]]
+        place = [0.0, 0.0, float(low[2]) - FLOOR - half[2]]
         pybullet.createMultiBody(0.0, box, basePosition=place, **self._options)
 
     def close(self) -> None:
