@@ -10,7 +10,7 @@ import numpy as np
 
 from simulators.bullet import pybullet, without_output
 from simulators.chain import GRAVITY
-from simulators.physics.choice import FLOOR, STEP
+from simulators.physics.scene import FLOOR, STEP
 
 GAIN = 0.12
 """A servo removes this share of its position error in one step; 0.02 s is the time constant."""

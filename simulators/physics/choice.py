@@ -92,12 +92,6 @@ class ServoArm(Protocol):
         ...
 
 
-STEP = 0.0025
-"""The physics of an arm advances in steps of this duration [s]."""
-FLOOR = 0.02
-"""The floor is this far below what stands still [m]."""
-
-
 @contextmanager
 def using(engine: str | None) -> Iterator[None]:
     """Make worlds with this engine; None leaves the choice to what is installed."""

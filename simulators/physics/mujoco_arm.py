@@ -8,8 +8,8 @@ import mujoco
 import numpy as np
 
 from simulators.chain import GRAVITY
-from simulators.physics.choice import FLOOR, STEP
 from simulators.physics.mujoco_body import Joints, with_compiler
+from simulators.physics.scene import FLOOR, STEP
 
 STIFFNESS = 50.0
 """A servo is critically damped with this frequency [rad/s]; its time constant is 0.02 s."""

@@ -8,7 +8,8 @@ from typing_extensions import override
 
 from hal.config import RobotConfig
 from simulators.faults import UnknownPart
-from simulators.physics.choice import STEP, make_arm
+from simulators.physics.choice import make_arm
+from simulators.physics.scene import STEP
 from simulators.robots.urdf_arm.body import EFFORT, JOINT, MOTOR, TIP, Body, arm_in
 from simulators.robots.urdf_arm.body_file import physics_urdf
 from simulators.robots.urdf_arm.camera import TipCamera
