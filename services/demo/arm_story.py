@@ -6,6 +6,7 @@ from statistics import mode
 
 import numpy as np
 
+from gemuco.errors import NotEnoughData
 from hal.config import RobotConfig
 from hal.errors import ConfigError
 from services.client import Client
@@ -101,6 +102,7 @@ class ArmStory:
         figures = (
             f"{MOVES} postures, {miss:.3f} rad away from them on average (norm of {len(self._place)} joints)",
             f"the joint that moved most moved by {span:.2f} rad",
+            self._learn_normal(),
         )
         return Stage("moves to postures", start, self._joints.now(), figures, miss < FOLLOWS and span > 0.2)
 
@@ -163,6 +165,14 @@ class ArmStory:
         duration = float(np.abs(goal - self._place).max()) / self._speed + SETTLE
         self._place = goal
         self._actor.go(self._signal, goal, duration)
+
+    def _learn_normal(self) -> str:
+        """Learn what is normal for this body, which is not the designer's; return a sentence on it."""
+        try:
+            reply = self._client.ask("model", "normal")
+        except NotEnoughData as error:
+            return f"statistics of normal errors not learned: {error}"
+        return f"statistics of normal errors learned anew from {reply['samples']} samples"
 
     def _estimated(self, signal: str, index: int) -> bool:
         estimate = self._client.estimate()
