@@ -11,7 +11,7 @@ import numpy as np
 from gemuco.errors import DatasetError, NotEnoughData, SchemaError, WrongSize, check_kind, described
 from gemuco.signals import Layout, Signal
 from gemuco.splits.division import Division
-from gemuco.writing import writing
+from gemuco.writing import replacing, writing
 
 FORMAT = "gemuco.dataset"
 VERSION = 1
@@ -152,7 +152,7 @@ class Dataset:
         return Dataset(layout, tuple(parts))
 
     def save(self, path: str | Path) -> None:
-        """Write one .npz file without pickled objects."""
+        """Write one .npz file without pickled objects, in one step."""
         head = {
             "format": FORMAT,
             "version": VERSION,
@@ -161,12 +161,8 @@ class Dataset:
         }
         arrays = {f"episode_{i}": self.layout.join(e.values) for i, e in enumerate(self.episodes)}
         path = Path(path)
-        draft = path.with_name(path.name + ".draft")
-        with writing("The data", path):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with draft.open("wb") as file:
-                np.savez_compressed(file, head=np.array(json.dumps(head)), **arrays)  # type: ignore[arg-type]
-            draft.replace(path)
+        with writing("The data", path), replacing(path) as file:
+            np.savez_compressed(file, head=np.array(json.dumps(head)), **arrays)  # type: ignore[arg-type]
 
     @classmethod
     def load(cls, path: str | Path) -> "Dataset":

@@ -34,25 +34,30 @@ class LinearPath:
         moments: Sums of the products of x_in and 1 over each part of the data [standard deviations squared], shape
             (parts, in_size + 1, in_size + 1).
         cross: Sums of the products of x_in and 1 with the code, shape (parts, in_size + 1, width).
+        outputs: x_out by the code and 1 [standard deviations], shape (width + 1, out_size).
     """
 
     moments: np.ndarray
     cross: np.ndarray
+    outputs: np.ndarray
     _maps: dict[bytes, np.ndarray] = field(default_factory=dict, init=False, repr=False)
 
     @classmethod
-    def none(cls, in_size: int) -> "LinearPath":
+    def none(cls, in_size: int, out_size: int) -> "LinearPath":
         """Return a path without code, as in a network without linear path."""
-        return cls(np.zeros((1, in_size + 1, in_size + 1)), np.zeros((1, in_size + 1, 0)))
+        return cls(np.zeros((1, in_size + 1, in_size + 1)), np.zeros((1, in_size + 1, 0)), np.zeros((1, out_size)))
 
     @classmethod
-    def fit(cls, x: np.ndarray, code: np.ndarray) -> "LinearPath":
+    def fit(cls, x: np.ndarray, x_out: np.ndarray, width: int) -> "LinearPath":
         """Learn from samples, oldest first.
 
         Args:
             x: x_in [standard deviations], shape (samples, in_size), complete.
-            code: The code of each sample, shape (samples, width).
+            x_out: x_out [standard deviations], shape (samples, out_size), complete.
+            width: Length of the code: the main components of x_out.
         """
+        mean, components = basis(x_out, width)
+        code, outputs = (x_out - mean) @ components.T, np.concatenate([components, mean[None]])
         rows = np.concatenate([x, np.ones((len(x), 1))], axis=1)
         parts = np.array_split(np.arange(len(rows)), FOLDS)
         weight, whole = np.ones(len(rows)), np.ones(x.shape[1])
@@ -61,6 +66,7 @@ class LinearPath:
             path = cls(
                 np.stack([weighted[part].T @ rows[part] for part in parts]),
                 np.stack([weighted[part].T @ code[part] for part in parts]),
+                outputs,
             )
             error = np.linalg.norm(code - rows @ path.map(whole), axis=1)
             limit = ROBUST * np.median(error)
@@ -87,6 +93,20 @@ class LinearPath:
                 self._maps.clear()
             result = self._maps[key] = self._map(np.append(np.flatnonzero(gate), len(gate)))
         return result
+
+    def direct(self, gate: np.ndarray, share: np.ndarray) -> np.ndarray:
+        """Return the part of the linear path in x_out: its regression times 1 - share, then the share of the network.
+
+        Args:
+            gate: See `map`.
+            share: Share of the network in every element of x_out, 0 to 1, shape (out_size,).
+
+        Returns:
+            Shape (in_size + 2, out_size), float32: x_out = (x_in, 1) direct[:-1] + direct[-1] network.
+        """
+        line = self.map(gate).astype(float) @ self.outputs[:-1]
+        line[-1] += self.outputs[-1]
+        return np.concatenate([line * (1.0 - share), share[None]]).astype(np.float32)
 
     def _map(self, known: np.ndarray) -> np.ndarray:
         result = np.zeros(self.cross.shape[1:], np.float32)

@@ -32,6 +32,10 @@ ERRORS = "error from mask (% of std)"
 """This is the head of the table of errors."""
 
 
+PER_SIGNAL = 1.1
+"""A mask must lower the squared error by this factor per further signal to be preferred: useless inputs do no harm."""
+
+
 class Gate(NamedTuple):
     """Share of the network input that a mask determines, float32.
 
@@ -39,11 +43,13 @@ class Gate(NamedTuple):
         through: 0 or 1 for every element of x_in, shape (in_size,).
         line: Regression of the code l of the linear path, shape (in_size + 1, width).
         tail: m and p, shape (signals of x_in + bias_size,).
+        direct: Part of the linear path in x_out (`LinearPath.direct`), shape (in_size + 2, out_size).
     """
 
     through: np.ndarray
     line: np.ndarray
     tail: np.ndarray
+    direct: np.ndarray
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -65,6 +71,8 @@ class BodySchema:
         biases: Condition -> its p.
         manifest: Further facts that are stored with the schema (JSON values).
         linear: The linear path; of width 0 without one, which is the default.
+        shares: Mask -> share of the network in every element of x_out, shape (out_size,), 1 where not given; the rest
+            is the linear path itself.
         out_layout: The layout of x_out alone.
         in_index: Positions of the elements of x_in in the layout, shape (in_size,).
         out_index: Positions of the elements of x_out in the layout, shape (out_size,).
@@ -84,6 +92,7 @@ class BodySchema:
     biases: Mapping[str, np.ndarray] = field(default_factory=dict)
     manifest: Mapping[str, Any] = field(default_factory=dict)
     linear: LinearPath | None = None
+    shares: Mapping[Mask, np.ndarray] = field(default_factory=dict)
     out_layout: Layout = field(init=False)
     in_index: np.ndarray = field(init=False)
     out_index: np.ndarray = field(init=False)
@@ -98,7 +107,7 @@ class BodySchema:
         set_field(self, "in_index", self.layout.indices(self.x_in))
         set_field(self, "out_index", self.layout.indices(self.x_out))
         if self.linear is None:
-            set_field(self, "linear", LinearPath.none(len(self.in_index)))
+            set_field(self, "linear", LinearPath.none(len(self.in_index), len(self.out_index)))
         inputs = len(self.in_index) + self.path.width + len(self.x_in) + len(self.bias)
         shape = (self.weights.encoder[0].matrix.shape[0], self.weights.decoder[-1].matrix.shape[1])
         if shape != (inputs, len(self.out_index)):
@@ -209,7 +218,8 @@ class BodySchema:
             sizes = [self.layout.signal(name).size for name in self.x_in]
             through = np.repeat(m, sizes).astype(np.float32)
             tail = np.concatenate([m, self.bias]).astype(np.float32)
-            gate = self._gates[mask] = Gate(through, self.path.map(through), tail)
+            direct = self.path.direct(through, self.shares.get(mask, np.ones(len(self.out_index))))
+            gate = self._gates[mask] = Gate(through, self.path.map(through), tail, direct)
         return gate
 
     def chain(self, mask: Mask) -> Chain:
@@ -226,14 +236,18 @@ class BodySchema:
             matrix[:size] += line[:-1] @ by_code
             matrix[size : size + self.path.width] = 0.0
             begin = first._replace(matrix=matrix, offset=first.offset + line[-1] @ by_code)
-            folded = self._folded[mask] = (begin, *others)
+            folded = self._folded[mask] = _beside((begin, *others), self.gate(mask).direct)
         return folded
 
     def ranked(self, name: str) -> tuple[Mask, ...]:
-        """Return the feasible masks, sorted by the error of a signal of x_out, the smallest first."""
+        """Return the feasible masks, sorted by the error of a signal of x_out, the smallest first.
+
+        Of nearly equal masks the one with fewer signals comes first: see `PER_SIGNAL`.
+        """
         ranked = self._ranked.get(name)
         if ranked is None:
-            ranked = self._ranked[name] = tuple(sorted(self.masks, key=lambda m: self.mask_error(m, name)))
+            key = {mask: self.mask_error(mask, name) * PER_SIGNAL ** len(mask) for mask in self.masks}
+            ranked = self._ranked[name] = tuple(sorted(self.masks, key=key.__getitem__))
         return ranked
 
     def mask_error(self, mask: Mask, name: str) -> float:
@@ -253,7 +267,7 @@ class BodySchema:
             mask: The given signals.
             bias: p of every sample, shape (samples, bias_size), or of all samples; the schema's p if not given.
         """
-        through, line, tail = self.gate(mask)
+        through, line, tail, _ = self.gate(mask)
         size, width = line.shape[0] - 1, line.shape[1]
         x = np.empty((*normalised.shape[:-1], size + width + len(tail)), np.float32)
         values = np.where(through, normalised[..., self.in_index], 0.0)
@@ -264,9 +278,18 @@ class BodySchema:
             x[..., -len(self.bias) :] = bias
         return x
 
-    def infer(self, normalised: np.ndarray, mask: Mask) -> np.ndarray:
-        """Infer x_out from the signals of a mask, usages (a) and (b) [standard deviations], shape (..., out_size)."""
-        return run(self.weights.whole, self.network_input(normalised, mask))
+    def infer(self, normalised: np.ndarray, mask: Mask, bias: np.ndarray | None = None) -> np.ndarray:
+        """Infer x_out from the signals of a mask, usages (a) and (b) [standard deviations], shape (..., out_size).
+
+        See `network_input` for the arguments.
+        """
+        network = run(self.weights.whole, self.network_input(normalised, mask, bias))
+        gate = self.gate(mask)
+        line, share = gate.direct[:-1], gate.direct[-1]
+        if (share == 1.0).all():
+            return network
+        values = np.where(gate.through, normalised[..., self.in_index], 0.0)
+        return np.asarray(share * network + (values @ line[:-1] + line[-1]), np.float32)
 
     def normalise(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
         """Join named arrays [unit] into a vector [standard deviations]; NaN for absent and infinite values."""
@@ -336,13 +359,44 @@ class BodySchema:
         return replace(self, manifest={**self.manifest, **facts})
 
 
+def _beside(chain: Chain, direct: np.ndarray) -> Chain:
+    """Return a chain of which the outputs are mixed with the linear path; see `LinearPath.direct`.
+
+    The linear path has a column of its own in every layer for each output that it has a part in.
+    """
+    line, share = direct[:-1], direct[-1]
+    part = np.flatnonzero(share < 1.0)
+    if not len(part):
+        return chain
+    layers = []
+    for index, layer in enumerate(chain):
+        wide, narrow = layer.matrix.shape
+        is_first, is_last = index == 0, index == len(chain) - 1
+        above = 0 if is_first else len(part)
+        aside = 0 if is_last else len(part)
+        matrix = np.zeros((wide + above, narrow + aside), layer.matrix.dtype)
+        matrix[:wide, :narrow] = layer.matrix * share if is_last else layer.matrix
+        offset = np.zeros(narrow + aside, layer.offset.dtype)
+        offset[:narrow] = layer.offset * share if is_last else layer.offset
+        if is_first:
+            matrix[: len(line) - 1, narrow:] = line[:-1, part]
+            offset[narrow:] = line[-1, part]
+        elif is_last:
+            matrix[wide:, part] = np.eye(len(part))
+        else:
+            matrix[wide:, narrow:] = np.eye(len(part))
+        straight = layer.straight if is_last else layer.straight + aside
+        layers.append(layer._replace(matrix=matrix, offset=offset, straight=straight))
+    return tuple(layers)
+
+
 def stacked(schema: BodySchema, masks: Sequence[Mask]) -> Gate:
     """Return the gates of several masks, each array with a row per mask."""
     gates = [schema.gate(mask) for mask in masks]
     if not gates:
-        size = len(schema.in_index)
-        empty = np.zeros((0, size), np.float32), np.zeros((0, size + 1, schema.path.width), np.float32)
-        return Gate(*empty, np.zeros((0, len(schema.x_in) + len(schema.bias)), np.float32))
+        size, tail = len(schema.in_index), len(schema.x_in) + len(schema.bias)
+        shapes = (size,), (size + 1, schema.path.width), (tail,), (size + 2, len(schema.out_index))
+        return Gate(*(np.zeros((0, *shape), np.float32) for shape in shapes))
     return Gate(*(np.stack(column) for column in zip(*gates, strict=True)))
 
 

@@ -2,127 +2,48 @@
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator, model_validator
+from pydantic import BaseModel, Field, ValidationError, ValidationInfo, field_validator, model_validator
 
+from hal.bounds_config import (
+    Above0,
+    Finite,
+    LimitConfig,
+    NumbersConfig,
+    PlausibleConfig,
+    Positive,
+    RangeConfig,
+    Rate,
+    Section,
+    per_element,
+)
 from hal.errors import ConfigError
-from hal.units import check_robot_unit, check_units, factor
+from hal.units import check_robot_unit
 
-
-class Section(BaseModel):
-    """A part of the robot file: frozen, unknown keys are errors."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Rate = Annotated[float, Field(gt=0, le=10_000, allow_inf_nan=False)]
-"""A rate [Hz] is at most what a loop in Python can reach."""
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-
-
-def per_element(value: float | tuple[float, ...] | None, size: int, where: str, default: float = np.nan) -> np.ndarray:
-    """Return one value per element, shape (size,), from one value for all or one for each; `default` for None.
-
-    Raises:
-        ValueError: The number of values is not `size`.
-    """
-    array = np.asarray(default if value is None else value, float)
-    if array.ndim and array.shape != (size,):
-        raise ValueError(f"{where} has {array.size} values, the signal has {size}.")
-    return np.broadcast_to(array, (size,)).copy()
-
-
-class NumbersConfig(Section):
-    """Numbers of one signal, in its unit unless the section declares another one."""
-
-    written_in: str | None = None
-    """Unit of the numbers of this section, if it differs from that of the signal; rates are in this unit per second."""
-
-    def in_unit(self, unit: str, where: str) -> Self:
-        """Return these numbers in `unit`, that of their signal; `where` is their place in the robot file.
-
-        Raises:
-            ValueError: `written_in` cannot be converted to it.
-        """
-        if self.written_in is None:
-            return self
-        try:
-            check_units(unit, self.written_in)
-        except ValueError as error:
-            raise ValueError(f"{where}: {error}") from None
-        scale = factor(unit, self.written_in)
-        numbers = ((name, value) for name, value in self if isinstance(value, int | float | tuple))
-        scaled = {
-            n: tuple(scale * v for v in value) if isinstance(value, tuple) else scale * value for n, value in numbers
-        }
-        return self.model_copy(update={**scaled, "written_in": None})
-
-
-class RangeConfig(NumbersConfig):
-    """Range of one signal, per element or one for all."""
-
-    low: Finite | tuple[Finite, ...] | None = None
-    high: Finite | tuple[Finite, ...] | None = None
-
-    def bounds(self, size: int, where: str) -> tuple[np.ndarray, np.ndarray]:
-        """Return lowest and highest value, each of shape (size,); infinite where not stated.
-
-        Args:
-            size: Number of elements of the signal.
-            where: Place in the robot file, for error messages.
-
-        Raises:
-            ValueError: The number of values is not `size`, or low is not below high.
-        """
-        low = per_element(self.low, size, f"{where}.low", -np.inf)
-        high = per_element(self.high, size, f"{where}.high", np.inf)
-        if np.any(low >= high):
-            raise ValueError(f"{where}: low must be below high in every element.")
-        return low, high
-
-
-class LimitConfig(RangeConfig):
-    """Limits of a measured or commanded signal, per element or one for all."""
-
-    rate: Positive | tuple[Positive, ...] | None = None
-    """Largest change of a command [unit/s]: velocity if positions are commanded, acceleration if velocities are."""
-    acceleration: Positive | tuple[Positive, ...] | None = None
-    """Largest change of that rate [unit/s^2], for commanded positions."""
-    soft_high: Positive | tuple[Positive, ...] | None = None
-    """Measured load above which the command is relaxed: muscle tension, or effort of a drive in both directions."""
-    trip_low: Finite | tuple[Finite, ...] | None = None
-    """Measured value below which the robot stops and disables, such as the tension of a slack muscle."""
-    trip_high: Finite | tuple[Finite, ...] | None = None
-    """Measured value above which the robot stops and disables."""
-
-    def check(self, size: int, where: str, is_commanded: bool) -> None:
-        """Check that the limits of a signal of `size` elements are consistent.
-
-        Raises:
-            ValueError: They are not.
-        """
-        self.bounds(size, where)
-        ladder = [
-            (label, per_element(getattr(self, label), size, f"{where}.{label}"))
-            for label in ("trip_low", "low", "high", "soft_high", "trip_high")
-        ]
-        for index, (lower, below) in enumerate(ladder):
-            for upper, above in ladder[index + 1 :]:
-                if (lower, upper) != ("high", "soft_high") and np.any(below >= above):
-                    raise ValueError(f"{where}: {lower} must be below {upper}.")
-        for label in ("rate", "acceleration"):
-            per_element(getattr(self, label), size, f"{where}.{label}")
-            if getattr(self, label) is not None and not is_commanded:
-                raise ValueError(f"{where}.{label} is of a command, but this signal is not the commanded one.")
-
-    @property
-    def is_watched(self) -> bool:
-        """Whether the HAL must measure the signal."""
-        return any(value is not None for value in (self.soft_high, self.trip_low, self.trip_high))
+__all__ = [
+    "BusConfig",
+    "CommandConfig",
+    "ComputedConfig",
+    "DeviceConfig",
+    "Finite",
+    "KindConfig",
+    "LimitConfig",
+    "PlausibleConfig",
+    "Positive",
+    "RangeConfig",
+    "Rate",
+    "RatesConfig",
+    "RobotConfig",
+    "Section",
+    "SignalConfig",
+    "StopConfig",
+    "explain",
+    "load_robot",
+    "per_element",
+]
 
 
 class CommandConfig(Section):
@@ -133,6 +54,13 @@ class CommandConfig(Section):
     """A command is followed up to this age [s]."""
     hold: Annotated[float, Field(ge=0)] = 1.0
     """The last applied command is held for this time [s] before the robot stops; a stop holds or damps as long."""
+    enable_timeout: Annotated[float, Field(gt=0, le=60)] = 2.0
+    """The drives together may take this time [s] to enable, with their brakes and precharges."""
+    following_error: Above0 | tuple[Above0, ...] | None = None
+    """Largest difference between set-points and measurement [unit of the commanded signal]; beyond it the robot stops.
+    Default: a part of the range."""
+    following_lag: Annotated[float, Field(gt=0, le=5)] = 0.25
+    """A drive is where a set-point of this last time [s] was."""
 
 
 class StopConfig(NumbersConfig):
@@ -179,6 +107,8 @@ class SignalConfig(Section):
     """Publisher of the signal: the HAL, or the process of a camera."""
     computed: ComputedConfig | None = None
     """Computation by the HAL; None for a signal that devices measure."""
+    plausible: PlausibleConfig | None = None
+    """Physically possible measurements; what is not given follows from the limits."""
 
     @field_validator("unit", mode="before")
     @classmethod
@@ -186,6 +116,12 @@ class SignalConfig(Section):
         text = str(unit or "")  # `unit: 1` is a number in YAML
         check_robot_unit(text)
         return text
+
+    @field_validator("plausible")
+    @classmethod
+    def _plausible_in_unit(cls, plausible: PlausibleConfig | None, info: ValidationInfo) -> PlausibleConfig | None:
+        unit = info.data.get("unit")
+        return plausible.in_unit(unit, "plausible") if plausible and unit else plausible
 
     @property
     def is_measured(self) -> bool:
@@ -301,8 +237,12 @@ class RobotConfig(Section):
             raise ValueError(f"command.signal '{self.command.signal}' is not a signal. Known: {signals}.")
         if not self.signals[self.command.signal].is_measured:
             raise ValueError(f"command.signal '{self.command.signal}' must be measured by devices, to start from it.")
-        for name in self.signals:
+        for name, signal in self.signals.items():
             self._computed_fits(name)
+            if signal.plausible is not None:
+                signal.plausible.check(signal.size, f"signals.{name}.plausible")
+                if not signal.is_measured:
+                    raise ValueError(f"signals.{name}.plausible: no device measures this signal. Check its inputs.")
         for name, limit in self.limits.items():
             if name not in self.signals:
                 raise ValueError(f"limits.{name} is not a signal. Known: {signals}.")

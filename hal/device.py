@@ -95,6 +95,8 @@ class Device(abc.ABC):
     """Identity of this very device, as `canopen:<vendor>-<product>-<serial>`; empty before `open`, or if unknown."""
     long_request: Callable[[], None] | None = None
     """Request that takes longer than a cycle; the caretaker runs it in a thread."""
+    compliance: float = 0.0
+    """Distance from its set-point at which a healthy drive pushes with its largest effort [unit of the command]."""
     can_damp: bool = False
     """Whether the device implements `damp`."""
     measures: tuple[str, ...] = ()

@@ -8,8 +8,6 @@ from hal.config import RobotConfig
 from hal.device import Device, DeviceState
 from hal.errors import CommandRefused
 
-ENABLE_TIMEOUT = 2.0
-"""All drives together may take this time [s] to enable; a brake needs about 0.1 s."""
 DISABLE_TIMEOUT = 1.0
 """The drives may take this time [s] to disable, including a quick stop."""
 HOMING_TIMEOUT = 60.0
@@ -58,6 +56,7 @@ class ModeMachine:
     def __init__(self, actuators: Actuators, config: RobotConfig) -> None:
         self._actuators = actuators
         self._hold = config.command.hold
+        self._enable_timeout = config.command.enable_timeout
         self._stop_act = _STOPS[config.stop.behaviour]
         hold = Act.DAMP if actuators.quantity == "effort" and self._stop_act is Act.DAMP else Act.HOLD
         self._acts = {Mode.ENABLING: Act.START, Mode.HOLD: hold, Mode.FOLLOW: Act.FOLLOW}
@@ -106,7 +105,7 @@ class ModeMachine:
                 )
         self._actuators.enable()
         self.mode = Mode.ENABLING
-        self._deadline = now + ENABLE_TIMEOUT
+        self._deadline = now + self._enable_timeout
 
     def home(self, device: Device, now: float) -> None:
         """Ask one device to find its zero.
@@ -235,7 +234,10 @@ class ModeMachine:
             self.mode, self._deadline = Mode.HOLD, now + self._hold
         elif now > self._deadline:
             late = self._actuators.names_not_in(DeviceState.ENABLED, states)
-            self.fault(f"Not enabled within {ENABLE_TIMEOUT:g} s: {late}. Is the motor supply on?")
+            self.fault(
+                f"Not enabled within {self._enable_timeout:g} s: {late}. Is the motor supply on? If a brake or "
+                "precharge takes longer, set command.enable_timeout."
+            )
 
     def _holding(self, now: float, states: list[DeviceState], has_command: bool, is_parked: bool) -> None:
         if has_command:
@@ -285,7 +287,7 @@ class ModeMachine:
             self.mode, self._homing = Mode.OFF, None
         elif health.state is not DeviceState.READY or self._homing_seen:
             self.fault(f"'{device.name}' is {health.state} without having found its zero. {health.text}".rstrip())
-        elif now > self._deadline - HOMING_TIMEOUT + ENABLE_TIMEOUT:
+        elif now > self._deadline - HOMING_TIMEOUT + self._enable_timeout:
             self.fault(f"'{device.name}' has not started its homing. {health.text}".rstrip())
 
 

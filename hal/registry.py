@@ -1,7 +1,8 @@
 """Objects that a robot file names (drivers, simulators, functions), imported on demand."""
 
 import importlib
-from collections.abc import Mapping
+import sys
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from pydantic import ValidationError
@@ -21,24 +22,34 @@ DRIVERS = {
 }
 
 
-def load_object(name: str) -> Any:
+def load_object(name: str, what: str = "function", needs: Sequence[str] = ("__call__",)) -> Any:
     """Import and return the object `module:name`.
 
+    Args:
+        name: Module and object; never of Python's own modules, which have no part of a robot.
+        what: Kind of the object, for the message.
+        needs: An object of this kind has these attributes.
+
     Raises:
-        ConfigError: The name is malformed, or the module or the object does not exist.
+        ConfigError: The name is malformed, the module or the object does not exist, or it is of another kind.
     """
     module_name, colon, attribute = name.partition(":")
     if not (colon and module_name and attribute):
         raise ConfigError(f"'{name}' is not of the form 'module:name'.")
+    if module_name.partition(".")[0] in sys.stdlib_module_names:
+        raise ConfigError(f"'{name}' is a part of Python and not a {what} of a robot. Name one of your own modules.")
     try:
         module = importlib.import_module(module_name)
     except ImportError as error:
         raise ConfigError(f"'{name}' cannot be loaded: {error}. Is its package installed?") from error
     try:
-        return getattr(module, attribute)
+        named = getattr(module, attribute)
     except AttributeError:
         known = sorted(key for key, value in vars(module).items() if not key.startswith("_") and callable(value))
         raise ConfigError(f"Module '{module_name}' has no '{attribute}'. It has: {', '.join(known)}.") from None
+    if missing := [need for need in needs if not hasattr(named, need)]:
+        raise ConfigError(f"'{name}' is not a {what}: it has no {', no '.join(missing)}.")
+    return named
 
 
 def driver(name: str) -> Any:
@@ -48,10 +59,10 @@ def driver(name: str) -> Any:
         ConfigError: The driver is unknown.
     """
     if ":" in name:
-        return load_object(name)
+        return load_object(name, "driver", ("Settings",))
     if name not in DRIVERS:
         raise ConfigError(f"There is no driver '{name}'. Known: {', '.join(DRIVERS)}, or 'module:name' of your own.")
-    return load_object(DRIVERS[name])
+    return load_object(DRIVERS[name], "driver", ("Settings",))
 
 
 def equipment(config: RobotConfig, device: str, measured: Mapping[str, Any] | None = None) -> tuple[Any, Any]:

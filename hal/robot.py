@@ -16,6 +16,7 @@ from hal.fleet import build
 from hal.modes import Act, Mode, ModeMachine
 from hal.safety.cycle_lock import PATIENCE, CycleLock
 from hal.safety.emergency import EmergencyStop, StopResult
+from hal.safety.following import Following
 from hal.safety.limiter import Limiter
 from hal.safety.start import Start
 from hal.safety.watchdog import CommandWatchdog, CycleWatchdog, checked
@@ -26,6 +27,8 @@ __all__ = ["Applied", "Robot", "Sample", "open_robot"]
 
 ANSWER_SHARE = 0.6
 """The cycle waits for this part of its period for the answers to its SYNC."""
+_TRACKED = (Act.HOLD, Act.FOLLOW, Act.PARK)
+"""In these cycles the drives are where their set-points are."""
 CLOSING_TIME = 1.5
 """`close` waits at most this time [s] for the drives to come to rest and disable."""
 
@@ -68,11 +71,12 @@ class Robot:
         self._caretaker = Caretaker(devices) if self._buses else None
         self._park = None if config.stop.park is None else np.array(config.stop.park)
         self._start = Start(config, self._actuators.quantity)
+        self._following = Following(config, self._actuators.devices, self._actuators.quantity)
         self._nothing = np.full(config.signals[config.command.signal].size, np.nan)
         self._nothing.flags.writeable = False
         self._desired: tuple[np.ndarray, float] | None = None
-        self._measured = self._assembler.nothing
-        self._number = self._incomplete = 0
+        self._measured = self._heard = self._assembler.nothing
+        self._number = self._incomplete = self._answered = 0
         self._is_open = False
         self._stop_reason = ""
 
@@ -211,7 +215,7 @@ class Robot:
         return self._emergency.watch(requests, lambda: self._number)
 
     def reset(self) -> None:
-        """Leave the fault, here and in the drives, without enabling a drive.
+        """Leave the fault, here and in the drives, without enabling a drive; no value is called frozen any more.
 
         Raises:
             CommandRefused: The robot is enabled.
@@ -219,6 +223,7 @@ class Robot:
         with self._lock.request():
             self._modes.reset()
             self._emergency.unlatch()
+            self._assembler.plausibility.reset()
             for device in self._devices:
                 device.reset()
 
@@ -230,8 +235,8 @@ class Robot:
             cycle: Number of the sample from which they were computed.
 
         Raises:
-            CommandRefused: The size is wrong, a value is not finite, the robot is not enabled, or the cycle is unknown
-                or too old.
+            CommandRefused: The size is wrong, a value is not finite, the robot is not enabled, the cycle is unknown or
+                too old, or a command that answers a later cycle was taken before.
         """
         signal = self.config.command.signal
         desired = checked(desired, signal, self.config.signals[signal].elements)
@@ -242,6 +247,12 @@ class Robot:
                     f"The robot is in mode '{self.mode}' and takes commands in 'hold' and 'follow'. "
                     f"{self.fault_text or 'Is it enabled?'}"
                 )
+            if cycle < self._answered:
+                raise CommandRefused(
+                    f"The command answers cycle {cycle}, but one that answers cycle {self._answered} came before it. "
+                    "Does the network change the order, or do two programs command?"
+                )
+            self._answered = cycle
             self._desired = (desired, expires)
 
     def cycle(self) -> tuple[Sample, Applied]:
@@ -271,7 +282,7 @@ class Robot:
         for bus in self._buses:
             complete &= bus.wait(start + ANSWER_SHARE * self.period)
         values, age, valid = self._assembler.assemble(self._clock.monotonic())
-        self._measured = values
+        self._measured, self._heard = values, self._assembler.heard
         self._start.note(values, start)
         self._incomplete += not complete
         return Sample(self._number, stamp, self.source, complete, values, age, valid), applied
@@ -279,8 +290,9 @@ class Robot:
     def _act(self, now: float, stamp: int) -> Applied:
         """Enter the mode of this cycle and send its set-points."""
         modes, limiter = self._modes, self._limiter
-        problem = self._cycle_watchdog.problem(now) or self._bus_problem() or limiter.trip(self._measured)
-        problem = problem or (self._start.moved(self._measured) if modes.mode is Mode.ENABLING else "")
+        problem = self._cycle_watchdog.problem(now) or self._bus_problem() or limiter.trip(self._heard)
+        problem = problem or (self._start.moved(self._heard) if modes.mode is Mode.ENABLING else "")
+        problem = problem or self._following.problem(self._heard, now)
         if self._emergency.latched and modes.mode is not Mode.FAULT:
             modes.emergency(self._emergency.latched)
         elif problem and modes.mode is not Mode.OFF and modes.mode is not Mode.FAULT:
@@ -291,6 +303,9 @@ class Robot:
         modes.step(now, desired is not None, self._park is not None and np.array_equal(limiter.set_point, self._park))
         act = modes.act
         limited = self._move(act, desired)
+        sent = limiter.set_point if act in _TRACKED else None
+        self._following.note(sent)
+        self._assembler.plausibility.command(sent)
         return Applied(
             self._number,
             stamp,
@@ -335,6 +350,8 @@ class Robot:
             "cycles": self._number,
             "incomplete": self._incomplete,
             "limits": self._limiter.blind(self._measured),
+            "implausible": self._assembler.plausibility.texts(),
+            "doubted": self._assembler.plausibility.count,
             "buses": {bus.name: bus.health() for bus in self._buses},
             "devices": {device.name: device.health().plain() for device in self._devices},
         }

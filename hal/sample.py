@@ -10,6 +10,7 @@ from hal.computed import function_of
 from hal.config import RobotConfig
 from hal.device import Device
 from hal.errors import ConfigError
+from hal.safety.plausibility import Plausibility
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +75,13 @@ class _Computed:
 
 
 class Assembler:
-    """Assembler of the readings of all devices into the signals of the robot file, without a loop over elements."""
+    """Assembler of the readings of all devices into the signals of the robot file, without a loop over elements.
+
+    Attributes:
+        plausibility: Check of every value that devices measure.
+        heard: Signal -> fresh values of the newest sample, also those that are not plausible; NaN where there is none.
+            Only what stops the robot may use them.
+    """
 
     def __init__(self, config: RobotConfig, devices: Sequence[Device]) -> None:
         """Compute the place of each device's values in the sample.
@@ -104,6 +111,8 @@ class Assembler:
         )
         signals = [name for name, signal in config.signals.items() if name in direct or signal.computed is not None]
         self._elements = Elements.of({name: config.signals[name].size for name in signals})
+        self.plausibility = Plausibility.of(config, direct, devices)
+        self.heard = self.nothing
         places = self._elements.places
         self._direct = np.concatenate([np.r_[places[name]] for name in direct] or [np.zeros(0, int)])
         self._computed = [
@@ -131,11 +140,21 @@ class Assembler:
         if not self._is_in_order:
             received, values = received[self._order], values[self._order]
         age = np.maximum(now - received, 0.0)
-        valid = (age <= self._stale_after) & np.isfinite(values)
-        np.copyto(values, np.nan, where=~valid)
+        fresh = (age <= self._stale_after) & np.isfinite(values)
+        np.copyto(values, np.nan, where=~fresh)
+        valid = self.plausibility.check(values, received, fresh)
+        doubted = fresh & ~valid
+        has_doubts = bool(doubted.any())
+        heard = values.copy() if has_doubts else values
+        np.copyto(values, np.nan, where=doubted)
         if self._computed:
             values, age, valid = self._with_computed(values, age, valid)
-        return Numbers(values, self._elements), Numbers(age, self._elements), Truths(valid, self._elements)
+        self.heard = numbers = Numbers(values, self._elements)
+        if has_doubts:
+            places = self._direct[doubted]
+            self.heard = Numbers(values.copy(), self._elements)
+            self.heard.flat[places] = heard[doubted]
+        return numbers, Numbers(age, self._elements), Truths(valid, self._elements)
 
     def _with_computed(self, values: np.ndarray, age: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return values, ages [s] and validity of all signals, measured and computed, in the order of a sample."""

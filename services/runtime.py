@@ -3,27 +3,27 @@
 import os
 from pathlib import Path
 
+from hal.own_folder import NotOwnFolder, own_folder
 from services.errors import ServiceError
 
 
 def runtime_folder() -> Path:
-    """Make and return this user's folder: `$XDG_RUNTIME_DIR/gemuco`, or one in the temporary directory.
+    """Make and return this user's folder, as `own_folder` does.
 
     Raises:
-        ServiceError: It cannot be made.
+        ServiceError: It cannot be made, or other users could exchange files in it.
     """
-    base = os.environ.get("XDG_RUNTIME_DIR")
-    if base:
-        folder = Path(base) / "gemuco"
-    else:
-        import tempfile  # this import takes longer than the rest of a health check
-
-        folder = Path(tempfile.gettempdir()) / f"gemuco-{os.getuid()}"
     try:
-        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        return own_folder()
+    except NotOwnFolder as error:
+        raise ServiceError(f"The folder for locks is not safe: {error}") from None
     except OSError as error:
-        raise ServiceError(f"The folder for locks, '{folder}', cannot be made: {error.strerror}.") from None
-    return folder
+        raise ServiceError(f"The folder for locks, '{error.filename}', cannot be made: {error.strerror}.") from None
+
+
+def open_file(path: str, flags: int) -> int:
+    """Open a file of the runtime folder for this user alone, and follow no link; an `opener` of `open`."""
+    return os.open(path, flags | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
 
 
 def services_here() -> list[tuple[str, str]]:

@@ -17,7 +17,7 @@ from typing import Any
 import can
 
 from simulators.hub_server import HubServer
-from simulators.hub_socket import HELLO, PACKET, RECORD, channels, socket_path
+from simulators.hub_socket import HELLO, PACKET, RECORD, channels, is_trusted, socket_path
 from simulators.wire_time import ERROR, EXTENDED, REMOTE
 
 __all__ = ["HubBus", "HubServer"]
@@ -157,9 +157,12 @@ def _join(channel: str, path: Path) -> socket.socket:
     link.settimeout(_PATIENCE)
     try:
         link.connect(str(path))
-        if link.recv(PACKET) == HELLO:
+        if not is_trusted(link):
+            reason = "a program of another user answers"
+        elif link.recv(PACKET) == HELLO:
             return link
-        reason = "another program answers"
+        else:
+            reason = "another program answers"
     except OSError as error:
         reason = error.strerror or "no answer"
     link.close()

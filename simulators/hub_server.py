@@ -14,7 +14,7 @@ from typing import Self
 
 import can
 
-from simulators.hub_socket import HELLO, PACKET, RECORD, socket_path
+from simulators.hub_socket import HELLO, PACKET, RECORD, mode_of, socket_path
 from simulators.wire_time import ERROR, Wire
 
 _log = logging.getLogger(__name__)
@@ -65,6 +65,7 @@ class HubServer:
         self._lock = _claim(self._path, self.channel)
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._path.unlink(missing_ok=True)
+        os.fchmod(self._listener.fileno(), mode_of(self._path))  # the file has this mode from the beginning
         self._listener.bind(str(self._path))
         self._listener.listen(64)
         self._listener.setblocking(False)
@@ -202,7 +203,7 @@ def _claim(path: Path, channel: str) -> int:
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     while True:
         try:
-            lock = os.open(_lock_path(path), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            lock = os.open(_lock_path(path), os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
         except OSError as error:
             raise can.CanInitializationError(
                 f"Hub channel '{channel}' cannot be served from '{path.parent}': {error.strerror}. Is the folder yours?"

@@ -2,11 +2,16 @@
 
 import os
 import re
+import socket
 import struct
 from pathlib import Path
 
 import can
 
+from hal.own_folder import NotOwnFolder, own_folder
+
+BUSES = "GEMUCO_BUSES"
+"""This variable names a folder for the sockets of hub channels that programs of several users share."""
 RECORD = struct.Struct("<IB3xd8s")
 """A record holds identifier with flags, length, time stamp [s since 1970] and data."""
 PACKET = 128 * RECORD.size
@@ -35,10 +40,24 @@ def socket_path(channel: str) -> Path:
 
 
 def _folder() -> Path:
-    runtime = os.environ.get("XDG_RUNTIME_DIR")
-    if runtime and Path(runtime).is_dir():
-        return Path(runtime) / "gemuco"
-    return Path(f"/tmp/gemuco-{os.getuid()}")
+    chosen = os.environ.get(BUSES)
+    if chosen:
+        return Path(chosen)
+    try:
+        return own_folder()
+    except (NotOwnFolder, OSError) as error:
+        raise can.CanInitializationError(f"There is no folder for hub channels: {error}") from None
+
+
+def is_trusted(link: socket.socket) -> bool:
+    """Whether the peer of a socket is a program of this user or of root, or channels are shared on purpose."""
+    _, user, _ = struct.unpack("3i", link.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
+    return BUSES in os.environ or user in (0, os.geteuid())
+
+
+def mode_of(path: Path) -> int:
+    """Return the permissions of a channel's socket: for this user alone, or for the group that shares the folder."""
+    return 0o660 if os.environ.get(BUSES) == str(path.parent) else 0o600
 
 
 def channels() -> list[str]:

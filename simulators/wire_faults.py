@@ -82,6 +82,8 @@ class FaultyWire:
         """Node id -> wrong id that the node uses on the bus; two nodes may have the same id."""
         self.babble: Callable[[random.Random], list[tuple[int, bytes]]] | None = None
         """Frames that an additional node sends each time `to_hal` is called."""
+        self.forged: dict[int, Callable[[bytes, float], bytes]] = {}
+        """Identifier -> (data, time [s]) -> data that the HAL receives instead: a node that lies."""
         self.counters = {"passed": 0, "lost": 0, "changed": 0}
 
     def to_nodes(self, now: float) -> None:
@@ -140,6 +142,8 @@ class FaultyWire:
         if self.is_cut or message.arbitration_id in self.lost or draw.random() < chances.loss:
             self.counters["lost"] += 1
             return
+        if direction is self._to_hal and message.arbitration_id in self.forged:
+            message = _with_data(message, self.forged[message.arbitration_id](bytes(message.data), now))
         message = self._changed(message, draw, direction is self._to_hal)
         if draw.random() < chances.duplicate:
             self._deliver(direction, message)
@@ -160,7 +164,7 @@ class FaultyWire:
         if data == message.data:
             return message
         self.counters["changed"] += 1
-        return can.Message(arbitration_id=message.arbitration_id, data=data, is_extended_id=message.is_extended_id)
+        return _with_data(message, data)
 
     def _deliver(self, direction: _Direction, message: can.Message) -> None:
         self.counters["passed"] += 1
@@ -176,6 +180,10 @@ class FaultyWire:
 def _with_node(message: can.Message, node: int) -> can.Message:
     identifier = message.arbitration_id & ~_NODE | node
     return can.Message(arbitration_id=identifier, data=message.data, is_extended_id=message.is_extended_id)
+
+
+def _with_data(message: can.Message, data: bytes) -> can.Message:
+    return can.Message(arbitration_id=message.arbitration_id, data=data, is_extended_id=message.is_extended_id)
 
 
 def _put(bus: can.BusABC, message: can.Message) -> None:

@@ -112,10 +112,10 @@ def _plain(rows: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(rows, np.float32)
 
 
-def gates(schema: BodySchema) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return `through`, `line` and m of every mask; see `Gate`."""
-    through, paths, tails = stacked(schema, schema.masks)
-    return through, paths, np.ascontiguousarray(tails[:, : len(schema.x_in)])
+def gates(schema: BodySchema) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return `through`, `line`, m and `direct` of every mask; see `Gate`."""
+    through, paths, tails, directs = stacked(schema, schema.masks)
+    return through, paths, np.ascontiguousarray(tails[:, : len(schema.x_in)]), directs
 
 
 def _others(schema: BodySchema) -> tuple[np.ndarray, np.ndarray]:

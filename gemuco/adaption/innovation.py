@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from gemuco.compiled.innovation import innovations
-from gemuco.layers import run
 from gemuco.masks import Mask
 from gemuco.schema import BodySchema, stacked
 
@@ -29,6 +28,7 @@ class Pairs:
         through: Gate of each mask, shape (masks, in_size).
         paths: Regression of the code l under each mask, shape (masks, in_size + 1, width).
         tails: m of each mask, and space for p, shape (masks, x_in signals + bias_size).
+        directs: Part of the linear path in x_out under each mask, shape (masks, in_size + 2, out_size).
     """
 
     masks: tuple[Mask, ...]
@@ -38,6 +38,12 @@ class Pairs:
     through: np.ndarray
     paths: np.ndarray
     tails: np.ndarray
+    directs: np.ndarray
+
+    @property
+    def parts(self) -> tuple[np.ndarray, ...]:
+        """The arrays as `compiled.innovation.innovations` takes them."""
+        return self.through, self.paths, self.tails, self.directs, self.index, self.whiten
 
 
 class Innovations:
@@ -109,8 +115,7 @@ class Innovations:
         known = self._anchor_errors.get(mask)
         if known is None:
             schema = self._schema
-            inputs = schema.network_input(self._anchors, mask, self._biases)
-            prediction = run(schema.weights.whole, inputs).astype(float)
+            prediction = schema.infer(self._anchors, mask, self._biases).astype(float)
             known = self._anchor_errors[mask] = self._anchors[:, schema.out_index] - prediction
         return known
 
@@ -130,7 +135,7 @@ class Innovations:
         """
         p = np.ascontiguousarray(biases, np.float32)
         x = np.ascontiguousarray(rows, float)
-        return innovations(schema.predictor, x, p, pairs.through, pairs.paths, pairs.tails, pairs.index, pairs.whiten)
+        return innovations(schema.predictor, x, p, *pairs.parts)
 
 
 def own_bias(schema: BodySchema, count: int) -> np.ndarray:

@@ -147,7 +147,7 @@ class Kalman:
         """Weight all beliefs by a sample, and move those of no known condition."""
         pairs = self._innovations.pairs(np.isfinite(row))
         if len(pairs.index):
-            prior, shape = self.prior, (pairs.through, pairs.paths, pairs.tails, pairs.index, pairs.whiten)
+            prior, shape = self.prior, pairs.parts
             seen, self._count = bank.see(
                 schema.predictor, row, self._beliefs, self._count, (prior.mean, prior.covariance), shape,
                 pairs.log_volume, self._near, self._scale, self._rules,

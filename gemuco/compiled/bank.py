@@ -73,7 +73,7 @@ def linearise(predictor, row, mean, pairs, near, rules, error, slope, before, sc
         predictor: The network.
         row: The sample [standard deviations], shape (size,).
         mean: p of every belief, shape (beliefs, k).
-        pairs: `through`, `paths`, `tails`, `index` and `whiten` of `innovations`.
+        pairs: `through`, `paths`, `tails`, `directs`, `index` and `whiten` of `innovations`.
         near: Largest difference between a p and the point at which it is linearised, shape (k,).
         rules: Constants.
         error: Result, shape (beliefs, n).
@@ -192,7 +192,7 @@ def see(predictor, row, beliefs, count, prior, pairs, log_volume, near, scale, r
         beliefs: The beliefs; they are changed in place.
         count: Number of beliefs.
         prior: Mean, shape (k,), and covariance, shape (k, k), of the p of an unknown body.
-        pairs: `through`, `paths`, `tails`, `index` and `whiten` of `innovations`.
+        pairs: `through`, `paths`, `tails`, `directs`, `index` and `whiten` of `innovations`.
         log_volume: Logarithm of the determinant of the errors' covariance.
         near: See `linearise`, shape (k,).
         scale: Factor of the errors' variance.
@@ -204,7 +204,7 @@ def see(predictor, row, beliefs, count, prior, pairs, log_volume, near, scale, r
     begin_anew(beliefs, count, prior[0], prior[1], rules)
     count += 1
     mean, covariance, weight = beliefs.mean[:count], beliefs.covariance[:count], beliefs.weight[:count]
-    size, n = mean.shape[1], len(pairs[3])
+    size, n = mean.shape[1], len(pairs[4])
     error, slope = np.empty((count, n)), np.empty((count, n, size))
     before, volumes = np.empty((count, size, size)), np.empty(count)
     for h in range(count):

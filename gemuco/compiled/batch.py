@@ -6,8 +6,10 @@ from gemuco.compiled.jit import jit
 
 
 @jit
-def under_masks(rows, biases, through, paths, bits, predictor):
+def under_masks(rows, biases, through, paths, bits, directs, predictor):
     """Return the inputs and target outputs of every mask and every sample that has all elements of the mask.
+
+    The targets are those of the network: x_out without the part of the linear path, NaN where the network has no part.
 
     Args:
         rows: Samples [standard deviations], shape (n, size), float32; NaN where not measured.
@@ -15,6 +17,7 @@ def under_masks(rows, biases, through, paths, bits, predictor):
         through: 1 for elements of x_in that a mask lets through, else 0, shape (masks, in_size).
         paths: Regression of the code l under every mask, shape (masks, in_size + 1, width).
         bits: m of every mask, shape (masks, x_in).
+        directs: Part of the linear path in x_out under every mask, shape (masks, in_size + 2, out_size).
         predictor: Positions of x_in and x_out in the layout, and the limit of inputs.
 
     Returns:
@@ -54,6 +57,15 @@ def under_masks(rows, biases, through, paths, bits, predictor):
                     inputs[k, head + signals + i] = biases[row, i]
                 for i in range(len(predictor.outputs)):
                     targets[k, i] = rows[row, predictor.outputs[i]]
+                    share = directs[mask, count + 1, i]
+                    if share == 0.0:
+                        targets[k, i] = np.nan
+                    elif share < 1.0:
+                        line = directs[mask, count, i]
+                        for j in range(count):
+                            if through[mask, j] > 0.0:
+                                line += rows[row, predictor.inputs[j]] * directs[mask, j, i]
+                        targets[k, i] = (targets[k, i] - line) / share
                 samples[k] = row
                 k += 1
     return inputs, targets, samples

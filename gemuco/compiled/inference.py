@@ -35,7 +35,7 @@ class Predictor(NamedTuple):
 
 
 @jit
-def infer(flat, form, inputs, outputs, scale, clip, joined, through, path, tail, requested, estimate):
+def infer(flat, form, inputs, outputs, scale, clip, joined, through, path, tail, direct, requested, estimate):
     """Predict one sample under a mask.
 
     The predictor is passed in `parts`, because Python passes arrays in half the time of tuples of arrays.
@@ -51,6 +51,7 @@ def infer(flat, form, inputs, outputs, scale, clip, joined, through, path, tail,
         through: 1 for elements of x_in that the mask lets through, else 0, shape (in_size,).
         path: Regression of the code l, shape (in_size + 1, width).
         tail: m and p, shape (masks + bias_size,).
+        direct: Part of the linear path in x_out, shape (in_size + 2, out_size).
         requested: Whether each element is requested, truth values, shape (size,).
         estimate: Result for the requested elements [its unit], shape (size,); NaN for elements that are not in x_out.
 
@@ -62,6 +63,7 @@ def infer(flat, form, inputs, outputs, scale, clip, joined, through, path, tail,
     values = space(chain, 1)
     line = first(chain, values, 1)[0]
     count, width = len(inputs), path.shape[1]
+    given = np.zeros(count)
     for k in range(width):
         line[count + k] = path[count, k]
     for i in range(count):
@@ -69,6 +71,7 @@ def infer(flat, form, inputs, outputs, scale, clip, joined, through, path, tail,
         if through[i] > 0.0:
             element = inputs[i]
             x = (joined[element] - scale[0, element]) / scale[1, element]
+            given[i] = x
             line[i] = min(max(x, -clip), clip)
             for k in range(width):
                 line[count + k] += x * path[i, k]
@@ -78,7 +81,13 @@ def infer(flat, form, inputs, outputs, scale, clip, joined, through, path, tail,
     for i in range(len(estimate)):
         if requested[i]:
             estimate[i] = np.nan
-    square, given = 0.0, 0
+    for i in range(len(outputs)):
+        share = direct[count + 1, i]
+        if share < 1.0:
+            prediction[i] = share * prediction[i] + direct[count, i]
+            for k in range(count):
+                prediction[i] += given[k] * direct[k, i]
+    square, known = 0.0, 0
     for i in range(len(outputs)):
         element = outputs[i]
         mean, std = scale[0, element], scale[1, element]
@@ -87,5 +96,5 @@ def infer(flat, form, inputs, outputs, scale, clip, joined, through, path, tail,
         if np.isfinite(joined[element]):
             residual = prediction[i] - (joined[element] - mean) / std
             square += residual * residual
-            given += 1
-    return np.sqrt(square / given) if given else np.nan
+            known += 1
+    return np.sqrt(square / known) if known else np.nan

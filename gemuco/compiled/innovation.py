@@ -9,7 +9,7 @@ from gemuco.compiled.jit import jit
 
 
 @jit
-def innovations(predictor, rows, biases, through, paths, tails, index, whiten):
+def innovations(predictor, rows, biases, through, paths, tails, directs, index, whiten):
     """Return the whitened errors of samples under several masks, and derivatives: error(p + dp) = error - slope dp.
 
     Args:
@@ -19,6 +19,7 @@ def innovations(predictor, rows, biases, through, paths, tails, index, whiten):
         through: 1 for elements of x_in that each mask lets through, else 0, shape (masks, in_size).
         paths: Regression of the code l under each mask, shape (masks, in_size + 1, width).
         tails: m of each mask, followed by any p, shape (masks, x_in signals + bias_size).
+        directs: Part of the linear path in x_out under each mask, shape (masks, in_size + 2, out_size).
         index: Positions of the errors in the flattened (masks, out_size) table, shape (n,).
         whiten: Matrix that converts the errors to independent ones of variance 1, shape (n, n).
 
@@ -29,6 +30,7 @@ def innovations(predictor, rows, biases, through, paths, tails, index, whiten):
     masks, outputs = len(through), len(predictor.outputs)
     batch = count * masks
     prediction = values_and_tangents(predictor, rows, biases, through, paths, tails)
+    mix(predictor, rows, prediction, count, through, directs)
     raw = np.empty((count * (1 + size), len(index)))
     for row in range(count):
         sample = rows[row if len(rows) > 1 else 0]
@@ -46,6 +48,24 @@ def innovations(predictor, rows, biases, through, paths, tails, index, whiten):
             for i in range(len(index)):
                 slope[row, i, j] = white[count + row * size + j, i]
     return white[:count], slope
+
+
+@jit
+def mix(predictor, rows, prediction, count, through, directs):
+    """Mix the network's outputs and derivatives with the linear path in place; see `innovations`."""
+    masks, wide = through.shape
+    for m in range(masks):
+        for i in range(prediction.shape[1]):
+            share = directs[m, wide + 1, i]
+            if share < 1.0:
+                for line in range(m, len(prediction), masks):
+                    prediction[line, i] *= share
+                for row in range(count):
+                    sample, line = rows[row if len(rows) > 1 else 0], directs[m, wide, i]
+                    for k in range(wide):
+                        if through[m, k] > 0.0:
+                            line += sample[predictor.inputs[k]] * directs[m, k, i]
+                    prediction[row * masks + m, i] += line
 
 
 @jit

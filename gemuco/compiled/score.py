@@ -21,12 +21,14 @@ class Judges(NamedTuple):
         through: 1 for elements of x_in that a mask lets through, else 0, shape (masks, in_size).
         paths: Regression of the code l under every mask, shape (masks, in_size + 1, width).
         tails: m and p of every mask, shape (masks, x_in + bias_size).
+        directs: Part of the linear path in x_out under every mask, shape (masks, in_size + 2, out_size).
         mask: Index of the mask that judges each element, shape (out_size,).
     """
 
     through: np.ndarray
     paths: np.ndarray
     tails: np.ndarray
+    directs: np.ndarray
     mask: np.ndarray
 
 
@@ -78,7 +80,15 @@ def errors(predictor, judges, joined):
     for i in range(len(judges.mask)):
         element, row = predictor.outputs[i], judges.mask[i]
         if complete[row]:
-            error[i] = joined[element] - prediction[row, i] * predictor.scale[1, element] - predictor.scale[0, element]
+            value, share = prediction[row, i], judges.directs[row, count + 1, i]
+            if share < 1.0:
+                value = share * value + judges.directs[row, count, i]
+                for k in range(count):
+                    if judges.through[row, k] > 0.0:
+                        of = predictor.inputs[k]
+                        x = (joined[of] - predictor.scale[0, of]) / predictor.scale[1, of]
+                        value += x * judges.directs[row, k, i]
+            error[i] = joined[element] - value * predictor.scale[1, element] - predictor.scale[0, element]
     return error
 
 

@@ -7,7 +7,6 @@ import numpy as np
 from gemuco.anomaly.healthy import learn_normal
 from gemuco.errors import NotEnoughData
 from gemuco.estimation import input_search, latent_search
-from gemuco.layers import run
 from gemuco.masks import Mask, all_masks, covered_by
 from gemuco.schema import BodySchema
 from gemuco.search.routes import STARTS
@@ -83,8 +82,7 @@ def error_rows(schema: BodySchema, rows: np.ndarray, conditions: np.ndarray) -> 
     for m in schema.masks:
         usable = np.isfinite(x[:, schema.layout.indices(m)]).all(axis=1)
         if usable.any():
-            prediction = run(schema.weights.whole, schema.network_input(x[usable], m, p[usable]))
-            errors["mask", m] = prediction - truth[usable]
+            errors["mask", m] = schema.infer(x[usable], m, p[usable]) - truth[usable]
     complete = np.flatnonzero(np.isfinite(x).all(axis=1))
     if not len(complete):
         return errors

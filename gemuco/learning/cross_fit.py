@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from gemuco.adaption.folds import Folds, chosen, series_of
+from gemuco.adaption.folds import FOLDS, Folds, chosen, series_of
 from gemuco.dataset import Dataset
 from gemuco.errors import NotEnoughData
 from gemuco.learning import outliers
@@ -18,6 +18,7 @@ from gemuco.learning.accuracy import (
 from gemuco.learning.learner import Progress
 from gemuco.learning.material import Material
 from gemuco.learning.task import Task
+from gemuco.linear import LinearPath
 from gemuco.masks import Mask
 from gemuco.schema import BodySchema
 
@@ -91,13 +92,44 @@ def cross_fitted(
 def doubted(schema: BodySchema, dataset: Dataset) -> BodySchema:
     """Return a schema with larger expected errors if fewer than 15 rows of its data are independent.
 
-    Held-out rows of such data resemble the learned ones. Without learning the error would be the standard deviation.
+    Held-out rows of such data resemble the learned ones. Other rows are expected to be as far off as a linear path that
+    was learned from a fifth of the data is on the rest of them, at most a standard deviation.
     """
     folds = Folds.of(dataset.rows() / schema.scaler.std, series_of(dataset))
     if folds.doubt == 0.0:
         return schema
-    errors = {key: folds.expected(error, scale_of(schema, key)) for key, error in schema.errors.items()}
+    afar = _errors_afar(schema, dataset)
+    errors = {
+        key: folds.expected(error, scale_of(schema, key) * afar.get(key, 1.0)) for key, error in schema.errors.items()
+    }
     return schema.with_weights(schema.weights, errors)
+
+
+def _errors_afar(schema: BodySchema, dataset: Dataset) -> Errors:
+    """Return the errors of linear paths, each learned from a part of the data, on the other parts, at most 1.
+
+    Returns:
+        (`mask`, mask) -> error of every element of x_out [standard deviations], shape (out_size,). Empty if a part has
+        too few complete samples.
+    """
+    rows = schema.scaler.normalise(dataset.rows())
+    rows[:, schema.scaler.dead] = 0.0
+    x, y = rows[:, schema.in_index], rows[:, schema.out_index]
+    complete = np.isfinite(x).all(axis=1) & np.isfinite(y).all(axis=1)
+    x, y = x[complete], y[complete]
+    squares: dict[tuple[str, Mask], list[np.ndarray]] = {("mask", mask): [] for mask in schema.masks}
+    part = np.arange(len(x)) * FOLDS // max(1, len(x))
+    for index in range(FOLDS):
+        learned = part == index
+        if learned.sum() < 2 * x.shape[1]:
+            return {}
+        path = LinearPath.fit(x[learned], y[learned], y.shape[1])
+        for mask in schema.masks:
+            through = schema.gate(mask).through
+            line = path.direct(through, np.zeros(y.shape[1]))[:-1]
+            missed = (x[~learned] * through) @ line[:-1] + line[-1] - y[~learned]
+            squares["mask", mask].append((missed**2).mean(axis=0))
+    return {key: np.minimum(1.0, np.sqrt(np.mean(parts, axis=0))) for key, parts in squares.items()}
 
 
 def _without_outliers(schema: BodySchema, dataset: Dataset, limit: float) -> tuple[np.ndarray, np.ndarray]:

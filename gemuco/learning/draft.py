@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save_file
+from safetensors.numpy import save
 
-from gemuco.writing import writing
+from gemuco.writing import replace, writing
 
 FORMAT = "gemuco.draft.3"
 
@@ -58,11 +58,8 @@ class Draft:
         text = json.dumps(dict(facts))
         whole = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
         head = {"format": FORMAT, "key": self.key, "facts": text, "sha256": _digest(whole.items(), text)}
-        part = self.path.with_name(self.path.name + ".part")
         with writing("The training", self.path):
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            save_file(whole, part, head)
-            part.replace(self.path)
+            replace(self.path, save(whole, head))
 
 
 def _digest(arrays: Iterable[tuple[str, np.ndarray]], facts: str) -> str:

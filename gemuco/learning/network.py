@@ -74,15 +74,15 @@ class Network(nn.Module):
         return Weights(export(self.encoder), export(self.decoder))
 
 
-def with_linear_path(weights: Weights, mean: np.ndarray, components: np.ndarray, place: int) -> Weights:
+def with_linear_path(weights: Weights, outputs: np.ndarray, place: int) -> Weights:
     """Return a network that begins as its linear path: the code l goes to z and from there to the output.
 
     Args:
         weights: First weights of a network without linear path.
-        mean: Mean of x_out [standard deviations], shape (out_size,).
-        components: Output per element of the code, shape (width, out_size); at most as many as z has elements.
+        outputs: x_out by the code and 1 (`LinearPath`), shape (width + 1, out_size); z is at least as long as the code.
         place: Position of the code in the network's input.
     """
+    components, mean = outputs[:-1], outputs[-1]
     width = len(components)
     chains = []
     for chain in (weights.encoder, weights.decoder):

@@ -53,8 +53,12 @@ class Task:
         set_field(self, "needs", np.stack([bits(m, layout.names) for m in self.masks]))
         set_field(self, "tails", np.stack([bits(m, x_in) for m in self.masks]))
         set_field(self, "through", np.repeat(self.tails, [layout.signal(name).size for name in x_in], axis=1))
-        linear = self.linear or LinearPath.none(len(self.in_index))
-        set_field(self, "paths", np.stack([linear.map(through) for through in self.through]))
+        set_field(self, "paths", np.stack([self.path.map(through) for through in self.through]))
+
+    @property
+    def path(self) -> LinearPath:
+        """The linear path, of width 0 without one."""
+        return self.linear or LinearPath.none(len(self.in_index), len(self.out_index))
 
     def any_of(self, elements: np.ndarray) -> np.ndarray:
         """Return whether any element of each signal is true, (samples, layout.size) -> (samples, signals)."""

@@ -11,6 +11,7 @@ from gemuco.dataset import Data, Dataset, as_dataset
 from gemuco.errors import NotEnoughData, check_kind
 from gemuco.layers import Weights
 from gemuco.learning.accuracy import assess
+from gemuco.learning.blend import blended
 from gemuco.learning.config import TrainConfig
 from gemuco.learning.cross_fit import doubted
 from gemuco.learning.draft import Draft, key_of
@@ -19,7 +20,7 @@ from gemuco.learning.learner import Learner, Progress
 from gemuco.learning.material import Material
 from gemuco.learning.network import Network, with_linear_path
 from gemuco.learning.task import Task
-from gemuco.linear import LinearPath, basis
+from gemuco.linear import LinearPath
 from gemuco.masks import Mask, label, mask
 from gemuco.scaler import Scaler
 from gemuco.schema import BodySchema
@@ -70,7 +71,7 @@ def fit(
     task, notes = _task(dataset, checked, outputs)
     notes.extend(dataset.repetitions())
     conditions = dataset.conditions
-    task, mean, components = _with_linear_path(task, scaler, train_data, config.latent_for(len(task.out_index)))
+    task = _with_linear_path(task, scaler, train_data, config.latent_for(len(task.out_index)))
     material = material_of(task, scaler, train_data, conditions)
     held = material_of(task, scaler, held_data, conditions)
     frozen = np.full(len(conditions), len(conditions) == 1)
@@ -80,7 +81,7 @@ def fit(
     size = len(task.in_index) + len(task.x_in) + bias_size
     latent = config.latent_for(len(task.out_index))
     weights = Network(size, len(task.out_index), config.hidden, latent, config.activation).weights()
-    weights = with_linear_path(weights, mean, components, len(task.in_index))
+    weights = with_linear_path(weights, task.path.outputs, len(task.in_index))
     unused = bias_size if frozen.all() else 0
     _mute(weights, task, scaler.dead, unused)
     biases = np.zeros((len(conditions), bias_size), np.float32)
@@ -89,7 +90,8 @@ def fit(
     schema = schema_of(learner, scaler, conditions)
     weights = learner.weights
     _mute(weights, task, scaler.dead, unused)
-    schema = doubted(assessed(schema.with_weights(weights), learner, conditions), dataset)
+    schema = blended(schema.with_weights(weights), *judged_rows(schema, learner.held, conditions))
+    schema = doubted(assessed(schema, learner, conditions), dataset)
     return schema, history_of(learner, scaler, notes)
 
 
@@ -127,8 +129,8 @@ def _bias_notes(config: TrainConfig, conditions: tuple[str, ...]) -> list[str]:
     ]
 
 
-def _with_linear_path(task: Task, scaler: Scaler, data: Dataset, latent: int) -> tuple[Task, np.ndarray, np.ndarray]:
-    """Return the task with a linear path, and the mean of x_out and its components (`basis`).
+def _with_linear_path(task: Task, scaler: Scaler, data: Dataset, latent: int) -> Task:
+    """Return the task with a linear path.
 
     The path is learned from the samples with all inputs and outputs. With less than two of them per input there is no
     path: the code has length 0.
@@ -139,10 +141,8 @@ def _with_linear_path(task: Task, scaler: Scaler, data: Dataset, latent: int) ->
     x, y = rows[np.ix_(complete, task.in_index)], rows[np.ix_(complete, task.out_index)]
     width = min(latent, y.shape[1])
     if len(x) < max(10, 2 * x.shape[1]):
-        return task, np.zeros(y.shape[1]), np.zeros((0, y.shape[1]))
-    mean, components = basis(y, width)
-    path = LinearPath.fit(x, (y - mean) @ components.T)
-    return replace(task, linear=path), mean, components
+        return task
+    return replace(task, linear=LinearPath.fit(x, y, width))
 
 
 def material_of(
@@ -219,14 +219,16 @@ def schema_of(
 
 def assessed(schema: BodySchema, learner: Learner, conditions: tuple[str, ...]) -> BodySchema:
     """Return the schema with errors and normal statistics of the held-out data without its outliers."""
+    held, learned = (judged_rows(schema, part, conditions) for part in (learner.held, learner.material))
+    return assess(schema, *held, training=learned)
+
+
+def judged_rows(schema: BodySchema, part: Material, conditions: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the new samples without outliers [unit], shape (n, size), and their index into `schema.biases`, (n,)."""
     names = list(schema.biases)
     owners = np.array([names.index(c) for c in conditions] if names else [0] * len(conditions), int)
-
-    def usable(part: Material) -> tuple[np.ndarray, np.ndarray]:
-        rows = np.where(part.suspected[:, part.task.signal_of], np.nan, part.rows)[: part.new]
-        return schema.scaler.restore(rows), owners[part.condition[: part.new]]
-
-    return assess(schema, *usable(learner.held), training=usable(learner.material))
+    rows = np.where(part.suspected[:, part.task.signal_of], np.nan, part.rows)[: part.new]
+    return schema.scaler.restore(rows), owners[part.condition[: part.new]]
 
 
 def history_of(learner: Learner, scaler: Scaler, notes: list[str]) -> History:

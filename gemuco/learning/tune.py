@@ -7,13 +7,14 @@ import numpy as np
 
 from gemuco.dataset import Dataset
 from gemuco.learning.accuracy import measure_errors
+from gemuco.learning.blend import blended
 from gemuco.learning.config import TrainConfig
 from gemuco.learning.cross_fit import Errors, conditions_of, cross_fitted, folds_of, share
 from gemuco.learning.draft import Draft
 from gemuco.learning.history import History
 from gemuco.learning.learner import Learner, Progress
 from gemuco.learning.task import Task
-from gemuco.learning.train import assessed, draft_key, history_of, material_of, schema_of
+from gemuco.learning.train import assessed, draft_key, history_of, judged_rows, material_of, schema_of
 from gemuco.scaler import Scaler
 from gemuco.schema import BodySchema
 
@@ -63,7 +64,9 @@ def fine_tune(
     learner = trained(0, dataset)
     train_data, _ = dataset.split(config.held_out, config.seed)
     history = history_of(learner, Scaler.fit(schema.layout, train_data.rows()), [])
-    result = assessed(schema_of(learner, schema.scaler, conditions, schema), learner, conditions)
+    result = schema_of(learner, schema.scaler, conditions, schema)
+    result = blended(result, *judged_rows(result, learner.held, conditions))
+    result = assessed(result, learner, conditions)
     if folds is not None:
         result = cross_fitted(
             result,

@@ -4,10 +4,12 @@ Each record belongs to one very device and has a hash, so that neither another d
 joint. A record is refused if its conditions have changed since, such as a gear or a number of counts.
 """
 
+import fcntl
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -24,6 +26,8 @@ SIMULATED = ("hub", "virtual")
 """Devices on these interfaces are simulated and need no calibration."""
 KEPT = ".before"
 """A copy of the file before the last change has this suffix."""
+PART = ".part"
+"""A file that is being written has its later name with this suffix."""
 WITHOUT_EFFECT = frozenset(
     (
         *("eds", "pdo", "master_id", "silent_after", "frozen_after", "periods", "heartbeat", "identity", "around"),
@@ -154,26 +158,47 @@ def save(config: RobotConfig, record: Record) -> Path:
         ConfigError: The present file cannot be read, or the folder cannot be written.
     """
     path = path_of(config)
-    entries = {
-        name: entry
-        for name, entry in _raw(path).items()
-        if name != _name(record) and not (isinstance(entry, dict) and entry.get("device") == record.device)
-    }
-    entries[_name(record)] = record.model_dump(mode="json")
-    text = _HEAD + yaml.safe_dump(entries, sort_keys=False, width=120)
-    fresh = path.with_name(f"{path.name}.{os.getpid()}")
     try:
-        with fresh.open("w") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        if path.exists():
-            path.with_name(path.name + KEPT).write_bytes(path.read_bytes())
-        fresh.replace(path)
+        with _locked(path.parent) as folder:
+            entries = {
+                name: entry
+                for name, entry in _raw(path).items()
+                if name != _name(record) and not (isinstance(entry, dict) and entry.get("device") == record.device)
+            }
+            entries[_name(record)] = record.model_dump(mode="json")
+            if path.exists():
+                _replace(path.with_name(path.name + KEPT), path.read_bytes())
+            _replace(path, (_HEAD + yaml.safe_dump(entries, sort_keys=False, width=120)).encode())
+            os.fsync(folder)
     except OSError as error:
-        fresh.unlink(missing_ok=True)
         raise ConfigError(f"The calibration cannot be saved in '{path}': {error.strerror}.") from None
     return path
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[int]:
+    """Keep other processes from saving in a folder; yield its handle."""
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        yield handle
+    finally:
+        os.close(handle)
+
+
+def _replace(path: Path, data: bytes) -> None:
+    """Write a file in one step; one that a killed process has begun is written anew, and a link is not followed."""
+    part = path.with_name(path.name + PART)
+    flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_CLOEXEC
+    try:
+        with os.fdopen(os.open(part, flags, 0o666), "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+    except OSError:
+        part.unlink(missing_ok=True)
+        raise
 
 
 def _name(record: Record) -> str:

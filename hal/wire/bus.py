@@ -16,6 +16,7 @@ import canopen
 from hal.clock import BusClock
 from hal.config import BusConfig
 from hal.errors import ConfigError
+from hal.log_limit import LogLimit
 from hal.protocols import cia301
 from hal.wire.budget import OWN_HEARTBEAT_RATE
 from hal.wire.kernel import Kernel, set_buffers
@@ -85,6 +86,7 @@ class Bus:
         """Whether the bus has CANopen nodes, which need the SYNC and the HAL's heartbeat."""
         self._config = config
         self._clock = clock
+        self._log = LogLimit(log)
         self._watch = BusWatch(self._changed)
         self._losses = 0
         self._sender = Sender(self.counters, lambda text: self._watch.worry(text, clock.monotonic()))
@@ -299,4 +301,5 @@ class Bus:
     def _changed(self, state: BusState, text: str) -> None:
         self._sender.is_barred = state is BusState.BUS_OFF
         is_expected = state is BusState.OK or self._closing.is_set()
-        log.log(logging.INFO if is_expected else logging.WARNING, "bus %s is %s. %s", self.name, state, text)
+        level = logging.INFO if is_expected else logging.WARNING
+        self._log.line(level, state, time.monotonic(), f"bus {self.name} is {state}. {text}")

@@ -16,7 +16,7 @@ from services.command.client_lease import NEEDS_LEASE, ClientLease
 from services.errors import NoAnswer, NotAllowed, ServiceError, ServiceUnavailable, TooSlow, WrongVersion
 from services.wire import keys, query
 from services.wire.caller import Caller, own_name
-from services.wire.member import Member, member_in
+from services.wire.member import Member, emergency_endpoints, member_in
 from services.wire.messages import Message, Sample
 from services.wire.query import describe_presence, starter
 from services.wire.session import CLIENT, close_session, new_boot, open_with, settings
@@ -60,13 +60,19 @@ class Link:
         self._presence: Presence | None = None
         self._make_lock = threading.Lock()
 
-    def open(self) -> None:
+    def open(self, is_emergency: bool = False) -> None:
         """Open the session.
+
+        Args:
+            is_emergency: Use the router's port for emergency stops, which accepts nothing else; without such a port in
+                the role file use the usual one.
 
         Raises:
             ServiceError: No session could be opened.
         """
         configuration = settings(self.robot, CLIENT, self._connect)
+        if is_emergency and (places := emergency_endpoints(configuration)):
+            configuration["connect"]["endpoints"] = places
         self.member = member_in(configuration)
         self._session = open_with(configuration, f"a client of robot '{self.robot}'")
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from types import TracebackType
 from typing import Any, Protocol, Self
 
+from services.command.lease import new_number
 from services.errors import CommandHeld, LeaseLost, NoAnswer, ServiceError, TooLate
 
 log = logging.getLogger(__name__)
@@ -47,7 +48,7 @@ class ClientLease:
 
     def __init__(self, client: LeaseLink, seconds: float = SECONDS) -> None:
         self._client, self._seconds = client, seconds
-        self._number = 0
+        self._number = new_number()
         self._end = 0.0
         self._lost_text = ""
         self._renewal_fault = ""
@@ -65,8 +66,8 @@ class ClientLease:
         if self._client.held_lease is not None:
             raise CommandHeld("This client already has the lease of this robot; one lease is enough.")
         request_time = time.monotonic()
-        answer = self._client.ask("hal", "lease", {"seconds": self._seconds})
-        self._number, self._end = answer["number"], request_time + self._seconds
+        self._client.ask("hal", "lease", {"seconds": self._seconds, "number": self._number, "new": True})
+        self._end = request_time + self._seconds
         self._client.held_lease = self
         self._thread.start()
         return self
@@ -78,7 +79,7 @@ class ClientLease:
         self._stop.set()
         self._thread.join(RELEASE_TIMEOUT)
         try:
-            self._client.ask("hal", "release", timeout=RELEASE_TIMEOUT)
+            self._client.ask("hal", "release", {"number": self._number}, RELEASE_TIMEOUT)
         except ServiceError as failure:
             log.warning("The lease could not be released; it expires by itself: %s", failure)
 

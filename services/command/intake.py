@@ -2,10 +2,13 @@
 
 import logging
 import math
+import threading
 import time
+from collections import OrderedDict, deque
 from collections.abc import Callable
 from typing import Any, Generic, TypeVar
 
+import msgspec
 import zenoh
 
 from hal.errors import CommandRefused
@@ -13,7 +16,8 @@ from hal.robot import Robot
 from services.command.lease import Lease
 from services.errors import CommandHeld, LeaseLost, TargetRefused
 from services.wire.caller import LONGEST_NAME, Caller
-from services.wire.messages import Command, Message, MessageError
+from services.wire.messages import UNREADABLE, Command, Message, MessageError
+from services.wire.order import Order
 from services.wire.plain_text import plain, shown
 from services.wire.streams import received_message
 
@@ -21,7 +25,13 @@ M = TypeVar("M", bound=Message)
 log = logging.getLogger(__name__)
 
 DEPTH = 8
-"""At most this many messages wait for a tick: a bad one must not displace a good one, and a flood must stay short."""
+"""At most this many messages of a sender wait for a tick: a bad one must not displace a good one."""
+SENDERS = 16
+"""At most this many senders have a ring of their own; the one that was silent longest loses it."""
+PER_TICK = 32
+"""At most this many messages are followed in a tick, of all senders in turn, so that a flood stays short."""
+LARGE = 1 << 14
+"""Messages of more bytes than this share the ring of messages without a sender."""
 LOG_EVERY = 1.0
 """Two log lines about bad messages are at least this long [s] apart."""
 NEWS_FOR = 5.0
@@ -39,39 +49,49 @@ class Intake(Generic[M]):
             `TargetRefused` if the message is refused.
 
     Attributes:
-        counters: Numbers of messages that were `accepted`, `refused` and `malformed`.
+        counters: Numbers of messages that were `accepted`, `refused`, `malformed`, or dropped because their sender
+            sends too many (`flooded`).
     """
 
     def __init__(self, session: zenoh.Session, key: str, record: type[M], use: Callable[[M], None]) -> None:
-        self.counters = {"accepted": 0, "refused": 0, "malformed": 0}
+        self.counters = {"accepted": 0, "refused": 0, "malformed": 0, "flooded": 0}
         self._record, self._use = record, use
         self._text = ""
         self._refused_at = self._logged_at = -math.inf
-        self._subscriber = session.declare_subscriber(key, zenoh.handlers.RingChannel(DEPTH))
+        self._order = Order()
+        self._rings = Rings()
+        self._subscriber = session.declare_subscriber(key, zenoh.handlers.Callback(self._rings.put, indirect=False))
 
     def take(self) -> None:
         """Follow the waiting messages; never wait, and never raise because of a message."""
-        for _ in range(DEPTH):
-            sample = self._subscriber.try_recv()
-            if sample is None:
-                return
+        flooded = self._rings.dropped
+        if flooded != self.counters["flooded"]:
+            self.counters["flooded"] = flooded
+            self._tell(
+                f"More than {DEPTH} {self._record.TYPE} messages of a sender came in a tick; the oldest are dropped."
+            )
+        for sample in self._rings.take(PER_TICK):
             self._follow(sample)
 
     def _follow(self, sample: zenoh.Sample) -> None:
         try:
-            self._use(received_message(sample, self._record))
+            message = received_message(sample, self._record)
+            if not self._order.problem(message):
+                self._use(message)
+                self._rings.kept = message.boot
+                self.counters["accepted"] += 1
+                return
+            self._tell(self._order.text)
         except (CommandRefused, CommandHeld, LeaseLost, TargetRefused) as error:
             self._refuse("refused", str(error))
         except MessageError as error:
             self._refuse("malformed", str(error))
         except Exception as error:  # no message may end the tick
             self._refuse("malformed", f"A {self._record.TYPE} could not be read: {type(error).__name__}: {error}")
-        else:
-            self.counters["accepted"] += 1
 
     def facts(self) -> dict[str, Any]:
         """Return the counters, and the fault of the last bad message as `text`."""
-        return {**self.counters, "text": self._text}
+        return {**self.counters, **self._order.counters, "text": self._text}
 
     def news(self) -> str:
         """Return the fault of the last bad message for `NEWS_FOR` seconds; empty otherwise."""
@@ -79,12 +99,73 @@ class Intake(Generic[M]):
 
     def _refuse(self, counter: str, text: str) -> None:
         self.counters[counter] += 1
+        self._tell(text)
+
+    def _tell(self, text: str) -> None:
         self._text = text = plain(text)
         self._refused_at = now = time.monotonic()
         if now - self._logged_at >= LOG_EVERY:
             self._logged_at = now
             log.warning("%s (%d refused, %d malformed so far)", text, self.counters["refused"],
                         self.counters["malformed"])  # fmt: skip
+
+
+class _Header(msgspec.Struct):
+    """The sender of a message."""
+
+    boot: int = 0
+
+
+_sender_of = msgspec.msgpack.Decoder(_Header).decode
+
+
+class Rings:
+    """A ring of waiting messages per sender, so that one sender's flood does not displace the messages of another.
+
+    Attributes:
+        dropped: Number of messages that newer ones of the same sender, or other senders, have displaced.
+        kept: Sender who keeps its ring and comes first, because its last message was accepted; 0 for none.
+    """
+
+    def __init__(self) -> None:
+        self.dropped = self.kept = 0
+        self._rings: OrderedDict[int, deque[zenoh.Sample]] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def put(self, sample: zenoh.Sample) -> None:
+        """Add a message; called by the session's thread."""
+        sender = 0
+        if len(sample.payload) <= LARGE:
+            try:
+                sender = _sender_of(sample.payload.to_bytes()).boot
+            except UNREADABLE:  # the tick will count it
+                sender = 0
+        with self._lock:
+            ring = self._rings.get(sender)
+            if ring is None:
+                if len(self._rings) >= SENDERS:
+                    oldest = next(known for known in self._rings if known != self.kept)
+                    self.dropped += len(self._rings.pop(oldest))
+                ring = self._rings[sender] = deque(maxlen=DEPTH)
+            self._rings.move_to_end(sender)
+            self.dropped += len(ring) == DEPTH
+            ring.append(sample)
+
+    def take(self, most: int) -> list[zenoh.Sample]:
+        """Remove and return at most this number of messages, the oldest of each sender first; never waits."""
+        if not self._lock.acquire(blocking=False):  # the next tick takes them
+            return []
+        try:
+            taken: list[zenoh.Sample] = []
+            rings = self._rings
+            first = [rings[self.kept]] if self.kept in rings else []
+            waiting = [ring for ring in first + [rings[one] for one in rings if one != self.kept] if ring]
+            while waiting and len(taken) < most:
+                taken.extend(ring.popleft() for ring in waiting[: most - len(taken)])
+                waiting = [ring for ring in waiting if ring]
+            return taken
+        finally:
+            self._lock.release()
 
 
 class Commands:

@@ -31,7 +31,8 @@ class Tenure:
         caller: The holder; a caller without a boot before the first tenure.
         until: End [monotonic s].
         through: `boot` of the service that commands for the holder; 0 if the holder commands itself.
-        number: Number of this lease; 0 if a stream of commands took it.
+        number: Secret of the holder, with which it renews and releases its lease; 0 if a stream of commands took it.
+            The boots of clients are published, so they prove nothing.
     """
 
     caller: Caller = UNKNOWN
@@ -60,25 +61,33 @@ class Lease:
         """Return the remaining time of the lease [s]; 0 without a holder."""
         return max(0.0, self._tenure.until - self._clock.monotonic())
 
-    def take(self, caller: Caller, seconds: Any) -> Tenure:
-        """Give the caller the lease for this time [s] from now; the holder may take its lease again.
+    def take(self, caller: Caller, seconds: Any, number: Any = 0) -> Tenure:
+        """Give the caller the lease for this time [s] from now; with the same number it may take it again.
+
+        Args:
+            caller: The client.
+            seconds: Length of the lease [s].
+            number: Number that the client chose, so that it may repeat a request whose answer was lost; 0: any.
 
         A service that was let command by a client without a lease commands for any client, so it gives way.
 
         Raises:
-            CommandHeld: Another client has the lease.
-            BadArguments: The time is not allowed, or the caller has no boot.
+            CommandHeld: Another client has the lease, or this one under another number.
+            BadArguments: The time or the number is not allowed, or the caller has no boot.
         """
         duration = _checked(seconds)
+        if type(number) is not int or not 0 <= number < 1 << 53:
+            raise BadArguments(f"The number of a lease is a whole number from 1 to 2^53 - 1, not {shown(number)}.")
         if not caller.boot:
             raise BadArguments("A client that takes the lease must send a `boot`, a random number, with its query.")
         with self._lock:
             tenure, until = self.tenure, self._clock.monotonic() + duration
             gives_way = tenure is not None and not tenure.number and tenure.caller.boot == self._shared
-            if tenure is not None and tenure.caller.boot != caller.boot and not gives_way:
+            is_other = tenure is not None and (tenure.caller.boot != caller.boot or tenure.number not in (0, number))
+            if tenure is not None and is_other and not gives_way:
                 raise self._refusal(tenure)
-            through, number = (0, 0) if tenure is None or gives_way else (tenure.through, tenure.number)
-            self._tenure = Tenure(caller, until, through, number or secrets.randbits(53) or 1)
+            through = 0 if tenure is None or gives_way else tenure.through
+            self._tenure = Tenure(caller, until, through, number or new_number())
             return self._tenure
 
     def renew(self, caller: Caller, seconds: Any, number: Any) -> Tenure:
@@ -104,11 +113,19 @@ class Lease:
             self._tenure = replace(tenure, until=self._clock.monotonic() + duration)
             return self._tenure
 
-    def give_back(self, caller: Caller) -> None:
-        """End the lease if the caller has it; a service that commanded for the caller must then stop."""
+    def give_back(self, caller: Caller, number: Any) -> None:
+        """End the caller's lease of this number; a service that commanded for the caller must then stop.
+
+        Raises:
+            CommandHeld: Another client has the lease, or this one under another number.
+        """
         with self._lock:
-            if caller.boot and self._tenure.caller.boot == caller.boot:
-                self._tenure = replace(self._tenure, until=-math.inf)
+            tenure = self.tenure
+            if tenure is None:
+                return
+            if tenure.caller.boot != caller.boot or not tenure.number or tenure.number != number:
+                raise self._refusal(tenure)
+            self._tenure = replace(tenure, until=-math.inf)
 
     def check(self, caller: Caller) -> None:
         """Raise `CommandHeld` if another client commands; a caller without a boot is never the holder."""
@@ -178,6 +195,11 @@ class Lease:
             f"{tenure.caller} commands this robot for another {left:.1f} s, and longer if it continues. "
             "Stopping is always allowed."
         )
+
+
+def new_number() -> int:
+    """Return a random number for a lease."""
+    return secrets.randbits(53) or 1
 
 
 def _checked(seconds: Any) -> float:

@@ -74,6 +74,7 @@ def _findings(robot: str, connect: tuple[str, ...]) -> Iterator[Finding]:
         yield from _devices(config, connect)
     yield from host_checks.clocks()
     yield from host_checks.real_time()
+    yield from host_checks.other_users(bool(split_connect(connect)[1]))
     yield from role_files(connect)
     yield from _network(config, connect)
 

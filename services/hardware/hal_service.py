@@ -82,7 +82,7 @@ class HalService:
         verb("stop", lambda _: self._do(lambda: robot.stop("A client asked to stop.")), always=True)
         verb("estop", self._estop, always=True)
         verb("lease", self._take_lease, self._cycles.check)
-        verb("release", lambda _: self._lease.give_back(CURRENT_CALLER.get()))
+        verb("release", self._release)
 
     def run(self, stop: threading.Event) -> None:
         """Commission the devices, cycle the robot until `stop` is set, and release the drives."""
@@ -163,15 +163,26 @@ class HalService:
 
     def _take_lease(self, arguments: dict[str, Any]) -> dict[str, Any]:
         """Give the caller the lease, or renew it."""
-        if not {"seconds"} <= set(arguments) <= {"seconds", "number"}:
-            raise BadArguments("lease takes {seconds}; a renewal takes {seconds, number} with the number of the lease.")
+        if not {"seconds"} <= set(arguments) <= {"seconds", "number", "new"}:
+            raise BadArguments(
+                "lease takes {seconds}, or {seconds, number, new: true} with a random number; a renewal takes "
+                "{seconds, number} with the number of the lease."
+            )
         caller = CURRENT_CALLER.get()
-        if "number" in arguments:
+        if arguments.get("new"):
+            tenure = self._lease.take(caller, arguments["seconds"], arguments.get("number"))
+        elif "number" in arguments:
             tenure = self._lease.renew(caller, arguments["seconds"], arguments["number"])
         else:
             tenure = self._lease.take(caller, arguments["seconds"])
         name, holder = str(tenure.caller), tenure.caller.boot
         return {"name": name, "holder": holder, "number": tenure.number, "left": self._lease.left()}
+
+    def _release(self, arguments: dict[str, Any]) -> None:
+        """End the caller's lease."""
+        if set(arguments) != {"number"}:
+            raise BadArguments("release takes {number}, the number of the lease, which only its holder knows.")
+        self._lease.give_back(CURRENT_CALLER.get(), arguments["number"])
 
     def _publish_holder(self, now: float) -> None:
         """Publish the lease holder when it has changed, and once per `HOLDER_EVERY`."""
@@ -215,6 +226,10 @@ def _problem(health: dict[str, Any]) -> str:
         name, device = faulty[0]
         more = f" (and {len(faulty) - 1} more devices)" if len(faulty) > 1 else ""
         return f"{name}: {device['text']}{more}"
+    implausible = list(health["implausible"].values())
+    if implausible:
+        more = f" (and {len(implausible) - 1} more elements)" if len(implausible) > 1 else ""
+        return f"{implausible[0]}{more} {health['limits']}".rstrip()
     return str(health["limits"])
 
 

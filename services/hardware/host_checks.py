@@ -2,6 +2,7 @@
 
 import ctypes
 import os
+import pwd
 import resource
 import threading
 import time
@@ -15,6 +16,8 @@ STEADY = 1e-3
 """A steady wall clock moves by at most this much [s] against the monotonic clock within `OBSERVED`."""
 OBSERVED = 0.3
 """The two clocks are compared over this time [s]."""
+FIRST_PERSON = 1000
+"""Users of services have lower numbers."""
 _TIMEX_BYTES = 256
 _MAX_ERROR_AT = 24
 """`maxerror` [us] has this offset in `struct timex` (64 bit)."""
@@ -78,6 +81,24 @@ def real_time() -> Iterator[Finding]:
         )
     else:
         yield ok("processor", f"{os.cpu_count()} cores, governor {', '.join(sorted(set(_governors()))) or 'unknown'}.")
+
+
+def other_users(has_role_file: bool) -> Iterator[Finding]:
+    """Report the users of this machine who can command the robot, which without role files are all of them."""
+    if has_role_file:
+        yield ok("users", "A role file is used, so other users of this machine need one to command the robot.")
+        return
+    names = [user.pw_name for user in pwd.getpwall() if user.pw_uid != os.geteuid() and _may_log_in(user)]
+    text = "Without role files every user and program of this machine can enable motors and command the robot"
+    if names:
+        known = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+        yield warning("users", f"{text}: {known} can log in here. Run `gemuco security init`, also for one machine.")
+    else:
+        yield ok("users", f"{text}; only root and this user can log in here.")
+
+
+def _may_log_in(user: pwd.struct_passwd) -> bool:
+    return user.pw_uid >= FIRST_PERSON and not user.pw_shell.endswith(("nologin", "false", "sync"))
 
 
 def _try_fifo() -> str:

@@ -59,7 +59,7 @@ def simulator_of(robot: RobotConfig) -> Simulator:
             f"Robot '{robot.robot}' names no simulator; add `simulator: module:name` to its file. "
             "simulators.robots.bench:simulator stands in for the devices of any robot file."
         )
-    simulator: Simulator = registry.load_object(robot.simulator)
+    simulator: Simulator = registry.load_object(robot.simulator, "simulator", ("variants", "conditions", "rig"))
     unknown = [condition for condition in robot.conditions if condition not in simulator.conditions]
     if unknown:
         known = ", ".join(simulator.conditions) or "none"

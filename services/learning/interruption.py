@@ -7,7 +7,7 @@ from pathlib import Path
 from gemuco.dataset import Dataset
 from gemuco.errors import SchemaError
 from gemuco.learning.draft import key_of
-from gemuco.writing import writing
+from gemuco.writing import replace, writing
 
 MARK = "begun"
 """A running training has a file of this name beside its drafts."""
@@ -26,8 +26,7 @@ def marked(drafts: Path, key: str) -> Iterator[bool]:
     mark = drafts / MARK
     was_interrupted = mark.exists() and mark.read_text() == key
     with writing("The training", mark):
-        drafts.mkdir(parents=True, exist_ok=True)
-        mark.write_text(key)
+        replace(mark, key.encode())
     try:
         yield was_interrupted
     except SchemaError:

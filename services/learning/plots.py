@@ -15,6 +15,7 @@ from matplotlib.axes import Axes
 from gemuco.learning.history import History
 from gemuco.structure.determination import Structure
 from gemuco.structure.result import with_unit
+from gemuco.writing import replacing
 
 DPI = 110
 GOOD, POOR, BAD = "tab:green", "tab:orange", "0.6"
@@ -28,8 +29,8 @@ def picture(path: Path, title: str = "", rows: int = 1, columns: int = 1, **opti
         if title:
             figure.suptitle(title)
         yield list(grid.flat)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=DPI)
+        with replacing(path) as file:
+            figure.savefig(file, dpi=DPI, format="png")
     finally:
         plt.close(figure)
 

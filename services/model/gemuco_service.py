@@ -15,7 +15,7 @@ from gemuco.schema import BodySchema
 from gemuco.search.descent import NewtonConfig
 from hal.clock import SystemClock
 from hal.config import RobotConfig
-from services.command.intake import Intake
+from services.command.intake import NEWS_FOR, Intake
 from services.command.permission import Permission
 from services.model.acquaintance import Acquaintance
 from services.model.anomaly_loop import VERDICT_RATE, AnomalyWatch
@@ -187,6 +187,8 @@ class GemucoService:
             text = f"Estimating {', '.join(missing)}: not measured at the moment.{self._blind()}"
         elif failing:
             text = failing[0]
+        else:
+            text = next(filter(None, (reader.disorder(NEWS_FOR) for reader in self._readers())), "")
         return Status(
             stamp_ns=time.time_ns(),
             service="model",
@@ -203,6 +205,7 @@ class GemucoService:
                 "scheduling": {loop.name: loop.scheduling for loop in self.loops},
                 "core": "any" if self._core.core is None else self._core.core,
                 "rejected": self._targets.counters["malformed"] + sum(reader.rejected for reader in self._readers()),
+                "disordered": self._disordered(),
                 "signals": self.estimation.counts(),
                 "anomaly": self.anomaly.summary(),
                 "failing": failing,
@@ -268,6 +271,11 @@ class GemucoService:
             ),
             "",
         )  # fmt: skip
+
+    def _disordered(self) -> dict[str, int]:
+        """Return the numbers of messages that came `repeated` or `late`, and were not used."""
+        orders = [reader.order.counters for reader in self._readers()]
+        return {name: sum(counters[name] for counters in orders) for name in ("repeated", "late")}
 
     def _readers(self) -> list[Reader[Any]]:
         readers: list[Reader[Any] | None] = [self._samples, self._seen, self._applied]

@@ -1,6 +1,7 @@
 """The body schema in use: four loops read it at any time, and one replaces it."""
 
 import threading
+from collections.abc import Iterable
 from pathlib import Path
 
 from gemuco.checkpoint import load
@@ -9,6 +10,7 @@ from gemuco.schema import BodySchema
 from gemuco.signals import Layout, Signal
 from hal.config import RobotConfig
 from services.model.model_config import model_config
+from services.wire.signature import verifier_of
 
 
 def layout_of(robot: RobotConfig) -> Layout:
@@ -17,15 +19,21 @@ def layout_of(robot: RobotConfig) -> Layout:
     return Layout(tuple(Signal(name, signal.size, signal.unit, signal.elements) for name, signal in signals))
 
 
-def load_model(robot: RobotConfig, folder: Path) -> BodySchema:
+def load_model(robot: RobotConfig, folder: Path, connect: Iterable[str] = ()) -> BodySchema:
     """Load the trained schema of a robot.
+
+    Args:
+        robot: The robot file.
+        folder: Folder of the model.
+        connect: Endpoints and role files. With a role file the model must be signed by its authority.
 
     Raises:
         CheckpointError: It is missing or damaged, or it is of another body than the robot file describes.
+        NotSigned: It is not signed by the authority of the role file.
     """
     if not folder.exists():
         raise CheckpointError(f"There is no model in '{folder}'. Make one with `gemuco collect` and `gemuco train`.")
-    schema = load(folder)
+    schema = load(folder, verifier_of(connect, folder))
     if set(schema.layout.signals) != set(layout_of(robot).signals):
         theirs, ours = ", ".join(schema.layout.names), ", ".join(layout_of(robot).names)
         raise CheckpointError(

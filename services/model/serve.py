@@ -31,12 +31,14 @@ def serve(robot: RobotConfig, folder: Path, connect: Iterable[str] = (), stop: t
 
     Raises:
         CheckpointError: The folder holds no model, or a model of another body.
+        NotSigned: The model is not signed by the authority of the role file.
         AlreadyRunning: The robot already has a model service.
     """
     prepare_process()
-    schema = load_model(robot, folder)
+    items = tuple(connect)
+    schema = load_model(robot, folder, items)
     make_ready()
-    with until_stopped(stop) as stopped, Service(robot.robot, "model", connect) as service:
+    with until_stopped(stop) as stopped, Service(robot.robot, "model", items) as service:
         model = GemucoService(robot, schema, service)
         ModelVerbs(model).serve(service)
         model.run(stopped)

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from typing import Any, Protocol, Self
 
 from services.health import heartbeat_path, judge, pid_space, started, this_boot
+from services.runtime import open_file
 
 log = logging.getLogger(__name__)
 
@@ -102,7 +103,8 @@ class Heartbeat:
         """Replace the whole file at once, so that a reader never sees half of it."""
         try:
             part = self._path.with_suffix(f".{os.getpid()}.part")
-            part.write_text(text)
+            with open(part, "w", opener=open_file) as file:
+                file.write(text)
             part.replace(self._path)
             self._failed = False
         except OSError as error:

@@ -5,12 +5,12 @@ import fcntl
 import logging
 import os
 from collections.abc import Iterable, Iterator
-from typing import TextIO
+from typing import IO
 
 import zenoh
 
 from services.errors import AlreadyRunning, NoAnswer, ServiceError
-from services.runtime import runtime_folder
+from services.runtime import open_file, runtime_folder
 from services.wire import keys, query
 from services.wire.session import address, close_session, open_with, settings
 
@@ -30,16 +30,20 @@ class ServiceLock:
 
     def __init__(self, robot: str, service: str) -> None:
         self.robot, self.service = robot, service
-        self._file: TextIO | None = None
+        self._file: IO[str] | None = None
 
     def acquire(self) -> None:
         """Take the lock.
 
         Raises:
             AlreadyRunning: Another process of this machine holds it; the message names its pid.
+            ServiceError: It is a link, or other users could exchange it.
         """
         path = runtime_folder() / f"{self.robot}.{self.service}.lock"
-        file = path.open("a+")
+        try:
+            file = open(path, "a+", opener=open_file)  # noqa: SIM115
+        except OSError as error:
+            raise ServiceError(f"The lock '{path}' cannot be opened: {error.strerror}. Remove it.") from None
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:

@@ -6,10 +6,12 @@ through it, so a robot works without it.
 
 import logging
 import threading
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from services.health import ROUTER
+from services.process.doors import door_settings
 from services.process.heartbeat import Heartbeat
 from services.process.loop import Loop
 from services.process.service import until_stopped
@@ -65,15 +67,32 @@ def run_router(listen: Iterable[str] = (), connect: Iterable[str] = (), stop: th
     Raises:
         ServiceError: A port is taken, an endpoint is malformed, or a role file cannot be read.
     """
-    configuration = router_settings(listen, connect)
-    with until_stopped(stop) as stopped:
-        session = open_with(configuration, WHO)
-        print(f"Router listens on {', '.join(configuration['listen']['endpoints'])}.", flush=True)
-        probe = Loop("probe", PROBE_RATE, lambda: check_answers(configuration["listen"]["endpoints"]))
+    with until_stopped(stop) as stopped, routing(listen, connect) as endpoints:
+        print(f"Router listens on {', '.join(endpoints)}.", flush=True)
+        probe = Loop("probe", PROBE_RATE, lambda: check_answers(endpoints))
         probe.start()
         try:
             with Heartbeat(ROUTER, "", [probe]):
                 stopped.wait()
         finally:
             probe.stop(0.0)
+
+
+@contextmanager
+def routing(listen: Iterable[str] = (), connect: Iterable[str] = ()) -> Iterator[list[str]]:
+    """Open the router and its doors for the time of the context, and yield their endpoints.
+
+    Raises:
+        ServiceError: As `run_router`.
+    """
+    configuration = router_settings(listen, connect)
+    sessions = []
+    endpoints: list[str] = []
+    try:
+        for name, door in {"": configuration, **door_settings(configuration)}.items():
+            sessions.append(open_with(door, f"the router's door for {name}" if name else WHO))
+            endpoints += door["listen"]["endpoints"]
+        yield endpoints
+    finally:
+        for session in reversed(sessions):
             close_session(session)

@@ -6,6 +6,7 @@ Messages are written while they are read, so a recording may be larger than the 
 import csv
 import json
 import math
+import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
@@ -14,6 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 from typing_extensions import override
 
+from gemuco.writing import PART
 from services.errors import RecordingError
 from services.recording.reading import Paths, Recorded, facts_of, one_robot, read
 from services.recording.schema import UNITS, Form
@@ -32,6 +34,8 @@ class Table(Protocol):
     """File that takes rows of the same columns."""
 
     path: Path
+    part: Path
+    """The file while it is being written; only a whole table gets the name `path`."""
 
     def write(self, rows: list[list[Any]]) -> None:
         """Add rows."""
@@ -44,8 +48,8 @@ class CsvTable(Table):
     """Comma-separated text with the names of the columns in the first line; unmeasured values are empty."""
 
     def __init__(self, path: Path, columns: list[str], first: list[Any]) -> None:
-        self.path = path.with_name(path.name + ".csv")
-        self._file = self.path.open("x", newline="", encoding="utf-8")
+        self.path, self.part = _new(path.with_name(path.name + ".csv"))
+        self._file = self.part.open("w", newline="", encoding="utf-8")
         self._writer = csv.writer(self._file)
         self._writer.writerow(columns)
 
@@ -65,13 +69,11 @@ class ParquetTable(Table):
         import pyarrow.parquet
 
         self._arrow = arrow
-        self.path = path.with_name(path.name + ".parquet")
-        if self.path.exists():
-            raise FileExistsError
+        self.path, self.part = _new(path.with_name(path.name + ".parquet"))
         kinds = {bool: arrow.bool_(), int: arrow.int64(), float: arrow.float64(), str: arrow.string()}
         pairs = zip(columns, first, strict=True)
         self._schema = arrow.schema([(name, kinds[float if value is None else type(value)]) for name, value in pairs])
-        self._writer = pyarrow.parquet.ParquetWriter(self.path, self._schema, compression="zstd")
+        self._writer = pyarrow.parquet.ParquetWriter(self.part, self._schema, compression="zstd")
 
     @override
     def write(self, rows: list[list[Any]]) -> None:
@@ -84,6 +86,13 @@ class ParquetTable(Table):
     @override
     def close(self) -> None:
         self._writer.close()
+
+
+def _new(path: Path) -> tuple[Path, Path]:
+    """Return the path of a new table, and its path while it is being written."""
+    if path.exists():
+        raise FileExistsError
+    return path, path.with_name(path.name + PART)
 
 
 def run_export(paths: Paths, out: Path, form: str) -> None:
@@ -128,6 +137,9 @@ def export(paths: Paths, out: Path, form: str) -> dict[Path, int]:
         ) from None
     except OSError as error:
         raise RecordingError(f"The tables in '{out}' cannot be written: {error.strerror or error}.") from None
+    finally:
+        for table in tables.values():
+            table.part.unlink(missing_ok=True)
     if not tables:
         raise RecordingError("There are no messages in these recordings.")
     return {table.path: table.rows for table in tables.values()}
@@ -161,7 +173,7 @@ class _OpenTable:
         self._columns = [name for name, _ in _cells(first)]
         self._waiting: list[list[Any]] = []
         self._table = make(path, self._columns, [value for _, value in _cells(first, typed=True)])
-        self.path = self._table.path
+        self.path, self.part = self._table.path, self._table.part
 
     def add(self, recorded: Recorded) -> None:
         self._waiting.append([value for _, value in _cells(recorded)])
@@ -172,6 +184,9 @@ class _OpenTable:
         if self._waiting:
             self._write()
         self._table.close()
+        with self.part.open("rb") as file:
+            os.fsync(file.fileno())
+        self.part.rename(self.path)
 
     def _write(self) -> None:
         self._table.write(self._waiting)

@@ -3,6 +3,7 @@
 import heapq
 import json
 import logging
+import struct
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from operator import itemgetter
@@ -161,9 +162,33 @@ def _messages(path: Path, only: frozenset[str]) -> Iterator[Recorded]:
             except MessageError as error:
                 raise RecordingError(f"'{path}' is damaged: {error}") from None
         elif isinstance(record, Schema) and record.name in _BY_TITLE:
-            forms[record.id] = Form(_BY_TITLE[record.name], Catalogue.of_schema(json.loads(record.data)))
+            forms[record.id] = _form(path, record)
         elif isinstance(record, Channel) and record.schema_id in forms:
             channels[record.id] = (record.topic, forms[record.schema_id])
+
+
+def _form(path: Path, schema: Schema) -> Form:
+    try:
+        return Form(_BY_TITLE[schema.name], Catalogue.of_schema(_object(schema.data)))
+    except (ValueError, TypeError, struct.error, MemoryError) as error:
+        raise RecordingError(
+            f"'{path}' is damaged: its schema of {schema.name} cannot be read ({str(error).rstrip('.')})."
+        ) from None
+
+
+def _object(text: str | bytes) -> dict[str, Any]:
+    """Return a JSON object.
+
+    Raises:
+        ValueError: The text is not JSON, or another value.
+    """
+    try:
+        value = json.loads(text)
+    except RecursionError:
+        raise ValueError("its parts are nested too deeply") from None
+    if not isinstance(value, dict):
+        raise ValueError(f"it is a {type(value).__name__} and not an object")
+    return value
 
 
 def _facts_of(path: Path) -> FileFacts:
@@ -192,7 +217,7 @@ def _facts_of(path: Path) -> FileFacts:
             recording=own["recording"],
             part=int(own["part"]),
             condition=own["condition"],
-            described=json.loads(facts[ROBOT]["describe"]),
+            described=_object(facts[ROBOT]["describe"]),
             losses={kind: int(lost.get(kind, 0)) for kind in KINDS},
             keys=_keys(listed if is_whole else _records(path)),
             begin_ns=begin_ns,

@@ -81,11 +81,12 @@ class Catalogue:
 
     @classmethod
     def of_schema(cls, schema: Mapping[str, Any]) -> Self:
-        """Make the catalogue of a schema that `Form` made."""
-        listed = schema.get("x-signals", {})
-        return cls(
-            {name: CatalogueSignal(signal["unit"], tuple(signal["elements"])) for name, signal in listed.items()}
-        )
+        """Make the catalogue of a schema that `Form` made.
+
+        Raises:
+            MessageError: `Form` did not make it.
+        """
+        return cls.of_description({"signals": schema.get("x-signals", {})})
 
     def plain(self) -> dict[str, Any]:
         """Return the catalogue as plain data for JSON."""
@@ -161,7 +162,7 @@ class Form:
             body = _decoder.decode(data)
             present = (item.name for item in self._fields if self._is_present(item.name, body))
             return self.record(**{name: self._read(name, body) for name in present})
-        except (ValueError, TypeError, LookupError, AttributeError) as error:
+        except (ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
             raise MessageError(f"It is not a recorded {self.record.TYPE} message: {error}.") from None
 
     def _is_present(self, name: str, body: dict[str, Any]) -> bool:

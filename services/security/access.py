@@ -12,6 +12,8 @@ from services.wire.roles import ASKED, COMPUTING, RATES, ROLES, SIZES, Role
 
 Rule = tuple[str, tuple[str, ...], tuple[str, ...]]
 """A rule is a flow, the allowed messages in this flow, and the allowed keys."""
+Subject = tuple[Mapping[str, Sequence[str]], Iterable[Rule]]
+"""A subject is a certificate and a user that identify it, and its rules."""
 _OPPOSITE = {"ingress": "egress", "egress": "ingress"}
 _ALL = (f"{keys.ROOT}/**",)
 _EVERY_MESSAGE = (
@@ -51,7 +53,7 @@ def mirrored(rules: Iterable[Rule]) -> list[Rule]:
     return [(_OPPOSITE[flow], messages, names) for flow, messages, names in rules]
 
 
-def access_control(subjects: Mapping[str, tuple[Mapping[str, Sequence[str]], Iterable[Rule]]]) -> dict[str, Any]:
+def access_control(subjects: Mapping[str, Subject]) -> dict[str, Any]:
     """Return zenoh's section `access_control`.
 
     Args:

@@ -171,7 +171,7 @@ class Inside:
     def foreign_password(self) -> Iterator[Attempt]:
         """Connect with a certificate and a password of two members, which must give no rights."""
         operator, viewer = self.names
-        configured = self.sessions.outside(viewer)
+        configured = self.sessions.outside(viewer, self.sessions.door_of(operator))
         configured["transport"]["auth"] = self.sessions.outside(operator)["transport"]["auth"]
         what = "viewer's certificate with the operator's password"
         try:

@@ -19,6 +19,7 @@ AUTHORITY_DAYS = 3650
 BACKDATED = timedelta(days=1)
 """Certificates are valid from this long before now, because the clock of a robot that just started may be late."""
 _BOTH = x509.ExtendedKeyUsage([ExtendedKeyUsageOID.CLIENT_AUTH, ExtendedKeyUsageOID.SERVER_AUTH])
+_CLIENT = x509.ExtendedKeyUsage([ExtendedKeyUsageOID.CLIENT_AUTH])
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,21 +37,21 @@ class Authority:
     identity: Identity
 
     @classmethod
-    def new(cls, days: int = AUTHORITY_DAYS) -> Self:
-        """Make a new authority with a key of its own."""
-        key = ec.generate_private_key(ec.SECP256R1())
+    def new(cls, days: int = AUTHORITY_DAYS, key: bytes | None = None) -> Self:
+        """Make a new authority, with a key of its own if none is given as PEM."""
+        signer = ec.generate_private_key(ec.SECP256R1()) if key is None else _private(key)
         name = _name(AUTHORITY)
         usage = x509.KeyUsage(
             digital_signature=True, key_cert_sign=True, crl_sign=True, content_commitment=False, key_encipherment=False,
             data_encipherment=False, key_agreement=False, encipher_only=False, decipher_only=False,
         )  # fmt: skip
         certificate = (
-            _builder(name, name, key.public_key(), datetime.now(UTC) + timedelta(days=days))
+            _builder(name, name, signer.public_key(), datetime.now(UTC) + timedelta(days=days))
             .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
             .add_extension(usage, critical=True)
-            .sign(key, hashes.SHA256())
+            .sign(signer, hashes.SHA256())
         )
-        return cls(Identity(_pem(certificate), _key_pem(key)))
+        return cls(Identity(_pem(certificate), _key_pem(signer)))
 
     def sign(self, name: str, hosts: Iterable[str], until: datetime) -> Identity:
         """Sign a certificate for a member.
@@ -60,17 +61,20 @@ class Authority:
             hosts: Names and addresses under which others reach the member; empty if it never listens.
             until: End of its validity.
         """
-        signer = serialization.load_pem_private_key(self.identity.key, None)
+        signer = _private(self.identity.key)
         issuer = x509.load_pem_x509_certificate(self.identity.certificate).subject
-        if not isinstance(signer, ec.EllipticCurvePrivateKey):
-            raise ServiceError("The authority's key was not made by `gemuco security init`.")
         key = ec.generate_private_key(ec.SECP256R1())
         builder = _builder(_name(name), issuer, key.public_key(), until)
         builder = builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
-        builder = builder.add_extension(_BOTH, critical=False)
-        if names := [_general_name(host) for host in hosts]:
+        names = [_general_name(host) for host in hosts]
+        builder = builder.add_extension(_BOTH if names else _CLIENT, critical=False)
+        if names:
             builder = builder.add_extension(x509.SubjectAlternativeName(names), critical=False)
         return Identity(_pem(builder.sign(signer, hashes.SHA256())), _key_pem(key))
+
+    def signature(self, data: bytes) -> str:
+        """Return a signature of data, which `services.wire.signature` checks with the certificate."""
+        return base64.b64encode(_private(self.identity.key).sign(data, ec.ECDSA(hashes.SHA256()))).decode()
 
 
 def encoded(pem: bytes) -> str:
@@ -81,6 +85,13 @@ def encoded(pem: bytes) -> str:
 def decoded(text: str) -> bytes:
     """Return the PEM of an inline text; inverse of `encoded`."""
     return base64.b64decode(text)
+
+
+def _private(key: bytes) -> ec.EllipticCurvePrivateKey:
+    loaded = serialization.load_pem_private_key(key, None)
+    if not isinstance(loaded, ec.EllipticCurvePrivateKey):
+        raise ServiceError("The authority's key was not made by `gemuco security init`.")
+    return loaded
 
 
 def _builder(

@@ -8,6 +8,8 @@ import typer
 from services.errors import ServiceError
 from services.security.attacks import Attempt, Inside, at_the_hal, entering, impostor, people
 from services.security.check_sessions import CheckSessions, Weaken
+from services.security.door_attacks import at_the_doors, in_the_routers_place
+from services.security.model_attacks import with_models
 from services.wire.connect import checked_endpoint
 
 _BAD = ("NOT REFUSED", "DOES NOT WORK")
@@ -55,3 +57,6 @@ def attempts(folder: Path, running: str | None = None, weaken: Weaken | None = N
         if sessions.hal:
             yield from at_the_hal(sessions, operator, viewer)
         yield from Inside(sessions, operator, viewer).run()
+        yield from with_models(sessions)
+        yield from in_the_routers_place(sessions, operator)
+        yield from at_the_doors(sessions, operator, viewer)

@@ -13,9 +13,13 @@ from typing import Any, Self
 import zenoh
 
 from services.errors import ServiceError
+from services.process.doors import door_settings
+from services.process.router import router_settings
 from services.security.plan import InstallationPlan
+from services.security.role_files import EMERGENCY_PORT, person_ports
 from services.wire import keys
-from services.wire.connect import merge, role_file, with_password_file
+from services.wire.connect import host_and_port, merge, role_file, with_password_file
+from services.wire.member import DOORS, EMERGENCY, doors_in
 from services.wire.roles import ROUTER
 
 Weaken = Callable[[str, dict[str, Any]], None]
@@ -65,7 +69,8 @@ class CheckSessions:
 
     Attributes:
         robot: Name of the attacked robot.
-        router: Endpoint of the router.
+        router: Endpoint of the router, for services.
+        doors: Endpoints of the router for each person and for emergency stops, by name.
         hal: Endpoint of the HAL; empty if the check starts no HAL.
     """
 
@@ -79,6 +84,10 @@ class CheckSessions:
         self._entities: list[Any] = []
         self.is_running = running is not None
         self.router = running or self.another_endpoint()
+        self.doors = {
+            name: self._running_door(offset) if running else self.another_endpoint()
+            for name, offset in {EMERGENCY: EMERGENCY_PORT, **person_ports(plan)}.items()
+        }
         self.hal = "" if running else self.another_endpoint()
 
     def __enter__(self) -> Self:
@@ -102,8 +111,12 @@ class CheckSessions:
     def _start(self) -> None:
         router = self.of(ROUTER)
         router["listen"]["endpoints"] = [self.router]
-        self._weaken(ROUTER, router)
-        self.open(router)
+        for name, door in doors_in(router).items():
+            door["listen"] = self.doors[name]
+        router = merge(router_settings(), router)
+        for name, configured in {ROUTER: router, **door_settings(router)}.items():
+            self._weaken(ROUTER if name == ROUTER else DOORS, configured)
+            self.open(configured)
         hal, model = (self.of(f"{service}.{self.robot}") for service in ("hal", "model"))
         hal["listen"]["endpoints"], model["listen"]["endpoints"] = [self.hal], []
         hal["connect"]["endpoints"], model["connect"]["endpoints"] = [self.router], [self.hal, self.router]
@@ -115,6 +128,14 @@ class CheckSessions:
                 session.liveliness().declare_token(self.key(service, "alive")),
             ]
 
+    def _running_door(self, offset: int) -> str:
+        host, port = host_and_port(self.router.partition("/")[2])
+        return f"{self.plan.protocol}/{host}:{int(port) + offset}"
+
+    def door_of(self, name: str) -> str:
+        """Return the endpoint of the router for a member."""
+        return self.doors.get(name, self.router)
+
     def another_endpoint(self) -> str:
         """Return a free endpoint of this machine."""
         return f"{self.plan.protocol}/127.0.0.1:{_free_port(self.plan.protocol)}"
@@ -124,13 +145,19 @@ class CheckSessions:
         path = self.folder / f"{name}.json"
         return copy.deepcopy(role_file(path))
 
+    def weakened(self, name: str, called: str) -> dict[str, Any]:
+        """Return a fresh copy of a member's role file; a test of the check may have weakened it."""
+        configured = self.of(name)
+        self._weaken(called, configured)
+        return configured
+
     def outside(self, name: str, where: str = "") -> dict[str, Any]:
         """Return a member's role file as an attacker uses it: for a client of the router or `where`, without rules."""
         copied = self.of(name)
         for part in ("access_control", "downsampling", "low_pass_filter", "listen"):
             copied.pop(part, None)
         copied["transport"]["auth"]["usrpwd"].pop("dictionary", None)
-        copied |= {"mode": "client", "connect": ONCE | {"endpoints": [where or self.router]}}
+        copied |= {"mode": "client", "connect": ONCE | {"endpoints": [where or self.door_of(name)]}}
         return copied
 
     def open(self, configuration: dict[str, Any]) -> zenoh.Session:
@@ -143,6 +170,11 @@ class CheckSessions:
             session = zenoh.open(zenoh.Config.from_json5(json.dumps(taken)))
         self._sessions.append(session)
         return session
+
+    @property
+    def last(self) -> zenoh.Session:
+        """The session that was opened last."""
+        return self._sessions[-1]
 
     def enters(self, configuration: dict[str, Any]) -> bool:
         """Whether a session opens."""
@@ -164,7 +196,8 @@ class CheckSessions:
             return self.open(configured)
         except zenoh.ZError:
             raise ServiceError(
-                f"'{name}' is refused at {where or self.router} with its own role file, so the check is impossible."
+                f"'{name}' is refused at {where or self.door_of(name)} with its own role file, so the check is "
+                "impossible."
             ) from None
 
     def key(self, *parts: str) -> str:

@@ -120,8 +120,9 @@ class _FolderAuthority:
 
 def _authority(folder: Path, changes: Changes) -> _FolderAuthority:
     certificate, key = folder / CA, folder / CA_KEY
-    if not certificate.exists() and not key.exists():
-        identity = Authority.new().identity
+    is_begun = key.exists() and not any(folder.glob("*.json"))  # a killed `init` left it
+    if not certificate.exists() and (is_begun or not key.exists()):
+        identity = Authority.new(key=key.read_bytes() if is_begun else None).identity
         write(key, identity.key.decode())
         write(certificate, identity.certificate.decode(), 0o644)
         changes.made += [CA, CA_KEY]

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 
 from services.errors import ServiceError
 from services.wire.connect import host_and_port
-from services.wire.member import ALL, Member
+from services.wire.member import ALL, EMERGENCY, Member
 from services.wire.roles import PEOPLE, ROLES, ROUTER
 from services.wire.session import ROUTER_PORT, is_loopback
 
@@ -54,7 +54,7 @@ class InstallationPlan(BaseModel):
     @classmethod
     def _check_names(cls, entries: dict[str, object]) -> dict[str, object]:
         for name in entries:
-            if not _NAME.fullmatch(name) or name in ROLES.keys() - set(PEOPLE) or name == ROUTER:
+            if not _NAME.fullmatch(name) or name in ROLES.keys() - set(PEOPLE) or name in (ROUTER, EMERGENCY):
                 raise ValueError(f"'{name}' cannot be a name here: use letters, digits, _ and -, but no service's name")
         return entries
 

@@ -9,6 +9,7 @@ import typer
 from services.security.init import CA_KEY, Changes
 from services.security.plan import FILE, InstallationPlan
 from services.wire.connect import WARN_BEFORE, certificate_end, role_file
+from services.wire.member import doors_in
 from services.wire.roles import PEOPLE, ROUTER
 
 VERBS = {"simulator": "simulate", "hal": "hal", "vision": "vision", "model": "serve", "recorder": "record"}
@@ -47,7 +48,11 @@ def _destinations(folder: Path, plan: InstallationPlan) -> Iterable[str]:
     """Yield for each file its command, its host, and the port that must be open there."""
     for name, member in plan.members().items():
         path = folder / f"{name}.json"
-        listens = role_file(path).get("listen", {}).get("endpoints", [])
+        configured = role_file(path)
+        listens = [
+            *configured.get("listen", {}).get("endpoints", []),
+            *(d["listen"] for d in doors_in(configured).values()),
+        ]
         place = f"   [{plan.hosts(name)[0]}, listens on {', '.join(listens)}]" if listens else ""
         if name == ROUTER:
             yield f"  gemuco router --connect {path}{place}"

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import typer
 
-from services.client import SLOW_TIMEOUT, Client
+from services.client import SLOW_TIMEOUT, Client, emergency_stop
 from services.errors import BadArguments, NoAnswer, RemoteError
 from services.verbs.answers import sentence
 from services.verbs.move import move
@@ -191,8 +191,7 @@ def _one(verb: str, words: Sequence[str], what: str) -> str:
 def estop_robot(robot: str, reason: str, connect: Iterable[str]) -> int:
     """Request the emergency stop and print one line per drive; return 0 only if every drive stopped."""
     try:
-        with Client(robot, connect) as client:
-            reply = client.estop(reason)
+        reply = emergency_stop(robot, reason, connect)
     except Exception as error:  # any failure must be loud
         typer.echo(f"gemuco: {error}", err=True)
         return _alarm(f"NO ANSWER of '{robot}': drives may still move. CUT THE POWER.")

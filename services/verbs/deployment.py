@@ -16,6 +16,7 @@ def register(app: typer.Typer) -> None:
     security = typer.Typer(no_args_is_help=True, help="Make and test certificates, passwords and access control.")
     security.command("init")(security_init)
     security.command("check")(security_check)
+    security.command("sign")(security_sign)
     app.add_typer(security, name="security")
     app.command()(health)
 
@@ -105,6 +106,17 @@ def security_check(
     from services.security.check import run_check
 
     return run_check(folder, connect)
+
+
+@report_errors
+def security_sign(
+    folder: Folder, model: Annotated[Path, typer.Argument(metavar="MODEL", help="Folder of a trained model.")]
+) -> None:
+    """Sign a model with the authority's key; a model service with a role file refuses other models."""
+    from services.security.signing import sign_model
+
+    sign_model(folder, model)
+    typer.echo(f"{model} is signed by the authority of {folder}.")
 
 
 @report_errors

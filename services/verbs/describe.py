@@ -9,7 +9,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from gemuco.writing import writing
+from gemuco.writing import replace, writing
 from services import show
 from services.errors import ServiceError
 from services.measured.draft import Draft, draft
@@ -43,8 +43,7 @@ def describe(
     here, folder = path.resolve().parent, result.recording.folder
     is_below = folder.is_relative_to(here)
     with writing("The description", path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(result.text(here if is_below else None), encoding="utf-8")
+        replace(path, result.text(here if is_below else None).encode())
     _show(result, show.console())
     typer.echo(f"Written to {path}.")
     if result.unknown:

@@ -23,6 +23,10 @@ OURS = ("gemuco", "hal", "services", "simulators")
 """These packages are always installed; others may be missing, as in the small image."""
 
 
+NO_MEMORY = ("failed to map segment", "Cannot allocate memory", "std::bad_alloc", "can't start new thread")
+"""Errors of the loader, the kernel, C++ and Python contain these texts if memory is short."""
+
+
 def report_errors(verb: Callable[..., Any]) -> Callable[..., Any]:
     """Print an expected error as one sentence on stderr; exit with 2 for a wrong robot file, with 1 otherwise."""
 
@@ -49,9 +53,26 @@ def report_errors(verb: Callable[..., Any]) -> Callable[..., Any]:
             raise typer.Exit(1) from None
         except KeyboardInterrupt:
             raise typer.Exit(130) from None
+        except (MemoryError, OSError, ImportError, RuntimeError) as error:
+            if not _lacks_memory(error):
+                raise
+            typer.echo(
+                "gemuco: there is not enough memory. Is it limited (`ulimit -v`, a container), or do others use it?",
+                err=True,
+            )
+            raise typer.Exit(1) from None
         raise typer.Exit(code or 0)
 
     return reporting
+
+
+def _lacks_memory(error: BaseException | None) -> bool:
+    """Whether an error, or one that it replaced, is a want of memory; libraries give it several names."""
+    while error is not None:
+        if isinstance(error, MemoryError) or any(text in str(error) for text in NO_MEMORY):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
 
 
 def robot_path(text: str) -> Path:

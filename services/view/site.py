@@ -1,31 +1,27 @@
-"""Web server of the page: viser on loopback, closed to pages of another origin and to publishing."""
+"""Web server of the page: viser behind a `Door`, closed to publishing."""
 
-import functools
 import logging
-import re
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from services.errors import ServiceError
 from services.extras import require
-from services.wire.session import is_loopback
+from services.view.door import Door
 
 if TYPE_CHECKING:
     import viser
 
-LOOPBACK_PAGES = re.compile(r"http://(127\.\d+\.\d+\.\d+|localhost|\[::1\])(:\d+)?")
-"""Only pages of these origins may connect to a server on loopback; other pages in the same browser may not."""
 
-
-def open_site(host: str, port: int, title: str) -> "viser.ViserServer":
+def open_site(host: str, port: int, title: str, door: Door) -> "viser.ViserServer":
     """Serve an empty page.
 
     Args:
         host: Address to bind.
         port: Port to bind; 0 for any.
         title: Title of the page.
+        door: Decision on every request.
 
     Raises:
         ServiceError: The packages are not installed, the port is taken, or this machine does not have the address.
@@ -39,7 +35,7 @@ def open_site(host: str, port: int, title: str) -> "viser.ViserServer":
     rich.get_console().quiet = True  # viser prints a table to stdout
     for name in ("websockets", "websockets.server"):  # else one traceback per browser that disconnects
         logging.getLogger(name).setLevel(logging.CRITICAL)
-    with _only_pages(LOOPBACK_PAGES if is_loopback(host) else None):
+    with _behind(door):
         site = viser.ViserServer(host=host, port=port, label=title, verbose=False)
     if port and site.get_port() != port:  # viser takes the next free one
         site.stop()
@@ -50,13 +46,16 @@ def open_site(host: str, port: int, title: str) -> "viser.ViserServer":
 
 
 @contextmanager
-def _only_pages(allowed: "re.Pattern[str] | None") -> Iterator[None]:
-    """Let viser's server refuse connections of other pages; viser has no option for it."""
+def _behind(door: Door) -> Iterator[None]:
+    """Let viser's server ask the door first; viser has no option for it."""
     from websockets.asyncio import server
 
     whole = server.serve
-    origins = None if allowed is None else [None, allowed]
-    server.serve = functools.partial(whole, origins=origins)  # type: ignore[misc, assignment]
+
+    def serve(*arguments: Any, process_request: Any = None, **options: Any) -> Any:
+        return whole(*arguments, process_request=door.guard(process_request), **options)
+
+    server.serve = serve  # type: ignore[misc, assignment]
     try:
         yield
     finally:

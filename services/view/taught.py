@@ -141,7 +141,7 @@ class TaughtFile:
     def _locked(self) -> Iterator[None]:
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            lock = self.path.with_name(self.path.name + ".lock").open("w")
+            lock = self.path.with_name(self.path.name + ".lock").open("a")
         except OSError as error:
             raise NotRecorded(f"'{self.path}' cannot be written: {error.strerror}.") from None
         with lock:

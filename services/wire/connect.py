@@ -142,6 +142,12 @@ def certificate_end(configuration: Mapping[str, Any]) -> datetime | None:
         raise ServiceError(f"The certificate of the role file cannot be read: {error}.") from None
 
 
+def authority_certificate(configuration: Mapping[str, Any]) -> bytes:
+    """Return the certificate of the authority in a configuration, PEM; empty without one."""
+    tls = ((configuration.get("transport") or {}).get("link") or {}).get("tls") or {}
+    return base64.b64decode(tls.get("root_ca_certificate_base64") or "")
+
+
 def expiry_warning(configuration: Mapping[str, Any]) -> str:
     """Return a warning if the certificate has ended or ends within `WARN_BEFORE`, else an empty text."""
     until = certificate_end(configuration)

@@ -8,6 +8,10 @@ from services.errors import ServiceError
 from services.wire.connect import role_file, split_connect
 from services.wire.roles import ROLES
 
+DOORS = "doors"
+"""Entry of the router's role file: further sessions with limits of their own."""
+EMERGENCY = "emergency"
+"""Entry of an operator's role file: endpoints at which only emergency stops are accepted."""
 ALL = "*"
 """In place of a robot's name this means every robot, future ones included."""
 
@@ -51,6 +55,16 @@ def member_of(connect: Iterable[str]) -> Member:
         if (member := member_in(role_file(file))).role:
             return member
     return Member()
+
+
+def doors_in(configuration: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return the doors of a router's role file by name; empty for other files."""
+    return dict(((configuration.get("metadata") or {}).get("gemuco") or {}).get(DOORS) or {})
+
+
+def emergency_endpoints(configuration: Mapping[str, Any]) -> list[str]:
+    """Return the endpoints for emergency stops in a configuration; empty without any."""
+    return list(((configuration.get("metadata") or {}).get("gemuco") or {}).get(EMERGENCY) or ())
 
 
 def member_in(configuration: Mapping[str, Any]) -> Member:

@@ -103,6 +103,12 @@ ROLES = {
 }
 """These are all roles but the router, which forwards the others' messages and publishes nothing itself."""
 
+STOPPING = Role(
+    "emergency", "stops a robot and does nothing else", asks=("hal/do/estop", "hal/do/stop"), is_service=False
+)
+"""Rights of an operator at the router's port for emergency stops."""
+ESTOP = ("hal", "estop")
+"""Service and verb of the emergency stop."""
 RATES = {"hal/command": 1000.0, "model/target": 100.0}
 """The router passes this many messages per second by key, and drops the rest."""
 ASKED = 50.0

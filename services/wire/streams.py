@@ -10,6 +10,7 @@ import zenoh
 from hal.clock import Clock, SystemClock
 from services.wire import messages
 from services.wire.messages import Message, MessageError, OtherVersion
+from services.wire.order import StreamOrder
 from services.wire.plain_text import plain
 
 M = TypeVar("M", bound=Message)
@@ -60,7 +61,8 @@ class Transit:
     arrival. The offset between the sender's wall clock and our monotonic clock is unknown, but the least difference
     belongs to the shortest delay, and any excess over it is delay. If a link becomes slower permanently, all messages
     count as late for a long time, because they look like old messages. A sender's clock that is seen to go back
-    restarts the estimate; a clock set back during a silence looks like a slower link.
+    restarts the estimate; a clock set back during a silence looks like a slower link. A message that is older than one
+    before must not come here (`services.wire.order`): it would look like a clock set back, and count as fresh.
     """
 
     DRIFT = 1e-3
@@ -97,7 +99,8 @@ class Reader(Generic[M]):
     """A subscriber that keeps the newest message of a key and its time of arrival.
 
     A thread takes messages from a ring of one, so a slow user neither delays the session nor reads old messages one by
-    one. Malformed messages are counted and dropped. The thread ends with the session.
+    one. Malformed messages, and those that come twice or after newer ones, are counted and dropped. The thread ends
+    with the session.
 
     Args:
         session: An open session.
@@ -120,6 +123,8 @@ class Reader(Generic[M]):
         """This is the number of malformed messages, which were dropped."""
         self.rejected_text = ""
         """This is the error of the last of them."""
+        self.order = StreamOrder()
+        """This counts the messages that came twice or late; they were dropped."""
         self.has_ended = False
         """This is True once the session was closed."""
         self.arrived = arrived or threading.Condition()
@@ -127,6 +132,7 @@ class Reader(Generic[M]):
         self._clock = clock or SystemClock()
         self._newest: Arrival[M] | None = None
         self._other_version: tuple[float, str] | None = None
+        self._disorder: tuple[float, str] | None = None
         self._subscriber = session.declare_subscriber(key, zenoh.handlers.RingChannel(1))
         self._thread = threading.Thread(target=self._receive, name=f"newest {key}", daemon=True)
         self._thread.start()
@@ -146,6 +152,11 @@ class Reader(Generic[M]):
         """Return the error of a newest message of another version that came at most `max_age` [s] ago, else ""."""
         newest = self._other_version
         return "" if newest is None or self._clock.monotonic() - newest[0] > max_age else newest[1]
+
+    def disorder(self, max_age: float) -> str:
+        """Return the sentence about a message that came twice or late at most `max_age` [s] ago, else ""."""
+        last = self._disorder
+        return "" if last is None or self._clock.monotonic() - last[0] > max_age else last[1]
 
     def wait(self, timeout: float) -> M | None:
         """Wait for the next message to arrive; None if none does within `timeout` [s]."""
@@ -175,6 +186,9 @@ class Reader(Generic[M]):
             received = self._clock.monotonic()
             try:
                 message = received_message(sample, self._record)
+                if text := self.order.problem_at(message, received):
+                    self._disorder = (received, text)
+                    continue
                 received -= transit.delay(message.stamp_ns, received)
             except Exception as error:  # any error: the thread must go on to the next message
                 self.rejected += 1

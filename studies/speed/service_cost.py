@@ -133,7 +133,7 @@ def torch_tick(
     torch.set_num_threads(1)
     network = nn.Sequential(*modules(schema))
     layout, mean, std = schema.layout, schema.scaler.mean, schema.scaler.std
-    gate, _, tail = schema.gate(MASKS[0])
+    gate, _, tail, _ = schema.gate(MASKS[0])
     zeros = np.zeros(layout.size)
     names = layout.names
 

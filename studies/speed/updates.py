@@ -36,7 +36,7 @@ def inference() -> Iterator[Row]:
     random = np.random.default_rng(1)
     values = {name: random.standard_normal(schema.layout.signal(name).size) for name in mask}
     joined = schema.layout.join(values)
-    gate, path, tail = schema.gate(mask)
+    gate, path, tail, direct = schema.gate(mask)
     mean, std = schema.scaler.mean, schema.scaler.std
 
     @torch.inference_mode()
@@ -48,7 +48,7 @@ def inference() -> Iterator[Row]:
 
     def ours() -> np.ndarray:
         prediction = np.empty(len(joined))
-        infer(*parts, joined, gate, path, tail, every, prediction)
+        infer(*parts, joined, gate, path, tail, direct, every, prediction)
         return prediction
 
     np.testing.assert_allclose(ours(), by_torch(), rtol=1e-3, atol=1e-4)
@@ -81,7 +81,7 @@ def step_on_weights() -> Row:
     for line in lived:
         updater.add(schema.layout.split(line))
     network = nn.Sequential(*modules(schema))
-    gates, _, tails = zip(*(map(torch.from_numpy, schema.gate(mask)) for mask in MASKS), strict=True)
+    gates, _, tails, _ = zip(*(map(torch.from_numpy, schema.gate(mask)) for mask in MASKS), strict=True)
     return faster(
         f"W update, {SAMPLES} samples x 3 masks, hidden 200",
         "torch eager with Adam",

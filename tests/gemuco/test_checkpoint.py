@@ -53,7 +53,13 @@ def test_a_place_that_cannot_be_written_to_is_a_sentence(schema, data, tmp_path)
 def test_overwrites_what_was_there(schema, folder):
     save(schema.with_manifest(robot="other"), folder)
     assert load(folder).manifest == {"robot": "other"}
-    assert sorted(path.name for path in folder.iterdir()) == ["manifest.json", "model.safetensors"]
+    assert len(list(folder.glob("model-*.safetensors"))) == 1  # the same arrays
+    assert {path.name for path in folder.iterdir()} == {"manifest.json", "manifest.json.before", arrays(folder).name}
+
+
+def arrays(folder):
+    (path,) = folder.glob("model-*.safetensors")
+    return path
 
 
 def change(folder, **entries):
@@ -68,22 +74,24 @@ def change(folder, **entries):
 
 
 def break_tensor(folder):
-    data = bytearray((folder / "model.safetensors").read_bytes())
+    data = bytearray(arrays(folder).read_bytes())
     data[-1] ^= 0xFF
-    (folder / "model.safetensors").write_bytes(data)
+    arrays(folder).write_bytes(data)
 
 
 @pytest.mark.parametrize(
     ("damage", "text"),
     [
         (lambda f: (f / "manifest.json").unlink(), "There is no model in"),
-        (lambda f: (f / "model.safetensors").unlink(), "has no model.safetensors"),
+        (lambda f: arrays(f).unlink(), "has no model-"),
         (lambda f: (f / "manifest.json").write_text("{"), "it is not JSON"),
+        (lambda f: (f / "manifest.json").write_text("[" * 100000), "it is not JSON"),
+        (lambda f: change(f, tensors={"file": "../model.safetensors", "sha256": "0"}), "in place of a file of arrays"),
         (lambda f: (f / "manifest.json").write_text("[]"), "does not describe a body schema but 'list'"),
         (lambda f: (f / "manifest.json").write_bytes(b"\xff\xfe\x00"), "is damaged"),
         (lambda f: change(f, format="dataset"), "does not describe a body schema but 'dataset'"),
-        (lambda f: change(f, version=99), "has version 99; this gemuco reads 3: use a newer gemuco"),
-        (lambda f: change(f, version=0), "has version 0; this gemuco reads 3: train it again"),
+        (lambda f: change(f, version=99), "has version 99; this gemuco reads 4: use a newer gemuco"),
+        (lambda f: change(f, version=0), "has version 0; this gemuco reads 4: train it again"),
         (lambda f: change(f, masks=None), "is damaged"),
         (lambda f: change(f, masks=["wire"]), "is damaged"),
         (lambda f: change(f, x_out=["joint_position"]), "is damaged"),
@@ -91,7 +99,7 @@ def break_tensor(folder):
         (lambda f: change(f, normal=[]), "is damaged"),
         (lambda f: change(f, network={"encoder": ["tanh"] * 9, "decoder": ["linear"]}), "is damaged"),
         (break_tensor, "does not match its manifest"),
-        (lambda f: (f / "model.safetensors").write_bytes(b""), "does not match its manifest"),
+        (lambda f: arrays(f).write_bytes(b""), "does not match its manifest"),
     ],
 )
 def test_says_in_a_sentence_what_is_wrong(folder, damage, text):
@@ -121,8 +129,9 @@ def usable(again, arm):
     score(again, values)
 
 
-@pytest.mark.parametrize("name", ["manifest.json", "model.safetensors"])
-def test_whatever_happens_to_a_byte_is_noticed_or_harmless(schema, arm, folder, name):
+@pytest.mark.parametrize("pattern", ["manifest.json", "model-*.safetensors"])
+def test_whatever_happens_to_a_byte_is_noticed_or_harmless(schema, arm, folder, pattern):
+    (name,) = (path.name for path in folder.glob(pattern))
     random = np.random.default_rng(4)
     sound = (folder / name).read_bytes()
     noticed = 0

@@ -68,9 +68,9 @@ def test_the_folded_chain_is_the_network_and_has_its_derivatives(schema):
 def test_every_mask_has_its_own_regression():
     random = np.random.default_rng(0)
     x = random.standard_normal((400, 3))
-    code = x @ np.array([[1.0, 0.0], [0.0, 2.0], [0.0, 0.0]]) + 0.1
-    path = LinearPath.fit(x, code)
-    whole, part = path.map(np.ones(3)), path.map(np.array([1.0, 0.0, 1.0]))
+    y = x @ np.array([[1.0, 0.0], [0.0, 2.0], [0.0, 0.0]]) + 0.1
+    path = LinearPath.fit(x, y, 2)
+    whole, part = (path.direct(np.array(gate), np.zeros(2))[:-1] for gate in ([1.0, 1.0, 1.0], [1.0, 0.0, 1.0]))
     np.testing.assert_allclose(whole, [[1.0, 0.0], [0.0, 2.0], [0.0, 0.0], [0.1, 0.1]], atol=1e-3)
     np.testing.assert_allclose(part[0], [1.0, 0.0], atol=0.3)
     assert not part[1].any()
@@ -81,8 +81,8 @@ def test_single_wrong_rows_do_not_turn_the_line():
     x = random.standard_normal((400, 1))
     code = 2.0 * x + 0.01 * random.standard_normal((400, 1))
     code[::50] += 30.0
-    path = LinearPath.fit(x, code)
-    np.testing.assert_allclose(path.map(np.ones(1))[:, 0], [2.0, 0.0], atol=0.02)
+    path = LinearPath.fit(x, code, 1)
+    np.testing.assert_allclose(path.direct(np.ones(1), np.zeros(1))[:2, 0], [2.0, 0.0], atol=0.02)
 
 
 def test_the_basis_restores_what_has_few_components():

@@ -60,7 +60,7 @@ def split_with(errors: dict[str, float], rest: float = 1.0) -> Measured:
     chain = Network(6, 3, (4,), 2, "tanh").weights().whole
     ones = np.ones((40, 3), np.float32)
     made = Measured(
-        LAYOUT, chain, LinearPath.none(3), ones, ones > 0, ones > 0, np.zeros((40, 0)), np.ones(3), np.full(3, 2.0)
+        LAYOUT, chain, LinearPath.none(3, 3), ones, ones > 0, ones > 0, np.zeros((40, 0)), np.ones(3), np.full(3, 2.0)
     )
     object.__setattr__(made, "table", table)
     return made

@@ -1,6 +1,9 @@
 """Break the robot in every way there is, with many seeds, and look whether a rule of the robot was broken.
 
     python tests/hal/campaign.py --seeds 8 --json runs/faults.json
+    python tests/hal/campaign.py --repeat 123456789 --only "wrong byte"
+
+Every run of this program draws new seeds, and prints them.
 
 Robot, nodes and wire run in lockstep, so that the times are those of the bus and not of this machine; the faults of a
 whole process (killed, frozen) run in real time on the hub.
@@ -10,6 +13,7 @@ import argparse
 import json
 import logging
 import random
+import secrets
 import statistics
 import sys
 import time
@@ -102,6 +106,10 @@ class Run:
             outcome.violated.update(referee.violations)
         return outcome
 
+    def moves_far(self) -> None:
+        """Move both muscles over most of their range from now on."""
+        self._speed, self._way = 2.0, np.array([0.15, 0.12])
+
     def _goal(self) -> np.ndarray:
         """A wave that is at times faster, and further, than the limits allow [m], shape (2,)."""
         return REST + self._way * np.sin(self._speed * self.bench.world.time)
@@ -132,9 +140,9 @@ class Run:
     def _insist(self) -> None:
         """Reset and enable while the fault is still there: the robot may refuse or stop again, and may not jump."""
         bench = self.bench
-        bench.robot.reset()
-        bench.cycle(20)
         try:
+            bench.robot.reset()
+            bench.cycle(20)
             bench.referee.was_asked = True
             bench.robot.enable()
         except CommandRefused:
@@ -154,6 +162,7 @@ class Run:
         """End the fault; then reset and enable must do, with the same robot in the same process."""
         bench = self.bench
         self.fault.end(self)
+        bench.cycle(5)
         bench.until(self._is_settled, "settling after the fault")
         if bench.robot.mode in ("off", "fault"):
             bench.robot.reset()
@@ -222,15 +231,20 @@ def table(outcomes: list[Outcome]) -> Table:
 def main(arguments: list[str]) -> int:
     """The whole campaign; 0 if no rule was broken and every robot recovered."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=7, help="runs of every fault")
+    parser.add_argument("--seeds", type=int, default=7, help="runs of every fault, with new seeds")
+    parser.add_argument(
+        "--repeat", type=int, nargs="+", metavar="SEED", help="the seeds of an earlier campaign instead"
+    )
     parser.add_argument("--only", default="", help="faults whose name contains this")
     parser.add_argument("--json", type=Path, help="where every run is written to")
     options = parser.parse_args(arguments)
     logging.getLogger("hal").addHandler(logging.NullHandler())
     start = time.monotonic()
-    outcomes = play([fault for fault in FAULTS if options.only in fault.name], range(options.seeds))
-    outcomes += play_processes(range(min(options.seeds, 3)), options.only)
+    seeds = options.repeat or [secrets.randbelow(10**9) for _ in range(options.seeds)]
     console = Console(width=140)
+    console.print(f"Seeds: {' '.join(map(str, seeds))} (again with --repeat)", soft_wrap=True, highlight=False)
+    outcomes = play([fault for fault in FAULTS if options.only in fault.name], seeds)
+    outcomes += play_processes(seeds[:3], options.only)
     console.print(table(outcomes))
     broken = [outcome for outcome in outcomes if outcome.violated or not outcome.recovered]
     for outcome in broken:

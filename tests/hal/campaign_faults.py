@@ -203,6 +203,114 @@ def _is_malformed(run):
     return run.counts()["malformed"] > run.before["malformed"]
 
 
+def _lies(names, forge, bus, patience, moves=True):
+    """Let a device lie, in frames that are in time and well-formed, with its heartbeat; `forge(run)` makes the liar."""
+
+    def begin(run):
+        run.name = run.chance.choice(sorted(names))
+        run.victim = signal, index, node = names[run.name]
+        run.bench.faulty[bus(run.name)].forged[0x180 + node] = forge(run)
+        run.bench.referee.forgiven[signal, index] = run.bench.world.time + patience
+        if moves:
+            run.moves_far()
+
+    return begin
+
+
+def _bus_of(name):
+    return "can0" if name in ("biceps_drive", "triceps_drive", "biceps_cell") else "can1"
+
+
+def _honest(run):
+    for wire in run.bench.faulty.values():
+        wire.forged.clear()
+    run.bench.world.stuck.clear()
+    run.bench.referee.is_hindered = False
+
+
+def _same_bytes(run):
+    first = []
+
+    def lie(data, now):
+        first.append(data) if not first else None
+        return first[0]
+
+    return lie
+
+
+def _counts(place, size, change):
+    """A liar who changes one number of each frame: (bytes `place` on, `size` of them) -> change(number, run)."""
+
+    def forge(run):
+        state = {}
+
+        def lie(data, now):
+            number = int.from_bytes(data[place : place + size], "little", signed=True)
+            told = change(number, run, state)
+            return data[:place] + told.to_bytes(size, "little", signed=True) + data[place + size :]
+
+        return lie
+
+    return forge
+
+
+def _shift(low, high):
+    """A jump by a constant of either sign, `low` to `high` counts, drawn once."""
+
+    def change(number, run, state):
+        by = state.setdefault("by", run.chance.choice((-1, 1)) * run.chance.randint(low, high))
+        return number + by
+
+    return change
+
+
+def _anywhere(number, run, state):
+    return run.chance.randint(90_000, 160_000)
+
+
+def _clipped(number, run, state):
+    return min(number, state.setdefault("end", number))
+
+
+def _says_enabled(run):
+    """Its power stage is off; its statusword stays at `operation enabled`, and its position is as measured."""
+    run.bench.rig.node(run.name).state = State.SWITCH_ON_DISABLED
+    run.bench.referee.is_hindered = True
+    return lambda data, now: b"\x27\x06" + data[2:]
+
+
+def _blocked(run):
+    run.name = run.chance.choice(sorted(DRIVES))
+    run.victim = DRIVES[run.name]
+    world = run.bench.world
+    world.stuck[f"{run.victim[0]}.{run.name.removesuffix('_drive')}"] = float(world.length[run.victim[1]])
+    run.bench.referee.is_hindered = True
+    run.moves_far()
+
+
+CELLS = {name: place for name, place in SENSORS.items() if name.endswith("_cell")}
+ENCODER = {"elbow_encoder": SENSORS["elbow_encoder"]}
+MOVING = 1.5
+"""A lie that only motion shows is to be noticed within this time [s] of a motion that begins slowly."""
+LIES = (
+    Fault("drive says enabled and is off", _lies(DRIVES, _says_enabled, _bus_of, 0.0), _has_stopped, STOPS, _honest,
+          MOVING),
+    Fault("motor blocked", _blocked, _has_stopped, STOPS, _honest, MOVING),
+    Fault("drive's answer frozen", _lies(DRIVES, _same_bytes, _bus_of, MOVING), _has_stopped, STOPS, _honest, MOVING),
+    Fault("drive's encoder jumps 30 mm or more", _lies(DRIVES, _counts(2, 4, _shift(71_000, 120_000)), _bus_of, 0.03),
+          _is_invalid, STOPS, _honest, BAR),
+    Fault("encoder jumps 0.5 rad or more", _lies(ENCODER, _counts(0, 4, _shift(21_000, 30_000)), _bus_of, 0.03),
+          _is_invalid, GOES_ON, _honest, BAR),
+    Fault("encoder at random places", _lies(ENCODER, _counts(0, 4, _anywhere), _bus_of, 0.5), _is_invalid, GOES_ON,
+          _honest),
+    Fault("sensor's answer frozen", _lies(SENSORS, _same_bytes, _bus_of, MOVING), _is_invalid, GOES_ON, _honest,
+          MOVING),
+    Fault("cell clips", _lies(CELLS, _counts(0, 4, _clipped), _bus_of, MOVING), _is_invalid, GOES_ON, _honest, MOVING),
+    Fault("cell with the other sign", _lies(CELLS, _counts(0, 4, lambda n, run, state: -n), _bus_of, 0.03),
+          _is_invalid, GOES_ON, _honest, BAR),
+    Fault("cell reads a thousandth", _lies(CELLS, _counts(0, 4, lambda n, run, state: n // 1000), _bus_of, 0.03),
+          _is_invalid, GOES_ON, _honest, BAR),
+)  # fmt: skip
 SILENT = (
     Fault("drive without power", _breaks("node_silent", DRIVES), _is_invalid, STOPS, _comes_back, BAR),
     Fault("sensor without power", _breaks("node_silent", SENSORS), _is_invalid, GOES_ON, _comes_back, BAR),
@@ -249,4 +357,4 @@ TIME = (
     Fault("cycle frozen for 0.3 s", _frozen(0.3), _has_stopped, STOPS, bar=BAR),
     Fault("cycle frozen for 3 s", _frozen(3.0), _has_stopped, STOPS, bar=BAR),
 )
-FAULTS = SILENT + SELF_TOLD + LOSSY + ADDRESSED + BUS + TIME
+FAULTS = SILENT + LIES + SELF_TOLD + LOSSY + ADDRESSED + BUS + TIME

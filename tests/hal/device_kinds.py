@@ -75,7 +75,12 @@ class DeviceKind:
         body = {
             "robot": "conformance",
             "signals": {
-                f"thing_{quantity}": {"unit": _UNITS[quantity], "elements": ["one"], "stale_after": STALE_AFTER}
+                f"thing_{quantity}": {
+                    "unit": _UNITS[quantity],
+                    "elements": ["one"],
+                    "stale_after": STALE_AFTER,
+                    "plausible": {"rate": math.inf},  # the stage moves it in no time
+                }
                 for quantity in self.quantities
             },
             "command": {"signal": f"thing_{self.commanded}", "time_to_live": 0.1, "hold": 0.5},

@@ -12,13 +12,15 @@ from simulators.nodes.mit_drive import MitConstants
 JOINTS = ("elbow", "wrist", "finger")
 DAMIAO = {"motor": "DM4310", "stiffness": 40.0, "damping": 2.0, "ramp": 0.1}
 T_MOTOR = {"motor": "AK80-9", "stiffness": 40.0, "damping": 2.0, "ramp": 0.1, "allow_no_watchdog": True}
+AT_ONCE = {"low": -np.inf, "high": np.inf, "rate": np.inf}
+"""A hand moves a joint anywhere in no time."""
 _numbers = itertools.count()
 
 
 def description(**changes):
     """A robot file as a mapping; `changes` replace whole sections."""
     signals = {
-        "joint_position": {"unit": "rad", "elements": list(JOINTS)},
+        "joint_position": {"unit": "rad", "elements": list(JOINTS), "plausible": AT_ONCE},
         "joint_velocity": {"unit": "rad/s", "elements": list(JOINTS)},
         "joint_effort": {"unit": "N m", "elements": list(JOINTS)},
         "motor_temperature": {"unit": "degC", "elements": list(JOINTS)},

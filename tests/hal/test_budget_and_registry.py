@@ -49,6 +49,8 @@ def test_finds_drivers_by_name_and_by_module():
         ("nonsense", "not of the form 'module:name'"),
         (":x", "not of the form"),
         ("no_such_module_here:x", "No module named"),
+        ("os:system", "part of Python and not a function of a robot"),
+        ("numpy:pi", "'numpy:pi' is not a function"),
         ("hal.robot:Robbot", "has no 'Robbot'. It has: .*Robot"),
     ],
 )

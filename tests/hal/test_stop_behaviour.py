@@ -71,7 +71,7 @@ def test_park_that_is_held_back_ends_in_a_fault_that_says_so():
     limits = {**LIMITS["position"], "joint_effort": {"soft_high": 5.0}}
     bench = SafetyBench("position", stop=PARK, limits=limits).enable()
     for joint in bench.joints:
-        joint.move = lambda duration, joint=joint: setattr(joint, "effort", -6.0)
+        joint.move = lambda duration, joint=joint: vars(joint).update(effort=-6.0, position=joint.target)
     bench.robot.stop("a test")
     assert bench.until("fault", 6000) * PERIOD == pytest.approx(5 + 2 * 3 / 0.4, abs=0.1)
     assert "was not parked within 20 s" in bench.robot.fault_text

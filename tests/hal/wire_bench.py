@@ -20,6 +20,8 @@ PERIOD = 1.0 / RATE
 STEP = 0.005
 TENSION_RAMP, ANGLE_RAMP = 1.0, 0.01
 """Of what is measured [N/s, rad/s], so that a value tells when it was true."""
+LEAST_TENSION = 5.0
+"""The muscles of this robot are never slack [N]."""
 MEMORY = 4.0
 """How far back [s] the world remembers its lengths."""
 DRIVES = ("muscle_length.biceps", "muscle_length.triceps")
@@ -27,6 +29,8 @@ STRAY = "stray_length.stray"
 LET_GO = 0.8
 """A drive may take so long [s] to be without power after the robot went into fault: 0.15 s until it misses the HAL's
 heartbeat, 0.5 s for the longest quick stop, and the cycles until it is told where it is."""
+UNDERWAY = 2.5 * PERIOD
+"""A drive may still become enabled by a request that was sent before the fault [s]."""
 WINDOW = 60
 """Steps of the world over which speed is averaged: lost set-points are caught up within them,"""
 CATCH_UP = 1.5
@@ -41,6 +45,8 @@ def wire_description():
     """Two drives and a cell on one bus, a cell and an encoder on the other, at 100 Hz."""
     body = description(rates={"hal": RATE})
     body["limits"]["muscle_length"]["acceleration"] = 2.0
+    body["limits"]["joint_position"] = {"low": -1.2, "high": 0.2}
+    body["signals"]["muscle_tension"]["plausible"] = {"low": LEAST_TENSION}
     body["devices"]["triceps_drive"]["bus"] = "can0"
     body["signals"]["stray_length"] = {"unit": "m", "elements": ["stray"], "source": "vision"}
     return body
@@ -66,12 +72,17 @@ class WitnessWorld(BenchWorld):
         self.stray = np.array([0.2])
         self.history = deque(maxlen=round(MEMORY / STEP))
         self.rises = []
+        self.stuck = {}
+        """`muscle_length.element` -> length at which its motor is blocked [m]."""
 
     def step(self, duration):
         super().step(duration)
         target, enabled = self.drives.get(STRAY, (0.0, False))
         if enabled:
             self.stray += np.clip(target - self.stray, -0.5 * duration, 0.5 * duration)
+        for index, element in enumerate(DRIVES):
+            if element in self.stuck:
+                self.length[index] = self.stuck[element]
         self.tension = np.array([20.0, 30.0]) + TENSION_RAMP * self.time
         self.angle = np.array([-0.7]) + ANGLE_RAMP * self.time
         self.history.append((self.time, *self.length, *self.stray))
@@ -200,6 +211,10 @@ class Referee(logging.Handler):
         """How much later [s] than it was sent a frame may arrive."""
         self.lies = False
         """Whether frames carry wrong values, which nobody could tell from right ones."""
+        self.is_hindered = False
+        """Whether a drive does not do as it is asked, so that it is not where its set-points are."""
+        self.forgiven = {}
+        """(signal, index) -> time [s] until which a value may be wrong: a lie that has just begun."""
         self._rises = 0
         self._fault_since = None
         self._applied = deque(maxlen=REACH)
@@ -256,7 +271,8 @@ class Referee(logging.Handler):
             return
         points = np.array(self._applied)
         low, high = points.min(axis=0) - BEYOND, points.max(axis=0) + BEYOND
-        if (world.length < low).any() or (world.length > high).any():
+        is_beyond = (world.length < low).any() or (world.length > high).any()
+        if is_beyond and not self.is_hindered:
             self._note("motion", f"lengths {world.length} beyond the set-points {low}..{high}")
         change = np.diff(points[-3:], n=2, axis=0)[0] / PERIOD**2
         if (np.abs(change) > self._acceleration).any():
@@ -267,6 +283,11 @@ class Referee(logging.Handler):
             oldest = self._bench.config.signals[signal].stale_after + self.extra_age + PERIOD + STEP
             for index in np.flatnonzero(valid):
                 value = sample.values[signal][index]
+                if np.isnan(value):
+                    self._note("stale", f"{signal}[{index}] is NaN, called valid")
+                    continue
+                if world.time < self.forgiven.get((signal, index), -np.inf):
+                    continue
                 age = world.age_of(signal, index, value)
                 if age > oldest:
                     self._note("stale", f"{signal}[{index}] = {value:.6g} was true {age:.3f} s ago, called valid")
@@ -276,8 +297,9 @@ class Referee(logging.Handler):
     def _look_at_power(self, mode, world):
         rises, self._rises = world.rises[self._rises :], len(world.rises)
         if mode in ("off", "fault"):
-            self.was_asked = False
             self._fault_since = world.time if self._fault_since is None else self._fault_since
+            if world.time - self._fault_since > UNDERWAY:
+                self.was_asked = False
             if world.time - self._fault_since > LET_GO and world.enabled:
                 self._note("power", f"{', '.join(world.enabled)} still enabled in mode {mode}")
         else:

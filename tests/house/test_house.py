@@ -52,6 +52,23 @@ def _code_lines(function: ast.FunctionDef) -> int:
     return (function.end_lineno or 0) - first.lineno + 1
 
 
+WRITE_OTHERWISE = {
+    "gemuco/writing.py": "is the one step",
+    "hal/calibration/store.py": "has its own, because hal does not know gemuco",
+    "services/process/heartbeat.py": "writes every second into memory, not to the disk",
+    "services/process/supervisor.py": "writes a log",
+    "services/recording/export.py": "writes tables larger than the memory",
+    "simulators/bullet.py": "writes nothing",
+}
+"""tests/system/test_kills.py kills those that write files."""
+
+
+@pytest.mark.parametrize("path", [path for path in MODULES if _name(path).split("/")[0] != "studies"], ids=_name)
+def test_a_file_is_replaced_in_one_step(path: Path) -> None:
+    found = re.findall(r"""\.write_(?:text|bytes)\(|(?:open|fdopen)\([^)]*["'][wx]b?["']""", path.read_text())
+    assert not found or _name(path) in WRITE_OTHERWISE, "use gemuco.writing.replacing"
+
+
 @pytest.mark.parametrize("path", MODULES, ids=_name)
 def test_name_says_something(path: Path) -> None:
     assert path.stem not in EMPTY_NAMES

@@ -103,6 +103,33 @@ def listens(stack: Stack) -> bool:
     return False
 
 
+def replayed(seconds: float) -> Callable[[Stack], Times]:
+    """All that was heard comes again, at once and `seconds` later, for 4 s; from the side of the HAL."""
+
+    def do(stack: Stack) -> Times:
+        command = inside(
+            stack.link.first, sys.executable, str(HERE / "replayer.py"), stack.robot, str(stack.roles["operator"]),
+            str(seconds),
+        )  # fmt: skip
+        process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=stack.env, start_new_session=True
+        )
+        assert process.stdout is not None
+        try:
+            if process.stdout.readline().strip() != "ready":
+                raise RuntimeError("The replayer did not start.")
+            broken = time.monotonic()
+            time.sleep(4.0)
+            played, _ = process.communicate(timeout=10.0)
+        finally:
+            process.kill()
+        if int(played) < 100:
+            raise RuntimeError(f"Only {played.strip()} messages were played again.")
+        return Times(broken, time.monotonic())
+
+    return do
+
+
 def watched(how_many: int, slow: float = 0.0, is_stopped: bool = False) -> Callable[[Stack], Times]:
     """Viewers beside the router for 4 s."""
 
@@ -156,6 +183,9 @@ CASES = (
     Case("1 % of packets lost, 4 s", bad(4.0, loss=0.01)),
     Case("5 % of packets lost, 4 s", bad(4.0, loss=0.05)),
     Case("20 % of packets lost, 4 s", bad(4.0, loss=0.2)),
+    Case("20 % of packets twice, 4 s", bad(4.0, twice=0.2), is_untouched=True),
+    Case("20 % of packets up to 30 ms out of order, 4 s", bad(4.0, swapped=0.2)),
+    Case("all messages again, at once and 2 s later, 4 s", replayed(2.0), is_untouched=True),
     Case("model frozen for 3 s", frozen("model", 3.0), gone="model"),
     Case("HAL frozen for 3 s", frozen("hal", 3.0), gone="hal"),
     Case("router killed and back", killed("router"), is_untouched=True, viewers=True),

@@ -74,6 +74,12 @@ class Way:
     """Share of packets."""
     rate: float = 0.0
     """[bit/s]; 0 without limit."""
+    twice: float = 0.0
+    """Share of packets that come twice."""
+    swapped: float = 0.0
+    """Share of packets that come up to `lateness` later, after packets that were sent after them."""
+    lateness: float = 0.03
+    """[s]"""
     counters: dict[str, int] = field(default_factory=lambda: {"sent": 0, "bytes": 0, "lost": 0, "overflow": 0})
     waiting: list[tuple[float, int, bytes]] = field(default_factory=list)
     waiting_bytes: int = 0
@@ -83,7 +89,7 @@ class Way:
 
     def change(self, wanted: dict[str, Any]) -> None:
         for name, value in wanted.items():
-            if name not in ("cut", "delay", "jitter", "loss", "rate"):
+            if name not in GOOD:
                 raise ValueError(f"a way has no '{name}'")
             setattr(self, name, value)
 
@@ -100,9 +106,12 @@ class Way:
             self.busy_until = due = max(now, self.busy_until) + 8 * len(packet) / self.rate
         due += self.delay + (chance.random() * self.jitter if self.jitter else 0.0)
         self.last_due = due = max(due, self.last_due)
-        self.number += 1
-        self.waiting_bytes += len(packet)
-        heapq.heappush(self.waiting, (due, self.number, packet))
+        if self.swapped and chance.random() < self.swapped:
+            due += chance.random() * self.lateness
+        for _ in range(2 if self.twice and chance.random() < self.twice else 1):
+            self.number += 1
+            self.waiting_bytes += len(packet)
+            heapq.heappush(self.waiting, (due, self.number, packet))
 
     def give(self, now: float, device: int) -> None:
         """Packets whose time has come leave; those on their way when the link was cut are lost."""
@@ -255,7 +264,7 @@ class Link:
         return self._process.stdout.readline().strip()
 
 
-GOOD = ("cut", "delay", "jitter", "loss", "rate")
+GOOD = ("cut", "delay", "jitter", "loss", "rate", "twice", "swapped", "lateness")
 
 
 def inside(namespace: str, *command: str) -> list[str]:

@@ -19,6 +19,7 @@ from hal.config import load_robot
 from services.process.supervisor import Supervisor, gemuco_command
 from services.security.init import init, placed
 from services.security.plan import InstallationPlan
+from services.security.signing import sign_model
 from services.wire.session import ROUTER_PORT, port
 
 HERE = Path(__file__).parent
@@ -226,5 +227,6 @@ class Stack:
         folder = self.folder / "security"
         hosts = placed(Link.ADDRESS["first"], Link.ADDRESS["second"])
         init(folder, InstallationPlan(protocol=self.protocol, routers=[ROUTER], robots={self.robot: hosts}, days=2))
+        sign_model(folder, self.model)
         services = {name: folder / f"{name}.{self.robot}.json" for name in ("simulator", "hal", "model")}
         return services | {name: folder / f"{name}.json" for name in ("router", "operator", "viewer")}

@@ -68,7 +68,7 @@ def run_hal(file: Path, record: BinaryIO, connect: list[str]) -> int:
 
 
 def run_model(file: Path, record: BinaryIO, folder: Path, connect: list[str]) -> int:
-    from services.model import gemuco_service
+    from services.model import serve
     from services.model.estimation import Estimation
 
     tick = Estimation.tick
@@ -82,7 +82,7 @@ def run_model(file: Path, record: BinaryIO, folder: Path, connect: list[str]) ->
 
     SystemClock.now_ns = staticmethod(time.time_ns)  # type: ignore[method-assign]
     Estimation.tick = witnessed  # type: ignore[method-assign]
-    gemuco_service.serve(load_robot(file), folder, connect)
+    serve.serve(load_robot(file), folder, connect)
     return 0
 
 

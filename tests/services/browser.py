@@ -21,10 +21,10 @@ CAMERA = {
 class Browser:
     """One browser window on a page of this machine."""
 
-    def __init__(self, port: int, origin: str | None = None) -> None:
+    def __init__(self, port: int, origin: str | None = None, token: str = "") -> None:
         self._messages: dict[str, dict[str, Any]] = {}
         self._socket = connect(
-            f"ws://127.0.0.1:{port}", subprotocols=[f"viser-v{viser.__version__}"], origin=origin, max_size=None
+            f"ws://127.0.0.1:{port}/{token}", subprotocols=[f"viser-v{viser.__version__}"], origin=origin, max_size=None
         )  # type: ignore[arg-type]
         self.say(CAMERA)
         self._thread = threading.Thread(target=self._read, daemon=True)

@@ -77,24 +77,30 @@ class WireWorld:
     def __init__(self) -> None:
         self.time = 0.0
         self._length = np.zeros(2)
+        self._flicker = False
+        """The last bit of real sensors is noise, so that they do not look frozen while the robot moves."""
         self._targets: dict[str, float] = {}
 
     def step(self, duration: float) -> None:
         self.time += duration
+        self._flicker = not self._flicker
         way = 0.5 * duration
         for index, muscle in enumerate(MUSCLES):
             target = self._targets.get(f"muscle_length.{muscle}")
             if target is not None:
                 self._length[index] += np.clip(target - self._length[index], -way, way)
 
-    def measure(self) -> Mapping[str, np.ndarray]:
+    def truth(self) -> Mapping[str, np.ndarray]:
         return {
             "joint_position": np.array([0.3]),
             "muscle_tension": np.array([20.0, 30.0]),
             "muscle_length": self._length.copy(),
         }
 
-    truth = measure
+    def measure(self) -> Mapping[str, np.ndarray]:
+        true = self.truth()
+        noise = {"joint_position": 3e-5 * self._flicker, "muscle_tension": 0.01 * self._flicker}
+        return {name: value + noise.get(name, 0.0) for name, value in true.items()}
 
     def drive(self, element: str, target: float, enabled: bool) -> None:
         if enabled:

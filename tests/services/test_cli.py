@@ -4,6 +4,9 @@ from importlib import metadata
 from pathlib import Path
 
 import pytest
+import typer
+
+from services.verbs.verb import report_errors
 
 ROOT = Path(__file__).parents[2]
 
@@ -40,6 +43,54 @@ def test_a_wrong_robot_file_is_one_sentence_and_exit_code_2(tmp_path: Path) -> N
         assert told.returncode == 2
         assert sentence in told.stderr.replace("\n", " ")
         assert "Traceback" not in told.stderr
+
+
+@pytest.mark.long
+def test_a_simulator_that_is_none_is_one_sentence(tmp_path: Path) -> None:
+    text = (ROOT / "robots" / "musashi_arm.yaml").read_text()
+    line = next(line for line in text.splitlines() if line.startswith("simulator:"))
+    for name, sentence in (
+        ("os:system", "'os:system' is a part of Python and not a simulator of a robot."),
+        ("numpy:zeros", "'numpy:zeros' is not a simulator: it has no variants, no conditions, no rig."),
+    ):
+        robot = tmp_path / "wrong.yaml"
+        robot.write_text(text.replace(line, f"simulator: {name}"))
+        told = gemuco("collect", str(robot))
+        assert told.returncode == 2 and sentence in told.stderr and "Traceback" not in told.stderr
+
+
+def _because(text: str) -> OSError:
+    error = OSError("a library cannot be found")
+    error.__context__ = OSError(text)
+    return error
+
+
+@pytest.mark.parametrize(
+    "error",
+    [MemoryError(), ImportError("libtorch_cpu.so: failed to map segment"), RuntimeError("std::bad_alloc"),
+     RuntimeError("can't start new thread"), _because("failed to map segment from shared object")],
+    ids=str,
+)  # fmt: skip
+def test_a_want_of_memory_is_one_sentence(error: Exception, capsys: pytest.CaptureFixture[str]) -> None:
+    @report_errors
+    def verb() -> None:
+        raise error
+
+    with pytest.raises(typer.Exit) as caught:
+        verb()
+    told = capsys.readouterr().err
+    assert (
+        caught.value.exit_code == 1 and told.startswith("gemuco: there is not enough memory.") and told.count("\n") == 1
+    )
+
+
+def test_another_error_of_these_kinds_is_not_hidden() -> None:
+    @report_errors
+    def verb() -> None:
+        raise RuntimeError("a mistake in gemuco")
+
+    with pytest.raises(RuntimeError, match="a mistake"):
+        verb()
 
 
 @pytest.mark.long

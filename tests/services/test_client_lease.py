@@ -29,10 +29,12 @@ class Line:
         if self.is_cut:
             raise NoAnswer("the cable is out")
         if verb == "release":
-            self.lease.give_back(ANNA)
+            self.lease.give_back(ANNA, (arguments or {})["number"])
             return None
         assert arguments is not None
-        if "number" in arguments:
+        if arguments.get("new"):
+            tenure = self.lease.take(ANNA, arguments["seconds"], arguments["number"])
+        elif "number" in arguments:
             tenure = self.lease.renew(ANNA, arguments["seconds"], arguments["number"])
         else:
             tenure = self.lease.take(ANNA, arguments["seconds"])
@@ -60,7 +62,7 @@ def test_a_lease_is_renewed_three_times_in_its_length_and_given_back(line: Line)
     assert 5 <= verbs.count("lease") <= 8  # once at first, then every 0.1 s
     first, second = line.asked[:2]
     assert second[0] - first[0] == pytest.approx(0.1, abs=0.05)
-    assert first[2] == {"seconds": 0.3}
+    assert first[2] == {"seconds": 0.3, "number": lease._number, "new": True}
     assert second[2] is not None
     assert second[2]["number"] > 0
     assert second[3] == pytest.approx(0.1, abs=0.02)
@@ -105,7 +107,7 @@ def test_one_lease_is_enough(line: Line) -> None:
 
 def test_a_lease_that_the_hal_ended_is_lost_at_once(line: Line) -> None:
     with ClientLease(line, 0.6) as lease:
-        line.lease.give_back(ANNA)
+        line.lease.give_back(ANNA, lease._number)
         line.lease.take(BERT, 5.0)
         time.sleep(0.3)
         assert "bert" in lease.text

@@ -3,9 +3,11 @@
 import math
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import FrozenInstanceError
+from dataclasses import FrozenInstanceError, dataclass
 from typing import Any
 
+import msgpack
+import msgspec
 import numpy as np
 import pytest
 
@@ -13,7 +15,7 @@ from hal.clock import ManualClock
 from hal.errors import CommandRefused
 from services.command import client_lease
 from services.command.client_lease import NEEDS_LEASE, ClientLease
-from services.command.intake import DEPTH, LOG_EVERY, NEWS_FOR, Commands, Intake
+from services.command.intake import DEPTH, LOG_EVERY, NEWS_FOR, PER_TICK, Commands, Intake, Rings
 from services.command.lateness import WITHIN, Cycles, age_of, refuse_late
 from services.command.lease import LONGEST, SHORTEST, STREAM, Lease, Tenure
 from services.command.permission import HEARD_WITHIN, Permission
@@ -40,7 +42,7 @@ def test_times_of_a_lease(case: Case) -> None:
     assert [SHORTEST, LONGEST, STREAM] == [0.2, 60.0, 1.0]
     assert [WITHIN, HEARD_WITHIN, NEWS_FOR, LOG_EVERY, DEPTH] == [1.0, 2.5, 5.0, 1.0, 8]
     for seconds in (0.2, 60.0, 1):
-        case.lease.take(ANNA, seconds)
+        case.lease.take(ANNA, seconds, 7)
         assert case.lease.left() == pytest.approx(seconds)
     for wrong in (0.199, 60.001, True):
         with pytest.raises(BadArguments):
@@ -57,7 +59,7 @@ def test_a_new_lease_is_nobodys() -> None:
     assert lease.left() == 0.0
     lease.check(UNKNOWN)
     lease.end_stream()
-    lease.give_back(UNKNOWN)
+    lease.give_back(UNKNOWN, 0)
     assert lease.tenure is None
 
 
@@ -66,7 +68,7 @@ def test_the_holder_takes_its_lease_again_under_the_same_number(case: Case) -> N
     assert (first.caller, first.through, first.number > 0) == (ANNA, 0, True)
     case.lease.delegate(Caller("anna", 11, through=99))
     case.clock.advance(0.5)
-    again = case.lease.take(ANNA, 5.0)
+    again = case.lease.take(ANNA, 5.0, first.number)
     assert (again.number, again.through) == (first.number, 99)
     assert case.lease.left() == pytest.approx(5.0)
     case.clock.advance(5.0)
@@ -98,7 +100,7 @@ def test_renewing(case: Case) -> None:
     for number in (held.number - 1, held.number + 1, None):
         with pytest.raises(LeaseLost):
             case.lease.renew(ANNA, 1.0, number)
-    case.lease.give_back(ANNA)
+    case.lease.give_back(ANNA, held.number)
     with pytest.raises(LeaseLost):
         case.lease.renew(ANNA, 1.0, held.number)
 
@@ -145,15 +147,16 @@ def test_only_a_stream_is_ended_with_the_mode(case: Case) -> None:
         case.lease.end_stream()
     assert case.lease.tenure == held
     case.lease.end_stream()
-    case.lease.take(ANNA, 1.0)  # no call keeps the lock
+    case.lease.take(ANNA, 1.0, held.number)  # no call keeps the lock
 
 
 def test_giving_back_what_another_client_has(case: Case) -> None:
     held = case.lease.take(ANNA, 2.0)
     for other in (BERT, UNKNOWN, Caller("anna", 10)):
-        case.lease.give_back(other)
+        with pytest.raises(CommandHeld):
+            case.lease.give_back(other, held.number)
         assert case.lease.tenure == held
-    case.lease.give_back(ANNA)
+    case.lease.give_back(ANNA, held.number)
     assert case.lease.tenure is None
     assert case.lease._tenure.caller == ANNA  # whose lease ended is still known
 
@@ -313,44 +316,110 @@ def test_a_query_on_behalf_of_a_caller() -> None:
     assert model.permission.engaged_by == Caller()
 
 
-class Queue:
-    """A subscriber of zenoh, and a session that has it."""
-
-    def __init__(self) -> None:
-        self.waiting: list[Any] = []
-        self.depth = 0
-
-    def declare_subscriber(self, key: str, channel: object) -> "Queue":
+class Payload(bytes):
+    def to_bytes(self) -> bytes:
         return self
 
-    def try_recv(self) -> Any:
-        return self.waiting.pop(0) if self.waiting else None
+
+@dataclass
+class Put:
+    """What zenoh hands out: the message as it is, and bytes that name its sender."""
+
+    message: Any
+    sender: int = 5
+
+    @property
+    def payload(self) -> Payload:
+        return Payload(msgpack.packb({"type": "command", "boot": self.sender}))
+
+
+class Queue:
+    """A session that has a subscriber."""
+
+    def declare_subscriber(self, key: str, handler: Any) -> None:
+        self.handler = handler
+
+    def put(self, *messages: Any, sender: int = 5) -> None:
+        for message in messages:
+            self.handler(Put(message, sender))
+
+
+def numbered(seq: int, stamp_ns: int = 0, boot: int = 5) -> Command:
+    return Command(signal="s", values=np.zeros(1), cycle=1, hal_boot=1, seq=seq, stamp_ns=stamp_ns, boot=boot)
 
 
 @pytest.fixture
 def intake(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Intake[Command], Queue, list[Any]]]:
-    monkeypatch.setattr("services.command.intake.received_message", lambda sample, record: sample)
+    monkeypatch.setattr("services.command.intake.received_message", lambda sample, record: sample.message)
     queue, used = Queue(), []
 
     def use(message: Any) -> None:
-        if isinstance(message, Exception):
-            raise message
-        used.append(message)
+        if isinstance(message.signal, Exception):
+            raise message.signal
+        used.append(message.seq)
 
     yield Intake(queue, "key", Command, use), queue, used  # type: ignore[arg-type]
 
 
-def test_a_tick_follows_at_most_eight_messages(intake: tuple[Intake[Command], Queue, list[Any]]) -> None:
+def raising(error: Exception, seq: int = 0) -> Any:
+    message = numbered(seq)
+    msgspec.structs.force_setattr(message, "signal", error)
+    return message
+
+
+def test_a_tick_follows_at_most_eight_messages_of_a_sender_the_newest(
+    intake: tuple[Intake[Command], Queue, list[Any]],
+) -> None:
     taken, queue, used = intake
-    assert taken.counters == {"accepted": 0, "refused": 0, "malformed": 0}
-    queue.waiting = list(range(11))
+    none = dict.fromkeys(("accepted", "refused", "malformed", "flooded", "repeated", "late"), 0)
+    assert taken.facts() == none | {"text": ""}
+    queue.put(*map(numbered, range(11)))
     taken.take()
-    assert used == list(range(8))
+    assert used == list(range(3, 11))
+    assert taken.facts() == none | {"accepted": 8, "flooded": 3, "text": taken.news()}
+    assert "More than 8 command messages of a sender came in a tick" in taken.news()
+
+
+def test_a_flood_does_not_displace_the_commands_of_another(intake: tuple[Intake[Command], Queue, list[Any]]) -> None:
+    taken, queue, used = intake
+    for tick in range(50):
+        queue.put(numbered(tick, boot=7), sender=7)
+        for sender in range(100, 140 if tick else 110):  # more than there are rings, once one was accepted
+            queue.put(*[raising(CommandHeld("no"), seq=1000 * tick + 1)] * 300, sender=sender)
+        used.clear()
+        taken.take()
+        assert used == [tick]
+        assert taken.counters["refused"] <= PER_TICK * (tick + 1)
+    assert taken.counters["flooded"] > 50 * 10 * 290
+
+
+def test_thousands_of_senders_take_no_more_room_than_sixteen() -> None:
+    rings = Rings()
+    for sender in range(5000):
+        rings.put(Put(numbered(1), sender))  # type: ignore[arg-type]
+    assert len(rings.take(10_000)) == 16
+    assert rings.dropped == 5000 - 16
+
+
+def test_a_ring_that_is_being_filled_is_taken_in_the_next_tick() -> None:
+    rings = Rings()
+    rings.put(Put(numbered(1)))  # type: ignore[arg-type]
+    with rings._lock:
+        assert rings.take(8) == []
+    assert len(rings.take(8)) == 1
+
+
+def test_a_command_that_comes_twice_or_late_is_counted_told_and_not_followed(
+    intake: tuple[Intake[Command], Queue, list[Any]],
+) -> None:
+    taken, queue, used = intake
+    queue.put(numbered(1, 100), numbered(3, 300), numbered(2, 200), numbered(3, 300))
+    queue.put(numbered(1, 50, boot=6), sender=6)
     taken.take()
-    taken.take()
-    assert used == list(range(11))
-    assert taken.facts() == {"accepted": 11, "refused": 0, "malformed": 0, "text": ""}
-    assert taken.news() == ""
+    assert sorted(used) == [1, 1, 3]
+    facts = taken.facts()
+    assert (facts["accepted"], facts["late"], facts["repeated"]) == (3, 1, 1)
+    assert "came twice (number 3 after number 3)" in taken.news()
 
 
 @pytest.mark.parametrize(
@@ -358,9 +427,10 @@ def test_a_tick_follows_at_most_eight_messages(intake: tuple[Intake[Command], Qu
 )
 def test_refused_messages(intake: tuple[Intake[Command], Queue, list[Any]], error: Exception) -> None:
     taken, queue, _ = intake
-    queue.waiting = [error, 1]
+    queue.put(raising(error), numbered(1))
     taken.take()
-    assert taken.facts() == {"accepted": 1, "refused": 1, "malformed": 0, "text": "no"}
+    facts = taken.facts()
+    assert (facts["accepted"], facts["refused"], facts["malformed"], facts["text"]) == (1, 1, 0, "no")
     assert taken.news() == "no"
 
 
@@ -372,7 +442,7 @@ def test_news_last_for_five_seconds_and_logs_are_a_second_apart(
     monkeypatch.setattr("services.command.intake.time.monotonic", lambda: now[0])
     for moment, logged in ((100.0, 1), (100.9, 1), (101.0, 2), (101.5, 2), (102.1, 3)):
         now[0] = moment
-        queue.waiting = [ValueError("odd")]
+        queue.put(raising(ValueError("odd")))
         taken.take()
         assert len(caplog.records) == logged
     assert taken.facts()["malformed"] == 5
@@ -436,15 +506,15 @@ class Link:
         self.asked.append((service, verb, arguments))
         if self.error is not None:
             raise self.error
-        return {"number": 5}
+        return {}
 
 
 def test_a_lease_is_asked_of_the_hal_and_ends_a_length_after_the_request(monkeypatch: pytest.MonkeyPatch) -> None:
     link, now = Link(), [50.0]
     monkeypatch.setattr("services.command.client_lease.time.monotonic", lambda: now[0])
     with ClientLease(link, 30.0) as lease:
-        assert link.asked == [("hal", "lease", {"seconds": 30.0})]
-        assert (lease._number, lease._end, link.held_lease) == (5, 80.0, lease)
+        assert link.asked == [("hal", "lease", {"seconds": 30.0, "number": lease._number, "new": True})]
+        assert (lease._number > 0, lease._end, link.held_lease) == (True, 80.0, lease)
         now[0] = 79.9
         lease.check()
         now[0] = 80.0
@@ -453,7 +523,7 @@ def test_a_lease_is_asked_of_the_hal_and_ends_a_length_after_the_request(monkeyp
         now[0] = 60.0
         with pytest.raises(LeaseLost):  # a lost lease stays lost
             lease.check()
-    assert link.asked[-1] == ("hal", "release", None)
+    assert link.asked[-1] == ("hal", "release", {"number": lease._number})
     assert link.held_lease is None
 
 
@@ -468,7 +538,7 @@ def test_errors_that_end_a_lease_at_once_and_those_that_do_not(error: Exception,
         time.sleep(0.25)
         assert (lease.text != "") is is_lost
         assert lease._renewal_fault == ("" if is_lost else str(error))
-        assert link.asked[1][2] == {"seconds": 0.6, "number": 5}
+        assert link.asked[1][2] == {"seconds": 0.6, "number": lease._number}
         link.error = None
         if not is_lost:
             time.sleep(0.25)

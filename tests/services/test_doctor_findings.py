@@ -1,5 +1,6 @@
 """What the doctor makes of this machine, of open ports, and of a HAL's status."""
 
+import pwd
 import socket
 from pathlib import Path
 
@@ -73,6 +74,25 @@ def test_every_check_of_this_machine_says_something() -> None:
     names = ["wall clock", "clock steps", "clock source", "scheduling", "memory", "processor"]
     assert [finding.what for finding in found] == names
     assert all(finding.text for finding in found)
+
+
+def test_other_users_who_can_command_the_robot_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    def user(name: str, number: int, shell: str = "/bin/bash") -> pwd.struct_passwd:
+        return pwd.struct_passwd((name, "x", number, number, "", "/", shell))
+
+    services = [user("root", 0), user("daemon", 1, "/usr/sbin/nologin"), user("nobody", 65534, "/usr/sbin/nologin")]
+    people = [user("anna", 1001), user("bert", 1002)]
+    monkeypatch.setattr(host_checks.os, "geteuid", lambda: 1001)
+    for known, verdict, said in (
+        (services, Severity.OK, "only root and this user can log in here"),
+        (services + people, Severity.WARNING, "every user and program of this machine can enable motors and command "),
+        (services + people, Severity.WARNING, "the robot: bert can log in here. Run `gemuco security init`"),
+    ):
+        monkeypatch.setattr(host_checks.pwd, "getpwall", lambda known=known: known)
+        (found,) = host_checks.other_users(has_role_file=False)
+        assert (found.what, found.verdict) == ("users", verdict) and said in found.text
+    (found,) = host_checks.other_users(has_role_file=True)
+    assert found.verdict is Severity.OK
 
 
 def test_role_files_are_checked_for_their_expiry(tmp_path: Path) -> None:

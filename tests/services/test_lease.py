@@ -144,15 +144,43 @@ def test_a_service_commands_for_the_holder_and_no_longer_than_that(case: Case) -
 
 
 def test_after_a_lease_was_given_back_the_service_is_to_be_engaged_anew(case: Case) -> None:
-    case.lease.take(ANNA, 5.0)
+    held = case.lease.take(ANNA, 5.0)
     case.lease.delegate(Caller(ANNA.name, ANNA.boot, through=MODEL.boot))
-    case.lease.give_back(BERT)
+    with pytest.raises(CommandHeld):
+        case.lease.give_back(BERT, held.number)
     case.lease.check_stream(MODEL)
-    case.lease.give_back(ANNA)
+    case.lease.give_back(ANNA, held.number)
     with pytest.raises(LeaseLost):
         case.lease.check_stream(MODEL)
     case.lease.delegate(Caller(BERT.name, BERT.boot, through=MODEL.boot))  # nobody commands: for whoever asks
     case.lease.check_stream(MODEL)
+
+
+def test_the_boot_that_is_published_neither_ends_a_lease_nor_takes_it(case: Case) -> None:
+    held = case.lease.take(ANNA, 5.0)
+    thief = Caller("thief", ANNA.boot)
+    for number in (0, None, 1, held.number + 1, str(held.number), float(held.number) + 0.5):
+        with pytest.raises(CommandHeld, match="anna"):
+            case.lease.give_back(thief, number)
+    for number in (0, 1, held.number ^ 1):
+        with pytest.raises(CommandHeld, match="anna"):
+            case.lease.take(thief, 60.0, number)
+        with pytest.raises(LeaseLost):
+            case.lease.renew(thief, 60.0, number)
+    assert case.lease.tenure == held
+
+
+def test_a_request_whose_answer_was_lost_is_repeated_with_its_number(case: Case) -> None:
+    first = case.lease.take(ANNA, 2.0, 77)
+    case.clock.advance(1.0)
+    again = case.lease.take(ANNA, 2.0, 77)
+    assert (first.number, again.number, case.lease.left()) == (77, 77, pytest.approx(2.0))
+    for wrong in (-1, 1 << 53, True, 7.0, "77", None):
+        with pytest.raises(BadArguments, match="The number of a lease is a whole number"):
+            case.lease.take(ANNA, 2.0, wrong)
+    case.lease.give_back(ANNA, 77)
+    case.lease.give_back(ANNA, 77)  # its answer was lost too
+    assert case.lease.tenure is None
 
 
 def test_while_the_model_commands_by_itself_whoever_asks_it_is_answered(case: Case) -> None:

@@ -142,7 +142,7 @@ def test_targets_come_in_their_order_and_what_is_none_is_counted(session: zenoh.
     for payload in (good[0], b"", b"\xc1 no msgpack", good[1], good[1][:-3], good[2]):
         session.put(keys.target(robot), payload)
     session.put("gemuco/**", good[0])
-    eventually(lambda: intake.take() or intake.counters == {"accepted": 3, "refused": 0, "malformed": 4})
+    eventually(lambda: intake.take() or (intake.counters["accepted"], intake.counters["malformed"]) == (3, 4))
     assert [float(target.values[0]) for target in targets] == [0.0, 1.0, 2.0]
 
 

@@ -6,6 +6,7 @@ import os
 import socket
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack, suppress
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -15,16 +16,34 @@ from mcap.exceptions import EndOfFile, InvalidMagic
 from mcap.stream_reader import StreamReader
 from small_arm import ROOT, description, eventually
 
+from hal.errors import CommandRefused
 from services.client import Client
 from services.errors import NoAnswer, NotAllowed
 from services.process.supervisor import Supervisor, gemuco_command
 from services.security.authority import Authority, Identity, encoded
 from services.security.init import CA, CA_KEY, init, placed
 from services.security.plan import InstallationPlan
+from services.security.role_files import PERSON_SESSIONS
+from services.verbs.ask import estop_robot
 from services.wire.session import address
 
 LEFT = timedelta(seconds=6)
 """How long the short certificate lasts: enough to get in on a busy machine."""
+
+
+def free_ports(count: int) -> int:
+    """The first of some consecutive free ports: the router's, that of emergency stops, and one per person."""
+    while True:
+        with ExitStack() as probes:
+            first = 0
+            try:
+                for offset in range(count):
+                    probe = probes.enter_context(socket.socket(type=socket.SOCK_DGRAM))
+                    probe.bind(("127.0.0.1", first + offset if first else 0))
+                    first = first or probe.getsockname()[1]
+                return first
+            except (OSError, OverflowError):
+                continue
 
 
 class Secured:
@@ -34,9 +53,7 @@ class Secured:
         self.robot, self.keys, self.folder = f"secured_{os.getpid()}", folder / "keys", folder
         self.file, self.recording = folder / "robot.yaml", folder / "runs" / "all.mcap"
         self.file.write_text(yaml.safe_dump(description(self.robot)))
-        with socket.socket(type=socket.SOCK_DGRAM) as probe:
-            probe.bind(("127.0.0.1", 0))
-            self.router = f"127.0.0.1:{probe.getsockname()[1]}"
+        self.router = f"127.0.0.1:{free_ports(4)}"
         init(self.keys, InstallationPlan(routers=[self.router], robots={self.robot: placed(address(self.robot))}))
         self.supervisor = Supervisor(folder / "logs")
 
@@ -52,6 +69,11 @@ class Secured:
 
     def role(self, name: str) -> str:
         return str(self.keys / f"{name}.json")
+
+    def door(self, name: str) -> str:
+        """The router's endpoint for a person."""
+        (place,) = json.loads(Path(self.role(name)).read_text())["connect"]["endpoints"]
+        return str(place)
 
     def own(self, service: str) -> str:
         return self.role(f"{service}.{self.robot}")
@@ -103,6 +125,49 @@ def test_an_operator_commands_and_a_viewer_looks_on(secured: Secured) -> None:
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("who", ["viewer", "operator"])
+def test_a_person_who_takes_all_sessions_keeps_nobody_from_stopping_the_robot(
+    secured: Secured, who: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with ExitStack() as sessions:
+        with suppress(NotAllowed):
+            for _ in range(PERSON_SESSIONS + 1):
+                sessions.enter_context(Client(secured.robot, secured.role(who)))
+            raise AssertionError("it has more sessions than a person may have")
+        if who == "viewer":
+            with Client(secured.robot, secured.role("operator")) as operator:
+                assert operator.sample(timeout=5.0) is not None
+        started = time.monotonic()
+        assert estop_robot(secured.robot, "tested with a full router", [secured.role("operator")]) == 0
+        assert time.monotonic() - started < 3.0
+    assert "drives stopped" in capsys.readouterr().out
+    eventually(lambda: _resets(secured))
+
+
+def _resets(secured: Secured) -> bool:
+    with suppress(NotAllowed, NoAnswer), Client(secured.robot, secured.role("operator")) as operator:
+        operator.reset()
+        return operator.status("hal", timeout=2.0) is not None
+    return False
+
+
+@pytest.mark.long
+def test_a_viewer_has_no_emergency_port_and_the_port_takes_nothing_else(secured: Secured, tmp_path: Path) -> None:
+    found = {name: json.loads(Path(secured.role(name)).read_text()) for name in ("viewer", "operator")}
+    place = found["operator"]["metadata"]["gemuco"]["emergency"]
+    assert "emergency" not in found["viewer"]["metadata"]["gemuco"]
+    found["viewer"]["connect"]["endpoints"] = place
+    with pytest.raises(NotAllowed):
+        Client(secured.robot, str(_written(tmp_path, found["viewer"]))).__enter__()
+    found["operator"]["connect"]["endpoints"] = place
+    with Client(secured.robot, str(_written(tmp_path, found["operator"]))) as operator:
+        assert operator.sample(timeout=1.0) is None
+        with pytest.raises((NoAnswer, CommandRefused)):
+            operator.ask("hal", "describe", timeout=1.0)
+        assert operator.stop()
+
+
+@pytest.mark.long
 @pytest.mark.parametrize("part", ["certificate", "password"])
 def test_half_an_identity_opens_nothing(secured: Secured, tmp_path: Path, part: str) -> None:
     found, other = (json.loads(Path(secured.role(name)).read_text()) for name in ("viewer", "operator"))
@@ -110,11 +175,13 @@ def test_half_an_identity_opens_nothing(secured: Secured, tmp_path: Path, part: 
         found["transport"]["link"]["tls"] = other["transport"]["link"]["tls"]
     else:
         found["transport"]["auth"]["usrpwd"]["password"] = "guessed"
-    path = _written(tmp_path, found)
-    if part == "certificate":  # it gets in, and then may do what both may: nothing
+    if part == "certificate":  # it gets in at the door of its password, and then may do what both may: nothing
+        found["connect"] = other["connect"] | {"endpoints": [secured.door("viewer")]}
+        path = _written(tmp_path, found)
         with Client(secured.robot, str(path)) as client:
             assert client.sample(timeout=1.0) is None
         return
+    path = _written(tmp_path, found)
     with pytest.raises(NotAllowed, match=r"quic/127\.0\.0\.1:\d+ refused it"):
         Client(secured.robot, str(path)).__enter__()
 

@@ -1,12 +1,15 @@
 """The page over a real socket: what a browser gets, what it may press, and what it cannot do."""
 
+import http.client
 import os
 import resource
 import socket
 import threading
 import time
+import urllib.parse
 import urllib.request
 from collections.abc import Iterator
+from email.message import Message
 from pathlib import Path
 
 import pytest
@@ -19,10 +22,19 @@ from gemuco.dataset import Dataset
 from services.errors import ServiceError
 from services.view import run
 from services.view.controls import Controls, why_read_only
+from services.view.door import Door, new_token
 from services.view.site import open_site
 from services.wire.member import Member
 
 BUTTONS = {"Engage", "Disengage", "Reset", "Stop", "EMERGENCY STOP", "Record this posture", "Take over and hold"}
+
+
+TOKEN = "the-secret-of-the-link"
+
+
+@pytest.fixture(autouse=True)
+def known_token(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run, "new_token", lambda: TOKEN)
 
 
 def free_port() -> int:
@@ -62,7 +74,7 @@ def talking(robot: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iter
 
 
 def test_the_page_shows_every_state_and_recovers(talking: TalkingRobot):
-    with Viewing(talking.robot) as page, Browser(page.port) as browser:
+    with Viewing(talking.robot) as page, Browser(page.port, token=TOKEN) as browser:
         browser.until(lambda b: "Healthy" in b.text() and "joint_position" in b.text())
         talking.silent = True
         browser.until(lambda b: "joint_position (elbow) is estimated from muscle_tension" in b.text())
@@ -79,7 +91,7 @@ def test_the_page_shows_every_state_and_recovers(talking: TalkingRobot):
 
 
 def test_buttons_ask_the_robot(talking: TalkingRobot):
-    with Viewing(talking.robot) as page, Browser(page.port) as browser:
+    with Viewing(talking.robot) as page, Browser(page.port, token=TOKEN) as browser:
         browser.until(lambda b: "Healthy" in b.text())
         assert browser.labels() >= BUTTONS
         browser.press("Stop")
@@ -90,7 +102,7 @@ def test_buttons_ask_the_robot(talking: TalkingRobot):
 
 
 def test_a_posture_is_recorded_from_the_page(talking: TalkingRobot, tmp_path: Path):
-    with Viewing(talking.robot) as page, Browser(page.port) as browser:
+    with Viewing(talking.robot) as page, Browser(page.port, token=TOKEN) as browser:
         browser.until(lambda b: "[rad]" in b.text() and "condition" in b.labels())
         browser.press("Record this posture")
         browser.until(lambda b: "needs a name" in b.text())
@@ -132,7 +144,7 @@ def test_a_read_only_page_asks_nothing_even_if_it_is_told_to():
 
 @pytest.mark.long
 def test_without_a_robot_a_button_says_why(robot: str):
-    with Viewing(robot) as page, Browser(page.port) as browser:
+    with Viewing(robot) as page, Browser(page.port, token=TOKEN) as browser:
         browser.until(lambda b: "No robot" in b.text() and "Engage" in b.labels())
         browser.press("Stop")
         browser.until(lambda b: "Is `gemuco hal` running?" in b.text() and "stop: " in b.text())
@@ -140,15 +152,76 @@ def test_without_a_robot_a_button_says_why(robot: str):
 
 def test_the_page_of_somebody_else_may_not_connect(robot: str):
     with Viewing(robot) as page:
-        with pytest.raises(InvalidStatus, match="403"):
-            Browser(page.port, origin="http://evil.example")
-        with pytest.raises(InvalidStatus, match="403"):
-            Browser(page.port, origin="http://127.0.0.1.evil.example")
-        Browser(page.port, origin=f"http://127.0.0.1:{page.port}").close()
+        own = f"127.0.0.1:{page.port}"
+        for origin in (
+            "http://evil.example",
+            "http://127.0.0.1.evil.example",
+            f"http://127.0.0.1:{page.port + 1}",  # another web server of this machine
+            "http://127.0.0.1",
+            f"http://localhost:{page.port}",
+            "null",
+        ):
+            with pytest.raises(InvalidStatus, match="403"):
+                Browser(page.port, origin=origin, token=TOKEN)
+        Browser(page.port, origin=f"http://{own}", token=TOKEN).close()
+
+
+def fetch(port: int, path: str = "/", **headers: str) -> tuple[int, Message, bytes]:
+    """One request, which follows no redirection."""
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10.0)
+    connection.request("GET", path, headers=headers)
+    answer = connection.getresponse()
+    return answer.status, answer.headers, answer.read()
+
+
+def test_without_the_link_the_page_is_read_only(talking: TalkingRobot):
+    with Viewing(talking.robot) as page:
+        for token in ("", "guessed", TOKEN[:-1], f"{TOKEN}x", f"x/{TOKEN}", f"?token={TOKEN}"):
+            with pytest.raises(InvalidStatus, match="403"):
+                Browser(page.port, token=token)
+            status, headers, _ = fetch(page.port, f"/{token}")
+            assert status == 303
+            other = urllib.parse.urlparse(headers["Location"]).port
+        assert other and other != page.port
+        with Browser(other) as browser:
+            browser.until(lambda b: "Read only: buttons need the link" in b.text() and "Healthy" in b.text())
+            assert not browser.labels() & BUTTONS
+        with Browser(page.port, token=TOKEN) as operator:
+            operator.until(lambda b: "Healthy" in b.text())
+            assert operator.labels() >= BUTTONS
+        assert talking.asked == []
+
+
+def test_no_page_may_frame_it_and_no_cookie_is_set(robot: str):
+    with Viewing(robot) as page:
+        for path in (f"/{TOKEN}", f"/{TOKEN}/", "/", "/elsewhere", f"/{TOKEN}/nothing"):
+            _, headers, _ = fetch(page.port, path)
+            assert headers["Content-Security-Policy"] == "frame-ancestors 'none'"
+            assert headers["X-Frame-Options"] == "DENY"
+            assert headers["Referrer-Policy"] == "no-referrer"
+            assert "Set-Cookie" not in headers  # other web servers of this machine would get it
+
+
+def test_a_foreign_name_for_this_machine_is_refused(robot: str):
+    """A page whose name was made to mean 127.0.0.1 is of the same origin for the browser."""
+    with Viewing(robot) as page:
+        for host in (f"evil.example:{page.port}", "evil.example", f"127.0.0.1.evil.example:{page.port}", ""):
+            assert fetch(page.port, f"/{TOKEN}", Host=host)[0] == 403
+        assert fetch(page.port, f"/{TOKEN}", Host=f"localhost:{page.port}")[0] == 200
+
+
+def test_the_link_is_printed_and_new_each_time(robot: str, capsys: pytest.CaptureFixture[str]):
+    with Viewing(robot) as page:
+        deadline = time.monotonic() + 10.0
+        told = ""
+        while "Ctrl-C" not in told and time.monotonic() < deadline:
+            told += capsys.readouterr().out
+    assert f"http://127.0.0.1:{page.port}/{TOKEN}  With buttons: who has this link commands the robot." in told
+    assert new_token() != new_token() and len(new_token()) >= 32
 
 
 def test_nothing_can_be_published_on_the_internet(robot: str):
-    site = open_site("127.0.0.1", 0, "x")
+    site = open_site("127.0.0.1", 0, "x", Door("127.0.0.1"))
     try:
         from viser import _messages
 
@@ -158,7 +231,7 @@ def test_nothing_can_be_published_on_the_internet(robot: str):
 
 
 def test_the_page_needs_nothing_from_elsewhere(robot: str):
-    with Viewing(robot) as page, urllib.request.urlopen(f"http://127.0.0.1:{page.port}/") as answer:
+    with Viewing(robot) as page, urllib.request.urlopen(f"http://127.0.0.1:{page.port}/{TOKEN}") as answer:
         html = answer.read().decode()
     head = html[: html.index("<body")] if "<body" in html else html
     assert not [tag for tag in head.split("<") if tag.startswith(("link", "script")) and 'src="http' in tag]
@@ -170,25 +243,25 @@ def test_a_taken_port_is_one_sentence(robot: str):
         other.listen()
         port = other.getsockname()[1]
         with pytest.raises(ServiceError, match=f"Port {port} on 127.0.0.1 is taken"):
-            open_site("127.0.0.1", port, "x")
+            open_site("127.0.0.1", port, "x", Door("127.0.0.1"))
     with pytest.raises(ServiceError, match="cannot be served"):
-        open_site("203.0.113.7", 8090, "x")
+        open_site("203.0.113.7", 8090, "x", Door("203.0.113.7"))
 
 
 def test_a_missing_package_is_one_sentence(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(__import__("sys").modules, "viser", None)
     with pytest.raises(ServiceError, match=r"pip install 'gemuco\[view\]'"):
-        open_site("127.0.0.1", 0, "x")
+        open_site("127.0.0.1", 0, "x", Door("127.0.0.1"))
 
 
 @pytest.mark.long
 def test_a_browser_that_never_reads_holds_nothing_up(talking: TalkingRobot):
-    with Viewing(talking.robot) as page, Browser(page.port) as browser:
+    with Viewing(talking.robot) as page, Browser(page.port, token=TOKEN) as browser:
         browser.until(lambda b: "Healthy" in b.text())
         deaf = socket.create_connection(("127.0.0.1", page.port))
         deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         deaf.sendall(
-            b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+            b"GET /" + TOKEN.encode() + b" HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
             b"Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Version: 13\r\n"
             b"Sec-WebSocket-Protocol: viser-v" + viser.__version__.encode() + b"\r\n\r\n"
         )

@@ -238,6 +238,7 @@ def test_named_channels_lie_in_the_runtime_folder_and_are_listed(tmp_path, monke
         assert socket_path(name) == tmp_path / "gemuco" / f"{name}.can"
         assert channels() == [name]
         assert (tmp_path / "gemuco").stat().st_mode & 0o777 == 0o700
+        assert socket_path(name).stat().st_mode & 0o777 == 0o600
         assert {"interface": "hub", "channel": name} in can.detect_available_configs(["hub"])
     monkeypatch.delenv("XDG_RUNTIME_DIR")
     assert str(os.getuid()) in str(socket_path(name).parent)

@@ -17,6 +17,7 @@ from hal.commissioning.sdo_client import SdoClient
 from hal.device import Check
 from hal.drivers.can_device import CanDevice, DeviceSettings, Place
 from hal.errors import ConfigError, DeviceRefused, HalError
+from hal.log_limit import LogLimit
 from hal.protocols import cia301
 from hal.protocols.cia301 import EmergencyMessage, MappedObject, NmtCommand, NmtState
 from hal.wire.bus import Handler
@@ -90,6 +91,7 @@ class CanopenNode(CanDevice):
         self._pdos = pdos
         check_map(self._pdos, sheet, str(place))
         self._sdo = SdoClient(place.bus, place.node, sheet, str(place))
+        self._log = LogLimit(log)
         self._emergency: EmergencyMessage | None = None
         self._started = threading.Event()
         self._beat_due = math.inf
@@ -274,7 +276,7 @@ class CanopenNode(CanDevice):
         if emergency.code:
             self._counters["emergencies"] += 1
             if before != emergency:
-                log.warning("%s reports %s", self._place, _describe(emergency))
+                self._log.line(logging.WARNING, "", received, f"{self._place} reports {_describe(emergency)}")
 
 
 def _describe(emergency: EmergencyMessage) -> str:

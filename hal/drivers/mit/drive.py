@@ -116,6 +116,7 @@ class MitDrive(CanDevice):
         self.fastest = self._ranges.velocity * abs(settings.scale)
         self._sizes = mit.SIZES[self._layout]
         self._law = Law(place, settings)
+        self.compliance = self._law.compliance
         damiao = self._layout is Layout.DAMIAO
         self._reply_id = settings.master_id if settings.master_id is not None else node + 16 if damiao else 0
         self._places = tuple((slot, QUANTITIES.index(quantity)) for quantity, slot in self._slots.items())

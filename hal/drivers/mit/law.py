@@ -37,6 +37,8 @@ class Law:
         most = settings.max_effort * abs(self.scale) if settings.max_effort else math.inf
         self._most = min(most, self.ranges.effort)
         self._check_limits(place, settings.motor)
+        self.compliance = abs(self.scale) * self._most / self._stiffness if self._mode == "position" else 0.0
+        """Distance from the set-point at which the drive pushes with its largest effort [rad or m]; else 0."""
 
     def _check_limits(self, place: Place, motor: str) -> None:
         scale, ranges = self.scale, self.ranges
