@@ -5,7 +5,7 @@ from typing import Annotated, ClassVar, Self
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
-from hal.units import check_units, factor
+from hal.calibration.units import check_units, factor
 
 
 class Section(BaseModel):

@@ -20,8 +20,8 @@ from hal.bounds_config import (
     Section,
     per_element,
 )
+from hal.calibration.units import check_robot_unit
 from hal.errors import ConfigError
-from hal.units import check_robot_unit
 
 __all__ = [
     "BusConfig",
@@ -99,7 +99,7 @@ class SignalConfig(Section):
     """A named vector of sensor or control values."""
 
     unit: str
-    """SI unit of its values, one of `hal.units.ROBOT_UNITS`."""
+    """SI unit of its values, one of `hal.calibration.units.ROBOT_UNITS`."""
     elements: tuple[str, ...] = Field(min_length=1)
     stale_after: Positive = 0.02
     """An element is valid up to this age [s]."""
