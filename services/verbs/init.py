@@ -33,6 +33,7 @@ def init(
     The file has joints, limits and torques; drives, encoders and a camera stand in for the hardware. `gemuco demo FILE`
     then collects, trains, runs, and loses an encoder and the camera.
     """
+    from gemuco.writing import replace
     from hal import registry
     from hal.errors import ConfigError
     from services.errors import ServiceError
@@ -50,7 +51,7 @@ def init(
         for sheet in draft.sheets:
             if not (sheets / sheet.name).exists():
                 shutil.copy(sheet, sheets)
-        file.write_text(draft.text)
+        replace(file, draft.text.encode())
     except OSError as error:
         raise ServiceError(f"'{file}' cannot be written: {error.strerror}.") from None
     typer.echo(f"{file}: {draft.summary}")

@@ -164,3 +164,11 @@ def test_limits_and_stop_are_converted_where_they_are_written(written):
 def test_numbers_in_a_unit_that_does_not_fit(written, signal, unit, told):
     assert told in refused(written(limits={signal: {"trip_high": 1.0, "written_in": unit}}))
     assert "stop" in refused(written(stop={"behaviour": "park", "park": [1, 1], "speed": 1, "written_in": "deg"}))
+
+
+def test_what_is_plausible_is_converted_too_but_not_its_time(written):
+    plausible = {"low": -180, "high": 180.0, "rate": 360, "frozen_after": 2.0, "written_in": "deg"}
+    config = load_robot(written(**changed("signals", ["joint_position", "plausible"], plausible)))
+    converted = config.signals["joint_position"].plausible
+    assert (converted.low, converted.rate) == (pytest.approx(-3.141593), pytest.approx(6.283185))
+    assert converted.frozen_after == 2.0
