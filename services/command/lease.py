@@ -123,7 +123,7 @@ class Lease:
             tenure = self.tenure
             if tenure is None:
                 return
-            if tenure.caller.boot != caller.boot or not tenure.number or tenure.number != number:
+            if tenure.caller.boot != caller.boot or not tenure.number or (type(number), number) != (int, tenure.number):
                 raise self._refusal(tenure)
             self._tenure = replace(tenure, until=-math.inf)
 
