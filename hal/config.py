@@ -8,8 +8,8 @@ import numpy as np
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator, model_validator
 
+from hal.calibration.units import check_robot_unit, check_units, factor
 from hal.errors import ConfigError
-from hal.units import check_robot_unit, check_units, factor
 
 
 class Section(BaseModel):
@@ -171,7 +171,7 @@ class SignalConfig(Section):
     """A named vector of sensor or control values."""
 
     unit: str
-    """SI unit of its values, one of `hal.units.ROBOT_UNITS`."""
+    """SI unit of its values, one of `hal.calibration.units.ROBOT_UNITS`."""
     elements: tuple[str, ...] = Field(min_length=1)
     stale_after: Positive = 0.02
     """An element is valid up to this age [s]."""

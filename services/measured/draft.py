@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from gemuco.errors import DatasetError
-from hal.units import CONVERSIONS, factor
+from hal.calibration.units import CONVERSIONS, factor
 from services.measured.column_groups import Column, Group, grouped, unit_in
 from services.measured.episode_files import Recording, read_recording
 

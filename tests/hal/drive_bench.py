@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 from hal_bench import ROBOTS, Bench
 
+from hal.calibration.units import axis_units
 from hal.config import RobotConfig
-from hal.units import axis_units
 from simulators.nodes.canopen.spec import DriveConstants, NodeSpec
 
 RATE = 200.0

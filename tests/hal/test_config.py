@@ -4,9 +4,9 @@ import pytest
 import yaml
 from hal_bench import description
 
+from hal.calibration.units import ROBOT_UNITS
 from hal.config import load_robot
 from hal.errors import ConfigError
-from hal.units import ROBOT_UNITS
 
 MUSASHI = Path(__file__).parents[2] / "robots" / "musashi_arm.yaml"
 

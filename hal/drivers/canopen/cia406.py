@@ -5,6 +5,7 @@ from typing import Any, Literal
 
 from typing_extensions import override
 
+from hal.calibration.units import axis_units
 from hal.commissioning.pdo_map import Pdo, PdoMap, lay_out
 from hal.config import Finite, Positive
 from hal.device import DeviceState
@@ -13,7 +14,6 @@ from hal.drivers.canopen.node import HEARTBEAT, CanopenNode, NodeSettings, PdoHa
 from hal.errors import DeviceRefused
 from hal.protocols import cia406
 from hal.protocols.cia301 import PDO_SIZE, MappedObject
-from hal.units import axis_units
 
 _SPEED_END = 2**15 - 1
 

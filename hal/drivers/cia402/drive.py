@@ -8,6 +8,7 @@ import can
 import numpy as np
 from typing_extensions import override
 
+from hal.calibration.units import axis_units
 from hal.commissioning.node import cob_id
 from hal.commissioning.pdo_map import Pdo, describe
 from hal.commissioning.sdo_client import SdoClient
@@ -21,7 +22,6 @@ from hal.errors import CommandRefused, ConfigError, DeviceRefused
 from hal.protocols import cia301, cia402
 from hal.protocols.cia301 import MappedObject
 from hal.protocols.cia402 import OperationMode, State, VelocityUnit
-from hal.units import axis_units
 from hal.wire.bus import Bus
 
 UNWATCHED = "{} does not detect the loss of the HAL (no 1016h)."

@@ -11,6 +11,7 @@ import can
 import numpy as np
 from typing_extensions import override
 
+from hal.calibration.units import axis_units
 from hal.device import Check, DeviceState
 from hal.drivers.can_device import CanDevice, Place
 from hal.drivers.mit.law import Law
@@ -19,7 +20,6 @@ from hal.drivers.mit.settings import MitSettings
 from hal.errors import ConfigError, DeviceRefused, DeviceSilent
 from hal.protocols import mit
 from hal.protocols.mit import Command, Layout, Register, Special
-from hal.units import axis_units
 from hal.wire.bus import Bus, Handler
 
 
