@@ -114,6 +114,24 @@ def test_the_chain_ends_at_the_tool_and_fingers_are_held(arm):
     assert any("2 joints that are not part" in note or "1 joints that are not part" in note for note in arm.notes)
 
 
+@pytest.mark.parametrize(
+    ("names", "tip"),
+    [
+        (("palm",), "palm"),
+        (("right_hand", "right_hand_camera_link"), "right_hand"),
+        (("gripper_base", "gripper_fingertip_3_link"), "gripper_base"),
+        (("flange", "tool0", "camera_tool"), "tool0"),
+        (("hand", "hand_tcp"), "hand_tcp"),
+        (("wrist_camera",), "wrist"),
+    ],
+)
+def test_the_tip_is_what_is_named_like_a_tool_or_a_hand(tmp_path, names, tip):
+    more = [link(name) for name in names]
+    chain = [joint(f"to {name}", "fixed", before, name) for before, name in zip(("wrist", *names), names, strict=False)]
+    text = "<robot name='a'>" + "".join([*LINKS[:5], *more, *JOINTS[:4], *chain]) + "</robot>"
+    assert choose_arm(read_tree(written(tmp_path, text))).tip == tip
+
+
 def humanoid() -> str:
     links, joints = [link("pelvis", 5.0)], []
     for side in ("left", "right"):

@@ -17,8 +17,12 @@ FINGERS = 2
 """Chains behind a link that have at most this many joints each are fingers: the arm ends at the link before them."""
 HAND = re.compile(r"finger|gripper|jaw|thumb|index|knuckle|hand")
 """Joints at the end of a chain with one of these words open a hand and do not move an arm."""
-TOOLS = ("tool", "tcp", "tip", "ee", "eef", "end_effector", "grasp", "hand", "gripper", "flange")
-"""Among the links that are fixed to the last one, the tip is the one with one of these words, the first word first."""
+TOOLS = ("tool", "tcp", "tip", "ee", "eef", "end_effector", "grasp")
+HANDS = ("hand", "gripper", "flange")
+"""Among the links that are fixed to the last one, the tip is the last one with one of the words of tools, or else the
+first one with one of the words of hands, the first word first."""
+NO_TIP = re.compile(r"camera|sensor|optical|finger|imu|inertia")
+"""A link with one of these words is no tip unless there is no other."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,15 +190,18 @@ def _moving_behind(tree: Tree, joint: Joint) -> int:
 
 
 def _tool(tree: Tree, link: str) -> str:
-    """Return the link that is most likely the tool, among those that are fixed to a link."""
-    fixed, ends = [link], [link]
+    """Return the link that is most likely the tool, among a link and all that are fixed to it."""
+    while link in tree.before and tree.before[link].kind == "fixed":
+        link = tree.before[link].parent
+    fixed = [link]
     for one in fixed:
         fixed += [joint.child for joint in tree.behind[one] if joint.kind == "fixed"]
-    ends = [one for one in fixed if not any(joint.kind == "fixed" for joint in tree.behind[one])]
-    for word in TOOLS:
-        named = [one for one in reversed(fixed) if re.search(rf"(^|_){word}", one.lower())]
+    usual = [one for one in fixed if not NO_TIP.search(one.lower())] or fixed
+    for word in (*TOOLS, *HANDS):
+        named = [one for one in usual if re.search(rf"(^|_){word}", one.lower())]
         if named:
-            return named[0]
+            return named[0 if word in HANDS else -1]
+    ends = [one for one in usual if not any(joint.kind == "fixed" for joint in tree.behind[one])]
     return ends[0] if ends else link
 
 
