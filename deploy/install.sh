@@ -1,24 +1,44 @@
 #!/bin/sh
 # install.sh [--target FOLDER] WORDS...: install into /opt/gemuco what deploy/requirements.py prints for these words, or
-# with the word `.` this package itself, in the versions of constraints.txt; then take away what no service ever reads.
+# with the word `.` this package itself; then take away what no service ever reads. Every file has a hash in
+# requirements.lock but those of torch, which each index builds itself; it comes from one index alone.
 set -eu
 site=$(/opt/gemuco/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')
 target=""
 if [ "${1:-}" = --target ]; then target=$2; shift 2; fi
 folder=${target:-$site}
-pip="python -m pip --python /opt/gemuco/bin/python install --quiet --constraint constraints.txt --find-links wheels"
+pip="python -m pip --python /opt/gemuco/bin/python install --quiet"
 [ -z "$target" ] || pip="$pip --no-compile --target $target" # trained with once, so not worth the space
 
+hashed() { [ "$(uname -m)" = x86_64 ]; } # the lock has no hashes for other processors
+
+# list WORDS...: what pip is to install.
+list() {
+    if hashed; then
+        python deploy/requirements.py --locked "$@" >/tmp/wanted.txt
+        how="--require-hashes --no-deps"
+    else
+        python deploy/requirements.py "$@" | grep -v '^torch' >/tmp/wanted.txt
+        how="--constraint constraints.txt"
+    fi
+}
+
 if [ "${1:-}" = . ]; then
-    $pip --no-deps --no-index . 2>/tmp/offline.log || $pip --no-deps .
+    list +build =setuptools
+    python -m pip install --quiet --target /tmp/build $how --find-links wheels --requirement /tmp/wanted.txt
+    PYTHONPATH=/tmp/build $pip --no-deps --no-index --no-build-isolation .
 else
-    python deploy/requirements.py "$@" >/tmp/wanted.txt
-    if $pip --no-index --requirement /tmp/wanted.txt 2>/tmp/offline.log; then
+    list "$@"
+    if $pip --no-index --find-links wheels $how --requirement /tmp/wanted.txt 2>/tmp/offline.log; then
         echo "installed from wheels/ alone"
     else
         grep -h ERROR /tmp/offline.log || true
         echo "wheels/ is not complete: asking the registry"
-        $pip --extra-index-url "$TORCH_INDEX" --requirement /tmp/wanted.txt
+        $pip --find-links wheels $how --requirement /tmp/wanted.txt
+    fi
+    if python deploy/requirements.py "$@" | grep -q '^torch'; then # from wheels/, else from one index and no other
+        torch=$(grep '^torch==' constraints.txt)
+        $pip --no-index --find-links wheels --no-deps "$torch" 2>/dev/null || $pip --no-deps --index-url "$TORCH_INDEX" "$torch"
     fi
 fi
 

@@ -7,7 +7,7 @@ before is kept: its manifest has the suffix `KEPT`.
 import hashlib
 import json
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -17,10 +17,11 @@ from safetensors import SafetensorError
 from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
+from gemuco.certainty import Certainty
 from gemuco.errors import CheckpointError, SchemaError
 from gemuco.layers import LINEAR, Chain, Layer, Weights, check_activation
 from gemuco.linear import LinearPath
-from gemuco.masks import label
+from gemuco.masks import Mask, label
 from gemuco.normal import Normal
 from gemuco.normal.soundness import check_normal
 from gemuco.scaler import FLOOR, Scaler
@@ -109,11 +110,20 @@ def _head(schema: BodySchema) -> dict[str, Any]:
             "decoder": [layer.activation for layer in schema.weights.decoder],
             "straight": [layer.straight for layer in schema.weights.whole],
         },
-        "errors": [[method, label(mask, schema.layout.names)] for method, mask in schema.errors],
+        "errors": _labels(schema, schema.errors),
         "conditions": list(schema.biases),
         "normal": None if schema.normal is None else schema.normal.facts(),
+        "certainty": None if schema.certainty is None else _labels(schema, schema.certainty.ways),
         "facts": dict(schema.manifest),
     }
+
+
+def _labels(schema: BodySchema, ways: Iterable[tuple[str, Mask]]) -> list[list[str]]:
+    return [[method, label(mask, schema.layout.names)] for method, mask in ways]
+
+
+def _ways(labels: Iterable[tuple[str, str]]) -> list[tuple[str, Mask]]:
+    return [(method, frozenset(text.split("+")) if text else frozenset()) for method, text in labels]
 
 
 def signed(head: Mapping[str, Any]) -> dict[str, Any]:
@@ -167,6 +177,8 @@ def _tensors(schema: BodySchema) -> dict[str, np.ndarray]:
     tensors["anchor_conditions"] = schema.anchor_conditions
     if schema.normal is not None:
         tensors |= {f"normal.{name}": array for name, array in schema.normal.arrays().items()}
+    if schema.certainty is not None:
+        tensors |= {f"certainty.{name}": array for name, array in schema.certainty.arrays().items()}
     return tensors
 
 
@@ -250,6 +262,10 @@ def _schema(head: Mapping[str, Any], tensors: Mapping[str, np.ndarray]) -> BodyS
         parts = {name.removeprefix("normal."): array for name, array in tensors.items() if name.startswith("normal.")}
         normal = Normal.of(parts, head["normal"])
     masks = tuple(frozenset(text.split("+")) for text in head["masks"])
+    certainty = None
+    if head.get("certainty") is not None:  # older models have none
+        parts = {name.removeprefix("certainty."): array for name, array in tensors.items()}
+        certainty = Certainty.of(tuple(_ways(head["certainty"])), parts)
     return BodySchema(
         layout=layout,
         x_in=tuple(head["x_in"]),
@@ -257,10 +273,7 @@ def _schema(head: Mapping[str, Any], tensors: Mapping[str, np.ndarray]) -> BodyS
         masks=masks,
         scaler=Scaler(*(tensors[f"scaler.{name}"] for name in SCALES)),
         weights=_weights(head, tensors),
-        errors={
-            (method, frozenset(text.split("+")) if text else frozenset()): tensors[f"errors.{index}"]
-            for index, (method, text) in enumerate(head["errors"])
-        },
+        errors={way: tensors[f"errors.{index}"] for index, way in enumerate(_ways(head["errors"]))},
         anchors=tensors["anchors"],
         anchor_conditions=tensors["anchor_conditions"],
         normal=normal,
@@ -269,6 +282,7 @@ def _schema(head: Mapping[str, Any], tensors: Mapping[str, np.ndarray]) -> BodyS
         manifest=head["facts"],
         linear=_path(tensors, layout.subset(tuple(head["x_out"])).size) if head["version"] > 2 else None,
         shares={mask: tensors[f"shares.{i}"] for i, mask in enumerate(masks)} if head["version"] > 3 else {},
+        certainty=certainty,
     )
 
 
@@ -323,6 +337,8 @@ def _check_arrays(schema: BodySchema) -> None:
         shapes.append(("anchors", schema.anchors, (len(schema.anchors), size)))
     if schema.normal is not None:
         shapes += schema.normal.shapes(size, outputs, p)
+    if schema.certainty is not None:
+        shapes += schema.certainty.shapes(size)
     for before, layer in pairwise(schema.weights.whole):
         shapes.append(("layer", layer.matrix, (len(before.offset), len(layer.offset))))
     for name, array, shape in shapes:
@@ -338,6 +354,8 @@ def _check_arrays(schema: BodySchema) -> None:
     for (method, _), array in schema.errors.items():
         if (array < 0.0).any():
             raise ValueError(f"an error of {method} is negative")
+    if schema.certainty is not None:
+        schema.certainty.check()
     if schema.normal is not None:
         check_normal(schema.normal, schema.scaler.std[schema.out_index], size + p)
 

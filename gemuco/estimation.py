@@ -9,6 +9,7 @@ import numpy as np
 
 from gemuco.compiled.inference import infer
 from gemuco.derived import ByPattern
+from gemuco.intervals.sureness import KNOWN, SURE, UNKNOWN, Judge, RangeJudge, Sureness, since_change
 from gemuco.layers import run
 from gemuco.masks import Mask, covered_by, label
 from gemuco.schema import BodySchema, check_schema
@@ -19,13 +20,17 @@ from gemuco.search.routes import STARTS, latent_starts
 SEARCH = NewtonConfig()
 
 
+_OF_NOTHING = Sureness(UNKNOWN, "nothing that it could be estimated from was measured")
+
+
 @dataclass(frozen=True, slots=True)
 class Estimate:
     """Measured and estimated values of a signal in one sample; of several samples, with one row per sample.
 
     Attributes:
         value: Measured values, and estimates of missing elements [unit], shape (n,); NaN if there is no estimate.
-        std: Expected error (1 sigma, from held-out data) [unit], shape (n,); 0 where measured, NaN where unknown.
+        std: Expected error of this estimate [unit], shape (n,): 90 % of the errors of held-out data are within
+            `gemuco.certainty.NINETY` std; 0 where measured, NaN where unknown.
         estimated: Whether each element is an estimate, shape (n,).
         method: `measured`, `mask` (usages a and b), `latent` (e), `input` (f) or `none`.
         mask: The signals from which it was estimated; empty where measured.
@@ -33,6 +38,9 @@ class Estimate:
             0 where measured, NaN without estimate. For `latent` the network also predicts the given values from the
             estimate, and the larger error counts, because a z outside the manifold of the data may fit values that no
             body has.
+        state: `known`; `doubtful` if the sample or p is a little, `unknown` if it is far outside of what was learned:
+            then neither the value nor its std can be relied on.
+        reason: One sentence on the state; empty if it is `known`.
     """
 
     value: np.ndarray
@@ -41,6 +49,8 @@ class Estimate:
     method: str | np.ndarray
     mask: Mask | np.ndarray
     residual: float | np.ndarray
+    state: str | np.ndarray = KNOWN
+    reason: str | np.ndarray = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +59,9 @@ class Recipe:
 
     Attributes:
         steps: Each step: method, mask, the elements to estimate as truth values, shape (size,), and their signals.
-        std: Expected error of every element [unit], shape (size,); see `Estimate`.
+        judges: The judge of each step's std and state; None where nothing is estimated.
+        unseen: The state of an estimate that nothing else speaks against: `SURE` unless the body changed.
+        std: Expected error of every element [unit], shape (size,), before a sample is known; see `Estimate`.
         estimated: Whether each element is estimated, shape (size,).
         method: Signal -> method.
         mask: Signal -> mask.
@@ -57,6 +69,8 @@ class Recipe:
     """
 
     steps: tuple[tuple[str, Mask, np.ndarray, tuple[str, ...]], ...]
+    judges: tuple[Judge | RangeJudge | None, ...]
+    unseen: Sureness
     std: np.ndarray
     estimated: np.ndarray
     method: Mapping[str, str]
@@ -86,7 +100,17 @@ class Recipe:
         estimated.setflags(write=False)
         masks = {name: sources[name][1] for name in slices}
         labels = {name: label(mask, schema.layout.names) for name, mask in masks.items()}
-        return cls(tuple(steps), std, estimated, {name: sources[name][0] for name in slices}, masks, labels)
+        judges = tuple(_judge(schema, (method, mask), finite) for method, mask, _, _ in steps)
+        return cls(
+            tuple(steps),
+            judges,
+            since_change(schema, ~finite),
+            std,
+            estimated,
+            {name: sources[name][0] for name in slices},
+            masks,
+            labels,
+        )
 
 
 class Completion(NamedTuple):
@@ -94,12 +118,16 @@ class Completion(NamedTuple):
 
     Attributes:
         value: Every element [its unit], shape (size,).
+        std: Expected error of every element [its unit], shape (size,).
         residual: Signal -> residual; see `Estimate`.
-        recipe: The steps, expected errors and methods.
+        sureness: Signal -> state and reason.
+        recipe: The steps and methods.
     """
 
     value: np.ndarray
+    std: np.ndarray
     residual: dict[str, float]
+    sureness: dict[str, Sureness]
     recipe: Recipe
 
 
@@ -125,11 +153,11 @@ def estimate(schema: BodySchema, values: Mapping[str, np.ndarray]) -> dict[str, 
     joined.setflags(write=False)
     if joined.ndim == 2:
         return _batch(schema, [fill(schema, row) for row in joined])
-    value, residual, recipe = fill(schema, joined)
+    value, std, residual, sureness, recipe = fill(schema, joined)
     return {
         name: Estimate(
-            value[span], recipe.std[span], recipe.estimated[span],
-            recipe.method[name], recipe.mask[name], residual[name],
+            value[span], std[span], recipe.estimated[span],
+            recipe.method[name], recipe.mask[name], residual[name], *sureness[name],
         )
         for name, span in schema.layout.slices.items()
     }  # fmt: skip
@@ -139,7 +167,7 @@ def _batch(schema: BodySchema, samples: list[Completion]) -> dict[str, Estimate]
     """Return the estimates of several samples, each attribute with a row per sample."""
     size = schema.layout.size
     value = np.array([sample.value for sample in samples]).reshape(-1, size)
-    std = np.array([sample.recipe.std for sample in samples]).reshape(-1, size)
+    std = np.array([sample.std for sample in samples]).reshape(-1, size)
     estimated = np.array([sample.recipe.estimated for sample in samples], bool).reshape(-1, size)
     estimates = {}
     for name, span in schema.layout.slices.items():
@@ -147,26 +175,45 @@ def _batch(schema: BodySchema, samples: list[Completion]) -> dict[str, Estimate]
         mask[:] = [sample.recipe.mask[name] for sample in samples]
         method = np.array([sample.recipe.method[name] for sample in samples], object)
         residual = np.array([sample.residual[name] for sample in samples], float)
-        estimates[name] = Estimate(value[:, span], std[:, span], estimated[:, span], method, mask, residual)
+        state, reason = (np.array([sample.sureness[name][k] for sample in samples], object) for k in range(2))
+        estimates[name] = Estimate(
+            value[:, span], std[:, span], estimated[:, span], method, mask, residual, state, reason
+        )
     return estimates
 
 
-def fill(schema: BodySchema, joined: np.ndarray) -> Completion:
+def fill(schema: BodySchema, joined: np.ndarray, recipe: Recipe | None = None) -> Completion:
     """Complete a sample in one array [unit of each element], shape (size,), NaN where missing; see `estimate`.
 
-    The array must be read-only, as in a service: the code is compiled for read-only arrays.
+    The array must be read-only, as in a service: the code is compiled for read-only arrays. The recipe is that of its
+    finite elements; the schema's if not given.
     """
-    recipe = schema.derived(recipes)(np.isfinite(joined))
-    value, residual = joined.copy(), dict.fromkeys(recipe.method, 0.0)
-    for method, mask, missing, names in recipe.steps:
+    recipe = recipe or schema.derived(recipes)(np.isfinite(joined))
+    value, residual, std = joined.copy(), dict.fromkeys(recipe.method, 0.0), recipe.std
+    sureness = dict.fromkeys(recipe.method, SURE)
+    if recipe.steps:
+        std = std.copy()
+    for (method, mask, missing, names), judge in zip(recipe.steps, recipe.judges, strict=True):
+        own = float("nan")
         if method == "mask":
-            error = infer(*schema.parts, joined, *schema.gate(mask), missing, value)
+            error, own = infer(*schema.parts, joined, *schema.gate(mask), missing, value)
         else:
             prediction, error = _search(schema, method, mask, joined)
             np.copyto(value, prediction, where=missing)
+        sure = _OF_NOTHING if judge is None else judge.judge(joined, own, missing, std)
+        if sure is SURE:
+            sure = recipe.unseen
         for name in names:
-            residual[name] = error
-    return Completion(value, residual, recipe)
+            residual[name], sureness[name] = error, sure
+    return Completion(value, std, residual, sureness, recipe)
+
+
+def _judge(schema: BodySchema, way: tuple[str, Mask], finite: np.ndarray) -> Judge | RangeJudge | None:
+    if way[0] == "none":
+        return None
+    if schema.certainty is None:
+        return RangeJudge(schema, way[1], finite)
+    return Judge(schema, way, finite, _std(schema, *way))
 
 
 def _route(schema: BodySchema, name: str, whole: Mask, finite: np.ndarray) -> tuple[str, Mask]:

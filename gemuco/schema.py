@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
+from gemuco.certainty import Certainty
 from gemuco.compiled.chain import pack
 from gemuco.compiled.inference import Parts, Predictor
 from gemuco.derived import ByPattern
@@ -73,6 +74,7 @@ class BodySchema:
         linear: The linear path; of width 0 without one, which is the default.
         shares: Mask -> share of the network in every element of x_out, shape (out_size,), 1 where not given; the rest
             is the linear path itself.
+        certainty: Calibration of the std of estimates; None if unknown: the std is then the expected error.
         out_layout: The layout of x_out alone.
         in_index: Positions of the elements of x_in in the layout, shape (in_size,).
         out_index: Positions of the elements of x_out in the layout, shape (out_size,).
@@ -93,6 +95,7 @@ class BodySchema:
     manifest: Mapping[str, Any] = field(default_factory=dict)
     linear: LinearPath | None = None
     shares: Mapping[Mask, np.ndarray] = field(default_factory=dict)
+    certainty: Certainty | None = None
     out_layout: Layout = field(init=False)
     in_index: np.ndarray = field(init=False)
     out_index: np.ndarray = field(init=False)
@@ -325,8 +328,13 @@ class BodySchema:
         """Return the same body with another W, and with other errors if given."""
         return replace(self, weights=weights, errors=self.errors if errors is None else errors)
 
-    def with_bias(self, bias: np.ndarray) -> "BodySchema":
+    def with_bias(self, bias: np.ndarray, covariance: np.ndarray | None = None) -> "BodySchema":
         """Return the same network with another p, shape (bias_size,).
+
+        Args:
+            bias: p.
+            covariance: Covariance of p, shape (bias_size, bias_size); if not given, p is as uncertain as its distance
+                from the nearest trained one.
 
         Raises:
             WrongSize: p does not have this schema's size.
@@ -337,7 +345,10 @@ class BodySchema:
             raise WrongSize(f"p has shape {p.shape}; this schema's has {self.bias.shape}.")
         if not np.isfinite(p).all():
             raise NotFinite(f"p is {p.tolist()}; every element needs a finite number.")
-        return replace(self, bias=p)
+        certainty = self.certainty
+        if certainty is not None and (covariance is not None or certainty.covariance is not None):
+            certainty = certainty.at(covariance, certainty.unseen, certainty.excess)
+        return replace(self, bias=p, certainty=certainty)
 
     def under(self, condition: str) -> "BodySchema":
         """Return the same network with the trained p of a condition.
@@ -353,6 +364,10 @@ class BodySchema:
     def with_normal(self, normal: Normal | None) -> "BodySchema":
         """Return the same body with other statistics of prediction errors."""
         return replace(self, normal=normal)
+
+    def with_certainty(self, certainty: Certainty | None) -> "BodySchema":
+        """Return the same body with another calibration of the std of estimates."""
+        return replace(self, certainty=certainty)
 
     def with_manifest(self, **facts: Any) -> "BodySchema":
         """Return the same body with more facts in its manifest."""

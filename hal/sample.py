@@ -143,17 +143,17 @@ class Assembler:
         fresh = (age <= self._stale_after) & np.isfinite(values)
         np.copyto(values, np.nan, where=~fresh)
         valid = self.plausibility.check(values, received, fresh)
-        doubted = fresh & ~valid
-        has_doubts = bool(doubted.any())
-        heard = values.copy() if has_doubts else values
-        np.copyto(values, np.nan, where=doubted)
+        heard, doubted = values, None
+        if valid is not fresh:
+            doubted = fresh & ~valid
+            heard = values.copy()
+            np.copyto(values, np.nan, where=doubted)
         if self._computed:
             values, age, valid = self._with_computed(values, age, valid)
         self.heard = numbers = Numbers(values, self._elements)
-        if has_doubts:
-            places = self._direct[doubted]
+        if doubted is not None:
             self.heard = Numbers(values.copy(), self._elements)
-            self.heard.flat[places] = heard[doubted]
+            self.heard.flat[self._direct[doubted]] = heard[doubted]
         return numbers, Numbers(age, self._elements), Truths(valid, self._elements)
 
     def _with_computed(self, values: np.ndarray, age: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, ...]:

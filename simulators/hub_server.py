@@ -65,8 +65,9 @@ class HubServer:
         self._lock = _claim(self._path, self.channel)
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._path.unlink(missing_ok=True)
-        os.fchmod(self._listener.fileno(), mode_of(self._path))  # the file has this mode from the beginning
+        os.fchmod(self._listener.fileno(), mode_of(self._path))  # the file has at most this mode from the beginning
         self._listener.bind(str(self._path))
+        self._path.chmod(mode_of(self._path))  # also what umask took
         self._listener.listen(64)
         self._listener.setblocking(False)
         self._waker, self._wake = socket.socketpair()

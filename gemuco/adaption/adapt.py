@@ -9,8 +9,10 @@ from gemuco.adaption.config import UpdateConfig
 from gemuco.adaption.folds import Folds
 from gemuco.adaption.gradient import GradientSteps, mean_error
 from gemuco.adaption.recognise import recognise
+from gemuco.adaption.renewal import Renewal
 from gemuco.adaption.seen import SeenErrors, mean_squares, sample_errors, with_squares
 from gemuco.adaption.update import Updater
+from gemuco.certainty import Certainty
 from gemuco.errors import check_kind
 from gemuco.schema import BodySchema, ErrorTable, check_schema
 from gemuco.signals import check_samples
@@ -109,7 +111,7 @@ def _by_p_alone(schema: BodySchema, recognised: BodySchema, rows: np.ndarray) ->
     errors = SeenErrors(schema)
     for row in rows.astype(float):
         errors.see(chosen, row)
-    return _recorded(chosen.with_weights(chosen.weights, errors.table()), "p" if is_better else "nothing", len(rows), 0)
+    return _recorded(errors.renewed(chosen), "p" if is_better else "nothing", len(rows), 0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,6 +171,7 @@ class _Choice:
                 models, errors, chosen, steps = best.models, best.errors, final, best.steps
                 moved = " and ".join((["p"] if bias or self._has_p else []) + (["W"] if weights else []))
         chosen = chosen.with_weights(chosen.weights, self._expected(models, parts))
+        chosen = chosen.with_certainty(self._certainty(models, parts))
         return _recorded(chosen, moved, len(self._rows), steps, self._mean(before), self._mean(errors))
 
     def _replays(self) -> list[UpdateConfig]:
@@ -228,10 +231,26 @@ class _Choice:
         expected = {m: self._folds.expected(np.sqrt(after[m]), np.sqrt(before[m])) ** 2 for m in after}
         return with_squares(self._schema, expected)
 
+    def _certainty(self, models: Sequence[BodySchema], parts: Sequence[np.ndarray]) -> Certainty | None:
+        """Return the certainty renewed on the samples left out."""
+        renewal, counts = Renewal(self._schema), dict.fromkeys(self._schema.masks, 0)
+        for model, part in zip(models, parts, strict=True):
+            for m, squared in sample_errors(model, part).items():
+                covers = np.isfinite(part[:, model.layout.indices(m)]).all(axis=1)
+                for row, errors in zip(part[covers].astype(float), squared, strict=True):
+                    counts[m] += 1
+                    renewal.see(model, row, m, errors, 1.0 / counts[m])
+        return renewal.certainty()
+
 
 def _recorded(
     schema: BodySchema, moved: str, samples: int, steps: int, before: float | None = None, after: float | None = None
 ) -> BodySchema:
-    """Return the schema with the facts of its adaption in the manifest."""
+    """Return the schema with the facts of its adaption in the manifest.
+
+    The expected errors were measured with its p, so no error of p is added to them.
+    """
+    if samples and len(schema.bias):
+        schema = schema.with_bias(schema.bias, np.zeros((len(schema.bias),) * 2))
     facts = {"moved": moved, "samples": samples, "steps": steps, "error_before": before, "error_after": after}
     return schema.with_manifest(adaption=facts)

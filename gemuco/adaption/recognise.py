@@ -82,6 +82,25 @@ class Prior:
         difference = np.asarray(p, float) - other
         return float(np.sqrt(difference @ np.linalg.solve(self.covariance, difference)))
 
+    @property
+    def gap(self) -> float:
+        """Largest distance of a trained p from its nearest other one [their standard deviations]; 0 with one."""
+        if len(self.known) < 2:
+            return 0.0
+        others = (np.delete(self.known, index, axis=0) for index in range(len(self.known)))
+        pairs = zip(self.known, others, strict=True)
+        return max(min(self.between(p, other) for other in rest) for p, rest in pairs)
+
+    def beyond(self, p: np.ndarray) -> float:
+        """Return how much further p is from all trained ones than these are from each other; 0 if it is not."""
+        if len(self.known) < 2:
+            return 0.0
+        return max(0.0, min(self.between(p, known) for known in self.known) - self.gap)
+
+    def is_beyond(self, p: np.ndarray) -> bool:
+        """Whether p is further from all trained ones than these are from their nearest other ones."""
+        return self.beyond(p) > 0.0
+
     def is_settled(self, covariance: np.ndarray) -> bool:
         """Whether a p of this covariance, shape (bias_size, bias_size), is well known in every direction."""
         return bool(beliefs.is_below(covariance, SETTLED**2 * self.covariance))

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from gemuco.adaption.renewal import Renewal
 from gemuco.masks import Mask
 from gemuco.schema import BodySchema, ErrorTable
 
@@ -11,6 +12,11 @@ FORGET = 0.01
 """The newest sample has at least this share of the mean error."""
 TRUST = 5
 """The errors of the training count as this many samples."""
+
+EXPLAINED = 2.0
+"""A p explains what is seen if the errors are at most this many times as large as learned."""
+LEAST = 1e-6
+"""A learned mean square below this counts as this [standard deviations squared]."""
 
 Squares = dict[Mask, np.ndarray]
 """Mask -> mean squared error of every x_out element [standard deviations squared], shape (out_size,)."""
@@ -29,6 +35,7 @@ class SeenErrors:
         self._first = schema
         self._squares = expected_squares(schema)
         self._count = 0
+        self._renewal = Renewal(schema)
 
     def see(self, schema: BodySchema, x: np.ndarray) -> None:
         """Measure the prediction of a sample [standard deviations], shape (size,), under all masks that it covers."""
@@ -40,10 +47,54 @@ class SeenErrors:
                 squared = (schema.infer(x, m) - data) ** 2
                 known = self._squares.setdefault(m, squared)
                 self._squares[m] = np.where(np.isfinite(squared), known + share * (squared - known), known)
+                self._renewal.see(schema, x, m, squared, share)
 
-    def table(self) -> ErrorTable:
-        """Return the table of expected errors as it is now."""
-        return with_squares(self._first, self._squares)
+    def renewed(self, schema: BodySchema, unseen: np.ndarray | None = None, excess: float = 1.0) -> BodySchema:
+        """Return a schema with the expected errors and the certainty as they are now.
+
+        The errors were measured with its p, so the uncertainty of p counts less with every sample.
+
+        Args:
+            schema: The schema.
+            unseen: Whether each element was not measured since the body changed, shape (size,).
+            excess: See `Certainty`.
+        """
+        squares = dict(self._squares)
+        if excess > EXPLAINED:  # no sample of a body that changed just now is in the means
+            for m, learned in expected_squares(self._first).items():
+                squares[m] = np.maximum(squares[m], excess**2 * learned)
+        schema = schema.with_weights(schema.weights, with_squares(self._first, squares))
+        certainty = self._renewal.certainty()
+        if certainty is None or schema.certainty is None:
+            return schema
+        covariance = schema.certainty.covariance
+        if covariance is not None:
+            covariance = covariance * (TRUST / (TRUST + self._count))
+        return schema.with_certainty(certainty.at(covariance, unseen, excess))
+
+
+def excess(first: BodySchema, schema: BodySchema, rows: np.ndarray) -> float:
+    """Return the errors of a schema on samples as a share of those learned (root of the median over the samples).
+
+    Signals that a mask contains do not count: the network copies them whatever p is.
+
+    Args:
+        first: The schema whose expected errors are those learned.
+        schema: The schema that predicts.
+        rows: Samples [standard deviations], shape (n, size), NaN where not measured.
+    """
+    expected, total, count = expected_squares(first), np.zeros(len(rows)), np.zeros(len(rows))
+    for m in expected:
+        whole = np.isfinite(rows[:, schema.layout.indices(m)]).all(axis=1)
+        blind = np.array([s.name not in m for s in schema.out_layout.signals for _ in range(s.size)])
+        if not whole.any() or not blind.any():
+            continue
+        missed = schema.infer(rows[whole], m)[:, blind] - rows[whole][:, schema.out_index[blind]]
+        ratio = missed**2 / np.maximum(expected[m][blind], LEAST)
+        total[whole] += np.nansum(ratio, axis=1)
+        count[whole] += np.isfinite(ratio).sum(axis=1)
+    judged = count > 0
+    return float(np.sqrt(np.median(total[judged] / count[judged]))) if judged.any() else 1.0
 
 
 def expected_squares(schema: BodySchema) -> Squares:

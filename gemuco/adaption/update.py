@@ -6,6 +6,7 @@ of the other conditions under their own p, and goes back when its error on held-
 methods are the other choices.
 """
 
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -14,7 +15,7 @@ import numpy as np
 from gemuco.adaption.config import UpdateConfig
 from gemuco.adaption.recognise import RECOGNISERS, Prior, Recogniser
 from gemuco.adaption.relearn import Relearner
-from gemuco.adaption.seen import SeenErrors
+from gemuco.adaption.seen import EXPLAINED, SeenErrors, excess
 from gemuco.errors import SchemaError, check_kind
 from gemuco.schema import BodySchema, check_schema
 
@@ -25,6 +26,8 @@ YOUNG = 1500
 """A window of fewer samples than this gets more steps for a new sample, in inverse proportion to its samples."""
 ANOTHER = 0.3
 """The body has changed when p is this far from the p in use [standard deviations of the trained p]."""
+NEWEST = 20
+"""This is judged on at most this many of the newest samples."""
 STEADY = 0.02
 """p is settled, by gradient, when a step moves it less than this [standard deviations of the trained p]."""
 
@@ -41,7 +44,8 @@ class UpdateResult:
         dropped: Number of dropped samples: the oldest, and those before a change of the body.
         bias: p now, shape (bias_size,).
         bias_std: Its standard deviation, shape (bias_size,); NaN by gradient.
-        settled: Whether p is well known; true if p is not updated.
+        settled: Whether p is well known and explains what is seen: the errors are at most `EXPLAINED` times as large as
+            learned. True if p is not updated. W is updated also under a p that does not explain all.
         changed: Whether this step recognised a change of the body.
         held_out: Mean squared error of held-out samples when last judged [standard deviations squared].
         rolled_back: Number of times W went back.
@@ -110,6 +114,9 @@ class Updater:
         self._bias_std = np.full(len(schema.bias), np.nan)
         self._is_settled = not self._has_bias
         self._errors = SeenErrors(schema)
+        self._unseen: np.ndarray | None = None
+        self._newest: deque[np.ndarray] = deque(maxlen=NEWEST)
+        self._excess = 1.0
         self._owed = 0.0
         self._last_new: np.ndarray | None = None
         self._relearner.restart(schema)
@@ -133,6 +140,9 @@ class Updater:
         self._relearner.window.add(x)
         self._pending.append(x)
         self._errors.see(self.schema, x)
+        self._newest.append(x)
+        if self._unseen is not None:
+            self._unseen = self._unseen & ~np.isfinite(x)
         if self._is_new(x):
             self._last_new = x
             self._owed = min(self._owed + self._steps_of_a_sample(), float(YOUNG * self.config.steps))
@@ -187,7 +197,9 @@ class Updater:
                 self._is_settled = self._prior.between(before, schema.bias) < STEADY
             self.schema = schema
         if has_seen:
-            self.schema = self.schema.with_weights(self.schema.weights, self._errors.table())
+            if self._has_bias:
+                self._excess = excess(self._first, self.schema, np.array(self._newest))
+            self.schema = self._errors.renewed(self.schema, self._unseen, self._excess)
         return UpdateResult(
             steps=taken,
             loss=loss,
@@ -195,7 +207,7 @@ class Updater:
             dropped=relearner.window.dropped,
             bias=self.schema.bias,
             bias_std=self._bias_std,
-            settled=self._is_settled,
+            settled=self._is_settled and self._excess <= EXPLAINED,
             changed=has_changed,
             held_out=relearner.held_out,
             rolled_back=relearner.rolled_back,
@@ -216,10 +228,13 @@ class Updater:
                 self._since, has_changed = since, True
             self._is_settled = recognition.is_settled
             self._bias_std = np.sqrt(np.diag(recognition.covariance))
-            self.schema = self.schema.with_bias(recognition.bias)
+            self.schema = self.schema.with_bias(recognition.bias, recognition.covariance)
         if has_changed:
             self._relearner.restart(self.schema)
             self._errors, self._owed = SeenErrors(self._first), 0.0
+            self._unseen = ~np.isfinite(rows[-1])
+            self._newest.clear()
+            self._newest.extend(rows[-1:])
         return has_changed
 
     def rollback(self) -> BodySchema:

@@ -21,8 +21,9 @@ class Verdict:
     """Judgement of a body by its last samples.
 
     Attributes:
-        kind: `normal`; `environment` if another p explains the samples; `anomaly` if none does. Without parametric bias
-            every change is an anomaly. Empty if no error can be judged.
+        kind: `normal`; `environment` if another p explains the samples; `unknown` if this p, or the one in use, is
+            beyond the trained ones, so that it explains these samples and says little of others; `anomaly` if no p
+            does. Without parametric bias every change is an anomaly. Empty if no error can be judged.
         score: How far the samples are from normal under the p in use, as a share of what as many consecutive samples of
             a healthy body reach with the probability of a false alarm.
         explained: The same under the p that explains the samples best; equal to `score` if none was searched.
@@ -59,13 +60,14 @@ def judge(schema: BodySchema, samples: Iterable[Mapping[str, np.ndarray]]) -> Ve
     score = window_score(schema, rows)
     if not np.isfinite(score):
         return Verdict("", score, score, schema.bias, "")
+    prior = Prior.of(schema)
     if score <= 1.0:
-        return Verdict("normal", score, score, schema.bias, "")
+        is_beyond = len(schema.bias) > 0 and prior.is_beyond(schema.bias.astype(float))
+        return Verdict("unknown" if is_beyond else "normal", score, score, schema.bias, "")
     bias, explained = schema.bias, score
     if len(schema.bias):
-        prior = Prior.of(schema)
         bias, _ = solve(schema, Innovations(schema), prior, rows, schema.bias.astype(float))
         explained = window_score(schema.with_bias(bias), rows)
         if explained <= 1.0 and prior.between(bias, prior.mean) <= PLAUSIBLE:
-            return Verdict("environment", score, explained, bias, "")
+            return Verdict("unknown" if prior.is_beyond(bias) else "environment", score, explained, bias, "")
     return Verdict("anomaly", score, explained, bias, suspects(schema, rows)[0].name)

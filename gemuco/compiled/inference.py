@@ -57,11 +57,12 @@ def infer(flat, form, inputs, outputs, scale, clip, joined, through, path, tail,
 
     Returns:
         Root mean square of the difference between the sample and its prediction [standard deviations], NaN if no
-        element of x_out was given.
+        element of x_out was given; and the same of the elements that the mask lets through.
     """
     chain = Packed(flat, form)
     values = space(chain, 1)
     line = first(chain, values, 1)[0]
+    inside = np.zeros(len(joined), np.bool_)
     count, width = len(inputs), path.shape[1]
     given = np.zeros(count)
     for k in range(width):
@@ -70,6 +71,7 @@ def infer(flat, form, inputs, outputs, scale, clip, joined, through, path, tail,
         line[i] = 0.0
         if through[i] > 0.0:
             element = inputs[i]
+            inside[element] = True
             x = (joined[element] - scale[0, element]) / scale[1, element]
             given[i] = x
             line[i] = min(max(x, -clip), clip)
@@ -87,7 +89,7 @@ def infer(flat, form, inputs, outputs, scale, clip, joined, through, path, tail,
             prediction[i] = share * prediction[i] + direct[count, i]
             for k in range(count):
                 prediction[i] += given[k] * direct[k, i]
-    square, known = 0.0, 0
+    square, known, own, members = 0.0, 0, 0.0, 0
     for i in range(len(outputs)):
         element = outputs[i]
         mean, std = scale[0, element], scale[1, element]
@@ -97,4 +99,7 @@ def infer(flat, form, inputs, outputs, scale, clip, joined, through, path, tail,
             residual = prediction[i] - (joined[element] - mean) / std
             square += residual * residual
             known += 1
-    return np.sqrt(square / known) if known else np.nan
+            if inside[element]:
+                own += residual * residual
+                members += 1
+    return np.sqrt(square / known) if known else np.nan, np.sqrt(own / members) if members else np.nan

@@ -7,6 +7,7 @@ import numpy as np
 from gemuco.anomaly.healthy import learn_normal
 from gemuco.errors import NotEnoughData
 from gemuco.estimation import input_search, latent_search
+from gemuco.intervals.calibration import calibrate
 from gemuco.masks import Mask, all_masks, covered_by
 from gemuco.schema import BodySchema
 from gemuco.search.routes import STARTS
@@ -32,7 +33,7 @@ def assess(
     conditions: np.ndarray,
     training: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> BodySchema:
-    """Return the schema with its held-out errors and the statistics of its normal errors.
+    """Return the schema with its held-out errors, the calibration of its std, and the statistics of its normal errors.
 
     Args:
         schema: The body schema.
@@ -41,8 +42,14 @@ def assess(
         training: Samples that were learned from, and their conditions, from which every signal's relation to the others
             is learned; the held-out samples if not given.
     """
-    schema = schema.with_weights(schema.weights, measure_errors(schema, rows, conditions))
+    errors = error_rows(schema, rows, conditions)
+    schema = schema.with_weights(
+        schema.weights, {key: rms(part) * scale_of(schema, key) for key, part in errors.items()}
+    )
     learned = None if training is None else (training[0], bias_of(schema, training[1]))
+    held = schema.scaler.normalise(rows), bias_of(schema, conditions)
+    known = held[0] if learned is None else schema.scaler.normalise(learned[0])
+    schema = schema.with_certainty(calibrate(schema, held, known, errors))
     try:
         return schema.with_normal(learn_normal(schema, rows, bias_of(schema, conditions), training=learned))
     except NotEnoughData:

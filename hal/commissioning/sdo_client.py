@@ -56,6 +56,23 @@ class SdoClient:
         size = 4 - (answer[0] >> 2 & 3) if answer[0] & 0x01 else 4
         return int.from_bytes(answer[4 : 4 + size], "little")
 
+    def read_twice(self, index: int, subindex: int) -> int:
+        """Return an unsigned value that two successive readings agree on, for numbers that give all others a meaning.
+
+        Raises:
+            DeviceSilent: The node does not answer.
+            DeviceRefused: The object does not exist, is longer, or reads differently each time.
+        """
+        value = self.read(index, subindex)
+        for _ in range(TRIES):
+            before, value = value, self.read(index, subindex)
+            if value == before:
+                return value
+        raise DeviceRefused(
+            f"{self._label}: object {index:04X}h:{subindex} reads differently each time, last {value:X}h after "
+            f"{before:X}h. Do two devices have this node id?"
+        )
+
     def write(self, index: int, subindex: int, value: int, size: int) -> None:
         """Write `value` in `size` bytes, two's complement if negative.
 

@@ -59,6 +59,7 @@ class Plausibility:
         self._good = np.full(size, np.nan)  # newest plausible measurement and its time
         self._good_at = np.full(size, LONG_AGO)
         self._is_trusted = np.ones(size, bool)
+        self._has_doubts = self._is_marked = False
         self._calm_since = np.full(size, LONG_AGO)
         self._jumps = np.zeros(size, int)
         is_confirmed = bounds.return_after == 0.0  # by the next measurement, also after a pause
@@ -66,6 +67,8 @@ class Plausibility:
         self._longest = np.where(is_confirmed, period, np.inf)
         self._jumped_from = np.full(size, np.nan)
         self._stillness = Stillness(bounds, span, period)
+        self._reason = np.full(size, OK)  # for which trust was lost, and the value that was wrong
+        self._wrong = np.full(size, np.nan)
         self._state = np.full(size, OK)
         self._is_reset = False
 
@@ -82,7 +85,7 @@ class Plausibility:
         return cls(possible(config, signals, devices), span, 1.0 / config.rates.hal, quantity)
 
     def check(self, values: np.ndarray, received: np.ndarray, valid: np.ndarray) -> np.ndarray:
-        """Return whether each element may be used, shape (n,): valid and plausible.
+        """Return whether each element may be used, shape (n,): valid and plausible; `valid` itself if all are.
 
         Args:
             values: Newest measurements [their units], shape (n,).
@@ -93,23 +96,23 @@ class Plausibility:
             self._is_reset = False
             self._stillness.reset()
         bounds, before = self._bounds, self._before
-        fresh = valid & (received > self._received)
-        inside = (values >= bounds.low) & (values <= bounds.high)
-        reach = bounds.rate * (np.minimum(received - self._received, self._longest) + self._period)
-        jumped = fresh & (np.abs(values - before) > reach)
-        if jumped.any() or not (inside | ~fresh).all() or not self._is_trusted.all():
-            self._doubt(values, received, fresh, inside, jumped)
-        good = fresh & self._is_trusted
-        np.copyto(self._good, values, where=good)
-        np.copyto(self._good_at, received, where=good)
-        changed = fresh & (values != before)
+        since = received - self._received
+        fresh = valid & (since > 0.0)
+        change = np.abs(values - before)
+        outside = fresh & ((values < bounds.low) | (values > bounds.high))
+        jumped = fresh & (change > bounds.rate * (np.minimum(since, self._longest) + self._period))
+        if self._has_doubts or (outside | jumped).any():
+            self._doubt(values, received, fresh, outside, jumped)
         np.copyto(before, values, where=fresh)
         np.copyto(self._received, received, where=fresh)
-        frozen = self._stillness.note(values, received, changed)
+        frozen = self._stillness.note(values, received, fresh & (change != 0.0))
+        if not self._has_doubts and not self._stillness.is_any_frozen:
+            if self._is_marked:
+                self._state, self._is_marked = np.full_like(self._state, OK), False
+            return valid
         usable: np.ndarray = valid & self._is_trusted & ~frozen
-        trusted_state = np.where(frozen, FROZEN, OK)
-        doubted_state = np.where(fresh, np.where(inside, JUMP, RANGE), self._state)
-        self._state = np.where(self._is_trusted, trusted_state, doubted_state)
+        self._state = np.where(self._is_trusted, np.where(frozen, FROZEN, OK), self._reason)
+        self._is_marked = True
         self.count += int(np.count_nonzero(fresh & ~usable))
         return usable
 
@@ -130,11 +133,12 @@ class Plausibility:
         self._stillness.command(None if self._quantity == "effort" else set_point)
 
     def _doubt(
-        self, values: np.ndarray, received: np.ndarray, fresh: np.ndarray, inside: np.ndarray, jumped: np.ndarray
+        self, values: np.ndarray, received: np.ndarray, fresh: np.ndarray, outside: np.ndarray, jumped: np.ndarray
     ) -> None:
-        """Take and give back trust: `jumped` and not `inside` take it, a jump back or a calm time gives it back."""
+        """Take and give back trust: `outside` and `jumped` take it, a jump back or a calm time gives it back."""
         bounds, trusted = self._bounds, self._is_trusted
-        outside = fresh & ~inside
+        np.copyto(self._good, self._before, where=trusted)
+        np.copyto(self._good_at, self._received, where=trusted)
         calm = received - self._calm_since
         away = received - self._good_at
         self._jumps[trusted & (calm >= bounds.return_after) & ~jumped] = 0
@@ -142,25 +146,29 @@ class Plausibility:
         is_near = np.abs(values - self._good) <= bounds.rate * (np.minimum(away, JUMP_BACK) + self._period)
         back = jumped & ~trusted & is_near & (away <= JUMP_BACK) & (self._jumps <= JUMPS_FORGIVEN)
         after = np.where(self._jumps == 1, self._stays, bounds.return_after)
-        returned = fresh & inside & ~jumped & (calm >= after)
+        returned = fresh & ~outside & ~jumped & (calm >= after)
         np.copyto(self._jumped_from, self._good, where=jumped & trusted)
+        np.copyto(self._wrong, values, where=jumped | outside)
+        np.copyto(self._reason, JUMP, where=jumped)
+        np.copyto(self._reason, RANGE, where=outside)
         np.copyto(self._calm_since, received, where=jumped | outside)
         self._is_trusted = np.where(outside | (jumped & ~back), False, trusted | back | returned)
+        self._has_doubts = not self._is_trusted.all()
 
     def texts(self) -> dict[str, str]:
         """Return the reason for every implausible element, as `signal.element` -> sentence."""
         state, bounds = self._state.copy(), self._bounds
         texts = {}
         for index in np.flatnonzero(state != OK).tolist():
-            name, value = bounds.names[index], self._before[index]
+            name, value, wrong = bounds.names[index], self._before[index], self._wrong[index]
             if state[index] == RANGE:
                 reason = (
-                    f"reads {value:.4g}, possible is {bounds.low[index]:.4g} to {bounds.high[index]:.4g}. "
+                    f"read {wrong:.4g}, possible is {bounds.low[index]:.4g} to {bounds.high[index]:.4g}. "
                     "Is the sensor broken, its wire loose, its scale right?"
                 )
             elif state[index] == JUMP:
                 reason = (
-                    f"jumped from {self._jumped_from[index]:.4g} to {value:.4g}; possible is a change of "
+                    f"jumped from {self._jumped_from[index]:.4g} to {wrong:.4g}; possible is a change of "
                     f"{bounds.rate[index] * self._period:.3g} per cycle. Does the sensor slip or its wire break?"
                 )
             else:
@@ -168,7 +176,7 @@ class Plausibility:
                     f"reads {value:.6g} without a change of any bit while the robot is commanded to move. "
                     "Is the sensor frozen, or at an end of its range?"
                 )
-            texts[name] = f"{name} {reason}"
+            texts[name] = f"'{name}' {reason}"
         return texts
 
 
@@ -189,7 +197,8 @@ class Stillness:
         self._moved_at = np.full(size, np.inf)
         self._has_changed = np.zeros(size, bool)
         self._is_frozen = np.zeros(size, bool)
-        self._is_any_frozen = False
+        self.is_any_frozen = False
+        """Whether any element is frozen, or was until its bits have just changed."""
         self._rows = np.arange(size)
         self._is_watching = bool(np.isfinite(self._after).any())
         self._set_point: np.ndarray | None = None
@@ -205,7 +214,7 @@ class Stillness:
 
     def reset(self) -> None:
         """Begin again, without a frozen element."""
-        self._is_frozen, self._is_any_frozen = np.zeros_like(self._is_frozen), False
+        self._is_frozen, self.is_any_frozen = np.zeros_like(self._is_frozen), False
         self._moved_at[:] = np.inf
         self._start[:] = np.nan
 
@@ -214,7 +223,7 @@ class Stillness:
         if not self._is_watching:
             return self._is_frozen
         self._has_changed |= changed
-        if self._is_any_frozen:
+        if self.is_any_frozen:
             self._is_frozen = self._is_frozen & ~changed
         self._count += 1
         if self._count % self._every == 0:
@@ -236,4 +245,4 @@ class Stillness:
             np.copyto(self._moved_at, received, where=moved & np.isinf(self._moved_at))
         still = (received - self._moved_at > self._after) & (np.abs(values) > self._unloaded)
         self._is_frozen = self._is_frozen | still
-        self._is_any_frozen = bool(self._is_frozen.any())
+        self.is_any_frozen = bool(self._is_frozen.any())

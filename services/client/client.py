@@ -184,6 +184,8 @@ class Client:
             method={name: part["method"] for name, part in signals.items()},
             mask={name: part["mask"] for name, part in signals.items()},
             residual={name: part["residual"] for name, part in signals.items()},
+            state={name: part["state"] for name, part in signals.items() if "state" in part},
+            reason={name: part["reason"] for name, part in signals.items() if part.get("reason")},
         )
 
     def anomaly(

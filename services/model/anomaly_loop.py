@@ -33,7 +33,7 @@ VERDICT_RATE = 10.0
 PATIENCE = 1.0
 """An anomaly without a verdict after this time [s] is published without one."""
 UNKNOWN = "unknown"
-"""This verdict says that what is normal has not been learned on this body yet."""
+"""This verdict says that what is normal has not been learned on this body yet, or that p is beyond the trained ones."""
 
 
 class _Judged(NamedTuple):
@@ -199,7 +199,7 @@ class AnomalyWatch:
             cycle=cycle,
             score=deviation.distance,
             threshold=deviation.threshold,
-            is_anomaly=is_known and has_lasted and kind not in ("environment", "normal"),
+            is_anomaly=is_known and has_lasted and kind not in ("environment", "normal", UNKNOWN),
             blamed=blamed if is_known else "",
             elements=elements,
             contribution=Numbers(deviation.contribution, elements),

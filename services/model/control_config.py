@@ -95,6 +95,8 @@ class ControlConfig(Section):
     """Without terms, the loss is to match the target."""
     speed: Positive = 1.0
     """The reference moves from the present posture to the target at this speed [unit/s]."""
+    unknown: Literal["slow", "hold", "ignore"] = "slow"
+    """Where the body is unknown the reference moves at a tenth of this speed, does not go there, or goes as usual."""
 
 
 class SimulationConfig(Section):

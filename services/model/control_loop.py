@@ -7,6 +7,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from gemuco.intervals.sureness import SURE, UNKNOWN, Sureness
 from hal.clock import Clock
 from hal.config import RobotConfig
 from services.errors import CommandHeld, NotEngaged, TargetRefused, TooLate
@@ -20,6 +21,8 @@ BUMP = 0.3
 """The difference between the first command and the measured value decays with this time constant [s]."""
 LONGEST_STEP = 0.1
 """A late tick moves the reference at most as far as this time [s] allows."""
+SLOW = 0.1
+"""Share of the speed of the reference where the body is unknown."""
 LIVE_MODES = ("hold", "follow")
 DEAD_MODES = ("off", "homing", "stopping", "fault")
 
@@ -57,6 +60,13 @@ def check_target(robot: RobotConfig, config: ControlConfig, target: Target) -> n
     return np.array(target.values, float)
 
 
+def _towards(start: np.ndarray, end: np.ndarray, step: float) -> np.ndarray:
+    """Return the point on a straight line whose elements are at most `step` from the start; the end if it is nearer."""
+    distance = end - start
+    longest = float(np.abs(distance).max())
+    return end if longest <= step else start + distance * (step / longest)
+
+
 class Control:
     """The controller: it moves a reference towards the target, solves for the command, and sends it while safe."""
 
@@ -70,8 +80,22 @@ class Control:
         solver: Solver,
         send: Callable[[Command], None],
         clock: Clock,
+        judge: Callable[[np.ndarray], Sureness] = lambda _: SURE,
     ) -> None:
-        """Prepare; `newest` and `applied` return the newest messages of the HAL."""
+        """Prepare.
+
+        Args:
+            robot: The robot file's content.
+            config: Its `control` section.
+            newest: Returns the newest sample of the HAL.
+            applied: Returns the newest applied set-points.
+            estimation: The estimation loop.
+            solver: Solves for the command.
+            send: Sends a command.
+            clock: Source of time.
+            judge: Judges whether the body is known at a reference [unit of the target], shape (n,).
+        """
+        self._judge = judge
         self._robot, self._config, self._clock = robot, config, clock
         self._newest, self._applied, self._estimation = newest, applied, estimation
         self._solver, self._send = solver, send
@@ -93,8 +117,12 @@ class Control:
             TargetRefused: The target is not valid; the one before stays.
         """
         values = check_target(self._robot, self._config, target)
+        there = self._judge(values)
         with self._lock:
             self._target, self.text = values, ""
+            if there.state == UNKNOWN and self._config.unknown != "ignore":
+                word = "is slow" if self._config.unknown == "slow" else "stops"
+                self.text = f"The body is unknown at this target ({there.reason}), so the reference {word} before it."
 
     def try_target(self, target: Target, check: Callable[[Target], None] = lambda _: None) -> None:
         """Set a published target, whose sender gets no answer; `facts` reports and counts refusals.
@@ -193,10 +221,29 @@ class Control:
         step = self._config.speed * min(now - self._ticked_at, LONGEST_STEP)
         self._ticked_at = now
         if self._reference is not None and self._target is not None:
-            distance = self._target - self._reference
-            longest = float(np.abs(distance).max())
-            self._reference = self._target if longest <= step else self._reference + distance * (step / longest)
+            ahead = _towards(self._reference, self._target, step)
+            if self._config.unknown != "ignore" and not np.array_equal(ahead, self._reference):
+                ahead = self._careful(ahead, self._target, step)
+            self._reference = ahead
         return self._reference
+
+    def _careful(self, ahead: np.ndarray, target: np.ndarray, step: float) -> np.ndarray:
+        """Return the next reference: slower, or the present one, where the body is unknown.
+
+        A reference that is outside already may come back to a target at which the body is known.
+        """
+        assert self._reference is not None
+        there = self._judge(ahead)
+        latest = self._estimation.latest
+        if latest is not None and latest.state.get(self._config.target) == UNKNOWN:
+            there = Sureness(UNKNOWN, latest.reason.get(self._config.target, ""))
+        if there.state != UNKNOWN:
+            return ahead
+        if self._config.unknown == "hold" and self._judge(target).state == UNKNOWN:
+            self.text = f"The reference holds, because the body is unknown ahead: {there.reason}."
+            return self._reference
+        self.text = f"The reference is slow, because the body is unknown: {there.reason}."
+        return _towards(self._reference, target, SLOW * step)
 
     def _command(self, reference: np.ndarray, now: Mapping[str, np.ndarray]) -> np.ndarray:
         """Solve for the command, and blend it in from the measured values at the first tick."""

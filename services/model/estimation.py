@@ -9,13 +9,18 @@ from msgspec.structs import replace
 
 from gemuco.compiled.usable import usable
 from gemuco.estimation import fill
+from gemuco.intervals.sureness import DOUBTFUL, SURE, Sureness
 from gemuco.schema import BodySchema
 from hal.by_signal import Elements, Numbers, Truths
 from hal.clock import Clock
 from hal.config import RobotConfig
+from services.model.fusion import Fusion
 from services.model.living_model import layout_of
 from services.wire.messages import Estimates, Sample
 from services.wire.streams import Arrival
+
+WRONG = 3.0
+"""An estimate is doubtful if the errors of its element were this many times as large as learned, while it was seen."""
 
 SampleSource = Callable[[], Arrival[Sample] | None]
 """A function of this type returns the newest sample, of any age."""
@@ -134,6 +139,23 @@ def in_order(schema: BodySchema, values: Numbers) -> Numbers:
     return ordered
 
 
+def _widened(
+    schema: BodySchema, sureness: dict[str, Sureness], estimated: np.ndarray, factor: np.ndarray
+) -> dict[str, Sureness]:
+    """Return the states; a signal that was predicted badly while it was measured is doubtful."""
+    if not (bad := estimated & (factor > WRONG)).any():
+        return sureness
+    states = dict(sureness)
+    for name, span in schema.layout.slices.items():
+        if bad[span].any() and states[name] is SURE:
+            worst = schema.layout.element(span.start + int(np.argmax(factor[span] * bad[span])))
+            text = (
+                f"while it was measured, the errors of {worst} were {factor[span].max():.1f} times as large as learned"
+            )
+            states[name] = Sureness(DOUBTFUL, text)
+    return states
+
+
 class Estimation:
     """The source of one `Estimates` per tick, from the newest sample."""
 
@@ -143,11 +165,23 @@ class Estimation:
         schema: Callable[[], BodySchema],
         publish: Callable[[Estimates], None],
         clock: Clock,
+        factor: Callable[[], np.ndarray | None] = lambda: None,
+        fusion: Fusion | None = None,
     ) -> None:
-        """Prepare; `schema` returns the body schema in use."""
+        """Prepare.
+
+        Args:
+            freshness: Source of samples.
+            schema: Returns the body schema in use.
+            publish: Publishes the estimates.
+            clock: Source of time.
+            factor: Returns the factors on the std of the schema's elements, shape (size,), if there are any.
+            fusion: Combines measurements with estimates; without it they are published as measured.
+        """
         self._freshness, self._schema, self._publish, self._clock = freshness, schema, publish, clock
-        self._source: tuple[BodySchema, Numbers] | None = None
-        """This holds the schema and the values of `latest`."""
+        self._factor, self._fusion = factor, fusion
+        self._source: tuple[BodySchema, Numbers, np.ndarray | None] | None = None
+        """This holds the schema, the values and the factors of `latest`."""
         self._newest: Sample | None = None
         self._waited: float | None = None
         self.latest: Estimates | None = None
@@ -160,11 +194,13 @@ class Estimation:
         self._newest = None if fresh is None else fresh.message
         schema, stamp_ns = self._schema(), self._clock.now_ns()
         cycle = -1 if fresh is None else fresh.message.cycle
-        source = self._source
-        if self.latest is not None and source is not None and source[0] is schema and source[1] is values:
+        source, factor = self._source, self._factor()
+        is_same = source is not None and source[0] is schema and source[1] is values and source[2] is factor
+        if self.latest is not None and is_same:
             self.latest = replace(self.latest, stamp_ns=stamp_ns, cycle=cycle)
         else:
-            self.latest, self._source = _estimates(schema, in_order(schema, values), stamp_ns, cycle), (schema, values)
+            self.latest = _estimates(schema, in_order(schema, values), factor, self._fusion, stamp_ns, cycle)
+            self._source = schema, values, factor
         self._publish(self.latest)
 
     def waited(self) -> float | None:
@@ -174,12 +210,22 @@ class Estimation:
     def counts(self) -> dict[str, int]:
         """Count the signals that were `measured`, `estimated`, or neither (`none`) in the last tick."""
         methods = list(self.latest.method.values()) if self.latest is not None else []
-        measured, none = methods.count("measured"), methods.count("none")
+        measured, none = methods.count("measured") + methods.count("fused"), methods.count("none")
         return {"measured": measured, "estimated": len(methods) - measured - none, "none": none}
 
 
-def _estimates(schema: BodySchema, values: Numbers, stamp_ns: int, cycle: int) -> Estimates:
-    value, residual, recipe = fill(schema, values.flat)
+def _estimates(
+    schema: BodySchema, values: Numbers, factor: np.ndarray | None, fusion: Fusion | None, stamp_ns: int, cycle: int
+) -> Estimates:
+    value, std, residual, sureness, recipe = fill(schema, values.flat)
+    if factor is not None and recipe.steps:
+        std, sureness = std * factor, _widened(schema, sureness, recipe.estimated, factor)
+    method = dict(recipe.method)
+    if fusion is not None:
+        value, std, is_fused = fusion.fuse(schema, values.flat, value, std, factor)
+        for name, span in schema.layout.slices.items():
+            if method[name] == "measured" and is_fused[span].any():
+                method[name] = "fused"
     elements = values.elements
     return Estimates(
         stamp_ns=stamp_ns,
@@ -187,8 +233,10 @@ def _estimates(schema: BodySchema, values: Numbers, stamp_ns: int, cycle: int) -
         elements=elements,
         values=Numbers(value, elements),
         estimated=Truths(recipe.estimated, elements),
-        std=Numbers(recipe.std, elements),
-        method=dict(recipe.method),
+        std=Numbers(std, elements),
+        method=method,
         mask=dict(recipe.label),
         residual=residual,
+        state={name: sure.state for name, sure in sureness.items()},
+        reason={name: sure.reason for name, sure in sureness.items() if sure.reason},
     )

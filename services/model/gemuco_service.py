@@ -10,7 +10,10 @@ import numpy as np
 from msgspec.structs import replace
 
 from gemuco.adaption import update as adapt
+from gemuco.certainty import Certainty
 from gemuco.errors import SchemaError
+from gemuco.intervals.region import Region
+from gemuco.intervals.sureness import Sureness
 from gemuco.schema import BodySchema
 from gemuco.search.descent import NewtonConfig
 from hal.clock import SystemClock
@@ -22,6 +25,8 @@ from services.model.anomaly_loop import VERDICT_RATE, AnomalyWatch
 from services.model.control_config import ControlConfig, controller_of
 from services.model.control_loop import Control
 from services.model.estimation import Estimation, Freshness
+from services.model.fusion import Fusion
+from services.model.hindsight import Hindsight
 from services.model.living_model import LivingModel
 from services.model.model_config import ModelConfig, model_config
 from services.model.update_loop import OnlineUpdate
@@ -76,9 +81,17 @@ class ModelSolver:
         self._has_converged = False
         self._command = np.full(len(low), np.nan)
         self._target = config.target
+        self._region: tuple[np.ndarray, Certainty | None, Region] | None = None
         self._within = SHARE / robot.rates.control
         self.late = 0
         """This is the number of solves that ran out of time."""
+
+    def judge(self, reference: np.ndarray) -> Sureness:
+        """Return whether the body is known at a reference [unit of the target], shape (n,)."""
+        schema, known = self._living.schema, self._region
+        if known is None or known[0] is not schema.anchors or known[1] is not schema.certainty:
+            known = self._region = schema.anchors, schema.certainty, Region(schema, self._target)
+        return known[2].judge(reference)
 
     def __call__(self, target: Mapping[str, np.ndarray], now: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return the command [its unit], shape (n,), that reaches a target."""
@@ -121,7 +134,11 @@ class GemucoService:
         )
         self.history = HistoryRing({s.name: s.size for s in schema.layout.signals}, robot.rates.estimation)
         self._estimates = service.publisher(keys.estimate(robot.robot), Estimates)
-        self.estimation = Estimation(self.freshness, self._schema, self._publish, self.clock)
+        self.hindsight = Hindsight(self.freshness, self._schema, self.clock)
+        self.estimation = Estimation(
+            self.freshness, self._schema, self._publish, self.clock, lambda: self.hindsight.factor,
+            Fusion(schema.layout.size) if self.config.fuse else None,
+        )  # fmt: skip
         self.acquaintance = Acquaintance()
         self.anomaly = AnomalyWatch(
             self.freshness,
@@ -163,7 +180,7 @@ class GemucoService:
             loop("control", rates.control, self._control_tick),
             loop("anomaly", rates.anomaly, anomaly.tick),
             loop("update", rates.update, self.update.tick),
-            loop("verdict", VERDICT_RATE, anomaly.judge),
+            loop("verdict", VERDICT_RATE, self._look_back),
         ]
 
     def enable_hal(self) -> dict[str, Any]:
@@ -267,7 +284,7 @@ class GemucoService:
         return (
             Control(
                 self.robot, config.control, self._samples.last, self._newest_applied, self.estimation, solver,
-                lambda command: commands.put(replace(command, name=self.permission.name)), self.clock,
+                lambda command: commands.put(replace(command, name=self.permission.name)), self.clock, solver.judge,
             ),
             "",
         )  # fmt: skip
@@ -276,6 +293,11 @@ class GemucoService:
         """Return the numbers of messages that came `repeated` or `late`, and were not used."""
         orders = [reader.order.counters for reader in self._readers()]
         return {name: sum(counters[name] for counters in orders) for name in ("repeated", "late")}
+
+    def _look_back(self) -> None:
+        """Judge the last samples, and measure the errors of the model on them."""
+        self.anomaly.judge()
+        self.hindsight.look()
 
     def _readers(self) -> list[Reader[Any]]:
         readers: list[Reader[Any] | None] = [self._samples, self._seen, self._applied]

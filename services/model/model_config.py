@@ -104,6 +104,8 @@ class ModelConfig(Section):
 
     signals: tuple[str, ...] = ()
     """These signals are the body schema's x; by default all signals of the robot."""
+    fuse: bool = False
+    """Whether a measured output is combined with its estimate from the other signals, by their variances."""
     network: NetworkConfig = NetworkConfig()
     structure: StructureConfig = StructureConfig()
     training: TrainingConfig = TrainingConfig()

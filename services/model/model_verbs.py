@@ -223,8 +223,8 @@ class ModelVerbs:
 def _estimates(schema: BodySchema, values: Mapping[str, np.ndarray]) -> dict[str, dict[str, Any]]:
     joined = schema.layout.join_one(values)
     joined.setflags(write=False)
-    completion, residual, recipe = fill(schema, joined)
-    value, std, estimated = completion.tolist(), recipe.std.tolist(), recipe.estimated.tolist()
+    completion, expected, residual, sureness, recipe = fill(schema, joined)
+    value, std, estimated = completion.tolist(), expected.tolist(), recipe.estimated.tolist()
     return {
         signal.name: {
             "signal": signal.name,
@@ -236,6 +236,8 @@ def _estimates(schema: BodySchema, values: Mapping[str, np.ndarray]) -> dict[str
             "method": recipe.method[signal.name],
             "mask": recipe.label[signal.name],
             "residual": residual[signal.name],
+            "state": sureness[signal.name].state,
+            "reason": sureness[signal.name].reason,
         }
         for signal, span in zip(schema.layout.signals, schema.layout.slices.values(), strict=True)
     }

@@ -141,15 +141,22 @@ def _signals(rows: Sequence[SignalRow]) -> Table:
         ages = [row.age for row in own if not math.isnan(row.age)]
         is_measured = all(kind is Kind.MEASURED for kind in kinds)
         method = estimated.method if estimated is not None else "measured" if is_measured else "none"
+        state = estimated.state if estimated is not None and estimated.state != "known" else ""
         table.add_row(
             plain(signal),
             f"{kinds.count(Kind.MEASURED)}/{len(own)}",
             f"{1e3 * max(ages):.1f}" if ages else "-",
-            Text(plain(method), style="green" if is_measured else "red" if method == "none" else "yellow"),
+            Text(plain(f"{method}, {state}" if state else method), style=_style(is_measured, method, state)),
             Text(plain(estimated.source) if estimated is not None else "-"),
             _numbers([math.nan if row.kind is Kind.OLD else row.value for row in own], kinds),
         )
     return table
+
+
+def _style(is_measured: bool, method: str, state: str) -> str:
+    if is_measured:
+        return "green"
+    return "red" if method == "none" or state == "unknown" else "yellow"
 
 
 def _numbers(values: Sequence[float] | np.ndarray, kinds: Sequence[Kind] = ()) -> str:

@@ -7,6 +7,7 @@ from html import escape
 
 import numpy as np
 
+from gemuco.certainty.certainty import NINETY
 from services.view.trail import WINDOW
 
 COLORS = (
@@ -22,12 +23,21 @@ ROOMY = 3.0
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """One curve: name in the legend, values with NaN in gaps, shape (k,), color and style."""
+    """One curve.
+
+    Attributes:
+        name: Name in the legend.
+        values: Values with NaN in gaps, shape (k,).
+        color: Color of the curve.
+        dashed: Whether it is dashed.
+        half: Half the height of a band around the values, shape (k,); without it no band is drawn.
+    """
 
     name: str
     values: np.ndarray
     color: str
     dashed: bool = False
+    half: np.ndarray | None = None
 
 
 class Chart:
@@ -67,6 +77,7 @@ class Chart:
             parts.append(f'<text x="{x:.1f}" y="{self._height - 5}" text-anchor="{anchor}" class="axis">{label}</text>')
         parts.append(f'<text x="{LEFT + 4}" y="{TOP + 10}" class="axis">{escape(unit)}</text>')
         xs = self._x(time)
+        parts += [self._band(xs, line, low, high) for line in lines if line.half is not None]
         parts += [self._curve(xs, line, low, high) for line in lines]
         return "".join(parts) + "</svg>"
 
@@ -75,6 +86,20 @@ class Chart:
 
     def _y(self, value: float, low: float, high: float) -> float:
         return TOP + (high - value) / (high - low) * (self._height - TOP - BOTTOM)
+
+    def _band(self, xs: np.ndarray, line: Line, low: float, high: float) -> str:
+        """Return the band around a curve, cut at the frame."""
+        assert line.half is not None
+        is_drawn = np.isfinite(line.values) & np.isfinite(line.half) & (xs >= LEFT)
+        shapes = []
+        for run in np.split(np.arange(len(xs)), np.flatnonzero(np.diff(is_drawn)) + 1):
+            if not len(run) or not is_drawn[run[0]]:
+                continue
+            upper = [(xs[k], min(line.values[k] + line.half[k], high)) for k in run]
+            lower = [(xs[k], max(line.values[k] - line.half[k], low)) for k in run[::-1]]
+            corners = " ".join(f"{x:.0f},{self._y(value, low, high):.1f}" for x, value in (*upper, *lower))
+            shapes.append(f'<polygon points="{corners}" fill="{line.color}" fill-opacity="0.2"/>')
+        return "".join(shapes)
 
     def _curve(self, xs: np.ndarray, line: Line, low: float, high: float) -> str:
         path, pen_down = [], False
@@ -114,14 +139,15 @@ def ticks(low: float, high: float) -> list[float]:
 def legend(lines: Sequence[Line]) -> str:
     """Return the names of the solid curves, in their colors."""
     names = (f'<span style="color:{line.color}">━ {escape(line.name)}</span>' for line in lines if not line.dashed)
-    return f'<div class="legend">{" ".join(names)} <span class="dim">╍ estimated</span></div>'
+    return f'<div class="legend">{" ".join(names)} <span class="dim">╍ estimated, with the band of 90 %</span></div>'
 
 
-def signal_lines(elements: Sequence[str], measured: np.ndarray, estimated: np.ndarray) -> list[Line]:
-    """Return the curves of elements from measured and estimated values, each of shape (elements, k)."""
+def signal_lines(elements: Sequence[str], measured: np.ndarray, estimated: np.ndarray, std: np.ndarray) -> list[Line]:
+    """Return the curves of elements from measured and estimated values and std, each of shape (elements, k)."""
     lines: list[Line] = []
     for index, element in enumerate(elements):
         color = COLORS[index % len(COLORS)]
         lines.append(Line(element, measured[index], color))
-        lines.append(Line(element, estimated[index], "#ffb454" if len(elements) == 1 else color, dashed=True))
+        own = "#ffb454" if len(elements) == 1 else color
+        lines.append(Line(element, estimated[index], own, dashed=True, half=NINETY * std[index]))
     return lines

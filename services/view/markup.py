@@ -86,6 +86,10 @@ def _signal_lines(rows: Sequence[SignalRow]) -> Iterator[str]:
         if origin is not None:
             method = f" ({origin.method})" if origin.method not in ("", "mask") else ""
             recipe = escape(f" estimated from {origin.source}{method}")
+        bad = next((row for row in own if row.state in ("doubtful", "unknown")), None)
+        if bad is not None:
+            tone = "lost" if bad.state == "unknown" else "poor"
+            recipe += f' <span class="{tone}" title="{escape(bad.reason)}">{escape(bad.state)}</span>'
         unit = f"<small>[{escape(own[0].unit)}]</small>"
         title = f'{escape(signal)} {unit}<small class="k-estimated">{recipe}</small>'
         yield f'<tr class="s"><th colspan="5">{title}</th></tr>'

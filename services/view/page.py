@@ -193,7 +193,7 @@ class Page:
         rows = [row for row in self._rows if chosen in (row.signal, row.name)]
         if rows:
             curves = self._trail.curves([row.name for row in rows], now)
-            lines = signal_lines([row.element for row in rows], curves.measured, curves.estimated)
+            lines = signal_lines([row.element for row in rows], curves.measured, curves.estimated, curves.std)
             _set(self._plot, page(self._chart.svg(curves.time, lines, rows[0].unit, chosen) + legend(lines)))
         time, score, threshold = self._trail.scores(now)
         lines = [Line("score", score, "#7cc0ff"), Line("threshold", threshold, "#ff7b7b", dashed=True)]

@@ -28,11 +28,17 @@ class Curves:
         time: Time relative to now [s], shape (k,).
         measured: Measured values, NaN where there are none, shape (elements, k).
         estimated: Estimated values, NaN where there are none, shape (elements, k).
+        std: Expected errors of the estimates, NaN where there are none, shape (elements, k).
     """
 
     time: np.ndarray
     measured: np.ndarray
     estimated: np.ndarray
+    std: np.ndarray
+
+
+NOTHING = (np.nan, np.nan, np.nan)
+"""This is a moment without a value: measured, estimated, std."""
 
 
 class Trail:
@@ -40,7 +46,7 @@ class Trail:
 
     def __init__(self) -> None:
         self._times: deque[float] = deque(maxlen=POINTS)
-        self._values: dict[str, deque[tuple[float, float]]] = {}
+        self._values: dict[str, deque[tuple[float, float, float]]] = {}
         self._scores: deque[tuple[float, float]] = deque(maxlen=POINTS)
         self._bias: deque[np.ndarray] = deque(maxlen=WAY)
 
@@ -50,12 +56,16 @@ class Trail:
             return
         present = {row.name: row for row in rows}
         for name in present.keys() - self._values.keys():
-            self._values[name] = deque([(np.nan, np.nan)] * len(self._times), maxlen=POINTS)
+            self._values[name] = deque([NOTHING] * len(self._times), maxlen=POINTS)
         self._times.append(now)
         for name, values in self._values.items():
             row = present.get(name)
-            measured = row.value if row is not None and row.kind is Kind.MEASURED else np.nan
-            values.append((measured, row.value if row is not None and row.kind is Kind.ESTIMATED else np.nan))
+            if row is not None and row.kind is Kind.MEASURED:
+                values.append((row.value, np.nan, np.nan))
+            elif row is not None and row.kind is Kind.ESTIMATED:
+                values.append((np.nan, row.value, row.std))
+            else:
+                values.append(NOTHING)
         anomaly = fresh(snapshot.anomaly)
         self._scores.append((np.nan, np.nan) if anomaly is None else (anomaly.score, anomaly.threshold))
         update = fresh(snapshot.update)
@@ -65,11 +75,11 @@ class Trail:
     def curves(self, names: Sequence[str], now: float) -> Curves:
         """Return the curves of elements (`signal.element`); NaN for unknown elements."""
         time = self._since(now)
-        both = np.full((2, len(names), len(time)), np.nan)
+        all_three = np.full((3, len(names), len(time)), np.nan)
         for index, name in enumerate(names):
             if values := self._values.get(name):
-                both[:, index] = np.array(values).T
-        return Curves(time, both[0], both[1])
+                all_three[:, index] = np.array(values).T
+        return Curves(time, *all_three)
 
     def scores(self, now: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return time relative to now [s], anomaly score and threshold, each of shape (k,)."""

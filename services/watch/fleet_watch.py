@@ -18,6 +18,7 @@ from services.watch.snapshot import Newest, RobotSnapshot
 from services.wire import keys
 from services.wire.member import member_of
 from services.wire.messages import Holder, Message, MessageError, Status
+from services.wire.order import Order
 from services.wire.session import CLIENT, close_session, endpoint, open_with, settings
 from services.wire.streams import received_message
 
@@ -44,6 +45,7 @@ class ServiceRecord:
         is_alive: Whether the liveliness token is present.
         boots: Boot of each process -> arrival of its newest status [monotonic s].
         twin_until: Time until which two processes count as publishing under this name [monotonic s].
+        order: Order of the statuses of each process.
     """
 
     status: Status | None = None
@@ -51,9 +53,15 @@ class ServiceRecord:
     is_alive: bool = False
     boots: dict[int, float] = field(default_factory=dict)
     twin_until: float = -1e9
+    order: Order = field(default_factory=Order)
 
     def add(self, status: Status, now: float) -> None:
-        """Add a status; a new boot after the old one is a restart, boots in turns are two processes."""
+        """Add a status; a new boot after the old one is a restart, boots in turns are two processes.
+
+        A status that came before, or after a newer one of its process, is left out.
+        """
+        if self.order.problem(status):
+            return
         last = self.status.boot if self.status is not None else status.boot
         if status.boot != last and now - self.boots.get(status.boot, -1e9) < TWIN_FOR:
             self.twin_until = now + TWIN_FOR
@@ -68,6 +76,7 @@ class RobotRecord:
         self.robot = robot
         self.services: dict[str, ServiceRecord] = {}
         self.holder: tuple[float, Holder] | None = None
+        self.holders = Order()
         self.active_at = now
         """The last message or token of the robot arrived at this time [monotonic s]."""
 
@@ -209,7 +218,7 @@ class FleetWatch:
         if (holder := self._decoded(sample, Holder)) is None:
             return
         with self._lock:
-            if records := self._records(str(sample.key_expr)):
+            if (records := self._records(str(sample.key_expr))) and not records[0].holders.problem(holder):
                 records[0].holder = (records[2], holder)
 
     def _decoded(self, sample: zenoh.Sample, record: type[M]) -> M | None:

@@ -30,13 +30,15 @@ def snapshot_of(client: Client, alive: Iterable[str], clock: Clock | None = None
         clock: Clock of the ages.
         more: Further attributes of the snapshot.
     """
-    now, refused = (clock or SystemClock()).monotonic(), dict[str, None]()
+    now, refused, disordered = (clock or SystemClock()).monotonic(), dict[str, None](), dict[str, None]()
 
     def newest(key: str, record: type[M]) -> Newest[M] | None:
         reader = client.reader(key, record)
         last = reader.last()
         if text := reader.other_version(FRESH_STATUS):
             refused[text] = None
+        if text := reader.disorder(FRESH_STATUS):
+            disordered[text] = None
         return None if last is None else Newest(last.message, max(0.0, now - last.received))
 
     robot = client.robot
@@ -53,6 +55,7 @@ def snapshot_of(client: Client, alive: Iterable[str], clock: Clock | None = None
         holder=newest(keys.holder(robot), Holder),
         statuses={name: status for name, status in statuses.items() if status is not None},
         refused=tuple(refused),
+        disordered=tuple(disordered),
         **more,
     )
 

@@ -33,6 +33,8 @@ class SignalRow:
         age: Time since it was last measured [s]; infinite if it never was, NaN if unknown.
         source: Signals from which an estimate was made; empty otherwise.
         method: `mask`, `latent` or `input`; empty if nothing was estimated.
+        state: `known`, `doubtful` or `unknown`: whether an estimate is inside of what was learned; empty if not said.
+        reason: One sentence on the state.
     """
 
     signal: str
@@ -44,6 +46,8 @@ class SignalRow:
     age: float = math.nan
     source: str = ""
     method: str = ""
+    state: str = ""
+    reason: str = ""
 
     @property
     def name(self) -> str:
@@ -100,7 +104,7 @@ def _rows_of(
             yield SignalRow(
                 signal, element, unit, Kind.ESTIMATED, float(estimated.values[signal][index]),
                 float(estimated.std[signal][index]), age, estimated.mask[signal].replace("+", ", "),
-                estimated.method[signal],
+                estimated.method[signal], estimated.state.get(signal, ""), estimated.reason.get(signal, ""),
             )  # fmt: skip
         elif (newest is not None and (newest.is_fresh or is_seen)) or values is None:
             yield SignalRow(signal, element, unit, Kind.MASKED, math.nan, age=age)

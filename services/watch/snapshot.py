@@ -43,6 +43,7 @@ class RobotSnapshot:
         alive: Names of the live services.
         twins: Services of which two processes publish under this robot's name.
         refused: Reasons why newest messages cannot be read, such as another version of the wire format.
+        disordered: Sentences about messages that came twice or late in the last seconds, and were not used.
         statuses: Service -> its newest status.
         hal: Answer of the HAL's `describe`; empty before.
         model: Answer of the model's `describe`; empty before.
@@ -55,6 +56,7 @@ class RobotSnapshot:
     alive: frozenset[str] = frozenset()
     twins: tuple[str, ...] = ()
     refused: tuple[str, ...] = ()
+    disordered: tuple[str, ...] = ()
     sample: Newest[Sample] | None = None
     vision: Newest[Sample] | None = None
     applied: Newest[Applied] | None = None

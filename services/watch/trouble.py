@@ -15,8 +15,8 @@ TITLES = {"hal": "HAL", "model": "Model", "vision": "Camera", "simulator": "Simu
 
 
 LEARNING = (
-    "The body is not the one whose normal errors the model knows. If it is healthy, let it move, then run "
-    "`gemuco query ROBOT normal`."
+    "The body is not the one whose normal errors the model knows, or its tool is beyond the trained ones. If it is "
+    "healthy, let it move, then run `gemuco query ROBOT normal`; a new tool needs data of its own."
 )
 """This explains a body on which nothing can be called an anomaly yet."""
 
@@ -90,6 +90,8 @@ def _troubles(snapshot: RobotSnapshot, rows: Sequence[SignalRow]) -> Iterator[Tr
         return
     for text in snapshot.refused:
         yield Trouble(Level.TROUBLE, "Unreadable message", f"{text} Update the older of both programs.")
+    for text in snapshot.disordered:
+        yield Trouble(Level.NOTE, "Messages out of order", text)
     is_heard = any(newest.is_fresh for newest in (snapshot.sample, *snapshot.statuses.values()) if newest is not None)
     if not snapshot.alive and not is_heard:
         yield _gone(snapshot)
@@ -162,6 +164,11 @@ def _signals(rows: Sequence[SignalRow]) -> Iterator[Trouble]:
         sources = " and ".join(dict.fromkeys(row.source for row in estimated if row.source))
         origin = f" from {sources}" if sources else ""
         yield Trouble(Level.DEGRADED, "Sensor lost", f"{_names(estimated)} {_is(estimated)} estimated{origin}.")
+    for state, level in (("unknown", Level.DEGRADED), ("doubtful", Level.NOTE)):
+        bad = [row for row in estimated if row.state == state]
+        if bad:
+            reasons = "; ".join(dict.fromkeys(row.reason for row in bad if row.reason))
+            yield Trouble(level, f"Estimate {state}", f"{_names(bad)}: {reasons or 'no reason was given'}.")
     if masked:
         text = f"{_names(masked)} {_is(masked)} neither measured nor estimated."
         yield Trouble(Level.DEGRADED, "Not measured", text)

@@ -220,11 +220,16 @@ class Estimates(OfSignals, frozen=True, kw_only=True):
         values: Signal -> measured values, with estimates in place of the elements that are not valid [unit];
             NaN where neither is possible.
         estimated: Signal -> whether each element was estimated, shape (n,).
-        std: Signal -> expected error of an estimate (1 sigma) [unit], shape (n,); 0 where measured, NaN where unknown.
-        method: Signal -> `measured`, `mask`, `latent`, `input` or `none`.
+        std: Signal -> expected error of an estimate (1 sigma) [unit], shape (n,): 1.645 of them contain the truth in 90
+            of 100 samples that are like the learned ones; 0 where measured, NaN where unknown.
+        method: Signal -> `measured`, `fused` (a measurement combined with its estimate), `mask`, `latent`, `input` or
+            `none`.
         mask: Signal -> the signals it was estimated from, joined by `+`.
         residual: Signal -> error of the model on its own input (root mean square), in standard deviations of the
             training data; 0 where measured.
+        state: Signal -> `known`, `doubtful` or `unknown`: whether the sample and p are like those that were learned.
+            Older services do not publish it.
+        reason: Signal -> one sentence on the state; only of signals that are not `known`.
     """
 
     TYPE: ClassVar[str] = "estimates"
@@ -239,6 +244,8 @@ class Estimates(OfSignals, frozen=True, kw_only=True):
     method: dict[str, str]
     mask: dict[str, str]
     residual: dict[str, float]
+    state: dict[str, str] = msgspec.field(default_factory=dict)
+    reason: dict[str, str] = msgspec.field(default_factory=dict)
 
 
 class Anomaly(OfSignals, frozen=True, kw_only=True):
@@ -253,8 +260,8 @@ class Anomaly(OfSignals, frozen=True, kw_only=True):
         blamed: `signal.element` that is most likely wrong in the samples above the threshold; below the threshold, the
             one that contributes most; empty while the verdict is `unknown`.
         verdict: `normal`, `environment` (another condition of the body explains the samples above the threshold),
-            `anomaly` (no condition does), `unknown` (what is normal was not learned on this body yet), or empty before
-            a verdict.
+            `anomaly` (no condition does), `unknown` (what is normal was not learned on this body yet, or p is beyond
+            the trained conditions), or empty before a verdict.
         contribution: Signal -> each element's part of score^2, shape (n,).
     """
 
@@ -279,7 +286,7 @@ class Update(Message, frozen=True, kw_only=True):
         dropped: Number of samples dropped from it so far, oldest first.
         loss: Mean squared error over the window, in standard deviations of the training data.
         bias: The parametric bias p in use, shape (n,); empty without.
-        settled: Whether p is well known, so that W may be updated.
+        settled: Whether p is well known and explains what is seen.
         rolled_back: Number of times W was restored because its error on held-out samples grew.
     """
 

@@ -12,7 +12,11 @@ import sys
 from collections.abc import Sequence
 from fnmatch import fnmatch
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
+
+if find_spec("sklearn") is None:
+    raise ImportError("The peers need scikit-learn. Run `make peers`, or install the extra `peers`.")
 
 from studies.peers import anomalies, recordings, robots
 from studies.peers.anomalies import Fault, window_name

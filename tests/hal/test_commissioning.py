@@ -1,11 +1,15 @@
 """What the nodes are told before they are used, and what is said when they are not what they should be."""
 
+import math
 from dataclasses import replace
 
 import pytest
 from hal_bench import DRIVE, Bench, description, hardware
+from puppet import Puppet, driven
 
 from hal.config import RobotConfig
+from hal.drivers.canopen.cia406 import Cia406Encoder
+from hal.errors import DeviceRefused
 from simulators.nodes.canopen.spec import EncoderConstants
 
 
@@ -82,3 +86,39 @@ def test_the_cells_own_digits_are_used(close_after):
     bench = close_after(opened(nodes=nodes))
     assert bench.sample.values["muscle_tension"][0] == pytest.approx(20.0, abs=0.5)
     assert bench.sample.values["muscle_tension"][1] == pytest.approx(30.0, abs=0.005)
+
+
+class Misread(Puppet):
+    """Its first answer on each of some objects has a wrong byte."""
+
+    wrong: frozenset[str] = frozenset({"6501:0", "6502:0"})
+    is_hopeless = False
+
+    def _answer(self, request):
+        answer = super()._answer(request)
+        place = request[1:4]
+        key = f"{place[1]:02X}{place[0]:02X}:{place[2]}"
+        if request[0] == 0x40 and key in self.wrong:
+            self.wrong = self.wrong if self.is_hopeless else self.wrong - {key}
+            self.count = getattr(self, "count", 0) + 1
+            return answer[:4] + bytes([answer[4] ^ self.count % 256]) + answer[5:]
+        return answer
+
+
+ENCODER = {
+    "6000:0": "00 00", "6031:3": "01 00", "6031:4": "01 00", "6501:0": "00 00 04 00", "6502:0": "01 00",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("is_hopeless", [False, True])
+def test_one_wrong_byte_while_it_is_opened_does_not_make_another_scale(monkeypatch, is_hopeless):
+    monkeypatch.setattr("puppet.Puppet", Misread)
+    monkeypatch.setattr(Misread, "is_hopeless", is_hopeless)
+    settings = {"eds": "eds/joint_encoder.eds"}
+    with driven(Cia406Encoder, {"position": "joint.one"}, settings, dict(ENCODER), is_open=False) as (device, _):
+        if is_hopeless:
+            with pytest.raises(DeviceRefused, match="6501h:0 reads differently each time"):
+                device._calibrate()
+        else:
+            device._calibrate()
+            assert device._scale == pytest.approx(2 * math.pi / 262144)

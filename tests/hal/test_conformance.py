@@ -50,6 +50,24 @@ def test_measures_si_units_in_the_right_direction(stage):
 
 
 @every_kind
+def test_what_cannot_be_is_not_measured_whatever_the_driver(stage):
+    kind, name = stage.kind, f"{stage.kind.main}.one"
+    bounds = stage.robot._assembler.plausibility._bounds
+    bounds.high[bounds.names.index(name)] = kind.value + 0.5
+    stage.set(kind.value)
+    stage.cycle(6)
+    assert stage.value == pytest.approx(kind.value, abs=kind.tolerance)
+    stage.set(kind.value + 0.8)
+    stage.cycle(6)
+    assert not stage.is_valid
+    assert np.isnan(stage.value)
+    assert is_sentence(stage.robot.health()["implausible"][name])
+    stage.set(kind.value)
+    stage.until(lambda: stage.is_valid, "measured again")
+    assert name not in stage.robot.health()["implausible"]
+
+
+@every_kind
 def test_silence_is_noticed_told_and_over_when_it_is_back(stage):
     stage.cycle(5)
     stage.rig.fault(f"node_silent {NAME}")

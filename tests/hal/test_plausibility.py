@@ -245,7 +245,10 @@ def test_what_is_not_plausible_still_trips_the_robot():
     assert bench.robot.mode == "hold"
     assert not bench.sample.valid["joint_temperature"][0]
     assert np.isnan(bench.sample.values["joint_temperature"][0])
-    assert "joint_temperature.shoulder reads 70" in bench.robot.health()["implausible"]["joint_temperature.shoulder"]
+    assert (
+        "'joint_temperature.shoulder' read 70, possible is"
+        in bench.robot.health()["implausible"]["joint_temperature.shoulder"]
+    )
     bench.joints[0].temperature = 90.0
     bench.cycle(2)
     assert "over its trip limit" in bench.robot.fault_text

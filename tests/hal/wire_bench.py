@@ -241,6 +241,12 @@ class Referee(logging.Handler):
     def _note(self, rule, text):
         self.violations.setdefault(rule, text)
 
+    def forgive_all(self, duration):
+        """For some time [s] any value may be wrong."""
+        until = self._bench.world.time + duration
+        for name, signal in self._bench.config.signals.items():
+            self.forgiven.update({(name, index): until for index in range(signal.size)})
+
     def look(self):
         """Look at the cycle that has just been."""
         bench, world = self._bench, self._bench.world

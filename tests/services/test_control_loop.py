@@ -3,6 +3,7 @@ import pytest
 from arm_model import arm, fresh, small_model
 
 from gemuco.estimation import estimate
+from gemuco.intervals.sureness import SURE, UNKNOWN, Sureness
 from hal.clock import ManualClock
 from services.errors import NotEngaged, TargetRefused
 from services.model.control_loop import BUMP, Control
@@ -19,10 +20,11 @@ PERIOD = 0.02
 class Bench:
     """The controller between a HAL that is only a mode and a newest sample, and a list of commands."""
 
-    def __init__(self) -> None:
+    def __init__(self, unknown: str = "slow", edge: float = np.inf) -> None:
         robot = arm()
         config = model_config(robot).control
         assert config is not None
+        config = config.model_copy(update={"unknown": unknown})
         self.clock = ManualClock()
         self.newest: Arrival[Sample] | None = fresh(3, self.clock.monotonic(), cycle=10)
         self.mode = "off"
@@ -32,8 +34,9 @@ class Bench:
         self.estimation = Estimation(freshness, small_model, lambda _: None, self.clock)
         solver = ModelSolver(LivingModel(small_model()), robot, config)
         self.control = Control(
-            robot, config, lambda: self.newest, self.applied, self.estimation, solver, self.sent.append, self.clock
-        )
+            robot, config, lambda: self.newest, self.applied, self.estimation, solver, self.sent.append, self.clock,
+            lambda values: SURE if values[3] <= edge else Sureness(UNKNOWN, "too far"),
+        )  # fmt: skip
         self.estimation.tick()
 
     def applied(self) -> Applied:
@@ -202,3 +205,32 @@ def test_another_model_is_used_at_once_and_a_reference_that_moves_keeps_the_layo
     after = solver(moved, {})
     assert solver._controller.schema is living.schema
     assert np.abs(after - before).max() > 0.0
+
+
+@pytest.mark.parametrize("unknown", ["slow", "hold", "ignore"])
+def test_where_the_body_is_unknown_the_reference_is_slow_or_holds_and_says_so(unknown: str) -> None:
+    bench = Bench(unknown=unknown, edge=-0.8)
+    bench.control.engage(bench.enable)
+    bench.turn()
+    start = np.array(bench.control.facts()["reference"])
+    inside, outside = start.copy(), start.copy()
+    inside[3], outside[3] = -0.9, -0.3
+    bench.control.set_target(Target(signal="joint_position", values=inside))
+    assert bench.control.facts()["text"] == ""
+    bench.turn(100)
+    np.testing.assert_array_equal(bench.control.facts()["reference"], inside)
+    bench.control.set_target(Target(signal="joint_position", values=outside))
+    assert ("The body is unknown at this target (too far)" in bench.control.facts()["text"]) == (unknown != "ignore")
+    bench.turn(20)  # 0.4 s
+    reference = bench.control.facts()["reference"][3]
+    if unknown == "ignore":
+        assert reference == pytest.approx(-0.5)
+    elif unknown == "hold":
+        assert -0.85 < reference <= -0.8
+        assert bench.control.facts()["text"] == "The reference holds, because the body is unknown ahead: too far."
+    else:
+        assert -0.8 < reference < -0.7
+        assert "The reference is slow" in bench.control.facts()["text"]
+    bench.control.set_target(Target(signal="joint_position", values=inside))
+    bench.turn(100)
+    np.testing.assert_array_equal(bench.control.facts()["reference"], inside)

@@ -8,8 +8,9 @@ import pytest
 from test_command_intake import BOOT, Taken
 
 from hal.errors import CommandRefused
+from services.watch.fleet_watch import ServiceRecord
 from services.wire import keys, messages
-from services.wire.messages import Command, Sample, Update
+from services.wire.messages import Command, Sample, Status, Update
 from services.wire.order import CLOCK_WAS_SET, SENDERS, Order, StreamOrder
 from services.wire.session import close_session, open_session
 from services.wire.streams import Reader, Transit
@@ -87,6 +88,16 @@ def test_a_sample_that_is_replayed_byte_for_byte_is_not_the_newest(robot: str) -
     assert reader.order.counters == {"repeated": 1, "late": 22}
     assert "came twice" in reader.order.text
     close_session(session)
+
+
+def test_gemuco_top_takes_a_status_once_and_says_that_messages_are_out_of_order() -> None:
+    record = ServiceRecord()
+    for seq in (1, 2, 1, 2):
+        status = Status(service="hal", state="running", facts={}, seq=seq, stamp_ns=seq * 10**9, boot=5)
+        record.add(status, float(seq))
+    assert record.status is not None
+    assert (record.status.seq, record.received) == (2, 2.0)
+    assert record.order.counters == {"repeated": 1, "late": 1}
 
 
 def test_what_order_lets_through_is_never_younger_than_it_is() -> None:

@@ -102,6 +102,15 @@ def test_gaps_stay_gaps_in_a_plot():
     assert curve.count("M") == 2
 
 
+def test_an_estimate_has_a_band_that_stays_in_the_frame():
+    values, half = np.array([1.0, 2.0, np.nan, 3.0, 4.0]), np.array([0.1, 0.1, 0.1, 0.2, 1e6])
+    svg = Chart(100).svg(np.linspace(-4, 0, 5), [Line("a", values, "#fff", half=half)], "rad", "a")
+    bands = [part.split('"')[1] for part in svg.split("<polygon ")[1:]]
+    assert [len(band.split()) for band in bands] == [4, 4]
+    heights = [float(corner.split(",")[1]) for band in bands for corner in band.split()]
+    assert all(0.0 <= height <= 100.0 for height in heights)
+
+
 @pytest.mark.parametrize("ends", [(0.0, 1.0), (-0.031, 0.027), (1e4, 1e4 + 3), (-1e-5, 1e-5)])
 def test_ticks_are_few_and_inside(ends):
     found = ticks(*ends)
@@ -119,4 +128,5 @@ def test_a_trail_is_bounded_and_knows_what_vanished():
     assert curves.time[-1] == 0.0
     assert np.isnan(curves.measured[0, -1])
     assert curves.estimated[0, -1] == -0.48
+    assert curves.std[0, -1] == 0.02
     assert np.isnan(curves.measured[1]).all()

@@ -1,12 +1,15 @@
 """The one judge of trouble, from all messages of a robot and from its statuses alone."""
 
 import math
+from dataclasses import replace
 
 import pytest
+from msgspec.structs import replace as msgspec_replace
 from rich.console import Console
 from talking_robot import BOTH, anomaly, estimates, sample, seen
 
 from services.verbs import top
+from services.view.markup import signals_html
 from services.watch.service_rows import Level, service_rows
 from services.watch.signal_rows import Kind, signal_rows
 from services.watch.snapshot import Newest, RobotSnapshot
@@ -48,6 +51,21 @@ def test_a_lost_sensor_is_estimated_and_its_sources_are_named():
     assert judged(seen(silent=True)) == Trouble(Level.DEGRADED, "Sensor lost", text)
 
 
+def test_an_estimate_outside_of_what_was_learned_is_said():
+    told = msgspec_replace(estimates(True), state={"joint_position": "unknown"}, reason={"joint_position": "too far"})
+    moment = replace(seen(silent=True), estimate=Newest(told, 0.01))
+    row = signal_rows(moment)[1]
+    assert (row.state, row.reason) == ("unknown", "too far")
+    assert Trouble(Level.DEGRADED, "Estimate unknown", "joint_position (elbow): too far.") in troubles(
+        moment, signal_rows(moment)
+    )
+    console = Console(width=160)
+    with console.capture() as shown:
+        console.print(top.view(moment))
+    assert "mask, unknown" in shown.get()
+    assert ' <span class="lost" title="too far">unknown</span>' in signals_html(signal_rows(moment))
+
+
 def test_a_poor_model_is_a_note():
     known = judged(seen(model={"manifest": {"poor": ["joint_effort"]}}))
     assert known.level is Level.NOTE
@@ -87,6 +105,7 @@ ENDED = {"hal": Newest(Status(service="hal", state="running"), 9.0)}
         (RobotSnapshot(robot="arm"), Level.GONE, "No robot"),
         (seen(linked=False, link_text="No answer."), Level.GONE, "Router gone"),
         (seen(refused=(NEW_PROGRAM,)), Level.TROUBLE, "Unreadable message"),
+        (seen(disordered=("A sample came twice.",)), Level.NOTE, "Messages out of order"),
         (seen(statuses=FAULT), Level.TROUBLE, "HAL fault"),
         (seen(statuses=statuses(text="A command was refused.")), Level.NOTE, "HAL running"),
         (seen(statuses=statuses(age=9.0)), Level.TROUBLE, "HAL service silent"),

@@ -1,16 +1,20 @@
 """What the files of a deployment promise, without Docker: `make test-compose` looks whether they keep it."""
 
 import configparser
+import importlib.util
 import re
 import shutil
 import subprocess
 import sys
+from importlib import metadata
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
 import typer
 import yaml
+from packaging.requirements import Requirement
 
 from services.hardware.hal_service import AT_REST_WITHIN
 from services.verbs.verb import report_errors
@@ -22,6 +26,18 @@ HEAVY = ("torch", "matplotlib", "pybullet", "pyarrow", "viser")
 """What the image of a robot's services does not hold."""
 SERVICES = ("router", "hal", "gemuco", "recorder", "simulator", "train")
 ROLES = {"hal": "hal", "gemuco": "model", "recorder": "recorder", "simulator": "simulator"}
+
+
+def script(name: str) -> ModuleType:
+    """A program of deploy/, which is no package."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "deploy" / f"{name}.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+wanted, sbom = script("requirements"), script("sbom")
 
 
 def compose(name: str = "docker-compose.yml") -> dict[str, Any]:
@@ -39,7 +55,6 @@ def test_the_stack_is_what_it_is_said_to_be() -> None:
 @pytest.mark.parametrize("name", SERVICES)
 def test_every_container_can_do_little(name: str) -> None:
     one = compose()["services"][name]
-    assert one["user"] == "10001:10001"
     assert one["read_only"] is True
     assert one["cap_drop"] == ["ALL"]
     assert one["security_opt"] == ["no-new-privileges:true"]
@@ -48,6 +63,103 @@ def test_every_container_can_do_little(name: str) -> None:
     assert one["mem_limit"]
     assert one["logging"]["options"]["max-size"]
     assert all(volume.endswith(":ro") for volume in one["volumes"] if volume.startswith("."))
+
+
+def test_every_container_has_a_user_and_a_runtime_folder_of_its_own() -> None:
+    services = compose()["services"]
+    users = {name: one["user"].split(":") for name, one in services.items()}
+    assert len({user for user, _ in users.values()}) == len(services)
+    assert {group for _, group in users.values()} == {"10001"}
+    for name, one in services.items():
+        folders = [text for text in one["tmpfs"] if text.startswith("/run/gemuco:")]
+        assert len(folders) == (name != "train"), "its healthcheck is disabled"
+        assert all(f"mode=0700,uid={users[name][0]}," in text for text in folders)
+        assert not any("/run/gemuco" in volume for volume in one["volumes"])
+    shared = {name for name, one in services.items() if any(v.startswith("buses:") for v in one["volumes"])}
+    assert shared == {"hal", "simulator"}
+    options = compose()["volumes"]["buses"]["driver_opts"]["o"]
+    assert f"mode=0750,uid={users['simulator'][0]},gid=10001" in options
+    image = (ROOT / "Dockerfile").read_text()
+    assert "number=10001" in image and image.count("10001") >= len(services) - 1
+
+
+PINS = dict(re.findall(r"^([\w.-]+)==(\S+)$", (ROOT / "constraints.txt").read_text(), re.M))
+LOCKED = re.findall(
+    r"^# (\S+) <- (.*)\n(\S+)==(\S+) --hash=sha256:([0-9a-f]{64})$", (ROOT / "requirements.lock").read_text(), re.M
+)
+
+
+def test_the_lock_has_a_hash_for_every_version_that_is_pinned() -> None:
+    pins = {wanted.name_of(name): version for name, version in PINS.items()}
+    locked = {name: version for name, _, _, version, _ in LOCKED}
+    text = (ROOT / "requirements.lock").read_text()
+    assert len(LOCKED) == text.count("\n# ") - 1 == text.count("--hash"), "a line that is no entry"
+    assert set(pins) - set(locked) <= {"torch"} | _not_needed(pins, locked)
+    assert {name: locked[name] for name in set(pins) & set(locked)} == {
+        name: pins[name] for name in set(pins) & set(locked)
+    }
+    assert set(locked) <= set(pins)
+
+
+def _not_needed(pins: dict[str, str], locked: dict[str, str]) -> set[str]:
+    """Packages that are pinned for other processors or other versions of Python only."""
+    return {name for name in pins if name not in locked and not _installed(name)}
+
+
+def _installed(name: str) -> bool:
+    try:
+        metadata.distribution(name)
+    except metadata.PackageNotFoundError:
+        return False
+    return True
+
+
+@pytest.mark.parametrize(
+    "words",
+    [("-torch", "-matplotlib"), ("=torch", "=matplotlib", "=pybullet", "=joblib", "+sim", "+studies"),
+     ("+sim", "+dev", "+build"), ("+build", "=setuptools")],
+    ids=" ".join,
+)  # fmt: skip
+def test_what_is_installed_by_hash_needs_nothing_else(
+    words: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    wanted.main(["--locked", *words])
+    lines = capsys.readouterr().out.splitlines()
+    chosen = {line.partition("==")[0] for line in lines}
+    assert all("--hash=sha256:" in line for line in lines) and len(chosen) == len(lines)
+    for name in chosen:
+        for line in metadata.requires(name) or ():
+            needed = Requirement(line)
+            if needed.marker is None or needed.marker.evaluate({"extra": ""}):
+                other = wanted.name_of(needed.name)
+                assert other in chosen | {"torch"} or f"-{other}" in words or _is_in_small_image(other, words), (
+                    f"{name} needs {other}"
+                )
+
+
+def _is_in_small_image(name: str, words: tuple[str, ...]) -> bool:
+    """The workshop's image lies on the small one."""
+    return "=torch" in words and name in {wanted.name_of(line) for line in wanted.PROJECT["dependencies"]}
+
+
+def test_no_second_index_can_slip_in_a_package() -> None:
+    for path in (ROOT / "Makefile", ROOT / "Dockerfile", *(ROOT / "deploy").glob("*.*")):
+        assert "extra-index" not in path.read_text().lower().replace("_", "-"), path.name
+
+
+def test_the_bill_of_materials_names_what_is_installed(tmp_path: Path) -> None:
+    site = metadata.distribution("numpy").locate_file("")
+    status = "Package: libc6\nStatus: install ok installed\nArchitecture: amd64\nVersion: 2.36-9+deb12u10\n\n"
+    status += "Package: gone\nStatus: deinstall ok config-files\nArchitecture: all\nVersion: 1\n"
+    made = sbom.bill([str(site)], status)
+    assert (made["bomFormat"], made["specVersion"]) == ("CycloneDX", "1.5")
+    found = {one["name"]: one for one in made["components"]}
+    assert found["numpy"]["purl"] == f"pkg:pypi/numpy@{metadata.version('numpy')}"
+    assert re.fullmatch("[0-9a-f]{64}", found["numpy"]["hashes"][0]["content"])
+    assert found["libc6"]["purl"] == "pkg:deb/debian/libc6@2.36-9%2Bdeb12u10?arch=amd64" and "gone" not in found
+    assert {"cpython", "eclipse-zenoh", "pyyaml"} <= set(found)
+    text = (ROOT / "Dockerfile").read_text()
+    assert text.count("deploy/sbom.py /opt/") == 2
 
 
 @pytest.mark.parametrize("name", [name for name in SERVICES if name != "train"])

@@ -47,14 +47,14 @@ def as_stranger(work: Callable[[], object]) -> None:
     assert os.waitpid(begin_as_stranger(work), 0)[1] == 0
 
 
-def begin_as_stranger(work: Callable[[], object]) -> int:
+def begin_as_stranger(work: Callable[[], object], user: int = STRANGER, group: int = STRANGER) -> int:
     """Do work in a process of another user, and return its number."""
     pid = os.fork()
     if pid == 0:
         try:
             os.setgroups([])
-            os.setgid(STRANGER)
-            os.setuid(STRANGER)
+            os.setgid(group)
+            os.setuid(user)
             work()
         except BaseException:
             traceback.print_exc(file=sys.__stderr__)
@@ -192,10 +192,41 @@ def test_a_link_in_the_folder_is_not_followed(shared: Path, tmp_path: Path) -> N
     assert victim.read_text() == "important"
 
 
+@needs_root
+def test_a_bus_is_shared_between_two_users_of_one_group(shared: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As between the containers of the simulator and of the HAL (docker-compose.yml)."""
+    monkeypatch.setenv(BUSES, str(shared))
+    os.chown(shared, 10005, 10001)
+    shared.chmod(0o750)
+    reader, writer = os.pipe()
+    ended, end = os.pipe()
+
+    def serve() -> None:
+        with HubServer("bus"):
+            os.write(writer, b"x")
+            os.read(ended, 1)
+
+    def join() -> None:
+        with pytest.raises(PermissionError):
+            (shared / "more").touch()
+        HubBus("bus").shutdown()
+
+    def look() -> None:
+        with pytest.raises(can.CanInitializationError, match="Permission denied"):
+            HubBus("bus")
+
+    server = begin_as_stranger(serve, 10005, 10001)
+    os.read(reader, 1)
+    assert os.waitpid(begin_as_stranger(join, 10002, 10001), 0)[1] == 0
+    assert os.waitpid(begin_as_stranger(look), 0)[1] == 0
+    os.write(end, b"x")
+    assert os.waitpid(server, 0)[1] == 0
+
+
 def test_shared_buses_are_for_a_group(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(BUSES, str(tmp_path))
     name = uuid.uuid4().hex[:8]
-    mask = os.umask(0)
+    mask = os.umask(0o077)
     try:
         with HubServer(name):
             assert socket_path(name) == tmp_path / f"{name}.can"

@@ -380,7 +380,7 @@ class Cia404Cell(AnalogNode):
     def _unit_scale(self, channel: Channel) -> float:
         if self._fixed is not None:
             return self._fixed
-        code = self._sdo.read(analog.UNIT_CODE, channel.number)
+        code = self._sdo.read_twice(analog.UNIT_CODE, channel.number)
         unit = analog.unit(code)
         if unit is None or unit.quantity != self._settings.measures:
             raise DeviceRefused(
@@ -394,7 +394,7 @@ class Cia404Cell(AnalogNode):
             return self._cell.digits
         if not CELL_PRESETS[self._cell.preset].form.has_digits or channel.value.kind == "float":
             return 0
-        return self._sdo.read(analog.DIGITS, channel.number)
+        return self._sdo.read_twice(analog.DIGITS, channel.number)
 
     @override
     def tare(self) -> None:
@@ -419,7 +419,7 @@ class Cia404Cell(AnalogNode):
 
     def _offset(self, number: int) -> int:
         """Return the offset that the tare has set, as the bits of a REAL32."""
-        bits = self._sdo.read(analog.OFFSET, number)
+        bits = self._sdo.read_twice(analog.OFFSET, number)
         if not math.isfinite(struct.unpack("<f", bits.to_bytes(4, "little"))[0]):
             raise DeviceRefused(f"{self._place} reports an offset (6124h:{number}) after the tare that is no number.")
         return bits

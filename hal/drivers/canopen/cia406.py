@@ -87,7 +87,7 @@ class Cia406Encoder(CanopenNode):
 
     def _optional(self, item: MappedObject) -> int:
         """Return the value of an object; 0 if the data sheet does not have it."""
-        return self._sdo.read(item.index, item.subindex) if self._sdo.has(item.index, item.subindex) else 0
+        return self._sdo.read_twice(item.index, item.subindex) if self._sdo.has(item.index, item.subindex) else 0
 
     @override
     def _pdo_handler(self, pdo: Pdo) -> PdoHandler:

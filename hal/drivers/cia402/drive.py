@@ -205,7 +205,7 @@ class Cia402Drive(CanopenNode):
     def _velocity_unit(self) -> VelocityUnit:
         name = self._settings.velocity_unit
         if name is None and self._sdo.has(cia402.VELOCITY_UNIT.index):
-            code = self._sdo.read(cia402.VELOCITY_UNIT.index, 0)
+            code = self._sdo.read_twice(cia402.VELOCITY_UNIT.index, 0)
             unit = cia402.velocity_unit(code)
             if unit is not None:
                 return unit
@@ -223,7 +223,7 @@ class Cia402Drive(CanopenNode):
             return self._settings.rated_torque
         if "effort" not in self._slots:
             return math.nan
-        torque = self._sdo.read(cia402.RATED_TORQUE.index, 0) * 1e-3
+        torque = self._sdo.read_twice(cia402.RATED_TORQUE.index, 0) * 1e-3
         if not torque:
             raise DeviceRefused(f"{self._place} reports a rated torque of 0 (6076h). Give rated_torque.")
         return torque

@@ -1,0 +1,60 @@
+"""The region of some signals in which the body is known."""
+
+from typing import Any
+
+import numpy as np
+
+from gemuco.intervals.sureness import MARGIN, SURE, UNKNOWN, Sureness
+from gemuco.schema import BodySchema
+
+FAR = 1.3
+"""A value is outside if it is this many times as far from its nearest anchor as nearly all anchors are from theirs."""
+NEARLY_ALL = 0.995
+
+
+class Region:
+    """The learned values of one signal, by its ranges and by the anchors of a schema.
+
+    Args:
+        schema: The body schema. Without anchors only the ranges count.
+        name: The signal.
+    """
+
+    def __init__(self, schema: BodySchema, name: str) -> None:
+        self._span, self._name, self._layout = schema.layout.slice(name), name, schema.layout
+        scaler = schema.scaler
+        self._mean, self._std = scaler.mean[self._span], scaler.std[self._span]
+        anchors = schema.anchors[:, self._span].astype(float) if len(schema.anchors) else np.zeros((0, len(self._std)))
+        edges = np.stack([scaler.low[self._span], scaler.high[self._span]])
+        certainty = schema.certainty
+        if certainty is not None:
+            edges = np.stack([certainty.low[self._span], certainty.high[self._span]]) * self._std + self._mean
+        known: dict[Any, Any] = {} if certainty is None else certainty.known
+        if ("region", name) not in known:
+            known["region", name] = _limit(anchors)
+        self._edges, self._anchors, self._limit = edges, anchors, known["region", name]
+
+    def judge(self, values: np.ndarray) -> Sureness:
+        """Return whether the body is known at some values [the signal's unit], shape (n,)."""
+        low, high = self._edges
+        over = np.maximum(low - values, values - high) - MARGIN * (high - low)
+        k = int(over.argmax())
+        if over[k] > 0.0:
+            edge, word = (high[k], "to") if values[k] > high[k] else (low[k], "from")
+            element, unit = self._layout.element(self._span.start + k), self._layout.signal(self._name).unit
+            text = f"outside of the range of {element}: {values[k]:.4g} {unit}, learned {word} {edge:.4g} {unit}"
+            return Sureness(UNKNOWN, text)
+        x = (values - self._mean) / self._std
+        if len(self._anchors) and float(((self._anchors - x) ** 2).sum(axis=1).min()) > self._limit**2:
+            return Sureness(UNKNOWN, f"this {self._name} is far from all learned ones")
+        return SURE
+
+
+def _limit(anchors: np.ndarray) -> float:
+    """Return the largest usual distance of a value from its nearest anchor, times `FAR` [standard deviations]."""
+    if len(anchors) < 2:
+        return float("inf")
+    squared = (anchors**2).sum(axis=1)
+    between = squared[:, None] + squared - 2.0 * anchors @ anchors.T
+    np.fill_diagonal(between, np.inf)
+    return FAR * float(np.quantile(np.sqrt(between.min(axis=1).clip(min=0.0)), NEARLY_ALL))
