@@ -70,9 +70,6 @@ model:
   structure: {{threshold_out: 0.5, threshold_in: 0.5, epochs: 60, splits: 2}}
   control:
     target: joint_position
-    # The motors' positions are inferred from the wanted joint positions, given as if they were measured.
-    route: input
-    mask: [joint_position, joint_effort]
     speed: {speed:.3g}
 """
 
