@@ -116,8 +116,8 @@ def _installed(name: str) -> bool:
 
 @pytest.mark.parametrize(
     "words",
-    [("-torch", "-matplotlib"), ("=torch", "=matplotlib", "=pybullet", "=joblib", "+sim", "+studies"),
-     ("+sim", "+dev", "+build"), ("+build", "=setuptools")],
+    [(), ("=torch", "=matplotlib", "=pybullet", "=joblib", "+train", "+sim", "+studies"), ("+dev", "+build"),
+     ("+build", "=setuptools")],
     ids=" ".join,
 )  # fmt: skip
 def test_what_is_installed_by_hash_needs_nothing_else(
