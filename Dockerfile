@@ -11,7 +11,7 @@ RUN python -m venv --without-pip /opt/gemuco
 COPY wheels/ wheels/
 COPY deploy/install.sh deploy/requirements.py deploy/sbom.py deploy/
 COPY pyproject.toml constraints.txt requirements.lock ./
-RUN deploy/install.sh -torch -matplotlib
+RUN deploy/install.sh
 COPY README.md LICENSE ./
 COPY gemuco/ gemuco/
 COPY hal/ hal/
@@ -43,7 +43,7 @@ CMD ["--help"]
 
 FROM packages AS heavy
 # Only what the first image lacks, in a folder of its own: both images share all the layers below it.
-RUN deploy/install.sh --target /opt/workshop =torch =matplotlib =pybullet =joblib +sim +studies \
+RUN deploy/install.sh --target /opt/workshop =torch =matplotlib =pybullet =joblib +train +sim +studies \
     && python deploy/sbom.py /opt/workshop/sbom.json /opt/gemuco/lib/python3.*/site-packages /opt/workshop
 
 FROM services AS workshop

@@ -15,7 +15,7 @@ wait $$beside || failed=1; cat build/clockless.log; exit $$failed
 endef
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo reproduce test test-all check format faults fuzz mutation peers bench test-socketcan test-controllers results clean test-compose wheels lock test-network docs
+.PHONY: help setup demo reproduce test test-all check format faults fuzz mutation peers bench test-socketcan test-controllers results clean test-compose wheel wheels lock test-network docs
 
 help:            ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 18
@@ -24,8 +24,8 @@ help:            ## list the targets
 $(STAMP): pyproject.toml constraints.txt requirements.lock
 	$(PYTHON) -m venv .venv
 	@if $(BIN)/python -c 'import sys, platform; sys.exit((sys.version_info[:2], platform.system(), platform.machine()) != ((3, 11), "Linux", "x86_64"))'; then \
-	    $(BIN)/python deploy/requirements.py --locked +sim +dev +build | $(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes --no-deps --requirement /dev/stdin; fi
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[sim,dev]'
+	    $(BIN)/python deploy/requirements.py --locked +dev +build | $(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes --no-deps --requirement /dev/stdin; fi
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[all,dev]'
 	$(BIN)/python -m gemuco.warm
 	@touch $(STAMP)
 
@@ -67,13 +67,18 @@ test-controllers: $(STAMP)  ## drivers on two CAN controllers at 1 Mbit/s: can0 
 test-compose: $(STAMP)  ## the simulated stack in containers: up, a client, each container killed once, down; needs Docker
 	$(BIN)/python tests/system/compose_check.py
 
+wheel: $(STAMP)  ## the package as one file in build/wheel
+	rm -rf build/lib build/bdist.*  # a build takes what an earlier one left there
+	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir build/wheel .
+	@ls build/wheel/*.whl
+
 wheels: $(STAMP)  ## fill wheels/, from which the images are then built without a network
-	$(BIN)/python deploy/requirements.py --locked +sim +studies +build | $(BIN)/python -m pip download --quiet --dest wheels --require-hashes --no-deps --requirement /dev/stdin
+	$(BIN)/python deploy/requirements.py --locked +train +sim +studies +build | $(BIN)/python -m pip download --quiet --dest wheels --require-hashes --no-deps --requirement /dev/stdin
 	$(BIN)/python -m pip download --quiet --dest wheels --no-deps $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) "$$(grep '^torch==' constraints.txt)"
 
 lock: $(STAMP)   ## write requirements.lock: the hashes of the versions in constraints.txt
 	@mkdir -p build
-	$(BIN)/python -m pip install --quiet --dry-run --ignore-installed --report build/lock.json --constraint constraints.txt '.[sim,dev,mutation,peers]' setuptools
+	$(BIN)/python -m pip install --quiet --dry-run --ignore-installed --report build/lock.json --constraint constraints.txt '.[all,dev,mutation,peers]' setuptools
 	$(BIN)/python deploy/lock.py build/lock.json
 
 faults: $(STAMP)  ## the robot broken in every way with many seeds (docs/safety.md), and a million random frames

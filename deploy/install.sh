@@ -5,7 +5,7 @@
 set -eu
 site=$(/opt/gemuco/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')
 target=""
-if [ "$1" = --target ]; then target=$2; shift 2; fi
+if [ "${1:-}" = --target ]; then target=$2; shift 2; fi
 folder=${target:-$site}
 pip="python -m pip --python /opt/gemuco/bin/python install --quiet"
 [ -z "$target" ] || pip="$pip --no-compile --target $target" # trained with once, so not worth the space
@@ -23,7 +23,7 @@ list() {
     fi
 }
 
-if [ "$1" = . ]; then
+if [ "${1:-}" = . ]; then
     list +build =setuptools
     python -m pip install --quiet --target /tmp/build $how --find-links wheels --requirement /tmp/wanted.txt
     PYTHONPATH=/tmp/build $pip --no-deps --no-index --no-build-isolation .

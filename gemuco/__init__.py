@@ -98,10 +98,19 @@ if TYPE_CHECKING:
 else:
 
     def __getattr__(name: str) -> object:
-        """Import an exported name from its room."""
+        """Import an exported name from its room, or the room `plot`."""
+        if name == "plot":
+            return import_module("gemuco.plot")
         if name not in _ROOM_OF:
             raise AttributeError(f"module 'gemuco' has no attribute '{name}'")
-        globals()[name] = value = getattr(import_module(_ROOM_OF[name]), name)
+        try:
+            room = import_module(_ROOM_OF[name])
+        except ModuleNotFoundError as error:
+            if error.name != "torch":
+                raise
+            text = f"gemuco.{name} needs the package 'torch', not installed here: pip install 'gemuco[train]'."
+            raise ModuleNotFoundError(text, name="torch") from None
+        globals()[name] = value = getattr(room, name)
         return value
 
 

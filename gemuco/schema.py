@@ -6,6 +6,7 @@ while another thread makes the next.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from html import escape
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -154,6 +155,27 @@ class BodySchema:
         if self.manifest.get("poor"):
             lines.append(f"POOR: {', '.join(self.manifest['poor'])} is inferred with an error above the threshold.")
         return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        """Return the signals, and what explains them best, as a small table for notebooks."""
+        heads = ("signal", "elements", "unit", "best inferred from", "error")
+        rows = []
+        for signal in self.layout.signals:
+            mask = next((m for m in self.ranked(signal.name) if signal.name not in m), None)
+            is_known = signal.name in self.x_out and mask is not None and ("mask", mask) in self.errors
+            if is_known and mask is not None:
+                rms = float(np.sqrt(np.mean(self.out_layout.split(self.errors["mask", mask])[signal.name] ** 2)))
+                percent = 100.0 * float(np.sqrt(self.mask_error(mask, signal.name)))
+                best, error = label(mask, self.layout.names).replace("+", " + "), f"{rms:.3g} ({percent:.0f} % of std)"
+            else:
+                best, error = "not inferred" if signal.name not in self.x_out else "", ""
+            rows.append((signal.name, str(signal.size), signal.unit, best, error))
+        table = "".join(f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in rows)
+        head = "".join(f"<th>{text}</th>" for text in heads)
+        poor = ", ".join(self.manifest.get("poor", ()))
+        notes = [f"{len(self.masks)} feasible masks", f"conditions: {', '.join(self.biases) or 'none'}"]
+        notes += [f"POOR: {poor}"] if poor else []
+        return f"<table><thead><tr>{head}</tr></thead><tbody>{table}</tbody></table><p>{escape('; '.join(notes))}</p>"
 
     def __reduce__(self) -> tuple[type["BodySchema"], tuple[Any, ...]]:
         """Pickle only the arguments; another process derives the rest again."""

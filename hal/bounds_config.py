@@ -1,9 +1,11 @@
 """Ranges, limits and possible values of a signal in a robot file, per element or one for all."""
 
-from typing import Annotated
+from typing import Annotated, ClassVar, Self
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+
+from hal.calibration.units import check_units, factor
 
 
 class Section(BaseModel):
@@ -36,7 +38,35 @@ def per_element(value: float | tuple[float, ...] | None, size: int, where: str, 
     return np.broadcast_to(array, (size,)).copy()
 
 
-class RangeConfig(Section):
+class NumbersConfig(Section):
+    """Numbers of one signal, in its unit unless the section declares another one."""
+
+    TIMES: ClassVar[tuple[str, ...]] = ()
+    """These numbers are times [s] in any case."""
+    written_in: str | None = None
+    """Unit of the numbers of this section, if it differs from that of the signal; rates are in this unit per second."""
+
+    def in_unit(self, unit: str, where: str) -> Self:
+        """Return these numbers in `unit`, that of their signal; `where` is their place in the robot file.
+
+        Raises:
+            ValueError: `written_in` cannot be converted to it.
+        """
+        if self.written_in is None:
+            return self
+        try:
+            check_units(unit, self.written_in)
+        except ValueError as error:
+            raise ValueError(f"{where}: {error}") from None
+        scale = factor(unit, self.written_in)
+        numbers = ((n, v) for n, v in self if isinstance(v, int | float | tuple) and n not in self.TIMES)
+        scaled = {
+            n: tuple(scale * v for v in value) if isinstance(value, tuple) else scale * value for n, value in numbers
+        }
+        return self.model_copy(update={**scaled, "written_in": None})
+
+
+class RangeConfig(NumbersConfig):
     """Range of one signal, per element or one for all."""
 
     low: Finite | tuple[Finite, ...] | None = None
@@ -105,8 +135,10 @@ Above0 = Annotated[float, Field(gt=0)]
 """A positive number, also infinity."""
 
 
-class PlausibleConfig(Section):
+class PlausibleConfig(NumbersConfig):
     """Values that are physically possible, per element or one for all; each has a default from the limits."""
+
+    TIMES: ClassVar[tuple[str, ...]] = ("frozen_after",)
 
     low: Bound | tuple[Bound, ...] | None = None
     """Lowest possible value [the signal's unit]."""

@@ -6,12 +6,13 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import yaml
-from pydantic import BaseModel, Field, ValidationError, model_validator
+from pydantic import BaseModel, Field, ValidationError, ValidationInfo, field_validator, model_validator
 
 from hal.bounds_config import (
     Above0,
     Finite,
     LimitConfig,
+    NumbersConfig,
     PlausibleConfig,
     Positive,
     RangeConfig,
@@ -19,6 +20,7 @@ from hal.bounds_config import (
     Section,
     per_element,
 )
+from hal.calibration.units import check_robot_unit
 from hal.errors import ConfigError
 
 __all__ = [
@@ -61,7 +63,7 @@ class CommandConfig(Section):
     """A drive is where a set-point of this last time [s] was."""
 
 
-class StopConfig(Section):
+class StopConfig(NumbersConfig):
     """Behaviour of the robot when it is asked to stop, or when commands end."""
 
     behaviour: Literal["hold", "damp", "park", "off"] = "hold"
@@ -97,6 +99,7 @@ class SignalConfig(Section):
     """A named vector of sensor or control values."""
 
     unit: str
+    """SI unit of its values, one of `hal.calibration.units.ROBOT_UNITS`."""
     elements: tuple[str, ...] = Field(min_length=1)
     stale_after: Positive = 0.02
     """An element is valid up to this age [s]."""
@@ -106,6 +109,19 @@ class SignalConfig(Section):
     """Computation by the HAL; None for a signal that devices measure."""
     plausible: PlausibleConfig | None = None
     """Physically possible measurements; what is not given follows from the limits."""
+
+    @field_validator("unit", mode="before")
+    @classmethod
+    def _is_unit(cls, unit: object) -> str:
+        text = str(unit or "")  # `unit: 1` is a number in YAML
+        check_robot_unit(text)
+        return text
+
+    @field_validator("plausible")
+    @classmethod
+    def _plausible_in_unit(cls, plausible: PlausibleConfig | None, info: ValidationInfo) -> PlausibleConfig | None:
+        unit = info.data.get("unit")
+        return plausible.in_unit(unit, "plausible") if plausible and unit else plausible
 
     @property
     def is_measured(self) -> bool:
@@ -187,8 +203,12 @@ class RobotConfig(Section):
     devices: dict[str, DeviceConfig] = Field(default_factory=dict)
     simulator: str | None = None
     """`module:name` of the simulator that replaces the hardware."""
+    physics: Literal["bullet", "mujoco"] | None = None
+    """Engine of that simulator; by default PyBullet if it is installed, else MuJoCo."""
     urdf: Path | None = None
     """URDF file for the live page, relative to the robot file."""
+    tip: str | None = None
+    """Link of the URDF whose place the camera of a simulator made from it sees."""
     conditions: tuple[str, ...] = ()
     """Known conditions of the body, such as the tools that it may hold; the first is the default."""
     model: dict[str, Any] = Field(default_factory=dict)
@@ -197,6 +217,18 @@ class RobotConfig(Section):
     """Settings of random safe motion; the collector checks this section itself."""
     folder: Path = Path()
     """Folder of the robot file; paths in the file are relative to it."""
+
+    @field_validator("limits")
+    @classmethod
+    def _limits_in_unit(cls, limits: dict[str, LimitConfig], info: ValidationInfo) -> dict[str, LimitConfig]:
+        signals = info.data.get("signals", {})
+        return {n: limit.in_unit(signals[n].unit, n) if n in signals else limit for n, limit in limits.items()}
+
+    @field_validator("stop")
+    @classmethod
+    def _stop_in_unit(cls, stop: StopConfig, info: ValidationInfo) -> StopConfig:
+        name, signals = getattr(info.data.get("command"), "signal", ""), info.data.get("signals", {})
+        return stop.in_unit(signals[name].unit, name) if name in signals else stop
 
     @model_validator(mode="after")
     def _names_fit(self) -> "RobotConfig":

@@ -5,6 +5,7 @@ safety code: `hal.robot` applies limits, command age and watchdogs to every devi
 """
 
 import abc
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -106,6 +107,9 @@ class Device(abc.ABC):
     """Elements that `apply` takes, in order; empty for a sensor."""
     command_quantity: str = "position"
     """Quantity that `apply` takes: `position`, `velocity` or `effort`."""
+    fastest: float = math.inf
+    """Highest speed of the commanded element [its unit/s] that the drive can reach, as far as it is known: some drives
+    report it to `inspect`."""
     served: Mapping[str, str] = MappingProxyType({})
     """Quantity (`position`, `velocity`, `effort`, ...) -> `signal.element`, where the quantity is known."""
 

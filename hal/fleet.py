@@ -39,6 +39,7 @@ def build(
         calibration = calibrations.get(name)
         driver, settings = registry.equipment(config, name, calibration.settings if calibration else None)
         elements = _elements(driver, settings, entry, name)
+        _check_units(config, driver, settings, elements, name)
         bounds = _bounds(config, elements.get(driver.commanded(settings)))
         place = Place(
             name, elements, buses[entry.bus], entry.node, config.folder, config.rates.hal, calibration, bounds
@@ -67,6 +68,22 @@ def _elements(driver: Any, settings: Any, entry: DeviceConfig, name: str) -> dic
             f"Add `{commanded}: signal.element`, or set another mode."
         )
     return {quantity: elements[quantity] for quantity in known if quantity in elements}
+
+
+def _check_units(config: RobotConfig, driver: Any, settings: Any, elements: Mapping[str, str], name: str) -> None:
+    """Check that the signals have the units in which a device measures.
+
+    Raises:
+        ConfigError: One has another unit, so its limits would be in that unit and its numbers in the device's.
+    """
+    for quantity, element in elements.items():
+        unit, signal = driver.unit_of(settings, quantity), element.partition(".")[0]
+        if unit not in (None, config.signals[signal].unit):
+            hint = " Does it lack spool_radius?" if config.signals[signal].unit in ("m", "m/s", "N") else ""
+            raise ConfigError(
+                f"Device '{name}' has its {quantity} in {unit}, and the unit of {signal} is "
+                f"{config.signals[signal].unit}. Change the unit of the signal, or the settings of the device.{hint}"
+            )
 
 
 def _bounds(config: RobotConfig, element: str | None) -> tuple[float, float]:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from services.verbs import deployment, describe, hardware, page, recording
+from services.verbs import deployment, describe, hardware, init, page, recording
 from services.verbs.verb import Connect, RobotFile, load, report_errors, robot_name, robot_path
 
 app = typer.Typer(
@@ -210,6 +210,8 @@ def query(
 
     [bold]engage[/], [bold]disengage[/] let the model move the robot or not    [bold]adapt on|off[/] online update
 
+    [bold]move SIGNAL V1 V2 ...[/] move once, with or without a model, and let go
+
     [bold]control SIGNAL V1 V2 ...[/] command for a target    [bold]simulate V1 V2 ...[/] state after a command
 
     [bold]anomaly[/] anomaly score    [bold]rollback[/] restore the model before the update
@@ -309,7 +311,7 @@ def reproduce(
     typer.echo(f"Figures and tables are in {out / robot}.")
 
 
-for verbs in (describe, hardware, deployment, recording, page):
+for verbs in (init, describe, hardware, deployment, recording, page):
     verbs.register(app)
 
 

@@ -14,19 +14,21 @@ from simulators.chain import GRAVITY
 
 
 @contextlib.contextmanager
-def _without_greeting() -> Iterator[None]:
-    """Discard the output of C code to the file descriptor of standard error."""
-    stderr, sink = os.dup(2), os.open(os.devnull, os.O_WRONLY)
-    os.dup2(sink, 2)
+def without_output(*descriptors: int) -> Iterator[None]:
+    """Discard the output of C code to file descriptors: 1 is standard output, 2 standard error."""
+    kept, sink = [os.dup(one) for one in descriptors], os.open(os.devnull, os.O_WRONLY)
+    for one in descriptors:
+        os.dup2(sink, one)
     try:
         yield
     finally:
-        os.dup2(stderr, 2)
-        os.close(stderr)
+        for one, copy in zip(descriptors, kept, strict=True):
+            os.dup2(copy, one)
+            os.close(copy)
         os.close(sink)
 
 
-with _without_greeting():  # pybullet prints its build time when it is imported
+with without_output(2):  # pybullet prints its build time when it is imported
     import pybullet
 
 

@@ -14,10 +14,10 @@ from collections.abc import Mapping
 import numpy as np
 from typing_extensions import override
 
-from simulators.bullet import BulletBody
 from simulators.faults import MUSCLE_CUT, check_part
 from simulators.muscle_body import Body, Friction, Servo
 from simulators.muscle_kernels import held, pull
+from simulators.physics.choice import make_body
 from simulators.world import World, servo_index
 
 
@@ -42,7 +42,7 @@ class MuscleWorld(World):
         self._body = body
         self._servo = servo or Servo()
         joints, muscles = body.paths.chain.joints, body.paths.names
-        self._bullet = BulletBody(body.urdf, joints, body.rest)
+        self._physics = make_body(body.urdf, joints, body.rest)
         self._random = np.random.default_rng(seed)
         self._muscles = {f"muscle_length.{name}": index for index, name in enumerate(muscles)}
         self._noise = {
@@ -84,7 +84,7 @@ class MuscleWorld(World):
     @override
     def truth(self) -> dict[str, np.ndarray]:
         return {
-            "joint_position": self._bullet.position.copy(),
+            "joint_position": self._physics.position.copy(),
             "muscle_tension": self._tension.copy(),
             "muscle_length": self._spool - self._body.slack,
         }
@@ -106,11 +106,11 @@ class MuscleWorld(World):
             self._whole[self._body.paths.names.index(muscle)] = 0.0
         else:
             hand = self._body.paths.chain.joints[-1]
-            self._bullet.add_mass(hand, self._body.object_mass, self._body.object_radius)
+            self._physics.add_mass(hand, self._body.object_mass, self._body.object_radius)
 
     @override
     def close(self) -> None:
-        self._bullet.close()
+        self._physics.close()
 
     def _refresh(self, duration: float) -> None:
         """Solve the paths at the present posture, and the matrix for implicit steps of `duration` [s].
@@ -119,9 +119,9 @@ class MuscleWorld(World):
         gives the same dv with M alone.
         """
         body = self._body
-        self._solved_at = self._bullet.position.copy()
+        self._solved_at = self._physics.position.copy()
         self._lengths, self._arms = body.paths.solve(self._solved_at)
-        mass, self._bias = self._bullet.inertia()
+        mass, self._bias = self._physics.inertia()
         elastic = body.elastic.stiffness(self._pull) * duration**2
         viscous = body.loss_time * body.elastic.rate * self._pull * duration
         slope = self._joints[1] / self._numbers[-1] * duration**2  # of dry friction before it slips
@@ -135,12 +135,12 @@ class MuscleWorld(World):
 
     def _substep(self, duration: float) -> None:
         torque = self._pulled(duration, self._wires, self._slid_joint)
-        self._bullet.step(self._bias + self._implicit @ (torque - self._bias), duration)
+        self._physics.step(self._bias + self._implicit @ (torque - self._bias), duration)
 
     def _pulled(self, duration: float, wires: np.ndarray, slid_joint: np.ndarray) -> np.ndarray:
         """Advance wires and sliding joints by one step; return the torques [N m], shape (n,)."""
         torque: np.ndarray = pull(
-            duration, self._bullet.position, self._bullet.velocity, self._solved_at, self._lengths, self._arms,
+            duration, self._physics.position, self._physics.velocity, self._solved_at, self._lengths, self._arms,
             wires, self._orders, self._build, slid_joint, self._joints, self._numbers,
         )  # fmt: skip
         return torque

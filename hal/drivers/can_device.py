@@ -80,6 +80,11 @@ class CanDevice(Device):
         return None
 
     @classmethod
+    def unit_of(cls, settings: Any, quantity: str) -> str | None:
+        """Return the unit of a quantity; None if the robot file decides it, as for an analogue input."""
+        return None
+
+    @classmethod
     def traffic(cls, settings: Any, rate: float) -> tuple[tuple[int, float] | tuple[int, float, bool], ...]:
         """Return data bytes and frames per second [Hz] of its whole traffic, at `rate` cycles per second.
 

@@ -17,6 +17,7 @@ from hal.device import Device
 from hal.drivers.can_device import CanDevice
 from hal.errors import ConfigError, HalError
 from hal.finding import link
+from hal.finding.plausible import drive_questions, position_questions
 from hal.fleet import build
 from hal.wire import budget
 from hal.wire.bus import Bus
@@ -75,7 +76,7 @@ MUTE = 0.5
 def check_file(config: RobotConfig) -> Iterator[Finding]:
     """Check the robot file, the budget of its buses, and its calibrations; nothing is opened."""
     try:
-        build(config, SystemClock(), _calibrations(config))
+        _, devices = build(config, SystemClock(), _calibrations(config))
     except ConfigError as error:
         yield bad("robot file", str(error))
         return
@@ -83,7 +84,18 @@ def check_file(config: RobotConfig) -> Iterator[Finding]:
     yield ok("robot file", f"'{config.robot}': {counts}.")
     for bus_budget in budget.budgets(config):
         yield ok(f"budget {bus_budget.bus}", f"{bus_budget}.")
+    yield from check_limits(config, devices)
     yield check_calibration(config)
+
+
+def check_limits(config: RobotConfig, devices: Iterable[Device]) -> Iterator[Finding]:
+    """Ask about limits that no robot of this kind is likely to have, or that a drive cannot reach."""
+    questions = list(position_questions(config))
+    yield from (warning("limits", text) for text in questions)
+    too_fast = list(drive_questions(config, devices))
+    yield from (warning(f"rate {name}", text) for name, text in too_fast)
+    if config.limits and not questions and not too_fast:
+        yield ok("limits", f"Likely for {', '.join(config.limits)}.")
 
 
 def _calibrations(config: RobotConfig) -> dict[str, Calibration]:
@@ -142,6 +154,8 @@ def check_devices(config: RobotConfig, duration: float = DURATION) -> Iterator[F
         with pulse(buses):
             checks = dict(zip(answering, pool.map(_inspect, answering), strict=True))
         yield from _summary(checks)
+        for name, text in drive_questions(config, answering):
+            yield warning(f"rate {name}", text)
     finally:
         list(pool.map(lambda device: device.close(), devices))
         pool.shutdown()

@@ -48,6 +48,8 @@ class Lease:
         self._clock = clock or SystemClock()
         self._lock = threading.Lock()
         self._tenure = Tenure()
+        self._shared = 0
+        """`boot` of the service that commands for any client, because its client had no lease; 0 without one."""
 
     @property
     def tenure(self) -> Tenure | None:
@@ -67,6 +69,8 @@ class Lease:
             seconds: Length of the lease [s].
             number: Number that the client chose, so that it may repeat a request whose answer was lost; 0: any.
 
+        A service that was let command by a client without a lease commands for any client, so it gives way.
+
         Raises:
             CommandHeld: Another client has the lease, or this one under another number.
             BadArguments: The time or the number is not allowed, or the caller has no boot.
@@ -78,9 +82,11 @@ class Lease:
             raise BadArguments("A client that takes the lease must send a `boot`, a random number, with its query.")
         with self._lock:
             tenure, until = self.tenure, self._clock.monotonic() + duration
-            if tenure is not None and (tenure.caller.boot != caller.boot or tenure.number not in (0, number)):
+            gives_way = tenure is not None and not tenure.number and tenure.caller.boot == self._shared
+            is_other = tenure is not None and (tenure.caller.boot != caller.boot or tenure.number not in (0, number))
+            if tenure is not None and is_other and not gives_way:
                 raise self._refusal(tenure)
-            through = 0 if tenure is None else tenure.through
+            through = 0 if tenure is None or gives_way else tenure.through
             self._tenure = Tenure(caller, until, through, number or new_number())
             return self._tenure
 
@@ -117,7 +123,7 @@ class Lease:
             tenure = self.tenure
             if tenure is None:
                 return
-            if tenure.caller.boot != caller.boot or not tenure.number or tenure.number != number:
+            if tenure.caller.boot != caller.boot or not tenure.number or (type(number), number) != (int, tenure.number):
                 raise self._refusal(tenure)
             self._tenure = replace(tenure, until=-math.inf)
 
@@ -140,7 +146,7 @@ class Lease:
             self.check(caller)
             tenure = self.tenure
             if tenure is None:
-                self._tenure = Tenure()
+                self._tenure, self._shared = Tenure(), caller.through
             elif tenure.caller.boot == caller.boot:
                 self._tenure = replace(tenure, through=caller.through)
 

@@ -13,18 +13,22 @@ from gemuco.warm import warm
 from hal.config import RobotConfig, load_robot
 from hal.errors import ConfigError
 from services.client import Client
-from services.demo import pace
+from services.demo import arm_story, pace
 from services.demo.actor import Actor, Stage
+from services.demo.arm_story import ArmStory
 from services.demo.pace import CycleCounts
 from services.demo.story import MUSCLE, Story
 from services.demo.timeline import Timeline
 from services.demo.tool_story import ToolStory
+from services.errors import AlreadyRunning
+from services.extras import engine_of, require
 from services.learning import collector, trainer
 from services.model import artifacts
 from services.model.control_config import ControlConfig
 from services.model.living_model import load_model
 from services.model.model_config import model_config
 from services.process.supervisor import Supervisor, gemuco_command
+from services.runtime import services_here
 from services.show import progress
 
 READY_WITHIN = 180.0
@@ -46,6 +50,7 @@ def play(robot: RobotConfig, path: Path, seed: int, out: Path) -> int:
     console = Console()
     started = time.monotonic()
     target = control_of(robot).target
+    check_start(robot)
     make_model(robot, console)
     with progress("compiling") as report:  # otherwise each process would wait for it
         warm(report)
@@ -125,10 +130,11 @@ def control_of(robot: RobotConfig) -> ControlConfig:
         ConfigError: The robot file has no control, or no story fits the robot.
     """
     control = model_config(robot).control
-    if not has_tools(robot) and MUSCLE not in robot.signals[robot.command.signal].elements:
+    is_arm = arm_story.fits(robot, control)
+    if not (has_tools(robot) or is_arm) and MUSCLE not in robot.signals[robot.command.signal].elements:
         raise ConfigError(
-            f"There is no story for '{robot.robot}': it needs conditions and a signal that a camera sees, or a muscle "
-            f"{MUSCLE} to cut."
+            f"There is no story for '{robot.robot}': it needs a camera and encoders apart from its drives, as files of "
+            f"`gemuco init` have, or a camera and conditions, or a muscle {MUSCLE} to cut."
         )
     if control is None:
         raise ConfigError(
@@ -155,11 +161,46 @@ def perform(
             tool_marks = ToolStory(robot, client, timeline, seed, actor, console.print, schema).play()
         tool_plot.plot(robot, target, schema, timeline, tool_marks, picture)
         return tool_marks.stages
+    control = model_config(robot).control
+    if control is not None and arm_story.fits(robot, control):
+        return _play_arm(robot, client, control, seed, actor, picture, console)
     from services.demo import story_plot
 
     with Timeline(client, target, *sizes, [target]) as timeline:
         marks = Story(robot, client, timeline, seed, actor, console.print).play()
     story_plot.plot(robot, timeline, marks, picture)
+    return marks.stages
+
+
+def check_start(robot: RobotConfig) -> None:
+    """Check, before work that takes minutes, that nothing is missing and no service of this robot runs here.
+
+    Raises:
+        MissingExtra: A package for simulation or training is not installed.
+        AlreadyRunning: A service of a robot with this name runs on this machine.
+    """
+    require("torch", "matplotlib", engine_of(robot.physics))
+    running = [service for name, service in services_here() if name == robot.robot]
+    if running:
+        raise AlreadyRunning(
+            f"Services of a robot '{robot.robot}' run on this machine: {', '.join(running)}. The demo starts its own; "
+            "stop them first, or give the robot in the file another name."
+        )
+
+
+def _play_arm(
+    robot: RobotConfig, client: Client, control: ControlConfig, seed: int, actor: Actor, picture: Path, console: Console
+) -> list[Stage]:
+    from services.demo import arm_plot
+
+    (seen,) = robot.seen
+    commands = robot.signals[robot.command.signal].size
+    with (
+        Timeline(client, control.target, robot.signals[control.target].size, commands, [control.target]) as joints,
+        Timeline(client, seen, robot.signals[seen].size, commands, [seen]) as tip,
+    ):
+        marks = ArmStory(robot, client, joints, tip, control, seed, actor, console.print).play()
+    arm_plot.plot(robot, control.target, joints, tip, marks, picture)
     return marks.stages
 
 

@@ -147,6 +147,15 @@ def collect_bus(
             client.disable()
 
 
+def motion_of(robot: RobotConfig, seed: int) -> Motion:
+    """Return the motion that a recording of the robot plays under its first condition.
+
+    Raises:
+        ConfigError: The robot file has no motion.
+    """
+    return _motion(robot, collect_config(robot), condition_of(robot, None), seed, EVERYTHING)
+
+
 def _motion(robot: RobotConfig, config: CollectConfig, condition: str | None, seed: int, request: Request) -> Motion:
     if request.postures is not None:
         return taught(robot, config, load_postures(request.postures, robot, config.hold))

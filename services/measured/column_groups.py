@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from services.measured.units import CONVERSIONS, NAMED, PLAIN
+from hal.calibration.units import CONVERSIONS, NAMED, PLAIN
 
 BRACKET = re.compile(r"\s*[\[(]([^\])\d][^\])]*)[\])]\s*$")
 TAIL = re.compile(

@@ -15,10 +15,10 @@ import yaml
 from pydantic import BeforeValidator, Field, ValidationError, model_validator
 
 from gemuco.signals import Layout, Signal
+from hal.calibration.units import check_units, factor
 from hal.config import Positive, Section, explain
 from hal.errors import ConfigError
 from services.measured.text_table import TextStyle
-from services.measured.units import check_units, factor
 from services.model.model_config import Count, ModelConfig, NetworkConfig, StructureConfig, TrainingConfig
 
 USUAL = 10.0

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from gemuco.errors import DatasetError
+from hal.calibration.units import CONVERSIONS, factor
 from services.measured.column_groups import Column, Group, grouped, unit_in
 from services.measured.episode_files import Recording, read_recording
-from services.measured.units import CONVERSIONS, factor
 
 ENOUGH = 20_000
 """A draft thins a recording of more rows out to about this many."""

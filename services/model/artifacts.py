@@ -10,6 +10,9 @@ from services.model.model_config import model_config
 
 RUNS = Path("runs")
 ROBOTS = Path("robots")
+"""The user's robot files are in this folder of the working directory."""
+SHIPPED = Path(__file__).resolve().parents[2] / "robots"
+"""Robot files of this package are beside its modules, in a checkout and in an installation."""
 
 
 def data_path(robot: str) -> Path:
@@ -35,7 +38,7 @@ def fingerprint(robot: RobotConfig) -> str:
 
 
 def robot_file(text: str) -> Path:
-    """Return the path of a robot file, given its path or the robot's name (`musashi_arm`).
+    """Return the path of a robot file, given its path or the robot's name (`musashi_arm`), the user's own first.
 
     Raises:
         ConfigError: There is no such file.
@@ -43,8 +46,9 @@ def robot_file(text: str) -> Path:
     path = Path(text)
     if path.suffix in (".yaml", ".yml") or path.exists():
         return path
-    named = ROBOTS / f"{text}.yaml"
-    if named.exists():
-        return named
-    known = ", ".join(sorted(file.stem for file in ROBOTS.glob("*.yaml") if "." not in file.stem)) or "none"
-    raise ConfigError(f"There is no robot '{text}'. Known in {ROBOTS}/: {known}; or give the path of a robot file.")
+    for folder in (ROBOTS, SHIPPED):
+        if (named := folder / f"{text}.yaml").exists():
+            return named
+    files = [file.stem for folder in (ROBOTS, SHIPPED) for file in folder.glob("*.yaml")]
+    known = ", ".join(sorted({stem for stem in files if "." not in stem})) or "none"
+    raise ConfigError(f"There is no robot '{text}'. Known robots: {known}; or give the path of a robot file.")

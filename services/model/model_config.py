@@ -181,14 +181,16 @@ def collect_config(robot: RobotConfig) -> CollectConfig:
         raise ConfigError(f"{where}: with 'motion', speed, hold, forecast and constraints have no effect. Remove them.")
     if collect.constraints and collect.forecast is None:
         raise ConfigError(f"{where}: 'constraints' need a 'forecast'.")
+    constraints = {}
     for name, allowed in collect.constraints.items():
         if name not in robot.signals:
             raise ConfigError(f"{where}: constraints.{name} is not a signal. Known: {', '.join(robot.signals)}.")
         try:
+            constraints[name] = allowed.in_unit(robot.signals[name].unit, f"constraints.{name}")
             allowed.bounds(robot.signals[name].size, f"constraints.{name}")
         except ValueError as error:
             raise ConfigError(f"{where}: {error}") from None
-    return collect
+    return collect.model_copy(update={"constraints": constraints})
 
 
 S = TypeVar("S", bound=Section)

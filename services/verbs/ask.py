@@ -10,6 +10,8 @@ import typer
 
 from services.client import SLOW_TIMEOUT, Client, emergency_stop
 from services.errors import BadArguments, NoAnswer, RemoteError
+from services.verbs.answers import sentence
+from services.verbs.move import move
 from services.wire import keys
 
 WITHOUT_WORDS = {
@@ -29,6 +31,7 @@ VERBS = (
     "control",
     "simulate",
     "target",
+    "move",
     "adapt",
     "describe",
     "fault",
@@ -61,7 +64,13 @@ def ask_robot(
                 return _watch(client, signal, hide)
             typer.echo(estimate_line(_estimate(client, signal, hide)))
             return 0
-        for key, value in _answer(client, verb, words, hide).items():
+        if verb == "move":
+            return move(client, *_target(verb, words))
+        reply = _answer(client, verb, words, hide)
+        if text := sentence(client, verb, words, reply):
+            typer.echo(text)
+            return 0
+        for key, value in reply.items():
             typer.echo(f"{key}: {value if isinstance(value, str) else json.dumps(value)}")
     return 0
 
@@ -100,12 +109,10 @@ def _watch(client: Client, signal: str, hide: Sequence[str]) -> int:
 
 def _answer(client: Client, verb: str, words: Sequence[str], hide: Sequence[str]) -> dict[str, Any]:
     if verb in ("target", "control"):
-        if len(words) < 2:
-            raise BadArguments(f"'{verb}' needs a signal and one value per element: {verb} joint_position 0 0 0 -0.6 0")
-        values = _numbers(verb, words[1:], "after the signal")
+        signal, values = _target(verb, words)
         if verb == "control":
-            return client.control({words[0]: values})
-        return client.ask("model", "target", {"signal": words[0], "values": values})
+            return client.control({signal: values})
+        return client.ask("model", "target", {"signal": signal, "values": values})
     if verb == "simulate":
         if not words:
             raise BadArguments("'simulate' needs a command: one value per element of the commanded signal.")
@@ -136,6 +143,13 @@ def _answer(client: Client, verb: str, words: Sequence[str], hide: Sequence[str]
     if verb == "anomaly":
         return client.ask("model", "anomaly", {"hide": list(hide)}, SLOW_TIMEOUT)
     return client.ask(WITHOUT_WORDS[verb], verb)
+
+
+def _target(verb: str, words: Sequence[str]) -> tuple[str, list[float]]:
+    """Return the signal and the values that follow a verb."""
+    if len(words) < 2:
+        raise BadArguments(f"'{verb}' needs a signal and one value per element: {verb} joint_position 0 0 0 -0.6 0")
+    return words[0], _numbers(verb, words[1:], "after the signal")
 
 
 def _numbers(verb: str, words: Sequence[str], where: str) -> list[float]:

@@ -47,7 +47,9 @@ def report_errors(verb: Callable[..., Any]) -> Callable[..., Any]:
         except ModuleNotFoundError as error:
             if (error.name or "").partition(".")[0] in OURS:
                 raise
-            typer.echo(f"gemuco: this verb needs the package '{error.name}', which is not installed here.", err=True)
+            from services.extras import sentence
+
+            typer.echo(f"gemuco: {sentence((error.name or '').partition('.')[0])}", err=True)
             raise typer.Exit(1) from None
         except KeyboardInterrupt:
             raise typer.Exit(130) from None

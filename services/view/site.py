@@ -7,12 +7,11 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from services.errors import ServiceError
+from services.extras import require
 from services.view.door import Door
 
 if TYPE_CHECKING:
     import viser
-
-MISSING = "The live page needs two more packages: pip install 'gemuco[view]' (viser and yourdfpy)."
 
 
 def open_site(host: str, port: int, title: str, door: Door) -> "viser.ViserServer":
@@ -27,12 +26,11 @@ def open_site(host: str, port: int, title: str, door: Door) -> "viser.ViserServe
     Raises:
         ServiceError: The packages are not installed, the port is taken, or this machine does not have the address.
     """
-    try:
-        import rich
-        import viser
-        from viser import _messages
-    except ImportError:
-        raise ServiceError(MISSING) from None
+    require("viser", "yourdfpy")
+    import rich
+    import viser
+    from viser import _messages
+
     _check_free(host, port)
     rich.get_console().quiet = True  # viser prints a table to stdout
     for name in ("websockets", "websockets.server"):  # else one traceback per browser that disconnects

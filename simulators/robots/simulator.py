@@ -6,6 +6,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from simulators.physics.choice import using
+
 if TYPE_CHECKING:
     from hal.config import RobotConfig
     from hal.robot import Robot
@@ -36,10 +38,12 @@ class RobotSimulator(ABC):
         """Return the world behind simulated nodes on the robot file's buses."""
         from simulators.rig import Rig
 
-        return Rig(config, self.world(variant, seed, condition), self._hardware())
+        with using(config.physics):
+            return Rig(config, self.world(variant, seed, condition), self._hardware())
 
     def direct(self, config: RobotConfig, variant: str, seed: int, condition: str | None = None) -> Robot:
         """Return the world without a bus, as fast as it computes."""
         from simulators.direct import direct_robot
 
-        return direct_robot(config, self.world(variant, seed, condition))
+        with using(config.physics):
+            return direct_robot(config, self.world(variant, seed, condition))

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 from hal_bench import ROBOTS, Bench
 
+from hal.calibration.units import axis_units
 from hal.config import RobotConfig
 from simulators.nodes.canopen.spec import DriveConstants, NodeSpec
 
@@ -62,7 +63,8 @@ def joint_description(mode="csp", quantities=tuple(ELBOW), limits=None, **settin
     if "temperature" in quantities:
         settings = {"temperature": TEMPERATURE, **settings}
     elements = {quantity: ELBOW[quantity] for quantity in quantities}
-    signals = {f"joint_{q}": {"unit": UNITS[q], "elements": ["elbow"], "stale_after": 0.3} for q in quantities}
+    units = UNITS | (axis_units(is_linear=True) if settings.get("spool_radius") else {})
+    signals = {f"joint_{q}": {"unit": units[q], "elements": ["elbow"], "stale_after": 0.3} for q in quantities}
     signals.setdefault("joint_position", {"unit": "rad", "elements": ["elbow"], "source": "vision"})
     signals["joint_load"] = {"unit": "N m", "elements": ["elbow"], "source": "vision"}
     commanded = f"joint_{COMMANDED[mode]}"

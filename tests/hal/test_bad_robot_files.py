@@ -38,6 +38,28 @@ def test_two_devices_with_one_node_id(tmp_path):
     assert is_one_sentence(told)
 
 
+@pytest.mark.parametrize(
+    ("signal", "unit", "told"),
+    [
+        ("muscle_length", "rad", "Device 'biceps_drive' has its position in m, and the unit of muscle_length is rad."),
+        ("joint_position", "m", "has its position in rad, and the unit of joint_position is m. Change the unit"),
+    ],
+)
+def test_a_signal_in_another_unit_than_its_device(tmp_path, signal, unit, told):
+    body = description(limits={})
+    body["signals"][signal]["unit"] = unit
+    text = refused(body, tmp_path)
+    assert told in text
+
+
+def test_a_wire_without_a_spool(tmp_path):
+    body = description()
+    body["kinds"]["drive"]["settings"] = {**body["kinds"]["drive"]["settings"], "spool_radius": None}
+    text = refused(body, tmp_path)
+    assert "has its position in rad, and the unit of muscle_length is m." in text
+    assert text.endswith("Does it lack spool_radius?")
+
+
 def test_a_gear_of_zero(tmp_path):
     body = description()
     body["kinds"]["drive"]["settings"] = {**body["kinds"]["drive"]["settings"], "gear": 0}

@@ -4,6 +4,7 @@ import pytest
 import yaml
 from hal_bench import description
 
+from hal.calibration.units import ROBOT_UNITS
 from hal.config import load_robot
 from hal.errors import ConfigError
 
@@ -101,3 +102,73 @@ def test_mistakes_are_told_in_one_sentence(written, changes, told):
     message = refused(written(**changes))
     assert told in message
     assert "\n" not in message
+
+
+@pytest.mark.parametrize(
+    ("unit", "told"),
+    [
+        ("deg", "'deg' is not an SI unit; write unit: rad, and written_in: deg beside its numbers in limits, stop"),
+        ("degrees", "write unit: rad, and written_in: deg"),
+        ("rpm", "write unit: rad/s, and written_in: rpm"),
+        ("Nm", "the unit 'Nm' is written 'N m'"),
+        ("Rad", "the unit 'Rad' is unknown; is it 'rad'? Known units: "),
+        ("furlong", "the unit 'furlong' is unknown. Known units: "),
+        (None, "a signal needs a unit, such as rad"),
+    ],
+)
+def test_a_unit_is_one_of_a_list(written, unit, told):
+    text = refused(written(**changed("signals", ["joint_position", "unit"], unit)))
+    assert "signals.joint_position.unit: " in text and told in text
+    assert "\n" not in text
+
+
+def test_the_document_lists_every_unit():
+    text = (MUSASHI.parents[1] / "docs" / "robots.md").read_text().replace("1 (no unit)", "1")
+    assert f"is one of {', '.join(ROBOT_UNITS)}." in " ".join(text.split())
+
+
+def test_a_number_without_a_unit_has_the_unit_one(written):
+    assert (
+        load_robot(written(**changed("signals", ["joint_position", "unit"], 1))).signals["joint_position"].unit == "1"
+    )
+
+
+def test_limits_and_stop_are_converted_where_they_are_written(written):
+    limits = {
+        "muscle_length": {"low": [100, 120.0], "high": 500, "rate": 50, "acceleration": 1000, "written_in": "mm"},
+        "joint_position": {"trip_low": -90, "trip_high": 90.0, "written_in": "deg"},
+        "muscle_tension": {"trip_high": 0.5, "written_in": "kN"},
+    }
+    stop = {"behaviour": "park", "park": [200, 300], "speed": 20, "written_in": "mm"}
+    config = load_robot(written(limits=limits, stop=stop))
+    length, joint = config.limits["muscle_length"], config.limits["joint_position"]
+    assert (length.low, length.high, length.rate, length.acceleration) == ((0.1, 0.12), 0.5, 0.05, 1.0)
+    assert (joint.trip_low, joint.trip_high) == (pytest.approx(-1.570796), pytest.approx(1.570796))
+    assert config.limits["muscle_tension"].trip_high == 500.0
+    assert (config.stop.park, config.stop.speed) == ((0.2, 0.3), 0.02)
+    assert type(config).model_validate(config.model_dump(by_alias=True)) == config  # nothing is converted twice
+
+
+@pytest.mark.parametrize(
+    ("signal", "unit", "told"),
+    [
+        (
+            "joint_position",
+            "mm",
+            "limits: joint_position: 'mm' cannot be converted to 'rad'; to 'rad' can be converted",
+        ),
+        ("joint_position", "degree", "the unit 'degree' is written 'deg'"),
+        ("muscle_tension", "deg", "'deg' cannot be converted to 'N'; to 'N' can be converted: mN, kN, kgf"),
+    ],
+)
+def test_numbers_in_a_unit_that_does_not_fit(written, signal, unit, told):
+    assert told in refused(written(limits={signal: {"trip_high": 1.0, "written_in": unit}}))
+    assert "stop" in refused(written(stop={"behaviour": "park", "park": [1, 1], "speed": 1, "written_in": "deg"}))
+
+
+def test_what_is_plausible_is_converted_too_but_not_its_time(written):
+    plausible = {"low": -180, "high": 180.0, "rate": 360, "frozen_after": 2.0, "written_in": "deg"}
+    config = load_robot(written(**changed("signals", ["joint_position", "plausible"], plausible)))
+    converted = config.signals["joint_position"].plausible
+    assert (converted.low, converted.rate) == (pytest.approx(-3.141593), pytest.approx(6.283185))
+    assert converted.frozen_after == 2.0

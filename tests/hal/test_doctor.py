@@ -210,3 +210,44 @@ def test_interfaces_that_are_no_hardware_say_so():
     assert told == {"interface can0": Severity.WARNING, "interface can1": Severity.WARNING}
     told = verdicts(check_interfaces(RobotConfig.model_validate(description(interface="hub"))))
     assert set(told.values()) == {Severity.OK}
+
+
+def asked(**changes):
+    """What the doctor says of limits, by its subject; nothing is opened."""
+    found = doctor.check_file(RobotConfig.model_validate(description(**changes)))
+    return {finding.what: finding for finding in found if finding.what.startswith(("limits", "rate"))}
+
+
+@pytest.mark.parametrize(
+    ("limits", "told"),
+    [
+        ({"joint_position": {"trip_high": 2.0}}, "Likely for joint_position"),
+        (
+            {"joint_position": {"low": -90, "high": 90}},
+            "may go to 90 rad, which is more than two turns. Are these deg?",
+        ),
+        ({"muscle_length": {"low": 100, "high": 500}}, "may go to 500 m, which is more than 20 m. Are these mm?"),
+        ({"muscle_length": {"low": 0.1, "high": 0.5, "rate": 250}}, "may move at 250 m/s. Are these mm?"),
+    ],
+)
+def test_limits_that_are_unlikely_are_asked_about(limits, told):
+    found = asked(limits=limits)["limits"]
+    assert told in found.text
+    assert (found.verdict is Severity.OK) == told.startswith("Likely")
+
+
+def test_a_rate_that_the_drive_cannot_reach_is_asked_about():
+    kinds = description()["kinds"]
+    kinds["drive"]["settings"] = {**kinds["drive"]["settings"], "max_velocity": 0.2}
+    found = asked(kinds=kinds)
+    assert "allows 0.25 m/s, and the drive moves at most at 0.2 m/s" in found["rate biceps_drive"].text
+    assert found["rate biceps_drive"].verdict is Severity.WARNING
+
+
+def test_the_drive_is_asked_for_its_fastest_speed():
+    with running() as (config, rig):
+        assert "rate biceps_drive" not in asked()
+        rig.node("biceps_drive").objects.values[0x6080, 0] = 4000  # turns of the motor per minute: 0.116 m/s
+        found = by_what(doctor.check_devices(config, 0.1))
+    assert "the drive moves at most at 0.1156 m/s" in found["rate biceps_drive"].text
+    assert "rate triceps_drive" not in found

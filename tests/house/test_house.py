@@ -59,6 +59,7 @@ WRITE_OTHERWISE = {
     "services/process/supervisor.py": "writes a log",
     "services/recording/export.py": "writes tables larger than the memory",
     "simulators/bullet.py": "writes nothing",
+    "simulators/physics/bullet_arm.py": "writes a file that only PyBullet reads, at once",
 }
 """tests/system/test_kills.py kills those that write files."""
 

@@ -190,6 +190,26 @@ def test_while_the_model_commands_by_itself_whoever_asks_it_is_answered(case: Ca
         case.lease.check(BERT)
 
 
+def test_a_service_that_was_engaged_without_a_lease_gives_way_to_the_next_one(case: Case) -> None:
+    case.lease.delegate(Caller(ANNA.name, ANNA.boot, through=MODEL.boot))  # one request, as of `gemuco query engage`
+    case.lease.stream(MODEL)
+    tenure = case.lease.take(BERT, 2.0)
+    assert (tenure.caller, tenure.through) == (BERT, 0)
+    with pytest.raises(CommandHeld, match="bert"):
+        case.lease.check_stream(MODEL)
+    case.lease.stream(MODEL)  # what was on its way does not take it back
+    assert case.lease.tenure == tenure
+    with pytest.raises(CommandHeld, match="bert"):
+        case.lease.take(ANNA, 1.0)
+
+
+def test_a_client_that_streams_by_itself_does_not_give_way(case: Case) -> None:
+    case.lease.delegate(Caller(ANNA.name, ANNA.boot, through=MODEL.boot))
+    case.lease.stream(ANNA)
+    with pytest.raises(CommandHeld, match="anna"):
+        case.lease.take(BERT, 2.0)
+
+
 def test_of_many_who_take_it_at_once_one_has_it() -> None:
     lease, refused, start = Lease(), [], threading.Barrier(16)
 

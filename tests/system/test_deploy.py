@@ -116,8 +116,8 @@ def _installed(name: str) -> bool:
 
 @pytest.mark.parametrize(
     "words",
-    [("-torch", "-matplotlib"), ("=torch", "=matplotlib", "=pybullet", "=joblib", "+sim", "+studies"),
-     ("+sim", "+dev", "+build"), ("+build", "=setuptools")],
+    [(), ("=torch", "=matplotlib", "=pybullet", "=joblib", "+train", "+sim", "+studies"), ("+dev", "+build"),
+     ("+build", "=setuptools")],
     ids=" ".join,
 )  # fmt: skip
 def test_what_is_installed_by_hash_needs_nothing_else(
@@ -256,7 +256,7 @@ def test_what_the_small_image_lacks_is_told_in_a_sentence(
     with pytest.raises(typer.Exit) as ended:
         report_errors(lambda: __import__("torch"))()
     assert ended.value.exit_code == 1
-    assert "needs the package 'torch'" in capsys.readouterr().err
+    assert "needs the package 'torch', not installed here: pip install 'gemuco[train]'." in capsys.readouterr().err
     with pytest.raises(ModuleNotFoundError):
         report_errors(lambda: __import__("services.no_such_file"))()
 
@@ -267,10 +267,14 @@ def requirements(*words: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_requirements_of_an_image() -> None:
-    small = requirements("-torch", "-matplotlib").stdout
+    small = requirements().stdout
     assert "numpy" in small
-    assert "torch" not in small
-    assert requirements("=torch", "+sim", "=pybullet").stdout.split() == ["torch>=2.6", "pybullet>=3.2.7"]
+    assert not any(name in small for name in HEAVY)
+    assert "numpy" not in requirements("-numpy").stdout
+    assert requirements("+train", "=torch", "+sim", "=pybullet").stdout.splitlines() == [
+        "torch>=2.6",
+        "pybullet>=3.2.7; python_version < '3.12'",
+    ]
     assert "does not ask for tensorflow" in requirements("-tensorflow").stderr
 
 

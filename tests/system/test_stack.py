@@ -70,8 +70,8 @@ def test_what_cannot_be_is_refused_in_one_sentence(stack: Stack) -> None:
 def test_the_model_can_be_asked_what_it_is_and_does(stack: Stack) -> None:
     described = ask(stack, "describe", "model")
     assert "muscle_tension+muscle_length" in described.stdout
-    assert "active: true" in ask(stack, "adapt", "on").stdout
-    assert "active: false" in ask(stack, "rollback").stdout
+    assert "The online update runs and learns" in ask(stack, "adapt", "on").stdout
+    assert "The model before the online update is in use again" in ask(stack, "rollback").stdout
     normal = ask(stack, "normal")
     assert normal.returncode == 1
     assert "Let the robot move for a while with the update stopped." in normal.stderr
@@ -132,3 +132,27 @@ def test_a_killed_process_comes_back_and_state_flows_again(stack: Stack, name: s
     stack.start(name)
     eventually(lambda: stack.method() == "measured")
     assert stack.mode() == "off"
+
+
+def test_a_client_gets_the_lease_after_somebody_engaged_by_a_query(stack: Stack) -> None:
+    engaged = ask(stack, "engage")
+    assert "The controller is engaged and holds joint_position." in engaged.stdout, engaged.stderr
+    eventually(lambda: stack.mode() == "follow")
+    with stack.client.lease():  # as in the README, by another program
+        stack.client.engage()
+        eventually(lambda: stack.mode() == "follow")
+        assert stack.client.holder().name.startswith(stack.client._link.caller.name)
+    eventually(lambda: stack.mode() in ("off", "stopping"))
+    idle = ask(stack, "target", "joint_position", "0.1", "0.1", "0", "-0.6", "0")
+    assert idle.stdout.startswith("Nothing moves: the controller is not engaged.")
+
+
+def test_a_target_is_reached_by_one_command_line(stack: Stack) -> None:
+    eventually(lambda: stack.mode() == "off")
+    answer = ask(stack, "move", "joint_position", "0.2", "-0.3", "0.0", "-0.9", "0.1")
+    assert answer.returncode == 0, answer.stderr
+    assert answer.stdout.startswith("joint_position is at shoulder_roll ")
+    assert "The lease has ended" in answer.stdout
+    assert "No client commands this robot." in ask(stack, "holder").stdout
+    wrong = ask(stack, "move", "muscle_tension", "1")
+    assert "'muscle_tension' cannot be moved; muscle_length or joint_position can." in wrong.stderr

@@ -5,6 +5,7 @@ from typing import Any, Literal
 
 from typing_extensions import override
 
+from hal.calibration.units import axis_units
 from hal.commissioning.pdo_map import Pdo, PdoMap, lay_out
 from hal.config import Finite, Positive
 from hal.device import DeviceState
@@ -40,6 +41,11 @@ class Cia406Encoder(CanopenNode):
     @override
     def quantities(cls, settings: EncoderSettings) -> tuple[str, ...]:
         return ("position", "velocity")
+
+    @classmethod
+    @override
+    def unit_of(cls, settings: EncoderSettings, quantity: str) -> str | None:
+        return axis_units(False).get(quantity)
 
     @classmethod
     @override

@@ -8,6 +8,7 @@ import can
 import numpy as np
 from typing_extensions import override
 
+from hal.calibration.units import axis_units
 from hal.commissioning.node import cob_id
 from hal.commissioning.pdo_map import Pdo, describe
 from hal.commissioning.sdo_client import SdoClient
@@ -125,6 +126,11 @@ class Cia402Drive(CanopenNode):
 
     @classmethod
     @override
+    def unit_of(cls, settings: DriveSettings, quantity: str) -> str | None:
+        return axis_units(settings.spool_radius is not None).get(quantity)
+
+    @classmethod
+    @override
     def traffic_of(
         cls, settings: DriveSettings, rate: float, quantities: tuple[str, ...]
     ) -> tuple[tuple[int, float], ...]:
@@ -146,6 +152,7 @@ class Cia402Drive(CanopenNode):
         super().__init__(place, settings, cia402.PROFILE, settings.pdos(tuple(place.elements)))
         check_objects(settings, "effort" in place.elements, self._sheet, str(place))
         self.can_damp = settings.damping is not None
+        self.fastest = settings.max_velocity or math.inf
         self._mode = MODES[settings.mode]
         self._is_watched = self._sdo.has(cia301.CONSUMER_HEARTBEAT, 1)
         self._handshake = SetPointHandshake()
@@ -376,7 +383,19 @@ class Cia402Drive(CanopenNode):
         if self._units is None:  # not opened yet
             self._calibrate()
         checks = drive_checks(self._sdo, self._mode, self._is_watched, str(self._place))
+        self.fastest = self._motor_speed()
         return (*super().inspect(), *checks)
+
+    def _motor_speed(self) -> float:
+        """Return the highest speed of the motor (6080h) at the output [unit/s]; infinite if the drive has none."""
+        known = self._settings.max_velocity or math.inf
+        if self._units is None or not self._sdo.has(cia402.MAX_MOTOR_SPEED.index):
+            return known
+        try:
+            turns = self._sdo.read(cia402.MAX_MOTOR_SPEED.index, 0)
+        except DeviceRefused:  # some data sheets list objects that the drive does not have
+            return known
+        return turns / 60.0 * self._units.motor_turn if turns else known
 
     def _leads_to_enabled(self, rest: int) -> bool:
         """Return whether the drive takes set-points; if not, send the command of this cycle instead.

@@ -11,6 +11,7 @@ import can
 import numpy as np
 from typing_extensions import override
 
+from hal.calibration.units import axis_units
 from hal.device import Check, DeviceState
 from hal.drivers.can_device import CanDevice, Place
 from hal.drivers.mit.law import Law
@@ -99,6 +100,11 @@ class MitDrive(CanDevice):
 
     @classmethod
     @override
+    def unit_of(cls, settings: MitSettings, quantity: str) -> str | None:
+        return axis_units(settings.spool_radius is not None).get(quantity)
+
+    @classmethod
+    @override
     def traffic(cls, settings: MitSettings, rate: float) -> tuple[tuple[int, float], ...]:
         return ((mit.COMMAND_LAYOUT.size, rate), (max(mit.SIZES[settings.actuator[0]]), rate))
 
@@ -107,6 +113,7 @@ class MitDrive(CanDevice):
         node = place.node
         self._model = settings.motor
         self._layout, self._ranges = settings.actuator
+        self.fastest = self._ranges.velocity * abs(settings.scale)
         self._sizes = mit.SIZES[self._layout]
         self._law = Law(place, settings)
         self.compliance = self._law.compliance

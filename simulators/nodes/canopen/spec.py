@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Protocol
 
-_CHECKOUT = Path(__file__).resolve().parents[3]
-EDS_FOLDER = (_CHECKOUT if (_CHECKOUT / "robots").is_dir() else Path.cwd()) / "robots" / "eds"
-"""EDS files are beside this package, or, without a checkout, in the working directory's folder of robot files."""
+_BESIDE = Path(__file__).resolve().parents[3]
+EDS_FOLDER = (_BESIDE if (_BESIDE / "robots").is_dir() else Path.cwd()) / "robots" / "eds"
+"""EDS files are beside this package; a container has them in the working directory's folder of robot files."""
 
 
 class Constants(Protocol):

@@ -11,8 +11,8 @@ from dataclasses import replace
 import numpy as np
 from typing_extensions import override
 
-from simulators.bullet import BulletBody
 from simulators.faults import changed_tool, check_condition
+from simulators.physics.choice import make_body
 from simulators.robots.pr2_duster.body import FASTEST, LAG, REST, URDF, Body, chain
 from simulators.robots.pr2_duster.camera import SIGNAL, DepthCamera
 from simulators.robots.pr2_duster.duster import GRASPS, Grasp
@@ -45,7 +45,7 @@ class DusterWorld(World):
         self._hand = chain().joints[-1]
         self._servos = {f"joint_position.{name}": index for index, name in enumerate(chain().joints)}
         self._grasp = self._gripped(condition or body.condition)
-        self._bullet = BulletBody(URDF, chain().joints, REST)
+        self._physics = make_body(URDF, chain().joints, REST)
 
     @override
     def step(self, duration: float) -> None:
@@ -66,8 +66,8 @@ class DusterWorld(World):
     @override
     def truth(self) -> dict[str, np.ndarray]:
         """Return the truth; joint positions are those of ideal encoders with these zeros."""
-        self._bullet.place(self._position)
-        rotation, origin = self._bullet.frame(self._hand)
+        self._physics.place(self._position)
+        rotation, origin = self._physics.frame(self._hand)
         tip = self._grasp.cloth(rotation[None], (origin + rotation @ self._body.grip)[None])[0]
         return {"joint_position": self._position - self._body.zero, SIGNAL: tip}
 
@@ -85,7 +85,7 @@ class DusterWorld(World):
 
     @override
     def close(self) -> None:
-        self._bullet.close()
+        self._physics.close()
 
     def _gripped(self, condition: str) -> Grasp:
         meant, body = GRASPS[condition], self._body

@@ -1,5 +1,6 @@
-"""Units of measured data: those of the model, their spellings, and the conversion of others into them."""
+"""Units of robots and measured data: those in use, their spellings, and the conversion of others into them."""
 
+import difflib
 import math
 
 CONVERSIONS = {
@@ -61,6 +62,17 @@ SPELLINGS = {
 NAMED = {spelling: unit for unit, spellings in SPELLINGS.items() for spelling in spellings}
 PLAIN = {*SPELLINGS, *CONVERSIONS, "Pa", "K", "px", "Hz", "%", "W"}
 """These units are written as they are."""
+OTHERS = ("m^2", "m^3", "m^3/s", "kg/s", "N/m", "N m/rad", "N s", "px/s", "J", "ohm", "T", "lx", "dB")
+"""A robot may have these units too."""
+ROBOT_UNITS = (*sorted(PLAIN - {*CONVERSIONS}, key=str.lower), *OTHERS)
+"""A signal of a robot has one of these units."""
+
+
+def axis_units(is_linear: bool) -> dict[str, str]:
+    """Return the unit of every quantity of a drive that winds a wire or, if it is not linear, turns a joint."""
+    length, force = ("m", "N") if is_linear else ("rad", "N m")
+    motion = {"position": length, "following_error": length, "velocity": f"{length}/s", "effort": force}
+    return motion | {"temperature": "degC", "temperature_driver": "degC"}
 
 
 def check_units(unit: str, written_in: str | None) -> None:
@@ -85,3 +97,26 @@ def check_units(unit: str, written_in: str | None) -> None:
 def factor(unit: str, written_in: str | None) -> float:
     """Return the factor from a number of a file to `unit`."""
     return 1.0 if written_in in (None, unit) else CONVERSIONS[str(written_in)][1]
+
+
+def check_robot_unit(unit: str) -> None:
+    """Refuse a unit that a signal of a robot cannot have, because drivers and limits would read its numbers as SI.
+
+    Raises:
+        ValueError: A sentence with the unit to write instead.
+    """
+    if unit in ROBOT_UNITS:
+        return
+    if not unit:
+        raise ValueError("a signal needs a unit, such as rad, N m, or 1 for a number without one")
+    proper = unit if unit in CONVERSIONS else NAMED.get(unit.lower(), "")
+    if proper in CONVERSIONS:
+        raise ValueError(
+            f"'{unit}' is not an SI unit; write unit: {CONVERSIONS[proper][0]}, and written_in: {proper} beside its "
+            "numbers in limits, stop and collect.constraints"
+        )
+    if proper:
+        raise ValueError(f"the unit '{unit}' is written '{proper}'")
+    near = difflib.get_close_matches(unit.lower(), [*ROBOT_UNITS, *CONVERSIONS], 1)
+    hint = f"; is it '{near[0]}'?" if near else "."
+    raise ValueError(f"the unit '{unit}' is unknown{hint} Known units: {', '.join(ROBOT_UNITS)}")
