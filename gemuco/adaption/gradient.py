@@ -56,8 +56,8 @@ class GradientSteps:
         """
         first = float("nan")
         for index in range(count):
-            inputs, outputs, present = self._batch(schema, rows)
-            before, by_weights, by_input = gradients(self._chain, inputs, outputs, SQUARED, weights, bias)
+            inputs, targets, counts, present = self._batch(schema, rows)
+            before, by_weights, by_input = gradients(self._chain, inputs, targets, counts, SQUARED, weights, bias)
             if weights:
                 self.optimiser.move(self._chain.flat, by_weights)
                 self._taken += 1
@@ -82,11 +82,12 @@ class GradientSteps:
             else schema
         )
 
-    def _batch(self, schema: BodySchema, samples: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _batch(self, schema: BodySchema, samples: np.ndarray) -> tuple[np.ndarray, ...]:
         """Draw samples, each under every mask it covers.
 
         Returns:
-            Inputs (rows, inputs), measured x_out (rows, out_size), and whether rows are of the present body (rows,).
+            Inputs (rows, inputs), targets and their weights (rows, out_size) of `under_masks`, and whether a row is of
+            the present body (rows,).
         """
         config = self._config
         old = config.replay if len(self._anchors) else 0
@@ -97,15 +98,18 @@ class GradientSteps:
         if old:
             rows = np.concatenate([rows, self._anchors[replayed]])
             biases = np.concatenate([biases, self._anchor_biases[replayed]])
-        inputs, outputs, origin = under_masks(_plain(rows), _plain(biases), *self._gates, schema.predictor)
-        return inputs, outputs, origin < len(now)
+        inputs, targets, counts, origin = under_masks(_plain(rows), _plain(biases), *self._gates, schema.predictor)
+        return inputs, targets, counts, origin < len(now)
 
 
 def mean_error(schema: BodySchema, rows: np.ndarray) -> float:
-    """Return the mean squared error of samples under all masks they cover [standard deviations squared]."""
+    """Return the mean squared error of samples under all masks they cover [standard deviations squared].
+
+    Only elements in which the network has a share count: W does not change the others.
+    """
     biases = np.repeat(schema.bias[None], len(rows), axis=0)
-    inputs, outputs, _ = under_masks(_plain(rows), _plain(biases), *gates(schema), schema.predictor)
-    return float(loss(schema.predictor.chain, inputs, outputs, SQUARED))
+    inputs, targets, counts, _ = under_masks(_plain(rows), _plain(biases), *gates(schema), schema.predictor)
+    return float(loss(schema.predictor.chain, inputs, targets, counts, SQUARED))
 
 
 def _plain(rows: np.ndarray) -> np.ndarray:

@@ -21,8 +21,9 @@ def under_masks(rows, biases, through, paths, bits, directs, predictor):
         predictor: Positions of x_in and x_out in the layout, and the limit of inputs.
 
     Returns:
-        Inputs of the network, shape (k, n_in); x_out, shape (k, out_size); and the index of the sample, shape (k,).
-        They are ordered by mask.
+        Inputs of the network, shape (k, n_in); its targets, shape (k, out_size); the weights of their squared errors,
+        shape (k, out_size), with which these are squared errors of x_out; and the index of the sample, shape (k,). They
+        are ordered by mask.
     """
     masks, count = through.shape
     signals, wide = bits.shape[1], paths.shape[2]
@@ -38,6 +39,7 @@ def under_masks(rows, biases, through, paths, bits, directs, predictor):
     size = int(allowed.sum())
     inputs = np.zeros((size, width), np.float32)
     targets = np.empty((size, len(predictor.outputs)), np.float32)
+    weights = np.empty((size, len(predictor.outputs)), np.float32)
     samples = np.empty(size, np.int64)
     clip, k = np.float32(predictor.clip), 0
     for mask in range(masks):
@@ -58,6 +60,7 @@ def under_masks(rows, biases, through, paths, bits, directs, predictor):
                 for i in range(len(predictor.outputs)):
                     targets[k, i] = rows[row, predictor.outputs[i]]
                     share = directs[mask, count + 1, i]
+                    weights[k, i] = share * share
                     if share == 0.0:
                         targets[k, i] = np.nan
                     elif share < 1.0:
@@ -68,4 +71,4 @@ def under_masks(rows, biases, through, paths, bits, directs, predictor):
                         targets[k, i] = (targets[k, i] - line) / share
                 samples[k] = row
                 k += 1
-    return inputs, targets, samples
+    return inputs, targets, weights, samples

@@ -11,15 +11,18 @@ MOMENTUM = 0.9
 SQUARES = 0.999
 SQUARED = np.float32(np.inf)
 """With this bend every error counts squared."""
+EQUAL = np.empty((0, 0), np.float32)
+"""With these weights every error counts alike."""
 
 
 @jit
-def huber(prediction, target, bend, gradient):
+def huber(prediction, target, weight, bend, gradient):
     """Return the mean loss of a prediction, and write its derivatives by the prediction into `gradient`.
 
     Args:
         prediction: Outputs of the network, shape (rows, n_out).
         target: Known outputs, shape (rows, n_out), NaN where not known.
+        weight: Weight of every loss, shape (rows, n_out), or `EQUAL`.
         bend: Errors above this count linearly instead of squared (Huber); infinite: all are squared.
         gradient: Result, shape (rows, n_out), or (0, 0) if it is not needed.
     """
@@ -29,11 +32,12 @@ def huber(prediction, target, bend, gradient):
             error = prediction[row, i] - target[row, i]
             known = np.isfinite(target[row, i])
             bound = min(max(error, -bend), bend) if known else np.float32(0.0)
+            counts = weight[row, i] if len(weight) else np.float32(1.0)
             if known:
-                total += bound * (error + error - bound)
+                total += counts * bound * (error + error - bound)
                 count += 1
             if len(gradient):
-                gradient[row, i] = bound
+                gradient[row, i] = counts * bound
     share = np.float32(2.0 / max(count, 1))
     for row in range(len(gradient)):
         for i in range(gradient.shape[1]):
@@ -42,22 +46,23 @@ def huber(prediction, target, bend, gradient):
 
 
 @jit
-def loss(chain, inputs, target, bend):
+def loss(chain, inputs, target, weight, bend):
     """Return the mean loss of a batch; see `huber`."""
     values = space(chain, len(inputs))
     first(chain, values, len(inputs))[:] = inputs
     prediction = forward(chain, values, len(inputs))
-    return huber(prediction, target, bend, np.empty((0, 0), prediction.dtype))
+    return huber(prediction, target, weight, bend, np.empty((0, 0), prediction.dtype))
 
 
 @jit
-def gradients(chain, inputs, target, bend, by_weights, by_inputs):
+def gradients(chain, inputs, target, weight, bend, by_weights, by_inputs):
     """Return the mean loss of a batch, and its derivatives.
 
     Args:
         chain: The network.
         inputs: Inputs, shape (rows, n_in).
         target: Known outputs, shape (rows, n_out), NaN where not known.
+        weight: See `huber`.
         bend: See `huber`.
         by_weights: Whether derivatives by W are computed.
         by_inputs: Whether derivatives by the inputs are computed.
@@ -71,7 +76,7 @@ def gradients(chain, inputs, target, bend, by_weights, by_inputs):
     first(chain, values, rows)[:] = inputs
     prediction = forward(chain, values, rows)
     gradient = np.empty_like(prediction)
-    total = huber(prediction, target, bend, gradient)
+    total = huber(prediction, target, weight, bend, gradient)
     slope = np.empty(len(chain.flat) if by_weights else 0, chain.flat.dtype)
     for layer in range(len(chain.form) - 1, -1, -1):
         code = chain.form[layer, CODE]

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from gemuco.compiled.chain import pack, unpack
-from gemuco.compiled.learning import SQUARED, gradients, loss
+from gemuco.compiled.learning import EQUAL, SQUARED, gradients, loss
 from gemuco.layers import Weights
 from gemuco.learning import outliers
 from gemuco.learning.config import TrainConfig
@@ -172,8 +172,9 @@ class Learner:
     def _step(self, batch: Batch, pace: float, bend: float) -> float:
         """Do one step and return the loss before it."""
         before, by_weights, by_input = gradients(
-            self.chain, self._inputs(batch, self.biases), batch.target, self._bend(bend), True, self.biases.size > 0
-        )
+            self.chain, self._inputs(batch, self.biases), batch.target, EQUAL, self._bend(bend), True,
+            self.biases.size > 0,
+        )  # fmt: skip
         self.optimiser.move(self.chain.flat, by_weights, pace * self.config.rate)
         if self.biases.size:
             by_bias = np.zeros_like(self.biases)
@@ -199,7 +200,8 @@ class Learner:
             return math.inf
         batch = self.held.take(rows, masks)
         chain = self.chain._replace(flat=self._mean["weights"])
-        return float(loss(chain, self._inputs(batch, self._mean["biases"]), batch.target, self._bend(HUBER[1])))
+        inputs = self._inputs(batch, self._mean["biases"])
+        return float(loss(chain, inputs, batch.target, EQUAL, self._bend(HUBER[1])))
 
     def _reject_outliers(self, spare_rare: bool = False) -> None:
         """Search the training samples and the held-out samples for outliers.

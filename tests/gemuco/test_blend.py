@@ -88,7 +88,7 @@ def test_errors_and_innovations_mix_alike(mixed):
 
 def test_the_network_learns_what_the_line_leaves(mixed):
     rows = mixed.normalise(body(5, 105)).astype(np.float32)
-    inputs, targets, origin = under_masks(rows, np.zeros((5, 0), np.float32), *gates(mixed), mixed.predictor)
+    inputs, targets, weights, origin = under_masks(rows, np.zeros((5, 0), np.float32), *gates(mixed), mixed.predictor)
     prediction = run(mixed.weights.whole, inputs)
     assert np.isnan(targets[:, 0]).all()
     share = np.array([0.5, 0.7])
@@ -96,3 +96,4 @@ def test_the_network_learns_what_the_line_leaves(mixed):
     for line, (mask, row) in enumerate(zip(masks, origin, strict=True)):
         missed = rows[row, mixed.out_index] - mixed.infer(rows[row], mixed.masks[mask])
         np.testing.assert_allclose((targets[line] - prediction[line])[1:] * share, missed[1:], atol=1e-4)
+        np.testing.assert_allclose(weights[line], [0.0, *share**2], rtol=1e-6)

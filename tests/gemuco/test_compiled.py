@@ -13,7 +13,7 @@ from muscle_arm import gravity
 
 from gemuco.compiled import descent, newton
 from gemuco.compiled.chain import pack, unpack
-from gemuco.compiled.learning import SQUARED, gradients, loss
+from gemuco.compiled.learning import EQUAL, SQUARED, gradients, loss
 from gemuco.layers import ACTIVATIONS, Layer
 from gemuco.learning.network import Network
 from gemuco.search.descent import DescentConfig, NewtonConfig, descend, minimise
@@ -75,7 +75,7 @@ def test_every_shape_agrees_with_torch(shape, activation, straight, seed):
     wanted = random.standard_normal((rows, outputs)).astype(np.float32)
     wanted[random.random(wanted.shape) < 0.2] = np.nan
     chain = pack(network.weights().whole)
-    found_loss, by_weights, by_input = gradients(chain, x, wanted, np.float32(straight), True, True)
+    found_loss, by_weights, by_input = gradients(chain, x, wanted, EQUAL, np.float32(straight), True, True)
     given_x, there = torch.from_numpy(x).double().requires_grad_(), torch.from_numpy(np.isfinite(wanted))
     network = network.double()
     missed = torch.where(there, network(given_x) - torch.from_numpy(np.nan_to_num(wanted)), 0.0)
@@ -86,7 +86,7 @@ def test_every_shape_agrees_with_torch(shape, activation, straight, seed):
     truth = each.sum() / max(int(there.sum()), 1)
     truth.backward()
     assert found_loss == pytest.approx(truth.item(), rel=1e-5)
-    assert loss(chain, x, wanted, np.float32(straight)) == found_loss
+    assert loss(chain, x, wanted, EQUAL, np.float32(straight)) == found_loss
     flat = [g.numpy().ravel() for m in network.linear for g in (m.weight.grad.T, m.bias.grad)]
     for found, expected in ((by_weights, np.concatenate(flat)), (by_input, given_x.grad.numpy())):
         np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5 * max(np.abs(expected).max(), 1e-3))
@@ -190,7 +190,7 @@ def test_time_that_is_up_ends_the_search_with_the_best_so_far(schema):
 def test_what_is_no_number_is_not_hidden():
     layers = tuple(Layer(np.ones((2, 2), np.float32), np.zeros(2, np.float32), name) for name in ("tanh", "linear"))
     x = np.array([[np.nan, 0.0], [1e30, 0.0]], np.float32)
-    begun, _, _ = gradients(pack(layers), x, np.zeros((2, 2), np.float32), SQUARED, False, True)
+    begun, _, _ = gradients(pack(layers), x, np.zeros((2, 2), np.float32), EQUAL, SQUARED, False, True)
     assert np.isnan(begun)
 
 
