@@ -79,7 +79,8 @@ class DeviceKind:
                     "unit": _UNITS[quantity],
                     "elements": ["one"],
                     "stale_after": STALE_AFTER,
-                    "plausible": {"rate": math.inf},  # the stage moves it in no time
+                    # the stage moves it in no time, which is any velocity
+                    "plausible": {"low": -math.inf, "high": math.inf, "rate": math.inf},
                 }
                 for quantity in self.quantities
             },
