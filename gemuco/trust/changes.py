@@ -12,8 +12,8 @@ AGES = (1, 2, 3, 5, 8, 12, 20, 30)
 """A change may be this number of blocks old."""
 LONGEST = AGES[-1]
 """A test looks at this number of the newest blocks."""
-CLIP = 1.6
-"""In the sum of small deviations no block counts more than this multiple of the size that matters."""
+MOST = 6.0
+"""One independent look adds at most this much to the sum: a healthy body is far off now and then, at a rare posture."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,8 +87,7 @@ class LastingTest:
             looks: Number of independent looks that this block is worth, at most 1, shape (n,).
         """
         for row, sign in enumerate((1.0, -1.0)):
-            value = np.clip(np.nan_to_num(sign * z), -CLIP * least, CLIP * least)
-            gain = (least * value - 0.5 * least**2) * looks
+            gain = np.clip(least * np.nan_to_num(sign * z) - 0.5 * least**2, -MOST, MOST) * looks
             self.sums[row] = np.maximum(0.0, self.sums[row] + gain)
 
     @property

@@ -12,6 +12,8 @@ from gemuco.trust.recent import View
 
 NOISE = 8.0
 """A burst of noise has at least this multiple of the healthy variance."""
+RECENT = 20
+"""The usual error is that of this number of blocks."""
 QUIET = 0.5
 """It has at least this multiple of the variance of healthy errors."""
 
@@ -26,6 +28,7 @@ class Evidence:
         age: Age of the most likely change [blocks].
         step: Result of the step test [standard deviations].
         is_noise: Whether noise is the strongest evidence.
+        level: Usual error of the columns that are not hidden [that of a healthy body when it was learned], a scalar.
     """
 
     ratio: np.ndarray
@@ -33,6 +36,7 @@ class Evidence:
     age: np.ndarray
     step: np.ndarray
     is_noise: np.ndarray
+    level: float
 
 
 class Judge:
@@ -70,4 +74,13 @@ class Judge:
         strength = np.where(is_noise, 10.0 * noise, strength)
         hidden = list(view.hidden)
         ratio[hidden] = strength[hidden] = 0.0
-        return Evidence(ratio, strength, age, step, is_noise)
+        return Evidence(ratio, strength, age, step, is_noise, _level(view))
+
+
+def _level(view: View) -> float:
+    """Return the median over the columns in use of the root mean square error of the newest blocks; 0 if unknown."""
+    used = np.ones(view.z.shape[1], bool)
+    used[list(view.hidden)] = False
+    z = view.z[:, used][-RECENT:]
+    z = z[np.isfinite(z).all(axis=1)]
+    return float(np.median(np.sqrt(np.mean(z**2, axis=0)))) if z.size else 0.0

@@ -12,8 +12,10 @@ TAIL_MEMORY = 6000.0
 """The largest steps are remembered for this number of blocks."""
 APART = 5
 """The slow part of the errors follows from blocks that are this far apart."""
-SCALES = (0.3, 2.5)
+SCALES = (0.3, 20.0)
 """The errors on this body are at least and at most this multiple of those that were learned."""
+LEAST_PACE = 0.03
+"""The usual pace of motion is at least this [standard deviations per block]."""
 PRIOR = 100.0
 """What is assumed at the start counts as this number of blocks."""
 COMMON, EXCEEDS = 3.0, 0.015
@@ -32,23 +34,25 @@ class Healthy:
     """Running statistics of standardised errors, by judged column."""
 
     def __init__(self, size: int) -> None:
-        self.count = 0
+        self.count, self.moved = 0, 0.0
         self._square = np.ones(size)
         self._near, self._far = np.full(size, 0.85), np.full(size, 0.5)
         self._excess, self._exceeding = np.full(size, TAIL * EXCESSES), np.full(size, EXCESSES)
-        self._pace = 0.0
+        self._pace = LEAST_PACE
         self._noise, self._noise_count = np.full(size, 1e-6), 0
 
-    def add(self, z: np.ndarray, steps: np.ndarray, noise: np.ndarray) -> None:
+    def add(self, z: np.ndarray, steps: np.ndarray, noise: np.ndarray, motion: float) -> None:
         """Learn from one block; columns whose newest error is NaN keep what they have.
 
         Args:
             z: The newest errors, oldest first, shape (LONGEST, n), in units of the learned ones; NaN where missing.
             steps: Result of the step test, shape (n,).
             noise: Variance of the noise within the block, in the same units, shape (n,); NaN where unknown.
+            motion: Result of `motion`; a body at rest shows the same errors again and again.
         """
         self.count += 1
-        share = 1.0 / min(PRIOR + self.count, MEMORY)
+        self.moved += motion
+        share = motion / min(PRIOR + self.moved, MEMORY)
         now = z[-1]
         is_new = np.isfinite(now)
         square = np.clip(np.where(is_new, now**2, self._square), 0.0, 9.0 * self._square)
@@ -63,7 +67,7 @@ class Healthy:
         is_noise = np.isfinite(noise)
         if is_noise.any():
             self._noise_count += 1
-            share = max(share, 1.0 / self._noise_count)
+            share = 1.0 / min(self._noise_count, MEMORY)
             change = np.clip(np.where(is_noise, noise, self._noise), 0.0, 9.0 * self._noise + 1e-4)
             self._noise += share * (change - self._noise)
 
@@ -74,8 +78,8 @@ class Healthy:
             moved: Root mean square change of all elements since the block before [standard deviations].
         """
         if moved > RESTS * self._pace:
-            self._pace += (moved - self._pace) / min(1.0 + self.count, MEMORY)
-        return min(1.0, moved / self._pace) if self._pace > 0.0 else 0.0
+            self._pace = max(LEAST_PACE, self._pace + (moved - self._pace) / min(1.0 + self.count, MEMORY))
+        return min(1.0, moved / self._pace)
 
     @property
     def scale(self) -> np.ndarray:

@@ -12,7 +12,7 @@ from gemuco.trust.changes import LONGEST, LastingTest
 from gemuco.trust.config import BLOCK, Finding, TrustConfig
 from gemuco.trust.evidence import Evidence, Judge
 from gemuco.trust.healthy import Healthy
-from gemuco.trust.hypotheses import Cause, explain
+from gemuco.trust.hypotheses import SEARCHED, Cause, explain
 from gemuco.trust.kinds import kind_of
 from gemuco.trust.recent import Recent, View
 from gemuco.trust.relations import Hidden, Relations
@@ -27,10 +27,22 @@ REFRESH = 10
 """Limits follow the healthy errors once in this number of blocks."""
 AGAIN = 5
 """Hidden elements are judged anew once in this number of blocks."""
-SETTLED = 40
+SETTLED = 25
 """A cause and its kind may be corrected for this number of blocks."""
+OTHER = 100.0
+"""After this number of blocks of motion in which no element explains what is seen, the body counts as another one: what
+is healthy is learned from it, and small lies are noticed no more."""
+STRANGE = 1.8
+"""If the errors without a cause are usually this multiple of those that were learned, no sensor is hidden."""
 LAPSES = 10
 """A suspicion ends if nothing speaks for it in this number of blocks."""
+DOUBTFUL, PLAIN = 0.4, 1.5
+"""From the first share of an alarm on, two wrong columns may hide each other; without one of them the other reaches the
+second multiple of an alarm."""
+UNEXPLAINED, ONCE_MORE = 10, 100
+"""If alarms of this number of blocks have no cause, those hidden in this number of blocks were no cause either."""
+CLEAR = 2.0
+"""A lie begins with the first error of this size [errors of a healthy prediction]."""
 AT_ONCE, ONCE = 3, 15
 """At most this number of elements are wrong at once, which is within this number of blocks; otherwise the body is."""
 SURE = 2.0
@@ -98,6 +110,7 @@ class TrustMonitor:
             return
         size = len(self._relations.columns)
         self._recent.clear()
+        self._other = 0.0
         self._healthy, self._lasting = Healthy(size), LastingTest(size)
         self._least = self._sizes(schema, self._relations)
         self._judge = self._fresh_judge()
@@ -159,19 +172,23 @@ class TrustMonitor:
             self._lasting = LastingTest(len(self._relations.columns))
         if self._count % REFRESH == 0:
             self._judge = self._fresh_judge()
-        looks = self._healthy.motion(self._recent.moved()) / self._judge.time
-        self._lasting.add(view.z[-1] / self._judge.scale, self._judge.least, looks)
+        motion = self._healthy.motion(self._recent.moved())
+        self._lasting.add(view.z[-1] / self._judge.scale, self._judge.least, motion / self._judge.time)
         evidence = self._judge(view, self._lasting)
         if self._healthy.is_known:
             self._decide(evidence, hidden)
-        if not self._healthy.is_known or float(evidence.ratio.max(initial=0.0)) < LEARNING:
-            self._learn(view, evidence)
+        is_other = any(case.cause.cause == "body" for case in self._cases)
+        self._other = self._other + motion if is_other else 0.0
+        is_quiet = float(evidence.ratio.max(initial=0.0)) < LEARNING
+        if not self._healthy.is_known or is_quiet or self._other > OTHER:
+            self._learn(view, evidence, motion)
 
     def _decide(self, evidence: Evidence, hidden: Hidden) -> None:
         immune = [self._place[p] for p in self._immune if p in self._place]
         ratio = evidence.ratio.copy()
         ratio[immune] = 0.0
-        if float(ratio.max(initial=0.0)) >= 1.0:
+        highest = float(ratio.max(initial=0.0))
+        if highest >= 1.0 or (highest >= DOUBTFUL and self._count % AGAIN == 0 and self._hides_others(ratio, hidden)):
             cause = explain(evidence, self._without(hidden), self._joined, self._parts, self._environment - hidden)
             self._suspect(cause, evidence, hidden)
         else:
@@ -194,16 +211,32 @@ class TrustMonitor:
             known = _Case(cause, began, self._count, self._count)
             self._cases.append(known)
         self._describe(known, hidden | cause.columns, bool(evidence.is_noise[cause.lead]))
+        if cause.cause == "body" and known.seen >= UNEXPLAINED:
+            self._release_recent()
         if known.seen >= CONFIRMED and cause.cause != "body":
             known.reason = self._refusal(known)
             known.is_hidden = not known.reason
             self._limit_at_once(known)
 
+    def _release_recent(self) -> None:
+        """Show elements again that were hidden a short time ago, because they do not explain what is seen."""
+        recent = [case for case in self._cases if case.is_hidden and self._count - case.first < ONCE_MORE]
+        for case in recent:
+            if case.cause.cause != "environment":
+                self._cases.remove(case)
+                self._immune.update(self._at(case))
+
     def _has_lapsed(self, case: _Case, highest: float) -> bool:
         """Whether nothing speaks for a suspicion any more; `highest` is the evidence against any element."""
         if highest >= 1.0 and case.cause.cause == "body":
             case.last = self._count
-        return highest < CALM or self._count - case.last > LAPSES
+        return self._count - case.last > LAPSES
+
+    def _hides_others(self, ratio: np.ndarray, hidden: Hidden) -> bool:
+        """Whether one of the columns with the most evidence hides another one that is wrong too."""
+        without, order = self._without(hidden), np.argsort(-ratio)[:SEARCHED]
+        alone = (float(without(frozenset({int(column)})).ratio.max()) for column in order if ratio[column] > 0.0)
+        return any(highest >= PLAIN for highest in alone)
 
     def _limit_at_once(self, new: _Case) -> None:
         """Take a change of many elements at once as one of the body, which hides none of them."""
@@ -225,8 +258,10 @@ class TrustMonitor:
         if case.cause.cause == "either" and self._config.pairs == "use":
             return "they look alike, and the settings say to use them"
         elements = self._at(case)
+        if self._without(self._hidden_columns() | self._recent.missing())(case.cause.columns).level > STRANGE:
+            return "what is normal is not known on this body"
         if self._immune & elements:
-            return "an operator trusts it"
+            return "it is not hidden again before it has agreed once"
         if not self._replaces(self.hidden | elements):
             return "the model cannot replace it"
         return ""
@@ -283,11 +318,17 @@ class TrustMonitor:
         if not known.any():
             return
         values, error, spans = values[known], error[known], spans[known]
+        healthy = view.healthy[-count:][known][:, lead]
+        clear = np.abs(error[:, lead]) > CLEAR * healthy * self._judge.scale[lead]
+        if case.kind != "noise" and not is_noise and clear.any() and not case.is_hidden:
+            first = int(np.argmax(clear))
+            values, error, spans, healthy = values[first:], error[first:], spans[first:], healthy[first:]
+            case.began = self._count - len(values) + 1
         position = int(self._relations.columns[lead])
         std, unit = float(self._schema.scaler.std[position]), self._unit(position)
         others = [c for c in columns if c != lead]
         case.kind = kind_of(
-            values[:, lead], error[:, lead], float(np.nanmean(view.healthy[-count:, lead])), std, unit, is_noise,
+            values[:, lead], error[:, lead], float(healthy.mean()), std, unit, is_noise,
             values[:, others] - error[:, others] if case.cause.cause == "all" else None, float(spans[:, lead].max()),
         )  # fmt: skip
         case.size = float(np.sqrt(np.mean(error[:, lead] ** 2))) * std
@@ -299,12 +340,12 @@ class TrustMonitor:
                 return signal.unit
         return ""
 
-    def _learn(self, view: View, evidence: Evidence) -> None:
+    def _learn(self, view: View, evidence: Evidence, motion: float) -> None:
         noise = view.newest.copy()
         z = view.z.copy()
         z[:, list(view.hidden)], noise[list(view.hidden)] = np.nan, np.nan
         if np.isfinite(z[-1]).any():
-            self._healthy.add(z, evidence.step, noise)
+            self._healthy.add(z, evidence.step, noise, motion)
 
     def _fresh_judge(self) -> Judge:
         return Judge(self._healthy, self._config.false_alarms, self._least)

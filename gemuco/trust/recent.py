@@ -10,7 +10,7 @@ from gemuco.trust.changes import LONGEST
 from gemuco.trust.relations import Hidden, Relations, rows_of
 
 NOISY = 5
-"""The noise of this number of the newest blocks is averaged."""
+"""The noise is the median of this number of the newest blocks."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -20,7 +20,7 @@ class View:
     Attributes:
         z: Errors [those of a healthy body], oldest first, shape (LONGEST, n); NaN where a used element was missing.
         healthy: Errors of a healthy body [standard deviations of the signal], shape (LONGEST, n).
-        noise: Variance of the noise within the newest blocks [squared errors of a healthy body], shape (n,).
+        noise: Median variance of the noise within the newest blocks [squared errors of a healthy body], shape (n,).
         newest: The same of the newest block alone, shape (n,).
         hidden: The hidden columns.
     """
@@ -103,7 +103,7 @@ class Recent:
             z, healthy = np.concatenate([lacking, z]), np.concatenate([lacking, healthy])
         newest = list(self.blocks)[-NOISY:]
         noise = np.array([_noise(block.each, relation.maps) for block in newest]) / healthy[-len(newest) :] ** 2
-        return View(z, healthy, _mean(noise), noise[-1], hidden)
+        return View(z, healthy, _median(noise), noise[-1], hidden)
 
     def clear(self) -> None:
         """Forget all blocks."""
@@ -117,8 +117,11 @@ def _noise(features: np.ndarray, maps: np.ndarray) -> np.ndarray:
     return np.asarray(0.5 * np.mean((np.diff(features, axis=0) @ maps) ** 2, axis=0))
 
 
-def _mean(values: np.ndarray) -> np.ndarray:
+def _median(values: np.ndarray) -> np.ndarray:
+    """Return the median of every column, NaN if half of it is unknown; a step within one block is no noise."""
     known = np.isfinite(values)
-    return np.where(
-        known.any(axis=0), np.where(known, values, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1), np.nan
-    )
+    result = np.full(values.shape[1], np.nan)
+    enough = 2 * known.sum(axis=0) > len(values)
+    if enough.any():
+        result[enough] = np.nanmedian(values[:, enough], axis=0)
+    return result

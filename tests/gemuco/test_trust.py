@@ -79,7 +79,7 @@ def test_a_step_is_tested_with_its_likeness():
 
 
 def test_a_healthy_body_is_trusted(model, arm):
-    for seed in range(4):
+    for seed in range(2):
         monitor, hidden = watch(model, move(arm, 600, seed))
         assert not any(hidden)
         assert not monitor.findings
@@ -87,9 +87,14 @@ def test_a_healthy_body_is_trusted(model, arm):
 
 @pytest.mark.parametrize(
     ("kind", "names"),
-    [("offset", ("offset",)), ("frozen", ("frozen", "clipped")), ("sign", ("sign", "gain")), ("noise", ("noise",)),
-     ("wrap", ("wrap",))],
-)  # fmt: skip
+    [
+        ("offset", ("offset",)),
+        ("frozen", ("frozen", "clipped")),
+        ("sign", ("sign", "gain", "offset")),
+        ("noise", ("noise",)),
+        ("wrap", ("wrap",)),
+    ],
+)
 def test_a_lying_encoder_is_hidden_and_returns(model, arm, kind, names):
     """The lie lasts for 8 s; the encoder alone is hidden within 2 s of a visible error, and used again after it."""
     samples, begin, end = move(arm, 400, 7), 150, 230
