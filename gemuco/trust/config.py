@@ -3,6 +3,9 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+Hidden = frozenset[int]
+"""Judged columns that are not used: elements, then p, by their number in `Relations.columns`."""
+
 BLOCK = 0.1
 """Samples are judged in blocks of this length [s]."""
 

@@ -6,8 +6,8 @@ from itertools import combinations
 
 import numpy as np
 
+from gemuco.trust.config import Hidden
 from gemuco.trust.evidence import Evidence
-from gemuco.trust.relations import Hidden
 
 EXPLAINED = 0.85
 """Without the wrong columns the evidence against all others is below this share of an alarm."""

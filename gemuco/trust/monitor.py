@@ -9,13 +9,13 @@ import numpy as np
 from gemuco.anomaly.blame import parts
 from gemuco.schema import BodySchema
 from gemuco.trust.changes import LONGEST, LastingTest
-from gemuco.trust.config import BLOCK, Finding, TrustConfig
+from gemuco.trust.config import BLOCK, Finding, Hidden, TrustConfig
 from gemuco.trust.evidence import Evidence, Judge
 from gemuco.trust.healthy import Healthy
 from gemuco.trust.hypotheses import SEARCHED, Cause, explain
 from gemuco.trust.kinds import kind_of
 from gemuco.trust.recent import Recent, View
-from gemuco.trust.relations import Hidden, Relations
+from gemuco.trust.relations import Relations
 
 CONFIRMED = 2
 """The same cause must explain this number of successive blocks before it is hidden."""
@@ -43,6 +43,8 @@ UNEXPLAINED, ONCE_MORE = 10, 100
 """If alarms of this number of blocks have no cause, those hidden in this number of blocks were no cause either."""
 CLEAR = 2.0
 """A lie begins with the first error of this size [errors of a healthy prediction]."""
+GROSS = 3.0
+"""On a body that is not known to be as the model says, a lie is hidden from this multiple of an alarm on."""
 AT_ONCE, ONCE = 3, 15
 """At most this number of elements are wrong at once, which is within this number of blocks; otherwise the body is."""
 SURE = 2.0
@@ -91,6 +93,8 @@ class TrustMonitor:
             replaces: Whether a set of elements can be estimated.
         """
         self._config, self._devices, self._replaces = config or TrustConfig(), list(devices), replaces
+        self.is_known = True
+        """Whether the model's normal errors are known to be those of this body."""
         self._recent, self._count, self._now = Recent(), 0, 0.0
         self._by_hand: dict[int, float] = {}
         self._immune: set[int] = set()
@@ -214,7 +218,7 @@ class TrustMonitor:
         if cause.cause == "body" and known.seen >= UNEXPLAINED:
             self._release_recent()
         if known.seen >= CONFIRMED and cause.cause != "body":
-            known.reason = self._refusal(known)
+            known.reason = self._refusal(known, float(evidence.ratio.max()))
             known.is_hidden = not known.reason
             self._limit_at_once(known)
 
@@ -249,8 +253,8 @@ class TrustMonitor:
         self._cases.append(_Case(body, min(case.began for case in together), self._count, self._count))
         self._immune.update(elements)
 
-    def _refusal(self, case: _Case) -> str:
-        """Return why a cause is not hidden; empty if it is."""
+    def _refusal(self, case: _Case, ratio: float) -> str:
+        """Return why a cause is not hidden; empty if it is. `ratio` is the evidence, as a multiple of an alarm."""
         if case.cause.cause == "environment":
             return ""
         if case.cause.cause == "part":
@@ -258,7 +262,8 @@ class TrustMonitor:
         if case.cause.cause == "either" and self._config.pairs == "use":
             return "they look alike, and the settings say to use them"
         elements = self._at(case)
-        if self._without(self._hidden_columns() | self._recent.missing())(case.cause.columns).level > STRANGE:
+        rest = self._without(self._hidden_columns() | self._recent.missing())(case.cause.columns)
+        if rest.level > STRANGE or (not self.is_known and ratio < GROSS):
             return "what is normal is not known on this body"
         if self._immune & elements:
             return "it is not hidden again before it has agreed once"

@@ -7,7 +7,9 @@ import numpy as np
 
 from gemuco.schema import BodySchema
 from gemuco.trust.changes import LONGEST
-from gemuco.trust.relations import Hidden, Relations, rows_of
+from gemuco.trust.config import Hidden
+from gemuco.trust.relations import Relations, rows_of
+from gemuco.trust.sensitivity import Sensed
 
 NOISY = 5
 """The noise is the median of this number of the newest blocks."""
@@ -34,13 +36,14 @@ class View:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Block:
-    """Samples of one block: mean, shape (columns,), features of mean and samples, and the range of every column."""
+    """Samples of one block: mean, features of mean and samples, range and absence of every column, network errors."""
 
     mean: np.ndarray
     features: np.ndarray
     each: np.ndarray
     span: np.ndarray
     missing: np.ndarray
+    sensed: Sensed
 
 
 class Recent:
@@ -62,7 +65,8 @@ class Recent:
         full = np.full((1 + len(whole), len(rows_of(schema, samples[:1])[0])), np.nan)
         full[0, relations.columns], full[1:, relations.columns] = mean, whole
         features = relations.features(full)
-        self.blocks.append(_Block(mean, features[0], features[1:], span, missing))
+        sensed = relations.sensitivity.sense(schema, full[:1])
+        self.blocks.append(_Block(mean, features[0], features[1:], span, missing, sensed))
 
     def missing(self) -> Hidden:
         """Return the columns that are missing in the newest block."""
@@ -91,8 +95,9 @@ class Recent:
         fresh = before is not None and before.hidden == hidden
         blocks = [self.blocks[-1]] if fresh else list(self.blocks)
         features = np.array([block.features for block in blocks])
-        healthy = relation.healthy(features)
-        z = relation.errors(features) / healthy
+        sensed = Sensed(*(np.concatenate(parts) for parts in zip(*(block.sensed for block in blocks), strict=True)))
+        errors, healthy = relations.judged(hidden, features, sensed)
+        z = errors / healthy
         unusable = np.array([(block.missing & used).any() for block in blocks])
         z[unusable] = np.nan
         z[np.array([block.missing for block in blocks])] = np.nan
@@ -102,7 +107,8 @@ class Recent:
             lacking = np.full((LONGEST - len(z), z.shape[1]), np.nan)
             z, healthy = np.concatenate([lacking, z]), np.concatenate([lacking, healthy])
         newest = list(self.blocks)[-NOISY:]
-        noise = np.array([_noise(block.each, relation.maps) for block in newest]) / healthy[-len(newest) :] ** 2
+        usual = relation.healthy(np.array([block.features for block in newest]))
+        noise = np.array([_noise(block.each, relation.maps) for block in newest]) / usual**2
         return View(z, healthy, _median(noise), noise[-1], hidden)
 
     def clear(self) -> None:

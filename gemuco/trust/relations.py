@@ -10,9 +10,8 @@ import numpy as np
 
 from gemuco.anomaly.prediction import with_bias
 from gemuco.schema import BodySchema
-
-Hidden = frozenset[int]
-"""Judged columns that are not used, by their number in `Relations.columns`."""
+from gemuco.trust.config import Hidden
+from gemuco.trust.sensitivity import Sensed, Sensitivity
 
 NEAR = 0.2
 """The variance of a prediction has this constant part; the rest grows with the distance from the known samples."""
@@ -34,6 +33,8 @@ class Relation:
         places: Features that contain each column, shape (columns, places).
         removal: Takes these features out of the distance from the known samples, shape (columns, places, places).
         distance: Mean distance of the known samples.
+        network: Whether the network's errors say more of each column than the watch does, shape (columns,).
+        calibration: Healthy errors of the lies that these suggest, in their own standard deviations, shape (columns,).
     """
 
     maps: np.ndarray
@@ -43,6 +44,8 @@ class Relation:
     places: np.ndarray
     removal: np.ndarray
     distance: np.ndarray
+    network: np.ndarray
+    calibration: np.ndarray
 
     def errors(self, features: np.ndarray) -> np.ndarray:
         """Return measured minus predicted [standard deviations], shape (n, columns).
@@ -91,6 +94,8 @@ class Relations:
         self._inverse = {float(penalty): watch.inverse(float(penalty)) for penalty in set(self._penalty)}
         rows = schema.normal.rows.astype(float)
         self._rows = self.features(rows)
+        self.sensitivity = Sensitivity(schema, self.columns)
+        self._sensed = self.sensitivity.sense(schema, rows)
         self._least = FLOOR * np.maximum(rows[:, self.columns].std(axis=0), 1e-3)
         self._kept: dict[Hidden, Relation] = {}
         self._inflation = np.ones(inputs)
@@ -142,13 +147,47 @@ class Relations:
         removal = np.array([_removal(spread, own, outside) for own in places])
         rows = self._rows.copy()
         rows[:, outside] = 0.0
-        draft = Relation(maps, np.zeros(inputs), np.ones(inputs), spread, places, removal, np.ones(inputs))
+        zero, one = np.zeros(inputs), np.ones(inputs)
+        draft = Relation(maps, zero, one, spread, places, removal, one, zero > 0.0, one)
         distance = np.maximum(draft.far(rows).mean(axis=0), 1e-9)
         draft = replace(draft, distance=distance)
         errors = draft.errors(self._rows)
         mean = errors.mean(axis=0)
         std = np.sqrt(np.mean(((errors - mean) / draft.healthy(self._rows)) ** 2, axis=0)) * self._inflation
-        return replace(draft, mean=mean, std=np.maximum(std, self._least))
+        std = np.maximum(std, self._least)
+        factor = np.maximum(1.0, draft.healthy(rows))
+        network, calibration = self._by_network(hidden, std, factor)
+        return replace(draft, mean=mean, std=std, network=network, calibration=calibration)
+
+    def _by_network(self, hidden: Hidden, std: np.ndarray, factor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return whether the network says more of each column than the watch, and its calibration.
+
+        Args:
+            hidden: The hidden columns.
+            std: Healthy errors of the watch, shape (columns,).
+            factor: Growth of errors with the distance from the known samples, shape (samples, columns).
+        """
+        lies, spread = self.sensitivity.lies(self._sensed, hidden)
+        spread = spread * factor
+        known = np.isfinite(spread)
+        ratio = np.where(known, lies, 0.0) / np.where(known, spread, 1.0)
+        calibration = np.maximum(1.0, np.sqrt((ratio**2).sum(axis=0) / np.maximum(known.sum(axis=0), 1)))
+        usual = np.median(spread, axis=0) * calibration
+        return np.asarray(usual < std), calibration
+
+    def judged(self, hidden: Hidden, features: np.ndarray, sensed: Sensed) -> tuple[np.ndarray, np.ndarray]:
+        """Return the errors of samples with some columns hidden, and those of a healthy body, shapes (n, columns).
+
+        Each error is that of the watch, or the lie that the network's errors suggest, whichever is known better.
+        """
+        relation = self.without(hidden)
+        errors, healthy = relation.errors(features), relation.healthy(features)
+        if relation.network.any():
+            lies, spread = self.sensitivity.lies(sensed, hidden)
+            spread = spread * relation.calibration * np.maximum(1.0, healthy / relation.std)
+            better = relation.network & np.isfinite(spread)
+            errors, healthy = np.where(better, lies, errors), np.where(better, spread, healthy)
+        return errors, healthy
 
     def _prediction(self, index: int, outside: np.ndarray, inverse: np.ndarray) -> np.ndarray:
         """Return the map of the error of a hidden column, which the features with hidden columns do not enter."""

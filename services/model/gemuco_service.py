@@ -176,7 +176,16 @@ class GemucoService:
     def _make_trust(self) -> Trust:
         settings = self.config.trust
         config = settings.config() if settings.active else None
-        return Trust(self.robot, self.freshness, self._schema, config, self.clock, self._stop_for, self._forget)
+        return Trust(
+            self.robot,
+            self.freshness,
+            self._schema,
+            config,
+            self.clock,
+            self._stop_for,
+            self.acquaintance.is_known,
+            self._forget,
+        )
 
     def _make_loops(self) -> list[Loop]:
         rates, estimation, anomaly = self.robot.rates, self.estimation, self.anomaly

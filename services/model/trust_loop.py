@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from gemuco.estimation import recipes
+from gemuco.normal import Normal
 from gemuco.schema import BodySchema
 from gemuco.trust.config import BLOCK, Finding, TrustConfig
 from gemuco.trust.monitor import TrustMonitor
@@ -48,6 +49,7 @@ class Trust:
         config: TrustConfig | None,
         clock: Clock,
         stop: Callable[[str], None] = lambda reason: None,
+        is_known: Callable[[BodySchema], bool] = lambda schema: True,
         changed: Callable[[float], None] = lambda since: None,
     ) -> None:
         """Prepare.
@@ -59,11 +61,14 @@ class Trust:
             config: The settings; None to look for no lies.
             clock: Source of time.
             stop: Stops the robot for a reason, if an element that motion needs is distrusted.
+            is_known: Whether a model's normal errors are known to be those of this body.
             changed: Called when other elements are hidden, with the time [s] since when samples are not to be learned
                 from.
         """
         self._freshness, self._schema, self._clock = freshness, schema, clock
-        self._stop, self._changed = stop, changed
+        self._stop, self._is_known, self._changed = stop, is_known, changed
+        self._known: Normal | None = None
+        """These normal errors were those of this body once; an update of W does not change that."""
         layout, self._is_active = schema().layout, config is not None
         self._names = [layout.element(index) for index in range(layout.size)]
         self._units = [signal.unit for signal in layout.signals for _ in range(signal.size)]
@@ -95,7 +100,10 @@ class Trust:
             rows, self._rows, self._began = self._rows, [], now
             if is_late or not rows or not self._is_active:
                 return
+            if self._is_known(schema):
+                self._known = schema.normal
             self._monitor.use(schema)
+            self._monitor.is_known = self._known is schema.normal
             self._monitor.add(np.array(rows), now)
             self._publish()
         self._stop_if_needed()

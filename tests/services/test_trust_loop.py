@@ -53,8 +53,9 @@ class Bench:
         self.newest: Arrival[Sample] | None = None
         self.freshness = Freshness(arm(), lambda: self.newest, self.clock)
         self.trust = Trust(
-            arm(), self.freshness, model, config or TrustConfig(), self.clock, self.stops.append, self.changes.append
-        )
+            arm(), self.freshness, model, config or TrustConfig(), self.clock, self.stops.append,
+            changed=self.changes.append,
+        )  # fmt: skip
         self.published: list[Estimates] = []
         self.estimation = Estimation(self.freshness, model, self.published.append, self.clock)
         self.cycle = 0
