@@ -43,8 +43,9 @@ UNEXPLAINED, ONCE_MORE = 10, 100
 """If alarms of this number of blocks have no cause, those hidden in this number of blocks were no cause either."""
 CLEAR = 2.0
 """A lie begins with the first error of this size [errors of a healthy prediction]."""
-GROSS = 3.0
-"""On a body that is not known to be as the model says, a lie is hidden from this multiple of an alarm on."""
+GROSS, LONG, LIKE = 3.0, 50.0, 1.3
+"""On a body that is not known to be as the model says, a lie is hidden if it is the first multiple of an alarm,
+explains the second number of blocks of motion, and leaves errors below the third multiple of those learned."""
 AT_ONCE, ONCE = 3, 15
 """At most this number of elements are wrong at once, which is within this number of blocks; otherwise the body is."""
 SURE = 2.0
@@ -65,6 +66,7 @@ class _Case:
     first: int
     last: int
     seen: int = 1
+    moved: float = 0.0
     is_hidden: bool = False
     kind: str = "unknown"
     size: float = math.nan
@@ -114,7 +116,7 @@ class TrustMonitor:
             return
         size = len(self._relations.columns)
         self._recent.clear()
-        self._other = 0.0
+        self._other = self._motion = 0.0
         self._healthy, self._lasting = Healthy(size), LastingTest(size)
         self._least = self._sizes(schema, self._relations)
         self._judge = self._fresh_judge()
@@ -176,7 +178,7 @@ class TrustMonitor:
             self._lasting = LastingTest(len(self._relations.columns))
         if self._count % REFRESH == 0:
             self._judge = self._fresh_judge()
-        motion = self._healthy.motion(self._recent.moved())
+        motion = self._motion = self._healthy.motion(self._recent.moved())
         self._lasting.add(view.z[-1] / self._judge.scale, self._judge.least, motion / self._judge.time)
         evidence = self._judge(view, self._lasting)
         if self._healthy.is_known:
@@ -209,6 +211,7 @@ class TrustMonitor:
         known = next((case for case in self._cases if not case.is_hidden and case.cause.cause == cause.cause), None)
         if known is not None and known.cause.columns == cause.columns:
             known.seen, known.last = known.seen + 1, self._count
+            known.moved += self._motion
         else:
             self._cases = [case for case in self._cases if case.is_hidden]
             began = self._count - int(evidence.age[cause.lead]) + 1
@@ -263,7 +266,8 @@ class TrustMonitor:
             return "they look alike, and the settings say to use them"
         elements = self._at(case)
         rest = self._without(self._hidden_columns() | self._recent.missing())(case.cause.columns)
-        if rest.level > STRANGE or (not self.is_known and ratio < GROSS):
+        is_gross = ratio >= GROSS and case.moved >= LONG and rest.level < LIKE
+        if rest.level > STRANGE or not (self.is_known or is_gross):
             return "what is normal is not known on this body"
         if self._immune & elements:
             return "it is not hidden again before it has agreed once"
