@@ -39,8 +39,8 @@ LAPSES = 10
 DOUBTFUL, PLAIN = 0.4, 1.5
 """From the first share of an alarm on, two wrong columns may hide each other; without one of them the other reaches the
 second multiple of an alarm."""
-UNEXPLAINED, ONCE_MORE = 10, 100
-"""If alarms of this number of blocks have no cause, those hidden in this number of blocks were no cause either."""
+UNEXPLAINED, ONCE_MORE = 3, 100
+"""If this number of searches found no cause, those hidden in this number of blocks were no cause either."""
 CLEAR = 2.0
 """A lie begins with the first error of this size [errors of a healthy prediction]."""
 GROSS, LONG, LIKE = 3.0, 50.0, 1.3
@@ -194,7 +194,10 @@ class TrustMonitor:
         ratio = evidence.ratio.copy()
         ratio[immune] = 0.0
         highest = float(ratio.max(initial=0.0))
-        if highest >= 1.0 or (highest >= DOUBTFUL and self._count % AGAIN == 0 and self._hides_others(ratio, hidden)):
+        body = next((case for case in self._cases if case.cause.cause == "body"), None)
+        if highest >= 1.0 and body is not None and self._count % AGAIN:
+            body.last = self._count  # a search without a result costs as much as 50 blocks
+        elif highest >= 1.0 or (highest >= DOUBTFUL and self._count % AGAIN == 0 and self._hides_others(ratio, hidden)):
             cause = explain(evidence, self._without(hidden), self._joined, self._parts, self._environment - hidden)
             self._suspect(cause, evidence, hidden)
         else:

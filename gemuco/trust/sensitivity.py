@@ -1,7 +1,7 @@
 """Errors of the network, and what they say of every column: how far it would have to be wrong to explain them.
 
 Where the network predicts a signal better than the watch does, a small lie shows in the network's errors only. An error
-of the tip of an arm may come from the camera or from any joint; its derivatives tell which lie of which size would
+of the tip of an arm may come from the camera or from any joint; its derivatives show which lie of which size would
 explain it. Hidden columns may be wrong by any amount, so the directions in which they move the errors do not count.
 """
 

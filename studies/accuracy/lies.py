@@ -7,7 +7,8 @@ muscle-driven arm in simulated physics with friction; the KUKA is a recording of
 are trained once and kept in runs/lies. A lie begins after 20 s in an element drawn by the seed and lasts for 8 s. Its
 size is in standard errors of the healthy prediction: the error of the model's estimate of this element while it is
 hidden, on healthy motion (for the KUKA that of the watch). The other method is ridge regression of each element on all
-others, with the largest error of the healthy motion as the threshold, and the largest multiple of it as the culprit.
+others, learned from the same normal samples, with the largest error of the healthy motion that is judged as the
+threshold (so it raises no false alarm in it), and the largest multiple of it as the culprit.
 """
 
 import argparse
@@ -80,7 +81,8 @@ def body_of(name: str) -> Body:
     columns = relations.columns[: relations.count]
     rows = {c: under(schema, c).scaler.normalise(schema.layout.join(values)) for c, values in motion.items()}
     error = _errors(schema, rows, relations) if name == "kuka" else _estimate_errors(schema, motion, columns)
-    every = np.concatenate(list(rows.values()))[::PART][:, columns]
+    assert schema.normal is not None
+    every = schema.normal.rows.astype(float)[:, columns]
     ridge = np.zeros((len(columns) + 1, len(columns)))
     for index in range(len(columns)):
         others = np.c_[np.delete(every, index, axis=1), np.ones(len(every))]
@@ -204,13 +206,13 @@ def rows_of_table(name: str, seeds: int) -> Iterator[tuple[str, ...]]:
         kind: [o for (k, s), os in outcomes.items() if k == kind and s != 3 for o in os] for kind in (*SIZED, *WHOLE)
     }
     groups["all from size 5"] = [o for (_, s), os in outcomes.items() if s != 3 for o in os]
-    for group, found in groups.items():
-        if found:
-            delays = [max(o.delay, 0.0) for o in found if not np.isnan(o.delay)]
-            share = [f"{np.mean([getattr(o, key) for o in found]):.0%}" for key in ("alone", "named", "leaked")]
-            ridge = [f"{np.mean([getattr(o, key) for o in found]):.0%}" for key in ("ridge", "ridge_right")]
+    for group, played in groups.items():
+        if played:
+            delays = [max(o.delay, 0.0) for o in played if not np.isnan(o.delay)]
+            share = [f"{np.mean([getattr(o, key) for o in played]):.0%}" for key in ("alone", "named", "leaked")]
+            ridge = [f"{np.mean([getattr(o, key) for o in played]):.0%}" for key in ("ridge", "ridge_right")]
             median = f"{np.median(delays):.1f} s" if delays else "-"
-            yield name, group, str(len(found)), f"{len(delays) / len(found):.0%}", median, *share, *ridge
+            yield name, group, str(len(played)), f"{len(delays) / len(played):.0%}", median, *share, *ridge
 
 
 def healthy(name: str) -> str:
