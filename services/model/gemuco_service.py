@@ -155,23 +155,26 @@ class GemucoService:
             self.clock,
             self.acquaintance,
         )
-        self.update = OnlineUpdate(
-            self.freshness,
-            self.living,
-            self.config.update,
-            self._learner,
-            lambda: self.control is not None and self.control.engaged,
-            service.publisher(keys.update(robot.robot), Update).put,
-            self.clock,
-            self._others_keep_time,
-            self.acquaintance.learned,
-            1.0 / robot.rates.update,
-        )
+        self.update = self._make_update()
         self._solver: ModelSolver | None = None
         self.control, self.no_control = self._make_control(self.config)
         self.loops = self._make_loops()
         self._core = OneCore()
         service.watch(*self.loops)
+
+    def _make_update(self) -> OnlineUpdate:
+        return OnlineUpdate(
+            self.freshness,
+            self.living,
+            self.config.update,
+            self._learner,
+            lambda: self.control is not None and self.control.engaged,
+            self.service.publisher(keys.update(self.robot.robot), Update).put,
+            self.clock,
+            self._others_keep_time,
+            self.acquaintance.learned,
+            1.0 / self.robot.rates.update,
+        )
 
     def _make_trust(self) -> Trust:
         settings = self.config.trust
