@@ -222,6 +222,8 @@ def query(
 
     [bold]tare SENSOR[/] make the present value zero, while the robot is off
 
+    [bold]trust ELEMENT[/], [bold]distrust ELEMENT[/] use an element as measured, or estimate it in its place
+
     [bold]describe[/] the robot    [bold]describe SERVICE[/] a service    [bold]holder[/] lease holder
 
     [bold]fault TEXT[/] apply a fault in the simulator

@@ -12,6 +12,7 @@ import numpy as np
 from hal.config import BusConfig, RobotConfig
 from simulators.faults import TOOL_CHANGED
 from simulators.hub import HubServer
+from simulators.lies import LIES, SWAPPED, TRUE, known_lies, lie_of
 from simulators.nodes.canopen.segment import Segment
 from simulators.nodes.canopen.spec import NodeSpec
 from simulators.nodes.node import SimulatedDrive, SimulatedNode
@@ -123,8 +124,9 @@ class Rig:
     def fault(self, text: str) -> str:
         """Break a part, or restore a node; return a sentence on what was done.
 
-        `sensor_silent NODE`, `node_silent NODE`, `node_back NODE`, `node_reboot NODE`, `emcy NODE`; anything else is a
-        part of the world, as in `muscle_cut biceps` or `tool_changed CONDITION`.
+        `sensor_silent NODE`, `node_silent NODE`, `node_back NODE`, `node_reboot NODE`, `emcy NODE`; a lie of
+        `simulators.lies`, such as `sensor_frozen NODE` or `sensor_offset NODE 1.0`, which `sensor_true NODE` ends;
+        anything else is a part of the world, as in `muscle_cut biceps` or `tool_changed CONDITION`.
 
         Raises:
             UnknownFault: The fault or the node does not exist.
@@ -132,11 +134,13 @@ class Rig:
         words = text.split()
         if words and words[0] in _NODE_FAULTS:
             return self._fault_node(words)
+        if words and words[0] in (*LIES, SWAPPED, TRUE):
+            return self._lie(words)
         try:
             with self._world_lock:
                 self._world.break_part(":".join(words))
         except ValueError as error:
-            known = ", ".join(f"{fault} NODE" for fault in _NODE_FAULTS)
+            known = ", ".join([*(f"{fault} NODE" for fault in _NODE_FAULTS), *known_lies()])
             raise UnknownFault(f"{error} Faults of nodes: {known}.") from None
         return f"The tool is now {words[1]}." if words[0] == TOOL_CHANGED else f"Broke {' '.join(words)}."
 
@@ -185,6 +189,28 @@ class Rig:
         with self._segments[node.spec.bus].lock:
             act(node, time.monotonic() if self._running.is_set() else self._now)
         return f"{node.spec.name} (node {node.spec.node} on {node.spec.bus}) {sentence}."
+
+    def _lie(self, words: list[str]) -> str:
+        """Let the sensor of a node lie about its element, or end that."""
+        if len(words) < 2:
+            raise UnknownFault(f"'{words[0]}' takes the name of a node. Known nodes: {', '.join(self._nodes())}.")
+        element, plant = self.node(words[1]).spec.element, self._plant
+        if words[0] == TRUE:
+            plant.lies.pop(element, None)
+            for one in (element, plant.swapped.pop(element, element)):
+                plant.swapped.pop(one, None)
+            return f"{words[1]} measures {element} as it is."
+        if words[0] == SWAPPED:
+            if len(words) != 3:
+                raise UnknownFault(f"'{SWAPPED}' takes the names of two nodes.")
+            other = self.node(words[2]).spec.element
+            plant.swapped.update({element: other, other: element})
+            return f"{words[1]} measures {other}, and {words[2]} measures {element}."
+        try:
+            plant.lies[element], sentence = lie_of(words[0], words[2:], plant.read(element), plant.time)
+        except ValueError as error:
+            raise UnknownFault(str(error)) from None
+        return f"{words[1]} {sentence} of {element}."
 
     def _move(self, duration: float) -> None:
         with self._world_lock:

@@ -237,6 +237,15 @@ class Watch:
             np.concatenate([np.zeros(0, int), *kind]),
         )
 
+    def inverse(self, penalty: float) -> np.ndarray:
+        """Return the inverse of the moments with a ridge penalty of the products, shape (features, features)."""
+        return np.asarray(np.linalg.inv(self.moments + self._ridge(penalty)))
+
+    def _ridge(self, penalty: float) -> np.ndarray:
+        ridge = np.full(len(self.moments), penalty)
+        ridge[0], ridge[1 : 1 + len(self.inputs)] = 1e-9, LINEAR
+        return np.diag(ridge)
+
     def _maps(
         self, moments: np.ndarray, targets: list[Target], penalties: list[float], kept: np.ndarray | None = None
     ) -> list[np.ndarray]:
@@ -251,9 +260,7 @@ class Watch:
         position = np.cumsum(used) - 1
         result: list[np.ndarray | None] = [None] * len(targets)
         for penalty in sorted(set(penalties)):
-            ridge = np.full(len(moments), penalty)
-            ridge[0], ridge[1 : 1 + count] = 1e-9, LINEAR
-            inverse = np.linalg.inv((moments + np.diag(ridge))[np.ix_(used, used)])
+            inverse = np.linalg.inv((moments + self._ridge(penalty))[np.ix_(used, used)])
             for index, target in enumerate(targets):
                 if penalties[index] != penalty:
                     continue

@@ -186,6 +186,7 @@ class Client:
             residual={name: part["residual"] for name, part in signals.items()},
             state={name: part["state"] for name, part in signals.items() if "state" in part},
             reason={name: part["reason"] for name, part in signals.items() if part.get("reason")},
+            distrusted=answer.get("distrusted", {}),
         )
 
     def anomaly(
@@ -354,6 +355,14 @@ class Client:
     def rollback(self) -> dict[str, Any]:
         """Return to the model before the online update."""
         return self.ask("model", "rollback", timeout=SLOW_TIMEOUT)
+
+    def trust(self, element: str) -> dict[str, Any]:
+        """Let the model use an element (`joint_position.elbow_pitch`) as measured again; return what is distrusted."""
+        return self.ask("model", "trust", {"element": element})
+
+    def distrust(self, element: str) -> dict[str, Any]:
+        """Hide an element from the model, which then estimates it, until `trust`; return what is distrusted."""
+        return self.ask("model", "distrust", {"element": element})
 
     def infer(self, signal: str, values: Values | None = None, hide: Iterable[str] = ()) -> dict[str, Any]:
         """Query the model for a signal, from `values` or from the newest sample, with some signals hidden."""

@@ -1,4 +1,4 @@
-"""Story of the demo: an arm moves, loses a sensor, learns its body and loses a muscle."""
+"""Story of the demo: an arm moves, loses a sensor, learns its body, has sensors that lie, and loses a muscle."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -34,6 +34,14 @@ INSIDE = 0.15
 """The distance of targets from the limits is at least this share of the range."""
 ENCODER, SILENT_ELEMENT = "shoulder_roll_encoder", "shoulder_roll"
 MUSCLE = "deltoid_side"
+LIES = (("elbow_pitch", "sensor_offset elbow_pitch_encoder 1.0", "one radian off"),
+        ("shoulder_pitch", "sensor_frozen shoulder_pitch_encoder", "frozen"))  # fmt: skip
+"""Elements whose encoders lie, the faults, and the lies in words."""
+LYING_POSES = 2
+TRUE_POSES = 6
+"""A lying encoder is trusted again within this number of poses."""
+LEAKS_AFTER = 2.0
+"""After this time [s] no wrong value may be passed on as measured."""
 
 
 @dataclass(slots=True)
@@ -70,7 +78,7 @@ class Story:
 
     def play(self) -> Marks:
         """Play all stages, about a minute."""
-        for stage in (self.move, self.lose_sensor, self.learn, self.lose_muscle):
+        for stage in (self.move, self.lose_sensor, self.learn, self.lie, self.lose_muscle):
             self.marks.stages.append(self._actor.play(stage))
         return self.marks
 
@@ -138,10 +146,55 @@ class Story:
         )
         return Stage("learns its own body", start, self._timeline.now(), figures, after < before)
 
-    def lose_muscle(self) -> Stage:
-        """Play (d): a muscle is cut, and the anomaly detection names it."""
+    def lie(self) -> Stage:
+        """Play (d): an encoder is one radian off, then another one freezes; each is hidden until it is right again."""
         self._become_calm()
-        self._report(f"[bold](d)[/] The wire of {MUSCLE} is cut.")
+        start, figures, observed = self._timeline.now(), [], True
+        for element, fault, words in LIES:
+            self._report(f"[bold](d)[/] The encoder of {element} lies: {words}.")
+            figure, is_seen = self._lying(element, fault, words)
+            figures.append(figure)
+            observed &= is_seen
+        return Stage("has encoders that lie", start, self._timeline.now(), tuple(figures), observed)
+
+    def _lying(self, element: str, fault: str, words: str) -> tuple[str, bool]:
+        """Let an encoder lie and be right again; return a sentence, and whether it was hidden and trusted again."""
+        index, start = self._elements.index(element), self._timeline.now()
+        self._client.fault(fault)
+        for _ in range(LYING_POSES):
+            self._go(self._pose(), LEARNING_TIME)
+        reason = self._reason(element)
+        self._client.fault(f"sensor_true {element}_encoder")
+        end = self._timeline.now()
+        for _ in range(TRUE_POSES):
+            if not self._is_estimated(index):
+                break
+            self._go(self._pose(), LEARNING_TIME)
+        returned = self._timeline.now() - end
+        at, hidden = (self._timeline.between(name, start, end) for name in ("time", "estimated"))
+        hidden = hidden[:, index] > 0
+        error = np.abs(self._silent_error(index, start, end))
+        wrong = error[hidden]
+        if not reason or not hidden.any():
+            return f"{element} {words}: not noticed", False
+        delay = float(at[np.argmax(hidden)]) - start
+        late = ~hidden & (at > start + LEAKS_AFTER)
+        leak = f", wrong as measured later by {error[late].max():.3f} rad" if late.any() else ""
+        is_back = not self._is_estimated(index)
+        back = f"trusted again {returned:.0f} s after it was right" if is_back else "not trusted again"
+        text = (
+            f"{element} {words}: {reason}; hidden after {delay:.1f} s, estimate wrong by {wrong.mean():.3f} rad; {back}"
+        )
+        return text + leak, is_back and not late.any()
+
+    def _reason(self, element: str) -> str:
+        estimate = self._client.estimate()
+        return "" if estimate is None else estimate.distrusted.get(f"{self._signal}.{element}", "")
+
+    def lose_muscle(self) -> Stage:
+        """Play (e): a muscle is cut, and the anomaly detection names it."""
+        self._become_calm()
+        self._report(f"[bold](e)[/] The wire of {MUSCLE} is cut.")
         start = self._timeline.now()
         calm = self._timeline.between("is_anomaly", start - CALM_TIME, start)
         score = float(np.nanmedian(self._timeline.between("score", start - CALM_TIME, start)))

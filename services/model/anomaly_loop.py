@@ -130,6 +130,10 @@ class AnomalyWatch:
             verdict = judge(schema, list(self._odd) if self._above_since <= since else lasting)
             self._judged = _Judged(since, now, self._steady(since, verdict))
 
+    def forget(self) -> None:
+        """Begin new windows, because a sensor lied in these samples and is hidden now, or is used again."""
+        self._recent.clear()
+
     def summary(self) -> dict[str, Any]:
         """Return the result of the last tick without the contributions; empty before the first."""
         latest = self.latest

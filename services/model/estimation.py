@@ -2,7 +2,8 @@
 
 import math
 from bisect import bisect_left
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from msgspec.structs import replace
@@ -24,6 +25,24 @@ WRONG = 3.0
 
 SampleSource = Callable[[], Arrival[Sample] | None]
 """A function of this type returns the newest sample, of any age."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Distrust:
+    """Hidden elements; a change makes another object.
+
+    Attributes:
+        hidden: Whether each element of the model is hidden, shape (size,).
+        reasons: `signal.element` -> reason, such as `distrusted: frozen since 12:03:11`.
+    """
+
+    hidden: np.ndarray
+    reasons: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether no element is hidden."""
+        return not self.reasons
 
 
 class Freshness:
@@ -58,14 +77,28 @@ class Freshness:
         nothing = _unwritable(np.full(self.elements.size, np.nan))
         self._nothing = nothing, False
         self._joined: tuple[np.ndarray, np.ndarray, Numbers] = nothing, nothing, Numbers(nothing, self.elements)
+        self.distrust = Distrust(np.zeros(self.elements.size, bool))
+        """These elements are not used as measured."""
+        self._trusted: tuple[Numbers, Distrust, Numbers] | None = None
 
     def take(self) -> tuple[Arrival[Sample] | None, Numbers]:
-        """Return the HAL's newest sample, and all usable values [unit], shapes (n,); NaN where invalid or stale.
+        """Return the HAL's newest sample, and all usable values [unit], shapes (n,).
 
-        The sample is None if no value of it is usable; values of the camera may be usable then. The arrays are
-        read-only: the same object is returned until another sample comes or a value becomes stale. Any thread may call
-        this.
+        Values are NaN where they are invalid, stale or distrusted. The sample is None if no value of it is usable;
+        values of the camera may be usable then. The arrays are read-only: the same object is returned until another
+        sample comes, a value becomes stale, or the distrust changes. Any thread may call this.
         """
+        fresh, values = self.measured()
+        distrust, trusted = self.distrust, self._trusted
+        if distrust.is_empty:
+            return fresh, values
+        if trusted is None or trusted[0] is not values or trusted[1] is not distrust:
+            rest = Numbers(_unwritable(np.where(distrust.hidden, np.nan, values.flat)), self.elements)
+            trusted = self._trusted = values, distrust, rest
+        return fresh, trusted[2]
+
+    def measured(self) -> tuple[Arrival[Sample] | None, Numbers]:
+        """Return the same as `take`, with the values of distrusted elements."""
         now, fresh = self._clock.monotonic(), self._newest()
         measured, is_there = self._nothing if fresh is None else self._hal.usable(fresh, now)
         seen = self._nothing[0]
@@ -199,7 +232,9 @@ class Estimation:
         if self.latest is not None and is_same:
             self.latest = replace(self.latest, stamp_ns=stamp_ns, cycle=cycle)
         else:
-            self.latest = _estimates(schema, in_order(schema, values), factor, self._fusion, stamp_ns, cycle)
+            self.latest = _estimates(
+                schema, in_order(schema, values), factor, self._fusion, stamp_ns, cycle, self._freshness.distrust
+            )
             self._source = schema, values, factor
         self._publish(self.latest)
 
@@ -215,7 +250,13 @@ class Estimation:
 
 
 def _estimates(
-    schema: BodySchema, values: Numbers, factor: np.ndarray | None, fusion: Fusion | None, stamp_ns: int, cycle: int
+    schema: BodySchema,
+    values: Numbers,
+    factor: np.ndarray | None,
+    fusion: Fusion | None,
+    stamp_ns: int,
+    cycle: int,
+    distrust: Distrust,
 ) -> Estimates:
     value, std, residual, sureness, recipe = fill(schema, values.flat)
     if factor is not None and recipe.steps:
@@ -239,4 +280,5 @@ def _estimates(
         residual=residual,
         state={name: sure.state for name, sure in sureness.items()},
         reason={name: sure.reason for name, sure in sureness.items() if sure.reason},
+        distrusted=dict(distrust.reasons),
     )

@@ -1,4 +1,4 @@
-"""The body schema as a service: estimation, control, anomaly and update, four loops on the newest sample."""
+"""The body schema as a service: estimation, control, anomaly, trust and update, loops on the newest sample."""
 
 import logging
 import threading
@@ -18,17 +18,21 @@ from gemuco.schema import BodySchema
 from gemuco.search.descent import NewtonConfig
 from hal.clock import SystemClock
 from hal.config import RobotConfig
+from hal.errors import HalError
 from services.command.intake import NEWS_FOR, Intake
 from services.command.permission import Permission
+from services.errors import ServiceError
 from services.model.acquaintance import Acquaintance
 from services.model.anomaly_loop import VERDICT_RATE, AnomalyWatch
 from services.model.control_config import ControlConfig, controller_of
-from services.model.control_loop import Control
+from services.model.control_loop import LIVE_MODES, Control
 from services.model.estimation import Estimation, Freshness
 from services.model.fusion import Fusion
 from services.model.hindsight import Hindsight
 from services.model.living_model import LivingModel
 from services.model.model_config import ModelConfig, model_config
+from services.model.trust_loop import RATE as TRUST_RATE
+from services.model.trust_loop import Trust
 from services.model.update_loop import OnlineUpdate
 from services.process.loop import Loop
 from services.process.one_core import OneCore
@@ -52,10 +56,12 @@ then stays until the reference or the model changes."""
 NETWORK_PRIORITY = 45
 STATUS_PRIORITY = 10
 """The status is less urgent than any loop that keeps time: it takes 1 ms, once a second."""
-PRIORITIES = {"estimation": 40, "control": 35, "anomaly": 30, "update": 10, "verdict": 10}
+PRIORITIES = {"estimation": 40, "control": 35, "anomaly": 30, "trust": 20, "update": 10, "verdict": 10}
 """These are SCHED_FIFO priorities, where the system allows it. Learning and verdicts have the lowest ones, but not
 none: they would hold the interpreter lock while other processes run."""
-OFFSETS = {"estimation": 0.8e-3, "anomaly": 1.4e-3, "control": 1.9e-3, "update": 7.4e-3, "verdict": 29.4e-3}
+OFFSETS = {
+    "estimation": 0.8e-3, "anomaly": 1.4e-3, "control": 1.9e-3, "trust": 3.4e-3, "update": 7.4e-3, "verdict": 29.4e-3
+}  # fmt: skip
 """Each loop begins this time [s] after the multiples of its period. At usual rates no two begin together, none begins
 with the HAL, which begins at those multiples, and learning begins after a solve, which takes 1 to 2 ms."""
 
@@ -140,6 +146,7 @@ class GemucoService:
             Fusion(schema.layout.size) if self.config.fuse else None,
         )  # fmt: skip
         self.acquaintance = Acquaintance()
+        self.trust = self._make_trust()
         self.anomaly = AnomalyWatch(
             self.freshness,
             self._schema,
@@ -148,23 +155,40 @@ class GemucoService:
             self.clock,
             self.acquaintance,
         )
-        self.update = OnlineUpdate(
-            self.freshness,
-            self.living,
-            self.config.update,
-            self._learner,
-            lambda: self.control is not None and self.control.engaged,
-            service.publisher(keys.update(robot.robot), Update).put,
-            self.clock,
-            self._others_keep_time,
-            self.acquaintance.learned,
-            1.0 / robot.rates.update,
-        )
+        self.update = self._make_update()
         self._solver: ModelSolver | None = None
         self.control, self.no_control = self._make_control(self.config)
         self.loops = self._make_loops()
         self._core = OneCore()
         service.watch(*self.loops)
+
+    def _make_update(self) -> OnlineUpdate:
+        return OnlineUpdate(
+            self.freshness,
+            self.living,
+            self.config.update,
+            self._learner,
+            lambda: self.control is not None and self.control.engaged,
+            self.service.publisher(keys.update(self.robot.robot), Update).put,
+            self.clock,
+            self._others_keep_time,
+            self.acquaintance.learned,
+            1.0 / self.robot.rates.update,
+        )
+
+    def _make_trust(self) -> Trust:
+        settings = self.config.trust
+        config = settings.config() if settings.active else None
+        return Trust(
+            self.robot,
+            self.freshness,
+            self._schema,
+            config,
+            self.clock,
+            self._stop_for,
+            self.acquaintance.is_known,
+            self._forget,
+        )
 
     def _make_loops(self) -> list[Loop]:
         rates, estimation, anomaly = self.robot.rates, self.estimation, self.anomaly
@@ -180,6 +204,7 @@ class GemucoService:
             loop("control", rates.control, self._control_tick),
             loop("anomaly", rates.anomaly, anomaly.tick),
             loop("update", rates.update, self.update.tick),
+            loop("trust", min(rates.hal, TRUST_RATE), self.trust.tick),
             loop("verdict", VERDICT_RATE, self._look_back),
         ]
 
@@ -191,6 +216,24 @@ class GemucoService:
         self.permission.begin(caller)
         return answer
 
+    def _forget(self, since: float) -> None:
+        """Neither learn what is normal from samples after a time [s], nor judge the body by them."""
+        self.update.forget(since)
+        self.anomaly.forget()
+
+    def _stop_for(self, reason: str) -> None:
+        """Stop the moving robot as its robot file says, because an element that motion needs is distrusted."""
+        applied = self._newest_applied()
+        if self.control is not None and self.control.engaged:
+            self.control.disengage(f"Stopped: {reason}")
+        if applied is None or applied.mode not in LIVE_MODES:
+            return
+        log.warning("The robot is stopped: %s", reason)
+        try:
+            query.ask(self.service.session, keys.verb(self.robot.robot, "hal", "stop"))
+        except (ServiceError, HalError) as error:
+            log.error("The HAL did not stop the robot: %s", error)
+
     def status(self) -> Status:
         """Return the state and the counters."""
         fresh, values = self.freshness.take()
@@ -200,6 +243,8 @@ class GemucoService:
         text = ""
         if fresh is None:
             text = "No fresh sample comes from the HAL. Is `gemuco hal` running?"
+        elif distrusted := self.trust.text():
+            text = distrusted
         elif missing:
             text = f"Estimating {', '.join(missing)}: not measured at the moment.{self._blind()}"
         elif failing:
@@ -225,6 +270,7 @@ class GemucoService:
                 "disordered": self._disordered(),
                 "signals": self.estimation.counts(),
                 "anomaly": self.anomaly.summary(),
+                "trust": self.trust.facts(),
                 "failing": failing,
             },
         )

@@ -5,6 +5,7 @@ from typing import Annotated, Literal, TypeVar
 from pydantic import Field, ValidationError
 
 from gemuco.learning.config import TrainConfig
+from gemuco.trust.config import TrustConfig
 from hal.config import Positive, RangeConfig, RobotConfig, Section, explain
 from hal.errors import ConfigError
 from services.model.control_config import ControlConfig, SimulationConfig, named_signals
@@ -12,6 +13,8 @@ from services.model.control_config import ControlConfig, SimulationConfig, named
 Count = Annotated[int, Field(ge=1)]
 DEFAULT = TrainConfig()
 """These defaults of training are those of the library."""
+TRUST = TrustConfig()
+"""These defaults of trust are those of the library."""
 
 
 class NetworkConfig(Section):
@@ -99,6 +102,25 @@ class AnomalyConfig(Section):
     """The score must stay above its threshold for this time [s]."""
 
 
+class TrustSettings(Section):
+    """The conditions under which a measured element is hidden, because the others contradict it."""
+
+    active: bool = True
+    """Whether lies are looked for; an operator can distrust an element also without."""
+    false_alarms: Annotated[float, Field(gt=0, le=60)] = TRUST.false_alarms
+    """A healthy robot may have this number of wrong verdicts per hour of motion; the default is one a week."""
+    size: Positive = TRUST.size
+    """A lie matters from this size on, in errors of a healthy prediction."""
+    sizes: dict[str, Positive] = Field(default_factory=dict)
+    """The same for single signals: signal -> size; it replaces `size`."""
+    pairs: Literal["hide", "use"] = "hide"
+    """Elements that look alike: `hide` all of them, or `use` them all."""
+
+    def config(self) -> TrustConfig:
+        """Return the settings for the library."""
+        return TrustConfig(self.false_alarms, self.size, self.sizes, self.pairs)
+
+
 class ModelConfig(Section):
     """The whole `model` section."""
 
@@ -114,6 +136,7 @@ class ModelConfig(Section):
     simulation: SimulationConfig = SimulationConfig()
     update: UpdateConfig = UpdateConfig()
     anomaly: AnomalyConfig = AnomalyConfig()
+    trust: TrustSettings = TrustSettings()
 
 
 class CollectConfig(Section):
@@ -156,13 +179,20 @@ def model_config(robot: RobotConfig) -> ModelConfig:
         raise ConfigError(
             f"Robot '{robot.robot}': model.signals names '{wrong[0]}', which is unknown or named twice. Known: {known}."
         )
+    names = model.signals or tuple(robot.signals)
+    for name in model.trust.sizes:
+        if name not in names:
+            raise ConfigError(
+                f"Robot '{robot.robot}': model.trust.sizes '{name}' is not a signal of the model. "
+                f"Known: {', '.join(names)}."
+            )
     for section in ("control", "simulation"):
         part = getattr(model, section)
         for key, signal in [] if part is None else named_signals(part):
-            if signal not in (known_signals := model.signals or tuple(robot.signals)):
+            if signal not in names:
                 raise ConfigError(
                     f"Robot '{robot.robot}': model.{section}.{key} '{signal}' is not a signal of the model. "
-                    f"Known: {', '.join(known_signals)}."
+                    f"Known: {', '.join(names)}."
                 )
     return model
 

@@ -44,12 +44,14 @@ class ModelVerbs:
             "adapt": self.adapt,
             "rollback": self.rollback,
             "normal": self.normal,
+            "trust": self.trust,
+            "distrust": self.distrust,
         }
 
     def serve(self, service: Service) -> None:
         """Answer all verbs. A verb that changes the motion needs permission; `disengage` is open to every client."""
         permission = self._service.permission
-        guards: dict[str, Guard] = dict.fromkeys(("adapt", "rollback", "normal"), self._may_change)
+        guards: dict[str, Guard] = dict.fromkeys(("adapt", "rollback", "normal", "trust", "distrust"), self._may_change)
         guards |= {"engage": permission.may_move, "target": permission.may_move}
         for name, handler in self.handlers().items():
             service.verb(name, handler, guards.get(name), always=name == "disengage")
@@ -83,7 +85,8 @@ class ModelVerbs:
         if not isinstance(arguments.get("signal", ""), str):
             raise BadArguments(f"'signal' must be a name. Known signals: {', '.join(schema.layout.names)}.")
         values, cycle = self._values(arguments)
-        facts = {"cycle": cycle, "model_version": self._service.living.version}
+        reasons = {} if arguments.get("values") is not None else dict(self._service.freshness.distrust.reasons)
+        facts = {"cycle": cycle, "model_version": self._service.living.version, "distrusted": reasons}
         factor = self._service.hindsight.factor
         if "signal" in arguments:
             signal = schema.layout.signal(arguments["signal"])
@@ -160,6 +163,8 @@ class ModelVerbs:
         """Engage the controller at the present posture, and ask the HAL to enable."""
         _only(arguments)
         control = self._control()
+        if refusal := self._service.trust.refusal():
+            raise NotEngaged(f"{refusal} Repair it, or run `gemuco query ROBOT trust ELEMENT`.")
         control.engage(self._service.enable_hal)
         return control.facts()
 
@@ -199,6 +204,18 @@ class ModelVerbs:
             return {"samples": samples, "threshold": None}
         facts = {"threshold": normal.threshold, "false_alarm": normal.false_alarm, "at_most": normal.bound}
         return {"samples": samples, **facts, "text": normal.trust}
+
+    def trust(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Use an element as measured again; it is not hidden again before it has agreed with the others once."""
+        _only(arguments, "element")
+        self._service.trust.trust(str(arguments.get("element", "")))
+        return self._service.trust.facts()
+
+    def distrust(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Hide a measured element, which is then estimated, until `trust`."""
+        _only(arguments, "element")
+        self._service.trust.distrust(str(arguments.get("element", "")))
+        return self._service.trust.facts()
 
     def _control(self) -> Control:
         if self._service.control is None:

@@ -95,7 +95,8 @@ class OnlineUpdate:
         self._make_learner, self._publish, self._clock = learner, publish, clock
         self._lock = threading.Lock()
         self._learner: BodyUpdater | None = None
-        self._since_change: deque[Values] = deque(maxlen=config.window)
+        self._since_change: deque[tuple[float, Values]] = deque(maxlen=config.window)
+        """Times [s] and samples since the model changed."""
         self._last: np.ndarray | None = None
         self._awaits_first = False
         self._taken_at = -math.inf
@@ -137,8 +138,14 @@ class OnlineUpdate:
         with self._lock:
             return self._learn_normal()
 
+    def forget(self, since: float) -> None:
+        """Learn no normal errors from samples after a time [s]: a sensor lied in them."""
+        with self._lock:
+            while self._since_change and self._since_change[-1][0] >= since:
+                self._since_change.pop()
+
     def _learn_normal(self) -> int:
-        samples = list(self._since_change)
+        samples = [sample for _, sample in self._since_change]
         schema = self._living.schema
         try:
             if not samples:
@@ -157,7 +164,7 @@ class OnlineUpdate:
         with self._lock:
             sample, moved = self._newest()
             if sample is not None and _is_complete(sample) and (moved or self._is_engaged()):
-                self._since_change.append(sample)
+                self._since_change.append((self._clock.monotonic(), sample))
             if self._learner is not None and not self._may_learn():
                 self.waited += 1
                 if moved and sample is not None:

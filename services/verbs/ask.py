@@ -37,6 +37,8 @@ VERBS = (
     "fault",
     "home",
     "tare",
+    "trust",
+    "distrust",
     "holder",
     *WITHOUT_WORDS,
 )
@@ -90,7 +92,9 @@ def estimate_line(reply: dict[str, Any]) -> str:
     source = reply["mask"].replace("+", ", ") or "single elements"
     error = f"{spread:.3f} {reply['unit']}" if np.isfinite(spread) else "unknown"
     state = f"; {reply['state']}: {reply['reason']}" if reply.get("reason") else ""
-    return f"{start}  {values}  * estimated from {source}, expected error {error}{state}"
+    reasons = [reply.get("distrusted", {}).get(f"{reply['signal']}.{name}") for name in reply["elements"]]
+    causes = "".join(f"; {name} {why}" for name, why in zip(reply["elements"], reasons, strict=True) if why)
+    return f"{start}  {values}  * estimated from {source}, expected error {error}{causes}{state}"
 
 
 def _estimate(client: Client, signal: str, hide: Sequence[str]) -> dict[str, Any]:
@@ -130,6 +134,9 @@ def _answer(client: Client, verb: str, words: Sequence[str], hide: Sequence[str]
         return client.home(_one(verb, words, "the name of a drive"))
     if verb == "tare":
         return client.tare(_one(verb, words, "the name of a sensor"))
+    if verb in ("trust", "distrust"):
+        element = _one(verb, words, "an element, such as joint_position.elbow_pitch")
+        return client.trust(element) if verb == "trust" else client.distrust(element)
     if verb == "describe":
         service = words[0] if words else ""
         if service not in ("", *keys.SERVICES):

@@ -95,6 +95,7 @@ def _signal_lines(rows: Sequence[SignalRow]) -> Iterator[str]:
         yield f'<tr class="s"><th colspan="5">{title}</th></tr>'
         for row in own:
             word = f'<span class="k-{row.kind}">{SYMBOLS[row.kind]} {row.kind}</span>'
+            word += f'<div class="also">{escape(row.distrust)}</div>' if row.distrust else ""
             std = number(row.std, row.unit) if row.kind is Kind.ESTIMATED else ""
             yield (
                 f'<tr class="k-{row.kind}"><td>{escape(row.element)}</td><td>{word}</td>'

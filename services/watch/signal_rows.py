@@ -35,6 +35,7 @@ class SignalRow:
         method: `mask`, `latent` or `input`; empty if nothing was estimated.
         state: `known`, `doubtful` or `unknown`: whether an estimate is inside of what was learned; empty if not said.
         reason: One sentence on the state.
+        distrust: Why it is estimated although it is measured, such as `distrusted: frozen since 12:03:11`; else empty.
     """
 
     signal: str
@@ -48,6 +49,7 @@ class SignalRow:
     method: str = ""
     state: str = ""
     reason: str = ""
+    distrust: str = ""
 
     @property
     def name(self) -> str:
@@ -97,17 +99,19 @@ def _rows_of(
         age = math.nan if ages is None else float(ages[index])
         is_fresh = newest is not None and newest.is_fresh and valid is not None and bool(valid[index])
         # The model knows the robot file and applies its own age limits to what a camera measured.
-        is_hidden = estimated is not None and bool(estimated.estimated[signal][index]) and is_seen
+        is_estimated = estimated is not None and bool(estimated.estimated[signal][index])
+        distrust = "" if estimate is None else estimate.distrusted.get(f"{signal}.{element}", "")
+        is_hidden = (is_estimated and is_seen) or bool(distrust)
         if is_fresh and not is_hidden and values is not None:
             yield SignalRow(signal, element, unit, Kind.MEASURED, float(values[index]), age=age)
         elif estimated is not None and np.isfinite(estimated.values[signal][index]):
             yield SignalRow(
                 signal, element, unit, Kind.ESTIMATED, float(estimated.values[signal][index]),
                 float(estimated.std[signal][index]), age, estimated.mask[signal].replace("+", ", "),
-                estimated.method[signal], estimated.state.get(signal, ""), estimated.reason.get(signal, ""),
+                estimated.method[signal], estimated.state.get(signal, ""), estimated.reason.get(signal, ""), distrust,
             )  # fmt: skip
         elif (newest is not None and (newest.is_fresh or is_seen)) or values is None:
-            yield SignalRow(signal, element, unit, Kind.MASKED, math.nan, age=age)
+            yield SignalRow(signal, element, unit, Kind.MASKED, math.nan, age=age, distrust=distrust)
         else:
             last = float(values[index])
             yield SignalRow(signal, element, unit, Kind.OLD if np.isfinite(last) else Kind.MASKED, last, age=age)

@@ -158,8 +158,13 @@ def _streams(snapshot: RobotSnapshot) -> Iterator[Trouble]:
 
 
 def _signals(rows: Sequence[SignalRow]) -> Iterator[Trouble]:
-    estimated = [row for row in rows if row.kind is Kind.ESTIMATED]
-    masked = [row for row in rows if row.kind is Kind.MASKED]
+    estimated = [row for row in rows if row.kind is Kind.ESTIMATED and not row.distrust]
+    masked = [row for row in rows if row.kind is Kind.MASKED and not row.distrust]
+    for row in [row for row in rows if row.distrust]:
+        instead = (
+            f"estimated from {row.source}" if row.source else "estimated" if row.kind is Kind.ESTIMATED else "masked"
+        )
+        yield Trouble(Level.ANOMALY, "Sensor distrusted", f"{row.name} is {instead}, {row.distrust}.")
     if estimated:
         sources = " and ".join(dict.fromkeys(row.source for row in estimated if row.source))
         origin = f" from {sources}" if sources else ""
@@ -180,6 +185,7 @@ def _body(snapshot: RobotSnapshot) -> Iterator[Trouble]:
     if poor:
         names = " and ".join(map(str, poor))
         yield Trouble(Level.NOTE, "Poor model", f"The error of {names} is above the threshold of the training.")
+    yield from _suspects(snapshot)
     judged = verdict(snapshot)
     if judged is None:
         return
@@ -191,6 +197,15 @@ def _body(snapshot: RobotSnapshot) -> Iterator[Trouble]:
         yield Trouble(Level.NOTE, "Environment changed", text)
     elif judged.is_anomaly:
         yield Trouble(Level.ANOMALY, "Anomaly", f"Most likely wrong: {judged.blamed or 'unknown'}.{score}")
+
+
+def _suspects(snapshot: RobotSnapshot) -> Iterator[Trouble]:
+    """Yield the sensors that are suspected and still used, from the model's status."""
+    trust = snapshot.facts("model").get("trust")
+    findings = trust.get("findings") if isinstance(trust, dict) else None
+    for finding in findings if isinstance(findings, list) else []:
+        if isinstance(finding, dict) and finding.get("state") == "suspect" and isinstance(finding.get("text"), str):
+            yield Trouble(Level.NOTE, "Sensors contradict each other", finding["text"])
 
 
 def _names(rows: Sequence[SignalRow]) -> str:

@@ -230,6 +230,8 @@ class Estimates(OfSignals, frozen=True, kw_only=True):
         state: Signal -> `known`, `doubtful` or `unknown`: whether the sample and p are like those that were learned.
             Older services do not publish it.
         reason: Signal -> one sentence on the state; only of signals that are not `known`.
+        distrusted: `signal.element` -> reason, such as `distrusted: frozen since 12:03:11`, of elements that are
+            estimated although they are measured, because the others contradict them or an operator said so.
     """
 
     TYPE: ClassVar[str] = "estimates"
@@ -246,6 +248,7 @@ class Estimates(OfSignals, frozen=True, kw_only=True):
     residual: dict[str, float]
     state: dict[str, str] = msgspec.field(default_factory=dict)
     reason: dict[str, str] = msgspec.field(default_factory=dict)
+    distrusted: dict[str, str] = msgspec.field(default_factory=dict)
 
 
 class Anomaly(OfSignals, frozen=True, kw_only=True):

@@ -1,0 +1,1 @@
+"""Trust: which measured elements the others contradict, for how long, and what is wrong with them."""

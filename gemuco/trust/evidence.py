@@ -1,0 +1,86 @@
+"""Evidence against every judged column, as a share of what a healthy body reaches once per allowed false alarm."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from gemuco.trust.changes import AGES, LastingTest, StepTest
+from gemuco.trust.config import BLOCK
+from gemuco.trust.healthy import Healthy
+from gemuco.trust.recent import View
+
+NOISE = 8.0
+"""A burst of noise has at least this multiple of the healthy variance."""
+RECENT = 20
+"""The usual error is that of this number of blocks."""
+QUIET = 0.5
+"""It has at least this multiple of the variance of healthy errors."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evidence:
+    """Results of all tests of one view, arrays of shape (columns,).
+
+    Attributes:
+        ratio: Largest evidence of any test; from 1 on it is an alarm. Zero for hidden columns.
+        strength: Logarithm of the likelihood ratio of the strongest test.
+        age: Age of the most likely change [blocks].
+        step: Result of the step test [standard deviations].
+        is_noise: Whether noise is the strongest evidence.
+        level: Usual error of the columns that are not hidden [that of a healthy body when it was learned], a scalar.
+    """
+
+    ratio: np.ndarray
+    strength: np.ndarray
+    age: np.ndarray
+    step: np.ndarray
+    is_noise: np.ndarray
+    level: float
+
+
+class Judge:
+    """Limits and tests for the body as it is."""
+
+    def __init__(self, healthy: Healthy, false_alarms: float, least: np.ndarray) -> None:
+        """Prepare.
+
+        Args:
+            healthy: What is known of the errors of this body.
+            false_alarms: Allowed wrong verdicts per hour.
+            least: Size of a lie that matters [errors of a healthy prediction], shape (columns,).
+        """
+        chance = false_alarms * BLOCK / 3600.0 / len(least)
+        self.scale, self.least = healthy.scale, np.maximum(1.0, healthy.tail / 0.4) * least
+        likeness = healthy.likeness
+        self.time = likeness.time
+        self._steps, self._limit = StepTest(likeness), np.maximum(healthy.limit(chance), least)
+        self._sum = -math.log(chance)
+        self._noise = np.maximum(NOISE * healthy.noise, QUIET * self.scale**2)
+
+    def __call__(self, view: View, lasting: LastingTest | None = None) -> Evidence:
+        """Return the evidence in a view; without `lasting` from its blocks alone."""
+        step, best = self._steps(np.nan_to_num(view.z / self.scale))
+        ratio, strength, age = step / self._limit, 0.5 * step**2, np.array(AGES)[best]
+        if lasting is not None:
+            likelihood = lasting.likelihood
+            is_longer = likelihood / self._sum > ratio
+            ratio = np.where(is_longer, likelihood / self._sum, ratio)
+            strength = np.maximum(strength, likelihood)
+            age = np.where(is_longer, AGES[-1], age)
+        noise = np.nan_to_num(view.noise) / self._noise
+        is_noise = (noise >= 1.0) & (np.sqrt(noise) > ratio)
+        ratio = np.where(is_noise, np.sqrt(noise), ratio)
+        strength = np.where(is_noise, 10.0 * noise, strength)
+        hidden = list(view.hidden)
+        ratio[hidden] = strength[hidden] = 0.0
+        return Evidence(ratio, strength, age, step, is_noise, _level(view))
+
+
+def _level(view: View) -> float:
+    """Return the median over the columns in use of the root mean square error of the newest blocks; 0 if unknown."""
+    used = np.ones(view.z.shape[1], bool)
+    used[list(view.hidden)] = False
+    z = view.z[:, used][-RECENT:]
+    z = z[np.isfinite(z).all(axis=1)]
+    return float(np.median(np.sqrt(np.mean(z**2, axis=0)))) if z.size else 0.0

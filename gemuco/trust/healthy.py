@@ -1,0 +1,111 @@
+"""Errors of the body as it is, learned while nothing is suspected: their scale, likeness, steps and noise."""
+
+import math
+
+import numpy as np
+
+from gemuco.trust.changes import LONGEST, Likeness
+
+MEMORY = 600.0
+"""Averages forget with this number of blocks."""
+TAIL_MEMORY = 6000.0
+"""The largest steps are remembered for this number of blocks."""
+APART = 5
+"""The slow part of the errors follows from blocks that are this far apart."""
+SCALES = (0.3, 20.0)
+"""The errors on this body are at least and at most this multiple of those that were learned."""
+LEAST_PACE = 0.03
+"""The usual pace of motion is at least this [standard deviations per block]."""
+PRIOR = 100.0
+"""What is assumed at the start counts as this number of blocks."""
+COMMON, EXCEEDS = 3.0, 0.015
+"""A healthy body's step test exceeds `COMMON` standard deviations in at most about this share of the blocks."""
+TOGETHER = 4.0
+"""Blocks with a large step come in groups of about this number, each of which would be one false alarm."""
+TAIL, EXCESSES = 0.4, 20.0
+"""Mean excess above `COMMON` that is assumed at the start, and the number of excesses that this counts as."""
+TAILS = (0.3, 0.7)
+"""The mean excess is at least and at most this; 0.28 for normal errors."""
+RESTS = 0.2
+"""Slower than this share of its usual pace the body is at rest."""
+
+
+class Healthy:
+    """Running statistics of standardised errors, by judged column."""
+
+    def __init__(self, size: int) -> None:
+        self.count, self.moved = 0, 0.0
+        self._square = np.ones(size)
+        self._near, self._far = np.full(size, 0.85), np.full(size, 0.5)
+        self._excess, self._exceeding = np.full(size, TAIL * EXCESSES), np.full(size, EXCESSES)
+        self._pace = LEAST_PACE
+        self._noise, self._noise_count = np.full(size, 1e-6), 0
+
+    def add(self, z: np.ndarray, steps: np.ndarray, noise: np.ndarray, motion: float) -> None:
+        """Learn from one block; columns whose newest error is NaN keep what they have.
+
+        Args:
+            z: The newest errors, oldest first, shape (LONGEST, n), in units of the learned ones; NaN where missing.
+            steps: Result of the step test, shape (n,).
+            noise: Variance of the noise within the block, in the same units, shape (n,); NaN where unknown.
+            motion: Result of `motion`; a body at rest shows the same errors again and again.
+        """
+        self.count += 1
+        self.moved += motion
+        share = motion / min(PRIOR + self.moved, MEMORY)
+        now = z[-1]
+        is_new = np.isfinite(now)
+        square = np.clip(np.where(is_new, now**2, self._square), 0.0, 9.0 * self._square)
+        self._square += share * (square - self._square)
+        for lag, name in ((1, "_near"), (APART, "_far")):
+            mean, product = getattr(self, name), now * z[-1 - lag] / self._square
+            product = np.where(np.isfinite(product), np.clip(product, -4.0, 4.0), mean)
+            setattr(self, name, mean + share * (product - mean))
+        above, fade = is_new & (steps > COMMON), 1.0 - 1.0 / TAIL_MEMORY
+        self._excess = self._excess * fade + np.where(above, steps - COMMON, 0.0)
+        self._exceeding = self._exceeding * fade + above
+        is_noise = np.isfinite(noise)
+        if is_noise.any():
+            self._noise_count += 1
+            share = 1.0 / min(self._noise_count, MEMORY)
+            change = np.clip(np.where(is_noise, noise, self._noise), 0.0, 9.0 * self._noise + 1e-4)
+            self._noise += share * (change - self._noise)
+
+    def motion(self, moved: float) -> float:
+        """Return how much of a look at a new posture a block is, from 0 at rest to 1.
+
+        Args:
+            moved: Root mean square change of all elements since the block before [standard deviations].
+        """
+        if moved > RESTS * self._pace:
+            self._pace = max(LEAST_PACE, self._pace + (moved - self._pace) / min(1.0 + self.count, MEMORY))
+        return min(1.0, moved / self._pace)
+
+    @property
+    def scale(self) -> np.ndarray:
+        """Standard deviation of the errors on this body, in units of the learned ones, shape (n,)."""
+        return np.clip(np.sqrt(self._square), *SCALES)
+
+    @property
+    def noise(self) -> np.ndarray:
+        """Variance of the noise within a block, in units of the learned errors, shape (n,)."""
+        return self._noise
+
+    @property
+    def likeness(self) -> Likeness:
+        """Likeness of neighbouring errors."""
+        return Likeness.of(self._near, self._far, APART)
+
+    @property
+    def tail(self) -> np.ndarray:
+        """Mean excess of large steps, shape (n,)."""
+        return np.clip(self._excess / self._exceeding, *TAILS)
+
+    def limit(self, chance: float) -> np.ndarray:
+        """Return the step that a healthy element exceeds in one block with this probability, shape (n,)."""
+        return np.asarray(COMMON + self.tail * math.log(EXCEEDS * TOGETHER / chance))
+
+    @property
+    def is_known(self) -> bool:
+        """Whether enough blocks were seen to judge."""
+        return self.count >= LONGEST

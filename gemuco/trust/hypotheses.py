@@ -1,0 +1,108 @@
+"""The cause of an alarm: the smallest set of columns without which the others agree again."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from gemuco.trust.config import Hidden
+from gemuco.trust.evidence import Evidence
+
+EXPLAINED = 0.85
+"""Without the wrong columns the evidence against all others is below this share of an alarm."""
+CANDIDATES = 5
+"""This many columns with the most evidence are held against each other."""
+SEARCHED = 6
+"""Partners are searched for this many columns with the most evidence."""
+PLAUSIBLE = 0.4
+"""A column is a candidate from this share of an alarm on."""
+ALIKE = 6.0
+"""Two columns look alike if their logarithms of the likelihood ratio differ by less than this."""
+CLOSE = 0.8
+"""Nor if the smaller is more than this share of the larger."""
+MOST = 3
+"""At most this number of columns is named as alternatives."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cause:
+    """Columns that explain an alarm.
+
+    Attributes:
+        columns: The columns.
+        cause: As in `Finding`.
+        lead: The column with the most evidence.
+    """
+
+    columns: Hidden
+    cause: str
+    lead: int
+
+
+def explain(
+    evidence: Evidence,
+    without: Callable[[Hidden], Evidence],
+    devices: Sequence[Hidden],
+    parts: Sequence[Hidden],
+    environment: Hidden,
+) -> Cause:
+    """Return the most likely cause of an alarm.
+
+    Args:
+        evidence: The evidence while nothing more is hidden.
+        without: Returns the evidence with more columns hidden.
+        devices: Columns that one device measures.
+        parts: Columns that belong to one part of the body, such as a muscle, which may itself have changed.
+        environment: The columns of p.
+    """
+    order = np.argsort(-evidence.strength)
+    lead = int(order[0])
+    singles = [int(c) for c in order[:CANDIDATES] if evidence.ratio[c] >= PLAUSIBLE and int(c) not in environment]
+    solved: dict[Hidden, bool] = {}
+
+    def solves(columns: Hidden) -> bool:
+        if columns not in solved:
+            solved[columns] = float(without(columns).ratio.max(initial=0.0)) < EXPLAINED
+        return solved[columns]
+
+    def partners() -> Iterator[Hidden]:
+        """Yield pairs of columns that hide each other: without the first the second stands out."""
+        for column in order[:SEARCHED].tolist():
+            if column not in environment:
+                yield frozenset({column, int(without(frozenset({column})).strength.argmax())})
+
+    single = [column for column in singles if solves(frozenset({column}))]
+    best = float(evidence.strength[single[0]]) if single else 0.0
+    if environment:
+        own = float(evidence.strength[list(environment)].max())
+        if own >= CLOSE * best - ALIKE and solves(environment):
+            return Cause(environment, "environment", lead)
+    if single:
+        alike = [c for c in single if _is_alike(best, float(evidence.strength[c]))]
+        if len(alike) == 1:
+            return Cause(frozenset(alike), "element", alike[0])
+        return Cause(frozenset(alike[:MOST]), "either", alike[0])
+    for columns, cause in _sets(singles, devices, parts, partners):
+        if solves(columns):
+            return Cause(columns, cause, max(columns, key=lambda c: evidence.strength[c]))
+    return Cause(frozenset(), "body", lead)
+
+
+def _is_alike(best: float, other: float) -> bool:
+    return best - other < ALIKE or other > CLOSE * best
+
+
+def _sets(
+    singles: Sequence[int],
+    devices: Sequence[Hidden],
+    parts: Sequence[Hidden],
+    partners: Callable[[], Iterator[Hidden]],
+) -> Iterator[tuple[Hidden, str]]:
+    """Yield the parts and devices that contain one of the first two candidates, and pairs."""
+    first = set(singles[:2])
+    yield from ((part, "part") for part in parts if part & first)
+    yield from ((frozenset(pair), "all") for pair in combinations(singles[:3], 2))
+    yield from ((pair, "all") for pair in partners() if len(pair) == 2)
+    for device in sorted((device for device in devices if device & first and len(device) > 1), key=len):
+        yield device, "all"

@@ -1,0 +1,391 @@
+"""The monitor: it judges every element block by block, and hides those that lie until they have agreed again."""
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from gemuco.anomaly.blame import parts
+from gemuco.schema import BodySchema
+from gemuco.trust.changes import LONGEST, LastingTest
+from gemuco.trust.config import BLOCK, Finding, Hidden, TrustConfig
+from gemuco.trust.evidence import Evidence, Judge
+from gemuco.trust.healthy import Healthy
+from gemuco.trust.hypotheses import SEARCHED, Cause, explain
+from gemuco.trust.kinds import kind_of
+from gemuco.trust.recent import Recent, View
+from gemuco.trust.relations import Relations
+
+CONFIRMED = 2
+"""The same cause must explain this number of successive blocks before it is hidden."""
+CALM = 0.6
+"""Elements agree if the evidence against all is below this share of an alarm."""
+LEARNING = 0.8
+"""What is healthy is learned only from blocks with less evidence than this."""
+REFRESH = 10
+"""Limits follow the healthy errors once in this number of blocks."""
+AGAIN = 5
+"""Hidden elements are judged anew once in this number of blocks."""
+SETTLED = 25
+"""A cause and its kind may be corrected for this number of blocks."""
+OTHER = 100.0
+"""After this number of blocks of motion in which no element explains what is seen, the body counts as another one: what
+is healthy is learned from it, and small lies are noticed no more."""
+STRANGE = 1.8
+"""If the errors without a cause are usually this multiple of those that were learned, no sensor is hidden."""
+LAPSES = 10
+"""A suspicion ends if nothing speaks for it in this number of blocks."""
+DOUBTFUL, PLAIN = 0.4, 1.5
+"""From the first share of an alarm on, two wrong columns may hide each other; without one of them the other reaches the
+second multiple of an alarm."""
+UNEXPLAINED, ONCE_MORE = 3, 100
+"""If this number of searches found no cause, those hidden in this number of blocks were no cause either."""
+CLEAR = 2.0
+"""A lie begins with the first error of this size [errors of a healthy prediction]."""
+GROSS, LONG, LIKE = 3.0, 50.0, 1.3
+"""On a body that is not known to be as the model says, a lie is hidden if it is the first multiple of an alarm,
+explains the second number of blocks of motion, and leaves errors below the third multiple of those learned."""
+AT_ONCE, ONCE = 3, 15
+"""At most this number of elements are wrong at once, which is within this number of blocks; otherwise the body is."""
+SURE = 2.0
+"""Another cause replaces one if its evidence is this multiple."""
+MOVES = 3.0
+"""Before a frozen element returns, it and its prediction move by this much [errors of a healthy prediction]."""
+
+Replaces = Callable[[frozenset[int]], bool]
+"""Whether all elements of a set can be estimated while none of them is measured."""
+
+
+@dataclass(slots=True)
+class _Case:
+    """A cause under suspicion, or hidden."""
+
+    cause: Cause
+    began: int
+    first: int
+    last: int
+    seen: int = 1
+    moved: float = 0.0
+    is_hidden: bool = False
+    kind: str = "unknown"
+    size: float = math.nan
+    reason: str = ""
+
+
+class TrustMonitor:
+    """Sequential tests of all elements of one body.
+
+    Give it every block of samples, also the values of hidden elements, because they show when an element agrees again.
+    """
+
+    def __init__(
+        self,
+        schema: BodySchema,
+        config: TrustConfig | None = None,
+        devices: Iterable[frozenset[int]] = (),
+        replaces: Replaces = lambda elements: True,
+    ) -> None:
+        """Prepare.
+
+        Args:
+            schema: The model in use.
+            config: The settings.
+            devices: Positions of the elements that each device measures.
+            replaces: Whether a set of elements can be estimated.
+        """
+        self._config, self._devices, self._replaces = config or TrustConfig(), list(devices), replaces
+        self.is_known = True
+        """Whether the model's normal errors are known to be those of this body."""
+        self._recent, self._count, self._now = Recent(), 0, 0.0
+        self._by_hand: dict[int, float] = {}
+        self._immune: set[int] = set()
+        self._cases: list[_Case] = []
+        self._relations: Relations | None = None
+        self._schema: BodySchema | None = None
+        self.use(schema)
+
+    def use(self, schema: BodySchema) -> None:
+        """Judge by another model; what is known of the body is kept unless the normal errors were learned anew."""
+        before, self._schema = self._schema, schema
+        if before is not None and before.normal is schema.normal:
+            return
+        self._relations = Relations.of(schema)
+        self._view: View | None = None
+        if self._relations is None:
+            return
+        size = len(self._relations.columns)
+        self._recent.clear()
+        self._other = self._motion = 0.0
+        self._healthy, self._lasting = Healthy(size), LastingTest(size)
+        self._least = self._sizes(schema, self._relations)
+        self._judge = self._fresh_judge()
+        place = {int(position): column for column, position in enumerate(self._relations.columns)}
+        self._place = place
+        self._environment = frozenset(range(self._relations.count, size))
+        movable = [int(p) for p in self._relations.columns[: self._relations.count]]
+        self._parts = [frozenset(place[p] for p in part) for part in parts(schema, movable)]
+        self._joined = [frozenset(place[p] for p in device if p in place) for device in self._devices]
+
+    @property
+    def hidden(self) -> frozenset[int]:
+        """Positions in the layout that must not be used as measured."""
+        return frozenset(self._by_hand) | frozenset(p for case in self._cases if case.is_hidden for p in self._at(case))
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether lies can be noticed: what is normal is known, and enough blocks were seen."""
+        return self._relations is not None and self._healthy.is_known
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """Everything that is suspected or hidden, the oldest first."""
+        by_hand = [
+            Finding((position,), "element", "unknown", since, is_distrusted=True, by_hand=True)
+            for position, since in self._by_hand.items()
+        ]
+        return (*by_hand, *(self._finding(case) for case in self._cases))
+
+    def distrust(self, position: int, now: float) -> None:
+        """Hide an element until `trust`."""
+        self._immune.discard(position)
+        self._by_hand[position] = now
+
+    def trust(self, position: int) -> None:
+        """Use an element again; it is not hidden again before it has agreed with the others once."""
+        self._by_hand.pop(position, None)
+        cases = [case for case in self._cases if position in self._at(case)]
+        for case in cases:
+            self._cases.remove(case)
+            self._immune.update(self._at(case))
+
+    def add(self, samples: np.ndarray, now: float) -> None:
+        """Judge one block.
+
+        Args:
+            samples: All samples of the last `BLOCK` seconds [standard deviations], hidden elements included, shape
+                (n, size); NaN where not measured.
+            now: Time of the last sample [s].
+        """
+        if self._relations is None or self._schema is None or not len(samples):
+            return
+        self._count, self._now = self._count + 1, now
+        self._recent.add(self._schema, self._relations, samples)
+        hidden = self._hidden_columns() | self._recent.missing()
+        before = self._view
+        view = self._view = self._recent.view(self._relations, hidden, before)
+        if before is None or before.hidden != hidden:
+            self._lasting = LastingTest(len(self._relations.columns))
+        if self._count % REFRESH == 0:
+            self._judge = self._fresh_judge()
+        motion = self._motion = self._healthy.motion(self._recent.moved())
+        self._lasting.add(view.z[-1] / self._judge.scale, self._judge.least, motion / self._judge.time)
+        evidence = self._judge(view, self._lasting)
+        if self._healthy.is_known:
+            self._decide(evidence, hidden)
+        is_other = any(case.cause.cause == "body" for case in self._cases)
+        self._other = self._other + motion if is_other else 0.0
+        is_quiet = float(evidence.ratio.max(initial=0.0)) < LEARNING
+        if not self._healthy.is_known or is_quiet or self._other > OTHER:
+            self._learn(view, evidence, motion)
+
+    def _decide(self, evidence: Evidence, hidden: Hidden) -> None:
+        immune = [self._place[p] for p in self._immune if p in self._place]
+        ratio = evidence.ratio.copy()
+        ratio[immune] = 0.0
+        highest = float(ratio.max(initial=0.0))
+        body = next((case for case in self._cases if case.cause.cause == "body"), None)
+        if highest >= 1.0 and body is not None and self._count % AGAIN:
+            body.last = self._count  # a search without a result costs as much as 50 blocks
+        elif highest >= 1.0 or (highest >= DOUBTFUL and self._count % AGAIN == 0 and self._hides_others(ratio, hidden)):
+            cause = explain(evidence, self._without(hidden), self._joined, self._parts, self._environment - hidden)
+            self._suspect(cause, evidence, hidden)
+        else:
+            highest = float(evidence.ratio.max(initial=0.0))
+            self._cases = [case for case in self._cases if case.is_hidden or not self._has_lapsed(case, highest)]
+        if self._count % AGAIN == 0:
+            for case in [case for case in self._cases if case.is_hidden]:
+                self._judge_again(case)
+        if immune and self._count % AGAIN == 0 and float(evidence.ratio[immune].max()) < CALM:
+            self._immune.clear()
+
+    def _suspect(self, cause: Cause, evidence: Evidence, hidden: Hidden) -> None:
+        """Suspect a cause, or hide it if it has been suspected before."""
+        known = next((case for case in self._cases if not case.is_hidden and case.cause.cause == cause.cause), None)
+        if known is not None and known.cause.columns == cause.columns:
+            known.seen, known.last = known.seen + 1, self._count
+            known.moved += self._motion
+        else:
+            self._cases = [case for case in self._cases if case.is_hidden]
+            began = self._count - int(evidence.age[cause.lead]) + 1
+            known = _Case(cause, began, self._count, self._count)
+            self._cases.append(known)
+        self._describe(known, hidden | cause.columns, bool(evidence.is_noise[cause.lead]))
+        if cause.cause == "body" and known.seen >= UNEXPLAINED:
+            self._release_recent()
+        if known.seen >= CONFIRMED and cause.cause != "body":
+            known.reason = self._refusal(known, float(evidence.ratio.max()))
+            known.is_hidden = not known.reason
+            self._limit_at_once(known)
+
+    def _release_recent(self) -> None:
+        """Show elements again that were hidden a short time ago, because they do not explain what is seen."""
+        recent = [case for case in self._cases if case.is_hidden and self._count - case.first < ONCE_MORE]
+        for case in recent:
+            if case.cause.cause != "environment":
+                self._cases.remove(case)
+                self._immune.update(self._at(case))
+
+    def _has_lapsed(self, case: _Case, highest: float) -> bool:
+        """Whether nothing speaks for a suspicion any more; `highest` is the evidence against any element."""
+        if highest >= 1.0 and case.cause.cause == "body":
+            case.last = self._count
+        return self._count - case.last > LAPSES
+
+    def _hides_others(self, ratio: np.ndarray, hidden: Hidden) -> bool:
+        """Whether one of the columns with the most evidence hides another one that is wrong too."""
+        without, order = self._without(hidden), np.argsort(-ratio)[:SEARCHED]
+        alone = (float(without(frozenset({int(column)})).ratio.max()) for column in order if ratio[column] > 0.0)
+        return any(highest >= PLAIN for highest in alone)
+
+    def _limit_at_once(self, new: _Case) -> None:
+        """Take a change of many elements at once as one of the body, which hides none of them."""
+        together = [c for c in self._cases if c.is_hidden and abs(c.began - new.began) < ONCE and self._at(c)]
+        elements = frozenset().union(*(self._at(case) for case in together))
+        if len(elements) <= AT_ONCE or any(elements <= device for device in self._devices):
+            return
+        self._cases = [case for case in self._cases if case not in together]
+        body = Cause(frozenset(), "body", new.cause.lead)
+        self._cases.append(_Case(body, min(case.began for case in together), self._count, self._count))
+        self._immune.update(elements)
+
+    def _refusal(self, case: _Case, ratio: float) -> str:
+        """Return why a cause is not hidden; empty if it is. `ratio` is the evidence, as a multiple of an alarm."""
+        if case.cause.cause == "environment":
+            return ""
+        if case.cause.cause == "part":
+            return "a part of the body has changed, and not its sensors"
+        if case.cause.cause == "either" and self._config.pairs == "use":
+            return "they look alike, and the settings say to use them"
+        elements = self._at(case)
+        rest = self._without(self._hidden_columns() | self._recent.missing())(case.cause.columns)
+        is_gross = ratio >= GROSS and case.moved >= LONG and rest.level < LIKE
+        if rest.level > STRANGE or not (self.is_known or is_gross):
+            return "what is normal is not known on this body"
+        if self._immune & elements:
+            return "it is not hidden again before it has agreed once"
+        if not self._replaces(self.hidden | elements):
+            return "the model cannot replace it"
+        return ""
+
+    def _judge_again(self, case: _Case) -> None:
+        """Let a hidden cause return if it agrees, and correct it while that is possible."""
+        assert self._relations is not None
+        rest = (self._hidden_columns() - case.cause.columns) | self._recent.missing()
+        shown = self._recent.view(self._relations, rest)
+        evidence = self._judge(shown)
+        columns = sorted(case.cause.columns - self._recent.missing())
+        if not columns:
+            return
+        if float(evidence.ratio.max(initial=0.0)) < CALM:
+            is_silent = (
+                np.abs(shown.z[:, columns] / self._judge.scale[columns]).max() < self._judge.least[columns].max()
+            )
+            if is_silent and np.isfinite(shown.z[:, columns]).all() and self._has_moved(case, shown):
+                self._cases.remove(case)
+            return
+        if self._count - case.first > SETTLED or case.cause.cause == "environment":
+            return
+        self._describe(case, self._hidden_columns(), case.kind == "noise")
+        if case.cause.cause not in ("element", "either"):
+            return
+        again = explain(evidence, self._without(rest), self._joined, self._parts, frozenset())
+        if again.cause == "element" and again.columns != case.cause.columns:
+            inside = again.columns < case.cause.columns
+            rival, own = again.lead, max(case.cause.columns - again.columns, key=lambda c: evidence.strength[c])
+            if evidence.strength[rival] > (1.0 if inside else SURE) * evidence.strength[own]:
+                case.cause = again
+                self._describe(case, rest | again.columns, case.kind == "noise")
+
+    def _has_moved(self, case: _Case, shown: View) -> bool:
+        """Whether an element that was frozen has moved with its prediction."""
+        if case.kind not in ("frozen", "clipped"):
+            return True
+        values = self._recent.values()[-LONGEST:]
+        healthy = shown.healthy[-len(values) :]
+        return all(np.ptp(values[:, c]) > MOVES * np.nanmean(healthy[:, c]) for c in case.cause.columns)
+
+    def _describe(self, case: _Case, hidden: Hidden, is_noise: bool) -> None:
+        """Find kind and size of a lie from its blocks so far, predicted from trusted elements only."""
+        assert self._relations is not None and self._schema is not None
+        columns = sorted(case.cause.columns)
+        if not columns or case.cause.cause == "environment":
+            return
+        view = self._recent.view(self._relations, hidden | case.cause.columns)
+        count = min(max(1, self._count - case.began + 1), len(self._recent.blocks), LONGEST)
+        lead = case.cause.lead if case.cause.lead in columns else columns[0]
+        values, spans = self._recent.values()[-count:], self._recent.spans()[-count:]
+        error = view.z[-count:] * view.healthy[-count:]
+        known = np.isfinite(error[:, columns]).all(axis=1)
+        if not known.any():
+            return
+        values, error, spans = values[known], error[known], spans[known]
+        healthy = view.healthy[-count:][known][:, lead]
+        clear = np.abs(error[:, lead]) > CLEAR * healthy * self._judge.scale[lead]
+        if case.kind != "noise" and not is_noise and clear.any() and not case.is_hidden:
+            first = int(np.argmax(clear))
+            values, error, spans, healthy = values[first:], error[first:], spans[first:], healthy[first:]
+            case.began = self._count - len(values) + 1
+        position = int(self._relations.columns[lead])
+        std, unit = float(self._schema.scaler.std[position]), self._unit(position)
+        others = [c for c in columns if c != lead]
+        case.kind = kind_of(
+            values[:, lead], error[:, lead], float(healthy.mean()), std, unit, is_noise,
+            values[:, others] - error[:, others] if case.cause.cause == "all" else None, float(spans[:, lead].max()),
+        )  # fmt: skip
+        case.size = float(np.sqrt(np.mean(error[:, lead] ** 2))) * std
+
+    def _unit(self, position: int) -> str:
+        assert self._schema is not None
+        for signal, span in zip(self._schema.layout.signals, self._schema.layout.slices.values(), strict=True):
+            if span.start <= position < span.stop:
+                return signal.unit
+        return ""
+
+    def _learn(self, view: View, evidence: Evidence, motion: float) -> None:
+        noise = view.newest.copy()
+        z = view.z.copy()
+        z[:, list(view.hidden)], noise[list(view.hidden)] = np.nan, np.nan
+        if np.isfinite(z[-1]).any():
+            self._healthy.add(z, evidence.step, noise, motion)
+
+    def _fresh_judge(self) -> Judge:
+        return Judge(self._healthy, self._config.false_alarms, self._least)
+
+    def _without(self, hidden: Hidden) -> Callable[[Hidden], Evidence]:
+        relations, judge = self._relations, self._judge
+        assert relations is not None
+        return lambda more: judge(self._recent.view(relations, hidden | more))
+
+    def _hidden_columns(self) -> Hidden:
+        by_hand = {self._place[p] for p in self._by_hand if p in self._place}
+        return frozenset(by_hand).union(*(case.cause.columns for case in self._cases if case.is_hidden))
+
+    def _at(self, case: _Case) -> frozenset[int]:
+        """Return the positions in the layout of a case's elements, without p."""
+        assert self._relations is not None
+        columns = [c for c in case.cause.columns if c < self._relations.count]
+        return frozenset(int(self._relations.columns[c]) for c in columns)
+
+    def _finding(self, case: _Case) -> Finding:
+        lead = case.cause.lead
+        at = sorted(self._at(case), key=lambda p: (self._place[p] != lead, p))
+        since = self._now - (self._count - case.began) * BLOCK
+        return Finding(tuple(at), case.cause.cause, case.kind, since, case.size, case.is_hidden, reason=case.reason)
+
+    def _sizes(self, schema: BodySchema, relations: Relations) -> np.ndarray:
+        least = np.full(len(relations.columns), self._config.size)
+        for name, size in self._config.sizes.items():
+            span = schema.layout.slice(name)
+            least[(relations.columns >= span.start) & (relations.columns < span.stop)] = size
+        return least

@@ -1,0 +1,133 @@
+"""The newest blocks of samples, and their errors under any hypothesis about which columns are wrong."""
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from gemuco.schema import BodySchema
+from gemuco.trust.changes import LONGEST
+from gemuco.trust.config import Hidden
+from gemuco.trust.relations import Relations, rows_of
+from gemuco.trust.sensitivity import Sensed
+
+NOISY = 5
+"""The noise is the median of this number of the newest blocks."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """Errors of the newest blocks if some columns are hidden.
+
+    Attributes:
+        z: Errors [those of a healthy body], oldest first, shape (LONGEST, n); NaN where a used element was missing.
+        healthy: Errors of a healthy body [standard deviations of the signal], shape (LONGEST, n).
+        noise: Median variance of the noise within the newest blocks [squared errors of a healthy body], shape (n,).
+        newest: The same of the newest block alone, shape (n,).
+        hidden: The hidden columns.
+    """
+
+    z: np.ndarray
+    healthy: np.ndarray
+    noise: np.ndarray
+    newest: np.ndarray
+    hidden: Hidden
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Block:
+    """Samples of one block: mean, features of mean and samples, range and absence of every column, network errors."""
+
+    mean: np.ndarray
+    features: np.ndarray
+    each: np.ndarray
+    span: np.ndarray
+    missing: np.ndarray
+    sensed: Sensed
+
+
+class Recent:
+    """The newest blocks."""
+
+    def __init__(self) -> None:
+        self.blocks: deque[_Block] = deque(maxlen=LONGEST)
+
+    def add(self, schema: BodySchema, relations: Relations, samples: np.ndarray) -> None:
+        """Add the samples of one block [standard deviations], shape (n, size), NaN where missing."""
+        rows = rows_of(schema, samples)[:, relations.columns]
+        finite = np.isfinite(rows)
+        missing = finite.sum(axis=0) * 2 < len(rows)
+        whole = rows[finite[:, ~missing].all(axis=1)]
+        mean = np.full(rows.shape[1], np.nan)
+        mean[~missing] = np.nan_to_num(np.nanmean(rows[:, ~missing], axis=0)) if (~missing).any() else 0.0
+        span = np.full(rows.shape[1], np.nan)
+        span[~missing] = np.ptp(np.where(finite, rows, mean)[:, ~missing], axis=0)
+        full = np.full((1 + len(whole), len(rows_of(schema, samples[:1])[0])), np.nan)
+        full[0, relations.columns], full[1:, relations.columns] = mean, whole
+        features = relations.features(full)
+        sensed = relations.sensitivity.sense(schema, full[:1])
+        self.blocks.append(_Block(mean, features[0], features[1:], span, missing, sensed))
+
+    def missing(self) -> Hidden:
+        """Return the columns that are missing in the newest block."""
+        return frozenset(np.flatnonzero(self.blocks[-1].missing).tolist())
+
+    def moved(self) -> float:
+        """Return the root mean square change of all columns in the newest block; 0 if unknown."""
+        if len(self.blocks) < 2:
+            return 0.0
+        change = self.blocks[-1].mean - self.blocks[-2].mean
+        change = change[np.isfinite(change)]
+        return float(np.sqrt(np.mean(change**2))) if len(change) else 0.0
+
+    def values(self) -> np.ndarray:
+        """Return the means of the newest blocks [standard deviations], shape (blocks, columns)."""
+        return np.array([block.mean for block in self.blocks])
+
+    def spans(self) -> np.ndarray:
+        """Return the range of every column within each of the newest blocks, shape (blocks, columns)."""
+        return np.array([block.span for block in self.blocks])
+
+    def view(self, relations: Relations, hidden: Hidden, before: View | None = None) -> View:
+        """Return the errors with some columns hidden; `before` is the same view without the newest block."""
+        relation, used = relations.without(hidden), np.ones(len(relations.columns), bool)
+        used[list(hidden)] = False
+        fresh = before is not None and before.hidden == hidden
+        blocks = [self.blocks[-1]] if fresh else list(self.blocks)
+        features = np.array([block.features for block in blocks])
+        sensed = Sensed(*(np.concatenate(parts) for parts in zip(*(block.sensed for block in blocks), strict=True)))
+        errors, healthy = relations.judged(hidden, features, sensed)
+        z = errors / healthy
+        unusable = np.array([(block.missing & used).any() for block in blocks])
+        z[unusable] = np.nan
+        z[np.array([block.missing for block in blocks])] = np.nan
+        if before is not None and fresh:
+            z, healthy = np.concatenate([before.z[1:], z]), np.concatenate([before.healthy[1:], healthy])
+        elif len(z) < LONGEST:
+            lacking = np.full((LONGEST - len(z), z.shape[1]), np.nan)
+            z, healthy = np.concatenate([lacking, z]), np.concatenate([lacking, healthy])
+        newest = list(self.blocks)[-NOISY:]
+        usual = relation.healthy(np.array([block.features for block in newest]))
+        noise = np.array([_noise(block.each, relation.maps) for block in newest]) / usual**2
+        return View(z, healthy, _median(noise), noise[-1], hidden)
+
+    def clear(self) -> None:
+        """Forget all blocks."""
+        self.blocks.clear()
+
+
+def _noise(features: np.ndarray, maps: np.ndarray) -> np.ndarray:
+    """Return half of the mean squared difference of successive errors, shape (columns,); NaN of fewer than three."""
+    if len(features) < 3:
+        return np.full(maps.shape[1], np.nan)
+    return np.asarray(0.5 * np.mean((np.diff(features, axis=0) @ maps) ** 2, axis=0))
+
+
+def _median(values: np.ndarray) -> np.ndarray:
+    """Return the median of every column, NaN if half of it is unknown; a step within one block is no noise."""
+    known = np.isfinite(values)
+    result = np.full(values.shape[1], np.nan)
+    enough = 2 * known.sum(axis=0) > len(values)
+    if enough.any():
+        result[enough] = np.nanmedian(values[:, enough], axis=0)
+    return result

@@ -1,0 +1,221 @@
+"""Prediction of every element, and of p, from the others with any set of them hidden, and a healthy body's errors.
+
+A wrong element disturbs the predictions of all others. Hidden, it disturbs none; so every hypothesis about what is
+wrong needs predictions without it. They all follow from the second moments of the watch.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gemuco.anomaly.prediction import with_bias
+from gemuco.schema import BodySchema
+from gemuco.trust.config import Hidden
+from gemuco.trust.sensitivity import Sensed, Sensitivity
+
+NEAR = 0.2
+"""The variance of a prediction has this constant part; the rest grows with the distance from the known samples."""
+KEPT = 64
+"""At most this number of relations is kept."""
+FLOOR = 0.002
+"""A healthy error is at least this share of the spread of its column in the known samples."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Relation:
+    """Prediction of every judged column from all columns but itself and the hidden ones.
+
+    Attributes:
+        maps: Features of the watch -> measured minus predicted [standard deviations], shape (features, columns).
+        mean: Mean error of a healthy body, shape (columns,).
+        std: Its standard deviation at the mean distance from the known samples, shape (columns,).
+        spread: Inverse of the moments of the used features, shape (features, features), zero elsewhere.
+        places: Features that contain each column, shape (columns, places).
+        removal: Takes these features out of the distance from the known samples, shape (columns, places, places).
+        distance: Mean distance of the known samples.
+        network: Whether the network's errors say more of each column than the watch does, shape (columns,).
+        calibration: Healthy errors of the lies that these suggest, in their own standard deviations, shape (columns,).
+    """
+
+    maps: np.ndarray
+    mean: np.ndarray
+    std: np.ndarray
+    spread: np.ndarray
+    places: np.ndarray
+    removal: np.ndarray
+    distance: np.ndarray
+    network: np.ndarray
+    calibration: np.ndarray
+
+    def errors(self, features: np.ndarray) -> np.ndarray:
+        """Return measured minus predicted [standard deviations], shape (n, columns).
+
+        Args:
+            features: Features of samples, shape (n, features), zero where they cannot be computed.
+        """
+        return np.asarray(features @ self.maps - self.mean)
+
+    def healthy(self, features: np.ndarray) -> np.ndarray:
+        """Return a healthy body's standard deviation of the errors of samples, shape (n, columns).
+
+        It grows with the distance of the other columns from the known samples: a wrong value does not excuse itself.
+        """
+        factor = (NEAR * self.distance + self.far(features)) / ((1.0 + NEAR) * self.distance)
+        return np.asarray(np.sqrt(factor) * self.std)
+
+    def far(self, features: np.ndarray) -> np.ndarray:
+        """Return the distance of the other columns from the known samples, shape (n, columns)."""
+        scaled = features @ self.spread
+        own = scaled[:, self.places]
+        removed = np.einsum("nck,ckl,ncl->nc", own, self.removal, own, optimize=True)
+        return np.asarray((np.einsum("ij,ij->i", features, scaled)[:, None] - removed).clip(min=0.0))
+
+
+class Relations:
+    """All relations of one schema; each is computed at its first use."""
+
+    def __init__(self, schema: BodySchema) -> None:
+        """Prepare, for a schema whose normal errors have a watch."""
+        assert schema.normal is not None and schema.normal.watch is not None
+        watch = self._watch = schema.normal.watch
+        judged = watch.signal >= 0
+        self.count = int(judged.sum())
+        """This is the number of judged elements; the columns after them are p."""
+        self.columns = watch.inputs
+        """Positions of all judged columns: elements in the layout, ascending, then p behind the layout's size."""
+        inputs = len(watch.inputs)
+        first, second = watch.reading(None, maps=False).pairs
+        self._holds = np.zeros((len(watch.moments), inputs), bool)
+        self._holds[1 + np.arange(inputs), np.arange(inputs)] = True
+        products = 1 + inputs + np.arange(len(first))
+        self._holds[products, first] = self._holds[products, second] = True
+        penalties = watch.penalties[: self.count]
+        self._penalty = np.concatenate([penalties, np.full(inputs - self.count, np.median(penalties))])
+        self._inverse = {float(penalty): watch.inverse(float(penalty)) for penalty in set(self._penalty)}
+        rows = schema.normal.rows.astype(float)
+        self._rows = self.features(rows)
+        self.sensitivity = Sensitivity(schema, self.columns)
+        self._sensed = self.sensitivity.sense(schema, rows)
+        self._least = FLOOR * np.maximum(rows[:, self.columns].std(axis=0), 1e-3)
+        self._kept: dict[Hidden, Relation] = {}
+        self._inflation = np.ones(inputs)
+        outputs = schema.out_layout.size
+        promised = np.sqrt(np.diag(schema.normal.covariance))[outputs : outputs + self.count]
+        ratio = promised / self.without(frozenset()).std[: self.count]
+        self._inflation = np.maximum(1.0, np.concatenate([ratio, np.full(inputs - self.count, np.median(ratio))]))
+        self._kept.clear()
+
+    @classmethod
+    def of(cls, schema: BodySchema) -> "Relations | None":
+        """Return the relations of a schema, or None if what is normal for it is not known."""
+        normal = schema.normal
+        is_possible = normal is not None and normal.watch is not None and len(normal.rows) > 0
+        return cls(schema) if is_possible else None
+
+    def features(self, rows: np.ndarray) -> np.ndarray:
+        """Return the features of samples and their p, zero where an element is not finite: (n, features)."""
+        return np.asarray(np.nan_to_num(self._watch.reading(None, maps=False).features(rows)))
+
+    def without(self, hidden: Hidden) -> Relation:
+        """Return the relation that uses none of the hidden columns."""
+        known = self._kept.get(hidden)
+        if known is None:
+            if len(self._kept) >= KEPT:
+                self._kept.clear()
+            known = self._kept[hidden] = self._relation(hidden)
+        return known
+
+    def _relation(self, hidden: Hidden) -> Relation:
+        inputs, away = len(self.columns), np.zeros(len(self.columns), bool)
+        away[list(hidden)] = True
+        outside = np.asarray(self._holds[:, away].any(axis=1))
+        kept = {penalty: _without(inverse, outside) for penalty, inverse in self._inverse.items()}
+        maps = np.zeros((len(self._holds), inputs))
+        for index in range(inputs):
+            inverse = kept[float(self._penalty[index])]
+            own = self._holds[:, index] & ~outside
+            if away[index]:  # predicted by the features without all hidden ones; their inverse has no entry of its own
+                maps[:, index] = self._prediction(index, outside, self._inverse[float(self._penalty[index])])
+            else:
+                block = inverse[own]
+                unit = (np.flatnonzero(own) == 1 + index).astype(float)
+                maps[:, index] = np.linalg.solve(block[:, own], unit) @ block
+                maps[own, index] = 0.0
+            maps[1 + index, index] = 1.0
+        spread = next(iter(kept.values()))
+        places = np.array([np.flatnonzero(self._holds[:, index]) for index in range(inputs)])
+        removal = np.array([_removal(spread, own, outside) for own in places])
+        rows = self._rows.copy()
+        rows[:, outside] = 0.0
+        zero, one = np.zeros(inputs), np.ones(inputs)
+        draft = Relation(maps, zero, one, spread, places, removal, one, zero > 0.0, one)
+        distance = np.maximum(draft.far(rows).mean(axis=0), 1e-9)
+        draft = replace(draft, distance=distance)
+        errors = draft.errors(self._rows)
+        mean = errors.mean(axis=0)
+        std = np.sqrt(np.mean(((errors - mean) / draft.healthy(self._rows)) ** 2, axis=0)) * self._inflation
+        std = np.maximum(std, self._least)
+        factor = np.maximum(1.0, draft.healthy(rows))
+        network, calibration = self._by_network(hidden, std, factor)
+        return replace(draft, mean=mean, std=std, network=network, calibration=calibration)
+
+    def _by_network(self, hidden: Hidden, std: np.ndarray, factor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return whether the network says more of each column than the watch, and its calibration.
+
+        Args:
+            hidden: The hidden columns.
+            std: Healthy errors of the watch, shape (columns,).
+            factor: Growth of errors with the distance from the known samples, shape (samples, columns).
+        """
+        lies, spread = self.sensitivity.lies(self._sensed, hidden)
+        spread = spread * factor
+        known = np.isfinite(spread)
+        ratio = np.where(known, lies, 0.0) / np.where(known, spread, 1.0)
+        calibration = np.maximum(1.0, np.sqrt((ratio**2).sum(axis=0) / np.maximum(known.sum(axis=0), 1)))
+        usual = np.median(spread, axis=0) * calibration
+        return np.asarray(usual < std), calibration
+
+    def judged(self, hidden: Hidden, features: np.ndarray, sensed: Sensed) -> tuple[np.ndarray, np.ndarray]:
+        """Return the errors of samples with some columns hidden, and those of a healthy body, shapes (n, columns).
+
+        Each error is that of the watch, or the lie that the network's errors suggest, whichever is known better.
+        """
+        relation = self.without(hidden)
+        errors, healthy = relation.errors(features), relation.healthy(features)
+        if relation.network.any():
+            lies, spread = self.sensitivity.lies(sensed, hidden)
+            spread = spread * relation.calibration * np.maximum(1.0, healthy / relation.std)
+            better = relation.network & np.isfinite(spread)
+            errors, healthy = np.where(better, lies, errors), np.where(better, spread, healthy)
+        return errors, healthy
+
+    def _prediction(self, index: int, outside: np.ndarray, inverse: np.ndarray) -> np.ndarray:
+        """Return the map of the error of a hidden column, which the features with hidden columns do not enter."""
+        unit = (np.flatnonzero(outside) == 1 + index).astype(float)
+        result = np.zeros(len(inverse))
+        block = inverse[outside]
+        result[~outside] = np.linalg.solve(block[:, outside], unit) @ block[:, ~outside]
+        return result
+
+
+def rows_of(schema: BodySchema, x: np.ndarray) -> np.ndarray:
+    """Return samples [standard deviations], shape (n, size), followed by the schema's p."""
+    return with_bias(schema, x)
+
+
+def _without(inverse: np.ndarray, outside: np.ndarray) -> np.ndarray:
+    """Return the inverse of the moments of the features that remain, zero for the others."""
+    if not outside.any():
+        return inverse
+    block = inverse[outside]
+    result = inverse - block.T @ np.linalg.solve(block[:, outside], block)
+    result[outside] = result[:, outside] = 0.0
+    return result
+
+
+def _removal(spread: np.ndarray, own: np.ndarray, outside: np.ndarray) -> np.ndarray:
+    """Return the matrix that takes some features out of the distance; zero for those that are out already."""
+    result, kept = np.zeros((len(own), len(own))), ~outside[own]
+    if kept.any():
+        result[np.ix_(kept, kept)] = np.linalg.inv(spread[np.ix_(own[kept], own[kept])])
+    return result

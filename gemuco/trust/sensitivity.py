@@ -1,0 +1,131 @@
+"""Errors of the network, and what they say of every column: how far it would have to be wrong to explain them.
+
+Where the network predicts a signal better than the watch does, a small lie shows in the network's errors only. An error
+of the tip of an arm may come from the camera or from any joint; its derivatives show which lie of which size would
+explain it. Hidden columns may be wrong by any amount, so the directions in which they move the errors do not count.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from gemuco.anomaly.prediction import judging_masks, prediction_errors
+from gemuco.layers import push, trace
+from gemuco.schema import BodySchema
+from gemuco.trust.config import Hidden
+
+LINEAR = 0.5
+"""The derivatives hold while hidden columns are wrong by at most this [standard deviations of the signal]."""
+LEAST = 1e-4
+"""The errors say nothing of a column with less information than this."""
+FREE = 1e-9
+"""This keeps inverses finite in directions without information."""
+
+
+class Sensed(NamedTuple):
+    """Errors of the network and their derivatives.
+
+    Attributes:
+        errors: Measured minus predicted [standard deviations], shape (n, errors).
+        slopes: Their derivatives by every judged column, shape (n, errors, columns).
+    """
+
+    errors: np.ndarray
+    slopes: np.ndarray
+
+
+class Sensitivity:
+    """The errors of those outputs that the network predicts better than the watch does."""
+
+    def __init__(self, schema: BodySchema, columns: np.ndarray) -> None:
+        """Prepare for judged columns: positions in the layout, then p."""
+        assert schema.normal is not None
+        outputs, std = schema.out_layout.size, schema.scaler.std[schema.out_index]
+        self._index = np.flatnonzero(np.isfinite(schema.normal.mean[:outputs]))
+        self._columns, self._std = columns, std
+        place = np.ix_(self._index, self._index)
+        covariance = schema.normal.covariance[:outputs, :outputs] / np.outer(std, std)
+        self._mean = schema.normal.mean[:outputs][self._index] / std[self._index]
+        self._precision = np.linalg.inv(covariance[place]) if len(self._index) else np.zeros((0, 0))
+
+    def sense(self, schema: BodySchema, rows: np.ndarray) -> Sensed:
+        """Return the errors of samples followed by p, shape (n, size + bias_size); zero where a value is missing."""
+        size = schema.layout.size
+        biases, owner = np.unique(rows[:, size:], axis=0, return_inverse=True)
+        if len(biases) <= 1:
+            is_own = not len(biases) or np.array_equal(biases[0], schema.bias)
+            return self._sense(schema if is_own else schema.with_bias(biases[0]), rows[:, :size])
+        errors = np.zeros((len(rows), len(self._index)))
+        slopes = np.zeros((len(rows), len(self._index), len(self._columns)))
+        for number, bias in enumerate(biases):
+            of = owner.reshape(-1) == number
+            errors[of], slopes[of] = self._sense(schema.with_bias(bias), rows[of, :size])
+        return Sensed(errors, slopes)
+
+    def _sense(self, schema: BodySchema, x: np.ndarray) -> Sensed:
+        if not len(self._index):
+            return Sensed(np.zeros((len(x), 0)), np.zeros((len(x), 0, len(self._columns))))
+        errors = prediction_errors(schema, x)[:, self._index] / self._std[self._index] - self._mean
+        slopes = np.zeros((len(x), schema.out_layout.size, len(self._columns)))
+        for mask in set(schema.derived(judging_masks).values()):
+            outputs = [n for n, m in schema.derived(judging_masks).items() if m == mask]
+            index = schema.out_layout.indices(outputs)
+            inputs = schema.network_input(np.nan_to_num(x), mask)
+            values, through = trace(schema.chain(mask), inputs), schema.gate(mask).through
+            for number, column in enumerate(self._columns):
+                place = self._place(schema, int(column), through)
+                if place is not None:
+                    tangent = np.zeros_like(inputs)
+                    tangent[:, place] = 1.0
+                    slopes[:, index, number] = -push(schema.chain(mask), values, tangent)[:, index]
+        for number, column in enumerate(self._columns):
+            slopes[:, schema.out_index == column, number] += 1.0
+        return Sensed(np.nan_to_num(errors), slopes[:, self._index])
+
+    def _place(self, schema: BodySchema, column: int, through: np.ndarray) -> int | None:
+        """Return the position of a judged column in the network's input; None if the mask does not contain it."""
+        if column >= schema.layout.size:
+            return column - schema.layout.size - len(schema.bias)
+        places = np.flatnonzero(schema.in_index == column)
+        return int(places[0]) if len(places) and through[places[0]] > 0 else None
+
+    def lies(self, sensed: Sensed, hidden: Hidden) -> tuple[np.ndarray, np.ndarray]:
+        """Return the lie of every column that alone would explain the errors, and its standard deviation.
+
+        Both have the shape (n, columns) [standard deviations of the signal]; the second is infinite where the errors
+        say nothing of a column, or where hidden columns are too far off for the derivatives.
+        """
+        count, columns = len(sensed.errors), len(self._columns)
+        value, spread = np.zeros((count, columns)), np.full((count, columns), np.inf)
+        if not len(self._index):
+            return value, spread
+        whole = np.broadcast_to(self._precision, (count, *self._precision.shape))
+        shared = self._without(whole, sensed.slopes[:, :, sorted(hidden)]) if hidden else whole
+        value, spread = self._ratios(shared, sensed, list(range(columns)))
+        for column in sorted(hidden):
+            others = sorted(hidden - {column})
+            precision = self._without(whole, sensed.slopes[:, :, others]) if others else whole
+            own = self._ratios(precision, sensed, [column])
+            value[:, column], spread[:, column] = own[0][:, 0], own[1][:, 0]
+        if hidden:
+            far = (np.abs(value[:, sorted(hidden)]) > LINEAR).any(axis=1)
+            spread[far] = np.inf
+        return value, spread
+
+    @staticmethod
+    def _ratios(precision: np.ndarray, sensed: Sensed, columns: list[int]) -> tuple[np.ndarray, np.ndarray]:
+        """Return the lies of some columns and their standard deviations under precisions of the errors."""
+        slopes = sensed.slopes[:, :, columns]
+        scaled = precision @ slopes
+        information = np.einsum("nec,nec->nc", scaled, slopes)
+        known = information > LEAST
+        divisor = np.where(known, information, 1.0)
+        value = np.where(known, np.einsum("nec,ne->nc", scaled, sensed.errors), 0.0) / divisor
+        return value, np.where(known, divisor**-0.5, np.inf)
+
+    @staticmethod
+    def _without(precision: np.ndarray, slopes: np.ndarray) -> np.ndarray:
+        """Return precisions without the directions of some columns, shape (n, errors, errors)."""
+        scaled = precision @ slopes
+        inner = np.swapaxes(slopes, 1, 2) @ scaled + FREE * np.eye(slopes.shape[2])
+        return np.asarray(precision - scaled @ np.linalg.pinv(inner, rcond=1e-9) @ np.swapaxes(scaled, 1, 2))

@@ -1,0 +1,265 @@
+"""The trust loop: measured elements that the others contradict are hidden, estimated and marked with the reason."""
+
+import logging
+import math
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from gemuco.estimation import recipes
+from gemuco.normal import Normal
+from gemuco.schema import BodySchema
+from gemuco.trust.config import BLOCK, Finding, TrustConfig
+from gemuco.trust.monitor import TrustMonitor
+from hal.by_signal import Numbers
+from hal.clock import Clock
+from hal.config import RobotConfig
+from services.errors import BadArguments
+from services.model.estimation import Distrust, Freshness, in_order
+from services.wire.plain_text import shown
+
+log = logging.getLogger(__name__)
+
+RATE = 50.0
+"""Samples are taken at most this often [Hz]."""
+BEFORE = 1.0
+"""A lie may have begun this long [s] before it was noticed."""
+CAUSES = {
+    "environment": "another tool or load than the model takes to be in use",
+    "body": "no sensor explains what is measured; the body has changed",
+}
+"""These are causes without an element, in words."""
+SIZED = ("offset", "drift", "noise", "clipped", "frozen", "gain", "unknown")
+"""The size of these kinds is reported."""
+CALIBRATED = ("offset", "wrap", "gain", "sign")
+"""`gemuco calibrate` may be the repair of these kinds."""
+
+
+class Trust:
+    """The judge of all measured elements; the freshness of the values hides those that it distrusts."""
+
+    def __init__(
+        self,
+        robot: RobotConfig,
+        freshness: Freshness,
+        schema: Callable[[], BodySchema],
+        config: TrustConfig | None,
+        clock: Clock,
+        stop: Callable[[str], None] = lambda reason: None,
+        is_known: Callable[[BodySchema], bool] = lambda schema: True,
+        changed: Callable[[float], None] = lambda since: None,
+    ) -> None:
+        """Prepare.
+
+        Args:
+            robot: The robot file.
+            freshness: Source of samples; its `distrust` is set.
+            schema: Returns the model in use.
+            config: The settings; None to look for no lies.
+            clock: Source of time.
+            stop: Stops the robot for a reason, if an element that motion needs is distrusted.
+            is_known: Whether a model's normal errors are known to be those of this body.
+            changed: Called when other elements are hidden, with the time [s] since when samples are not to be learned
+                from.
+        """
+        self._freshness, self._schema, self._clock = freshness, schema, clock
+        self._stop, self._is_known, self._changed = stop, is_known, changed
+        self._known: Normal | None = None
+        """These normal errors were those of this body once; an update of W does not change that."""
+        layout, self._is_active = schema().layout, config is not None
+        self._names = [layout.element(index) for index in range(layout.size)]
+        self._units = [signal.unit for signal in layout.signals for _ in range(signal.size)]
+        place = self._place = {name: index for index, name in enumerate(self._names)}
+        devices = {name: [place[e] for e in one.served if e in place] for name, one in robot.devices.items()}
+        self._device = {index: name for name, indices in devices.items() for index in indices}
+        self.needed = _needed(robot, place)
+        """Positions of the elements without which the robot must not move."""
+        self._lock = threading.Lock()
+        groups = [frozenset(indices) for indices in devices.values() if len(indices) > 1]
+        self._monitor = TrustMonitor(schema(), config, groups, self._replaces)
+        self._rows: list[np.ndarray] = []
+        self._last: Numbers | None = None
+        self._began = -math.inf
+        self._stopped_for: frozenset[int] = frozenset()
+        self.findings: tuple[Finding, ...] = ()
+
+    def tick(self) -> None:
+        """Take the newest sample, and judge the samples of the last block."""
+        _, values = self._freshness.measured()
+        now, schema = self._clock.monotonic(), self._schema()
+        with self._lock:
+            if values is not self._last:
+                self._last = values
+                self._rows.append(schema.scaler.normalise(in_order(schema, values).flat))
+            if now - self._began < 0.99 * BLOCK:
+                return
+            is_late = now - self._began > 5.0 * BLOCK
+            rows, self._rows, self._began = self._rows, [], now
+            if is_late or not rows or not self._is_active:
+                return
+            if self._is_known(schema):
+                self._known = schema.normal
+            self._monitor.use(schema)
+            self._monitor.is_known = self._known is schema.normal
+            self._monitor.add(np.array(rows), now)
+            self._publish()
+        self._stop_if_needed()
+
+    def trust(self, element: str) -> int:
+        """Use an element again; it is not hidden again before it has agreed with the others once.
+
+        Raises:
+            BadArguments: The model has no such element.
+        """
+        index = self._index(element)
+        with self._lock:
+            self._monitor.trust(index)
+            self._publish()
+        return index
+
+    def distrust(self, element: str) -> int:
+        """Hide an element until `trust`.
+
+        Raises:
+            BadArguments: The model has no such element.
+        """
+        index = self._index(element)
+        with self._lock:
+            self._monitor.distrust(index, self._clock.monotonic())
+            self._publish()
+        self._stop_if_needed()
+        return index
+
+    def refusal(self) -> str:
+        """Return why the robot must not be engaged; empty if it may."""
+        needed = sorted(self._monitor.hidden & self.needed)
+        if not needed:
+            return ""
+        name = self._names[needed[0]]
+        return f"{name} is {self._freshness.distrust.reasons.get(name, 'distrusted')}, and motion needs it."
+
+    def text(self) -> str:
+        """Return one sentence on what is distrusted or suspected; empty without."""
+        parts = [self._sentence(finding) for finding in self.findings]
+        return " ".join(parts)
+
+    def facts(self) -> dict[str, Any]:
+        """Return the state for the status message."""
+        return {
+            "ready": self._is_active and self._monitor.is_ready,
+            "findings": [
+                {
+                    "elements": [self._names[index] for index in finding.elements],
+                    "cause": finding.cause,
+                    "kind": finding.kind,
+                    "state": "distrusted" if finding.is_distrusted else "suspect",
+                    "by_hand": finding.by_hand,
+                    "size": finding.size,
+                    "text": self._sentence(finding),
+                }
+                for finding in self.findings
+            ],
+        }
+
+    def _publish(self) -> None:
+        """Hide what is distrusted; the object changes only with its content."""
+        findings = self._monitor.findings
+        for finding in findings:
+            if finding.is_distrusted and not any(_is_same(finding, known) for known in self.findings):
+                log.warning("%s", self._sentence(finding))
+        self.findings = findings
+        reasons = {
+            self._names[index]: f"distrusted: {self._reason(finding, index)}"
+            for finding in findings
+            if finding.is_distrusted
+            for index in finding.elements
+        }
+        before = self._freshness.distrust
+        if reasons.keys() == before.reasons.keys() and all(
+            _kind(a) == _kind(before.reasons[n]) for n, a in reasons.items()
+        ):
+            return
+        hidden = np.zeros(len(self._names), bool)
+        hidden[list(self._monitor.hidden)] = True
+        if reasons.keys() != before.reasons.keys():
+            since = min((finding.since for finding in findings if finding.is_distrusted), default=math.inf)
+            self._changed(since - BEFORE)
+        self._freshness.distrust = Distrust(self._in_robot_order(hidden), reasons)
+
+    def _in_robot_order(self, hidden: np.ndarray) -> np.ndarray:
+        """Return truth values of the model's layout in the order of the freshness."""
+        spans = self._schema().layout.slices
+        return np.concatenate([hidden[spans[name]] for name in self._freshness.elements.counts])
+
+    def _stop_if_needed(self) -> None:
+        needed = self._monitor.hidden & self.needed
+        if needed - self._stopped_for:
+            self._stop(self.refusal())
+        self._stopped_for = needed
+
+    def _replaces(self, elements: frozenset[int]) -> bool:
+        """Whether the model can estimate a set of elements while all others are as they are now."""
+        schema, last = self._schema(), self._last
+        finite = np.ones(len(self._names), bool) if last is None else np.isfinite(in_order(schema, last).flat)
+        finite[list(elements)] = False
+        recipe = schema.derived(recipes)(finite)
+        return bool(recipe.estimated[list(elements)].all())
+
+    def _index(self, element: str) -> int:
+        index = self._place.get(element)
+        if index is None:
+            raise BadArguments(f"The model has no element {shown(element)}. Known elements: {', '.join(self._names)}.")
+        return index
+
+    def _reason(self, finding: Finding, index: int) -> str:
+        since = self._wall_time(finding.since)
+        if finding.by_hand:
+            return f"by an operator since {since}"
+        words = f"{finding.kind} since {since}" if finding.kind != "unknown" else f"contradicted since {since}"
+        others = [self._names[other] for other in finding.elements if other != index]
+        if finding.cause == "either" and others:
+            return f"it or {' or '.join(others)} is {words}"
+        return words
+
+    def _sentence(self, finding: Finding) -> str:
+        since, names = self._wall_time(finding.since), [self._names[index] for index in finding.elements]
+        if finding.cause in CAUSES:
+            return f"Since {since}: {CAUSES[finding.cause]}."
+        joint = " or " if finding.cause == "either" else " and "
+        state = "distrusted" if finding.is_distrusted else "suspected"
+        text = f"{joint.join(names)} {'is' if len(names) == 1 else 'are'} {state}"
+        if finding.by_hand:
+            return f"{text} by an operator since {since}."
+        kind = "" if finding.kind == "unknown" else f"{finding.kind} "
+        text += f": {kind}since {since}"
+        if finding.kind in SIZED and math.isfinite(finding.size):
+            text += f", off by {finding.size:.3g} {self._units[finding.elements[0]]}"
+        device = self._device.get(finding.elements[0])
+        if finding.kind in CALIBRATED and device is not None and len(names) == 1:
+            text += f"; `gemuco calibrate` measures {device} anew"
+        return f"{text} (still used: {finding.reason})." if finding.reason else f"{text}."
+
+    def _wall_time(self, since: float) -> str:
+        """Return a monotonic time as the local time of day."""
+        wall = 1e-9 * self._clock.now_ns() - (self._clock.monotonic() - since)
+        return time.strftime("%H:%M:%S", time.localtime(wall))
+
+
+def _needed(robot: RobotConfig, place: dict[str, int]) -> frozenset[int]:
+    """Return the elements that motion needs: commanded ones, and limited ones of the same name."""
+    command = robot.command.signal
+    moved = robot.signals[command].elements
+    signals = {command, *robot.limits}
+    names = [f"{signal}.{element}" for signal in signals for element in moved]
+    return frozenset(place[name] for name in names if name in place)
+
+
+def _is_same(one: Finding, other: Finding) -> bool:
+    return one.elements == other.elements and one.is_distrusted == other.is_distrusted and one.kind == other.kind
+
+
+def _kind(reason: str) -> str:
+    return reason.partition(" since ")[0]

@@ -1,0 +1,183 @@
+"""Lies of sensors: found, named, hidden, and trusted again; and a healthy body is left alone."""
+
+import numpy as np
+import pytest
+
+from gemuco.anomaly.healthy import learn_normal
+from gemuco.learning.config import TrainConfig
+from gemuco.learning.train import fit
+from gemuco.normal.watch import Watch
+from gemuco.trust.changes import LONGEST, Likeness, StepTest
+from gemuco.trust.config import BLOCK, TrustConfig
+from gemuco.trust.monitor import TrustMonitor
+from gemuco.trust.relations import Relations, rows_of
+
+SAMPLES = 5
+"""Samples in a block."""
+JOINT, TENSION, LENGTH = 0, 3, 8
+NOISE = np.r_[np.full(2, 0.002), np.full(5, 0.3), np.full(5, 2e-4)]
+
+
+def move(arm, blocks, seed):
+    """Return samples of a smooth motion that rests now and then, shape (blocks, SAMPLES, 12)."""
+    random, count = np.random.default_rng(seed), blocks * SAMPLES
+    pace = np.repeat(random.random(blocks // 10 + 1) > 0.2, 10 * SAMPLES)[:count]
+    phase = random.uniform(0, 6.0, 7) + np.cumsum(pace)[:, None] * random.uniform(0.01, 0.03, 7)
+    theta = np.array([0.0, 0.9]) + 0.6 * np.sin(phase[:, :2])
+    tension = 50.0 + 40.0 * np.sin(phase[:, 2:])
+    whole = np.concatenate([theta, tension, arm.length(theta, tension)], axis=1)
+    return (whole + random.normal(0.0, 1.0, whole.shape) * NOISE).reshape(blocks, SAMPLES, 12)
+
+
+@pytest.fixture(scope="module")
+def model(data, arm):
+    masks = [("joint_position", "muscle_tension"), ("muscle_tension", "muscle_length")]
+    schema = fit(data, TrainConfig(hidden=(60, 20), latent=7, epochs=30, batch=100), masks)[0]
+    rows = np.concatenate([move(arm, 600, 100 + seed)[:, 0] for seed in range(8)])
+    return schema.with_normal(learn_normal(schema, rows))
+
+
+def watch(model, samples, monitor=None, config=None):
+    """Judge all blocks; return the monitor, and the hidden elements after every block."""
+    monitor = monitor or TrustMonitor(model, config)
+    hidden = []
+    for index, block in enumerate(model.scaler.normalise(samples)):
+        monitor.add(block, index * BLOCK)
+        hidden.append(monitor.hidden)
+    return monitor, hidden
+
+
+def test_a_relation_is_the_prediction_of_the_watch(model, arm):
+    """With and without a hidden element the errors are those of `Watch.reading`."""
+    relations, normal = Relations.of(model), model.normal
+    rows = rows_of(model, model.scaler.normalise(move(arm, 40, 1)[:, 0]))
+    features = relations.features(rows)
+    alone = features @ relations.without(frozenset()).maps
+    assert np.allclose(alone, normal.watch.reading(None).residuals(rows)[:, :12], atol=1e-6)
+    rows[:, JOINT] = np.nan
+    partly = relations.features(rows) @ relations.without(frozenset({JOINT})).maps
+    assert np.allclose(
+        np.delete(partly, JOINT, axis=1), normal.watch.reading(np.isfinite(rows[0])).residuals(rows)[:, :11], atol=1e-6
+    )
+    assert isinstance(normal.watch, Watch)
+
+
+def test_a_step_is_tested_with_its_likeness():
+    """A healthy slow error passes; the deviation of a step is that of the likelihood ratio of normal variables."""
+    likeness = Likeness(np.array([0.9]), np.array([0.1]))
+    random, lag = np.random.default_rng(0), np.abs(np.subtract.outer(np.arange(LONGEST), np.arange(LONGEST)))
+    covariance = 0.9 * 0.9**lag + 0.1 * np.eye(LONGEST)
+    healthy = np.linalg.cholesky(covariance) @ random.normal(size=(LONGEST, 2000))
+    test = StepTest(likeness)
+    deviations = np.array([test(column[:, None])[0][0] for column in healthy.T])
+    assert 0.9 < np.sqrt(np.mean(deviations**2)) < 2.5  # the largest of eight ages
+    step = np.where(np.arange(LONGEST) >= LONGEST - 5, 3.0, 0.0)
+    found, age = test(step[:, None])
+    expected = np.sqrt(step @ np.linalg.inv(covariance) @ step)
+    assert found[0] == pytest.approx(expected, rel=1e-6)
+    assert (1, 2, 3, 5)[age[0]] == 5
+
+
+def test_a_healthy_body_is_trusted(model, arm):
+    for seed in range(2):
+        monitor, hidden = watch(model, move(arm, 600, seed))
+        assert not any(hidden)
+        assert not monitor.findings
+
+
+@pytest.mark.parametrize(
+    ("kind", "names"),
+    [
+        ("offset", ("offset",)),
+        ("frozen", ("frozen", "clipped")),
+        ("sign", ("sign", "gain", "offset")),
+        ("noise", ("noise",)),
+        ("wrap", ("wrap",)),
+    ],
+)
+def test_a_lying_encoder_is_hidden_and_returns(model, arm, kind, names):
+    """The lie lasts for 8 s; the encoder alone is hidden within 2 s of a visible error, and used again after it."""
+    samples, begin, end = move(arm, 400, 7), 150, 230
+    true, wrong, span = samples[..., JOINT].copy(), samples[..., JOINT], slice(begin, end)
+    random = np.random.default_rng(3)
+    wrong[span] = {
+        "offset": true[span] + 0.3,
+        "frozen": np.full((end - begin, SAMPLES), true[begin, 0]),
+        "sign": -true[span],
+        "noise": true[span] + 0.1 * random.normal(size=(end - begin, SAMPLES)),
+        "wrap": true[span] + 2.0 * np.pi,
+    }[kind]
+    visible = begin + int(np.argmax(np.abs(wrong - true)[span].mean(axis=1) > 0.1 if kind != "noise" else True))
+    monitor = TrustMonitor(model)
+    _, hidden = watch(model, samples[: visible + 20], monitor)
+    assert not any(hidden[:begin])
+    assert hidden[-1] == {JOINT}
+    (finding,) = monitor.findings
+    assert finding.is_distrusted and finding.elements == (JOINT,)
+    kinds = []
+    for index, block in enumerate(model.scaler.normalise(samples[visible + 20 :])):
+        monitor.add(block, (visible + 20 + index) * BLOCK)
+        assert monitor.hidden == {JOINT} or index + visible + 20 > end
+        kinds += [finding.kind for finding in monitor.findings]
+    assert kinds[-1] in names
+    assert not monitor.hidden
+
+
+def test_elements_that_look_alike_are_both_named(model, arm):
+    """A length and a tension of one muscle contradict each other; nothing else knows which is right."""
+    samples = move(arm, 260, 11)
+    samples[150:, :, LENGTH] += 0.01
+    _, hidden = watch(model, samples)
+    assert LENGTH in hidden[-1]
+    assert hidden[-1] <= {LENGTH, TENSION}
+    used, _ = watch(model, samples, config=TrustConfig(pairs="use"))
+    if len(hidden[-1]) > 1:
+        assert not used.hidden
+        assert "alike" in used.findings[0].reason
+
+
+def test_two_swapped_elements_are_both_hidden(model, arm):
+    samples = move(arm, 240, 12)
+    samples[150:, :, [0, 1]] = samples[150:, :, [1, 0]]
+    _, hidden = watch(model, samples)
+    assert hidden[-1] == {0, 1}
+
+
+def test_never_more_than_the_model_can_replace(model, arm):
+    samples = move(arm, 200, 13)
+    samples[150:, :, JOINT] += 0.5
+    monitor = TrustMonitor(model, replaces=lambda elements: False)
+    watch(model, samples, monitor)
+    assert not monitor.hidden
+    assert monitor.findings[0].reason == "the model cannot replace it"
+
+
+def test_an_operator_decides(model, arm):
+    samples = move(arm, 300, 14)
+    samples[150:, :, JOINT] += 0.5
+    monitor = TrustMonitor(model)
+    monitor.distrust(1, 0.0)
+    _, hidden = watch(model, samples[:200], monitor)
+    assert hidden[-1] == {0, 1}
+    monitor.trust(0)
+    monitor.trust(1)
+    _, hidden = watch(model, samples[200:], monitor)
+    assert not any(hidden)
+
+
+def test_a_wrong_body_distrusts_no_sensor(model, arm):
+    """All lengths change: no element explains that, and nothing is hidden for it."""
+    samples = move(arm, 260, 15)
+    samples[150:, :, 7:] *= 1.0 + np.array([0.03, -0.04, 0.05, -0.03, 0.04])
+    monitor, causes = TrustMonitor(model), set()
+    for index, block in enumerate(model.scaler.normalise(samples)):
+        monitor.add(block, index * BLOCK)
+        causes |= {finding.cause for finding in monitor.findings}
+    assert len(monitor.hidden) <= 1
+    assert "body" in causes
+
+
+def test_a_model_without_normal_errors_judges_nothing(model, arm):
+    monitor = TrustMonitor(model.with_normal(None))
+    monitor.add(model.scaler.normalise(move(arm, 1, 0)[0]), 0.0)
+    assert not monitor.is_ready

@@ -1,0 +1,139 @@
+"""A lying sensor in the model service: hidden, estimated, marked with the reason; an operator decides otherwise."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from arm_model import arm, sample_of, small_model
+
+from gemuco.anomaly.healthy import learn_normal
+from gemuco.schema import BodySchema
+from gemuco.trust.config import TrustConfig
+from hal.clock import ManualClock
+from services.errors import BadArguments
+from services.model.estimation import Estimation, Freshness
+from services.model.model_config import model_config
+from services.model.trust_loop import Trust
+from services.verbs.ask import estimate_line
+from services.wire.messages import Estimates, Sample
+from services.wire.streams import Arrival
+from simulators.robots.musashi_arm.model import wire_lengths
+
+PERIOD = 0.02
+ELBOW = "joint_position.elbow_pitch"
+
+
+def motion(count: int, seed: int) -> list[dict[str, np.ndarray]]:
+    """Samples of smooth motion of the designer's arm, with the noise of sensors."""
+    random, robot = np.random.default_rng(seed), arm()
+    low, high = robot.bounds("joint_position")
+    time = np.arange(count)[:, None] * PERIOD
+    phase = random.uniform(0.0, 6.0, 15) + time * random.uniform(0.5, 1.5, 15)
+    position = 0.5 * (low + high) + 0.35 * (high - low) * np.sin(phase[:, :5])
+    tension = 60.0 + 40.0 * np.sin(phase[:, 5:])
+    length = np.array([wire_lengths(q, f) for q, f in zip(position, tension, strict=True)])
+    rows = {"joint_position": position, "muscle_tension": tension, "muscle_length": length}
+    noise = {"joint_position": 1e-3, "muscle_tension": 0.5, "muscle_length": 5e-5}
+    noisy = {name: value + noise[name] * random.normal(size=value.shape) for name, value in rows.items()}
+    return [{name: value[index] for name, value in noisy.items()} for index in range(count)]
+
+
+@cache
+def model() -> BodySchema:
+    schema = small_model()
+    rows = [schema.layout.join(sample) for seed in range(4) for sample in motion(300, 50 + seed)[::2]]
+    return schema.with_normal(learn_normal(schema, np.array(rows)))
+
+
+class Bench:
+    """Freshness, trust and estimation on samples in hand."""
+
+    def __init__(self, config: TrustConfig | None = None) -> None:
+        self.clock, self.stops, self.changes = ManualClock(), list[str](), list[float]()
+        self.newest: Arrival[Sample] | None = None
+        self.freshness = Freshness(arm(), lambda: self.newest, self.clock)
+        self.trust = Trust(
+            arm(), self.freshness, model, config or TrustConfig(), self.clock, self.stops.append,
+            changed=self.changes.append,
+        )  # fmt: skip
+        self.published: list[Estimates] = []
+        self.estimation = Estimation(self.freshness, model, self.published.append, self.clock)
+        self.cycle = 0
+
+    def feed(self, values: dict[str, np.ndarray]) -> Estimates:
+        self.clock.advance(PERIOD)
+        self.cycle += 1
+        shape = sample_of(0)
+        sample = Sample(
+            cycle=self.cycle, boot=7, source="simulated", complete=True, values=values, age=shape.age, valid=shape.valid
+        )
+        self.newest = Arrival(sample, self.clock.monotonic())
+        self.trust.tick()
+        self.estimation.tick()
+        return self.published[-1]
+
+
+@pytest.mark.long
+def test_a_lying_encoder_is_estimated_and_marked_until_it_agrees() -> None:
+    bench, samples = Bench(), motion(1000, 1)
+    for sample in samples[:300]:
+        bench.feed(sample)
+    assert not any(estimates.distrusted for estimates in bench.published)
+    for sample in samples[300:500]:
+        sample["joint_position"][3] += 1.0
+        estimates = bench.feed(sample)
+    assert estimates.distrusted[ELBOW].startswith("distrusted: offset since ")
+    assert estimates.estimated["joint_position"].tolist() == [False, False, False, True, False]
+    assert abs(estimates.values["joint_position"][3] - (samples[499]["joint_position"][3] - 1.0)) < 0.2
+    hidden = [bool(estimates.distrusted) for estimates in bench.published]
+    assert hidden.index(True) - 300 < 50, "hidden within a second"
+    text = bench.trust.text()
+    assert "joint_position.elbow_pitch is distrusted: offset since" in text
+    assert "`gemuco calibrate` measures elbow_pitch_encoder anew" in text
+    assert bench.changes and not bench.stops
+    for sample in samples[500:]:
+        estimates = bench.feed(sample)
+    assert not estimates.distrusted
+    assert not estimates.estimated.flat.any()
+
+
+def test_an_operator_distrusts_and_trusts() -> None:
+    bench, samples = Bench(), motion(60, 2)
+    bench.feed(samples[0])
+    bench.trust.distrust(ELBOW)
+    estimates = bench.feed(samples[1])
+    assert "by an operator since" in estimates.distrusted[ELBOW]
+    assert estimates.estimated["joint_position"][3]
+    assert bench.trust.facts()["findings"][0]["by_hand"]
+    bench.trust.trust(ELBOW)
+    assert not bench.feed(samples[2]).distrusted
+    with pytest.raises(BadArguments, match=r"Known elements: joint_position\.shoulder_roll"):
+        bench.trust.distrust("joint_position.knee")
+
+
+def test_a_robot_stops_without_an_element_that_motion_needs() -> None:
+    bench = Bench()
+    bench.feed(motion(1, 3)[0])
+    assert not bench.trust.refusal()
+    bench.trust.distrust("muscle_length.biceps")
+    assert len(bench.stops) == 1
+    assert "muscle_length.biceps is distrusted: by an operator" in bench.stops[0]
+    assert "motion needs it" in bench.trust.refusal()
+    bench.trust.distrust(ELBOW)
+    assert len(bench.stops) == 1, "an encoder of a joint can be estimated, and the arm goes on"
+
+
+def test_the_line_of_an_estimate_gives_the_reason() -> None:
+    reply = {
+        "signal": "joint_position", "unit": "rad", "elements": ["a", "b"], "values": [1.0, 2.0], "std": [0.1, 0.0],
+        "estimated": [True, False], "method": "mask", "mask": "muscle_length",
+        "distrusted": {"joint_position.a": "distrusted: frozen since 12:03:11"},
+    }  # fmt: skip
+    assert estimate_line(reply).endswith("expected error 0.100 rad; a distrusted: frozen since 12:03:11")
+
+
+def test_settings_of_the_robot_file() -> None:
+    given = {"false_alarms": 1.0, "size": 5.0, "sizes": {"muscle_tension": 8.0}, "pairs": "use"}
+    robot = arm().model_copy(update={"model": arm().model | {"trust": given}})
+    assert model_config(robot).trust.config() == TrustConfig(1.0, 5.0, {"muscle_tension": 8.0}, "use")
+    assert model_config(arm()).trust.config() == TrustConfig()
