@@ -27,7 +27,7 @@ def test_shipped_sections_are_understood() -> None:
 @pytest.mark.parametrize(
     ("section", "content", "sentence"),
     [
-        ("model", {"netwrok": {}}, "unknown key 'netwrok'. Known keys there: signals, network, structure"),
+        ("model", {"netwrok": {}}, "unknown key 'netwrok'. Known keys there: signals, fuse, network, structure"),
         (
             "model",
             {"update": {"windows": 3}},
