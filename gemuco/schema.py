@@ -33,7 +33,7 @@ ERRORS = "error from mask (% of std)"
 """This is the head of the table of errors."""
 
 
-PER_SIGNAL = 1.1
+PER_SIGNAL = 1.02
 """A mask must lower the squared error by this factor per further signal to be preferred: useless inputs do no harm."""
 
 

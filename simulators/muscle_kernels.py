@@ -197,7 +197,9 @@ def pull(
         target, follows, grip, whole = orders[:, muscle]
         scale, rate, wire_share, guide_share = build[:, muscle]
         move = min(max((target - wires[0, muscle]) * share, -reach), reach) * follows
-        spool = max(wires[0, muscle] + move, path - grip)
+        spool = wires[0, muscle] + move
+        if whole > 0.0:  # a cut wire does not drag its spool
+            spool = max(spool, path - grip)
         paid_out = spool - wires[0, muscle]
         loss = min(max(1.0 + loss_time * rate * (path_rate - paid_out / duration), 0.0), 1.5)
         force = scale * math.expm1(rate * max(path - spool, 0.0)) * loss * whole

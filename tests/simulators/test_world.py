@@ -118,6 +118,19 @@ def test_a_cut_muscle_carries_nothing_any_more(world):
     assert abs(world.truth()["joint_position"] - before)[3] > 0.02
 
 
+def test_the_arm_does_not_drag_the_spool_of_a_cut_muscle(world):
+    index = list(ROUTES).index("brachialis")
+    world.break_part("muscle_cut:brachialis")
+    lengths = world.truth()["muscle_length"]
+    lengths[index] -= 0.02
+    for bent in (0.03, 0.0, 0.03):
+        others = lengths.copy()
+        others[6] -= bent
+        drive(world, others)
+        run(world, 1.5)
+        assert world.truth()["muscle_length"][index] == pytest.approx(lengths[index], abs=1e-3)  # m
+
+
 def test_a_heavy_object_weighs_on_the_arm(world):
     run(world, 1.0)
     before = world.truth()["joint_position"]
