@@ -109,8 +109,8 @@ def _errors_afar(schema: BodySchema, dataset: Dataset) -> Errors:
     """Return the errors of linear paths, each learned from a part of the data, on the other parts, at most 1.
 
     Returns:
-        (`mask`, mask) -> error of every element of x_out [standard deviations], shape (out_size,). Empty if a part has
-        too few complete samples.
+        (`mask`, mask) -> error of every element of x_out [standard deviations], shape (out_size,), not larger than with
+        a part of the mask's signals. Empty if a part has too few complete samples.
     """
     rows = schema.scaler.normalise(dataset.rows())
     rows[:, schema.scaler.dead] = 0.0
@@ -129,7 +129,9 @@ def _errors_afar(schema: BodySchema, dataset: Dataset) -> Errors:
             line = path.direct(through, np.zeros(y.shape[1]))[:-1]
             missed = (x[~learned] * through) @ line[:-1] + line[-1] - y[~learned]
             squares["mask", mask].append((missed**2).mean(axis=0))
-    return {key: np.minimum(1.0, np.sqrt(np.mean(parts, axis=0))) for key, parts in squares.items()}
+    errors = {mask: np.minimum(1.0, np.sqrt(np.mean(parts, axis=0))) for (_, mask), parts in squares.items()}
+    within = {mask: [errors[part] for part in schema.masks if part <= mask] for mask in schema.masks}
+    return {("mask", mask): np.min(parts, axis=0) for mask, parts in within.items()}
 
 
 def _without_outliers(schema: BodySchema, dataset: Dataset, limit: float) -> tuple[np.ndarray, np.ndarray]:
