@@ -113,7 +113,7 @@ def test_data_that_do_not_fit_are_one_sentence(tmp_path: Path) -> None:
         "joint_position": {"unit": "deg", "elements": ["elbow", "wrist"]},
         "muscle_tension": {"unit": "N", "elements": ["biceps"]},
     }
-    with pytest.raises(DatasetError, match=r"elbow, wrist \[rad\]; elbow, wrist \[deg\] are expected"):
+    with pytest.raises(DatasetError, match=r"elbow, wrist \[rad\]; elbow, wrist \[m\] are expected"):
         select(_robot(signals=signals), files)
     with pytest.raises(DatasetError, match="'elbow_temperature' is not in"):
         more = {
