@@ -110,7 +110,7 @@ def test_data_that_do_not_fit_are_one_sentence(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="Give it with --condition; the robot file has duster, none"):
         select(_robot(conditions=["duster", "none"]), files)
     signals = {
-        "joint_position": {"unit": "deg", "elements": ["elbow", "wrist"]},
+        "joint_position": {"unit": "m", "elements": ["elbow", "wrist"]},
         "muscle_tension": {"unit": "N", "elements": ["biceps"]},
     }
     with pytest.raises(DatasetError, match=r"elbow, wrist \[rad\]; elbow, wrist \[m\] are expected"):

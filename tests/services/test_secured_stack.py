@@ -108,7 +108,8 @@ def _hears(made: Secured) -> bool:
     try:
         with Client(made.robot, made.role("viewer")) as viewer:
             status = viewer.status("recorder", timeout=2.0)
-            return viewer.sample(timeout=2.0) is not None and status is not None
+            sample = viewer.sample(timeout=2.0)
+            return sample is not None and sample.complete and status is not None
     except (NoAnswer, NotAllowed):
         return False
 
