@@ -10,7 +10,7 @@ from hal import load_object, load_robot
 
 config = load_robot(Path(__file__).parents[1] / "robots" / "musashi_arm.yaml")
 motion = load_object(config.collect["motion"])(config, seed=0)
-with load_object(config.simulator).direct(config, "geometric", seed=0) as robot:
+with load_object(config.simulator, "simulator", ("direct",)).direct(config, "geometric", seed=0) as robot:
     deadline = robot.clock.monotonic()
     sample, _ = robot.cycle()
     robot.enable()

@@ -33,7 +33,7 @@ def record(
     robot: RobotConfig, arm: int, seed: int, rate: float, duration: float, part: str = ""
 ) -> dict[str, np.ndarray]:
     """Return signal -> samples (count, n) [unit] of one actual arm."""
-    world = registry.load_object(robot.simulator or "").world("actual", arm)
+    world = registry.load_object(robot.simulator or "", "simulator", ("world",)).world("actual", arm)
     if part:
         world.break_part(part)
     clock = WorldClock(world)

@@ -73,7 +73,7 @@ def robot_file() -> RobotConfig:
 
 def record(config: RobotConfig) -> tuple[list[Bus], list[Device], dict[str, list[can.Message]]]:
     """Return buses, their commissioned devices, and the newest process data of every node."""
-    rig = registry.load_object(str(config.simulator)).rig(config, "geometric", 0)
+    rig = registry.load_object(str(config.simulator), "simulator", ("rig",)).rig(config, "geometric", 0)
     clock = SystemClock()
     buses, devices = build(config, clock, {})
     robot = Robot(config, devices, buses, clock)

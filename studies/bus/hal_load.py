@@ -73,7 +73,7 @@ def on_hub(config: RobotConfig, folder: str) -> RobotConfig:
 
 def simulate(config: RobotConfig, ready: Event, stop: Event) -> None:
     """Run the simulated nodes until `stop`."""
-    simulator = registry.load_object(str(config.simulator))
+    simulator = registry.load_object(str(config.simulator), "simulator", ("rig",))
     rig = simulator.rig(config, simulator.variants[0], 0)
     realtime.prepare_process()
     rig.start()

@@ -26,7 +26,9 @@ class Body:
     """
 
     def __init__(self, robot: RobotConfig, variant: str, seed: int, condition: str, arrived: float) -> None:
-        self._world: Any = registry.load_object(str(robot.simulator)).world(variant, seed, condition)
+        self._world: Any = registry.load_object(str(robot.simulator), "simulator", ("world",)).world(
+            variant, seed, condition
+        )
         self._low, self._high = robot.bounds(JOINTS)
         self._elements = [f"{JOINTS}.{name}" for name in robot.signals[JOINTS].elements]
         self._signals, self._arrived = layout_of(robot).names, arrived

@@ -49,7 +49,7 @@ class LiveDevice(DirectDevice):
 
 def in_process(config: RobotConfig, seed: int) -> Robot:
     """Return a robot without a bus, in real time, with the first variant of its simulator."""
-    simulator = registry.load_object(config.simulator or "")
+    simulator = registry.load_object(config.simulator or "", "simulator", ())
     world = simulator.world(simulator.variants[0], seed)
     return Robot(config, [LiveDevice(config, world)], source="simulated")
 

