@@ -50,6 +50,7 @@ class Marks:
 
     silent: tuple[float, float] = (0.0, 0.0)
     learning: tuple[float, float] = (0.0, 0.0)
+    lies: float = 0.0
     cut: float = 0.0
     alarm: float = float("nan")
     blamed: str = ""
@@ -150,6 +151,7 @@ class Story:
         """Play (d): an encoder is one radian off, then another one freezes; each is hidden until it is right again."""
         self._become_calm()
         start, figures, observed = self._timeline.now(), [], True
+        self.marks.lies = start
         for element, fault, words in LIES:
             self._report(f"[bold](d)[/] The encoder of {element} lies: {words}.")
             figure, is_seen = self._lying(element, fault, words)
@@ -175,15 +177,16 @@ class Story:
         hidden = hidden[:, index] > 0
         error = np.abs(self._silent_error(index, start, end))
         wrong = error[hidden]
-        if not reason or not hidden.any():
+        if not hidden.any():
             return f"{element} {words}: not noticed", False
         delay = float(at[np.argmax(hidden)]) - start
         late = ~hidden & (at > start + LEAKS_AFTER)
         leak = f", wrong as measured later by {error[late].max():.3f} rad" if late.any() else ""
         is_back = not self._is_estimated(index)
         back = f"trusted again {returned:.0f} s after it was right" if is_back else "not trusted again"
+        seen = reason or "not plausible, as the HAL found"
         text = (
-            f"{element} {words}: {reason}; hidden after {delay:.1f} s, estimate wrong by {wrong.mean():.3f} rad; {back}"
+            f"{element} {words}: {seen}; hidden after {delay:.1f} s, estimate wrong by {wrong.mean():.3f} rad; {back}"
         )
         return text + leak, is_back and not late.any()
 
@@ -198,7 +201,7 @@ class Story:
         start = self._timeline.now()
         calm = self._timeline.between("is_anomaly", start - CALM_TIME, start)
         score = float(np.nanmedian(self._timeline.between("score", start - CALM_TIME, start)))
-        alarms = float(np.mean(self._timeline.between("is_anomaly", 0.0, start)))
+        alarms = float(np.mean(self._timeline.between("is_anomaly", 0.0, self.marks.lies)))
         self._client.fault(f"muscle_cut {MUSCLE}")
         self.marks.cut = start
         alarmed = self._actor.wait(self._is_alarmed, NOTICED_WITHIN)
@@ -215,7 +218,7 @@ class Story:
             f"anomaly score {score:.1f} before the cut, {after:.1f} after it, threshold {limit:.1f}",
             f"reported after {1e3 * (self.marks.alarm - start):.0f} ms; blamed element {element or 'none'}",
             f"muscle with the largest part in the score: {self.marks.blamed or 'none'}",
-            f"before the cut an anomaly was reported {alarms:.1%} of the time",
+            f"before anything was wrong an anomaly was reported {alarms:.1%} of the time",
         )
         right = self.marks.blamed == MUSCLE
         self._client.disengage()
