@@ -28,7 +28,7 @@ DEPTH = 8
 """At most this many messages of a sender wait for a tick: a bad one must not displace a good one."""
 SENDERS = 16
 """At most this many senders have a ring of their own; the one that was silent longest loses it."""
-PER_TICK = 32
+PER_TICK = 16
 """At most this many messages are followed in a tick, of all senders in turn, so that a flood stays short."""
 LARGE = 1 << 14
 """Messages of more bytes than this share the ring of messages without a sender."""

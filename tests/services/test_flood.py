@@ -49,6 +49,8 @@ def test_a_flood_of_commands_stops_neither_the_cycle_nor_the_holder(tmp_path: Pa
         assert flooder.stdin is not None
         assert flooder.stdout is not None
         assert flooder.stdout.readline().strip() == "ready"
+        calm = arm.client.status("hal", timeout=5.0)
+        assert calm is not None
         arm.client.enable()
         eventually(lambda: arm.mode() == "hold")
         start, modes = arm.client.next_sample(), Counter[str]()
@@ -72,5 +74,6 @@ def test_a_flood_of_commands_stops_neither_the_cycle_nor_the_holder(tmp_path: Pa
         assert modes["follow"] > 0.8 * modes.total(), (modes, status.text)  # a busy machine delays the client itself
         assert commands["accepted"] > 100, commands
         assert commands["flooded"] > 0.5 * sent or commands["refused"] + commands["repeated"] > 100, (sent, commands)
-        assert status.loops["hal"]["rate"] > 0.9 * status.loops["hal"]["rate_wanted"], status.loops
+        usual = min(calm.loops["hal"]["rate"], status.loops["hal"]["rate_wanted"])  # lower on a busy machine
+        assert status.loops["hal"]["rate"] > 0.9 * usual, (calm.loops, status.loops)
         print(sent, dict(modes), commands, status.loops["hal"])
