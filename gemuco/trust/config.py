@@ -41,6 +41,7 @@ class Finding:
         is_distrusted: Whether the elements are hidden; if not, they are suspected and still used.
         by_hand: Whether an operator decided.
         reason: Why they are still used, if a rule forbids to hide them; else empty.
+        condition: The trained condition whose p explains what is seen, if the cause is the environment; else empty.
     """
 
     elements: tuple[int, ...]
@@ -51,3 +52,4 @@ class Finding:
     is_distrusted: bool = False
     by_hand: bool = False
     reason: str = ""
+    condition: str = ""

@@ -1,6 +1,6 @@
 """The cause of an alarm: the smallest set of columns without which the others agree again."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -23,6 +23,10 @@ CLOSE = 0.8
 """Nor if the smaller is more than this share of the larger."""
 MOST = 3
 """At most this number of columns is named as alternatives."""
+AGREES = 0.6
+"""Another trained p explains an alarm if under it the evidence against all elements is below this share of one."""
+RIVALS = 0.1
+"""And if no single element explains it better by more than this share of an alarm."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,11 +37,13 @@ class Cause:
         columns: The columns.
         cause: As in `Finding`.
         lead: The column with the most evidence.
+        condition: The trained condition whose p explains the alarm; empty if none does.
     """
 
     columns: Hidden
     cause: str
     lead: int
+    condition: str = ""
 
 
 def explain(
@@ -46,6 +52,7 @@ def explain(
     devices: Sequence[Hidden],
     parts: Sequence[Hidden],
     environment: Hidden,
+    conditions: Callable[[], Iterable[tuple[str, Evidence, bool]]] = lambda: (),
 ) -> Cause:
     """Return the most likely cause of an alarm.
 
@@ -55,6 +62,9 @@ def explain(
         devices: Columns that one device measures.
         parts: Columns that belong to one part of the body, such as a muscle, which may itself have changed.
         environment: The columns of p.
+        conditions: Returns each other trained condition, the evidence under its p, and whether the healthy errors
+            under it are known; if not, a doubt is in favour
+            of the sensors.
     """
     order = np.argsort(-evidence.strength)
     lead = int(order[0])
@@ -74,6 +84,11 @@ def explain(
 
     single = [column for column in singles if solves(frozenset({column}))]
     best = float(evidence.strength[single[0]]) if single else 0.0
+    if environment and not evidence.is_noise[lead]:
+        rest = min((float(without(frozenset({c})).ratio.max(initial=0.0)) for c in single), default=1.0)
+        for name, other, is_known in conditions():
+            if float(other.ratio.max(initial=0.0)) < (min(AGREES, rest + RIVALS) if is_known else EXPLAINED):
+                return Cause(environment, "environment", lead, name)
     if environment:
         own = float(evidence.strength[list(environment)].max())
         if own >= CLOSE * best - ALIKE and solves(environment):

@@ -1,14 +1,14 @@
 """The monitor: it judges every element block by block, and hides those that lie until they have agreed again."""
 
 import math
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gemuco.anomaly.blame import parts
 from gemuco.schema import BodySchema
-from gemuco.trust.changes import LONGEST, LastingTest
+from gemuco.trust.changes import AGES, LONGEST, LastingTest
 from gemuco.trust.config import BLOCK, Finding, Hidden, TrustConfig
 from gemuco.trust.evidence import Evidence, Judge
 from gemuco.trust.healthy import Healthy
@@ -46,6 +46,10 @@ CLEAR = 2.0
 GROSS, LONG, LIKE = 3.0, 50.0, 1.3
 """On a body that is not known to be as the model says, a lie is hidden if it is the first multiple of an alarm,
 explains the second number of blocks of motion, and leaves errors below the third multiple of those learned."""
+MOVED = 30.0
+"""A body is not known before it has moved for this number of blocks, with this tool: at rest it shows one posture."""
+OTHER_TOOL = 0.2
+"""Another tool or load is one whose p differs by this share of the range of the trained ones."""
 AT_ONCE, ONCE = 3, 15
 """At most this number of elements are wrong at once, which is within this number of blocks; otherwise the body is."""
 SURE = 2.0
@@ -103,17 +107,23 @@ class TrustMonitor:
         self._cases: list[_Case] = []
         self._relations: Relations | None = None
         self._schema: BodySchema | None = None
+        self._healthy, self._met, self._met_at = Healthy(0), schema.bias, 0.0
         self.use(schema)
 
     def use(self, schema: BodySchema) -> None:
         """Judge by another model; what is known of the body is kept unless the normal errors were learned anew."""
         before, self._schema = self._schema, schema
         if before is not None and before.normal is schema.normal:
+            if _is_another(schema, schema.bias, self._met[None])[0]:
+                self._met, self._met_at = schema.bias, self._healthy.moved
             return
+        self._met, self._met_at = schema.bias, 0.0
         self._relations = Relations.of(schema)
         self._view: View | None = None
         if self._relations is None:
             return
+        assert schema.normal is not None
+        self._biases = np.unique(schema.normal.rows[:, schema.layout.size :], axis=0)
         size = len(self._relations.columns)
         self._recent.clear()
         self._other = self._motion = 0.0
@@ -136,6 +146,15 @@ class TrustMonitor:
     def is_ready(self) -> bool:
         """Whether lies can be noticed: what is normal is known, and enough blocks were seen."""
         return self._relations is not None and self._healthy.is_known
+
+    @property
+    def _is_known_body(self) -> bool:
+        """Whether what is healthy is known of this body, with this tool, in motion."""
+        assert self._schema is not None
+        if any(case.is_hidden and case.cause.cause == "environment" for case in self._cases):
+            return False
+        has_moved = self._healthy.moved - self._met_at >= MOVED
+        return self.is_known and has_moved and not _is_another(self._schema, self._schema.bias, self._biases).all()
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -198,7 +217,10 @@ class TrustMonitor:
         if highest >= 1.0 and body is not None and self._count % AGAIN:
             body.last = self._count  # a search without a result costs as much as 50 blocks
         elif highest >= 1.0 or (highest >= DOUBTFUL and self._count % AGAIN == 0 and self._hides_others(ratio, hidden)):
-            cause = explain(evidence, self._without(hidden), self._joined, self._parts, self._environment - hidden)
+            cause = explain(
+                evidence, self._without(hidden), self._joined, self._parts, self._environment - hidden,
+                lambda: self._conditions(hidden, int(evidence.age.flat[evidence.strength.argmax()])),
+            )  # fmt: skip
             self._suspect(cause, evidence, hidden)
         else:
             highest = float(evidence.ratio.max(initial=0.0))
@@ -208,6 +230,25 @@ class TrustMonitor:
                 self._judge_again(case)
         if immune and self._count % AGAIN == 0 and float(evidence.ratio[immune].max()) < CALM:
             self._immune.clear()
+
+    def _conditions(self, hidden: Hidden, age: int) -> Iterator[tuple[str, Evidence, bool]]:
+        """Yield each other trained condition, the evidence if it holds since about `age` blocks, and if it is known."""
+        schema, relations, judge = self._schema, self._relations, self._judge
+        assert schema is not None
+        assert relations is not None
+        place, now = AGES.index(age), self._recent.view(relations, hidden)
+        ages = range(AGES[max(place - 1, 0)], min(AGES[min(place + 1, len(AGES) - 1)] + 1, LONGEST))
+        unknown = np.full(now.z.shape[1], np.nan)
+        for name, bias in schema.biases.items():
+            if np.array_equal(bias, schema.bias):
+                continue
+            other, changed = self._recent.under(schema.under(name), relations).view(relations, hidden), []
+            for since in ages:
+                z = np.concatenate([now.z[:-since], other.z[-since:]])
+                z[-since - 1] = np.nan  # the tool was changed within this block
+                changed.append(judge(replace(now, z=z, noise=unknown)))
+            best = min(changed, key=lambda evidence: float(evidence.ratio.max(initial=0.0)))
+            yield name, best, not _is_another(schema, bias, self._biases).all()
 
     def _suspect(self, cause: Cause, evidence: Evidence, hidden: Hidden) -> None:
         """Suspect a cause, or hide it if it has been suspected before."""
@@ -270,7 +311,7 @@ class TrustMonitor:
         elements = self._at(case)
         rest = self._without(self._hidden_columns() | self._recent.missing())(case.cause.columns)
         is_gross = ratio >= GROSS and case.moved >= LONG and rest.level < LIKE
-        if rest.level > STRANGE or not (self.is_known or is_gross):
+        if rest.level > STRANGE or not (self._is_known_body or is_gross):
             return "what is normal is not known on this body"
         if self._immune & elements:
             return "it is not hidden again before it has agreed once"
@@ -300,7 +341,7 @@ class TrustMonitor:
         if case.cause.cause not in ("element", "either"):
             return
         again = explain(evidence, self._without(rest), self._joined, self._parts, frozenset())
-        if again.cause == "element" and again.columns != case.cause.columns:
+        if again.cause == "element" and again.columns != case.cause.columns and not again.columns & self._environment:
             inside = again.columns < case.cause.columns
             rival, own = again.lead, max(case.cause.columns - again.columns, key=lambda c: evidence.strength[c])
             if evidence.strength[rival] > (1.0 if inside else SURE) * evidence.strength[own]:
@@ -318,8 +359,8 @@ class TrustMonitor:
     def _describe(self, case: _Case, hidden: Hidden, is_noise: bool) -> None:
         """Find kind and size of a lie from its blocks so far, predicted from trusted elements only."""
         assert self._relations is not None and self._schema is not None
-        columns = sorted(case.cause.columns)
-        if not columns or case.cause.cause == "environment":
+        columns = [column for column in sorted(case.cause.columns) if column < self._relations.count]
+        if not columns:  # p alone
             return
         view = self._recent.view(self._relations, hidden | case.cause.columns)
         count = min(max(1, self._count - case.began + 1), len(self._recent.blocks), LONGEST)
@@ -381,7 +422,10 @@ class TrustMonitor:
         lead = case.cause.lead
         at = sorted(self._at(case), key=lambda p: (self._place[p] != lead, p))
         since = self._now - (self._count - case.began) * BLOCK
-        return Finding(tuple(at), case.cause.cause, case.kind, since, case.size, case.is_hidden, reason=case.reason)
+        return Finding(
+            tuple(at), case.cause.cause, case.kind, since, case.size, case.is_hidden,
+            reason=case.reason, condition=case.cause.condition,
+        )  # fmt: skip
 
     def _sizes(self, schema: BodySchema, relations: Relations) -> np.ndarray:
         least = np.full(len(relations.columns), self._config.size)
@@ -389,3 +433,10 @@ class TrustMonitor:
             span = schema.layout.slice(name)
             least[(relations.columns >= span.start) & (relations.columns < span.stop)] = size
         return least
+
+
+def _is_another(schema: BodySchema, bias: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Return whether p is that of another tool or load than each of some others, shape (n,)."""
+    trained = np.array(list(schema.biases.values()))
+    span = np.ptp(trained, axis=0).max() if trained.size else 0.0
+    return np.asarray(np.abs(others - bias).max(axis=1, initial=0.0) > OTHER_TOOL * span)

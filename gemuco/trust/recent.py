@@ -1,7 +1,7 @@
 """The newest blocks of samples, and their errors under any hypothesis about which columns are wrong."""
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,6 +11,8 @@ from gemuco.trust.config import Hidden
 from gemuco.trust.relations import Relations, rows_of
 from gemuco.trust.sensitivity import Sensed
 
+JERKS = 0.5
+"""Noise of an element exceeds this share of the noise in what the others predict of it."""
 NOISY = 5
 """The noise is the median of this number of the newest blocks."""
 
@@ -68,6 +70,20 @@ class Recent:
         sensed = relations.sensitivity.sense(schema, full[:1])
         self.blocks.append(_Block(mean, features[0], features[1:], span, missing, sensed))
 
+    def under(self, schema: BodySchema, relations: Relations) -> "Recent":
+        """Return the same blocks with the p of another schema; their noise is unknown."""
+        other = Recent()
+        full = np.full((len(self.blocks), schema.layout.size + len(schema.bias)), np.nan)
+        full[:, relations.columns] = self.values()
+        full[:, schema.layout.size :] = schema.bias
+        features, sensed = relations.features(full), relations.sensitivity.sense(schema, full)
+        none = np.zeros((0, features.shape[1]))
+        for number, block in enumerate(self.blocks):
+            own = Sensed(*(part[number : number + 1] for part in sensed))
+            mean = full[number, relations.columns]
+            other.blocks.append(replace(block, mean=mean, features=features[number], each=none, sensed=own))
+        return other
+
     def missing(self) -> Hidden:
         """Return the columns that are missing in the newest block."""
         return frozenset(np.flatnonzero(self.blocks[-1].missing).tolist())
@@ -117,10 +133,17 @@ class Recent:
 
 
 def _noise(features: np.ndarray, maps: np.ndarray) -> np.ndarray:
-    """Return half of the mean squared difference of successive errors, shape (columns,); NaN of fewer than three."""
+    """Return the variance of what is not smooth in successive errors, shape (columns,); NaN of fewer than three.
+
+    Errors that change with the posture are smooth in time; the second difference of white noise has six times its
+    variance. A jerk of the body is in the prediction too, and counts `JERKS` times as large there.
+    """
     if len(features) < 3:
         return np.full(maps.shape[1], np.nan)
-    return np.asarray(0.5 * np.mean((np.diff(features, axis=0) @ maps) ** 2, axis=0))
+    bends = np.diff(features, n=2, axis=0)
+    error = bends @ maps
+    predicted = bends[:, 1 : 1 + maps.shape[1]] - error
+    return np.asarray(np.maximum(np.mean(error**2 - JERKS * predicted**2, axis=0), 0.0) / 6.0)
 
 
 def _median(values: np.ndarray) -> np.ndarray:

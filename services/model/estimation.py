@@ -4,6 +4,7 @@ import math
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from msgspec.structs import replace
@@ -43,6 +44,18 @@ class Distrust:
     def is_empty(self) -> bool:
         """Whether no element is hidden."""
         return not self.reasons
+
+
+class Dated(NamedTuple):
+    """The usable values of one process.
+
+    Attributes:
+        time: Time of measurement [monotonic s of this process]; NaN without a sample.
+        values: All elements of the model [unit], shape (size,), NaN where not usable; the same array until they change.
+    """
+
+    time: float
+    values: np.ndarray
 
 
 class Freshness:
@@ -109,6 +122,22 @@ class Freshness:
             both = measured if seen is self._nothing[0] else np.where(np.isnan(measured), seen, measured)
             joined = self._joined = measured, seen, Numbers(_unwritable(both), self.elements)
         return (fresh if is_there else None), joined[2]
+
+    def apart(self) -> tuple[Dated, Dated | None]:
+        """Return the values of the HAL and those of the camera, as `measured`; None if the robot has no camera."""
+        now, fresh = self._clock.monotonic(), self._newest()
+        hal = self._dated(self._hal, fresh, now)
+        if self._vision is None or self._seen is None:
+            return hal, None
+        return hal, self._dated(self._vision, self._seen(), now)
+
+    def _dated(self, source: "_Source", arrival: Arrival[Sample] | None, now: float) -> Dated:
+        if arrival is None:
+            return Dated(math.nan, self._nothing[0])
+        age = arrival.message.age.flat
+        youngest = float(np.min(age, initial=math.inf, where=np.isfinite(age)))
+        values, _ = source.usable(arrival, now)
+        return Dated(arrival.received - (youngest if math.isfinite(youngest) else 0.0), values)
 
 
 class _Source:

@@ -12,6 +12,7 @@ import numpy as np
 from gemuco.estimation import recipes
 from gemuco.normal import Normal
 from gemuco.schema import BodySchema
+from gemuco.trust.aligned import Aligned
 from gemuco.trust.config import BLOCK, Finding, TrustConfig
 from gemuco.trust.monitor import TrustMonitor
 from hal.by_signal import Numbers
@@ -82,18 +83,18 @@ class Trust:
         self._monitor = TrustMonitor(schema(), config, groups, self._replaces)
         self._rows: list[np.ndarray] = []
         self._last: Numbers | None = None
+        self._aligned, self._hal, self._camera = Aligned(), np.zeros(0), np.zeros(0)
         self._began = -math.inf
         self._stopped_for: frozenset[int] = frozenset()
         self.findings: tuple[Finding, ...] = ()
 
     def tick(self) -> None:
         """Take the newest sample, and judge the samples of the last block."""
-        _, values = self._freshness.measured()
         now, schema = self._clock.monotonic(), self._schema()
         with self._lock:
-            if values is not self._last:
-                self._last = values
-                self._rows.append(schema.scaler.normalise(in_order(schema, values).flat))
+            self._last = self._freshness.measured()[1]
+            fresh = self._new_rows(now)
+            self._rows += [schema.scaler.normalise(in_order(schema, row).flat) for row in fresh]
             if now - self._began < 0.99 * BLOCK:
                 return
             is_late = now - self._began > 5.0 * BLOCK
@@ -107,6 +108,21 @@ class Trust:
             self._monitor.add(np.array(rows), now)
             self._publish()
         self._stop_if_needed()
+
+    def _new_rows(self, now: float) -> list[Numbers]:
+        """Return the samples since the last tick, with the camera's values at the time of the others."""
+        hal, camera = self._freshness.apart()
+        is_new, self._hal = hal.values is not self._hal, hal.values
+        if camera is None:
+            rows = [hal.values] if is_new else []
+        else:
+            if is_new and math.isfinite(hal.time):
+                self._aligned.add(hal.time, hal.values)
+            if camera.values is not self._camera and math.isfinite(camera.time):
+                self._camera = camera.values
+                self._aligned.see(camera.time, camera.values)
+            rows = self._aligned.take(now)
+        return [Numbers(row, self._freshness.elements) for row in rows]
 
     def trust(self, element: str) -> int:
         """Use an element again; it is not hidden again before it has agreed with the others once.
@@ -227,7 +243,8 @@ class Trust:
     def _sentence(self, finding: Finding) -> str:
         since, names = self._wall_time(finding.since), [self._names[index] for index in finding.elements]
         if finding.cause in CAUSES:
-            return f"Since {since}: {CAUSES[finding.cause]}."
+            known = f": '{finding.condition}' explains what is measured" if finding.condition else ""
+            return f"Since {since}: {CAUSES[finding.cause]}{known}."
         joint = " or " if finding.cause == "either" else " and "
         state = "distrusted" if finding.is_distrusted else "suspected"
         text = f"{joint.join(names)} {'is' if len(names) == 1 else 'are'} {state}"

@@ -1,0 +1,73 @@
+"""Samples whose elements were measured at one time, although a camera reports later than the other sensors."""
+
+import math
+from collections import deque
+
+import numpy as np
+
+WAIT = 0.3
+"""After this time [s] without a frame, samples are used without the camera."""
+GAP = 0.1
+"""Between two samples that are further apart [s] nothing is interpolated."""
+MOST = 256
+"""At most this number of samples, and of frames, is kept."""
+
+
+class Aligned:
+    """Rows of all elements at the times of the camera's frames, those of the other sensors interpolated.
+
+    An arm at 2 rad/s moves by 0.1 rad within the 50 ms after which a frame arrives: beside the newest joint angles a
+    right camera looks wrong. The other sensors are read more often than the camera, so they are interpolated.
+    """
+
+    def __init__(self) -> None:
+        self._rows: deque[tuple[float, np.ndarray]] = deque(maxlen=MOST)
+        self._frames: deque[tuple[float, np.ndarray]] = deque(maxlen=MOST)
+        self._latest = -math.inf
+        self._has_frame = False
+        """Whether the latest row had a frame."""
+
+    def add(self, time: float, row: np.ndarray) -> None:
+        """Add a sample without the camera; one that is not newer than the one before is ignored.
+
+        Args:
+            time: Time of measurement [s].
+            row: Every element [its unit], shape (size,); NaN for those of the camera, and where not measured.
+        """
+        if not self._rows or time > self._rows[-1][0]:
+            self._rows.append((time, row))
+
+    def see(self, time: float, frame: np.ndarray) -> None:
+        """Add a frame of the camera; the arguments are those of `add`, with NaN for the other elements."""
+        if time > (self._frames[-1][0] if self._frames else self._latest):
+            self._frames.append((time, frame))
+
+    def take(self, now: float) -> list[np.ndarray]:
+        """Return the new rows, oldest first, each of shape (size,)."""
+        taken = []
+        while self._frames and self._rows and self._frames[0][0] <= self._rows[-1][0]:
+            time, frame = self._frames.popleft()
+            row = self._at(time)
+            if row is not None and time > self._latest:
+                taken.append(np.where(np.isnan(row), frame, row))
+                self._latest, self._has_frame = time, True
+        while self._rows and now - self._rows[0][0] >= WAIT:
+            time, row = self._rows.popleft()
+            if time > self._latest + (WAIT if self._has_frame else 0.0):  # those between two frames are not used
+                taken.append(row)
+                self._latest, self._has_frame = time, False
+        return taken
+
+    def _at(self, time: float) -> np.ndarray | None:
+        """Return the other sensors at a time, shape (size,); None if the samples around it are missing or far apart."""
+        while len(self._rows) > 1 and self._rows[1][0] <= time:
+            self._rows.popleft()
+        first, before = self._rows[0]
+        if time <= first:
+            return before if time == first else None
+        if len(self._rows) < 2:
+            return None
+        second, after = self._rows[1]
+        if second - first > GAP:
+            return None
+        return np.asarray(before + (time - first) / (second - first) * (after - before))
