@@ -163,9 +163,10 @@ class Story:
         """Let an encoder lie and be right again; return a sentence, and whether it was hidden and trusted again."""
         index, start = self._elements.index(element), self._timeline.now()
         self._client.fault(fault)
+        reason = ""
         for _ in range(LYING_POSES):
             self._go(self._pose(), LEARNING_TIME)
-        reason = self._reason(element)
+            reason = self._reason(element) or reason
         self._client.fault(f"sensor_true {element}_encoder")
         end = self._timeline.now()
         for _ in range(TRUE_POSES):
@@ -177,22 +178,24 @@ class Story:
         hidden = hidden[:, index] > 0
         error = np.abs(self._silent_error(index, start, end))
         wrong = error[hidden]
-        if not hidden.any():
+        if not reason or not hidden.any():
             return f"{element} {words}: not noticed", False
         delay = float(at[np.argmax(hidden)]) - start
         late = ~hidden & (at > start + LEAKS_AFTER)
         leak = f", wrong as measured later by {error[late].max():.3f} rad" if late.any() else ""
         is_back = not self._is_estimated(index)
         back = f"trusted again {returned:.0f} s after it was right" if is_back else "not trusted again"
-        seen = reason or "not plausible, as the HAL found"
         text = (
-            f"{element} {words}: {seen}; hidden after {delay:.1f} s, estimate wrong by {wrong.mean():.3f} rad; {back}"
+            f"{element} {words}: {reason}; hidden after {delay:.1f} s, estimate wrong by {wrong.mean():.3f} rad; {back}"
         )
         return text + leak, is_back and not late.any()
 
     def _reason(self, element: str) -> str:
-        estimate = self._client.estimate()
-        return "" if estimate is None else estimate.distrusted.get(f"{self._signal}.{element}", "")
+        """Return why an element is hidden now: by the model, or by the HAL; empty if no reason is given."""
+        name, estimate, status = f"{self._signal}.{element}", self._client.estimate(), self._client.status("hal")
+        if estimate is not None and name in estimate.distrusted:
+            return estimate.distrusted[name]
+        return status.text.rstrip(".") if status is not None and name in status.text else ""
 
     def lose_muscle(self) -> Stage:
         """Play (e): a muscle is cut, and the anomaly detection names it."""

@@ -32,5 +32,6 @@ def test_blocks_run_in_an_empty_folder(tmp_path):
     measured, lost, few, other = values[:4]
     assert max(abs(a - b) for a, b in zip(measured, lost, strict=True)) < 0.03
     assert max(abs(a - b) for a, b in zip(measured, few, strict=True)) < 0.12
+    assert max(abs(a - b) for a, b in zip(measured, other, strict=True)) > 0.3
     std = [float(cell) for cell in outputs[4].splitlines()[3].split("[")[2].split("]")[0].split()]
     assert max(abs(a - b) / s for a, b, s in zip(measured, other, std, strict=True)) > 3.0  # the load is in p
