@@ -8,7 +8,7 @@ EXTRAS = {
     "torch": "train",
     "matplotlib": "train",
     "pybullet": "sim",
-    "mujoco": "sim",
+    "mujoco": "mjcf",
     "viser": "view",
     "yourdfpy": "view",
     "pyarrow": "parquet",
