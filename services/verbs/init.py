@@ -1,4 +1,4 @@
-"""The verb `init`: a robot file with a simulator, made from a URDF or MJCF file."""
+"""The verb `init`: a robot file with a simulator, from a URDF or MJCF file, from vendors' files, or from a bus."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,7 +9,7 @@ import typer
 from services.verbs.verb import report_errors
 
 DESCRIBE = "simulators.robots.urdf_arm:describe"
-"""The function that reads the file is named by this text, because services know simulators by name only."""
+"""The function that reads a URDF is named by this text, because services know simulators by name only."""
 
 
 def register(app: typer.Typer) -> None:
@@ -20,39 +20,84 @@ def register(app: typer.Typer) -> None:
 @report_errors
 def init(
     source: Annotated[
-        Path, typer.Argument(metavar="FILE", help="The URDF or MJCF file of an arm, a leg or a whole robot.")
-    ],
+        Path | None,
+        typer.Argument(
+            metavar="[SOURCE]", help="A URDF or MJCF file, or a folder with EDS, DCF and DBC files of devices."
+        ),
+    ] = None,
     tip: Annotated[
         str | None, typer.Option(metavar="LINK", help="End of the chain to use; the longest arm if not given.")
     ] = None,
     name: Annotated[str | None, typer.Option(help="Name of the robot; that in the file if not given.")] = None,
     out: Annotated[
-        Path | None, typer.Option(help="The robot file to write; in this folder, named like FILE, if not given.")
+        Path | None, typer.Option(help="The robot file to write; in this folder, named like SOURCE, if not given.")
     ] = None,
+    scan: Annotated[
+        str | None,
+        typer.Option(metavar="CHANNEL", help="Use the nodes on this bus: can0 of SocketCAN, or INTERFACE:CHANNEL."),
+    ] = None,
+    bitrate: Annotated[int, typer.Option(min=10_000, help="Bit rate of the scanned bus \\[bit/s].")] = 1_000_000,
 ) -> None:
-    """Write a robot file for the arm that a URDF or an MJCF file describes, with a simulator of it.
+    """Write a robot file, with a simulator, for an arm in a URDF or MJCF file, or for the devices that you have.
 
-    The file has joints, limits and torques; drives, encoders and a camera stand in for the hardware. `gemuco demo FILE`
-    then collects, trains, runs, and loses an encoder and the camera. An MJCF file (of MuJoCo) is converted to a URDF.
+    For an arm the file has joints, limits and torques; drives, encoders and a camera stand in for the hardware. `gemuco
+    demo FILE` then collects, trains, runs, and loses an encoder and the camera. For a folder or a bus it has the
+    devices, on a bench; complete what no file knows: gears, zeros, limits.
     """
-    from hal import registry
-    from hal.errors import ConfigError
-    from services.errors import ServiceError
+    from services.errors import BadArguments, ServiceError
 
-    file = out or Path(f"{source.name.partition('.')[0]}.yaml")
+    if source is None and scan is None:
+        raise BadArguments("Give a URDF or MJCF file, a folder with EDS, DCF and DBC files, or --scan can0.")
+    if tip is not None and (scan is not None or (source is not None and source.is_dir())):
+        raise BadArguments("--tip is for a URDF or MJCF file; devices have no chain of links.")
+    file = out or Path(f"{_stem(source, scan)}.yaml")
     if file.suffix not in (".yaml", ".yml"):
         raise ServiceError(f"A robot file ends in .yaml, not as '{file}'. Name another one by --out.")
     if file.exists():
         raise ServiceError(f"'{file}' exists. Remove it, or name another file by --out.")
+    if scan is not None or (source is not None and source.is_dir()):
+        _of_devices(source, scan, bitrate, name, file)
+    elif source is not None:
+        _of_arm(source, tip, name, file)
+
+
+def _stem(source: Path | None, scan: str | None) -> str:
+    if source is not None:
+        return source.resolve().name.partition(".")[0] or "robot"
+    return f"robot_on_{Path(str(scan).rpartition(':')[2]).name}"
+
+
+def _of_arm(source: Path, tip: str | None, name: str | None, file: Path) -> None:
+    from hal import registry
+
     draft: Any = registry.load_object(DESCRIBE)(source, tip, name, file.parent)
-    _check_name(draft.robot, ConfigError)
+    _check_name(draft.robot)
     sheets = {f"eds/{sheet.name}": sheet.read_bytes() for sheet in draft.sheets}
     sheets = {name: content for name, content in sheets.items() if not (file.parent / name).exists()}
     _write(file, draft.text, {**sheets, **draft.files})
-    typer.echo(f"{file}: {draft.summary}")
-    for note in draft.notes:
-        typer.echo(f"  {note}")
+    _report(file, draft.summary, draft.notes)
     typer.echo(f"Next: gemuco demo {file}")
+
+
+def _of_devices(source: Path | None, scan: str | None, bitrate: int, name: str | None, file: Path) -> None:
+    from services.hardware.draft import draft_devices
+
+    if name is not None:
+        _check_name(name)
+    draft = draft_devices(source, scan, bitrate, name, file)
+    copies = {place: path.read_bytes() for place, path in draft.copies.items() if not (file.parent / place).exists()}
+    _write(file, draft.text, copies)
+    _report(file, draft.summary, draft.notes)
+    typer.echo(
+        f"Next: complete the lines with 'set' in {file}; then gemuco simulate {file}, gemuco hal {file}, "
+        f"gemuco doctor {file}"
+    )
+
+
+def _report(file: Path, summary: str, notes: tuple[str, ...]) -> None:
+    typer.echo(f"{file}: {summary}")
+    for note in notes:
+        typer.echo(f"  {note}")
 
 
 def _write(file: Path, text: str, more: Mapping[str, bytes]) -> None:
@@ -72,11 +117,13 @@ def _write(file: Path, text: str, more: Mapping[str, bytes]) -> None:
         raise ServiceError(f"'{file}' cannot be written: {error.strerror}.") from None
 
 
-def _check_name(robot: str, error: type[Exception]) -> None:
+def _check_name(robot: str) -> None:
     """Check the name before anything is written."""
     import re
 
+    from hal.errors import ConfigError
+
     if not re.fullmatch(r"[a-z][a-z0-9_]*", robot):
-        raise error(
+        raise ConfigError(
             f"'{robot}' is no name of a robot: it has lower-case letters, digits and underscores. Give another --name."
         )

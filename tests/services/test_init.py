@@ -61,6 +61,20 @@ def test_what_cannot_be_is_refused_in_a_sentence(tmp_path: Path, words: tuple[st
     assert not list(tmp_path.glob("*.yaml"))
 
 
+def test_a_folder_of_files_becomes_a_robot_file(tmp_path: Path) -> None:
+    (tmp_path / "vendors").mkdir()
+    for name in ("eds/servo_drive.eds", "dbc/load_cell.dbc"):
+        (tmp_path / "vendors" / Path(name).name).write_bytes((ROOT / "robots" / name).read_bytes())
+    told = gemuco(tmp_path, "init", "vendors")
+    assert told.returncode == 0, told.stderr
+    assert told.stdout.startswith("vendors.yaml: 2 devices, 1 of them drives, 3 elements; 3 lines to set.\n")
+    assert "Next: complete the lines with 'set' in vendors.yaml; then gemuco simulate vendors.yaml" in told.stdout
+    robot = load_robot(tmp_path / "vendors.yaml")
+    assert sorted(robot.devices) == ["cell", "servo_drive"]
+    again = gemuco(tmp_path, "init", "vendors")
+    assert again.stderr == "gemuco: 'vendors.yaml' exists. Remove it, or name another file by --out.\n"
+
+
 def test_the_story_fits_arms_with_encoders_of_their_own(tmp_path: Path) -> None:
     assert gemuco(tmp_path, "init", str(named(tmp_path, "My Arm"))).returncode == 0
     robot = load_robot(tmp_path / "arm.yaml")

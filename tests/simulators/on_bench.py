@@ -4,12 +4,13 @@ import itertools
 import os
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import numpy as np
 
 from hal.config import RobotConfig
+from hal.errors import CommandRefused
 from hal.robot import Robot, open_robot
 from hal.sample import Sample
 from simulators.rig import Rig
@@ -51,7 +52,8 @@ def cycle_until(robot: Robot, condition: Any, target: np.ndarray | None = None) 
         sample, _ = robot.cycle()
         is_valid = sample.complete and all(valid.all() for valid in sample.valid.values())
         if target is not None and robot.mode == "off" and is_valid:
-            robot.enable()
+            with suppress(CommandRefused):  # a drive that is still opening is enabled a few cycles later
+                robot.enable()
         elif target is not None and robot.mode in ("hold", "follow"):
             robot.command(target, sample.cycle)
         if condition(sample):
