@@ -8,7 +8,7 @@ EXTRAS = {
     "torch": "train",
     "matplotlib": "train",
     "pybullet": "sim",
-    "mujoco": "mjcf",
+    "mujoco": "sim",
     "viser": "view",
     "yourdfpy": "view",
     "pyarrow": "parquet",

@@ -193,7 +193,7 @@ def test_a_port_that_is_taken_is_named(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("package", "extra", "words"),
     [
-        ("mujoco", "mjcf", ("init", "panda.xml")),
+        ("mujoco", "sim", ("init", "panda.xml")),
         ("viser", "view", ("view", "good.yaml")),
         ("torch", "train", ("demo", "musashi_arm")),
     ],
