@@ -8,6 +8,10 @@ import numpy as np
 import pytest
 from on_bench import arrives, cycle_until, running, states, virtual
 
+from hal.errors import ConfigError
+from hal.protocols.dbc import load
+from simulators.nodes.dbc.frames import Output, decoded, raw_of
+
 SENSOR = """VERSION ""
 BU_: Cell Host
 BO_ 1792 Load: 8 Cell
@@ -228,3 +232,29 @@ def test_a_broken_servo_is_off_until_it_is_reset(tmp_path: Path) -> None:
         cycle_until(robot, arrives("joint_position", np.array([0.3])), np.array([0.3]))
         rig.fault("node_reboot axis")
         cycle_until(robot, lambda one: robot._devices[0]._counters["boots"] == 1)
+
+
+def test_pages_are_sent_in_turn_and_a_frame_that_is_none_is_ignored(tmp_path: Path) -> None:
+    (tmp_path / "cells.dbc").write_text(SENSOR)
+    message = load(tmp_path / "cells.dbc").message("Pages")
+    output = Output(message, 5)
+    assert [output.encode()[0] for _ in range(2)] == [1, 1]  # the first page of the file
+    output.use("Angle")
+    output.use("Serial")
+    output.put("Angle", 90.0)
+    assert [decoded(message, output.encode())["Page"] for _ in range(4)] == [1.0, 2.0, 1.0, 2.0]
+    assert decoded(message, bytes([9, 0, 0, 0, 0, 0, 0, 0])) is None  # a page that the file does not have
+    assert decoded(message, b"\1") is None
+
+
+def test_a_value_that_does_not_fit_is_sent_as_the_nearest_one(tmp_path: Path) -> None:
+    (tmp_path / "cells.dbc").write_text(SENSOR)
+    file = load(tmp_path / "cells.dbc")
+    force, heat = file.signal("Load.Force")[1], file.signal("Load.Heat")[1]
+    assert raw_of(force, 1e9) == 2**19 - 1
+    assert raw_of(force, -1e9) == -(2**19)
+    assert raw_of(heat, -100.0) == 0.0
+    assert raw_of(force, float("nan")) == 0.0
+    assert raw_of(file.signal("Load.Flags")[1], "OVERLOAD") == 1.0
+    with pytest.raises(ConfigError, match=r"has no value 'BROKEN'\. It has: FINE, OVERLOAD"):
+        raw_of(file.signal("Load.Flags")[1], "BROKEN")

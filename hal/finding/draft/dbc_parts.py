@@ -10,6 +10,7 @@ from cantools.database.can.signal import Signal
 
 from hal.calibration.units import CONVERSIONS, NAMED, ROBOT_UNITS
 from hal.finding.draft.parts import STALE_AFTER, Measure, Names, Part
+from hal.finding.scan import EXTENDED
 from hal.protocols.dbc import Dbc
 
 COMMAND = re.compile(r"cmd|command|request|set_?point|^set|_set_|target|demand|ctrl|control(?!.*stat)", re.IGNORECASE)
@@ -92,13 +93,14 @@ def parts_of(
         names: Names that were given.
         node: Node id of the first one.
         notes: Sentences on what was left out are appended.
-        rates: Identifier on a bus -> frames per second [Hz]; only messages that are there are used, with these rates.
+        rates: Identifier on a bus, as in `Scan.unknown` -> frames per second [Hz]; only messages that are there are
+            used, with these rates.
     """
     own: dict[str, list[Message]] = {}
     commands, without = [], []
     for message in file.messages:
         sender = next(iter(message.senders), "") or ""
-        if rates is not None and not rates.get(message.frame_id, 0.0):
+        if rates is not None and not rates.get(_key(message), 0.0):
             continue
         if HOST.search(sender) or COMMAND.search(message.name):
             commands.append(message.name)
@@ -168,8 +170,13 @@ def _signals(messages: list[Message]) -> Iterator[tuple[Message, Signal]]:
 def _period(message: Message, rates: Mapping[int, float] | None) -> float:
     """Return the period of a message [s]: measured on a bus, or stated by the file."""
     if rates is not None:
-        return float(f"{1.0 / rates[message.frame_id]:.2g}")
+        return float(f"{1.0 / rates[_key(message)]:.2g}")
     return message.cycle_time / 1000.0 if message.cycle_time else PERIOD
+
+
+def _key(message: Message) -> int:
+    """Return the identifier of a message as a scan has it."""
+    return message.frame_id | (EXTENDED if message.is_extended_frame else 0)
 
 
 def _listed(names: list[str]) -> str:

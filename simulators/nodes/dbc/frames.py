@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+import cantools
 from cantools.database import Message
 from cantools.database.can.signal import Signal
 
@@ -75,13 +76,28 @@ class Output:
         """Set a signal [unit of the DBC file]."""
         self.raws[name] = raw_of(self.signal(name), value)
 
+    def _known_pages(self) -> list[int]:
+        return sorted({page for signal in self.definition.signals for page in signal.multiplexer_ids or ()})[:1] or [0]
+
+    def check(self) -> None:
+        """Refuse a message that cannot be sent.
+
+        Raises:
+            ConfigError: cantools cannot encode it, as some with pages within pages.
+        """
+        try:
+            self.encode()
+        except (cantools.Error, KeyError) as error:
+            raise ConfigError(f"Message '{self.definition.name}' cannot be simulated: {error}.") from None
+
     def encode(self) -> bytes:
         """Return the data of the next frame; a multiplexed message sends its pages in turn."""
         values = dict(self.raws)
         if self.definition.is_multiplexed():
             for signal in self.definition.signals:
-                if signal.is_multiplexer and signal.multiplexer_ids is None and self.pages:
-                    values[signal.name] = self.pages[self.turn % len(self.pages)]
+                if signal.is_multiplexer and signal.multiplexer_ids is None:
+                    pages = self.pages or self._known_pages()
+                    values[signal.name] = pages[self.turn % len(pages)]
             self.turn += 1
         whole = {
             signal.name: values[signal.name] if signal.is_float else int(values[signal.name])
@@ -145,10 +161,13 @@ def _is_same(one: float | None, other: float) -> bool:
 
 
 def decoded(message: Message, data: bytes) -> Mapping[str, float] | None:
-    """Return signal -> raw value of a frame; None if it is too short for the message."""
+    """Return signal -> raw value of a frame; None if the message cannot be such a frame."""
     if len(data) < message.length:
         return None
     if not message.signals:
         return {}
-    values: Any = message.decode(data, decode_choices=False, scaling=False)
+    try:
+        values: Any = message.decode(data, decode_choices=False, scaling=False)
+    except cantools.Error:
+        return None  # such as a page of a multiplexed message that the file does not have
     return {name: float(value) for name, value in values.items()}

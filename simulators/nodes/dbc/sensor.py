@@ -61,6 +61,8 @@ class DbcNode(SimulatedNode):
         self._tare = 0.0
         self._due: dict[str, float] = {}
         self._prepare()
+        for output in self._outputs.values():
+            output.check()
 
     def _prepare(self) -> None:
         settings = self._settings
