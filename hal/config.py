@@ -2,6 +2,7 @@
 
 import difflib
 import re
+import sys
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
@@ -360,8 +361,11 @@ def load_robot(path: str | Path) -> RobotConfig:
         raise ConfigError(f"Robot file '{path}' is not YAML: {_yaml_problem(error)}.") from None
     if not isinstance(raw, dict):
         raise ConfigError(f"Robot file '{path}' is empty or not a mapping. Compare it with robots/*.yaml.")
+    folder = path.resolve().parent
+    if str(folder) not in sys.path:
+        sys.path.append(str(folder))  # simulators, drivers and motions of a user are modules beside the robot file
     try:
-        return RobotConfig.model_validate({**raw, "folder": path.resolve().parent})
+        return RobotConfig.model_validate({**raw, "folder": folder})
     except ValidationError as error:
         raise ConfigError(f"Robot file '{path}': {explain(error, RobotConfig)}") from None
 
