@@ -15,6 +15,7 @@ from hal.errors import ConfigError
 from hal.finding.draft.draft import Draft, draft_bus, draft_folder
 from hal.finding.scan import scan
 from hal.finding.tap import Tap
+from services.model.model_config import collect_config
 from simulators.robots.bench import simulator
 
 SHIPPED = Path(__file__).parents[2] / "robots"
@@ -62,6 +63,7 @@ def test_a_folder_becomes_devices_with_what_the_files_state(folder: Path, tmp_pa
     assert "# set: counts_per_turn, gear" in draft.text or "# set: gear" in draft.text
     assert "# set: period of Load, Pages" in draft.text
     assert not draft.copies
+    assert collect_config(robot).samples == 2000
 
 
 @pytest.mark.long

@@ -32,6 +32,8 @@ kinds:
 devices:
 {devices}
 simulator: simulators.robots.bench:simulator  # the bench: every device answers, nothing is behind it
+
+collect: {{samples: 2000, rate: 10}}  # random postures within the limits
 """
 
 
