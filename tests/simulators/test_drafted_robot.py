@@ -145,5 +145,7 @@ def test_a_silent_bus_is_refused(tmp_path: Path) -> None:
     config = BusConfig(interface="virtual", channel="nothing_here")
     with can.Bus(interface="virtual", channel="nothing_here"), Tap("can0", config) as tap:
         result = scan(tap, listen=0.05, ask=False)
-    with pytest.raises(ConfigError, match=r"No node on can0 has a driver \(0 nodes, 0 other identifiers\)\. Are they"):
+    with pytest.raises(
+        ConfigError, match=r"No node on can0 has a driver \(0 nodes, 0 other identifiers\)\. Are they.*Only listened"
+    ):
         draft_bus(result, "", 1_000_000, None, "none", tmp_path, SHIPPED)

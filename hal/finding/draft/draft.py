@@ -147,6 +147,8 @@ def draft_bus(
     files = files_in(source) if source else []
     known = list(_sheets(files, work.notes))
     work.has_encoders = any(node.profile == 406 for node in result.nodes)
+    if result.silence:
+        work.notes.append(result.silence)
     for node in result.nodes:
         _add_node(work, node, known)
     for path in files:
