@@ -5,6 +5,7 @@ MuJoCo reads the file, so includes, defaults, meshes and attached models are as 
 
 from __future__ import annotations
 
+import warnings
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -75,8 +76,11 @@ def convert(path: Path) -> Converted:
     import mujoco
 
     try:
-        spec = mujoco.MjSpec.from_file(str(path))
-        model = spec.compile()
+        with warnings.catch_warnings(
+            action="ignore"
+        ):  # of attributes that MuJoCo will drop, which are not ours to change
+            spec = mujoco.MjSpec.from_file(str(path))
+            model = spec.compile()
     except (ValueError, RuntimeError, mujoco.FatalError) as error:
         reason = " ".join(str(error).split()).rstrip(".")
         raise ConfigError(f"MuJoCo cannot read '{path}': {reason}. Are its meshes and includes beside it?") from None
