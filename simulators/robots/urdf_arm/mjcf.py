@@ -76,9 +76,7 @@ def convert(path: Path) -> Converted:
     import mujoco
 
     try:
-        with warnings.catch_warnings(
-            action="ignore"
-        ):  # of attributes that MuJoCo will drop, which are not ours to change
+        with warnings.catch_warnings(action="ignore"):  # MuJoCo warns of attributes that a later version will not have
             spec = mujoco.MjSpec.from_file(str(path))
             model = spec.compile()
     except (ValueError, RuntimeError, mujoco.FatalError) as error:
