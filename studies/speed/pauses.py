@@ -19,12 +19,10 @@ import msgpack
 import numpy as np
 import zenoh
 
-from hal.config import load_robot
-from services.process.supervisor import Supervisor, gemuco_command
+from services.process.supervisor import Supervisor
 from services.wire import keys
-from studies.stack import light_model, light_robot
 from studies.stack.processes import cpu
-from studies.stack.soak import RATE, _client, free_port, start
+from studies.stack.soak.robot import Robot, client_of
 
 LONGEST = 60.0
 """A pause that is longer than this [s] ends the study."""
@@ -45,21 +43,17 @@ class Newest:
 
 def run(times: int, folder: Path) -> list[float]:
     """Print a line per kill, and return the pauses [s]."""
-    file, model = light_robot.write(folder, f"pauses_{os.getpid()}", RATE, True), folder / "model"
-    light_model.make(file, model)
-    robot, router = load_robot(file).robot, f"tcp/127.0.0.1:{free_port()}"
-    command = gemuco_command("serve", str(file), "--model", str(model), "--connect", router)
     newest, chance, pauses = Newest(), random.Random(1), []
     with Supervisor(folder) as supervisor:
-        supervisor.start("router", gemuco_command("router", "--listen", router))
-        with _client(robot, router) as client:
-            start(supervisor, client, file, model, router, folder)
-            subscriber = client.session.declare_subscriber(keys.estimate(robot), newest.take)
+        robot = Robot(supervisor, f"pauses_{os.getpid()}", folder / "model")
+        robot.start_router()
+        with client_of(robot.name, robot.router) as client:
+            robot.start(client)
+            subscriber = client.session.declare_subscriber(keys.estimate(robot.name), newest.take)
             for _ in range(times):
                 time.sleep(chance.uniform(0.5, 1.5))
-                supervisor.kill("model")
                 killed = time.monotonic()
-                supervisor.start("model", command)
+                robot.kill("model")
                 while newest.at < killed + 0.05:
                     if time.monotonic() - killed > LONGEST:
                         raise TimeoutError(f"No estimate within {LONGEST:g} s.")
