@@ -19,6 +19,7 @@ import pytest
 import yaml
 
 from hal.config import RobotConfig, load_robot
+from hal.errors import CommandRefused
 from hal.robot import open_robot
 
 ROOT = Path(__file__).parents[2]
@@ -184,8 +185,17 @@ class Master:
         self.until(lambda: self.sample is not None and all(v.all() for v in self.sample.valid.values()), what)
 
     def enable(self) -> None:
+        """Enable, and again if this machine stood still for longer than a cycle may take: that is a fault, rightly."""
+
+        def is_enabled() -> bool:
+            if self.robot.mode == "fault" and "The cycle did not turn" in self.robot.fault_text:
+                with contextlib.suppress(CommandRefused):  # a drive has power still, or is not ready yet
+                    self.robot.reset()
+                    self.robot.enable()
+            return self.robot.mode == "hold"
+
         self.robot.enable()
-        self.until(lambda: self.robot.mode == "hold", "enabled")
+        self.until(is_enabled, "enabled")
 
     def bus(self, name: str) -> dict:
         return self.robot.health()["buses"][name]

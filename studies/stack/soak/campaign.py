@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import msgpack
 import numpy as np
 
 from hal.errors import HalError
@@ -23,7 +22,7 @@ from studies.stack.arrivals import Arrivals
 from studies.stack.driving import Mover
 from studies.stack.processes import BareLoops, look
 from studies.stack.soak.faults import PATIENCE, Faults, Program, own_disk
-from studies.stack.soak.referee import Referee
+from studies.stack.soak.referee import Referee, unpacked
 from studies.stack.soak.robot import Robot, client_of
 
 BROKEN_AT, MENDED_AT, MINUTE = 10.0, 40.0, 60.0
@@ -55,7 +54,7 @@ def run(minutes: int, out: Path, only: Sequence[str] = ()) -> dict[str, Any]:
 def _run(robot: Robot, client: Client, minutes: int, out: Path, only: Sequence[str], is_disk: bool) -> dict[str, Any]:
     arrivals = Arrivals(GAP)
     subscriber = client.session.declare_subscriber(
-        keys.estimate(robot.name), lambda sample: arrivals.add(msgpack.unpackb(sample.payload.to_bytes()))
+        keys.estimate(robot.name), unpacked("estimates", arrivals.add, lambda message: None)
     )
     priorities = {"hal": CYCLE_PRIORITY, **PRIORITIES}
     rates = {name: rate for name, rate in robot.config.rates.model_dump().items() if name in priorities}
@@ -77,6 +76,7 @@ def _run(robot: Robot, client: Client, minutes: int, out: Path, only: Sequence[s
         for number in range(minutes):
             name = plan[number % len(plan)]
             row = _minute(faults, name, referee, arrivals, begun + MINUTE * number)
+            faults.insist(lambda: client.adapt(True))  # a model that was killed learns only after a request
             robot.tidy()
             pids = {**robot.pids(), "client": os.getpid(), "bare": bare.pid, "ten clients": watchers.process.pid}
             result["rows"].append(

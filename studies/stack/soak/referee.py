@@ -30,6 +30,9 @@ KEPT = 400
 """Number of cycles whose stamps are kept, and of truths."""
 
 
+Hear = Callable[[dict[str, Any]], None]
+
+
 class Referee:
     """Judge of all estimates of one robot.
 
@@ -47,6 +50,7 @@ class Referee:
         longest: Fault -> longest time [s] in which a wrong value was called measured.
         pauses: Fault -> longest pause [s] between two estimates, restarts of the model included.
         estimated: Number of estimated elements, and of those within 1.645 published std of the truth.
+        others: Messages of another type on the keys that it reads; at most `KEPT`.
     """
 
     def __init__(self, session: zenoh.Session, robot: str, promised: Mapping[str, np.ndarray]) -> None:
@@ -56,6 +60,7 @@ class Referee:
         self.longest: dict[str, float] = {}
         self.pauses: dict[str, float] = {}
         self.estimated = [0, 0]
+        self.others: deque[dict[str, Any]] = deque(maxlen=KEPT)
         self._promised, self._lock = promised, threading.Lock()
         self._stamps: OrderedDict[tuple[int, int], int] = OrderedDict()
         self._heard: dict[int, int] = {}
@@ -63,11 +68,14 @@ class Referee:
         self._waiting: deque[tuple[float, dict[str, Any], str]] = deque()
         self._streaks: dict[str, dict[str, Any]] = {}
         self._newest = 0.0
-        listeners: dict[str, Callable[[dict[str, Any]], None]] = {
-            keys.sample(robot): self._hear_sample, keys.truth(robot): self._hear_truth,
-            keys.estimate(robot): self._hear_estimate,
-        }  # fmt: skip
-        self._subscribers = [session.declare_subscriber(key, _unpacked(act)) for key, act in listeners.items()]
+        listeners: list[tuple[str, str, Hear]] = [
+            (keys.sample(robot), "sample", self._hear_sample),
+            (keys.truth(robot), "sample", self._hear_truth),
+            (keys.estimate(robot), "estimates", self._hear_estimate),
+        ]
+        self._subscribers = [
+            session.declare_subscriber(key, unpacked(kind, act, self._hear_other)) for key, kind, act in listeners
+        ]
 
     def close(self) -> None:
         """Stop listening."""
@@ -81,8 +89,12 @@ class Referee:
             return {
                 "judged": self.judged, "unjudged": self.unjudged, "baseless": self.baseless,
                 "wrong": [*self.wrong, *going_on], "longest": dict(self.longest), "pauses": dict(self.pauses),
-                "estimated": list(self.estimated),
+                "estimated": list(self.estimated), "others": list(self.others),
             }  # fmt: skip
+
+    def _hear_other(self, message: dict[str, Any]) -> None:
+        with self._lock:
+            self.others.append(message | {"fault": self.fault})
 
     def _hear_sample(self, message: dict[str, Any]) -> None:
         with self._lock:
@@ -167,9 +179,20 @@ class Referee:
             self.longest[name] = max(self.longest.get(name, 0.0), _lasted(streak))
 
 
-def _unpacked(act: Callable[[dict[str, Any]], None]) -> Callable[[zenoh.Sample], None]:
-    """Return a listener that reads a message as plain msgpack."""
-    return lambda sample: act(msgpack.unpackb(sample.payload.to_bytes()))
+def unpacked(kind: str, act: Hear, other: Hear) -> Callable[[zenoh.Sample], None]:
+    """Return a listener that reads messages as plain msgpack, and gives those of another type to `other`."""
+
+    def hear(sample: zenoh.Sample) -> None:
+        try:
+            message = msgpack.unpackb(sample.payload.to_bytes())
+        except ValueError:
+            message = "unreadable"
+        if isinstance(message, dict) and message.get("type") == kind:
+            act(message)
+        else:
+            other({"key": str(sample.key_expr), "message": repr(message)[:300]})
+
+    return hear
 
 
 def _lasted(streak: Mapping[str, Any]) -> float:

@@ -5,10 +5,12 @@ import os
 import socket
 import time
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 
 from hal.config import RobotConfig, load_robot
 from services.client import Client
+from services.errors import ServiceError
 from services.process.supervisor import Supervisor, gemuco_command
 from studies.stack import light_model, light_robot
 
@@ -98,17 +100,23 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def client_of(robot: str, router: str) -> Client:
-    """Return a client of a router that may still be starting.
+@contextlib.contextmanager
+def client_of(robot: str, router: str) -> Iterator[Client]:
+    """Connect a client to a router that may still be starting.
 
     Raises:
-        TimeoutError: There is no router within `READY_WITHIN`.
+        ServiceError: There is no router within `READY_WITHIN`.
     """
+    with contextlib.ExitStack() as stack:
+        yield _connected(stack, robot, router)
+
+
+def _connected(stack: contextlib.ExitStack, robot: str, router: str) -> Client:
     deadline = time.monotonic() + READY_WITHIN
     while True:
-        address = ("127.0.0.1", int(router.rpartition(":")[2]))
-        with contextlib.suppress(OSError), socket.create_connection(address, 1.0):
-            return Client(robot, (router,), name=f"soak {os.getpid()}")
-        if time.monotonic() > deadline:
-            raise TimeoutError(f"No router at {router} within {READY_WITHIN:g} s.")
-        time.sleep(0.1)
+        try:
+            return stack.enter_context(Client(robot, (router,), name=f"soak {os.getpid()}"))
+        except ServiceError:  # not there, or too busy for an answer
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(0.1)

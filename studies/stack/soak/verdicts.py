@@ -47,6 +47,7 @@ def _judge_measured(result: dict[str, Any], console: Console) -> bool:
     count, within = referee["estimated"]
     console.print(f"compared with the truth: {referee['judged']} estimates; not: {referee['unjudged']}")
     console.print(f"measured without a sample: {referee['baseless']} estimates")
+    console.print(f"messages of another type on the keys of samples, truth and estimates: {referee['others']}")
     console.print(f"promised std: {result['promised']}")
     console.print(f"estimated elements within 1.645 of their std: {100 * within / max(count, 1):.1f} % of {count}")
     for wrong in referee["wrong"]:
