@@ -24,10 +24,25 @@ FLOOD_SECONDS = 6.0
 LEFT_FREE = 1 << 20
 """A full disk has this many bytes left."""
 NODES = {JOINT: "encoder", LOAD: "cell", MOTOR: "drive"}
-LIES = ("sensor_offset", "sensor_frozen", "sensor_flipped", "sensor_drift", "sensor_gain", "sensor_noisy")
-SIZES = {"sensor_offset": (4.0, 6.0, 20.0), "sensor_drift": (1.0, 4.0, 16.0), "sensor_noisy": (6.0, 12.0, 30.0)}
+LIES = (
+    "sensor_offset",
+    "sensor_frozen",
+    "sensor_flipped",
+    "sensor_drift",
+    "sensor_gain",
+    "sensor_noisy",
+    "sensor_stuck",
+    "sensor_delayed",
+)
+SIZES = {
+    "sensor_offset": (4.0, 6.0, 20.0),
+    "sensor_drift": (1.0, 4.0, 16.0),
+    "sensor_noisy": (6.0, 12.0, 30.0),
+    "sensor_stuck": (0.3, 0.3, 0.3),
+}
 """Sizes of lies [promised std; a drift: per second], for the signals in order."""
-GAINS = (0.4, 0.8, 1.5)
+FACTORS = {"sensor_gain": (0.4, 0.8, 1.5), "sensor_delayed": (0.2, 0.3, 0.5)}
+"""Factors and delays [s], for the signals in order."""
 KILLED = ("model", "hal", "simulator", "recorder", "router")
 
 Fault = Callable[[], contextlib.AbstractContextManager[dict[str, Any]]]
@@ -99,8 +114,8 @@ class Faults:
         words = [kind, node]
         if kind in SIZES:
             words.append(f"{SIZES[kind][number % len(NODES)] * self._promised[signal_name][joint]:.4g}")
-        elif kind == "sensor_gain":
-            words.append(str(GAINS[number % len(NODES)]))
+        elif kind in FACTORS:
+            words.append(str(FACTORS[kind][number % len(NODES)]))
 
         @contextlib.contextmanager
         def lying() -> Iterator[dict[str, Any]]:
