@@ -352,7 +352,7 @@ def load_robot(path: str | Path) -> RobotConfig:
     path = Path(path)
     _check_kind(path)
     try:
-        raw = yaml.safe_load(path.read_text())
+        raw = parse_yaml(path.read_text())
     except FileNotFoundError:
         raise ConfigError(f"There is no robot file '{path}'. {_beside(path)}") from None
     except (OSError, UnicodeDecodeError) as error:
@@ -392,6 +392,20 @@ def _yaml_problem(error: yaml.YAMLError) -> str:
         return " ".join(str(error).split()).rstrip(".")
     hint = "; indent with spaces, not tabs" if "\\t" in problem else ""
     return f"line {mark.line + 1}, column {mark.column + 1}: {problem}{hint}"
+
+
+def parse_yaml(text: str, loader: type[yaml.SafeLoader] = yaml.SafeLoader) -> Any:
+    """Return the content of a YAML text.
+
+    Raises:
+        yaml.YAMLError: It is not YAML, is nested too deeply, or has a date or number that does not exist.
+    """
+    try:
+        return yaml.load(text, loader)
+    except RecursionError:
+        raise yaml.YAMLError("It is nested too deeply.") from None
+    except (ValueError, OverflowError) as error:  # such as 2025-13-01, or a number of 5000 digits
+        raise yaml.YAMLError(f"A value cannot be read: {error}.") from None
 
 
 def _beside(path: Path) -> str:

@@ -40,7 +40,7 @@ def load_object(name: str, what: str = "function", needs: Sequence[str] = ("__ca
         raise ConfigError(f"'{name}' is a part of Python and not a {what} of a robot. Name one of your own modules.")
     try:
         module = importlib.import_module(module_name)
-    except ImportError as error:
+    except (ImportError, TypeError, ValueError) as error:  # a relative name is a TypeError
         raise ConfigError(
             f"'{name}' cannot be loaded: {error}. Is its package installed, or the module beside the robot file?"
         ) from error
