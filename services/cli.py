@@ -279,7 +279,10 @@ def top(
 def demo(
     robot: RobotFile = "musashi_arm",
     seed: Annotated[int, typer.Option(help="Seed of the simulated actual robot.")] = 1,
-    out: Annotated[Path, typer.Option(help="Folder for plot, recording and logs.")] = Path("runs/demo"),
+    out: Annotated[Path, typer.Option(help="Folder for report, plot, recording and logs.")] = Path("runs/demo"),
+    view: Annotated[
+        bool, typer.Option("--view", help="Serve the page in the browser meanwhile; its link is printed first.")
+    ] = False,
 ) -> int:
     """Play one minute with a simulated arm: it loses a sensor, learns its own body, and loses a muscle.
 
@@ -289,7 +292,7 @@ def demo(
     """
     from services.demo.demo import play
 
-    return play(load(robot), robot_path(robot), seed, out)
+    return play(load(robot), robot_path(robot), seed, out, view)
 
 
 @app.command()

@@ -46,6 +46,8 @@ class Actor:
         self._client, self._idle, self._report = client, idle, report
         self.stops = 0
         """Number of times that the HAL stopped the robot by itself."""
+        self.played: list[Stage] = []
+        """Stages played so far."""
 
     def engage(self) -> None:
         """Engage the controller, after a reset if there is a fault; try again after a refusal.
@@ -101,6 +103,7 @@ class Actor:
     def play(self, stage: Callable[[], Stage]) -> Stage:
         """Play one stage and report its measured values."""
         played = stage()
+        self.played.append(played)
         for figure in played.figures:
             self._report(f"    {figure}")
         if not played.observed:

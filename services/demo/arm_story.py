@@ -28,6 +28,7 @@ NEAR = 0.1
 """A lost joint is estimated if its mean error is smaller than this [rad]."""
 SHARE = 0.03
 """The tip is estimated if its mean error is smaller than this share of the reach."""
+NAMES = ("moves to postures", "loses an encoder", "loses its sight")
 
 
 @dataclass(slots=True)
@@ -104,7 +105,7 @@ class ArmStory:
             f"the joint that moved most moved by {span:.2f} rad",
             self._learn_normal(),
         )
-        return Stage("moves to postures", start, self._joints.now(), figures, miss < FOLLOWS and span > 0.2)
+        return Stage(NAMES[0], start, self._joints.now(), figures, miss < FOLLOWS and span > 0.2)
 
     def lose_encoder(self) -> Stage:
         """Play (b): an encoder falls silent and comes back; the arm goes on with an estimate."""
@@ -129,7 +130,7 @@ class ArmStory:
             f"true error of {marks.element} meanwhile: mean {mean:.4f} rad, worst {np.nanmax(error):.4f} rad",
             "measured again when the node came back" if returned else "not measured again after the node came back",
         )
-        return Stage("loses an encoder", start, self._joints.now(), figures, noticed and returned and mean < NEAR)
+        return Stage(NAMES[1], start, self._joints.now(), figures, noticed and returned and mean < NEAR)
 
     def lose_sight(self) -> Stage:
         """Play (c): the camera is covered and uncovered; the tip is estimated and marked as estimated."""
@@ -155,9 +156,7 @@ class ArmStory:
             "every value published meanwhile is marked" if marked else "NOT every value published meanwhile is marked",
             "measured again when the camera was uncovered" if returned else "not measured again when it was uncovered",
         )
-        return Stage(
-            "loses its sight", start, self._tip.now(), figures, noticed and returned and marked and share < SHARE
-        )
+        return Stage(NAMES[2], start, self._tip.now(), figures, noticed and returned and marked and share < SHARE)
 
     def _go(self) -> None:
         """Go to the next posture, and rest there."""

@@ -1,22 +1,25 @@
 """`gemuco demo`: make a model, start all processes, play a story of one minute, and end every process."""
 
+import contextlib
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 from rich.console import Console
-from rich.table import Table
 
 from gemuco.warm import warm
 from hal.config import RobotConfig, load_robot
 from hal.errors import ConfigError
 from services.client import Client
-from services.demo import arm_story, pace
-from services.demo.actor import Actor, Stage
+from services.demo import arm_story, pace, report, story, tool_story
+from services.demo.actor import Actor
 from services.demo.arm_story import ArmStory
+from services.demo.live_view import Play, Screen, waiting
 from services.demo.pace import CycleCounts
+from services.demo.page import playing_along
+from services.demo.report import CLIENT, Ending
 from services.demo.story import MUSCLE, Story
 from services.demo.timeline import Timeline
 from services.demo.tool_story import ToolStory
@@ -33,39 +36,44 @@ from services.show import progress
 
 READY_WITHIN = 180.0
 """A process must be ready within this time [s], also on a busy machine."""
-CLIENT = "remote client"
-LEAST_LINES = 20
-"""The remote client must have printed this many estimates to count as observed."""
 
 
-def play(robot: RobotConfig, path: Path, seed: int, out: Path) -> int:
+def play(robot: RobotConfig, path: Path, seed: int, out: Path, with_page: bool = False) -> int:
     """Make a missing model, run the processes and play the story; return 0 if all events were observed.
 
     Args:
         robot: Content of the robot file.
         path: The robot file.
         seed: Seed of the simulated actual robot.
-        out: Folder for plot, recording and logs.
+        out: Folder for report, plot, recording and logs.
+        with_page: Serve the page in the browser meanwhile; its link is printed first.
     """
     console = Console()
-    started = time.monotonic()
+    started, picture = time.monotonic(), out / "story.png"
     target = control_of(robot).target
-    check_start(robot)
-    make_model(robot, console)
-    with progress("compiling") as report:  # otherwise each process would wait for it
-        warm(report)
-    with Supervisor(out, at_checks=True) as supervisor:
-        with running(robot, path, seed, target, out, supervisor, console) as cast:
-            stages = perform(cast.robot, cast.client, target, seed, cast.actor, out / "story.png", console)
-        supervisor.stop("client", "recorder")
-        cast.remote.print_new()
-    ok = summary(stages, cast.actor.stops, cast.remote, out, console)
-    if cast.robot.rates != robot.rates:
-        console.print(
-            f"Played at {cast.robot.rates.hal:g} Hz, because this machine did not keep {robot.rates.hal:g} Hz."
-        )
+    check_start(robot, with_page)
+    with contextlib.ExitStack() as stack:
+        link = ""
+        if with_page:
+            link = stack.enter_context(playing_along(path, out))
+            console.print(f"Page: {link}  It shows the robot as soon as its processes run.", soft_wrap=True)
+        make_model(robot, console)
+        with progress("compiling") as show:  # otherwise each process would wait for it
+            warm(show)
+        with Supervisor(out, at_checks=True) as supervisor:
+            with running(robot, path, seed, target, out, supervisor, console) as cast:
+                perform(cast, seed, picture, list(supervisor.children), link)
+            supervisor.stop("client", "recorder")
+            cast.remote.print_new()
+    actor, remote = cast.actor, cast.remote
+    rates = cast.robot.rates.hal, robot.rates.hal
+    ending = Ending(robot.robot, actor.played, actor.stops, remote.lines, remote.estimated, *rates)
+    report.show(ending, out, console)
+    report.write(ending, path, seed, picture)
+    if ending.rate != ending.wanted:
+        console.print(f"Played at {ending.rate:g} Hz, because this machine did not keep {ending.wanted:g} Hz.")
     console.print(f"{time.monotonic() - started:.0f} s in all.")
-    return 0 if ok else 1
+    return 0 if ending.is_observed else 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,12 +85,14 @@ class Cast:
         client: Client of the robot.
         actor: Program that moves the robot.
         remote: Output of a client in a process of its own.
+        screen: Output of the story.
     """
 
     robot: RobotConfig
     client: Client
     actor: Actor
     remote: "RemoteClient"
+    screen: Screen
 
 
 @contextmanager
@@ -95,19 +105,22 @@ def running(
         recording = out / "story.mcap"
         recording.unlink(missing_ok=True)
         with pace.at_rates(path, robot, rates) as file, Client(robot.robot) as client:
+            screen = Screen(console)
             remote = RemoteClient(f"{target} [{robot.signals[target].unit}]", out / "client.log", console)
             start(robot, file, seed, target, recording, supervisor, client, console)
 
-            def idle(remote: RemoteClient = remote) -> None:
+            def idle(remote: RemoteClient = remote, screen: Screen = screen) -> None:
                 supervisor.check()
                 remote.print_new()
+                screen.turn()
 
-            actor = Actor(client, idle, console.print)
-            counts = pace.count_cycles(client, actor.wait)
+            actor = Actor(client, idle, screen.report)
+            with waiting(console, f"counting whether this machine keeps {rates.hal:g} Hz"):
+                counts = pace.count_cycles(client, actor.wait)
             if not counts.is_kept:
                 console.print(too_slow(counts, halvings_left))
             if counts.is_kept or not halvings_left:
-                yield Cast(load_robot(file), client, actor, remote)
+                yield Cast(load_robot(file), client, actor, remote, screen)
                 return
             supervisor.stop_all()
         rates = pace.halved(rates)
@@ -148,60 +161,70 @@ def has_tools(robot: RobotConfig) -> bool:
     return bool(robot.conditions and robot.seen)
 
 
-def perform(
-    robot: RobotConfig, client: Client, target: str, seed: int, actor: Actor, picture: Path, console: Console
-) -> list[Stage]:
-    """Play and draw the story that fits the robot: tools, or a sensor and a muscle."""
+def stage_names(robot: RobotConfig, control: ControlConfig) -> tuple[str, ...]:
+    """Return the names of the stages of the story that fits the robot."""
+    if has_tools(robot):
+        return tool_story.NAMES
+    return arm_story.NAMES if arm_story.fits(robot, control) else story.NAMES
+
+
+def perform(cast: Cast, seed: int, picture: Path, services: Collection[str], link: str) -> None:
+    """Play and draw the story that fits the robot: tools, or a sensor and a muscle; `link` is that of the page."""
+    robot, control = cast.robot, control_of(cast.robot)
+    remote = cast.remote
+
+    def footer() -> list[str]:
+        counts = f"{CLIENT}: {remote.lines} estimates, {remote.estimated} of them not measured"
+        return [counts, f"page: {link}"] if link else [counts]
+
+    play = Play(stage_names(robot, control), cast.actor.played, (control.target, *robot.seen), footer)
+    with cast.screen.live(robot, cast.client, play, services):
+        draw = _play_story(cast, control, seed, picture)
+    draw()
+
+
+def _play_story(cast: Cast, control: ControlConfig, seed: int, picture: Path) -> Callable[[], None]:
+    """Play; return a function that draws the picture."""
+    robot, client, actor, report, target = cast.robot, cast.client, cast.actor, cast.screen.report, control.target
     sizes = robot.signals[target].size, robot.signals[robot.command.signal].size
     if has_tools(robot):
         from services.demo import tool_plot
 
         schema = load_model(robot, artifacts.model_folder(robot.robot))
         with Timeline(client, target, *sizes, robot.seen) as timeline:
-            tool_marks = ToolStory(robot, client, timeline, seed, actor, console.print, schema).play()
-        tool_plot.plot(robot, target, schema, timeline, tool_marks, picture)
-        return tool_marks.stages
-    control = model_config(robot).control
-    if control is not None and arm_story.fits(robot, control):
-        return _play_arm(robot, client, control, seed, actor, picture, console)
+            tool_marks = ToolStory(robot, client, timeline, seed, actor, report, schema).play()
+        return lambda: tool_plot.plot(robot, target, schema, timeline, tool_marks, picture)
+    if arm_story.fits(robot, control):
+        from services.demo import arm_plot
+
+        (seen,) = robot.seen
+        with (
+            Timeline(client, target, *sizes, [target]) as joints,
+            Timeline(client, seen, robot.signals[seen].size, sizes[1], [seen]) as tip,
+        ):
+            arm_marks = ArmStory(robot, client, joints, tip, control, seed, actor, report).play()
+        return lambda: arm_plot.plot(robot, target, joints, tip, arm_marks, picture)
     from services.demo import story_plot
 
     with Timeline(client, target, *sizes, [target]) as timeline:
-        marks = Story(robot, client, timeline, seed, actor, console.print).play()
-    story_plot.plot(robot, timeline, marks, picture)
-    return marks.stages
+        marks = Story(robot, client, timeline, seed, actor, report).play()
+    return lambda: story_plot.plot(robot, timeline, marks, picture)
 
 
-def check_start(robot: RobotConfig) -> None:
+def check_start(robot: RobotConfig, with_page: bool = False) -> None:
     """Check, before work that takes minutes, that nothing is missing and no service of this robot runs here.
 
     Raises:
-        MissingExtra: A package for simulation or training is not installed.
+        MissingExtra: A package for simulation, training or the page is not installed.
         AlreadyRunning: A service of a robot with this name runs on this machine.
     """
-    require("torch", "matplotlib", engine_of(robot.physics))
+    require("torch", "matplotlib", engine_of(robot.physics), *(("viser", "yourdfpy") if with_page else ()))
     running = [service for name, service in services_here() if name == robot.robot]
     if running:
         raise AlreadyRunning(
             f"Services of a robot '{robot.robot}' run on this machine: {', '.join(running)}. The demo starts its own; "
             "stop them first, or give the robot in the file another name."
         )
-
-
-def _play_arm(
-    robot: RobotConfig, client: Client, control: ControlConfig, seed: int, actor: Actor, picture: Path, console: Console
-) -> list[Stage]:
-    from services.demo import arm_plot
-
-    (seen,) = robot.seen
-    commands = robot.signals[robot.command.signal].size
-    with (
-        Timeline(client, control.target, robot.signals[control.target].size, commands, [control.target]) as joints,
-        Timeline(client, seen, robot.signals[seen].size, commands, [seen]) as tip,
-    ):
-        marks = ArmStory(robot, client, joints, tip, control, seed, actor, console.print).play()
-    arm_plot.plot(robot, control.target, joints, tip, marks, picture)
-    return marks.stages
 
 
 def make_model(robot: RobotConfig, console: Console) -> None:
@@ -211,11 +234,11 @@ def make_model(robot: RobotConfig, console: Console) -> None:
         console.print(f"Using the model in {folder}.")
         return
     console.print("No model yet: the body schema is learned from random motion of the designer's model.")
-    with progress("collecting") as report:
-        collection = collector.collect_direct(robot, None, 0, progress=report)
+    with progress("collecting") as show:
+        collection = collector.collect_direct(robot, None, 0, progress=show)
     console.print(f"{len(collection.dataset)} samples, {collection.speed:.0f} times faster than real time.")
-    with progress("training") as report:
-        result = trainer.train(robot, collection.dataset, 0, report)
+    with progress("training") as show:
+        result = trainer.train(robot, collection.dataset, 0, show)
     trainer.show(result, console)
     trainer.save(result, folder)
 
@@ -244,8 +267,9 @@ def start(
         "recorder": ("record", str(path), str(recording)),
     }
     for name, command in commands.items():
-        supervisor.start(name, gemuco_command(*command))
-        supervisor.wait_ready(name, _is_running(client, name), READY_WITHIN)
+        with waiting(console, f"starting {name}"):
+            supervisor.start(name, gemuco_command(*command))
+            supervisor.wait_ready(name, _is_running(client, name), READY_WITHIN)
     supervisor.start("client", gemuco_command("query", robot.robot, "estimate", target, "--watch"))
     names = ", ".join(f"{child.name} {child.process.pid}" for child in supervisor.children.values())
     console.print(f"[bold]Processes:[/] {names}")
@@ -272,7 +296,7 @@ class RemoteClient:
         """Number of printed estimates that were not measured."""
 
     def print_new(self) -> None:
-        """Print the new complete lines."""
+        """Count the new complete lines, and print them unless the output is a terminal."""
         if not self._log.exists():
             return
         with self._log.open() as log:
@@ -283,26 +307,6 @@ class RemoteClient:
         for line in whole.splitlines():
             self.lines += self._sign in line
             self.estimated += "estimated from" in line
+            if self._console.is_terminal:  # the live view counts them
+                continue
             self._console.print(f"    {CLIENT}: {line}", style="dim", highlight=False, markup=False)
-
-
-def summary(stages: list[Stage], stops: int, remote: RemoteClient, out: Path, console: Console) -> bool:
-    """Print a table of the stages; return whether all events were observed."""
-    table = Table(title="What happened", title_justify="left", show_lines=True)
-    table.add_column("stage")
-    table.add_column("measured")
-    table.add_column("observed", justify="center")
-    for stage in stages:
-        table.add_row(stage.name, "\n".join(stage.figures), _yes(stage.observed))
-    is_observed = remote.lines >= LEAST_LINES and remote.estimated > 0
-    text = f"{remote.lines} estimates printed by a separate process, {remote.estimated} of them not measured"
-    table.add_row(CLIENT, text, _yes(is_observed))
-    console.print(table)
-    if stops:
-        console.print(f"The HAL stopped the arm {stops} times by itself, see above.")
-    console.print(f"Plot: {out / 'story.png'}   recording: {out / 'story.mcap'}   logs: {out}/*.log")
-    return is_observed and all(stage.observed for stage in stages)
-
-
-def _yes(observed: bool) -> str:
-    return "[green]yes[/]" if observed else "[red]no[/]"

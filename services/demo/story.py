@@ -42,6 +42,7 @@ TRUE_POSES = 6
 """A lying encoder is trusted again within this number of poses."""
 LEAKS_AFTER = 2.0
 """After this time [s] no wrong value may be passed on as measured."""
+NAMES = ("moves to targets", "loses an encoder", "learns its own body", "has encoders that lie", "loses a muscle")
 
 
 @dataclass(slots=True)
@@ -97,7 +98,7 @@ class Story:
         )
         truth = self._timeline.between("truth", start, self._timeline.now())
         span = float(np.nanmax(np.nanmax(truth, axis=0) - np.nanmin(truth, axis=0)))
-        return Stage("moves to targets", start, self._timeline.now(), figures, reached < 0.5 and span > 0.3)
+        return Stage(NAMES[0], start, self._timeline.now(), figures, reached < 0.5 and span > 0.3)
 
     def lose_sensor(self) -> Stage:
         """Play (b): an encoder falls silent; the arm continues with an estimate."""
@@ -123,7 +124,7 @@ class Story:
             f"true error of {SILENT_ELEMENT} while silent: mean {mean:.3f} rad, worst {worst:.3f} rad",
             "measured again when the node came back" if returned else "not measured again after the node came back",
         )
-        return Stage("loses an encoder", start, self._timeline.now(), figures, noticed and returned and mean < 0.5)
+        return Stage(NAMES[1], start, self._timeline.now(), figures, noticed and returned and mean < 0.5)
 
     def learn(self) -> Stage:
         """Play (c): the model learns online while the arm moves, and its error is measured at test poses."""
@@ -145,7 +146,7 @@ class Story:
             f"distance from the targets now {_mean_norm(misses):.3f} rad",
             f"statistics of normal errors learned anew from {normal} samples",
         )
-        return Stage("learns its own body", start, self._timeline.now(), figures, after < before)
+        return Stage(NAMES[2], start, self._timeline.now(), figures, after < before)
 
     def lie(self) -> Stage:
         """Play (d): an encoder is one radian off, then another one freezes; each is hidden until it is right again."""
@@ -157,7 +158,7 @@ class Story:
             figure, is_seen = self._lying(element, fault, words)
             figures.append(figure)
             observed &= is_seen
-        return Stage("has encoders that lie", start, self._timeline.now(), tuple(figures), observed)
+        return Stage(NAMES[3], start, self._timeline.now(), tuple(figures), observed)
 
     def _lying(self, element: str, fault: str, words: str) -> tuple[str, bool]:
         """Let an encoder lie and be right again; return a sentence, and whether it was hidden and trusted again."""
@@ -225,7 +226,7 @@ class Story:
         )
         right = self.marks.blamed == MUSCLE
         self._client.disengage()
-        return Stage("loses a muscle", start, end, figures, alarmed and right and not calm.any())
+        return Stage(NAMES[4], start, end, figures, alarmed and right and not calm.any())
 
     def _gather(self, samples: int) -> int:
         """Go to more poses until the update's window has this many samples; return its number of samples."""

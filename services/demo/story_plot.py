@@ -23,8 +23,9 @@ def plot(robot: RobotConfig, timeline: Timeline, marks: Marks, path: Path) -> No
         _command(axes[3], robot, timeline)
         for axis in axes:
             _stages(axis, marks)
-        for stage in marks.stages:
-            axes[0].text(stage.start, 1.02, stage.name, transform=axes[0].get_xaxis_transform(), color=GREY, fontsize=9)
+        at = axes[0].get_xaxis_transform()
+        for index, stage in enumerate(marks.stages):
+            axes[0].text(stage.start, 1.02 + 0.06 * (index % 2), stage.name, transform=at, color=GREY, fontsize=9)
         axes[-1].set_xlabel("time [s]")
 
 

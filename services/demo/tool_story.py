@@ -32,6 +32,7 @@ BETTER = 0.5
 """After the tool is recognised, the tip's error must be at most this share of the error before."""
 FOLLOWS = 0.05
 """The tip's mean error [m] is smaller than this with a correct model."""
+NAMES = ("moves a tool to targets", "loses its sight", "its tool is changed", "recognises the tool")
 
 
 @dataclass(slots=True)
@@ -94,7 +95,7 @@ class ToolStory:
             f"{TARGETS} targets, tip {1e3 * self._first_error:.0f} mm away from them on average",
             f"statistics of normal errors learned anew from {normal['samples']} samples",
         )
-        return self._stage("moves a tool to targets", start, figures, self._first_error < FOLLOWS)
+        return self._stage(NAMES[0], start, figures, self._first_error < FOLLOWS)
 
     def lose_sight(self) -> Stage:
         """Play (b): the camera is covered; the tip is estimated and marked as estimated."""
@@ -126,7 +127,7 @@ class ToolStory:
             else "not measured again after the camera was uncovered",
         )
         seen = noticed and returned and bool(marked.all()) and mean < FOLLOWS
-        return self._stage("loses its sight", start, figures, seen)
+        return self._stage(NAMES[1], start, figures, seen)
 
     def change_tool(self) -> Stage:
         """Play (c): another tool is put into the hand without a message to the model."""
@@ -145,9 +146,7 @@ class ToolStory:
         )
         # Either verdict counts: it depends on the difference between this body and the designer's.
         noticed = verdict in ("environment", "anomaly")
-        return self._stage(
-            "its tool is changed", start, figures, noticed and self._new_error > self._first_error / BETTER
-        )
+        return self._stage(NAMES[2], start, figures, noticed and self._new_error > self._first_error / BETTER)
 
     def recognise(self) -> Stage:
         """Play (d): the update recognises the tool."""
@@ -161,7 +160,7 @@ class ToolStory:
             f"the same targets: tip {1e3 * self._new_error:.0f} mm away before, {1e3 * after:.0f} mm now",
             f"verdict now: {self._verdict(self._timeline.now() - 1.0)[0]}",
         )
-        return self._stage("recognises the tool", start, figures, is_recognised and after < BETTER * self._new_error)
+        return self._stage(NAMES[3], start, figures, is_recognised and after < BETTER * self._new_error)
 
     def _adapt(self, condition: str) -> tuple[bool, list[str]]:
         """Update while the tip moves; return whether the condition was recognised, and sentences on the result."""
