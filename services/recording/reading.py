@@ -117,29 +117,31 @@ def losses(paths: Paths) -> dict[str, int]:
     return {kind: sum(counts[kind] for counts in last.values()) for kind in KINDS}
 
 
-def read(paths: Paths, only: Iterable[str] = ()) -> Iterator[Recorded]:
+def read(paths: Paths, only: Iterable[str] = (), since_ns: int = 0) -> Iterator[Recorded]:
     """Yield the messages of recordings in the order of their arrival; foreign messages are left out.
 
     Args:
         paths: Files that the recorder wrote, finished or not, in any order.
         only: Keys to read; all if empty.
+        since_ns: Arrival of the first message to read [ns since 1970]; earlier ones are not decoded.
 
     Raises:
         RecordingError: As `facts_of`.
     """
     keys = frozenset(only)
-    for _, recorded in heapq.merge(*(_timed(file, keys) for file in facts_of(paths)), key=itemgetter(0)):
+    files = [file for file in facts_of(paths) if file.end_ns >= since_ns]
+    for _, recorded in heapq.merge(*(_timed(file, keys, since_ns) for file in files), key=itemgetter(0)):
         if recorded is not None:
             yield recorded
 
 
-def _timed(file: FileFacts, only: frozenset[str]) -> Iterator[tuple[int, Recorded | None]]:
+def _timed(file: FileFacts, only: frozenset[str], since_ns: int) -> Iterator[tuple[int, Recorded | None]]:
     """Yield first the begin [ns] of a file without a message, then arrival [ns] and message of its messages.
 
     The file is opened only after the first entry, because a long recording has more files than a process may open.
     """
     yield file.begin_ns, None
-    for recorded in _messages(file.path, only):
+    for recorded in _messages(file.path, only, since_ns):
         yield recorded.received_ns, recorded
 
 
@@ -149,13 +151,13 @@ def _listed(paths: Paths) -> list[Path]:
     return list(dict.fromkeys(Path(path) for path in entries))
 
 
-def _messages(path: Path, only: frozenset[str]) -> Iterator[Recorded]:
+def _messages(path: Path, only: frozenset[str], since_ns: int) -> Iterator[Recorded]:
     forms: dict[int, Form] = {}
     channels: dict[int, tuple[str, Form]] = {}
     for record in _records(path):
         if isinstance(record, McapMessage):
             key, form = channels.get(record.channel_id, ("", None))
-            if form is None or (only and key not in only):
+            if form is None or (only and key not in only) or record.log_time < since_ns:
                 continue
             try:
                 yield Recorded(key, record.log_time, form.read(record.data), form)

@@ -10,7 +10,6 @@ import math
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from msgspec.structs import replace
@@ -19,6 +18,7 @@ from hal.errors import CommandRefused
 from services.errors import BadArguments, RecordingError
 from services.process.service import Service, until_stopped
 from services.recording.reading import FileFacts, Paths, Recorded, facts_of, one_robot, read
+from services.recording.schedule import LATE, ReplayCounts, Schedule
 from services.recording.writer import CARRIED
 from services.wire import keys
 from services.wire.records import Applied, Message, Sample, Status
@@ -30,110 +30,9 @@ log = logging.getLogger(__name__)
 SOURCE = "replay"
 MEASURED = ("hal/sample", "hal/applied", "vision/sample")
 INFERRED = ("model/estimate", "model/anomaly", "model/update")
-LATE = 0.005
-"""A message that is published more than this [s] after its time counts as late."""
-LONGEST_PAUSE = 10.0
-"""A pause in the recordings that is longer than this [s] is cut to one second."""
 MOST_STEPS = 100_000
 MOVES = ("enable", "disable", "home", "tare", "reset", "stop", "estop", "lease", "release")
 """A replay refuses these verbs of a HAL."""
-
-
-@dataclass(slots=True)
-class ReplayCounts:
-    """Counts of a replay so far.
-
-    Attributes:
-        messages: Published messages.
-        samples: Published samples of the HAL.
-        reached: Played time of the recordings [s].
-        late: Messages published more than `LATE` after their time.
-        latest: Largest lateness [s].
-        pauses: Pauses that were cut to one second.
-    """
-
-    messages: int = 0
-    samples: int = 0
-    reached: float = 0.0
-    late: int = 0
-    latest: float = 0.0
-    pauses: int = 0
-
-
-class TimedSchedule:
-    """Schedule on an absolute grid: recorded times divided by the speed."""
-
-    def __init__(self, speed: float, stop: threading.Event, counts: ReplayCounts) -> None:
-        self._speed, self._stop, self._counts = speed, stop, counts
-        self._begun = time.monotonic()
-        self._begun_ns = time.time_ns()
-        self._last_ns: int | None = None
-        self._elapsed = 0.0
-
-    def wait(self, received_ns: int) -> bool:
-        """Wait until the message with this arrival is due; return False if the replay was stopped."""
-        self._advance(received_ns)
-        wait = self._begun + self._elapsed / self._speed - time.monotonic()
-        if wait > 0.0 and self._stop.wait(wait):
-            return False
-        late = -wait if wait < 0.0 else 0.0
-        self._counts.late += late > LATE
-        self._counts.latest = max(self._counts.latest, late)
-        return not self._stop.is_set()
-
-    def stamp_ns(self, recorded_ns: int, received_ns: int) -> int:
-        """Return the new stamp of a message [ns]; its transit, divided by the speed, stays the same."""
-        transit_ns = (received_ns - recorded_ns) / self._speed
-        return self._begun_ns + round(1e9 * self._elapsed / self._speed - transit_ns)
-
-    def _advance(self, received_ns: int) -> None:
-        if self._last_ns is not None:
-            step = max(received_ns - self._last_ns, 0) * 1e-9
-            if step > LONGEST_PAUSE:
-                self._counts.pauses += 1
-                step = 1.0
-            self._elapsed += step
-        self._last_ns = received_ns
-        self._counts.reached = self._elapsed
-
-
-class SteppedSchedule:
-    """Schedule on request: each request plays a number of the HAL's samples and all messages between them."""
-
-    def __init__(self, stop: threading.Event, counts: ReplayCounts) -> None:
-        self._stop, self._counts = stop, counts
-        self._changed = threading.Condition()
-        self._allowed = 0
-        self._first_ns: int | None = None
-
-    def allow(self, count: int, within: float) -> None:
-        """Release `count` more samples and wait until they are played, at most `within` [s]."""
-        with self._changed:
-            self._allowed = self._counts.samples + count
-            self._changed.notify_all()
-            self._changed.wait_for(lambda: self._is_waiting() or self._stop.is_set(), within)
-
-    def wait(self, received_ns: int) -> bool:
-        """Wait until the next message may be published; return False if the replay was stopped."""
-        with self._changed:
-            self._changed.notify_all()
-            while self._is_waiting() and not self._stop.is_set():
-                self._changed.wait(0.1)
-        first = self._first_ns = self._first_ns or received_ns
-        self._counts.reached = (received_ns - first) * 1e-9
-        return not self._stop.is_set()
-
-    def stamp_ns(self, recorded_ns: int, received_ns: int) -> int:
-        """Return the present time as the new stamp of a message [ns]."""
-        return time.time_ns()
-
-    def end(self) -> None:
-        """Wake all waiting threads; the replay has ended."""
-        with self._changed:
-            self._changed.notify_all()
-
-    def _is_waiting(self) -> bool:
-        return self._counts.samples >= self._allowed
 
 
 class Replay:
@@ -142,8 +41,8 @@ class Replay:
     Args:
         services: Services by name; `hal` is among them.
         files: Facts of the played files.
-        messages: Messages of the files in order.
-        speed: Multiple of the recorded speed; 0 plays only on request by `hal/do/step`.
+        messages: Returns the messages of the files in order, from an arrival on [ns].
+        speed: Multiple of the recorded speed; 0 begins with a pause.
         stop: Event that ends the replay; the replay sets it after the last message.
     """
 
@@ -151,13 +50,14 @@ class Replay:
         self,
         services: dict[str, Service],
         files: Sequence[FileFacts],
-        messages: Iterator[Recorded],
+        messages: Callable[[int], Iterator[Recorded]],
         speed: float,
         stop: threading.Event,
     ) -> None:
         self.counts = ReplayCounts()
         self._services, self._files, self._messages, self._speed, self._stop = services, files, messages, speed, stop
-        self._steps = SteppedSchedule(stop, self.counts) if speed == 0.0 else None
+        self._begin_ns = min(file.begin_ns for file in files)
+        self._schedule = Schedule(speed, self._begin_ns, stop, self.counts)
         self._publishers: dict[tuple[str, int], Publisher[Any]] = {}
         self._boots: dict[int, int] = {}
         self._mode = ""
@@ -165,13 +65,15 @@ class Replay:
         hal = services["hal"]
         for verb in MOVES:
             hal.verb(verb, _refuse(verb), always=True)
-        if self._steps is not None:
-            hal.verb("step", self._step)
+        hal.verb("step", self._step)
+        hal.verb("seek", self._seek)
+        hal.verb("pause", lambda arguments: self._act("pause", arguments, self._schedule.pause))
+        hal.verb("play", lambda arguments: self._act("play", arguments, self._schedule.play))
 
     @property
     def length(self) -> float:
         """Time that the files cover, with the pauses between them [s]."""
-        return (max(file.end_ns for file in self._files) - min(file.begin_ns for file in self._files)) * 1e-9
+        return (max(file.end_ns for file in self._files) - self._begin_ns) * 1e-9
 
     def run(self) -> None:
         """Play until the end or until stopped."""
@@ -194,18 +96,19 @@ class Replay:
         return text + (f"; {counts.pauses} long pauses were cut to 1 s." if counts.pauses else ".")
 
     def _play(self) -> None:
+        since_ns: int | None = 0
         try:
-            schedule = self._steps or TimedSchedule(self._speed, self._stop, self.counts)
-            for recorded in self._messages:
-                if not schedule.wait(recorded.received_ns):
-                    return
-                self._publish(recorded, schedule.stamp_ns(recorded.message.stamp_ns, recorded.received_ns))
+            while since_ns is not None:
+                for recorded in self._messages(since_ns):
+                    if not self._schedule.wait(recorded.received_ns):
+                        break
+                    self._publish(recorded, self._schedule.stamp_ns(recorded.message.stamp_ns, recorded.received_ns))
+                since_ns = self._schedule.taken()
         except RecordingError as error:
             self._failure = str(error)
         finally:
             self._stop.set()
-            if self._steps is not None:
-                self._steps.end()
+            self._schedule.end()
 
     def _publish(self, recorded: Recorded, stamp_ns: int) -> None:
         noun = _noun(recorded.key)
@@ -227,13 +130,34 @@ class Replay:
         self.counts.samples += noun == MEASURED[0]
 
     def _step(self, arguments: dict[str, Any]) -> dict[str, Any]:
-        assert self._steps is not None
         count = arguments.get("count", 1)
         is_number = isinstance(count, int) and not isinstance(count, bool)
         if set(arguments) - {"count"} or not is_number or not 1 <= count <= MOST_STEPS:
             raise BadArguments(f"step takes {{count: 1 to {MOST_STEPS}}}, the number of samples to play.")
-        self._steps.allow(count, within=1.0)
-        return {"samples": self.counts.samples, "reached": self.counts.reached, "ended": self._stop.is_set()}
+        return self._act("step", {}, lambda: self._schedule.allow(count, within=1.0))
+
+    def _seek(self, arguments: dict[str, Any]) -> dict[str, Any]:
+        to = arguments.get("to")
+        is_number = isinstance(to, int | float) and not isinstance(to, bool) and 0.0 <= to <= self.length
+        if set(arguments) - {"to"} or not is_number or to is None:
+            raise BadArguments(f"seek takes {{to: 0 to {self.length:.1f}}}, the time since the beginning [s].")
+        return self._act("seek", {}, lambda: self._schedule.seek(self._begin_ns + round(1e9 * to), within=1.0))
+
+    def _act(self, verb: str, arguments: dict[str, Any], act: Callable[[], None]) -> dict[str, Any]:
+        """Change the schedule, publish the new state at once, and return it."""
+        if arguments:
+            raise BadArguments(f"{verb} takes no arguments.")
+        act()
+        if not self._stop.is_set():
+            self._services["hal"].publish_status(lambda: self._status("hal"))
+        counts = self.counts
+        return {
+            "samples": counts.samples,
+            "reached": counts.reached,
+            "position": counts.position,
+            "paused": self._schedule.is_paused,
+            "ended": self._stop.is_set(),
+        }
 
     def _statuses(self) -> Status:
         for name, service in self._services.items():
@@ -243,12 +167,15 @@ class Replay:
 
     def _status(self, name: str) -> Status:
         counts = self.counts
-        speed = "step by step" if self._speed == 0.0 else f"at {self._speed:g} x"
-        text = f"A replay {speed}, not a robot: {counts.reached:.1f} of {self.length:.1f} s."
+        is_paused = self._schedule.is_paused
+        speed = "that is paused" if is_paused else f"at {self._speed or 1.0:g} x"
+        text = f"A replay {speed}, not a robot: {counts.position:.1f} of {self.length:.1f} s."
         facts: dict[str, Any] = {
             "replay": {
                 "files": [file.path.name for file in self._files],
                 "speed": self._speed,
+                "length": self.length,
+                "paused": is_paused,
                 **{field: getattr(counts, field) for field in ReplayCounts.__slots__},
             }
         }
@@ -270,7 +197,7 @@ def run_replay(
     Args:
         paths: Recordings of one robot, in any order.
         robot: Name of the robot in the replay; the recorded name if None.
-        speed: Multiple of the recorded speed; 0 plays only on request by `hal/do/step`.
+        speed: Multiple of the recorded speed; 0 begins with a pause, for `hal/do/step` and `hal/do/play`.
         with_model: Play also the messages of the model service, in place of it.
         connect: Endpoints, such as a router's, and role files.
         stop: Event that ends the replay, in place of SIGTERM and SIGINT.
@@ -299,7 +226,8 @@ def run_replay(
             name: stack.enter_context(Service(robot or recorded, name, connect, lambda: _describe(files)))
             for name in names
         }
-        replay = Replay(services, files, read([file.path for file in files], playable), speed, stopped)
+        played = [file.path for file in files]
+        replay = Replay(services, files, lambda since_ns: read(played, playable, since_ns), speed, stopped)
         replay.run()
         for name in names[1:]:
             services[name].publish_status(_ended(name))

@@ -57,7 +57,7 @@ def replay(
     robot: Annotated[str | None, typer.Option(help="Name to play as; that of the recorded robot if not given.")] = None,
     speed: Annotated[
         float,
-        typer.Option(min=0, help="Multiple of the recorded speed; 0 plays on request of the verb hal/do/step."),
+        typer.Option(min=0, help="Multiple of the recorded speed; 0 begins with a pause: the page has play and step."),
     ] = 1.0,
     model: Annotated[bool, typer.Option("--model", help="Also play the messages of the model, in its place.")] = False,
     connect: Connect = None,
@@ -65,6 +65,7 @@ def replay(
     """Play recordings in place of a robot's HAL and camera; serve, top and view work as with the robot.
 
     Samples are marked as a replay. Commands are not played, and verbs that would move motors are refused.
+    The page pauses it, plays single steps and goes to another place.
     """
     from services.recording.replay import run_replay
 

@@ -9,7 +9,7 @@ from hal.clock import Clock, SystemClock
 from services.client import Client
 from services.client.live import FRESH_STATUS
 from services.errors import ServiceError
-from services.watch.snapshot import Newest, RobotSnapshot
+from services.watch.snapshot import Newest, RobotSnapshot, held
 from services.wire import keys
 from services.wire.caller import own_name
 from services.wire.messages import Anomaly, Applied, Estimates, Holder, Message, Sample, Status, Update
@@ -43,7 +43,7 @@ def snapshot_of(client: Client, alive: Iterable[str], clock: Clock | None = None
 
     robot = client.robot
     statuses = {name: newest(keys.status(robot, name), Status) for name in keys.SERVICES}
-    return RobotSnapshot(
+    snapshot = RobotSnapshot(
         robot=robot,
         alive=frozenset(alive),
         sample=newest(keys.sample(robot), Sample),
@@ -58,6 +58,7 @@ def snapshot_of(client: Client, alive: Iterable[str], clock: Clock | None = None
         disordered=tuple(disordered),
         **more,
     )
+    return held(snapshot)
 
 
 class Descriptions:

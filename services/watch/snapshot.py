@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Generic, TypeVar
 
 from services.client.live import FRESH_STATUS
@@ -97,6 +97,26 @@ class RobotSnapshot:
         """Return the facts of a service's status; empty if that is old."""
         status = fresh(self.statuses.get(service))
         return status.facts if status is not None else {}
+
+
+def held(snapshot: RobotSnapshot) -> RobotSnapshot:
+    """Return a snapshot whose messages count as fresh while a replay is paused, as they are the present ones there."""
+    replay = snapshot.facts("hal").get("replay")
+    if not (isinstance(replay, dict) and replay.get("paused") is True):
+        return snapshot
+    return replace(
+        snapshot,
+        sample=_now(snapshot.sample),
+        vision=_now(snapshot.vision),
+        applied=_now(snapshot.applied),
+        estimate=_now(snapshot.estimate),
+        anomaly=_now(snapshot.anomaly),
+        update=_now(snapshot.update),
+    )
+
+
+def _now(newest: Newest[M] | None) -> Newest[M] | None:
+    return None if newest is None else replace(newest, age=0.0)
 
 
 def fresh(newest: Newest[M] | None) -> M | None:

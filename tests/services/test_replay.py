@@ -51,9 +51,11 @@ def _replaying(*arguments: Any, **more: Any) -> Iterator[threading.Event]:
 
     thread = threading.Thread(target=run)
     thread.start()
-    yield stop
-    stop.set()
-    thread.join(30.0)
+    try:
+        yield stop
+    finally:
+        stop.set()
+        thread.join(30.0)
     assert not thread.is_alive() and not failed, failed
 
 
@@ -111,6 +113,50 @@ def test_twice_as_fast_takes_half_the_time_on_an_absolute_grid(robot: str, tmp_p
     assert took > 0.9 * (samples[-1][1].cycle - samples[0][1].cycle) / 200
     stamps = [sample.stamp_ns for _, sample in samples]
     assert np.allclose(np.diff(stamps), 5e6, atol=1e3)
+
+
+@pytest.mark.long
+def test_a_replay_is_paused_stepped_and_goes_on_from_another_place(robot: str, tmp_path: Path) -> None:
+    files = record(tmp_path / "run.mcap", "arm", 600, limits=Limits(max_seconds=0.7))
+    assert len(files) > 2
+
+    def cycles() -> list[int]:
+        return [messages.decode(data, Sample).cycle for _, data in heard.get(keys.sample(robot), ())]
+
+    with _listening(robot) as heard, _replaying(files, robot=robot, speed=0.0) as stop:
+        session = open_session(robot, "client")
+        _eventually(lambda: heard)
+        assert _ask(session, robot, "step", count=3)["samples"] == 3
+        told = _ask(session, robot, "seek", to=2.0)
+        assert told["paused"] and told["samples"] > 3  # the other place is shown
+        assert abs(told["position"] - 2.0) < 0.2
+        _ask(session, robot, "step", count=2)
+        _ask(session, robot, "seek", to=0.5)
+        shown = _ask(session, robot, "pause")["samples"]
+        _eventually(lambda: len(cycles()) == shown)
+        back = int(np.argmin(np.diff(cycles()))) + 1  # the first sample of the second jump
+        late, early = cycles()[3:back], cycles()[back:]
+        assert cycles()[:3] == [0, 1, 2] and late == list(range(late[0], late[-1] + 1))
+        assert early == list(range(early[0], early[-1] + 1))
+        assert abs(late[-3] - 4 * early[-1]) < 20 and early[-1] > 20
+        assert not _ask(session, robot, "play")["paused"]
+        _eventually(lambda: len(cycles()) > 20)
+        assert _ask(session, robot, "pause")["paused"]
+        count = _ask(session, robot, "pause")["samples"]
+        time.sleep(0.3)
+        assert _ask(session, robot, "pause")["samples"] == count and not stop.is_set()
+        statuses = [messages.decode(data, Status) for _, data in heard[keys.status(robot, "hal")]]
+        assert statuses[-1].facts["replay"]["paused"] is True and "paused" in statuses[-1].text
+        for wrong in ({}, {"to": -1.0}, {"to": 1e6}, {"to": "end"}, {"to": True}):
+            with pytest.raises(Exception, match="seek takes"):
+                _ask(session, robot, "seek", **wrong)
+        _ask(session, robot, "seek", to=2.5)
+        _ask(session, robot, "play")
+        _eventually(stop.is_set)
+        close_session(session)
+    assert cycles()[back:] == sorted(cycles()[back:]) and cycles()[-1] == 599
+    stamps = [messages.decode(data, Sample).stamp_ns for _, data in heard[keys.sample(robot)]]
+    assert stamps == sorted(stamps)  # or clients would take them as late
 
 
 @pytest.mark.long
