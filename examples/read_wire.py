@@ -1,16 +1,20 @@
 """Read a sensor sample with zenoh and msgpack alone; any language that has both can do this.
 
-python examples/read_wire.py tcp/127.0.0.1:PORT [ROBOT]
+python examples/read_wire.py [ROBOT [ENDPOINT]], such as musashi_arm tcp/127.11.74.180:32306. On the robot's machine
+`gemuco endpoint ROBOT hal` prints the endpoint, and this program asks it if none is given.
 """
 
 import json
+import subprocess
 import sys
 
 import msgpack
 import numpy as np
 import zenoh
 
-endpoint, robot = sys.argv[1], sys.argv[2] if len(sys.argv) > 2 else "musashi_arm"
+robot, *given = sys.argv[1:] or ["musashi_arm"]
+command = [sys.executable, "-m", "services.cli", "endpoint", robot, "hal"]  # as `gemuco endpoint`
+endpoint = given[0] if given else subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
 config = zenoh.Config()
 config.insert_json5("connect/endpoints", json.dumps([endpoint]))
 config.insert_json5("scouting/multicast/enabled", "false")

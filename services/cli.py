@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from services.verbs import deployment, describe, hardware, init, page, recording
+from services.verbs import deployment, describe, endpoint, hardware, init, page, recording
 from services.verbs.verb import CommandLine, Connect, RobotFile, load, report_errors, robot_name, robot_path
 
 app = typer.Typer(
@@ -317,7 +317,7 @@ def reproduce(
     typer.echo(f"Figures and tables are in {out / robot}.")
 
 
-for verbs in (init, describe, hardware, deployment, recording, page):
+for verbs in (init, describe, hardware, deployment, endpoint, recording, page):
     verbs.register(app)
 
 

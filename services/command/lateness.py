@@ -59,8 +59,11 @@ def refuse_late(caller: Caller, boot: int, age: float) -> None:
     if age <= WITHIN:
         return
     if not caller.hal_boot:
-        reason = "the request does not name its sender's newest sample (`hal_boot` and `cycle`)"
-    elif caller.hal_boot != boot:
+        raise TooLate(
+            "The request may move the robot, but does not name its sender's newest sample. Send the `boot` of that "
+            "sample as `hal_boot`, and its `cycle`, in the attachment of the query, a msgpack map (docs/keys.md)."
+        )
+    if caller.hal_boot != boot:
         reason = "its sender's newest sample is from another run of the HAL"
     elif math.isfinite(age):
         reason = f"its sender's newest sample was {age:.1f} s old when the request arrived"

@@ -5,6 +5,7 @@ import time
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+from rich import box
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.table import Table
@@ -26,6 +27,9 @@ FIRST_WAIT = 2.5
 """`--once` waits at most this time [s] for the first statuses."""
 LONGEST = 200
 """At most this number of letters of a sentence is shown."""
+WIDE = 150
+"""A terminal of at least this number of columns has a column per fact; a narrower one lists them below the sentence."""
+LONGEST_NAME = 20
 
 
 def watch_fleet(once: bool, connect: Iterable[str], console: Console | None = None) -> int:
@@ -50,12 +54,12 @@ def watch_fleet(once: bool, connect: Iterable[str], console: Console | None = No
             while not fleet.is_complete() and time.monotonic() < deadline:
                 time.sleep(0.05)
             robots = ranked(fleet.snapshots())
-            console.print(view(robots, fleet, where))
+            console.print(view(robots, fleet, where, console.width))
             return 0 if robots and robots[0][1].level < Level.ANOMALY else 1
         with Live(console=console, screen=console.is_terminal, auto_refresh=False) as live:
             while True:
                 fleet.look()
-                live.update(view(ranked(fleet.snapshots()), fleet, where), refresh=True)
+                live.update(view(ranked(fleet.snapshots()), fleet, where, console.width), refresh=True)
                 time.sleep(REFRESH)
 
 
@@ -65,8 +69,10 @@ def ranked(snapshots: Iterable[RobotSnapshot]) -> list[tuple[RobotSnapshot, Trou
     return sorted(robots, key=lambda robot: (-robot[1].level, robot[0].robot))
 
 
-def view(robots: Sequence[tuple[RobotSnapshot, Trouble]], fleet: FleetWatch, connect: Sequence[str]) -> RenderableType:
-    """Return the table, or the reason why there is none."""
+def view(
+    robots: Sequence[tuple[RobotSnapshot, Trouble]], fleet: FleetWatch, connect: Sequence[str], width: int = WIDE
+) -> RenderableType:
+    """Return the table for a terminal of this width, or the reason why there is none."""
     notes = []
     if not fleet.has_router:
         notes.append(Text(f"No link to {', '.join(connect)}: the table is old.", style="bold red"))
@@ -77,14 +83,17 @@ def view(robots: Sequence[tuple[RobotSnapshot, Trouble]], fleet: FleetWatch, con
     if not robots:
         place = f"through {', '.join(connect)}" if connect else "on this machine; others are behind a router: --connect"
         return Group(*notes, Text(f"No robot is seen {place}."))
-    return Group(*notes, table(robots))
+    return Group(*notes, table(robots, width))
 
 
-def table(robots: Sequence[tuple[RobotSnapshot, Trouble]]) -> Table:
-    """Return one row per robot, in the order given."""
+def table(robots: Sequence[tuple[RobotSnapshot, Trouble]], width: int = WIDE) -> Table:
+    """Return one row per robot, in the order given, for a terminal of this width."""
     counts = {level: sum(worst.level == level for _, worst in robots) for level in reversed(Level)}
     summary = ", ".join(f"{count} {level.name.lower()}" for level, count in counts.items() if count)
-    table = Table(title=f"{len(robots)} robots: {summary}", title_justify="left", expand=True)
+    title = f"{len(robots)} robots: {summary}"
+    if width < WIDE:
+        return _narrow(robots, title)
+    table = Table(title=title, title_justify="left", expand=True)
     table.add_column("robot", no_wrap=True)
     table.add_column("health", no_wrap=True)
     for column in ("services", "motors", "lease holder"):
@@ -97,6 +106,39 @@ def table(robots: Sequence[tuple[RobotSnapshot, Trouble]]) -> Table:
     for snapshot, worst in robots:
         table.add_row(*_row(snapshot, worst))
     return table
+
+
+def _narrow(robots: Sequence[tuple[RobotSnapshot, Trouble]], title: str) -> Table:
+    """Return the table for a narrow terminal: most of it belongs to what is wrong, with the facts below."""
+    table = Table(title=title, title_justify="left", expand=True, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    table.add_column("robot", no_wrap=True, max_width=LONGEST_NAME)
+    table.add_column("health", no_wrap=True)
+    table.add_column("motors", no_wrap=True, max_width=8)
+    table.add_column("what is wrong, and facts", ratio=1)
+    for snapshot, worst in robots:
+        style = STYLES[worst.level]
+        wrong = Text(f"{plain(str(worst), LONGEST)}\n" if worst.level > Level.GOOD else "", style=style)
+        name, health = _plain(snapshot.robot, style), Text(worst.level.name.lower(), style=style)
+        table.add_row(name, health, _plain(snapshot.motors), Text.assemble(wrong, _facts(snapshot)))
+    return table
+
+
+def _facts(snapshot: RobotSnapshot) -> Text:
+    """Return everything but the trouble, in one line."""
+    counts, judged, holder, age = _signal_counts(snapshot), verdict(snapshot), snapshot.lease_holder, snapshot.age
+    facts = []
+    if counts:
+        words = ("measured", "estimated", "none")
+        facts.append(", ".join(f"{count} {word}" for count, word in zip(counts, words, strict=True) if count))
+    if judged is not None and str(judged):
+        facts.append(plain(str(judged), 40))
+    late = _worst_loop(snapshot).plain
+    if late != "-":
+        facts.append(f"late {late.replace(' ', ' ms ', 1)}")
+    if holder not in ("none", "not known"):
+        facts.append(f"lease {plain(holder, 40)}")
+    facts.append(f"heard {age:.1f} s ago" if math.isfinite(age) else "never heard")
+    return Text(" · ".join(facts), style="dim")
 
 
 def _row(snapshot: RobotSnapshot, worst: Trouble) -> list[Text | str]:

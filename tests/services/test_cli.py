@@ -7,6 +7,8 @@ import pytest
 import typer
 
 from services.verbs.verb import report_errors
+from services.wire import keys
+from services.wire.session import endpoint
 
 ROOT = Path(__file__).parents[2]
 
@@ -18,7 +20,7 @@ def gemuco(*words: str, folder: Path | None = None) -> subprocess.CompletedProce
 
 VERBS = (
     "simulate, hal, serve, vision, collect, train, query, top, record, demo, reproduce, estop, scan, doctor, "
-    "calibrate joint, calibrate cell, can dump"
+    "calibrate joint, calibrate cell, can dump, view, endpoint"
 )
 
 
@@ -27,6 +29,19 @@ def test_every_verb_explains_itself(verb: str) -> None:
     told = gemuco(*verb.split(), "--help")
     assert told.returncode == 0
     assert "ROBOT" in told.stdout
+
+
+def test_the_endpoint_of_a_service_is_printed_for_programs() -> None:
+    assert gemuco("endpoint", "some_arm", "hal").stdout == f"{endpoint('some_arm', 'hal')}\n"
+    whole = gemuco("endpoint", "some_arm").stdout
+    assert [line.split()[0] for line in whole.splitlines()] == list(keys.SERVICES)
+    assert endpoint("some_arm", "model") in whole and "not running" in whole
+    wrong = gemuco("endpoint", "some_arm", "arm")
+    assert wrong.returncode == 1 and "There is no service 'arm'" in wrong.stderr
+
+
+def test_the_extra_of_the_page_is_named() -> None:
+    assert "gemuco[view]" in gemuco("view", "--help").stdout
 
 
 @pytest.mark.long

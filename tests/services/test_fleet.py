@@ -4,6 +4,7 @@ import json
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -75,6 +76,27 @@ def test_a_restart_is_no_twin_and_two_in_turns_are() -> None:
     assert found.twin_until > 4.0
     found.is_alive = True
     assert robot_with(4.0, hal=found).snapshot(4.5).twins == ("hal",)
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_a_narrow_terminal_has_room_for_what_is_wrong(width: int) -> None:
+    good = {"signals": {"measured": 3, "estimated": 1, "none": 0}, "anomaly": {"verdict": "normal"}}
+    text = "Drive 'elbow_drive' (node 5 on can0) is in its state 'fault'."
+    hal, model = record(status("hal", mode="follow"), 9.9), record(status("model", **good), 9.9)
+    bad = record(Status(service="hal", state="fault", boot=1, text=text), 9.9)
+    snapshots = [
+        robot_with(9.9, hal=hal, model=model).snapshot(10.0),
+        replace(robot_with(9.9, hal=bad, model=model).snapshot(10.0), robot="a_robot_with_a_long_name"),
+    ]
+    console = Console(width=width)
+    with console.capture() as shown:
+        console.print(fleet_top.table(fleet_top.ranked(snapshots), width))
+    lines = shown.get().splitlines()
+    assert max(len(line.rstrip()) for line in lines) <= width
+    assert len(lines) < 14
+    words = " ".join(" ".join(lines).split())
+    for part in ("HAL fault", "elbow_drive", "3 measured, 1 estimated", "late 4.0 ms hal", "heard 0.1 s ago", "follow"):
+        assert part in words
 
 
 def test_trouble_is_on_top_and_no_text_steers_the_terminal() -> None:
