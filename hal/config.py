@@ -191,6 +191,10 @@ class RatesConfig(Section):
     update: Rate = 10.0
 
 
+Via = tuple[str, Finite, Finite, Finite]
+"""A point of a wire is a link of the URDF and a place in its frame [m]."""
+
+
 class RobotConfig(Section):
     """A whole robot file."""
 
@@ -210,6 +214,8 @@ class RobotConfig(Section):
     """Engine of that simulator; by default PyBullet if it is installed, else MuJoCo."""
     urdf: Path | None = None
     """URDF file for the live page, relative to the robot file."""
+    wires: dict[str, Annotated[tuple[Via, ...], Field(min_length=2)]] = Field(default_factory=dict)
+    """Element of the tension signal -> points of its wire, which the live page draws."""
     tip: str | None = None
     """Link of the URDF whose place the camera of a simulator made from it sees."""
     conditions: tuple[str, ...] = ()

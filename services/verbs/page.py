@@ -1,11 +1,14 @@
 """The verb `view`: the live page."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from services.verbs.verb import Connect, RobotFile, report_errors, robot_name, robot_path
+
+if TYPE_CHECKING:
+    from services.view.scene import Looks
 
 
 def register(app: typer.Typer) -> None:
@@ -26,22 +29,23 @@ def view(
     urdf: Annotated[Path | None, typer.Option(help="URDF of the robot; that of the robot file if not given.")] = None,
     connect: Connect = None,
 ) -> None:
-    """Show a running robot in the browser: signals, the robot in 3D, plots, anomaly, loops, buttons, teaching.
+    r"""Show a running robot in the browser: signals, the robot in 3D, plots, anomaly, loops, buttons, teaching.
 
-    Needs the extra packages: pip install 'gemuco[view]'.
+    Needs the extra packages: pip install 'gemuco\[view]'.
     """
     from services.view.run import view as show
 
-    show(robot_name(robot), host, port, connect or (), urdf or _urdf_of(robot))
+    show(robot_name(robot), host, port, connect or (), _looks(robot, urdf))
 
 
-def _urdf_of(robot: str) -> Path | None:
-    """Return the URDF in the robot file; None without a robot file, which a client does not need."""
+def _looks(robot: str, urdf: Path | None) -> "Looks":
+    """Return the look in the robot file, with another URDF if one is given; a client needs no robot file."""
     from hal.config import load_robot
     from hal.errors import ConfigError
+    from services.view.scene import Looks
 
     try:
         config = load_robot(robot_path(robot))
     except ConfigError:
-        return None
-    return None if config.urdf is None else config.folder / config.urdf
+        return Looks(urdf)
+    return Looks(urdf or (None if config.urdf is None else config.folder / config.urdf), config.wires)

@@ -52,7 +52,7 @@ class Chart:
         self._range: tuple[float, float] | None = None
         self._key = ""
 
-    def svg(self, time: np.ndarray, lines: Sequence[Line], unit: str, key: str) -> str:
+    def svg(self, time: np.ndarray, lines: Sequence[Line], unit: str, key: str, at: str = "") -> str:
         """Return the picture as SVG.
 
         Args:
@@ -60,6 +60,7 @@ class Chart:
             lines: Curves.
             unit: Unit of all curves.
             key: Name of the picture; a new name gets a new axis.
+            at: Clock time of the right end if it is not now.
         """
         low, high = self._axis(lines, key)
         parts = [f'<svg viewBox="0 0 {WIDTH} {self._height}" class="gm-map" role="img">']
@@ -72,7 +73,7 @@ class Chart:
         for second in SECONDS:
             x = self._x(np.array([float(second)]))[0]
             parts.append(f'<path d="M{x:.1f} {TOP}V{bottom}" class="grid"/>')
-            label = f"{second} s" if second == 0 else f"{second}"
+            label = (at or "now") if second == 0 else f"{second} s"
             anchor = "end" if second == 0 else "middle"
             parts.append(f'<text x="{x:.1f}" y="{self._height - 5}" text-anchor="{anchor}" class="axis">{label}</text>')
         parts.append(f'<text x="{LEFT + 4}" y="{TOP + 10}" class="axis">{escape(unit)}</text>')

@@ -59,6 +59,15 @@ class Controls:
             self.last = Outcome(time.time(), False, f"{verb}: {error}")
         return self.last
 
+    def replay(self, verb: str, **arguments: Any) -> Outcome:
+        """Do a verb of a replay, such as `pause`; an error is the text of the outcome, never raised."""
+        try:
+            answer = self.open_client().ask("hal", verb, arguments)
+            self.last = Outcome(time.time(), True, f"{verb}: at {answer['position']:.2f} s")
+        except (ServiceError, HalError, SchemaError) as error:
+            self.last = Outcome(time.time(), False, f"{verb}: {error}")
+        return self.last
+
     def open_client(self) -> Client:
         """Return the client, for requests that may move the robot.
 

@@ -4,6 +4,7 @@ The token is a part of the path and not a cookie: cookies do not know ports, so 
 web server of the same machine.
 """
 
+import gzip
 import hmac
 import re
 import secrets
@@ -12,6 +13,7 @@ from dataclasses import replace
 from http import HTTPStatus
 from typing import TYPE_CHECKING
 
+from services.view.ending import ALIVE, with_ending
 from services.wire.session import is_loopback
 
 if TYPE_CHECKING:
@@ -48,21 +50,39 @@ class Door:
 
     def __init__(self, host: str, token: str = "", elsewhere: Callable[[], int] | None = None) -> None:
         self._is_local, self._token, self._elsewhere = is_loopback(host), token, elsewhere
+        self._page: tuple[bytes, bytes] = b"", b""
+        """The last page as viser sends it, and as it is sent from here."""
 
     def guard(self, process: "Process | None") -> "Process":
         """Return the function that answers a request here, or hands it to `process`; None opens a websocket."""
 
         def guarded(connection: "ServerConnection", request: "Request") -> "Response | None":
             response = self._refusal(connection, request)
-            if response is None:
-                request = replace(request, path=self._path_below(request.path) or "/")
+            path = self._path_below(request.path) or "/"
+            if response is None and path == ALIVE:
+                response = connection.respond(HTTPStatus.OK, "alive\n")
+            elif response is None:
+                request = replace(request, path=path)
                 response = process(connection, request) if process is not None else None
+                if response is not None and response.headers.get("Content-Type", "").startswith("text/html"):
+                    self._add_ending(response)
             if response is not None:
                 for name, value in HEADERS.items():
                     response.headers[name] = value
             return response
 
         return guarded
+
+    def _add_ending(self, response: "Response") -> None:
+        """Add the words for the end of the program to a page."""
+        body = bytes(response.body)
+        if body != self._page[0]:
+            is_packed = response.headers.get("Content-Encoding") == "gzip"
+            whole = with_ending(gzip.decompress(body) if is_packed else body)
+            self._page = body, gzip.compress(whole) if is_packed else whole
+        response.body = self._page[1]
+        del response.headers["Content-Length"]
+        response.headers["Content-Length"] = str(len(response.body))
 
     def _refusal(self, connection: "ServerConnection", request: "Request") -> "Response | None":
         host = request.headers.get("Host", "")

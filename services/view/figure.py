@@ -1,7 +1,8 @@
-"""A robot in the 3D scene: a rod for each link of its URDF and a sphere for each joint."""
+"""A robot in the 3D scene: a rod for each link of its URDF, a sphere for each joint, and wires."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,8 @@ ROD, KNOB = 0.09, 0.13
 """Rods and joints have these radii, as a share of the mean length of the robot's links."""
 SHORT = 1e-3
 """Links shorter than this [m] have no rod."""
+POSTURES = 40
+"""The room that a robot takes is computed from this number of postures."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,15 +77,29 @@ class Body:
                 ends.append(2.0 * np.asarray(inertial.origin)[:3, 3])
         return {link: [end for end in ends if np.linalg.norm(end) > SHORT] for link, ends in rods.items()}
 
-    def reach(self) -> float:
-        """Return the largest distance of a rod's end from the root in the zero posture [m]."""
-        rods = self.rods()
-        ends = [
-            (pose @ np.append(end, 1.0))[:3]
-            for link, pose in self.poses({}).items()
-            for end in [np.zeros(3), *rods[link]]
-        ]
-        return float(np.max(np.linalg.norm(ends, axis=1)))
+    def room(self) -> tuple[np.ndarray, float]:
+        """Return center [m], shape (3,), and radius [m] of a sphere around most postures within the joints' limits."""
+        random, low, high = np.random.default_rng(0), *self._limits()
+        places = [self._places(np.zeros(len(self.joints)))]
+        places += [self._places(random.uniform(low, high)) for _ in range(POSTURES)]
+        lowest, highest = np.min(places, axis=1), np.max(places, axis=1)  # per posture, shape (postures, 3)
+        least, most = np.quantile(lowest, 0.3, axis=0), np.quantile(highest, 0.7, axis=0)
+        return (least + most) / 2.0, max(float(np.linalg.norm(most - least)) / 2.0, 0.05)
+
+    def _limits(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the limits of the movable joints, at most a quarter of a turn [rad or m], each of shape (n,)."""
+        limits = [self._urdf.joint_map[name].limit for name in self.joints]
+        most = [np.pi / 2.0 if self._urdf.joint_map[name].type != "prismatic" else 1.0 for name in self.joints]
+        low = [0.0 if limit is None or limit.lower is None else limit.lower for limit in limits]
+        high = [0.0 if limit is None or limit.upper is None else limit.upper for limit in limits]
+        bound = np.array(most)
+        return np.clip(low, -bound, bound), np.clip(high, -bound, bound)
+
+    def _places(self, angles: np.ndarray) -> np.ndarray:
+        """Return the ends of all rods in the frame of the root [m], shape (ends, 3)."""
+        poses, rods = self.poses(dict(zip(self.joints, angles, strict=True))), self.rods()
+        ends = [(poses[link] @ np.append(end, 1.0))[:3] for link in self.links for end in [np.zeros(3), *rods[link]]]
+        return np.array(ends)
 
 
 class Figure:
@@ -92,18 +109,17 @@ class Figure:
         site: The page.
         name: Name in the scene.
         body: Kinematics.
-        at: Position of the root [m], shape (3,).
+        slim: Factor of the radii of rods and joints.
     """
 
-    def __init__(self, site: "viser.ViserServer", name: str, body: Body, at: np.ndarray) -> None:
-        self._body, self._at = body, at
+    def __init__(self, site: "viser.ViserServer", name: str, body: Body, slim: float = 1.0) -> None:
         self._poses: dict[str, np.ndarray] = {}
         self._frames: dict[str, Any] = {}
         self._shapes: dict[str, list[Any]] = {}
-        self._paints: dict[str, Paint] = {}
+        self._paints: dict[str, Paint | None] = {}
         rods = body.rods()
         lengths = [float(np.linalg.norm(end)) for ends in rods.values() for end in ends]
-        thick = float(np.mean(lengths)) if lengths else 0.1
+        thick = slim * (float(np.mean(lengths)) if lengths else 0.1)
         for link in body.links:
             root = f"/{name}/{link}"
             self._frames[link] = site.scene.add_frame(root, show_axes=False)
@@ -113,21 +129,62 @@ class Figure:
                 shapes.append(site.scene.add_mesh_simple(f"{root}/rod{number}", vertices, faces))
             self._shapes[link] = shapes
 
-    def show(self, angles: Mapping[str, float], paints: Mapping[str, Paint]) -> None:
-        """Move to joint angles [rad] and paint every link."""
+    def show(self, poses: Mapping[str, np.ndarray], paints: Mapping[str, Paint | None]) -> None:
+        """Move links to poses, each of shape (4, 4), and paint them; a link without a paint is not visible."""
         from viser.transforms import SO3
 
-        for link, pose in self._body.poses(angles).items():
+        for link, pose in poses.items():
             before = self._poses.get(link)
             if before is None or not np.allclose(pose, before, atol=1e-5):
                 self._poses[link] = pose.copy()
                 self._frames[link].wxyz = SO3.from_matrix(pose[:3, :3]).wxyz
-                self._frames[link].position = pose[:3, 3] + self._at
-            paint = paints[link]
-            if paint != self._paints.get(link):
-                self._paints[link] = paint
-                for shape in self._shapes[link]:
-                    shape.color, shape.opacity = paint.color, paint.opacity
+                self._frames[link].position = pose[:3, 3]
+        for link, paint in paints.items():
+            if link in self._paints and paint == self._paints[link]:
+                continue
+            self._paints[link] = paint
+            self._frames[link].visible = paint is not None
+            if paint is None:
+                continue
+            for shape in self._shapes[link]:
+                shape.color, shape.opacity = paint.color, paint.opacity
+
+
+class Wires:
+    """Wires of a muscle-driven robot, straight between their points.
+
+    Args:
+        site: The page.
+        routes: Name of a wire -> its points: link, and place in its frame [m].
+        thick: Thickness of a wire [m].
+    """
+
+    def __init__(
+        self, site: "viser.ViserServer", routes: Mapping[str, Sequence[tuple[str, float, float, float]]], thick: float
+    ) -> None:
+        self.names = tuple(routes)
+        """Names of the wires."""
+        self._stretches = [(index, *ends) for index, route in enumerate(routes.values()) for ends in pairwise(route)]
+        self._wire_of = np.array([index for index, *_ in self._stretches])
+        shape = (len(self._stretches), 2, 3)
+        self._lines = site.scene.add_line_segments(
+            "/wires", np.zeros(shape, np.float32), np.zeros(shape, np.uint8), thickness=thick, visible=False
+        )
+
+    def show(self, poses: Mapping[str, np.ndarray], colors: np.ndarray) -> None:
+        """Draw the wires of a posture.
+
+        Args:
+            poses: Link -> its frame, shape (4, 4).
+            colors: Color of every wire (0 to 255), shape (wires, 3).
+        """
+        points = [
+            [(poses[link] @ np.array([*place, 1.0]))[:3] for link, *place in (start, end)]
+            for _, start, end in self._stretches
+        ]
+        self._lines.points = np.array(points, np.float32)
+        self._lines.colors = np.repeat(colors[self._wire_of, None], 2, axis=1).round().astype(np.uint8)
+        self._lines.visible = True
 
 
 def _rod(end: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:

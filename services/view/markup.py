@@ -72,6 +72,24 @@ def facts_html(snapshot: RobotSnapshot, source: str, read_only: str, last: Outco
     return page(f'<div class="facts">{"".join(cells)}</div>')
 
 
+def legend_html(has_wires: bool) -> str:
+    """Return the meaning of the colors in 3D."""
+    colors = {
+        "#5ca0e6": "measured",
+        "#ffb04c": "estimated",
+        "#6d7583": "not known",
+        "#ffffff55": "what the sensor says",
+    }
+    parts = [f'<span><span style="color:{color}">■</span> {text}</span>' for color, text in colors.items()]
+    if has_wires:
+        parts.append(
+            "<span>wires: slack "
+            '<span style="background:linear-gradient(90deg,#1446e6,#ffa000,#ff1400);padding:0 22px"></span>'
+            " limit</span>"
+        )
+    return page(f'<div class="legend">{"".join(parts)}</div>')
+
+
 def signals_html(rows: Sequence[SignalRow]) -> str:
     """Return the table of all elements of all signals."""
     lines = list(_signal_lines(rows)) or ['<tr><td colspan="5" class="dim">No signal has arrived yet.</td></tr>']
@@ -135,11 +153,12 @@ def anomaly_html(snapshot: RobotSnapshot) -> str:
     kind = {"anomaly": "lost", "environment": "poor", "unknown": "dim"}.get(judged.kind, "good")
     words = {"": "nothing to judge", "environment": "environment changed", "unknown": "normal not known on this body"}
     word = words.get(judged.kind, judged.kind)
-    blamed = f"{'most likely wrong' if judged.is_anomaly else 'contributes most'}: {judged.blamed or '–'}"
+    blamed = f"most likely wrong: {judged.blamed or 'not known yet'}" if judged.is_anomaly else ""
     score = f'score <b>{judged.score:.1f}</b> <span class="dim">threshold</span> {judged.threshold:.1f}'
     return page(
         f'<div style="display:flex;justify-content:space-between"><span>{score}</span>'
-        f'<span class="{kind}">{escape(word)}</span></div><div class="dim">{escape(blamed)}</div>'
+        f'<span class="{kind}">{escape(word)}</span></div>'
+        f'<div class="dim" style="min-height:15px">{escape(blamed)}</div>'
     )
 
 

@@ -1,5 +1,6 @@
 """The page: widgets that show the snapshots of a robot, at fixed rates."""
 
+import copy
 import logging
 import math
 import threading
@@ -17,10 +18,12 @@ from services.view.markup import (
     banner_html,
     bias_html,
     facts_html,
+    legend_html,
     services_html,
     signals_html,
 )
-from services.view.scene import Scene
+from services.view.replay_panel import ReplayPanel, replay_of
+from services.view.scene import Looks, Scene
 from services.view.styles import page
 from services.view.teach_panel import TeachPanel
 from services.view.trail import Trail
@@ -89,22 +92,28 @@ class Page:
         robot: Name of the robot.
         look: Function that returns the present snapshot; it must not wait.
         controls: Sender of the buttons' requests.
-        urdf: URDF of the robot; None if there is none.
+        looks: Look of the robot.
         taught: File of taught samples.
     """
 
     def __init__(
         self, site: "viser.ViserServer", robot: str, look: Callable[[], RobotSnapshot], controls: Controls,
-        urdf: Path | None, taught: Path,
+        looks: Looks, taught: Path,
     ) -> None:  # fmt: skip
         self._site, self._look, self._controls = site, look, controls
         self._trail, self._steady, self._bias = Trail(), Steady(), BiasPicture()
-        self._chart, self._scores = Chart(180), Chart(100)
+        self._charts, self._scores = (Chart(170), Chart(170)), Chart(100)
+        self._paused: tuple[Trail, float] | None = None
+        """Past values and time [monotonic s] at which the plots were paused."""
         self._rows: tuple[SignalRow, ...] = ()
         self._choices: tuple[str, ...] = ()
-        self._tables, self._charts, self._slow = _Due(TABLES), _Due(CHARTS), _Due(SLOW)
+        self._tables, self._plots, self._slow = _Due(TABLES), _Due(CHARTS), _Due(SLOW)
         site.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, brand_color=(92, 160, 230))
-        self._scene = Scene(site, urdf)
+        self._scene, self._looks = Scene(site, looks), looks
+        self._group: Any = None
+        self._stops: tuple[Any, ...] = ()
+        self._is_replay = False
+        self._replay: ReplayPanel | None = None
         self._teach: TeachPanel | None = None
         self._make_left()
         self._make_right(robot, taught)
@@ -118,18 +127,23 @@ class Page:
         """Read the state and write what is due; without a browser nothing is written."""
         now, snapshot = time.monotonic(), self._look()
         rows = self._rows = signal_rows(snapshot)
-        self._trail.add(now, snapshot, rows)
+        replay = replay_of(snapshot)
+        if replay.get("paused") is not True:
+            self._trail.add(now, snapshot, rows)
         if self._teach is not None:
             self._teach.show(snapshot, now)
         shown = self._steady.show(troubles(snapshot, rows), now)
         if not self._site.get_clients():
             return
         self._scene.show(snapshot, rows)
+        self._switch(bool(replay))
+        if self._replay is not None:
+            self._replay.show(snapshot)
         if self._tables.now(now):
-            _set(self._signals, signals_html(rows))
+            _set(self._signals, legend_html(bool(self._looks.wires)) + signals_html(rows))
             _set(self._banner, banner_html(shown))
             _set(self._facts, facts_html(snapshot, source(snapshot), self._controls.read_only, self._controls.last))
-        if self._charts.now(now):
+        if self._plots.now(now):
             self._show_charts(snapshot, now)
         if self._slow.now(now):
             _set(self._services, services_html(service_rows(snapshot)))
@@ -151,10 +165,13 @@ class Page:
         self._facts = gui.add_html(page(""))
         if not self._controls.read_only:
             self._make_buttons()
+            self._replay = ReplayPanel(self._site, self._controls)
         tabs = gui.add_tab_group()
         with tabs.add_tab("Plots"):
-            self._chosen = gui.add_dropdown("plot", ("-",))
-            self._plot = gui.add_html(page(""))
+            self._pause = gui.add_checkbox("pause plots", False)
+            self._pause.on_update(lambda _: self._pause_plots())
+            self._chosen = gui.add_dropdown("plot", ("-",)), gui.add_dropdown("second plot", ("-",))
+            self._curves = gui.add_html(page("")), gui.add_html(page(""))
             self._anomaly = gui.add_html(page(""))
         with tabs.add_tab("Body"):
             self._map = gui.add_html(page(""))
@@ -173,8 +190,23 @@ class Page:
         gui = self._site.gui
         group = gui.add_button_group("control", tuple(GROUPED))
         group.on_click(lambda event: self._press(GROUPED[event.target.value]))
-        gui.add_button("Stop", color="orange", icon=viser.Icon.PLAYER_STOP).on_click(lambda _: self._press("stop"))
-        gui.add_button("EMERGENCY STOP", color="red").on_click(lambda _: self._press("estop"))
+        stop = gui.add_button("Stop", color="orange", icon=viser.Icon.HAND_STOP)
+        stop.on_click(lambda _: self._press("stop"))
+        estop = gui.add_button("EMERGENCY STOP", color="red")
+        estop.on_click(lambda _: self._press("estop"))
+        self._group, self._stops = group, (stop, estop)
+
+    def _switch(self, is_replay: bool) -> None:
+        """Switch the buttons that move a robot off in a replay, and on again for a robot."""
+        if is_replay == self._is_replay:
+            return
+        self._is_replay = is_replay
+        if self._group is not None:
+            self._group.visible = not is_replay  # viser cannot disable a group
+        for button in self._stops:
+            button.disabled = is_replay
+        if self._teach is not None:
+            self._teach.switch(not is_replay)
 
     def _press(self, verb: str) -> None:
         if verb in ("stop", "estop", "disengage") and self._teach is not None:
@@ -186,18 +218,28 @@ class Page:
         choices = (*signals, *(row.name for row in rows))
         if choices and choices != self._choices:
             self._choices = choices
-            self._chosen.options = choices  # the present choice stays if it is among them
+            first, second = self._chosen
+            first.options, second.options = choices, ("-", *choices)  # a present choice stays if it is among them
+
+    def _pause_plots(self) -> None:
+        is_paused = self._pause.value
+        self._paused = (copy.deepcopy(self._trail), time.monotonic()) if is_paused else None
 
     def _show_charts(self, snapshot: RobotSnapshot, now: float) -> None:
-        chosen = self._chosen.value
-        rows = [row for row in self._rows if chosen in (row.signal, row.name)]
-        if rows:
-            curves = self._trail.curves([row.name for row in rows], now)
+        trail, now = self._paused or (self._trail, now)
+        at = "" if self._paused is None else time.strftime("%H:%M:%S", time.localtime(time.time() - _since(now)))
+        for chart, choice, plot in zip(self._charts, self._chosen, self._curves, strict=True):
+            chosen = choice.value
+            rows = [row for row in self._rows if chosen in (row.signal, row.name)]
+            if not rows:
+                _set(plot, page(""))
+                continue
+            curves = trail.curves([row.name for row in rows], now)
             lines = signal_lines([row.element for row in rows], curves.measured, curves.estimated, curves.std)
-            _set(self._plot, page(self._chart.svg(curves.time, lines, rows[0].unit, chosen) + legend(lines)))
-        time, score, threshold = self._trail.scores(now)
+            _set(plot, page(chart.svg(curves.time, lines, rows[0].unit, chosen, at) + legend(lines)))
+        times, score, threshold = trail.scores(now)
         lines = [Line("score", score, "#7cc0ff"), Line("threshold", threshold, "#ff7b7b", dashed=True)]
-        _set(self._anomaly, anomaly_html(snapshot) + page(self._scores.svg(time, lines, "score", "score")))
+        _set(self._anomaly, anomaly_html(snapshot) + page(self._scores.svg(times, lines, "score", "score", at)))
 
     def _show_bias(self, snapshot: RobotSnapshot) -> None:
         biases: dict[str, Any] = dict(snapshot.model.get("biases", {}))
@@ -217,6 +259,10 @@ def source(snapshot: RobotSnapshot) -> str:
     if sample.source == "simulated" or "simulator" in snapshot.alive:
         return "simulated robot"
     return f"robot ({sample.source})"
+
+
+def _since(moment: float) -> float:
+    return time.monotonic() - moment
 
 
 def _set(handle: Any, content: str) -> None:

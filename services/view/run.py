@@ -12,6 +12,7 @@ from services.process.service import until_stopped
 from services.view.controls import Controls, why_read_only
 from services.view.door import Door, new_token
 from services.view.page import Page, serve_page
+from services.view.scene import Looks
 from services.view.site import open_site
 from services.watch.robot_watch import RobotWatch
 from services.wire.member import member_of
@@ -21,7 +22,7 @@ WITHOUT_LINK = "Read only: buttons need the link that `gemuco view` printed."
 
 
 def view(
-    robot: str, host: str, port: int, connect: Iterable[str], urdf: Path | None, stop: threading.Event | None = None
+    robot: str, host: str, port: int, connect: Iterable[str], looks: Looks, stop: threading.Event | None = None
 ) -> None:
     """Serve the page of a robot until SIGTERM, SIGINT or `stop`.
 
@@ -30,7 +31,7 @@ def view(
         host: Address to bind.
         port: Port to bind; 0 for any.
         connect: Endpoints, such as a router's, and role files.
-        urdf: URDF of the robot; None for a page without 3D.
+        looks: Look of the robot in 3D.
         stop: Event that ends the page in place of the signals.
 
     Raises:
@@ -46,7 +47,7 @@ def view(
             site = open_site(host, port, f"gemuco view {robot}", door)
             open_parts.callback(site.stop)
             controls = Controls(lambda: watch.client, read_only)
-            page = Page(site, robot, watch.look, controls, urdf, taught_path(robot))
+            page = Page(site, robot, watch.look, controls, looks, taught_path(robot))
             open_parts.callback(page.close)
             return page, site.get_port()
 

@@ -62,6 +62,11 @@ class TeachPanel:
         """Let the robot go and end the thread."""
         self.teacher.stop()
 
+    def switch(self, is_on: bool) -> None:
+        """Switch the buttons that move the robot or record it off, as in a replay, or on."""
+        for button in (self._take, self._record):
+            button.disabled = not is_on
+
     def show(self, snapshot: RobotSnapshot, now: float) -> None:
         """Show the state of teaching, and query the page that took over."""
         self._make_sliders(snapshot)

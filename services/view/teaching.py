@@ -66,6 +66,8 @@ class Reach:
         """
         if not hal:
             raise NotTeaching("The HAL has not described its limits yet. Is it running?")
+        if "command" not in hal:
+            raise NotTeaching("The description of this robot has no command, so it cannot be taught.")
         signal = hal["command"]["signal"]
         about, limit = hal["signals"][signal], hal["limits"].get(signal, {})
         count = len(about["elements"])

@@ -70,7 +70,9 @@ def verdict(snapshot: RobotSnapshot) -> AnomalyVerdict | None:
         anomaly = fresh(snapshot.anomaly)
         if anomaly is None:
             return None
-        return AnomalyVerdict(anomaly.verdict, anomaly.score, anomaly.threshold, anomaly.is_anomaly, anomaly.blamed)
+        # Before its verdict an anomaly has only the largest part of the present sample, which is no evidence.
+        blamed = anomaly.blamed if anomaly.is_anomaly and anomaly.verdict else ""
+        return AnomalyVerdict(anomaly.verdict, anomaly.score, anomaly.threshold, anomaly.is_anomaly, blamed)
     facts = snapshot.facts("model").get("anomaly")
     if not isinstance(facts, dict) or not facts:
         return None
@@ -196,7 +198,7 @@ def _body(snapshot: RobotSnapshot) -> Iterator[Trouble]:
         text = f"Another condition of the body explains what is measured.{score}"
         yield Trouble(Level.NOTE, "Environment changed", text)
     elif judged.is_anomaly:
-        yield Trouble(Level.ANOMALY, "Anomaly", f"Most likely wrong: {judged.blamed or 'unknown'}.{score}")
+        yield Trouble(Level.ANOMALY, "Anomaly", f"Most likely wrong: {judged.blamed or 'not known yet'}.{score}")
 
 
 def _suspects(snapshot: RobotSnapshot) -> Iterator[Trouble]:

@@ -54,6 +54,10 @@ class Browser:
         found = {str(one["label"]) for one in list(self._messages.values()) if "label" in one}
         return found | {option for one in list(self._messages.values()) for option in one.get("options") or ()}
 
+    def props(self, label: str) -> dict[str, Any]:
+        """Properties of a widget."""
+        return self._messages[self._labelled(label)]
+
     def press(self, label: str) -> None:
         """Press a button."""
         self.say({"type": "GuiUpdateMessage", "uuid": self._labelled(label), "updates": {"value": True}})

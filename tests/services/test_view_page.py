@@ -1,5 +1,6 @@
 """The page over a real socket: what a browser gets, what it may press, and what it cannot do."""
 
+import gzip
 import http.client
 import os
 import resource
@@ -15,14 +16,17 @@ from pathlib import Path
 import pytest
 import viser
 from browser import Browser
+from recorded_arm import record
 from talking_robot import TalkingRobot
 from websockets.exceptions import InvalidStatus
 
 from gemuco.dataset import Dataset
 from services.errors import ServiceError
+from services.recording.replay import run_replay
 from services.view import run
 from services.view.controls import Controls, why_read_only
 from services.view.door import Door, new_token
+from services.view.scene import Looks
 from services.view.site import open_site
 from services.wire.member import Member
 
@@ -48,7 +52,7 @@ class Viewing:
 
     def __init__(self, robot: str, connect: tuple[str, ...] = ()) -> None:
         self.port, self._stop = free_port(), threading.Event()
-        arguments = (robot, "127.0.0.1", self.port, connect, None, self._stop)
+        arguments = (robot, "127.0.0.1", self.port, connect, Looks(), self._stop)
         self._thread = threading.Thread(target=run.view, args=arguments, daemon=True)
 
     def __enter__(self) -> "Viewing":
@@ -190,6 +194,37 @@ def test_without_the_link_the_page_is_read_only(talking: TalkingRobot):
             operator.until(lambda b: "Healthy" in b.text())
             assert operator.labels() >= BUTTONS
         assert talking.asked == []
+
+
+def test_a_page_asks_whether_its_program_runs(robot: str):
+    with Viewing(robot) as page:
+        status, _, body = fetch(page.port, f"/{TOKEN}/alive")
+        assert (status, body) == (200, b"alive\n")
+        assert fetch(page.port, "/alive")[0] == 303
+        for more in ({}, {"Accept-Encoding": "gzip"}):
+            _, headers, body = fetch(page.port, f"/{TOKEN}", **more)
+            assert int(headers["Content-Length"]) == len(body)
+            html = gzip.decompress(body) if headers["Content-Encoding"] == "gzip" else body
+            assert b"This page has ended" in html
+
+
+@pytest.mark.long
+def test_a_replay_has_its_own_buttons_and_moves_nothing(robot: str, tmp_path: Path):
+    files, stop = record(tmp_path / "run.mcap", "arm", 300), threading.Event()
+    replaying = threading.Thread(target=run_replay, args=(files, robot, 0.0), kwargs={"stop": stop}, daemon=True)
+    replaying.start()
+    try:
+        with Viewing(robot) as page, Browser(page.port, token=TOKEN) as browser:
+            browser.until(lambda b: "A replay that is paused" in b.text())
+            browser.until(lambda b: b.props("Stop")["disabled"] and b.props("EMERGENCY STOP")["disabled"])
+            browser.until(lambda b: b.props("Take over and hold")["disabled"])
+            browser.press("Play")
+            browser.until(lambda b: "play: at" in b.text() and "Pause" in b.labels())
+            browser.press("Pause")
+            browser.until(lambda b: "pause: at" in b.text() and "Play" in b.labels())
+    finally:
+        stop.set()
+        replaying.join(30.0)
 
 
 def test_no_page_may_frame_it_and_no_cookie_is_set(robot: str):

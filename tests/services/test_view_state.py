@@ -1,20 +1,31 @@
 """What the page shows, without a browser and without a network."""
 
+from dataclasses import replace as replaced
+from pathlib import Path
+
 import numpy as np
 import pytest
-from talking_robot import BOTH, seen
+from msgspec.structs import replace
+from talking_robot import BOTH, DESCRIBED, anomaly, seen
 
+from hal.config import load_robot
 from services.view.bias_map import BiasPicture, project
 from services.view.charts import Chart, Line, ticks
 from services.view.controls import Outcome
+from services.view.ending import with_ending
+from services.view.figure import Body
 from services.view.markup import banner_html, facts_html, services_html, signals_html
 from services.view.page import LINGERS, Steady, source
+from services.view.scene import wire_colors
 from services.view.trail import POINTS, Trail
 from services.watch.service_rows import Level, service_rows
 from services.watch.signal_rows import Kind, signal_rows
-from services.watch.snapshot import Newest
-from services.watch.trouble import Trouble, troubles
+from services.watch.snapshot import Newest, held
+from services.watch.trouble import Trouble, troubles, verdict
 from services.wire.messages import Holder, Status
+from simulators.robots.musashi_arm.model import ROUTES
+
+ROBOTS = Path(__file__).parents[2] / "robots"
 
 
 def test_old_values_are_never_shown_as_fresh():
@@ -130,3 +141,51 @@ def test_a_trail_is_bounded_and_knows_what_vanished():
     assert curves.estimated[0, -1] == -0.48
     assert curves.std[0, -1] == 0.02
     assert np.isnan(curves.measured[1]).all()
+
+
+def test_a_blamed_part_needs_a_verdict():
+    early = Newest(replace(anomaly("anomaly"), verdict=""), 0.01)
+    assert verdict(seen(anomaly=early)).blamed == ""
+    assert "not known yet" in str(troubles(seen(anomaly=early), ())[0])
+    assert verdict(seen(anomaly=Newest(anomaly("anomaly"), 0.01))).blamed == "muscle_tension.biceps"
+
+
+def test_a_paused_replay_is_shown_as_present():
+    status = Status(service="hal", state="running", facts={"replay": {"paused": True}})
+    moment = seen(age=9.0, statuses={"hal": Newest(status, 0.5)})
+    assert {row.kind for row in signal_rows(moment)} == {Kind.OLD}
+    assert {row.kind for row in signal_rows(held(moment))} == {Kind.MEASURED}
+    playing = seen(age=9.0, statuses={"hal": Newest(replace(status, facts={"replay": {"paused": False}}), 0.5)})
+    assert held(playing) is playing
+
+
+def test_the_drawn_wires_are_those_of_the_simulator():
+    robot = load_robot(ROBOTS / "musashi_arm.yaml")
+    body = Body(robot.folder / robot.urdf)
+    assert robot.wires.keys() == ROUTES.keys()
+    links = sorted(body.links, key=lambda link: len(body.carried_by(link)))  # frame k is behind k joints
+    for name, route in ROUTES.items():
+        assert robot.wires[name] == tuple((links[via.frame], via.x, via.y, via.z) for via in route)
+
+
+@pytest.mark.parametrize(("tension", "is_red"), [(0.0, False), (280.0, True), (1000.0, True)])
+def test_a_wire_is_colored_by_its_tension(tension, is_red):
+    moment = seen(hal=DESCRIBED | {"limits": {"muscle_tension": {"soft_high": 280}}})
+    rows = [replaced(row, value=tension) if row.unit == "N" else row for row in signal_rows(moment)]
+    (color,) = wire_colors(moment, rows, ["biceps"])
+    assert bool(color[0] > color[2]) is is_red
+
+
+def test_a_camera_sees_the_whole_robot():
+    body = Body(load_robot(ROBOTS / "musashi_arm.yaml").folder / "../simulators/assets/musashi_arm/musashi_arm.urdf")
+    center, radius = body.room()
+    ends = np.array([pose[:3, 3] for pose in body.poses({}).values()])
+    assert np.linalg.norm(ends - center, axis=1).max() < 1.3 * radius
+    assert 0.2 < radius < 0.6  # an arm of 0.5 m
+
+
+def test_a_page_says_when_its_program_has_ended():
+    html = b"<html><head></head><body><div id=root></div></body></html>"
+    assert b"This page has ended" in with_ending(html)
+    assert with_ending(html).endswith(b"</body></html>")
+    assert with_ending(b"\x00\x01") == b"\x00\x01"
