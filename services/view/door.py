@@ -13,7 +13,7 @@ from dataclasses import replace
 from http import HTTPStatus
 from typing import TYPE_CHECKING
 
-from services.view.ending import ALIVE, with_ending
+from services.view.styles import ALIVE, with_ending
 from services.wire.session import is_loopback
 
 if TYPE_CHECKING:

@@ -12,11 +12,11 @@ from hal.config import load_robot
 from services.view.bias_map import BiasPicture, project
 from services.view.charts import Chart, Line, ticks
 from services.view.controls import Outcome
-from services.view.ending import with_ending
 from services.view.figure import Body
 from services.view.markup import banner_html, facts_html, services_html, signals_html
 from services.view.page import LINGERS, Steady, source
 from services.view.scene import wire_colors
+from services.view.styles import with_ending
 from services.view.trail import POINTS, Trail
 from services.watch.service_rows import Level, service_rows
 from services.watch.signal_rows import Kind, signal_rows
