@@ -130,7 +130,7 @@ def _facts(snapshot: RobotSnapshot) -> Text:
     if counts:
         words = ("measured", "estimated", "none")
         facts.append(", ".join(f"{count} {word}" for count, word in zip(counts, words, strict=True) if count))
-    if judged is not None and str(judged):
+    if judged is not None and judged.kind and not judged.is_anomaly:
         facts.append(plain(str(judged), 40))
     late = _worst_loop(snapshot).plain
     if late != "-":

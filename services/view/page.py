@@ -103,6 +103,8 @@ class Page:
         self._site, self._look, self._controls = site, look, controls
         self._trail, self._steady, self._bias = Trail(), Steady(), BiasPicture()
         self._charts, self._scores = (Chart(170), Chart(170)), Chart(100)
+        self._at = 0.0
+        """The right end of the plots is at this time [monotonic s], which stands still while a replay is paused."""
         self._paused: tuple[Trail, float] | None = None
         """Past values and time [monotonic s] at which the plots were paused."""
         self._rows: tuple[SignalRow, ...] = ()
@@ -129,7 +131,9 @@ class Page:
         rows = self._rows = signal_rows(snapshot)
         replay = replay_of(snapshot)
         if replay.get("paused") is not True:
+            self._at = now
             self._trail.add(now, snapshot, rows)
+        self._scene.follow(snapshot, rows)
         if self._teach is not None:
             self._teach.show(snapshot, now)
         shown = self._steady.show(troubles(snapshot, rows), now)
@@ -144,7 +148,7 @@ class Page:
             _set(self._banner, banner_html(shown))
             _set(self._facts, facts_html(snapshot, source(snapshot), self._controls.read_only, self._controls.last))
         if self._plots.now(now):
-            self._show_charts(snapshot, now)
+            self._show_charts(snapshot, self._at)
         if self._slow.now(now):
             _set(self._services, services_html(service_rows(snapshot)))
             self._choose_from(rows)
@@ -223,7 +227,7 @@ class Page:
 
     def _pause_plots(self) -> None:
         is_paused = self._pause.value
-        self._paused = (copy.deepcopy(self._trail), time.monotonic()) if is_paused else None
+        self._paused = (copy.deepcopy(self._trail), self._at) if is_paused else None
 
     def _show_charts(self, snapshot: RobotSnapshot, now: float) -> None:
         trail, now = self._paused or (self._trail, now)

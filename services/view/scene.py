@@ -66,6 +66,10 @@ class Scene:
     def __init__(self, site: "viser.ViserServer", looks: Looks) -> None:
         self._site = site
         self._angles: dict[str, dict[str, float]] = {"known": {}, "ghost": {}}
+        self._kinds: dict[str, Kind] = {}
+        self._sensed: dict[str, float] = {}
+        self._places: dict[str, float] = {}
+        """Coordinates of points, as measured last [m]."""
         self._points: dict[tuple[str, str], Any] = {}
         self._figures: dict[str, Figure] = {}
         self._wires: Wires | None = None
@@ -85,23 +89,27 @@ class Scene:
                 self._wires = Wires(site, looks.wires, 0.012 * self._radius)
         self._furnish()
 
-    def show(self, snapshot: RobotSnapshot, rows: Sequence[SignalRow]) -> None:
-        """Move the robot and its ghost to the present values; a link's color shows the origin of all its joints."""
-        kinds: dict[str, Kind] = {}
-        sensed = _sensed(snapshot, rows)
+    def follow(self, snapshot: RobotSnapshot, rows: Sequence[SignalRow]) -> None:
+        """Keep the present values, and what the sensors said last; also call it while no browser is open."""
+        self._kinds, self._sensed = {}, _sensed(snapshot, rows)
         for row in rows:
-            if row.element not in self._joints or row.unit != "rad" or row.element in kinds:
+            if row.unit == "m" and row.kind is Kind.MEASURED:
+                self._places[row.name] = row.value
+            if row.element not in self._joints or row.unit != "rad" or row.element in self._kinds:
                 continue
-            kinds[row.element] = row.kind
+            self._kinds[row.element] = row.kind
             if np.isfinite(row.value):
                 self._angles["known"][row.element] = row.value
-            value = sensed.get(row.name, row.value if row.kind is Kind.MEASURED else math.nan)
+            value = self._sensed.get(row.name, row.value if row.kind is Kind.MEASURED else math.nan)
             if np.isfinite(value):
                 self._angles["ghost"][row.element] = value
+
+    def show(self, snapshot: RobotSnapshot, rows: Sequence[SignalRow]) -> None:
+        """Move the robot and its ghost to the values kept; a link's color shows the origin of all its joints."""
         with self._site.atomic():
             if self._body is not None:
-                self._show_figures(self._body, kinds, snapshot, rows)
-            self._show_points(rows, sensed)
+                self._show_figures(self._body, self._kinds, snapshot, rows)
+            self._show_points(rows)
 
     def fit(self, aspect: float, field: float) -> tuple[np.ndarray, np.ndarray]:
         """Return position and target of a camera [m], each of shape (3,), that sees the whole robot.
@@ -144,7 +152,7 @@ class Scene:
             return Paint(BLUE)
         return Paint(AMBER) if below <= {Kind.MEASURED, Kind.ESTIMATED} else UNKNOWN
 
-    def _show_points(self, rows: Sequence[SignalRow], sensed: Mapping[str, float]) -> None:
+    def _show_points(self, rows: Sequence[SignalRow]) -> None:
         for signal in dict.fromkeys(row.signal for row in rows if row.unit == "m"):
             three = {row.element: row for row in rows if row.signal == signal}
             if tuple(three) != POINT:
@@ -152,7 +160,8 @@ class Scene:
             is_estimated = Kind.ESTIMATED in {row.kind for row in three.values()}
             place = np.array([three[axis].value for axis in POINT])
             self._place("known", signal, place, Paint(AMBER if is_estimated else BLUE))
-            was = np.array([sensed.get(three[axis].name, math.nan) for axis in POINT])
+            names = [three[axis].name for axis in POINT]
+            was = np.array([self._sensed.get(name, self._places.get(name, math.nan)) for name in names])
             self._place("ghost", signal, was if is_estimated else np.full(3, np.nan), GHOST)
 
     def _place(self, name: str, signal: str, place: np.ndarray, paint: Paint) -> None:
@@ -212,7 +221,7 @@ def wire_colors(snapshot: RobotSnapshot, rows: Sequence[SignalRow], names: Seque
     colors = np.empty((len(names), 3))
     for index, name in enumerate(names):
         row = tensions.get(name)
-        if row is None or not math.isfinite(row.value):
+        if row is None or row.kind is Kind.OLD or not math.isfinite(row.value):
             colors[index] = GREY.color
             continue
         limit = snapshot.hal.get("limits", {}).get(row.signal, {}).get("soft_high")

@@ -174,6 +174,8 @@ def test_a_wire_is_colored_by_its_tension(tension, is_red):
     rows = [replaced(row, value=tension) if row.unit == "N" else row for row in signal_rows(moment)]
     (color,) = wire_colors(moment, rows, ["biceps"])
     assert bool(color[0] > color[2]) is is_red
+    (old,) = wire_colors(moment, [replaced(row, kind=Kind.OLD) for row in rows], ["biceps"])
+    assert np.ptp(old) < 20  # grey
 
 
 def test_a_camera_sees_the_whole_robot():
