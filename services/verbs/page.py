@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from services.verbs.verb import Connect, RobotFile, report_errors, robot_name, robot_path
+from services.verbs.verb import Connect, RobotFile, report_errors, robot_name, urdf_of
 
 
 def register(app: typer.Typer) -> None:
@@ -32,16 +32,4 @@ def view(
     """
     from services.view.run import view as show
 
-    show(robot_name(robot), host, port, connect or (), urdf or _urdf_of(robot))
-
-
-def _urdf_of(robot: str) -> Path | None:
-    """Return the URDF in the robot file; None without a robot file, which a client does not need."""
-    from hal.config import load_robot
-    from hal.errors import ConfigError
-
-    try:
-        config = load_robot(robot_path(robot))
-    except ConfigError:
-        return None
-    return None if config.urdf is None else config.folder / config.urdf
+    show(robot_name(robot), host, port, connect or (), urdf or urdf_of(robot))

@@ -92,3 +92,15 @@ def load(text: str) -> Any:
 def robot_name(text: str) -> str:
     """Return the name of a robot; a client needs no robot file."""
     return str(load(text).robot) if Path(text).suffix in (".yaml", ".yml") else text
+
+
+def urdf_of(robot: str) -> Path | None:
+    """Return the URDF in the robot file; None without a robot file, which a client does not need."""
+    from hal.config import load_robot
+    from hal.errors import ConfigError
+
+    try:
+        config = load_robot(robot_path(robot))
+    except ConfigError:
+        return None
+    return None if config.urdf is None else config.folder / config.urdf
