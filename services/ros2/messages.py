@@ -12,6 +12,7 @@ JOINT_STATE = "sensor_msgs/msg/JointState"
 NUMBERS = "std_msgs/msg/Float64MultiArray"
 POINT = "geometry_msgs/msg/PointStamped"
 WRENCH = "geometry_msgs/msg/WrenchStamped"
+TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
 JOINTS = {"joint_position": "position", "joint_velocity": "velocity", "joint_effort": "effort"}
 """These signals are the fields of a JointState."""
 AXES = ("x", "y", "z")

@@ -142,7 +142,9 @@ class Node:
         """
         qos = names.LATCHED if is_latched else names.VOLATILE
         entity, token = self._declared(Kind.PUBLISHER, topic, kind, qos)
-        return Publisher(self.session, self._key(entity), kind, token, is_latched)
+        publisher = Publisher(self.session, self._key(entity), kind, token, is_latched)
+        self._kept.append(publisher)
+        return publisher
 
     def subscribe(self, topic: str, kind: str, take: Callable[[zenoh.Sample], None]) -> None:
         """Call `take` with every message on a topic of this type.
@@ -182,6 +184,23 @@ class Node:
             self.session.declare_queryable(self._key(entity), take, complete=True),
             self.session.liveliness().declare_token(token),
         ]
+
+    def mismatch(self, kind: Kind, topic: str, ros_type: str) -> str:
+        """Return why no other endpoint of this kind and type is on a topic, in a sentence; empty if one is."""
+        what = "publisher" if kind is Kind.PUBLISHER else "subscriber"
+        others = [one for one in self.graph.entities() if one.kind is kind and one.topic == topic]
+        if not others:
+            return f"Topic '{topic}' has no {what} in ROS domain {self.network.domain}. Is its node running?"
+        hash_ = names.hash_of(ros_type, self.network.distribution)
+        if any(one.type == ros_type and one.hash == hash_ for one in others):
+            return ""
+        other = others[0]
+        if other.type != ros_type:
+            return f"Topic '{topic}' of node '{other.node}' is of type {other.type or 'unknown'}, not {ros_type}."
+        return (
+            f"Topic '{topic}' of node '{other.node}' has the type hash {other.hash[:16]}, not {hash_[:16]}. "
+            "Is it of another ROS distribution?"
+        )
 
     @property
     def is_linked(self) -> bool:
@@ -265,5 +284,5 @@ def open_session(network: Network) -> zenoh.Session:
     except zenoh.ZError:
         raise ServiceUnavailable(
             f"No router of ROS 2 answers at {place}. Is `ros2 run rmw_zenoh_cpp rmw_zenohd` running, or, without ROS, "
-            "`gemuco router`? Name another place by --ros-router."
+            "`gemuco router`? Name another place by --ros-router, or in the robot file (`ros2: {router: ...}`)."
         ) from None
