@@ -8,16 +8,17 @@ from contextlib import ExitStack
 
 import typer
 
-from services.errors import ServiceUnavailable
+from services.errors import ServiceError, ServiceUnavailable
 from services.process.loop import Loop
 from services.process.service import until_stopped
 from services.ros2 import messages
-from services.ros2.diagnostics import DIAGNOSTIC_ARRAY, DIAGNOSTICS, OK, WARN, diagnostics, states
+from services.ros2.diagnostics import DIAGNOSTIC_ARRAY, DIAGNOSTICS, OK, WARN, diagnostics, element_status, states
 from services.ros2.frames import Frames
 from services.ros2.node import Network, Node
 from services.ros2.outgoing import Outgoing
 from services.watch.robot_watch import RobotWatch
-from services.watch.signal_rows import signal_rows
+from services.watch.signal_rows import Kind, SignalRow, signal_rows
+from services.watch.snapshot import RobotSnapshot
 
 log = logging.getLogger(__name__)
 
@@ -25,6 +26,11 @@ DIAGNOSTICS_EVERY = 1.0
 """The diagnostics are published at this interval [s], and at once when an element is lost or back."""
 TRY_EVERY = 1.0
 """The router of ROS 2 is tried again at this interval [s]."""
+
+
+def described_rows(snapshot: RobotSnapshot) -> list[SignalRow]:
+    """Return the rows of a robot; before `describe` has answered, when elements have numbers as names, none."""
+    return [row for row in signal_rows(snapshot) if row.unit]
 
 
 class Bridge:
@@ -40,13 +46,15 @@ class Bridge:
         self._node, self._watch = node, watch
         self._outgoing = Outgoing(node, watch.robot, frames)
         self._diagnostics = node.publisher(DIAGNOSTICS, DIAGNOSTIC_ARRAY)
+        node.serve(f"/{watch.robot}/estimate", "diagnostic_msgs/srv/SelfTest", self._answer_estimate)
+        node.serve(f"/{watch.robot}/stop", "std_srvs/srv/Trigger", self._answer_stop)
         self._due = 0.0
         self._states: object = None
 
     def tick(self) -> None:
         """Publish what is new."""
         snapshot = self._watch.look()
-        rows = signal_rows(snapshot)
+        rows = described_rows(snapshot)
         self._outgoing.publish(snapshot, rows)
         now, before = time.monotonic(), self._states
         self._states = states(rows)
@@ -54,6 +62,25 @@ class Bridge:
             self._due = now + DIAGNOSTICS_EVERY
             self._outgoing.check_names()
             self._diagnostics.put(diagnostics(snapshot, rows, self._status()))
+
+    def _answer_estimate(self, _: messages.Message) -> messages.Message:
+        """Return a status per element with its value, measured or estimated, and whether all are known."""
+        snapshot = self._watch.look()
+        rows = described_rows(snapshot)
+        known = [row.kind in (Kind.MEASURED, Kind.ESTIMATED) for row in rows]
+        statuses = [element_status(snapshot.robot, row) for row in rows]
+        return {"id": snapshot.robot, "passed": int(bool(known) and all(known)), "status": statuses}
+
+    def _answer_stop(self, _: messages.Message) -> messages.Message:
+        """Stop the robot as its file says, as every client may."""
+        client = self._watch.client
+        if client is None:
+            return {"success": False, "message": "The bridge has no connection to the robot."}
+        try:
+            answer = client.stop()
+        except ServiceError as error:
+            return {"success": False, "message": str(error)}
+        return {"success": True, "message": f"The robot's mode is '{answer.get('mode', 'not known')}'."}
 
     def _status(self) -> messages.Message:
         """Return the status of the bridge itself."""

@@ -30,7 +30,7 @@ def diagnostics(snapshot: RobotSnapshot, rows: Sequence[SignalRow], bridge: Mess
     robot = snapshot.robot
     statuses = [
         _whole(snapshot, rows),
-        *(_element(robot, row) for row in rows),
+        *(element_status(robot, row) for row in rows),
         *(status for row in service_rows(snapshot) for status in _service(robot, row)),
         bridge,
     ]
@@ -51,7 +51,8 @@ def _whole(snapshot: RobotSnapshot, rows: Sequence[SignalRow]) -> Message:
     return messages.status(f"{snapshot.robot}: robot", snapshot.robot, LEVELS[worst.level], str(worst), values)
 
 
-def _element(robot: str, row: SignalRow) -> Message:
+def element_status(robot: str, row: SignalRow) -> Message:
+    """Return the status of one element, with its value if it is measured or estimated."""
     level, text = WARN, row.distrust
     if row.kind is Kind.MEASURED:
         level, text = OK, "measured"

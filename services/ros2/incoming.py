@@ -20,7 +20,7 @@ from services.wire.streams import Transit
 log = logging.getLogger(__name__)
 
 SOURCES = 16
-"""At most this many publishers of a topic are told apart."""
+"""At most this many publishers of a topic are distinguished."""
 LARGEST = 1 << 16
 """Longer messages [bytes] are not read."""
 FUTURE, LATE = 0.5, 1.0

@@ -67,8 +67,9 @@ class RosLink:
                 with Node(self._name, self._network) as node:
                     self._serve(node)
             except ServiceError as error:
+                if str(error) != self._text:
+                    log.warning("%s It is tried again.", error)
                 self._text = str(error)
-                log.warning("%s Trying again.", error)
             except Exception:
                 log.exception("The node '%s' failed", self._name)
             self._stop.wait(TRY_EVERY)

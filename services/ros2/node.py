@@ -146,20 +146,27 @@ class Node:
         self._kept.append(publisher)
         return publisher
 
-    def subscribe(self, topic: str, kind: str, take: Callable[[zenoh.Sample], None]) -> None:
+    def subscribe(
+        self, topic: str, kind: str, take: Callable[[zenoh.Sample], None], *, is_latched: bool = False
+    ) -> None:
         """Call `take` with every message on a topic of this type.
 
         Args:
             topic: Full name of the topic.
             kind: ROS type.
             take: Function that only stores the message: the session's thread calls it.
+            is_latched: Whether to get the last messages of before too (transient local).
         """
-        entity, token = self._declared(Kind.SUBSCRIPTION, topic, kind, names.VOLATILE)
+        qos = names.LATCHED if is_latched else names.VOLATILE
+        entity, token = self._declared(Kind.SUBSCRIPTION, topic, kind, qos)
         handler = zenoh.handlers.Callback(take, indirect=False)
-        self._kept += [
-            self.session.declare_subscriber(self._key(entity), handler),
-            self.session.liveliness().declare_token(token),
-        ]
+        history = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
+        subscriber: Any = (
+            zenoh.ext.declare_advanced_subscriber(self.session, self._key(entity), handler, history=history)
+            if is_latched
+            else self.session.declare_subscriber(self._key(entity), handler)
+        )
+        self._kept += [subscriber, self.session.liveliness().declare_token(token)]
 
     def serve(self, name: str, kind: str, answer: Callable[[dict[str, Any]], Message]) -> None:
         """Answer a service of the ROS type `kind` (`std_srvs/srv/Trigger`), each request in a thread of its own."""

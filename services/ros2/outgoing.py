@@ -10,7 +10,7 @@ from services.ros2.frames import Frames
 from services.ros2.messages import Message
 from services.ros2.names import ros_name
 from services.ros2.node import Node, Publisher
-from services.watch.signal_rows import Kind, SignalRow, signal_rows
+from services.watch.signal_rows import Kind, SignalRow
 from services.watch.snapshot import RobotSnapshot, fresh
 
 log = logging.getLogger(__name__)
@@ -66,13 +66,11 @@ class Outgoing:
         """Number of messages so far, of all topics."""
         return sum(publisher.published for publisher in self._publishers.values())
 
-    def publish(self, snapshot: RobotSnapshot, rows: Rows | None = None) -> None:
+    def publish(self, snapshot: RobotSnapshot, rows: Rows) -> None:
         """Publish what is new: a message per topic for each new sample, nothing for a robot that is silent."""
-        rows = signal_rows(snapshot) if rows is None else rows
         by_signal: dict[str, list[SignalRow]] = {}
         for row in rows:
-            if row.unit:  # before `describe` has answered, elements have numbers as names
-                by_signal.setdefault(row.signal, []).append(row)
+            by_signal.setdefault(row.signal, []).append(row)
         for source, newest in (("hal", snapshot.sample), ("vision", snapshot.vision)):
             sample = fresh(newest)
             if sample is None or self._last.get(source) is sample:

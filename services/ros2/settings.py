@@ -1,8 +1,10 @@
 """Settings of ROS 2 in a robot file: the network of the section `ros2`, and the topics of the signals."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any
 
+import numpy as np
 from pydantic import Field, ValidationError
 
 from hal.bounds_config import Section
@@ -64,18 +66,23 @@ class SignalTopic:
     elements: tuple[str, ...]
 
 
-def network_of(config: RobotConfig, **given: Any) -> Network:
-    """Return the network of a robot file; values that are given and not None replace those of the file.
+def network_of(config: RobotConfig) -> Network:
+    """Return the network of a robot file; see `network_with`."""
+    return network_with(config.ros2)
+
+
+def network_with(section: Mapping[str, Any], **given: Any) -> Network:
+    """Return the network of the section `ros2`; values that are given and not None replace those of the file.
 
     Raises:
         ConfigError: The section `ros2` has an unknown key, or a value does not fit.
     """
     changes = {name: value for name, value in given.items() if value is not None}
     try:
-        section = Ros2Config.model_validate({**config.ros2, **changes})
+        config = Ros2Config.model_validate({**section, **changes})
     except ValidationError as error:
         raise ConfigError(f"ros2: {explain(error, Ros2Config)}") from None
-    return Network(**section.model_dump())
+    return Network(**config.model_dump())
 
 
 def topics_of(config: RobotConfig) -> list[SignalTopic]:
@@ -117,4 +124,10 @@ def _check_command(config: RobotConfig) -> None:
         raise ConfigError(
             f"command.signal '{command.signal}' is in {signal.unit}. Topics of ROS 2 are commanded in positions only, "
             "because a controller goes on with its last velocity or effort when the HAL ends."
+        )
+    low, high = config.bounds(command.signal)
+    limit = config.limits.get(command.signal)
+    if command.topic and (limit is None or limit.rate is None or not np.isfinite([low, high]).all()):
+        raise ConfigError(
+            f"limits.{command.signal} needs `low`, `high` and `rate`, because the robot is commanded by a topic."
         )

@@ -161,6 +161,8 @@ def _buses(robot: str | None, interface: str | None, channel: str | None, bitrat
         )
     if robot is not None:
         config = load(robot)
+        if not config.buses:
+            raise BadArguments(f"Robot '{config.robot}' has no bus. `gemuco top` shows what its HAL reads.")
         return config, dict(config.buses)
     if channel is None:
         raise BadArguments(f"--interface {interface} needs a --channel, such as can0.")

@@ -12,8 +12,10 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 from others import OtherHands
-from ros_listener import bridge, eventually, ros_network
+from ros_arm import hal
+from ros_listener import Listener, bridge, eventually, ros_network
 
+from hal.config import RobotConfig
 from services.client import Client
 from services.process.service import Service
 from services.ros2 import cdr
@@ -144,6 +146,9 @@ def test_node_topics_types_hashes_and_qos_are_seen_and_go(robot: str, network: N
             assert f"Node namespace: /{robot}" in info
             assert f"Type hash: {type_hash('sensor_msgs/msg/JointState')}" in info
             assert "QoS: 1:2:1,10:,:,:,," in info
+            served = other_hands.cli(port(network), "service", "list", "-t", timeout=1.0)
+            assert f"/{robot}/estimate [diagnostic_msgs/srv/SelfTest]" in served
+            assert f"/{robot}/stop [std_srvs/srv/Trigger]" in served
         finally:
             running.send_signal(signal.SIGKILL)
             running.wait()
@@ -162,3 +167,62 @@ def test_hashes_and_bytes_are_those_of_others(other_hands: OtherHands):
             "header": header, "name": one["names"], "position": position, "velocity": velocity, "effort": effort,
         }  # fmt: skip
         assert cdr.encode("sensor_msgs/msg/JointState", message).hex() == one["bytes"]
+
+
+def test_what_the_sdk_publishes_moves_the_signals(robot: str, network: Network, other_hands: OtherHands):
+    position = {
+        "unit": "rad", "elements": ["b", "a"], "source": "ros2", "topic": "/sdk_states", "field": "position",
+        "stale_after": 0.3,
+    }  # fmt: skip
+    config = RobotConfig.model_validate(
+        {
+            "robot": robot, "signals": {"joint_position": position}, "command": {"signal": "joint_position"},
+            "rates": {"hal": 100}, "ros2": {"router": network.router},
+        }
+    )  # fmt: skip
+    publishing = other_hands.script("publish", port(network), "/sdk_states", 12)
+    with hal(config), Client(robot) as client:
+        seen: list[np.ndarray] = []
+
+        def moves() -> bool:
+            sample = client.next_sample()
+            if sample is not None and sample.valid["joint_position"].all():
+                seen.append(sample.values["joint_position"])
+            return len(seen) > 200
+
+        eventually(moves, 60.0)
+        places = np.array(seen)
+        assert np.allclose(np.hypot(*places.T), 0.3, atol=1e-9), "a is 0.3 sin t, b is 0.3 cos t"
+        assert np.ptp(places, axis=0).min() > 0.01
+        listed = other_hands.cli(port(network), "topic", "info", "-v", "/sdk_states")
+        assert "Subscription count: 1" in listed
+        assert "Node name: hal" in listed
+        publishing.wait(60)
+        eventually(lambda: (now := client.sample()) is not None and not now.valid["joint_position"].any())
+
+
+def test_a_frozen_bridge_changes_nothing_for_the_robot(robot: str, network: Network):
+    command = [sys.executable, "-m", "services.cli", "ros2", robot, "--ros-router", network.router]
+    with MovingHal(robot), Client(robot) as client, Listener(network) as ros:
+        cycles: list[int] = []
+        heard = ros.listen(f"/{robot}/joint_states", "sensor_msgs/msg/JointState")
+        client.session.declare_subscriber(
+            keys.sample(robot), lambda sample: cycles.append(received_message(sample, Sample).cycle)
+        )
+        running = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+        try:
+            eventually(lambda: heard, 40.0)
+            running.send_signal(signal.SIGSTOP)
+            count = len(cycles)
+            eventually(lambda: len(cycles) > count + 300, 60.0)
+            running.send_signal(signal.SIGCONT)
+            before = len(heard)
+            eventually(lambda: len(heard) > before + 20)
+            newest = heard[-1][0]["header"]["stamp"]
+            assert time.time() - newest["sec"] < 5.0, "what was old when the bridge went on is not published"
+        finally:
+            running.kill()
+            running.wait()
+        count = len(cycles)
+        eventually(lambda: len(cycles) > count + 100, 60.0)
+        assert np.all(np.diff(cycles) == 1), "no sample was lost for another client"

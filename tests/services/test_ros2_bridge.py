@@ -10,6 +10,7 @@ from ros_listener import Listener, bridge, eventually, free_port, ros_network
 from talking_robot import TalkingRobot
 
 from services.process.router import routing
+from services.ros2 import cdr, names
 from services.ros2.bridge import run_bridge
 from services.ros2.frames import Frames
 from services.ros2.names import Kind, read_token
@@ -159,3 +160,31 @@ def test_a_router_that_restarts_finds_the_bridge_again(robot: str):
                 heard = ros.listen(f"/{robot}/joint_states", JOINT_STATE)
                 eventually(lambda heard=heard: heard)
                 eventually(lambda ros=ros: any("joint_states" in token for token in ros.tokens))
+
+
+def call(ros: Listener, name: str, kind: str) -> dict[str, Any]:
+    key = names.data_key(0, name, kind, names.hash_of(kind, "jazzy"))
+    request = cdr.encode(f"{kind}_Request", {"structure_needs_at_least_one_member": 0})
+    gid = bytes(range(16))
+    for reply in ros.session.get(key, payload=request, attachment=names.attachment(7, 1, gid), timeout=5.0):
+        assert reply.ok is not None, reply.err
+        assert names.read_attachment(reply.ok.attachment.to_bytes())[::2] == (7, gid)
+        return cdr.decode(f"{kind}_Response", reply.ok.payload.to_bytes())
+    return {}
+
+
+@pytest.mark.long
+def test_services_answer(robot: str, network: Network):
+    estimate, stop = (f"/{robot}/estimate", "diagnostic_msgs/srv/SelfTest"), (f"/{robot}/stop", "std_srvs/srv/Trigger")
+    with Listener(network) as ros, TalkingRobot(robot) as talking, bridge(robot, network):
+        eventually(lambda: call(ros, *estimate).get("passed") == 1)
+        talking.silent = True
+
+        def value() -> tuple[int, str]:
+            by_name = {one["name"]: one for one in call(ros, *estimate)["status"]}
+            elbow = by_name[f"{robot}: joint_position.elbow"]
+            return elbow["level"], {one["key"]: one["value"] for one in elbow["values"]}.get("value", "")
+
+        eventually(lambda: value() == (1, "-0.48"))
+        assert call(ros, *stop) == {"success": True, "message": "The robot's mode is 'off'."}
+        assert talking.asked == ["stop"]

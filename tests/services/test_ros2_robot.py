@@ -3,16 +3,20 @@
 import threading
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from ros_arm import COMMANDS, JOINTS, Driver, config_of, description, hal
 from ros_listener import eventually, free_port, ros_network
+from typer.testing import CliRunner
 
 from hal.clock import ManualClock
-from hal.config import RobotConfig
+from hal.config import RobotConfig, load_robot
 from hal.errors import ConfigError
+from services.cli import app
 from services.client import Client
 from services.process.router import routing
 from services.ros2 import messages
@@ -262,3 +266,46 @@ def test_topics_beside_a_bus_come_from_a_process_of_their_own(robot: str, networ
     stop.set()
     thread.join(20.0)
     assert not thread.is_alive()
+
+
+@pytest.mark.long
+def test_a_drafted_robot_file_runs(robot: str, network: Network, tmp_path: Path):
+    urdf = """<robot name="arm"><link name="a"/><link name="b"/>
+    <joint name="shoulder" type="revolute"><parent link="a"/><child link="b"/><axis xyz="0 0 1"/>
+    <limit lower="-0.7" upper="0.9" velocity="1.5" effort="1"/></joint></robot>"""
+    file = tmp_path / f"{robot}.yaml"
+    options = ["init", "--ros2", "--ros-router", network.router, "--out", str(file), "--ros-distro", "jazzy"]
+    with Driver(network), Node("/describer", network) as node:
+        node.publisher("/robot_description", "std_msgs/msg/String", is_latched=True).put({"data": urdf})
+        eventually(lambda: len(node.graph.publishers("/skin")) == 1)
+        result = CliRunner().invoke(app, options)
+        assert result.exit_code == 0, result.output
+        assert "Commands go to /arm_controller/joint_trajectory, which node /arm_driver reads" in result.output
+        assert "No limits are known of elbow" in result.output
+        config = load_robot(file)
+        assert (tmp_path / f"{robot}.urdf").read_text() == urdf
+        limit = config.limits["joint_position"]
+        assert (limit.low, limit.high, limit.rate) == ((-0.3, -0.7), (-0.1, 0.9), 0.2)
+        assert config.signals["joint_position"].elements == ("elbow", "shoulder")
+        assert {name: signal.field for name, signal in config.signals.items()} == {
+            "joint_position": "position", "joint_velocity": "velocity", "skin": "data",
+            "wrist_force": "force", "wrist_torque": "torque",
+        }  # fmt: skip
+        with hal(config), Client(robot) as client:
+            eventually(
+                lambda: (now := client.sample()) is not None and now.values["joint_position"].tolist() == [-0.2, 0.1]
+            )
+    assert CliRunner().invoke(app, options).exit_code == 1, "an existing file is not replaced"
+
+
+def test_init_takes_a_urdf_or_ros2():
+    result = CliRunner().invoke(app, ["init"])
+    assert (result.exit_code, result.stderr) == (1, "gemuco: `gemuco init` takes either a URDF or --ros2.\n")
+
+
+def test_a_robot_without_a_bus_has_nothing_to_scan(tmp_path: Path):
+    file = tmp_path / "ros_arm.yaml"
+    file.write_text(yaml.safe_dump(description("ros_arm", Network())))
+    result = CliRunner().invoke(app, ["scan", str(file)])
+    assert result.exit_code == 1
+    assert result.stderr.startswith("gemuco: Robot 'ros_arm' has no bus.")
