@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from services.verbs import deployment, describe, hardware, init, page, recording, ros2
+from services.verbs import deployment, describe, hardware, init, metrics, page, recording, ros2
 from services.verbs.verb import Connect, RobotFile, load, report_errors, robot_name, robot_path
 
 app = typer.Typer(
@@ -322,7 +322,7 @@ def reproduce(
     typer.echo(f"Figures and tables are in {out / robot}.")
 
 
-for verbs in (init, describe, hardware, deployment, recording, page, ros2):
+for verbs in (init, describe, hardware, deployment, recording, page, ros2, metrics):
     verbs.register(app)
 
 
