@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from services.ros2.definitions import type_hash
+from services.wire.plain_text import plain
 
 LIVELINESS = "@ros2_lv"
 NO_HASH = "TypeHashNotSupported"
@@ -93,7 +94,7 @@ def endpoint_token(domain: int, node_id: int, endpoint_id: int, entity: Entity) 
 
 def read_token(key: str) -> Entity | None:
     """Return the entity of a token; None for a key that is not a token, as of a later version."""
-    parts = key.split("/")
+    parts = [plain(part) for part in key.split("/")]  # they appear in messages and logs
     if len(parts) not in (9, 13) or parts[0] != LIVELINESS or parts[5] not in set(Kind):
         return None
     session, kind, namespace, name = parts[2], Kind(parts[5]), parts[7].replace("%", "/"), parts[8]

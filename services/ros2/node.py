@@ -27,6 +27,8 @@ SEEN_WITHIN = 0.5
 """Nodes that are there are known after this time [s]."""
 GONE_WITHIN = 1.5
 """A node that was killed is gone from the graph after this time [s]."""
+AT_ONCE = 8
+"""At most this many requests of services are answered at once."""
 HEARTBEAT = 0.5
 """A latched publisher says this often [s] which message was its last."""
 
@@ -103,6 +105,7 @@ class Node:
         self.name, self.network = name, network
         self._ids = 0
         self._kept: list[Any] = []
+        self._answering = threading.BoundedSemaphore(AT_ONCE)
 
     def __enter__(self) -> Self:
         self.session = open_session(self.network)
@@ -181,10 +184,15 @@ class Node:
                 log.warning("A request of %s was not answered: %s", name, error)
                 query.reply_err(str(error))
                 return
+            finally:
+                self._answering.release()
             attachment = names.attachment(sequence, time.time_ns(), gid)
             query.reply(self._key(entity), response, attachment=attachment)
 
         def take(query: zenoh.Query) -> None:
+            if not self._answering.acquire(blocking=False):
+                query.reply_err(f"More than {AT_ONCE} requests are being answered.")
+                return
             threading.Thread(target=reply, args=(query,), name=f"service {name}", daemon=True).start()
 
         self._kept += [

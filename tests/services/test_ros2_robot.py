@@ -20,6 +20,7 @@ from services.cli import app
 from services.client import Client
 from services.process.router import routing
 from services.ros2 import messages
+from services.ros2.hardware import check_topics
 from services.ros2.incoming import Topic
 from services.ros2.node import Network, Node
 from services.ros2.settings import SignalTopic, topics_of
@@ -309,3 +310,25 @@ def test_a_robot_without_a_bus_has_nothing_to_scan(tmp_path: Path):
     result = CliRunner().invoke(app, ["scan", str(file)])
     assert result.exit_code == 1
     assert result.stderr.startswith("gemuco: Robot 'ros_arm' has no bus.")
+
+
+@pytest.mark.long
+def test_the_doctor_checks_topics(robot: str, network: Network):
+    config = config_of(robot, network)
+
+    def findings() -> dict[str, tuple[str, str]]:
+        return {one.what: (one.verdict.value, one.text) for one in check_topics(config)}
+
+    names = ["router of ROS 2", "topic /joint_states", "topic /wrist", "topic /skin", f"topic {COMMANDS}"]
+    with Driver(network):
+        eventually(lambda: {verdict for verdict, _ in findings().values()} == {"ok"})
+        assert list(findings()) == names
+    with Node("/other", network) as node:
+        node.publisher("/skin", "std_msgs/msg/String")
+        assert findings()["topic /skin"] == (
+            "bad", "Topic '/skin' of node '/other' is of type std_msgs/msg/String, not std_msgs/msg/Float64MultiArray.",
+        )  # fmt: skip
+        assert findings()[f"topic {COMMANDS}"][1].startswith(f"Topic '{COMMANDS}' has no subscriber")
+    nowhere = config_of(robot, Network(f"tcp/127.0.0.1:{free_port()}"))
+    ((what, finding),) = {one.what: one for one in check_topics(nowhere)}.items()
+    assert (what, finding.verdict.value) == ("router of ROS 2", "bad")
