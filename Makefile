@@ -57,7 +57,7 @@ format: $(STAMP) ## apply formatting and the safe lint fixes
 test-socketcan: $(STAMP)  ## stack and drivers on vcan0 and vcan1 of a real Linux kernel, booted with $(VMCAN) if need be
 	@if [ -e /sys/class/net/vcan0 ]; then $(BIN)/python -m pytest $(SOCKETCAN); \
 	elif [ -x "$(VMCAN)" ] && command -v insmod >/dev/null; then "$(VMCAN)" -t 580 "$(CURDIR)" $(BIN)/python -m pytest -p no:cacheprovider $(SOCKETCAN); \
-	else echo "skipped: no vcan0 here (modprobe vcan; ip link add vcan0 type vcan), and no '$(VMCAN)' with insmod (package kmod) to boot a kernel that has one"; fi
+	else echo "skipped: no vcan0 here (modprobe vcan; ip link add vcan0 type vcan), and no '$(VMCAN)' with insmod (packages kmod, can-utils) to boot a kernel that has one"; fi
 
 test-controllers: $(STAMP)  ## drivers on two CAN controllers at 1 Mbit/s: can0 and can1 on one wire, or QEMU's SJA1000 by $(VMCAN)
 	@if [ -e /sys/class/net/can0/device ]; then $(BIN)/python -m pytest tests/system/test_socketcan_states.py; \

@@ -1,5 +1,9 @@
 """Typed models of a robot file (robots/*.yaml). An unknown key is an error that lists the known keys."""
 
+import difflib
+import re
+import sys
+from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -253,6 +257,9 @@ class RobotConfig(Section):
         if self.command.signal not in self.measured:
             raise ValueError(f"command.signal '{self.command.signal}' must be measured by devices, to start from it.")
         for name, signal in self.signals.items():
+            twice = [element for element, count in Counter(signal.elements).items() if count > 1]
+            if twice:
+                raise ValueError(f"signals.{name}: element '{twice[0]}' is there twice. Give each a name of its own.")
             self._computed_fits(name)
             if signal.plausible is not None:
                 signal.plausible.check(signal.size, f"signals.{name}.plausible")
@@ -375,25 +382,79 @@ def load_robot(path: str | Path) -> RobotConfig:
         ConfigError: The file is missing, not YAML, or does not describe a robot.
     """
     path = Path(path)
+    _check_kind(path)
     try:
-        raw = yaml.safe_load(path.read_text())
+        raw = parse_yaml(path.read_text())
     except FileNotFoundError:
         raise ConfigError(f"There is no robot file '{path}'. {_beside(path)}") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"Robot file '{path}' cannot be read: {error}.") from None
     except yaml.YAMLError as error:
-        raise ConfigError(f"Robot file '{path}' is not YAML: {' '.join(str(error).split())}") from None
+        raise ConfigError(f"Robot file '{path}' is not YAML: {_yaml_problem(error)}.") from None
     if not isinstance(raw, dict):
         raise ConfigError(f"Robot file '{path}' is empty or not a mapping. Compare it with robots/*.yaml.")
+    folder = path.resolve().parent
+    if str(folder) not in sys.path:
+        sys.path.append(str(folder))  # simulators, drivers and motions of a user are modules beside the robot file
     try:
-        return RobotConfig.model_validate({**raw, "folder": path.resolve().parent})
+        return RobotConfig.model_validate({**raw, "folder": folder})
     except ValidationError as error:
         raise ConfigError(f"Robot file '{path}': {explain(error, RobotConfig)}") from None
+
+
+def _check_kind(path: Path) -> None:
+    """Refuse a folder, and a file that is something else by its name, before it is read as YAML."""
+    if path.is_dir():
+        raise ConfigError(
+            f"'{path}' is a folder, not a robot file. `gemuco init {path}` drafts one from EDS and DBC files in it."
+        )
+    suffix = path.suffix.lower()
+    if suffix in (".yaml", ".yml") or not path.exists():
+        return
+    if suffix in (".urdf", ".xml"):
+        raise ConfigError(f"'{path}' is not a robot file. `gemuco init {path}` makes one of a URDF or MJCF file.")
+    raise ConfigError(
+        f"'{path}' is not a robot file, whose name ends in .yaml. robots/*.yaml are examples; `gemuco init` makes one."
+    )
+
+
+def _yaml_problem(error: yaml.YAMLError) -> str:
+    mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None)
+    if mark is None or problem is None:
+        return " ".join(str(error).split()).rstrip(".")
+    hint = "; indent with spaces, not tabs" if "\\t" in problem else ""
+    return f"line {mark.line + 1}, column {mark.column + 1}: {problem}{hint}"
+
+
+def parse_yaml(text: str, loader: type[yaml.SafeLoader] = yaml.SafeLoader) -> Any:
+    """Return the content of a YAML text.
+
+    Raises:
+        yaml.YAMLError: It is not YAML, is nested too deeply, or has a date or number that does not exist.
+    """
+    try:
+        return yaml.load(text, loader)
+    except RecursionError:
+        raise yaml.YAMLError("It is nested too deeply.") from None
+    except (ValueError, OverflowError) as error:  # such as 2025-13-01, or a number of 5000 digits
+        raise yaml.YAMLError(f"A value cannot be read: {error}.") from None
 
 
 def _beside(path: Path) -> str:
     files = sorted(str(file) for file in path.parent.glob("*.yaml") if "." not in file.stem)  # no x.calibration.yaml
     return f"Robot files there: {', '.join(files)}." if files else f"Is '{path.parent}' the right folder?"
+
+
+NUMBERS = {
+    "float_parsing": "a number",
+    "float_type": "a number",
+    "int_parsing": "a whole number",
+    "int_type": "a whole number",
+    "int_from_float": "a whole number",
+}
+"""Problem of pydantic -> the value that belongs there."""
+BRANCHES = re.compile(r"constrained-.*|tuple\[.*|float|int|function-.*|list\[.*")
+"""pydantic names the branch of a union by such words."""
 
 
 def explain(error: ValidationError, model: type[BaseModel]) -> str:
@@ -403,9 +464,16 @@ def explain(error: ValidationError, model: type[BaseModel]) -> str:
     where = ".".join(str(part) for part in first["loc"])
     if first["type"] == "extra_forbidden":
         fields = _model_at(model, first["loc"][:-1]).model_fields
-        known = ", ".join(field.alias or name for name, field in fields.items())
-        return f"unknown key '{where}'. Known keys there: {known}."
+        known = [field.alias or name for name, field in fields.items()]
+        near = difflib.get_close_matches(str(first["loc"][-1]), known, 1)
+        hint = f" Did you mean '{near[0]}'?" if near else ""
+        return f"unknown key '{where}'. Known keys there: {', '.join(known)}.{hint}"
     message = first["msg"].removeprefix("Value error, ")
+    if first["type"] in NUMBERS:  # in place of pydantic's words, and of the branch of a union that it names
+        where = ".".join(str(part) for part in first["loc"] if not BRANCHES.fullmatch(str(part)))
+        return f"{where}: {first['input']!r} is not {NUMBERS[first['type']]}."
+    if first["type"] == "string_pattern_mismatch" and where == "robot":
+        message = f"{first['input']!r} is no name of a robot: it has lower-case letters, digits and underscores"
     more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
     sentence = f"{message.removesuffix('.')}{more}"
     return f"{where + ': ' if where else ''}{sentence}{'' if sentence.endswith('?') else '.'}"

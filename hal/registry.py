@@ -35,13 +35,15 @@ def load_object(name: str, what: str = "function", needs: Sequence[str] = ("__ca
     """
     module_name, colon, attribute = name.partition(":")
     if not (colon and module_name and attribute):
-        raise ConfigError(f"'{name}' is not of the form 'module:name'.")
+        raise ConfigError(f"'{name}' is not of the form 'module:name', as my_sim:simulator is.")
     if module_name.partition(".")[0] in sys.stdlib_module_names:
         raise ConfigError(f"'{name}' is a part of Python and not a {what} of a robot. Name one of your own modules.")
     try:
         module = importlib.import_module(module_name)
-    except ImportError as error:
-        raise ConfigError(f"'{name}' cannot be loaded: {error}. Is its package installed?") from error
+    except (ImportError, TypeError, ValueError) as error:  # a relative name is a TypeError
+        raise ConfigError(
+            f"'{name}' cannot be loaded: {error}. Is its package installed, or the module beside the robot file?"
+        ) from error
     try:
         named = getattr(module, attribute)
     except AttributeError:

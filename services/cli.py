@@ -8,10 +8,11 @@ from typing import Annotated
 import typer
 
 from services.verbs import deployment, describe, hardware, init, metrics, page, recording, ros2
-from services.verbs.verb import Connect, RobotFile, load, report_errors, robot_name, robot_path
+from services.verbs.verb import CommandLine, Connect, RobotFile, load, report_errors, robot_name, robot_path
 
 app = typer.Typer(
     name="gemuco",
+    cls=CommandLine,
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,

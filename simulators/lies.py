@@ -2,6 +2,7 @@
 
 import math
 import random
+from collections import deque
 from collections.abc import Callable
 
 Lie = Callable[[float, float], float]
@@ -54,6 +55,26 @@ def noisy(value: float, time: float, amount: float) -> Lie:
     return lambda true, now: true + amount * draw.gauss(0.0, 1.0)
 
 
+def stuck(value: float, time: float, amount: float) -> Lie:
+    """Return a sensor that keeps its present value, with noise of this standard deviation, so that its bits change."""
+    draw = random.Random(round(1e6 * time))
+    return lambda true, now: value + amount * draw.gauss(0.0, 1.0)
+
+
+def delayed(value: float, time: float, amount: float) -> Lie:
+    """Return a sensor that reads the value of `amount` seconds ago."""
+    past = deque([(time, value)])
+
+    def read(true: float, now: float) -> float:
+        if now > past[-1][0]:
+            past.append((now, true))
+        while len(past) > 1 and past[1][0] <= now - amount:
+            past.popleft()
+        return past[0][1]
+
+    return read
+
+
 LIES: dict[str, tuple[Callable[[float, float, float], Lie], str, str]] = {
     "sensor_frozen": (frozen, "", "keeps its present value"),
     "sensor_offset": (offset, "AMOUNT", "reads {amount:g} too much"),
@@ -63,6 +84,8 @@ LIES: dict[str, tuple[Callable[[float, float, float], Lie], str, str]] = {
     "sensor_wrapped": (wrapped, "", "reads one turn too much"),
     "sensor_clipped": (clipped, "LIMIT", "reads at most {amount:g}"),
     "sensor_noisy": (noisy, "STD", "has noise of {amount:g}"),
+    "sensor_stuck": (stuck, "STD", "keeps its present value with noise of {amount:g}"),
+    "sensor_delayed": (delayed, "SECONDS", "reads the value of {amount:g} s ago"),
 }
 """Fault -> lie, the word for its number if it has one, and a sentence on it."""
 SWAPPED, TRUE = "sensors_swapped", "sensor_true"

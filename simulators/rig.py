@@ -10,6 +10,7 @@ import can
 import numpy as np
 
 from hal.config import BusConfig, RobotConfig
+from hal.errors import BusGone
 from simulators.faults import TOOL_CHANGED
 from simulators.hub import HubServer
 from simulators.lies import LIES, SWAPPED, TRUE, known_lies, lie_of
@@ -25,6 +26,10 @@ PERIOD = 0.005
 """The physics thread has this step [s]. Half of this step needs a few percent of a core more."""
 _SWITCH_INTERVAL = 5e-4
 """The interpreter switches between threads after this time [s]; the default delays answers to SYNC by 5 ms."""
+
+
+class BusNotOpened(BusGone, can.CanInitializationError):
+    """A bus that the simulated nodes cannot join."""
 
 
 class UnknownFault(ValueError):
@@ -78,9 +83,13 @@ class Rig:
         """Run in real time until `stop`.
 
         Raises:
-            can.CanInitializationError: A bus cannot be opened.
+            BusNotOpened: A bus cannot be opened.
         """
-        self._open(time.monotonic())
+        try:
+            self._open(time.monotonic())
+        except BusNotOpened:
+            self.stop()
+            raise
         self._interval = sys.getswitchinterval()
         sys.setswitchinterval(_SWITCH_INTERVAL)
         self._running.set()
@@ -175,10 +184,15 @@ class Rig:
     def _open(self, now: float) -> None:
         if self._is_open:
             return
-        for server in self._servers.values():
-            server.start()
-        for segment in self._segments.values():
-            segment.open(now)
+        for name, segment in self._segments.items():
+            try:
+                if name in self._servers:
+                    self._servers[name].start()
+                segment.open(now)
+            except (can.CanError, OSError) as error:
+                why = str(error).rstrip(".")
+                advice = "" if why.endswith("?") else ". Is it there, is it up?"
+                raise BusNotOpened(f"Bus '{name}' does not open: {why}{advice}") from error
         self._is_open = True
 
     def _fault_node(self, words: list[str]) -> str:

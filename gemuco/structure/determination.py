@@ -21,9 +21,10 @@ from gemuco.masks import Mask, all_masks, bits
 from gemuco.scaler import Scaler
 from gemuco.schema import BodySchema
 from gemuco.signals import Layout
-from gemuco.structure.mask_errors import LISTED, MaskErrors, train_split
+from gemuco.structure.mask_errors import LISTED, MaskErrors
 from gemuco.structure.mask_judge import Judge, Thresholds
 from gemuco.structure.mask_search import choose, find_border
+from gemuco.structure.mask_training import train_split
 from gemuco.structure.result import Structure
 
 __all__ = ["Judge", "Structure", "Thresholds", "determine", "learn", "search", "select"]

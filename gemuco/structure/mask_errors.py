@@ -3,7 +3,6 @@
 import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -13,13 +12,9 @@ from gemuco.compiled.masks import Rows, squared_errors
 from gemuco.dataset import Dataset
 from gemuco.layers import Chain
 from gemuco.learning import outliers
-from gemuco.learning.config import TrainConfig
-from gemuco.learning.learner import Progress
 from gemuco.learning.material import Material
 from gemuco.learning.task import Task
-from gemuco.learning.train import fit
 from gemuco.linear import LinearPath
-from gemuco.masks import Mask, all_masks
 from gemuco.scaler import CLIP
 from gemuco.schema import BodySchema
 from gemuco.signals import Layout
@@ -30,8 +25,6 @@ STRIPES = 20
 """Held-out rows are halved by this many stripes of neighbouring rows."""
 LISTED = 10
 """With at most this many signals every mask is measured."""
-TRAINED = 2000
-"""With more signals the network is trained under this many random masks, and generalises to the others."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -192,56 +185,3 @@ class MaskErrors:
     def by_signal(self, elements: np.ndarray) -> np.ndarray:
         """Return the sums over the elements of every signal, shape (..., size) -> (..., signals)."""
         return np.asarray(np.add.reduceat(elements, np.cumsum([0, *self.sizes[:-1]]), axis=-1))
-
-
-def train_masks(
-    dataset: Dataset,
-    config: TrainConfig,
-    splits: int = 1,
-    progress: Progress | None = None,
-    drafts: Path | None = None,
-) -> tuple[MaskErrors, ...]:
-    """Train one network under all masks per split of the data, and return each with its held-out rows.
-
-    Raises:
-        NotEnoughData: There are too few samples.
-    """
-
-    def share(split: int) -> Progress | None:
-        return None if progress is None else lambda done, text: progress((split + done) / splits, text)
-
-    return tuple(train_split(dataset, config, split, share(split), drafts) for split in range(splits))
-
-
-def train_split(
-    dataset: Dataset, config: TrainConfig, split: int, progress: Progress | None = None, drafts: Path | None = None
-) -> MaskErrors:
-    """Train a network under all masks on one split of the data, and return it with its held-out rows.
-
-    Args:
-        dataset: Episodes of one body.
-        config: Settings of the training.
-        split: Index of the split; successive ones hold out other motions.
-        progress: Called after every epoch.
-        drafts: A folder in which the training is saved; see `fit`.
-
-    Raises:
-        NotEnoughData: There are too few samples.
-    """
-    own = replace(config, seed=config.seed + split)
-    train, held = dataset.split(own.held_out, own.seed)
-    resume = None if drafts is None else drafts / f"structure_{split}.safetensors"
-    masks = _drawn_masks(dataset.layout.names, own.seed)
-    schema, _ = fit(dataset, own, masks, progress, title=f"structure, split {split + 1}", resume=resume)
-    return MaskErrors.of_schema(schema, train, held, config.outliers)
-
-
-def _drawn_masks(names: tuple[str, ...], seed: int) -> tuple[Mask, ...]:
-    """Return all masks, or the masks that lack one signal and `TRAINED` random masks of all sizes."""
-    if len(names) <= LISTED:
-        return all_masks(names)
-    random = np.random.default_rng(seed)
-    drawn = random.random((TRAINED, len(names))) < random.random((TRAINED, 1))
-    drawn[~drawn.any(axis=1), 0] = True
-    others = ~np.eye(len(names), dtype=bool)
-    return tuple(dict.fromkeys(frozenset(np.array(names)[line].tolist()) for line in np.concatenate([others, drawn])))

@@ -19,7 +19,7 @@ from pydantic import ValidationError
 
 from hal import registry
 from hal.calibration.line import Calibration, Point
-from hal.config import RobotConfig, Section, explain
+from hal.config import RobotConfig, Section, explain, parse_yaml
 from hal.errors import ConfigError
 
 SIMULATED = ("hub", "virtual")
@@ -207,7 +207,7 @@ def _name(record: Record) -> str:
 
 def _raw(path: Path) -> dict[str, Any]:
     try:
-        raw = yaml.safe_load(path.read_text())
+        raw = parse_yaml(path.read_text())
     except FileNotFoundError:
         return {}
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:

@@ -11,10 +11,12 @@ answer under their id + 16 by default).
 import math
 import time
 from collections import Counter, deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from hal.config import RobotConfig
 from hal.finding.book import Frame
+from hal.finding.dbc_nodes import DbcDevice, Identifier, dbc_devices
 from hal.finding.decode import nmt_words
 from hal.finding.tap import Tap
 from hal.protocols import cia301, sdo
@@ -29,6 +31,8 @@ _MIT_SPECIALS = {
     special(Special.ZERO): "set its position to zero",
 }
 _MIT_ANSWER = 16
+EXTENDED = 1 << 31
+"""This flag marks an identifier of 29 bits."""
 _BEGINS = (1, 2)
 """An SDO request that begins a transfer has one of these values in its upper three bits."""
 _ODRIVE_HEARTBEAT = 1
@@ -46,6 +50,8 @@ _PROFILES = {
     419: "charger",
 }
 
+_OTHERS = {"ODrive": "servo drive (ODrive)", "MIT": "servo drive (MIT mode)", "DBC": "node of a DBC file"}
+
 
 @dataclass(slots=True)
 class Node:
@@ -53,7 +59,7 @@ class Node:
 
     Attributes:
         node: Node id.
-        protocol: `CANopen`, `ODrive` or `MIT`.
+        protocol: `CANopen`, `ODrive`, `MIT`, or `DBC` for a node that only the robot file knows.
         state: NMT state in words, or other received information.
         objects: (index, sub-index) -> answer, for the objects that the node answered.
         is_doubled: Whether more than one node answers under this id.
@@ -84,7 +90,7 @@ class Node:
     def kind(self) -> str:
         """Kind of device in words."""
         if self.protocol != "CANopen":
-            return {"ODrive": "servo drive (ODrive)", "MIT": "servo drive (MIT mode)"}[self.protocol]
+            return _OTHERS[self.protocol]
         if self.profile is None:
             return ""
         return f"{_PROFILES.get(self.profile, 'device')} ({self.profile})"
@@ -93,9 +99,14 @@ class Node:
 class Traffic:
     """Frames that were received so far, and the nodes that sent them."""
 
-    def __init__(self) -> None:
+    def __init__(self, devices: Sequence[DbcDevice] = ()) -> None:
+        self._devices = {identifier: device for device in devices for identifier in device.known}
+        self._senders = {identifier: device for device in devices for identifier in device.sends}
         self.nodes: dict[tuple[str, int], Node] = {}
+        self.named: dict[str, Node] = {}
+        """Name in the robot file -> a node with a DBC file."""
         self.counts: Counter[int] = Counter()
+        """Identifier -> frames; 29-bit identifiers have `EXTENDED` set."""
         self.bits = 0
         self._last: dict[int, bytes] = {}
         self._masters: set[str] = set()
@@ -104,11 +115,13 @@ class Traffic:
 
     def note(self, frame: Frame | None) -> None:
         """Add a frame."""
-        if frame is None or frame.is_error or frame.is_extended or frame.is_remote:
+        if frame is None or frame.is_error or frame.is_remote:
             return
         identifier, data = frame.identifier, frame.data
-        self.counts[identifier] += 1
-        self.bits += frame_bits(len(data))
+        self.counts[identifier | (EXTENDED if frame.is_extended else 0)] += 1
+        self.bits += frame_bits(len(data), frame.is_extended)
+        if self._note_dbc((identifier, frame.is_extended)) or frame.is_extended:
+            return
         self._last[identifier] = data
         function, node = identifier & 0x780, identifier & 0x7F
         if identifier == cia301.SYNC and len(data) <= 1:
@@ -123,6 +136,20 @@ class Traffic:
             self.node("CANopen", node)
         elif data in _MIT_SPECIALS:
             self.node("MIT", identifier).state = f"received the command to {_MIT_SPECIALS[data]}"
+
+    def _note_dbc(self, identifier: Identifier) -> bool:
+        """Return whether a frame belongs to a device with a DBC file; the node is heard if it sends this frame."""
+        device = self._senders.get(identifier)
+        if device is not None:
+            node = self.named.setdefault(device.name, Node(device.node, "DBC"))
+            name = device.sends[identifier]
+            if name not in node.state.removeprefix("sends ").split(", "):
+                node.state = f"{node.state}, {name}" if node.state else f"sends {name}"
+        return identifier in self._devices
+
+    def barred(self, identifier: int) -> bool:
+        """Whether an 11-bit identifier means something to a device with a DBC file, so that nothing may be sent."""
+        return (identifier, False) in self._devices
 
     def node(self, protocol: str, node: int) -> Node:
         """Return the record of a node, which is created at its first frame."""
@@ -153,6 +180,10 @@ class Traffic:
         return sorted(identifier for identifier in self.counts if not self._explained(identifier))
 
     def _explained(self, identifier: int) -> bool:
+        if (identifier & ~EXTENDED, bool(identifier & EXTENDED)) in self._devices:
+            return True
+        if identifier & EXTENDED:
+            return False
         node = identifier & 0x7F
         if identifier in (cia301.NMT, cia301.SYNC, cia301.HEARTBEAT + OWN_NODE):
             return True
@@ -189,7 +220,8 @@ class _Dialogue:
 def identify_all(tap: Tap, traffic: Traffic, patience: float) -> None:
     """Find the CANopen nodes that answer, then request their identity."""
     barred = traffic.odrives()  # an SDO request to id n is a command to ODrive 48 + n // 32
-    ids = [node for node in range(1, 128) if (cia301.SDO_REQUEST + node) >> 5 not in barred]
+    requests = {node: cia301.SDO_REQUEST + node for node in range(1, 128)}
+    ids = [node for node, request in requests.items() if request >> 5 not in barred and not traffic.barred(request)]
     _read_all(tap, traffic, {node: [(cia301.DEVICE_TYPE, 0)] for node in ids}, patience)
     answering = [node.node for node in traffic.nodes.values() if node.protocol == "CANopen" and node.objects]
     _read_all(tap, traffic, {node: list(_IDENTITY) for node in answering}, patience)
@@ -260,7 +292,7 @@ def find_mit(tap: Tap, traffic: Traffic, patience: float) -> None:
     odrives = traffic.odrives()  # an identifier below 33 is a command to ODrive 0 or 1
     requests: list[int] = []
     for node in MIT_IDS:
-        if node >> 5 in odrives:
+        if node >> 5 in odrives or traffic.barred(node):
             continue
         tap.send(node, special(Special.EXIT))
         requests.append(node)
@@ -297,7 +329,9 @@ class Scan:
     Attributes:
         bus: Name of the bus.
         nodes: Nodes in the order of their ids.
-        unknown: Identifier -> frames per second [Hz], for identifiers that do not belong to a node.
+        unknown: Identifier -> frames per second [Hz], for identifiers that do not belong to a node; those with 29 bits
+            have `EXTENDED` set.
+        named: Name in the robot file -> node, for the nodes with a DBC file.
         load: Share of the bit rate while listening, 0 to 1.
         silence: Reason why no request was sent; empty if requests were sent.
     """
@@ -307,9 +341,17 @@ class Scan:
     unknown: dict[int, float]
     load: float
     silence: str
+    named: dict[str, Node] = field(default_factory=dict)
 
 
-def scan(tap: Tap, listen: float = LISTEN, ask: bool = True, mit: bool = False, patience: float = ANSWER_TIME) -> Scan:
+def scan(
+    tap: Tap,
+    listen: float = LISTEN,
+    ask: bool = True,
+    mit: bool = False,
+    patience: float = ANSWER_TIME,
+    devices: Sequence[DbcDevice] = (),
+) -> Scan:
     """Find the nodes of a bus; takes `listen` and about two seconds.
 
     Args:
@@ -318,11 +360,12 @@ def scan(tap: Tap, listen: float = LISTEN, ask: bool = True, mit: bool = False, 
         ask: Whether to request the identity of nodes, unless a master is active.
         mit: Whether to find MIT drives by ending their motor mode, which switches the motor off.
         patience: Longest time for an answer [s].
+        devices: Devices with a DBC file on this bus; nothing is sent under their identifiers.
 
     Raises:
         BusGone: The interface failed, or takes no frames.
     """
-    traffic = Traffic()
+    traffic = Traffic(devices)
     deadline = time.monotonic() + listen
     while (remaining := deadline - time.monotonic()) > 0:
         traffic.note(tap.receive(min(remaining, 0.1)))
@@ -337,14 +380,24 @@ def scan(tap: Tap, listen: float = LISTEN, ask: bool = True, mit: bool = False, 
         find_mit(tap, traffic, patience)
     traffic.add_odrives()
     nodes = sorted(traffic.nodes.values(), key=lambda node: (node.protocol, node.node))
-    return Scan(tap.name, nodes, {key: rates.get(key, 0.0) for key in traffic.unexplained()}, load, silence)
+    unknown = {key: rates.get(key, 0.0) for key in traffic.unexplained()}
+    nodes += sorted(traffic.named.values(), key=lambda node: node.node)
+    return Scan(tap.name, nodes, unknown, load, silence, traffic.named)
 
 
 def compare(result: Scan, config: RobotConfig) -> list[str]:
     """Return the differences between a bus and the robot file, one sentence each."""
-    devices = {device.node: name for name, device in config.devices.items() if device.bus == result.bus}
-    nodes = {node.node: node for node in result.nodes}
-    differences = []
+    by_dbc = {device.name: device for device in dbc_devices(config, result.bus)}
+    devices = {
+        device.node: name for name, device in config.devices.items() if device.bus == result.bus and name not in by_dbc
+    }
+    nodes = {node.node: node for node in result.nodes if node.protocol != "DBC"}
+    differences = [
+        f"{result.bus}: node {device.node} ('{name}') was not heard: none of {', '.join(device.sends.values())} came. "
+        "Is it powered, is its node id right, is it set to send?"
+        for name, device in by_dbc.items()
+        if device.sends and name not in result.named
+    ]
     for number, name in devices.items():
         place, driver = f"{result.bus}: node {number} ('{name}')", config.kinds[config.devices[name].kind].driver
         if number not in nodes:
@@ -353,7 +406,7 @@ def compare(result: Scan, config: RobotConfig) -> list[str]:
         node = nodes[number]
         if driver.startswith("cia") and node.profile is not None and str(node.profile) != driver.removeprefix("cia"):
             differences.append(f"{place} is a {node.kind}, the robot file says {driver}.")
-    for node in result.nodes:
+    for node in nodes.values():
         if node.node not in devices:
             kind = node.kind or "a CANopen node"
             differences.append(f"{result.bus}: node {node.node} is not in the robot file: {kind}.")

@@ -65,7 +65,12 @@ class Start:
         self._checked = self.median()[self._signal]
 
     def median(self) -> Arrays:
-        """Return the median of the last three measurements of the commanded signal, which ignores a single error."""
+        """Return the median of the last three measurements of the commanded signal, which ignores a single error.
+
+        It is NaN if a drive has not been measured for longer than `MEMORY`, as when it falls silent meanwhile.
+        """
+        if not self._recent:
+            return {self._signal: np.full(len(self._elements), np.nan)}
         return {self._signal: np.median(self._recent, axis=0)}
 
     def moved(self, measured: Arrays) -> str:

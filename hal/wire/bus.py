@@ -236,7 +236,10 @@ class Bus:
                 self._receive(interface)
             except BaseException as error:  # an interface plugin may raise anything, and this thread must survive
                 self.counters["failures"] += 1
-                self._watch.lost(f"{type(error).__name__}: {error} Trying again.")
+                text = f"{type(error).__name__}: {error} Trying again."
+                self._watch.lost(text)
+                if self.counters["failures"] == 1 and not self.counters["opened"]:
+                    self._changed(BusState.GONE, text)  # a bus begins in this state, so it is no change
                 log.debug("bus %s", self.name, exc_info=True)
             self._close_interface()
             self._tried.set()

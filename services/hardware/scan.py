@@ -9,7 +9,8 @@ from rich.table import Table
 
 from hal.config import BusConfig, RobotConfig
 from hal.errors import BusGone
-from hal.finding.scan import Node, Scan, compare, scan
+from hal.finding.dbc_nodes import dbc_devices
+from hal.finding.scan import EXTENDED, Node, Scan, compare, scan
 from hal.finding.tap import Tap
 from services import show
 from services.errors import AlreadyRunning
@@ -24,15 +25,15 @@ def run_scan(buses: Mapping[str, BusConfig], config: RobotConfig | None, listen:
     console = show.console()
     try:
         if config is None:
-            results = _scan_all(buses, listen, ask, mit)
+            results = _scan_all(buses, listen, ask, mit, None)
         else:
             with instead_of(config.robot, "hal"):
-                results = _scan_all(buses, listen, ask, mit)
+                results = _scan_all(buses, listen, ask, mit, config)
     except AlreadyRunning:
         console.print(
             "The HAL of this robot runs. The scan sends no requests, because each node has only one SDO server."
         )
-        results = _scan_all(buses, listen, False, False)
+        results = _scan_all(buses, listen, False, False, config)
     scans = [result for result in results if isinstance(result, Scan)]
     failures = [result for result in results if isinstance(result, BusGone)]
     _show(console, scans, config)
@@ -44,11 +45,15 @@ def run_scan(buses: Mapping[str, BusConfig], config: RobotConfig | None, listen:
     return 1 if differences or failures else 0
 
 
-def _scan_all(buses: Mapping[str, BusConfig], listen: float, ask: bool, mit: bool) -> list[Scan | BusGone]:
+def _scan_all(
+    buses: Mapping[str, BusConfig], listen: float, ask: bool, mit: bool, config: RobotConfig | None
+) -> list[Scan | BusGone]:
+    devices = {name: dbc_devices(config, name) if config else () for name in buses}
+
     def scan_bus(name: str) -> Scan | BusGone:
         try:
             with Tap(name, buses[name]) as tap:
-                return scan(tap, listen, ask, mit)
+                return scan(tap, listen, ask, mit, devices=devices[name])
         except BusGone as error:
             return error
 
@@ -63,9 +68,11 @@ def _show(console: Console, scans: Sequence[Scan], config: RobotConfig | None) -
     for result in scans:
         devices = config.devices.items() if config else ()
         names = {device.node: name for name, device in devices if device.bus == result.bus}
+        own = {id(node): name for name, node in result.named.items()}
         for node in result.nodes:
             row = _row(result.bus, node)
-            table.add_row(*row, *((escape(names.get(node.node, "-")),) if config else ()))
+            name = own.get(id(node)) or names.get(node.node, "-")
+            table.add_row(*row, *((escape(name),) if config else ()))
     if table.row_count:
         console.print(table)
     for result in scans:
@@ -73,8 +80,12 @@ def _show(console: Console, scans: Sequence[Scan], config: RobotConfig | None) -
         console.print(f"{result.bus}: {len(result.nodes)} nodes, load {result.load:.1%}.{silence}")
         unknown = sorted(result.unknown.items(), key=lambda item: -item[1])
         if unknown:
-            frames = ", ".join(f"{identifier:03X}h {rate:.3g} Hz" for identifier, rate in unknown[:MOST_UNKNOWN])
+            frames = ", ".join(f"{_hex(identifier)} {rate:.3g} Hz" for identifier, rate in unknown[:MOST_UNKNOWN])
             console.print(f"{result.bus}: frames of unknown nodes: {frames}")
+
+
+def _hex(identifier: int) -> str:
+    return f"{identifier & ~EXTENDED:08X}h" if identifier & EXTENDED else f"{identifier:03X}h"
 
 
 def _row(bus: str, node: Node) -> list[str]:

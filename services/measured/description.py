@@ -16,7 +16,7 @@ from pydantic import BeforeValidator, Field, ValidationError, model_validator
 
 from gemuco.signals import Layout, Signal
 from hal.calibration.units import check_units, factor
-from hal.config import Positive, Section, explain
+from hal.config import Positive, Section, explain, parse_yaml
 from hal.errors import ConfigError
 from services.measured.text_table import TextStyle
 from services.model.model_config import Count, ModelConfig, NetworkConfig, StructureConfig, TrainingConfig
@@ -222,7 +222,7 @@ def load_measured(path: Path) -> MeasuredConfig:
         ConfigError: The file is missing, is not YAML, or is not a description of data.
     """
     try:
-        content = yaml.load(path.read_text(encoding="utf-8"), _Loader)
+        content = parse_yaml(path.read_text(encoding="utf-8"), _Loader)
     except OSError as error:
         raise ConfigError(f"The description '{path}' cannot be read: {error.strerror}.") from None
     except yaml.MarkedYAMLError as error:
@@ -245,7 +245,7 @@ def is_description(path: Path) -> bool:
     except (OSError, UnicodeDecodeError):
         return False
     try:
-        content = yaml.safe_load(text)
+        content = parse_yaml(text)
     except yaml.YAMLError:
         return re.search(r"^recording\s*:", text, re.MULTILINE) is not None  # its fault is to be reported
     return isinstance(content, dict) and ("recording" in content or {"episodes", "signals"} <= set(content))

@@ -98,7 +98,9 @@ def read_recording(paths: list[Path]) -> Recording:
 def _places(path: Path) -> list[Path]:
     """Return the episodes in a file or folder."""
     if not path.exists():
-        raise DatasetError(f"There is no file or folder '{path}'.")
+        raise DatasetError(
+            f"There is no file or folder '{path}'. Give a table (.csv, .npz, .parquet) or a folder of them."
+        )
     if path.is_file():
         return [path]
     files = _tables(path)

@@ -1,5 +1,6 @@
 """Paths of a robot's data and model, and the fingerprint that links a model to a robot file."""
 
+import difflib
 import hashlib
 import json
 from pathlib import Path
@@ -50,5 +51,14 @@ def robot_file(text: str) -> Path:
         if (named := folder / f"{text}.yaml").exists():
             return named
     files = [file.stem for folder in (ROBOTS, SHIPPED) for file in folder.glob("*.yaml")]
-    known = ", ".join(sorted({stem for stem in files if "." not in stem})) or "none"
-    raise ConfigError(f"There is no robot '{text}'. Known robots: {known}; or give the path of a robot file.")
+    names = sorted({stem for stem in files if "." not in stem})
+    if path.suffix or len(path.parts) > 1:
+        raise ConfigError(
+            f"There is no file '{text}'. Is its folder right? Robots by name: {', '.join(names) or 'none'}."
+        )
+    near = difflib.get_close_matches(text, names, 1)
+    hint = f"Did you mean '{near[0]}'? " if near else ""
+    raise ConfigError(
+        f"There is no robot '{text}'. {hint}Known robots: {', '.join(names) or 'none'}; or give the path of a robot "
+        "file."
+    )

@@ -206,7 +206,10 @@ def collect_config(robot: RobotConfig) -> CollectConfig:
     collect = _section(robot, "collect", CollectConfig)
     where = f"Robot '{robot.robot}', section 'collect'"
     if not robot.collect:
-        raise ConfigError(f"Robot '{robot.robot}' has no 'collect' section, so its safe motion is unknown.")
+        raise ConfigError(
+            f"Robot '{robot.robot}' has no 'collect' section, so its safe motion is unknown. docs/robots.md, "
+            "Collecting, shows how to write one."
+        )
     if collect.motion is not None and collect.model_fields_set & {"speed", "hold", "forecast", "constraints"}:
         raise ConfigError(f"{where}: with 'motion', speed, hold, forecast and constraints have no effect. Remove them.")
     if collect.constraints and collect.forecast is None:

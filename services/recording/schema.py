@@ -162,7 +162,7 @@ class Form:
             body = _decoder.decode(data)
             present = (item.name for item in self._fields if self._is_present(item.name, body))
             return self.record(**{name: self._read(name, body) for name in present})
-        except (ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
+        except (ValueError, TypeError, LookupError, AttributeError, OverflowError, RecursionError) as error:
             raise MessageError(f"It is not a recorded {self.record.TYPE} message: {error}.") from None
 
     def _is_present(self, name: str, body: dict[str, Any]) -> bool:

@@ -1,6 +1,6 @@
-"""The verb `init`: a robot file with a simulator, made from a URDF, or a robot file of the topics of ROS 2."""
+"""The verb `init`: a robot file with a simulator, from a URDF or MJCF file, from vendors' files, a bus, or ROS 2."""
 
-import shutil
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,36 +19,53 @@ def register(app: typer.Typer) -> None:
 
 @report_errors
 def init(
-    urdf: Annotated[
-        Path | None, typer.Argument(metavar="[URDF]", help="The URDF of an arm, a leg or a whole robot.")
+    source: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[SOURCE]", help="A URDF or MJCF file, or a folder with EDS, DCF and DBC files of devices."
+        ),
     ] = None,
     tip: Annotated[
         str | None, typer.Option(metavar="LINK", help="End of the chain to use; the longest arm if not given.")
     ] = None,
-    name: Annotated[str | None, typer.Option(help="Name of the robot; that of the URDF if not given.")] = None,
+    name: Annotated[str | None, typer.Option(help="Name of the robot; that in the file if not given.")] = None,
     out: Annotated[
-        Path | None, typer.Option(help="The robot file to write; in this folder, named like the URDF, if not given.")
+        Path | None, typer.Option(help="The robot file to write; in this folder, named like SOURCE, if not given.")
     ] = None,
+    scan: Annotated[
+        str | None,
+        typer.Option(metavar="CHANNEL", help="Use the nodes on this bus: can0 of SocketCAN, or INTERFACE:CHANNEL."),
+    ] = None,
+    bitrate: Annotated[int, typer.Option(min=10_000, help="Bit rate of the scanned bus \\[bit/s].")] = 1_000_000,
     ros2: Annotated[bool, typer.Option("--ros2", help="Draft the file from the topics of a ROS 2 network.")] = False,
     router: RosRouter = None,
     domain: Domain = None,
     distribution: Distribution = None,
 ) -> None:
-    """Write a robot file for the arm that a URDF describes, with a simulator of it.
+    """Write a robot file, with a simulator, for an arm in a URDF or MJCF file, or for the devices that you have.
 
-    The file has joints, limits and torques; drives, encoders and a camera stand in for the hardware. `gemuco demo FILE`
-    then collects, trains, runs, and loses an encoder and the camera.
+    For an arm the file has joints, limits and torques; drives, encoders and a camera stand in for the hardware. `gemuco
+    demo FILE` then collects, trains, runs, and loses an encoder and the camera. For a folder or a bus it has the
+    devices, on a bench; complete what no file knows: gears, zeros, limits.
 
     With [bold]--ros2[/] the robot is one whose drivers are ROS 2 nodes: its topics are listed and become signals.
     """
-    from services.errors import ServiceError
+    from services.errors import BadArguments
 
-    if ros2 == (urdf is not None):
-        raise ServiceError("`gemuco init` takes either a URDF or --ros2.")
-    if urdf is not None:
-        _from_urdf(urdf, tip, name, out)
-    else:
-        _from_topics(name, out, {"router": router, "domain": domain, "distribution": distribution})
+    if ros2 and (source is not None or scan is not None):
+        raise BadArguments("--ros2 reads the topics of a network; give neither a file nor --scan with it.")
+    if ros2:
+        _of_topics(name, out, {"router": router, "domain": domain, "distribution": distribution})
+        return
+    if source is None and scan is None:
+        raise BadArguments("Give a URDF or MJCF file, a folder with EDS, DCF and DBC files, --scan can0, or --ros2.")
+    if tip is not None and (scan is not None or (source is not None and source.is_dir())):
+        raise BadArguments("--tip is for a URDF or MJCF file; devices have no chain of links.")
+    file = _new_file(out or Path(f"{_stem(source, scan)}.yaml"))
+    if scan is not None or (source is not None and source.is_dir()):
+        _of_devices(source, scan, bitrate, name, file)
+    elif source is not None:
+        _of_arm(source, tip, name, file)
 
 
 def _new_file(file: Path) -> Path:
@@ -62,61 +79,88 @@ def _new_file(file: Path) -> Path:
     return file
 
 
-def _from_topics(name: str | None, out: Path | None, given: dict[str, Any]) -> None:
-    from gemuco.writing import replace
-    from hal.errors import ConfigError
+def _of_topics(name: str | None, out: Path | None, given: dict[str, Any]) -> None:
     from services.errors import ServiceError
     from services.ros2.draft import draft
     from services.ros2.settings import network_with
 
     file = _new_file(out or Path(f"{name or 'ros_robot'}.yaml"))
     robot = name or file.stem
-    _check_name(robot, ConfigError)
+    _check_name(robot)
     made = draft(network_with({}, **given), robot)
     urdf = file.with_name(f"{robot}.urdf")
     if made.urdf and urdf.exists():
         raise ServiceError(f"'{urdf}' exists. Remove it, or give another --name.")
-    try:
-        if made.urdf:
-            replace(urdf, made.urdf.encode())
-        replace(file, made.text.encode())
-    except OSError as error:
-        raise ServiceError(f"'{file}' cannot be written: {error.strerror}.") from None
+    _write(file, made.text, {urdf.name: made.urdf.encode()} if made.urdf else {})
     typer.echo(f"{file}: {made.summary}")
     for note in made.notes:
         typer.echo(f"  {note}")
     typer.echo(f"Next: gemuco hal {file}, and gemuco top {file}")
 
 
-def _from_urdf(urdf: Path, tip: str | None, name: str | None, out: Path | None) -> None:
-    from gemuco.writing import replace
-    from hal import registry
-    from hal.errors import ConfigError
-    from services.errors import ServiceError
+def _stem(source: Path | None, scan: str | None) -> str:
+    if source is not None:
+        return source.resolve().name.partition(".")[0] or "robot"
+    return f"robot_on_{Path(str(scan).rpartition(':')[2]).name}"
 
-    file = _new_file(out or Path(f"{urdf.name.partition('.')[0]}.yaml"))
-    draft: Any = registry.load_object(DESCRIBE)(urdf, tip, name, file.parent)
-    _check_name(draft.robot, ConfigError)
-    try:
-        sheets = file.parent / "eds"
-        sheets.mkdir(parents=True, exist_ok=True)
-        for sheet in draft.sheets:
-            if not (sheets / sheet.name).exists():
-                shutil.copy(sheet, sheets)
-        replace(file, draft.text.encode())
-    except OSError as error:
-        raise ServiceError(f"'{file}' cannot be written: {error.strerror}.") from None
-    typer.echo(f"{file}: {draft.summary}")
-    for note in draft.notes:
-        typer.echo(f"  {note}")
+
+def _of_arm(source: Path, tip: str | None, name: str | None, file: Path) -> None:
+    from hal import registry
+
+    draft: Any = registry.load_object(DESCRIBE)(source, tip, name, file.parent)
+    _check_name(draft.robot)
+    sheets = {f"eds/{sheet.name}": sheet.read_bytes() for sheet in draft.sheets}
+    sheets = {name: content for name, content in sheets.items() if not (file.parent / name).exists()}
+    _write(file, draft.text, {**sheets, **draft.files})
+    _report(file, draft.summary, draft.notes)
     typer.echo(f"Next: gemuco demo {file}")
 
 
-def _check_name(robot: str, error: type[Exception]) -> None:
+def _of_devices(source: Path | None, scan: str | None, bitrate: int, name: str | None, file: Path) -> None:
+    from services.hardware.draft import draft_devices
+
+    if name is not None:
+        _check_name(name)
+    draft = draft_devices(source, scan, bitrate, name, file)
+    copies = {place: path.read_bytes() for place, path in draft.copies.items() if not (file.parent / place).exists()}
+    _write(file, draft.text, copies)
+    _report(file, draft.summary, draft.notes)
+    typer.echo(
+        f"Next: complete the lines with 'set' in {file}; then gemuco simulate {file}, gemuco hal {file}, "
+        f"gemuco doctor {file}"
+    )
+
+
+def _report(file: Path, summary: str, notes: tuple[str, ...]) -> None:
+    typer.echo(f"{file}: {summary}")
+    for note in notes:
+        typer.echo(f"  {note}")
+
+
+def _write(file: Path, text: str, more: Mapping[str, bytes]) -> None:
+    """Write a robot file and the files that belong into its folder; no other file is overwritten."""
+    from gemuco.writing import replace
+    from services.errors import ServiceError
+
+    others = {file.parent / name: content for name, content in more.items()}
+    for path, content in others.items():
+        if path.exists() and path.read_bytes() != content:
+            raise ServiceError(f"'{path}' exists with another content. Remove it, or name a file elsewhere by --out.")
+    try:
+        for path, content in (*others.items(), (file, text.encode())):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            replace(path, content)
+    except OSError as error:
+        raise ServiceError(f"'{file}' cannot be written: {error.strerror}.") from None
+
+
+def _check_name(robot: str) -> None:
     """Check the name before anything is written."""
     import re
 
+    from hal.errors import ConfigError
+
     if not re.fullmatch(r"[a-z][a-z0-9_]*", robot):
-        raise error(
+        raise ConfigError(
             f"'{robot}' is no name of a robot: it has lower-case letters, digits and underscores. Give another --name."
         )

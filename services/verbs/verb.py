@@ -1,12 +1,14 @@
 """Parts of all verbs of the command line: robot argument, error messages, exit codes."""
 
 import os
+import sys
 from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 RobotFile = Annotated[str, typer.Argument(metavar="ROBOT", help="A robot file, or the name of one in robots/.")]
 Connect = Annotated[
@@ -45,6 +47,42 @@ OURS = ("gemuco", "hal", "services", "simulators")
 
 NO_MEMORY = ("failed to map segment", "Cannot allocate memory", "std::bad_alloc", "can't start new thread")
 """Errors of the loader, the kernel, C++ and Python contain these texts if memory is short."""
+
+
+class CommandLine(TyperGroup):
+    """The command line: an argument that cannot be used is one sentence, as all other errors are."""
+
+    def main(self, *arguments: Any, **options: Any) -> Any:
+        """Run a verb; exit with its code, with 2 after an argument that cannot be used."""
+        if not options.get("standalone_mode", True):
+            return super().main(*arguments, **options)
+        options["standalone_mode"] = False
+        try:
+            code: Any = super().main(*arguments, **options)
+        except typer.Abort:
+            typer.echo("Aborted.", err=True)
+            sys.exit(1)
+        except Exception as error:
+            message = getattr(error, "format_message", None)  # click's own class, wherever typer has it from
+            if message is None:
+                raise
+            if type(error).__name__ == "NoArgsIsHelpError":
+                typer.echo(message(), err=True)
+            else:
+                text = message().rstrip(".")
+                end = " " if text.endswith("?") else ". "
+                typer.echo(f"gemuco: {text}{end}{_help_of(getattr(error, 'ctx', None))}", err=True)
+            sys.exit(getattr(error, "exit_code", 2))
+        sys.exit(code if isinstance(code, int) else 0)
+
+
+def _help_of(context: Any) -> str:
+    """Return a sentence on the help that lists the arguments of a verb."""
+    names: list[str] = []
+    while context is not None and context.parent is not None:
+        names.insert(0, context.info_name)
+        context = context.parent
+    return f"`{' '.join(['gemuco', *names])} --help` lists what it takes."
 
 
 def report_errors(verb: Callable[..., Any]) -> Callable[..., Any]:

@@ -7,6 +7,8 @@ from simulators.nodes.canopen.encoder import JointEncoder
 from simulators.nodes.canopen.load_cell import LoadCell
 from simulators.nodes.canopen.spec import CellConstants, DriveConstants, EncoderConstants, NodeSpec
 from simulators.nodes.cia402.drive import ServoDrive
+from simulators.nodes.dbc.sensor import DbcConstants
+from simulators.nodes.dbc.servo import make_dbc_node
 from simulators.nodes.dbc_cell import DbcCell, DbcCellConstants
 from simulators.nodes.mit_drive import MitConstants, MitDriveNode
 from simulators.nodes.node import Frame, SimulatedNode
@@ -21,6 +23,7 @@ KINDS: dict[type, Callable[[NodeSpec, Plant, list[Frame]], SimulatedNode]] = {
     MitConstants: MitDriveNode,
     OdriveConstants: OdriveAxis,
     DbcCellConstants: DbcCell,
+    DbcConstants: make_dbc_node,
 }
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from gemuco.learning.train import TrainConfig
 from gemuco.masks import bits
 from gemuco.structure.determination import Judge, Thresholds, search, select
-from gemuco.structure.mask_errors import train_masks
+from gemuco.structure.mask_training import train_masks
 from studies.accuracy.synthetic_body import SyntheticBody
 
 CONFIG = TrainConfig(hidden=(200, 100), latent=40, activation="relu", epochs=100, batch=500, rate=3e-3)

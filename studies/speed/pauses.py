@@ -19,48 +19,42 @@ import msgpack
 import numpy as np
 import zenoh
 
-from hal.config import load_robot
-from services.process.supervisor import Supervisor, gemuco_command
+from services.process.supervisor import Supervisor
 from services.wire import keys
-from studies.stack import light_model, light_robot
 from studies.stack.processes import cpu
-from studies.stack.soak import RATE, _client, free_port, start
+from studies.stack.soak.robot import Robot, client_of
 
 LONGEST = 60.0
 """A pause that is longer than this [s] ends the study."""
 
 
 class Newest:
-    """Time of the newest estimate [monotonic s] that is based on measurements."""
+    """Time [monotonic s] and sender of the newest estimate that is based on measurements."""
 
     def __init__(self) -> None:
-        self.at = 0.0
+        self.at, self.boot = 0.0, 0
 
     def take(self, sample: zenoh.Sample) -> None:
         """Look at a message of the model."""
         message: dict[str, Any] = msgpack.unpackb(sample.payload.to_bytes())
-        if set(message["method"].values()) != {"none"}:
-            self.at = time.monotonic()
+        if set(message.get("method", {}).values()) - {"none"}:
+            self.at, self.boot = time.monotonic(), message["boot"]
 
 
 def run(times: int, folder: Path) -> list[float]:
     """Print a line per kill, and return the pauses [s]."""
-    file, model = light_robot.write(folder, f"pauses_{os.getpid()}", RATE, True), folder / "model"
-    light_model.make(file, model)
-    robot, router = load_robot(file).robot, f"tcp/127.0.0.1:{free_port()}"
-    command = gemuco_command("serve", str(file), "--model", str(model), "--connect", router)
     newest, chance, pauses = Newest(), random.Random(1), []
     with Supervisor(folder) as supervisor:
-        supervisor.start("router", gemuco_command("router", "--listen", router))
-        with _client(robot, router) as client:
-            start(supervisor, client, file, model, router, folder)
-            subscriber = client.session.declare_subscriber(keys.estimate(robot), newest.take)
+        robot = Robot(supervisor, f"pauses_{os.getpid()}", folder / "model")
+        robot.start_router()
+        with client_of(robot.name, robot.router) as client:
+            robot.start(client)
+            subscriber = client.session.declare_subscriber(keys.estimate(robot.name), newest.take)
             for _ in range(times):
                 time.sleep(chance.uniform(0.5, 1.5))
-                supervisor.kill("model")
-                killed = time.monotonic()
-                supervisor.start("model", command)
-                while newest.at < killed + 0.05:
+                killed, boot = time.monotonic(), newest.boot
+                robot.kill("model")
+                while newest.boot == boot:
                     if time.monotonic() - killed > LONGEST:
                         raise TimeoutError(f"No estimate within {LONGEST:g} s.")
                     time.sleep(0.005)

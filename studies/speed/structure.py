@@ -14,7 +14,7 @@ from joblib import cpu_count
 from gemuco.learning.train import TrainConfig
 from gemuco.masks import all_masks, bits
 from gemuco.structure.determination import Judge, Thresholds
-from gemuco.structure.mask_errors import train_masks
+from gemuco.structure.mask_training import train_masks
 from studies.accuracy.synthetic_body import SyntheticBody
 from studies.speed.bodies import module
 from studies.speed.table import Row, faster, show

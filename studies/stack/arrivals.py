@@ -18,6 +18,8 @@ class Arrivals:
         self._gap = gap
         self._news = threading.Condition()
         self._estimated: dict[str, np.ndarray] = {}
+        self.methods: dict[str, str] = {}
+        """Signal -> method of the newest estimate."""
         self.restart()
 
     def restart(self) -> None:
@@ -29,13 +31,17 @@ class Arrivals:
     def add(self, message: dict[str, Any]) -> None:
         """Count one estimate."""
         now = time.monotonic()
+        is_same = self._newest is not None and self._newest[1] == message["boot"]
+        if self._newest is not None and is_same and message["seq"] <= self._newest[0]:
+            return  # played again
         self.arrived += 1
-        if self._newest is not None and self._newest[1] == message["boot"]:
+        if self._newest is not None and is_same:
             self.lost += message["seq"] - self._newest[0] - 1
             pause = now - self._newest[2]
             self.gaps += pause > self._gap
             self.longest = max(self.longest, pause)
         self._newest = (message["seq"], message["boot"], now)
+        self.methods = message["method"]
         elements, start = np.frombuffer(message["estimated"], "?"), 0
         with self._news:
             for signal, count in message["elements"].items():

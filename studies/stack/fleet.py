@@ -36,7 +36,7 @@ from studies.stack import light_robot
 from studies.stack.arrivals import Arrivals
 from studies.stack.in_process import main
 from studies.stack.processes import BareLoops, look
-from studies.stack.soak import free_port
+from studies.stack.soak.robot import free_port
 
 NUMBERS = (1, 2, 5, 10, 20)
 RATE = 20.0

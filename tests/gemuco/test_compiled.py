@@ -229,6 +229,8 @@ assert "torch" not in sys.modules
 
 
 COMPILER = """
+import sys
+sys.modules["torch"] = None  # the image of the services compiles everything without it
 import numba
 import numpy as np
 from pathlib import Path

@@ -12,7 +12,8 @@ from gemuco.learning.train import TrainConfig
 from gemuco.masks import all_masks, bits
 from gemuco.signals import Layout, Signal
 from gemuco.structure.determination import Judge, Thresholds, determine, select
-from gemuco.structure.mask_errors import MaskErrors, train_masks
+from gemuco.structure.mask_errors import MaskErrors
+from gemuco.structure.mask_training import train_masks
 
 TINY = TrainConfig(hidden=(20,), latent=5, epochs=3, batch=100)
 SHORT = TrainConfig(hidden=(40, 20), latent=6, epochs=25, batch=100)

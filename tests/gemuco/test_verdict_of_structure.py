@@ -17,7 +17,8 @@ from gemuco.signals import Layout, Signal
 from gemuco.structure import determination
 from gemuco.structure.determination import Judge, Thresholds, determine
 from gemuco.structure.inference import Split, infer_best
-from gemuco.structure.mask_errors import MaskErrors, train_masks
+from gemuco.structure.mask_errors import MaskErrors
+from gemuco.structure.mask_training import train_masks
 
 TINY = TrainConfig(hidden=(20,), latent=5, epochs=3, batch=100)
 SHORT = TrainConfig(hidden=(40, 20), latent=6, epochs=25, batch=100)

@@ -10,9 +10,11 @@ from dataclasses import dataclass, field
 from hal_bench import ROBOTS
 
 from hal.config import RobotConfig
+from hal.drivers.dbc import DbcNode, DbcServo
 from hal.drivers.odrive import profile
 from simulators.nodes.canopen.analog_input import AnalogConstants
 from simulators.nodes.canopen.spec import CellConstants, DriveConstants, EncoderConstants, NodeSpec
+from simulators.nodes.dbc.sensor import DbcConstants
 from simulators.nodes.dbc_cell import DbcCellConstants
 from simulators.nodes.mit_drive import MitConstants
 from simulators.nodes.odrive import OdriveConstants
@@ -127,6 +129,8 @@ DBC_CELL = {
     "error": {"signal": "Force.Status", "good": "GOOD"},
 }
 AXIS = {"dbc": "dbc/odrive_cansimple.dbc"}
+SERVO_BY_DBC = {**AXIS, **profile("position", 8.0, 0.2)}
+ONE_FORCE = {"force": "thing_force.one"}
 T_MOTOR = MitConstants(make="t_motor", velocity=50.0, torque=18.0)
 FORCE = {"quantities": ("force",), "value": 12.0, "tolerance": 0.02}
 SERVO = {"commanded": "position"}
@@ -157,6 +161,15 @@ KINDS = (
         tells_reboot=False, tells_state=False, watchdog=math.inf, **SERVO,
     ),
     DeviceKind("dbc", "dbc", DBC_CELL, DbcCellConstants(), (0x185,), tells_reboot=False, **FORCE),
+    DeviceKind(
+        "dbc_bench", "dbc", DBC_CELL, DbcConstants(DbcNode.Settings.model_validate(DBC_CELL), ROBOTS, ONE_FORCE),
+        (0x185,), tells_reboot=False, **FORCE,
+    ),
+    DeviceKind(
+        "dbc_servo_bench", "dbc_servo", SERVO_BY_DBC,
+        DbcConstants(DbcServo.Settings.model_validate(SERVO_BY_DBC), ROBOTS, {"position": "thing_position.one"}),
+        (5 << 5 | 0x09,), **SERVO,
+    ),
     DeviceKind(
         "dbc_servo", "dbc_servo", {**AXIS, **profile("position", 8.0, 0.2)}, OdriveConstants(),
         (5 << 5 | 0x09,), **SERVO,

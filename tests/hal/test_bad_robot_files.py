@@ -11,6 +11,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from hal import registry
+from hal.calibration import store
 from hal.clock import ManualClock
 from hal.config import RobotConfig, explain, load_robot
 from hal.errors import CommandRefused, ConfigError, HalError
@@ -179,3 +181,32 @@ def load_from(body):
         return RobotConfig.model_validate({**body, "folder": ROBOTS})
     except ValidationError as error:
         raise ConfigError(explain(error, RobotConfig)) from None
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("[" * 20_000, "nested too deeply"),
+        ("robot: a\nrates: {hal: 1" + "0" * 5000 + "}", "A value cannot be read"),
+        ("robot: 2025-13-45", "A value cannot be read"),
+        ("robot: !!python/object/apply:os.system [true]", "is not YAML"),
+    ],
+    ids=["nested", "number", "date", "object"],
+)
+def test_a_text_that_is_no_yaml_is_one_sentence(tmp_path, text, told):
+    path = tmp_path / "robot.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=told) as caught:
+        load_robot(path)
+    assert "\n" not in str(caught.value)
+    config = RobotConfig.model_validate({**description(), "folder": tmp_path})
+    store.path_of(config).write_text(text)
+    with pytest.raises(ConfigError, match="cannot be read"):
+        store.load(config)
+
+
+@pytest.mark.parametrize("name", ["..:x", ".:x", "a\0b:x", "os:system", "hal.config:load_robot"])
+def test_what_is_no_driver_is_one_sentence(name):
+    with pytest.raises(ConfigError) as caught:
+        registry.driver(name)
+    assert "\n" not in str(caught.value)

@@ -1,12 +1,16 @@
 """A storm of reports is counted, and not written down line by line."""
 
 import logging
+import time
 
 import pytest
 from hal_bench import Bench
 
+from hal.clock import SystemClock
+from hal.config import BusConfig
 from hal.log_limit import LogLimit
 from hal.protocols.error_frames import error_frame
+from hal.wire.bus import Bus
 from simulators.wire_faults import CONTROLLER, PASSIVE
 
 
@@ -52,3 +56,18 @@ def test_a_controller_that_changes_its_mind_with_each_frame_leaves_a_line_per_st
         watch.error(error_frame(CONTROLLER, bytes([0, PASSIVE if count % 2 else 0x40, *bytes(6)])), 10.0)
     lines = [record for record in caplog.records if "bus can0" in record.getMessage()]
     assert 1 <= len(lines) <= 6
+
+
+def test_a_bus_that_never_opens_is_said_once(caplog):
+    config = BusConfig(interface="hub", channel="nothing_serves_this")
+    bus = Bus("can0", config, SystemClock())
+    bus.open()
+    deadline = time.monotonic() + 30.0
+    while bus.counters["failures"] < 3 and time.monotonic() < deadline:
+        time.sleep(0.02)
+    bus.close()
+    assert bus.counters["failures"] >= 3
+    lines = [record.getMessage() for record in caplog.records if "bus can0 is gone" in record.getMessage()]
+    assert len(lines) == 1
+    assert "No server has the hub channel 'nothing_serves_this'" in lines[0]
+    assert lines[0].endswith("Trying again.")

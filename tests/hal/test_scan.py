@@ -6,11 +6,13 @@ from contextlib import contextmanager
 
 import can
 import pytest
+from device_kinds import DBC_CELL
 from hal_bench import BenchWorld, description, hardware
 
 from hal.config import BusConfig, RobotConfig
 from hal.errors import BusGone, ConfigError
-from hal.finding.scan import compare, scan
+from hal.finding.dbc_nodes import DbcDevice, dbc_devices
+from hal.finding.scan import EXTENDED, compare, scan
 from hal.finding.tap import Tap
 from simulators.nodes.canopen.spec import CellConstants, NodeSpec
 from simulators.rig import Rig
@@ -215,3 +217,48 @@ def test_a_bus_that_is_not_there():
         Tap("can0", BusConfig(interface="hub", channel="nobody_serves_this")),
     ):
         raise AssertionError("it opened")
+
+
+def test_nodes_with_a_dbc_file_are_known_by_their_messages_and_sent_nothing():
+    body = description()
+    cells = {"driver": "dbc", "settings": {**DBC_CELL, "node_offset": 1}}
+    body["kinds"]["wire_cell"] = cells
+    body["signals"]["wire_force"] = {"unit": "N", "elements": ["left", "right"]}
+    for node, element in ((5, "left"), (6, "right")):
+        body["devices"][element] = {
+            "kind": "wire_cell",
+            "bus": "can1",
+            "node": node,
+            "element": f"wire_force.{element}",
+        }
+    config = RobotConfig.model_validate(body)
+    devices = dbc_devices(config, "can1")
+    assert [device.name for device in devices] == ["left", "right"]
+    assert dbc_devices(config, "can0") == ()
+    with bus(config.buses["can1"]) as (tap, wire):
+        for _ in range(3):
+            send(wire, 0x180 + 5, "10 27 00 00 41")
+        tap.name = "can1"
+        found = scan(tap, listen=0.2, ask=False, devices=devices)
+    assert [(one.node, one.kind, one.state) for one in found.nodes] == [(5, "node of a DBC file", "sends Force")]
+    assert not found.unknown
+    told = [text for text in compare(found, config) if "Force" in text or "left" in text]
+    assert told == [
+        "can1: node 6 ('right') was not heard: none of Force came. Is it powered, is its node id right, is it set to "
+        "send?"
+    ]
+
+
+def test_identifiers_of_29_bits_are_listed_and_belong_to_dbc_nodes():
+    with bus() as (tap, wire):
+        for identifier in (0x18FF0201, 0x18FF0301):
+            wire.send(can.Message(arbitration_id=identifier, data=bytes(8), is_extended_id=True))
+        device = DbcDevice("axis", 1, {(0x18FF0201, True): "Status"}, frozenset({(0x18FF0201, True), (0x605, False)}))
+        found = scan(tap, listen=0.1, patience=0.05, devices=(device,))
+        asked = set()
+        while (message := wire.recv(0.0)) is not None:
+            asked.add(message.arbitration_id)
+    assert list(found.unknown) == [EXTENDED | 0x18FF0301]
+    assert list(found.named) == ["axis"]
+    assert {0x604, 0x606} <= asked
+    assert 0x605 not in asked  # a frame that the axis would take for its own

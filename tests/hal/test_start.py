@@ -2,7 +2,12 @@
 
 import struct
 
+import numpy as np
 import pytest
+
+from hal.config import RobotConfig
+from hal.safety.limiter import Limiter
+from hal.safety.start import MEMORY, Start
 
 OPERATION_ENABLED, SWITCHED_ON = 0x0237, 0x0233
 
@@ -56,3 +61,20 @@ def test_one_wrong_measurement_while_it_is_enabled_is_not_where_it_starts_from(b
         set_points.append(applied.values[0])
     assert bench.robot.mode == "hold"
     assert set_points == pytest.approx([0.3] * 30, abs=1e-4)  # m
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_drive_that_falls_silent_while_it_is_enabled_does_not_move_the_start():
+    config = RobotConfig.model_validate(
+        {
+            "robot": "arm",
+            "signals": {"joint_position": {"unit": "rad", "elements": ["elbow"]}},
+            "command": {"signal": "joint_position"},
+            "limits": {"joint_position": {"low": -1.0, "high": 1.0, "rate": 1.0}},
+        }
+    )
+    start, limiter = Start(config, "position"), Limiter(config, 0.01)
+    start.note({"joint_position": np.array([0.4])}, 0.0)
+    limiter.start(start.median())
+    start.note({"joint_position": np.array([np.nan])}, 1.1 * MEMORY)
+    assert limiter.start(start.median()) == pytest.approx([0.4])  # rad

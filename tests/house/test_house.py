@@ -60,6 +60,7 @@ WRITE_OTHERWISE = {
     "services/recording/export.py": "writes tables larger than the memory",
     "simulators/bullet.py": "writes nothing",
     "simulators/physics/bullet_arm.py": "writes a file that only PyBullet reads, at once",
+    "simulators/robots/urdf_arm/robot_file.py": "writes meshes that are read at once and removed",
 }
 """tests/system/test_kills.py kills those that write files."""
 

@@ -61,6 +61,43 @@ def test_what_cannot_be_is_refused_in_a_sentence(tmp_path: Path, words: tuple[st
     assert not list(tmp_path.glob("*.yaml"))
 
 
+def test_a_folder_of_files_becomes_a_robot_file(tmp_path: Path) -> None:
+    (tmp_path / "vendors").mkdir()
+    for name in ("eds/servo_drive.eds", "dbc/load_cell.dbc"):
+        (tmp_path / "vendors" / Path(name).name).write_bytes((ROOT / "robots" / name).read_bytes())
+    told = gemuco(tmp_path, "init", "vendors")
+    assert told.returncode == 0, told.stderr
+    assert told.stdout.startswith("vendors.yaml: 2 devices, 1 of them drives, 3 elements; 3 lines to set.\n")
+    assert "Next: complete the lines with 'set' in vendors.yaml; then gemuco simulate vendors.yaml" in told.stdout
+    robot = load_robot(tmp_path / "vendors.yaml")
+    assert sorted(robot.devices) == ["cell", "servo_drive"]
+    again = gemuco(tmp_path, "init", "vendors")
+    assert again.stderr == "gemuco: 'vendors.yaml' exists. Remove it, or name another file by --out.\n"
+
+
+def test_an_mjcf_file_becomes_a_robot_file_with_its_urdf(tmp_path: Path) -> None:
+    pytest.importorskip("mujoco")
+    from test_mjcf import SCENE
+
+    (tmp_path / "arm.xml").write_text(SCENE)
+    told = gemuco(tmp_path, "init", "arm.xml")
+    assert told.returncode == 0, told.stderr
+    assert told.stdout.startswith("arm.yaml: 4 joints from base to tool_center")
+    assert "Left out, because no motor moves it: cube." in told.stdout
+    robot = load_robot(tmp_path / "arm.yaml")
+    assert (robot.urdf, robot.tip) == (Path("arm.urdf"), "tool_center")
+    assert arm_story.reach_of(robot) > 0.7
+    (tmp_path / "arm.yaml").unlink()
+    assert gemuco(tmp_path, "init", "arm.xml").returncode == 0  # the same URDF may be there
+    (tmp_path / "arm.yaml").unlink()
+    (tmp_path / "arm.urdf").write_text("mine")
+    again = gemuco(tmp_path, "init", "arm.xml")
+    assert again.stderr.endswith(
+        "arm.urdf' exists with another content. Remove it, or name a file elsewhere by --out.\n"
+    )
+    assert (tmp_path / "arm.urdf").read_text() == "mine"
+
+
 def test_the_story_fits_arms_with_encoders_of_their_own(tmp_path: Path) -> None:
     assert gemuco(tmp_path, "init", str(named(tmp_path, "My Arm"))).returncode == 0
     robot = load_robot(tmp_path / "arm.yaml")

@@ -1,7 +1,10 @@
 """Recordings of other hands: whatever stands in a file, the reader answers in one sentence."""
 
+import copy
 import json
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from recorded_arm import record
@@ -64,6 +67,66 @@ def test_what_is_malformed_is_one_sentence(
 
 def _with(facts: dict[str, str], bad: str) -> dict[str, str]:
     return facts | {"describe": bad} if "describe" in facts else facts
+
+
+BAD_PARTS = (None, "x", [], {}, [[]], -1, True, 10**400, "\ud800")
+
+
+def parts_of(content: Any, place: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """Places in a JSON value; of a list only the first."""
+    yield place
+    inner = (
+        content.items() if isinstance(content, dict) else enumerate(content[:1]) if isinstance(content, list) else ()
+    )
+    for key, part in inner:
+        yield from parts_of(part, (*place, key))
+
+
+def with_part(content: Any, place: tuple[Any, ...], bad: Any) -> Any:
+    """The value with another part at a place."""
+    if not place:
+        return bad
+    changed = copy.copy(content)
+    changed[place[0]] = with_part(content[place[0]], place[1:], bad)
+    return changed
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("where", ["schema", "message"])
+def test_any_part_of_a_schema_or_message_may_be_wrong(
+    where: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever stands in one place is read, or refused in a sentence."""
+    wanted, bad, seen = "gemuco.Sample", None, b""
+    make, put = file.Writer.register_schema, file.Writer.add_message
+
+    def register_schema(self: Any, name: str, kind: str, data: bytes) -> int:
+        nonlocal seen
+        if name == wanted and where == "schema":
+            seen, data = data, data if bad is None else bad
+        return make(self, name, kind, data)
+
+    def add_message(self: Any, channel: int, log: int, data: bytes, *rest: Any) -> None:
+        nonlocal seen
+        if where == "message" and data.startswith(b'{"type":"sample"'):
+            seen, data = data, data if bad is None else bad
+        put(self, channel, log, data, *rest)
+
+    monkeypatch.setattr(file.Writer, "register_schema", register_schema)
+    monkeypatch.setattr(file.Writer, "add_message", add_message)
+    list(read(record(tmp_path / "whole.mcap", "arm", 1)))
+    whole, refused = json.loads(seen), 0
+    every = 5 if where == "schema" else 1  # most of its parts are words for people
+    for number, place in enumerate(list(parts_of(whole))[::every]):
+        for kind, part in enumerate(BAD_PARTS):
+            bad = json.dumps(with_part(whole, place, part)).encode()
+            files = record(tmp_path / f"{number}_{kind}.mcap", "arm", 1)
+            try:
+                list(read(files))
+            except ServiceError as error:
+                refused += 1
+                assert "\n" not in str(error)
+    assert refused > 20
 
 
 def test_a_whole_one_is_read(tmp_path: Path) -> None:

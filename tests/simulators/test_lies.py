@@ -35,6 +35,21 @@ def test_a_drift_grows_and_noise_varies():
     assert len(set(drawn)) == 2000
 
 
+def test_a_stuck_sensor_changes_its_bits_and_not_its_value():
+    stuck, _ = lie_of("sensor_stuck", ["0.01"], 1.0, 10.0)
+    drawn = [stuck(5.0 + number, 10.0 + number) for number in range(2000)]
+    assert sum(drawn) / 2000 == pytest.approx(1.0, abs=0.002)
+    assert len(set(drawn)) == 2000
+
+
+def test_a_delayed_sensor_reads_what_was():
+    delayed, sentence = lie_of("sensor_delayed", ["0.2"], 1.0, 10.0)
+    assert sentence == "reads the value of 0.2 s ago"
+    read = [delayed(1.0 + 0.1 * step, 10.0 + 0.1 * step) for step in range(1, 8)]
+    assert read == pytest.approx([1.0, 1.0, 1.1, 1.2, 1.3, 1.4, 1.5])
+    assert delayed(1.7, 10.7) == pytest.approx(1.5), "read twice in one step"
+
+
 def test_two_sensors_are_swapped_and_back():
     with bench() as b:
         plant = b.rig._plant

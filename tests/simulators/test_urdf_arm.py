@@ -76,7 +76,7 @@ def robot(tmp_path):
         (f"<robot {XACRO}><xacro:macro name='a'/><link name='a'/></robot>", "is a xacro file. Convert it first"),
         ("<robot><link name='${prefix}a'/></robot>", "is a xacro file"),
         ("<robot><link name='a'", "is not XML"),
-        ("<mujoco/>", "is an MJCF file of MuJoCo, but `gemuco init` needs a URDF"),
+        ("<mujoco/>", "is an MJCF file of MuJoCo. `gemuco init` makes a URDF of it."),
         ("<sdf/>", "is an SDF file of Gazebo"),
         ("<html/>", "is XML of <html>"),
         ("<robot/>", "has no link"),

@@ -47,7 +47,7 @@ from services.wire import keys, messages  # noqa: E402
 from services.wire.session import CLIENT, close_session, new_boot, open_session  # noqa: E402
 from studies.stack import light_model, light_robot  # noqa: E402
 from studies.stack.in_process import LiveDevice  # noqa: E402
-from studies.stack.soak import free_port  # noqa: E402
+from studies.stack.soak.robot import free_port  # noqa: E402
 
 RATE = 50.0
 PATIENCE = 100.0

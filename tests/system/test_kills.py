@@ -258,13 +258,13 @@ def test_a_hundred_kills_at_random_times(writer: Any, tmp_path: Path) -> None:
             while True:
                 last += 1
                 writer.write(tmp_path, last)
-        time.sleep(chance.uniform(0.0, 6.0 * usual))
+        time.sleep(chance.uniform(0.0, 10.0 * usual))
         os.kill(pid, signal.SIGKILL)
         os.waitpid(pid, 0)
         found = writer.read(tmp_path)
         assert found >= last
         last = found
-    assert last > 20  # writes were finished between the kills
+    assert last > 100  # writes were finished between the kills
 
 
 def test_a_recording_killed_at_any_line_is_read_up_to_its_last_commit(tmp_path: Path) -> None:

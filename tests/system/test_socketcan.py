@@ -121,12 +121,12 @@ def test_a_stranger_decodes_the_wire_with_canopen_and_the_eds(client: Client) ->
 def test_the_arm_follows_and_stops(client: Client) -> None:
     _sample(client)
     client.enable()
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + 90
     while time.monotonic() < deadline:
         applied = client.applied()
         if applied is not None and applied.mode == "hold":
             break
         time.sleep(0.05)
     else:
-        raise AssertionError("not enabled within 20 s")
+        raise AssertionError("not enabled within 90 s")
     client.stop()

@@ -14,7 +14,7 @@ from pathlib import Path
 import can
 import numpy as np
 import pytest
-from kernel_robot import Master, ip, one_muscle, running, write
+from kernel_robot import NEEDS_CAN_UTILS, Master, ip, one_muscle, running, write
 from serial_adapter import SerialAdapter
 
 NET = Path("/sys/class/net")
@@ -142,6 +142,7 @@ def test_a_peer_that_is_stopped_and_started(controlled):
     controlled.until_whole("whole again")
 
 
+@NEEDS_CAN_UTILS
 def test_a_receive_buffer_that_overflows(controlled):
     """A real error frame: the chip's buffer is full before the interrupt is served."""
     before = controlled.bus("can0")["counters"]["error_frames"]

@@ -20,6 +20,7 @@ from hal.errors import ConfigError, DeviceRefused, HalError
 from hal.log_limit import LogLimit
 from hal.protocols import cia301
 from hal.protocols.cia301 import EmergencyMessage, MappedObject, NmtCommand, NmtState
+from hal.protocols.eds import read_sheet, value_of
 from hal.wire.bus import Handler
 
 log = logging.getLogger(__name__)
@@ -303,7 +304,7 @@ def _own_layout(settings: PdoSettings, required: PdoMap, label: str) -> PdoMap:
 
 def _check_profile(sheet: canopen.ObjectDictionary, profile: int, what: str) -> None:
     entry = sheet.get_variable(cia301.DEVICE_TYPE, 0)
-    device_type = getattr(entry, "default", None)
+    device_type = None if entry is None else value_of(entry)
     if isinstance(device_type, int) and device_type & 0xFFFF and device_type & 0xFFFF != profile:
         raise ConfigError(f"{what} has device profile {device_type & 0xFFFF}, not {profile}. Is it another device's?")
 
@@ -315,9 +316,4 @@ def data_sheet(path: Path) -> canopen.ObjectDictionary:
     Raises:
         ConfigError: It is missing or not an EDS file.
     """
-    if not path.is_file():
-        raise ConfigError(f"There is no EDS file '{path}'. The path is relative to the folder of the robot file.")
-    try:
-        return canopen.import_od(str(path))
-    except Exception as error:  # canopen passes on every exception of its parser
-        raise ConfigError(f"'{path}' is not an EDS file that canopen can read: {error}.") from error
+    return read_sheet(path)

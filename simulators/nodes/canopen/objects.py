@@ -10,6 +10,8 @@ from pathlib import Path
 import canopen
 from canopen.objectdictionary import ODVariable
 
+from hal.protocols.eds import is_relative, read_sheet, value_of
+
 Key = tuple[int, int]
 """A key is an index and a sub-index."""
 Value = int | float | str
@@ -61,6 +63,8 @@ class Entry:
     low: int | None
     high: int | None
     mappable: bool
+    is_stated: bool = True
+    """Whether the EDS has this default."""
 
     @property
     def size(self) -> int:
@@ -99,34 +103,45 @@ class Entry:
 def read_eds(path: Path, node: int) -> dict[Key, Entry]:
     """Return every value of an EDS file, with the defaults for this node id."""
     entries = {}
-    for key, (entry, is_relative) in _sheet(path).items():
-        entries[key] = replace(entry, default=entry.default + node) if is_relative else entry  # type: ignore[operator]
+    for key, (entry, relative) in _sheet(path).items():
+        entries[key] = replace(entry, default=entry.default + node) if relative else entry  # type: ignore[operator]
     return entries
 
 
 def as_maker_says(ours: dict[Key, Entry], path: Path, node: int) -> dict[Key, Entry]:
-    """Return our node's values with the identity, defaults and limits of a maker's EDS file.
+    """Return our node's values with the identity, values and limits of a maker's EDS or DCF file.
 
-    Objects with another type in that file stay ours, since the node computes with them.
+    A value that the file does not state, as most do not for 1000h, 1018h and 6502h, stays ours, and so does an object
+    with another type in that file, since the node computes with them.
     """
     entries = dict(ours)
-    for key, (entry, is_relative) in _sheet(path, others_too=True).items():
-        if key not in ours or ours[key].format == entry.format:
-            entries[key] = replace(entry, default=entry.default + node) if is_relative else entry  # type: ignore[operator]
+    for key, (entry, relative) in _sheet(path, others_too=True).items():
+        if key not in ours:
+            entries[key] = replace(entry, default=entry.default + node) if relative else entry  # type: ignore[operator]
+        elif ours[key].format == entry.format:
+            stated = entry.default if entry.is_stated else ours[key].default
+            entries[key] = replace(entry, default=stated + node if relative else stated)  # type: ignore[operator]
     return entries
 
 
 @functools.cache
 def _sheet(path: Path, others_too: bool = False) -> dict[Key, tuple[Entry, bool]]:
-    """Return the values of an EDS file for node 0, and whether the node id is added to their defaults.
+    """Return the values of an EDS or DCF file for node 0, and whether the node id is added to them.
 
     Args:
         path: The file.
         others_too: Whether objects of types that our nodes do not use are left out rather than refused.
     """
-    dictionary = canopen.import_od(str(path), node_id=0)
+    dictionary = read_sheet(path, 0)
     variables = (v for v in _variables(dictionary) if not others_too or v.data_type in (*_FORMATS, _STRING))
-    return {(v.index, v.subindex): (_entry(v), v.relative) for v in variables}
+    entries = {(v.index, v.subindex): (_entry(v), is_relative(v)) for v in variables}
+    device = dictionary.device_information
+    numbers = (device.vendor_number, device.product_number, device.revision_number)
+    for sub, number in enumerate(numbers, 1):
+        entry, _ = entries.get((0x1018, sub), (None, False))
+        if entry is not None and not entry.is_stated and isinstance(number, int):
+            entries[0x1018, sub] = replace(entry, default=number, is_stated=True), False
+    return entries
 
 
 def _variables(dictionary: canopen.ObjectDictionary) -> Iterator[ODVariable]:
@@ -142,7 +157,8 @@ def _entry(variable: ODVariable) -> Entry:
     if kind != _STRING and kind not in _FORMATS:
         raise ValueError(f"Object {variable.index:04X}:{variable.subindex} has a data type {kind} that no node uses.")
     empty: Value = "" if kind == _STRING else 0
-    default = empty if variable.default is None else variable.default
+    value = value_of(variable)
+    default = empty if value is None or isinstance(value, bytes) else value
     return Entry(
         format=_FORMATS.get(kind, ""),
         access=variable.access_type,
@@ -150,6 +166,7 @@ def _entry(variable: ODVariable) -> Entry:
         low=variable.min,
         high=variable.max,
         mappable=variable.pdo_mappable,
+        is_stated=value is not None,
     )
 
 

@@ -103,15 +103,16 @@ class PdoTable:
         values = self._objects.values
         cob = int(values[index, 1])
         keys = self._mapped(index + 0x200)
-        if cob & _INVALID or not keys:
+        if cob & _INVALID or not cob & 0x7FF or not keys or any(key not in values for key in keys):
             return None
         layout = struct.Struct("<" + "".join(self._objects.entries[key].format for key in keys))
         period = int(values.get((index, 5), 0)) * 1e-3
-        return Pdo(cob & 0x7FF, int(values[index, 2]), keys, layout, period)
+        return Pdo(cob & 0x7FF, int(values.get((index, 2), 255)), keys, layout, period)
 
     def _mapped(self, index: int) -> tuple[Key, ...]:
         values = self._objects.values
-        numbers = [int(values[index, sub]) for sub in range(1, int(values[index, 0]) + 1)]
+        count = int(values.get((index, 0), 0))
+        numbers = [int(values.get((index, sub), 0)) for sub in range(1, count + 1)]
         return tuple((number >> 16, number >> 8 & 0xFF) for number in numbers)
 
     def _is_valid(self, index: int) -> bool:

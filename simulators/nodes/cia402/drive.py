@@ -50,8 +50,10 @@ class ServoDrive(CanopenNode):
             (0x6091, 1): round(self._constants.gear),
             (0x6076, 0): round(self._constants.rated_torque * 1e3),
             (0x60A9, 0): self._constants.velocity_unit,
-            (0x6502, 0): sum(1 << mode - 1 for mode in self._constants.modes),
         }
+        sheets_own = self.objects.entries[0x6502, 0]
+        if spec.sheet is None or not sheets_own.is_stated:  # a maker's file knows the modes of its drive
+            self.objects.power_on[0x6502, 0] = sum(1 << mode - 1 for mode in self._constants.modes)
         self._mechanics = DriveMechanics(self._constants, spec.element, plant, self.objects.values)
         self.objects.on_write[0x6060] = self._check_mode
         self.objects.on_write[0x605A] = self._check_quick_stop
@@ -189,7 +191,9 @@ class ServoDrive(CanopenNode):
         return word
 
     def _check_mode(self, sub: int, old: Value, new: Value) -> None:
-        if new not in (0, *self._constants.modes):
+        mode = int(new)
+        has_mode = mode == 0 or (mode > 0 and int(self.objects.values[0x6502, 0]) >> mode - 1 & 1)
+        if not has_mode:
             raise Refused(Abort.VALUE)
         if new != old and self.state is State.OPERATION_ENABLED:
             self.sample()

@@ -10,7 +10,7 @@ from hal.errors import ConfigError
 from hal.protocols.analog import UNITS
 from simulators.nodes.canopen.analog_input import AnalogConstants
 from simulators.nodes.canopen.spec import CellConstants, Constants, DriveConstants, EncoderConstants, NodeSpec
-from simulators.nodes.dbc_cell import DbcCellConstants
+from simulators.nodes.dbc.sensor import DbcConstants
 from simulators.nodes.mit_drive import MitConstants
 from simulators.nodes.odrive import OdriveConstants
 
@@ -83,12 +83,6 @@ def _mit(settings: Any) -> Constants:
     )
 
 
-def _dbc(settings: Any) -> Constants:
-    if settings.dbc.name != "load_cell.dbc":
-        raise ConfigError(f"The bench has no other end for '{settings.dbc}'. It has one for load_cell.dbc.")
-    return DbcCellConstants(unbalance=-settings.zero)
-
-
 def _odrive(settings: Any) -> Constants:
     def period(message: str) -> float:
         return float(settings.periods.get(message, 0.0))
@@ -112,10 +106,12 @@ CONSTANTS: dict[str, Callable[[Any], Constants]] = {
     "cia404": _cia404,
     "cia406": _cia406,
     "mit": _mit,
-    "dbc": _dbc,
     "odrive": _odrive,
 }
 """Driver of `hal.registry` -> constants of its simulated counterpart: one line per kind."""
+
+BY_DBC = ("dbc", "dbc_servo")
+"""These drivers have a counterpart that follows their settings and DBC file."""
 
 MAIN = "position"
 
@@ -129,12 +125,19 @@ def hardware(config: RobotConfig) -> list[NodeSpec]:
     nodes = []
     for name, device in config.devices.items():
         kind = config.kinds[device.kind].driver
-        if kind not in CONSTANTS:
-            raise ConfigError(
-                f"The bench has no other end for device '{name}' (driver '{kind}'). It has: {', '.join(CONSTANTS)}."
-            )
-        _, settings = registry.equipment(config, name)
+        if kind not in (*CONSTANTS, *BY_DBC):
+            known = ", ".join((*CONSTANTS, *BY_DBC))
+            raise ConfigError(f"The bench has no other end for device '{name}' (driver '{kind}'). It has: {known}.")
+        driver, settings = registry.equipment(config, name)
         element = device.elements.get(MAIN, device.served[0])
+        if kind in BY_DBC:
+            main = driver.commanded(settings) or next(iter(settings.quantities))
+            elements = device.elements or {main: device.served[0]}
+            element = elements.get(MAIN) or elements.get(main) or device.served[0]
+            nodes.append(
+                NodeSpec(name, device.bus, device.node, element, DbcConstants(settings, config.folder, elements))
+            )
+            continue
         constants: Any = CONSTANTS[kind](settings)
         if hasattr(settings, "channels"):
             constants = replace(constants, more=_more(settings, device.elements))

@@ -236,24 +236,24 @@ def find_mesh(name: str, urdf: Path) -> Path | None:
 
 def _write_link(body: Element, lump: Lump, factor: float) -> None:
     inertial = SubElement(body, "inertial")
-    SubElement(inertial, "origin", xyz=_text(lump.center), rpy="0 0 0")
+    inertial.append(origin(np.eye(3), lump.center))
     SubElement(inertial, "mass", value=repr(float(factor * lump.mass)))
     names = {"ixx": (0, 0), "iyy": (1, 1), "izz": (2, 2), "ixy": (0, 1), "ixz": (0, 2), "iyz": (1, 2)}
     matrix = factor * lump.central
     SubElement(inertial, "inertia", {key: repr(float(matrix[place])) for key, place in names.items()})
     for (turn, place), shape in lump.shapes:
         collision = SubElement(body, "collision")
-        SubElement(collision, "origin", xyz=_text(place), rpy=_text(_angles(turn)))
+        collision.append(origin(turn, place))
         SubElement(collision, "geometry").append(shape)
 
 
 def _write_joint(root: Element, name: str, before: str, pose: Pose, axis: np.ndarray) -> None:
     turn, place = pose
     body = SubElement(root, "joint", name=name, type="continuous")
-    SubElement(body, "origin", xyz=_text(place), rpy=_text(_angles(turn)))
+    body.append(origin(turn, place))
     SubElement(body, "parent", link=f"link {before}")
     SubElement(body, "child", link=f"link {name}")
-    SubElement(body, "axis", xyz=_text(axis))
+    SubElement(body, "axis", xyz=numbers_text(axis))
 
 
 def _angles(turn: np.ndarray) -> np.ndarray:
@@ -264,5 +264,11 @@ def _angles(turn: np.ndarray) -> np.ndarray:
     return np.array([math.atan2(turn[2, 1], turn[2, 2]), pitch, math.atan2(turn[1, 0], turn[0, 0])])
 
 
-def _text(values: np.ndarray) -> str:
+def origin(turn: np.ndarray, place: np.ndarray) -> Element:
+    """Return the <origin> of an orientation, shape (3, 3), and a place [m], shape (3,)."""
+    return Element("origin", xyz=numbers_text(place), rpy=numbers_text(_angles(turn)))
+
+
+def numbers_text(values: np.ndarray) -> str:
+    """Return numbers with spaces between, exactly."""
     return " ".join(repr(float(value)) for value in values)

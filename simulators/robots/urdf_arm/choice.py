@@ -17,11 +17,11 @@ FINGERS = 2
 """Chains behind a link that have at most this many joints each are fingers: the arm ends at the link before them."""
 HAND = re.compile(r"finger|gripper|jaw|thumb|index|knuckle|hand")
 """Joints at the end of a chain with one of these words open a hand and do not move an arm."""
-TOOLS = ("tool", "tcp", "tip", "ee", "eef", "end_effector", "grasp")
+TOOLS = ("tool", "tcp", "tip", "ee", "eef", "end_effector", "grasp", "attachment", "pinch", "gripperframe")
 HANDS = ("hand", "gripper", "flange")
 """Among the links that are fixed to the last one, the tip is the last one with one of the words of tools, or else the
 first one with one of the words of hands, the first word first."""
-NO_TIP = re.compile(r"camera|sensor|optical|finger|imu|inertia")
+NO_TIP = re.compile(r"camera|sensor|optical|finger|imu|inertia|_[xyz]$")
 """A link with one of these words is no tip unless there is no other."""
 
 

@@ -2,16 +2,19 @@
 
 import os
 import re
-from collections.abc import Iterable
-from dataclasses import dataclass
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
 from simulators.nodes.canopen.spec import EDS_FOLDER
 from simulators.robots.urdf_arm.choice import Arm, choose_arm, element_name
+from simulators.robots.urdf_arm.mjcf import convert, is_mjcf
 from simulators.robots.urdf_arm.survey import ACCELERATION, Survey, survey
-from simulators.robots.urdf_arm.tree import read_tree
+from simulators.robots.urdf_arm.tree import Tree, read_tree, tree_of
 
 GEAR = 100
 """Drives have this many turns of the motor per turn of the joint."""
@@ -82,6 +85,7 @@ class Draft:
         robot: Name of the robot.
         text: The robot file.
         sheets: EDS files that belong into the folder `eds` beside it.
+        files: Path from the folder of the robot file -> content of a file that belongs there too.
         summary: Sentence on what was found.
         notes: Sentences on what was chosen, narrowed or guessed.
     """
@@ -91,24 +95,40 @@ class Draft:
     sheets: tuple[Path, ...]
     summary: str
     notes: tuple[str, ...]
+    files: Mapping[str, bytes] = field(default_factory=dict)
 
 
 def draft(path: Path, tip: str | None, name: str | None, folder: Path) -> Draft:
-    """Return the robot file of the arm in a URDF, to be written into a folder.
+    """Return the robot file of the arm in a URDF or MJCF file, to be written into a folder.
 
     Raises:
-        ConfigError: The file is no URDF, or there is no arm in it that can move.
+        ConfigError: The file is neither, or there is no arm in it that can move.
+        ModuleNotFoundError: It is MJCF, and MuJoCo is not installed.
     """
-    tree = read_tree(path)
-    arm = choose_arm(tree, tip)
+    if not is_mjcf(path):
+        return _draft(read_tree(path), _beside(path, folder), tip, name)
+    converted, stem = convert(path), path.name.partition(".")[0]
+    meshes = f"{stem}_meshes"
+    with TemporaryDirectory() as scratch:  # the survey moves the arm before anything is written
+        for mesh, content in converted.meshes.items():
+            (Path(scratch) / mesh).write_bytes(content)
+        tree = tree_of(ElementTree.fromstring(converted.text(scratch)), path)
+        result = _draft(tree, f"{stem}.urdf", tip, name, converted.notes)
+    used = {f"{meshes}/{mesh}": content for mesh, content in converted.meshes.items()}
+    files = {f"{stem}.urdf": converted.text(meshes).encode(), **used}
+    return replace(result, files=files)
+
+
+def _draft(tree: Tree, urdf: str, tip: str | None, name: str | None, more: Sequence[str] = ()) -> Draft:
+    path, arm = tree.path, choose_arm(tree, tip)
     ranges = survey(arm)
     robot = name or robot_name(tree.name or path.stem)
-    notes = (*arm.notes, *ranges.notes)
+    notes = (*more, *arm.notes, *ranges.notes)
     mass = f"{len(arm.joints)} joints from {arm.joints[0].parent} to {arm.tip}"
     summary = f"{mass}, reach {arm.reach:.2f} m, largest torque {ranges.effort.max():.3g} N m."
     text = TEXT.format(
         title=f"{mass}.",
-        urdf=_quoted(_beside(path, folder)),
+        urdf=_quoted(urdf),
         notes="".join(f"# {note}\n" for note in notes),
         robot=robot,
         description=f"'{len(arm.joints)} joints of {path.name}, reach {arm.reach:.2f} m'",

@@ -111,7 +111,8 @@ def _free_range(arm: Arm, body: ServoArm) -> tuple[np.ndarray, np.ndarray, float
             best = (share, middle)
         if share >= FREE:
             break
-        middle = random.uniform(*(np.clip(ends, -np.pi, np.pi) for ends in (lowest + half, highest - half)))
+        ends = (np.clip(end, -np.pi, np.pi) for end in (lowest + half, np.maximum(highest - half, lowest + half)))
+        middle = random.uniform(*ends)
     share, middle = best if best[0] else (0.0, middle)
     return middle - half, middle + half, float(share)
 

@@ -12,7 +12,7 @@ import numpy as np
 from hal.errors import ConfigError
 
 TURNING = ("revolute", "continuous")
-OTHERS = {"mujoco": "an MJCF file of MuJoCo", "sdf": "an SDF file of Gazebo", "COLLADA": "a COLLADA file"}
+OTHERS = {"sdf": "an SDF file of Gazebo", "COLLADA": "a COLLADA file"}
 """Root elements of files that are taken for a URDF, and their names."""
 
 
@@ -98,7 +98,15 @@ def read_tree(path: Path) -> Tree:
     Raises:
         ConfigError: It is missing, is no URDF, or its links and joints are no tree.
     """
-    root = _parsed(path)
+    return tree_of(_parsed(path), path)
+
+
+def tree_of(root: Element, path: Path) -> Tree:
+    """Return the tree of a URDF that was read from, or made of, a file.
+
+    Raises:
+        ConfigError: Its links and joints are no tree.
+    """
     links = {str(link.get("name")): link for link in root.findall("link")}
     joints = [_joint(element, path) for element in root.findall("joint")]
     before: dict[str, Joint] = {}
@@ -137,8 +145,12 @@ def _parsed(path: Path) -> Element:
     if is_macro or path.name.endswith(".xacro"):
         raise ConfigError(f"'{path}' is a xacro file. Convert it first: xacro {path.name} > robot.urdf")
     if root.tag != "robot":
+        if root.tag == "mujoco":
+            raise ConfigError(f"'{path}' is an MJCF file of MuJoCo. `gemuco init` makes a URDF of it.")
         kind = OTHERS.get(root.tag.rpartition("}")[2], f"XML of <{root.tag}>")
-        raise ConfigError(f"'{path}' is {kind}, but `gemuco init` needs a URDF, whose root is <robot>.")
+        raise ConfigError(
+            f"'{path}' is {kind}, but `gemuco init` needs a URDF, whose root is <robot>, or an MJCF file of MuJoCo."
+        )
     if root.find("link") is None:
         raise ConfigError(f"'{path}' has no link, so it describes no robot.")
     return root

@@ -1,0 +1,69 @@
+"""Training of a network that infers every signal from any mask. `mask_errors` measures it without torch."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from gemuco.dataset import Dataset
+from gemuco.learning.config import TrainConfig
+from gemuco.learning.learner import Progress
+from gemuco.learning.train import fit
+from gemuco.masks import Mask, all_masks
+from gemuco.structure.mask_errors import LISTED, MaskErrors
+
+TRAINED = 2000
+"""With more signals the network is trained under this many random masks, and generalises to the others."""
+
+
+def train_masks(
+    dataset: Dataset,
+    config: TrainConfig,
+    splits: int = 1,
+    progress: Progress | None = None,
+    drafts: Path | None = None,
+) -> tuple[MaskErrors, ...]:
+    """Train one network under all masks per split of the data, and return each with its held-out rows.
+
+    Raises:
+        NotEnoughData: There are too few samples.
+    """
+
+    def share(split: int) -> Progress | None:
+        return None if progress is None else lambda done, text: progress((split + done) / splits, text)
+
+    return tuple(train_split(dataset, config, split, share(split), drafts) for split in range(splits))
+
+
+def train_split(
+    dataset: Dataset, config: TrainConfig, split: int, progress: Progress | None = None, drafts: Path | None = None
+) -> MaskErrors:
+    """Train a network under all masks on one split of the data, and return it with its held-out rows.
+
+    Args:
+        dataset: Episodes of one body.
+        config: Settings of the training.
+        split: Index of the split; successive ones hold out other motions.
+        progress: Called after every epoch.
+        drafts: A folder in which the training is saved; see `fit`.
+
+    Raises:
+        NotEnoughData: There are too few samples.
+    """
+    own = replace(config, seed=config.seed + split)
+    train, held = dataset.split(own.held_out, own.seed)
+    resume = None if drafts is None else drafts / f"structure_{split}.safetensors"
+    masks = _drawn_masks(dataset.layout.names, own.seed)
+    schema, _ = fit(dataset, own, masks, progress, title=f"structure, split {split + 1}", resume=resume)
+    return MaskErrors.of_schema(schema, train, held, config.outliers)
+
+
+def _drawn_masks(names: tuple[str, ...], seed: int) -> tuple[Mask, ...]:
+    """Return all masks, or the masks that lack one signal and `TRAINED` random masks of all sizes."""
+    if len(names) <= LISTED:
+        return all_masks(names)
+    random = np.random.default_rng(seed)
+    drawn = random.random((TRAINED, len(names))) < random.random((TRAINED, 1))
+    drawn[~drawn.any(axis=1), 0] = True
+    others = ~np.eye(len(names), dtype=bool)
+    return tuple(dict.fromkeys(frozenset(np.array(names)[line].tolist()) for line in np.concatenate([others, drawn])))

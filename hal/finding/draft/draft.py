@@ -1,0 +1,267 @@
+"""A whole draft: from a folder with the files of vendors, or from a scanned bus and such a folder."""
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from hal.errors import ConfigError
+from hal.finding.draft import dbc_parts, sheets
+from hal.finding.draft.parts import Measure, Names, Part
+from hal.finding.draft.sheets import FIRST_NODES, PROFILES, Sheet
+from hal.finding.draft.text import robot_text
+from hal.finding.scan import Node, Scan
+from hal.protocols import dbc
+
+STAND_IN = "stand_in"
+SUFFIXES = (".eds", ".dcf", ".dbc")
+DEPTH = 3
+"""Files are looked for at most this many folders deep."""
+SHIPPED = {402: "servo_drive", 406: "joint_encoder", 404: "load_cell", 401: "analog_input"}
+"""EDS files of this package, by device profile."""
+ODRIVE = "odrive_cansimple.dbc"
+
+
+@dataclass(frozen=True, slots=True)
+class Draft:
+    """A robot file that is not written yet.
+
+    Attributes:
+        robot: Name of the robot.
+        text: The robot file.
+        copies: Path from its folder -> file of this package to copy there.
+        summary: Sentence on the devices.
+        notes: Sentences on what was left out or guessed.
+    """
+
+    robot: str
+    text: str
+    copies: Mapping[str, Path]
+    summary: str
+    notes: tuple[str, ...]
+
+
+@dataclass(slots=True)
+class _Draughtsman:
+    """Files of a folder, and the parts drafted so far."""
+
+    folder: Path
+    shipped: Path
+    names: Names = field(default_factory=Names)
+    notes: list[str] = field(default_factory=list)
+    parts: list[Part] = field(default_factory=list)
+    copies: dict[str, Path] = field(default_factory=dict)
+    nodes: set[int] = field(default_factory=set)
+    has_encoders: bool = False
+
+    @property
+    def moved(self) -> str:
+        """Signal of the drives: motors if encoders measure the joints."""
+        return "motor_position" if self.has_encoders else "joint_position"
+
+    def path_of(self, path: Path) -> str:
+        """Return the path of a file from the folder of the robot file."""
+        return Path(os.path.relpath(path.resolve(), self.folder.resolve())).as_posix()
+
+    def copy(self, kind: str, name: str) -> str:
+        """Note a file of this package to be copied beside the robot file; return its path there."""
+        self.copies[f"{kind}/{name}"] = self.shipped / kind / name
+        return f"{kind}/{name}"
+
+    def node(self, wish: int | None, first: int) -> int:
+        """Return a node id that no other device has: the wished one, or the next from `first` on."""
+        node = wish if wish and wish not in self.nodes else first
+        while node in self.nodes:
+            node += 1
+        self.nodes.add(node)
+        return node
+
+    def add_stand_in(self) -> None:
+        """Add a drive if there is none, because a robot commands at least one element."""
+        if any(part.is_drive for part in self.parts):
+            return
+        settings = {"eds": self.copy("eds", "servo_drive.eds"), "counts_per_turn": 4096, "gear": 1.0}
+        measure = Measure("position", self.moved, STAND_IN, "rad")
+        node = self.node(None, FIRST_NODES[402])
+        self.parts.append(
+            Part(STAND_IN, "cia402", settings, node, (measure,), "no drive was there", "your drive", is_drive=True)
+        )
+        self.notes.append(
+            f"There is no drive, and a robot needs one: '{STAND_IN}' takes its place until you set yours."
+        )
+
+
+def draft_folder(source: Path, name: str, folder: Path, shipped: Path) -> Draft:
+    """Return a robot file with one device for each EDS or DCF file, and one for each sending node of a DBC file.
+
+    Args:
+        source: Folder with the files of vendors.
+        name: Name of the robot.
+        folder: Folder of the robot file.
+        shipped: Folder of the robot files of this package.
+
+    Raises:
+        ConfigError: There is no such file, or none that can be used.
+    """
+    files = files_in(source)
+    if not files:
+        raise ConfigError(
+            f"'{source}' has no EDS, DCF or DBC file. Give the folder with the files of your devices, or a URDF or "
+            "MJCF file."
+        )
+    work = _Draughtsman(folder, shipped)
+    known = list(_sheets(files, work.notes))
+    work.has_encoders = any(sheet.profile == 406 for sheet in known)
+    for sheet in known:
+        node = work.node(sheet.node, FIRST_NODES[sheet.profile])
+        work.parts.append(sheets.part_of(sheet, work.path_of(sheet.path), work.names, node, work.moved))
+    for path in files:
+        if path.suffix.lower() == ".dbc":
+            _add_dbc(work, path, None)
+    if not work.parts:
+        raise ConfigError(f"None of {len(files)} files in '{source}' can be used. {' '.join(work.notes)}")
+    work.add_stand_in()
+    count = f"{len(files)} file{'s' if len(files) > 1 else ''}"
+    real = "interface: socketcan, channel: can0. Node ids are guessed: `gemuco scan` lists them."
+    return _finished(work, name, f"{count} in {source}", "can0", real, 1_000_000)
+
+
+def draft_bus(
+    result: Scan, channel: str, bitrate: int, source: Path | None, name: str, folder: Path, shipped: Path
+) -> Draft:
+    """Return a robot file with one device for each node of a bus that a driver fits.
+
+    Args:
+        result: The scan.
+        channel: Interface and channel, as YAML.
+        bitrate: Bit rate of the bus [bit/s].
+        source: Folder with the files of vendors; None: EDS files of this package take their place.
+        name: Name of the robot.
+        folder: Folder of the robot file.
+        shipped: Folder of the robot files of this package.
+
+    Raises:
+        ConfigError: There is no node with a driver.
+    """
+    work = _Draughtsman(folder, shipped)
+    files = files_in(source) if source else []
+    known = list(_sheets(files, work.notes))
+    work.has_encoders = any(node.profile == 406 for node in result.nodes)
+    if result.silence:
+        work.notes.append(result.silence)
+    for node in result.nodes:
+        _add_node(work, node, known)
+    for path in files:
+        if path.suffix.lower() == ".dbc":
+            _add_dbc(work, path, result)
+    if not work.parts:
+        raise ConfigError(
+            f"No node on {result.bus} has a driver ({len(result.nodes)} nodes, {len(result.unknown)} other "
+            f"identifiers). Are they powered, is the bit rate {bitrate}? {' '.join(work.notes)}".rstrip()
+        )
+    work.add_stand_in()
+    return _finished(work, name, f"the nodes on {result.bus}", result.bus, channel, bitrate)
+
+
+def files_in(folder: Path) -> list[Path]:
+    """Return the EDS, DCF and DBC files in a folder and its folders, sorted.
+
+    Raises:
+        ConfigError: There is no such folder.
+    """
+    if not folder.is_dir():
+        raise ConfigError(f"There is no folder '{folder}'. Is its path right?")
+    files = [
+        path
+        for path in folder.rglob("*")
+        if path.suffix.lower() in SUFFIXES and len(path.relative_to(folder).parts) <= DEPTH and path.is_file()
+    ]
+    return sorted(files)
+
+
+def _sheets(files: Sequence[Path], notes: list[str]) -> Iterator[Sheet]:
+    """Yield the EDS and DCF files with a driver; a note says why one is left out."""
+    for path in files:
+        if path.suffix.lower() == ".dbc":
+            continue
+        try:
+            sheet = sheets.read(path)
+        except ConfigError as error:
+            notes.append(f"Left out: {error}")
+            continue
+        if sheet.profile in PROFILES:
+            yield sheet
+        else:
+            drivers = ", ".join(f"{number} ({word})" for number, word in PROFILES.items())
+            notes.append(
+                f"Left out: '{path.name}' has device profile {sheet.profile}; there are drivers for {drivers}."
+            )
+
+
+def _add_dbc(work: _Draughtsman, path: Path, result: Scan | None) -> None:
+    try:
+        file = dbc.load(path)
+    except ConfigError as error:
+        work.notes.append(f"Left out: {' '.join(str(error).split())}")
+        return
+    own = work.path_of(path)
+    if dbc_parts.is_odrive(file):
+        if result is None:
+            work.parts.append(dbc_parts.odrive_part(own, work.names, work.node(None, 3), path.name, work.moved))
+        return
+    rates = None if result is None else result.unknown
+    parts = dbc_parts.parts_of(file, own, work.names, work.node(None, 91), work.notes, rates)
+    work.nodes |= {part.node for part in parts}
+    work.parts += parts
+    if not parts:
+        where = "" if result is None else f" that was received on {result.bus}"
+        work.notes.append(f"Left out: no message of '{path.name}'{where} has a measured value.")
+
+
+def _add_node(work: _Draughtsman, node: Node, known: Sequence[Sheet]) -> None:
+    if node.protocol == "ODrive":
+        path = work.copy("dbc", ODRIVE)
+        work.nodes.add(node.node)
+        work.parts.append(
+            dbc_parts.odrive_part(
+                path, work.names, node.node, f"ODrive, node {node.node}", work.moved, f"axis_{node.node}"
+            )
+        )
+        return
+    label = f"node {node.node}" + (f" '{node.text(0x1008)}'" if node.text(0x1008) else "")
+    if node.protocol == "MIT":
+        work.notes.append(f"Left out: {label} is a drive in MIT mode, whose motor must be known (docs/devices.md).")
+        return
+    profile = node.profile
+    if profile not in PROFILES:
+        what = f"is a {node.kind}" if node.kind else "did not state its profile"
+        work.notes.append(f"Left out: {label} {what}; there are drivers for {', '.join(map(str, PROFILES))}.")
+        return
+    vendor, product = node.number(0x1018, 1), node.number(0x1018, 2)
+    fitting = [sheet for sheet in known if sheet.profile == profile]
+    same = [sheet for sheet in fitting if (sheet.vendor, sheet.product) == (vendor, product)]
+    if same or fitting:
+        sheet = (same or fitting)[0]
+        path = work.path_of(sheet.path)
+        if not same:
+            work.notes.append(f"'{sheet.path.name}' is taken for {label} by its profile; its identity is another one.")
+    else:
+        path = work.copy("eds", f"{SHIPPED[profile]}.eds")
+        sheet = sheets.read(work.copies[path])
+        work.notes.append(f"{label} has a general EDS file in place of its vendor's. Replace {path}.")
+    work.nodes.add(node.node)
+    name = f"{PROFILES[profile]}_{node.node}"
+    part = sheets.part_of(sheet, path, work.names, node.node, work.moved, name)
+    work.parts.append(part)
+
+
+def _finished(work: _Draughtsman, name: str, source: str, bus: str, real: str, bitrate: int) -> Draft:
+    parts = work.parts
+    text = robot_text(name, source, bus, real, bitrate, parts, work.notes)
+    drives = sum(part.is_drive for part in parts)
+    to_set = sum(bool(part.to_set) for part in parts)
+    summary = (
+        f"{len(parts)} devices, {drives} of them drives, {sum(len(part.measures) for part in parts)} elements; "
+        f"{to_set + 1} lines to set."
+    )
+    return Draft(name, text, work.copies, summary, tuple(work.notes))

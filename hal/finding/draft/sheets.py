@@ -1,0 +1,132 @@
+"""A device drafted from an EDS or DCF file: its profile, its node id, and what the file says of its encoder."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import canopen
+
+from hal.errors import ConfigError
+from hal.finding.draft.parts import Measure, Names, Part
+from hal.protocols import cia301
+from hal.protocols.eds import read_sheet, value_of
+
+PROFILES = {402: "drive", 406: "encoder", 404: "cell", 401: "input"}
+"""Each device profile with a driver, and the word for such devices in names."""
+FIRST_NODES = {402: 1, 406: 31, 404: 51, 401: 71}
+"""Node ids of the devices of a profile count from here, if no file states them."""
+SIGNS = ((0x6041, 402), (0x6004, 406), (0x9130, 404), (0x7130, 404), (0x6130, 404), (0x6401, 401), (0x6403, 401))
+"""An object that shows the profile of a file which does not state 1000h, the first one first."""
+MODES = ((8, "csp"), (1, "profile_position"))
+"""Modes of operation that a position can be commanded in, and their names, the preferred one first."""
+
+INPUT_PRESETS = ((0x6401, "int16"), (0x6402, "int32"), (0x6403, "float32"))
+CELL_PRESETS = ((0x9130, "int32"), (0x6130, "float32"), (0x7130, "int16"), (0x9100, "counts32"), (0x7100, "counts16"))
+"""Object of the value -> setting, the preferred one first."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sheet:
+    """An EDS or DCF file.
+
+    Attributes:
+        path: The file.
+        profile: Number of the device profile; 0 if it is not known.
+        vendor: Vendor number; None if not stated.
+        product: Product code; None if not stated.
+        node: Node id of a DCF file; None if not stated.
+        dictionary: All of its objects.
+    """
+
+    path: Path
+    profile: int
+    vendor: int | None
+    product: int | None
+    node: int | None
+    dictionary: canopen.ObjectDictionary
+
+    def number(self, index: int, subindex: int = 0) -> int | None:
+        """Return a stated value; None without one."""
+        return _number(self.dictionary, index, subindex)
+
+
+def read(path: Path) -> Sheet:
+    """Read an EDS or DCF file.
+
+    Raises:
+        ConfigError: It cannot be read.
+    """
+    dictionary = read_sheet(path)
+    stated = (_number(dictionary, cia301.DEVICE_TYPE, 0) or 0) & 0xFFFF
+    signs = (profile for index, profile in SIGNS if index in dictionary)
+    device = dictionary.device_information
+    vendor, product = _number(dictionary, 0x1018, 1), _number(dictionary, 0x1018, 2)
+    return Sheet(
+        path,
+        stated or next(signs, 0),
+        vendor or getattr(device, "vendor_number", None),
+        product or getattr(device, "product_number", None),
+        getattr(dictionary, "node_id", None),
+        dictionary,
+    )
+
+
+def _number(dictionary: canopen.ObjectDictionary, index: int, subindex: int) -> int | None:
+    variable = dictionary.get_variable(index, subindex)
+    value = None if variable is None else value_of(variable)
+    return value if isinstance(value, int) else None
+
+
+def part_of(sheet: Sheet, eds: str, names: Names, node: int, moved: str, name: str = "") -> Part:
+    """Return the device of a file.
+
+    Args:
+        sheet: The file.
+        eds: Its path as the robot file has it.
+        names: Names that were given.
+        node: Node id.
+        moved: Signal of a drive.
+        name: Name of the device; that of the file if empty.
+
+    Raises:
+        ConfigError: There is no driver for its profile.
+    """
+    if sheet.profile not in PROFILES:
+        what = f"device profile {sheet.profile}" if sheet.profile else "no device profile that is known"
+        drivers = ", ".join(f"{number} ({word})" for number, word in PROFILES.items())
+        raise ConfigError(f"'{sheet.path.name}' has {what}; there are drivers for {drivers}.")
+    own = names.new(name or sheet.path.stem)
+    settings: dict[str, Any] = {"eds": eds}
+    to_set = ""
+    if sheet.profile == 402:
+        signal, unit = moved, "rad"
+        settings |= {"mode": _mode(sheet), "counts_per_turn": _counts(sheet, 0x608F) or 4096, "gear": 1.0}
+        to_set = "gear" if _counts(sheet, 0x608F) else "counts_per_turn, gear"
+    elif sheet.profile == 406:
+        signal, unit = "joint_position", "rad"
+        to_set = "zero, direction"
+    else:
+        signal, unit = "force", "N"
+        presets = INPUT_PRESETS if sheet.profile == 401 else CELL_PRESETS
+        preset = next((name for index, name in presets if index in sheet.dictionary), presets[0][1])
+        settings |= {"preset": preset}
+        if sheet.profile == 401 or preset.startswith("counts"):
+            settings |= {"gain": 0.01}
+            to_set = "gain [N per count]"
+    quantity = "force" if unit == "N" else "position"
+    measure = Measure(quantity, signal, own, unit)
+    driver = f"cia{sheet.profile}"
+    return Part(own, driver, settings, node, (measure,), sheet.path.name, to_set, is_drive=sheet.profile == 402)
+
+
+def _mode(sheet: Sheet) -> str:
+    """Return the mode by 6502h; cyclic positions if the file does not state it."""
+    modes = sheet.number(0x6502)
+    if modes is None:
+        return MODES[0][1]
+    return next((name for mode, name in MODES if modes >> mode - 1 & 1), MODES[0][1])
+
+
+def _counts(sheet: Sheet, index: int) -> int | None:
+    counts, turns = sheet.number(index, 1), sheet.number(index, 2)
+    return round(counts / (turns or 1)) if counts and counts > 1 else None

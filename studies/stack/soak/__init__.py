@@ -1,0 +1,1 @@
+"""Endurance of a whole simulated robot while everything around it breaks."""

@@ -1,0 +1,151 @@
+"""`gemuco init` of a folder or a bus: the drafted robot file has the devices that are there, and runs on the bench."""
+
+from pathlib import Path
+
+import can
+import numpy as np
+import pytest
+import yaml
+from on_bench import arrives, cycle_until, running, virtual
+from test_bench_dbc import SENSOR, SERVO
+from test_bench_devices import DRIVE, UNSTATED, without_defaults
+
+from hal.config import BusConfig, load_robot
+from hal.errors import ConfigError
+from hal.finding.draft.draft import Draft, draft_bus, draft_folder
+from hal.finding.scan import scan
+from hal.finding.tap import Tap
+from services.model.model_config import collect_config
+from simulators.robots.bench import simulator
+
+SHIPPED = Path(__file__).parents[2] / "robots"
+ENCODER = (SHIPPED / "eds" / "joint_encoder.eds").read_text()
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Return a folder of vendors' files, one of them in a folder of its own."""
+    folder = tmp_path / "vendors"
+    (folder / "acme").mkdir(parents=True)
+    modes = without_defaults(DRIVE, *UNSTATED[:-1]).replace("DefaultValue=929", "DefaultValue=0x21")
+    (folder / "acme" / "Acme-Drive 3.EDS").write_text(modes)
+    commissioned = "[DeviceComissioning]\nNodeID=9\n"
+    (folder / "encoder.dcf").write_text(ENCODER + commissioned)
+    (folder / "cells.dbc").write_text(SENSOR)
+    return folder
+
+
+def written(draft: Draft, folder: Path) -> Path:
+    for place, path in draft.copies.items():
+        (folder / place).parent.mkdir(parents=True, exist_ok=True)
+        (folder / place).write_bytes(path.read_bytes())
+    file = folder / f"{draft.robot}.yaml"
+    file.write_text(draft.text)
+    return file
+
+
+def body_of(file: Path) -> dict:
+    return yaml.safe_load(file.read_text()) | {"folder": file.parent}
+
+
+def test_a_folder_becomes_devices_with_what_the_files_state(folder: Path, tmp_path: Path) -> None:
+    draft = draft_folder(folder, "arm", tmp_path, SHIPPED)
+    robot = load_robot(written(draft, tmp_path))
+    drive, encoder, cell = (robot.devices[name] for name in ("acme_drive_3", "encoder", "cell"))
+    assert robot.kinds["acme_drive_3"].settings["mode"] == "profile_position"
+    assert robot.kinds["acme_drive_3"].settings["eds"] == "vendors/acme/Acme-Drive 3.EDS"
+    assert (drive.element, encoder.element) == ("motor_position.acme_drive_3", "joint_position.encoder")
+    assert (drive.node, encoder.node) == (1, 9)
+    assert cell.elements == {"force": "force.cell_force", "heat": "temperature.cell_heat", "angle": "angle.cell_angle"}
+    settings = robot.kinds["cell"].settings
+    assert settings["quantities"]["angle"]["scale"] == pytest.approx(np.pi / 180)
+    assert settings["periods"] == {"Load": 0.1, "Pages": 0.1}
+    assert "# set: counts_per_turn, gear" in draft.text or "# set: gear" in draft.text
+    assert "# set: period of Load, Pages" in draft.text
+    assert not draft.copies
+    assert collect_config(robot).samples == 2000
+
+
+@pytest.mark.long
+def test_a_drafted_folder_runs_on_the_bench(folder: Path, tmp_path: Path) -> None:
+    file = written(draft_folder(folder, "arm", tmp_path, SHIPPED), tmp_path)
+    with running(virtual(body_of(file))) as (robot, rig):
+        rig.fault("set force.cell_force 17")
+        cycle_until(robot, arrives("motor_position", np.array([0.1])), np.array([0.1]))
+        sample = cycle_until(robot, arrives("force", np.array([17.0]), 0.02))
+        assert np.isfinite(sample.values["joint_position"]).all()
+
+
+def test_files_without_a_drive_have_one_that_stands_in(tmp_path: Path) -> None:
+    (tmp_path / "files").mkdir()
+    (tmp_path / "files" / "unit.dbc").write_text(
+        'VERSION ""\nBU_: X\nBO_ 5 Out: 8 Vector__XXX\n SG_ Pull : 0|16@1+ (1,0) [0|0] "" X\n'
+        ' SG_ Counter : 16|8@1+ (1,0) [0|0] "" X\n SG_ Rate : 24|16@1+ (1,0) [0|0] "furlong" X\n'
+    )
+    draft = draft_folder(tmp_path / "files", "cells", tmp_path, SHIPPED)
+    robot = load_robot(written(draft, tmp_path))
+    assert list(draft.copies) == ["eds/servo_drive.eds"]
+    assert robot.signals["value"].elements == ("unit_pull", "unit_rate")
+    assert robot.command.signal == "joint_position"
+    assert any("'stand_in' takes its place" in note for note in draft.notes)
+    assert any("Pull, Rate have no unit that is known" in note for note in draft.notes)
+
+
+def test_messages_of_the_host_are_left_out_and_said(tmp_path: Path) -> None:
+    (tmp_path / "files").mkdir()
+    (tmp_path / "files" / "servo.dbc").write_text(SERVO.replace("Demand: 4", "SetDemand: 4"))
+    draft = draft_folder(tmp_path / "files", "servo", tmp_path, SHIPPED)
+    assert any("the host sends SetDemand, Order. If a node is a servo" in note for note in draft.notes)
+    assert set(load_robot(written(draft, tmp_path)).kinds["drive"].settings["periods"]) == {"Status"}
+
+
+@pytest.mark.parametrize(
+    ("files", "words"),
+    [
+        ({}, "has no EDS, DCF or DBC file. Give the folder with the files of your devices"),
+        ({"a.eds": "hello"}, "None of 1 files in"),
+        ({"a.eds": without_defaults(DRIVE, "1000", value="DefaultValue=0x195\n")}, "has device profile 405"),
+        ({"a.dbc": 'VERSION ""\nBU_: X\n'}, "has a measured value"),
+        ({"a.dbc": "nonsense"}, "is not a DBC file that cantools can read"),
+    ],
+)
+def test_a_folder_of_which_nothing_can_be_used_is_refused(tmp_path: Path, files: dict[str, str], words: str) -> None:
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    with pytest.raises(ConfigError) as caught:
+        draft_folder(tmp_path, "none", tmp_path, SHIPPED)
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.long
+def test_a_bus_becomes_the_devices_that_answer(folder: Path, tmp_path: Path) -> None:
+    (folder / "axis.dbc").write_text((SHIPPED / "dbc" / "odrive_cansimple.dbc").read_text())
+    file = written(draft_folder(folder, "arm", tmp_path, SHIPPED), tmp_path)
+    config = virtual(body_of(file))
+    channel = config.buses["can0"].channel
+    rig = simulator.rig(config, "bench", 0)
+    rig.start()
+    try:
+        with Tap("can0", BusConfig(interface="virtual", channel=channel)) as tap:
+            result = scan(tap, listen=1.0)
+    finally:
+        rig.stop()
+    draft = draft_bus(result, "interface: socketcan, channel: can0", 500_000, folder, "again", tmp_path, SHIPPED)
+    robot = load_robot(written(draft, tmp_path))
+    nodes = {name: (robot.kinds[device.kind].driver, device.node) for name, device in robot.devices.items()}
+    assert nodes.pop("cell")[0] == "dbc"
+    assert nodes == {"drive_1": ("cia402", 1), "encoder_9": ("cia406", 9), "axis_3": ("odrive", 3)}
+    assert robot.kinds["drive_1"].settings["eds"] == "vendors/acme/Acme-Drive 3.EDS"
+    assert robot.kinds["cell"].settings["periods"]["Load"] == pytest.approx(0.1, rel=0.3)
+    assert robot.buses["can0"].bitrate == 500_000
+
+
+def test_a_silent_bus_is_refused(tmp_path: Path) -> None:
+    config = BusConfig(interface="virtual", channel="nothing_here")
+    with can.Bus(interface="virtual", channel="nothing_here"), Tap("can0", config) as tap:
+        result = scan(tap, listen=0.05, ask=False)
+    with pytest.raises(
+        ConfigError, match=r"No node on can0 has a driver \(0 nodes, 0 other identifiers\)\. Are they.*Only listened"
+    ):
+        draft_bus(result, "", 1_000_000, None, "none", tmp_path, SHIPPED)
