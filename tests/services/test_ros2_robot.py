@@ -301,7 +301,11 @@ def test_a_drafted_robot_file_runs(robot: str, network: Network, tmp_path: Path)
 
 def test_init_takes_a_urdf_or_ros2():
     result = CliRunner().invoke(app, ["init"])
-    assert (result.exit_code, result.stderr) == (1, "gemuco: `gemuco init` takes either a URDF or --ros2.\n")
+    assert result.exit_code == 1
+    assert result.stderr.endswith("a folder with EDS, DCF and DBC files, --scan can0, or --ros2.\n")
+    result = CliRunner().invoke(app, ["init", "arm.urdf", "--ros2"])
+    assert result.exit_code == 1
+    assert result.stderr == ("gemuco: --ros2 reads the topics of a network; give neither a file nor --scan with it.\n")
 
 
 def test_a_robot_without_a_bus_has_nothing_to_scan(tmp_path: Path):
