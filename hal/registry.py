@@ -7,8 +7,9 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from hal.config import RobotConfig, explain
+from hal.config import RobotConfig
 from hal.errors import ConfigError
+from hal.reading.mistakes import explain
 
 DRIVERS = {
     "cia402": "hal.drivers.cia402:Cia402Drive",

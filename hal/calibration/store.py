@@ -19,8 +19,9 @@ from pydantic import ValidationError
 
 from hal import registry
 from hal.calibration.line import Calibration, Point
-from hal.config import RobotConfig, Section, explain, parse_yaml
+from hal.config import RobotConfig, Section
 from hal.errors import ConfigError
+from hal.reading.mistakes import explain, parse_yaml
 
 SIMULATED = ("hub", "virtual")
 """Devices on these interfaces are simulated and need no calibration."""

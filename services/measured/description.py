@@ -16,8 +16,9 @@ from pydantic import BeforeValidator, Field, ValidationError, model_validator
 
 from gemuco.signals import Layout, Signal
 from hal.calibration.units import check_units, factor
-from hal.config import Positive, Section, explain, parse_yaml
+from hal.config import Positive, Section
 from hal.errors import ConfigError
+from hal.reading.mistakes import explain, parse_yaml
 from services.measured.text_table import TextStyle
 from services.model.model_config import Count, ModelConfig, NetworkConfig, StructureConfig, TrainingConfig
 

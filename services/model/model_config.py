@@ -6,8 +6,9 @@ from pydantic import Field, ValidationError
 
 from gemuco.learning.config import TrainConfig
 from gemuco.trust.config import TrustConfig
-from hal.config import Positive, RangeConfig, RobotConfig, Section, explain
+from hal.config import Positive, RangeConfig, RobotConfig, Section
 from hal.errors import ConfigError
+from hal.reading.mistakes import explain
 from services.model.control_config import ControlConfig, SimulationConfig, named_signals
 
 Count = Annotated[int, Field(ge=1)]

@@ -14,8 +14,9 @@ from pydantic import ValidationError
 from hal import registry
 from hal.calibration import store
 from hal.clock import ManualClock
-from hal.config import RobotConfig, explain, load_robot
+from hal.config import RobotConfig, load_robot
 from hal.errors import CommandRefused, ConfigError, HalError
+from hal.reading.mistakes import explain
 from hal.robot import open_robot
 
 

@@ -14,6 +14,7 @@ BLOCKS = re.findall(r"^```(sh|python)\n(.*?)^```$", TEXT, re.MULTILINE | re.DOTA
 
 
 @pytest.mark.long
+@pytest.mark.timeout(400)
 def test_blocks_run_in_an_empty_folder(tmp_path):
     program = f'gemuco() {{ "{sys.executable}" -m services.cli "$@"; }}\n'
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}

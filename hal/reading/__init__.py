@@ -1,0 +1,1 @@
+"""Files that people write: their text, and their mistakes in a sentence."""
