@@ -24,22 +24,24 @@ def description(robot: str, network: Network, **changes: Any) -> dict[str, Any]:
         "signals": {
             "joint_position": {
                 "unit": "rad", "elements": JOINTS, "source": "ros2", "topic": "/joint_states", "field": "position",
-                "stale_after": 0.2,
+                "stale_after": 0.5,
             },
             "joint_velocity": {
                 "unit": "rad/s", "elements": JOINTS, "source": "ros2", "topic": "/joint_states", "field": "velocity",
-                "stale_after": 0.2,
+                "stale_after": 0.5,
             },
             "wrist_force": {
                 "unit": "N", "elements": ["z"], "source": "ros2", "topic": "/wrist", "field": "force",
-                "stale_after": 0.2,
+                "stale_after": 0.5,
             },
             "skin": {
                 "unit": "1", "elements": ["s0", "s1", "s2"], "source": "ros2", "topic": "/skin", "field": "data",
-                "stale_after": 0.2,
+                "stale_after": 0.5,
             },
         },
-        "command": {"signal": "joint_position", "time_to_live": 0.3, "hold": 0.3, "topic": COMMANDS},
+        "command": {
+            "signal": "joint_position", "time_to_live": 0.5, "hold": 3.0, "topic": COMMANDS, "following_error": 2.0,
+        },
         "limits": {"joint_position": {"low": -1.0, "high": 1.0, "rate": 0.5, "acceleration": 5.0}},
         "rates": {"hal": 50},
         "ros2": {"router": network.router, "distribution": network.distribution},
