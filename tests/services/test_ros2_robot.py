@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from hal.clock import ManualClock
 from hal.config import RobotConfig, load_robot
-from hal.errors import ConfigError
+from hal.errors import CommandRefused, ConfigError
 from services.cli import app
 from services.client import Client
 from services.process.router import routing
@@ -46,6 +46,21 @@ def mode(client: Client) -> str:
     return "" if applied is None else applied.mode
 
 
+def enable(client: Client) -> None:
+    """Enable as soon as the HAL has seen the subscriber of the commands."""
+
+    def enabled() -> bool:
+        try:
+            client.enable()
+        except CommandRefused as error:
+            assert "has no subscriber" in str(error) or "No valid joint_position" in str(error)
+            return False
+        return True
+
+    eventually(enabled)
+    eventually(lambda: mode(client) == "hold")
+
+
 def command(client: Client, values: np.ndarray) -> None:
     sample = client.next_sample()
     if sample is not None:
@@ -65,8 +80,7 @@ def test_topics_are_signals_and_commands_move_the_driver_behind_the_limits(robot
         assert driver.commands == 0, "nothing is published before a client enables the robot"
 
         with client.lease():
-            client.enable()
-            eventually(lambda: mode(client) == "hold")
+            enable(client)
             begun, start = time.monotonic(), driver.position.copy()
             goal = np.array([0.5, 3.0])
             while abs(driver.position[0] - 0.5) > 0.01:
@@ -90,8 +104,7 @@ def test_a_driver_that_falls_silent_is_a_fault_and_its_values_are_not_fresh(robo
     with Driver(network) as driver, hal(config_of(robot, network)), Client(robot) as client:
         eventually(lambda: valid(client))
         with client.lease():
-            client.enable()
-            eventually(lambda: mode(client) == "hold")
+            enable(client)
             driver.change = lambda _: None
 
             def lost() -> bool:
