@@ -64,6 +64,11 @@ class CommandConfig(Section):
     Default: a part of the range."""
     following_lag: Annotated[float, Field(gt=0, le=5)] = 0.25
     """A drive is where a set-point of this last time [s] was."""
+    topic: str = ""
+    """Topic of ROS 2 on which set-points are published, of a robot whose drivers are ROS 2 nodes; without it such a
+    robot is only measured."""
+    message: Literal["JointTrajectory", "Float64MultiArray"] = "JointTrajectory"
+    """Type of the messages on this topic."""
 
 
 class StopConfig(NumbersConfig):
@@ -106,8 +111,12 @@ class SignalConfig(Section):
     elements: tuple[str, ...] = Field(min_length=1)
     stale_after: Positive = 0.02
     """An element is valid up to this age [s]."""
-    source: Literal["hal", "vision"] = "hal"
-    """Publisher of the signal: the HAL, or the process of a camera."""
+    source: Literal["hal", "vision", "ros2"] = "hal"
+    """Publisher of the signal: the HAL, the process of a camera, or nodes of ROS 2."""
+    topic: str = ""
+    """Topic of ROS 2 that has the signal."""
+    field: str = ""
+    """Field of the messages on this topic (`position`, `data`, `force`); it says their type too."""
     computed: ComputedConfig | None = None
     """Computation by the HAL; None for a signal that devices measure."""
     plausible: PlausibleConfig | None = None
@@ -126,10 +135,14 @@ class SignalConfig(Section):
         unit = info.data.get("unit")
         return plausible.in_unit(unit, "plausible") if plausible and unit else plausible
 
-    @property
-    def is_measured(self) -> bool:
-        """Whether devices on the buses measure it."""
-        return self.source == "hal" and self.computed is None
+    @model_validator(mode="after")
+    def _topic_fits(self) -> "SignalConfig":
+        if (self.source == "ros2") != bool(self.topic.startswith("/") and self.field):
+            raise ValueError(
+                "a signal with `source: ros2`, and only that, has the full name of its `topic` (/joint_states) and a "
+                "`field` (position)."
+            )
+        return self
 
     @property
     def size(self) -> int:
@@ -212,6 +225,8 @@ class RobotConfig(Section):
     """`module:name` of the simulator that replaces the hardware."""
     physics: Literal["bullet", "mujoco"] | None = None
     """Engine of that simulator; by default PyBullet if it is installed, else MuJoCo."""
+    ros2: dict[str, Any] = Field(default_factory=dict)
+    """Settings of the bridge to ROS 2, which checks this section itself."""
     urdf: Path | None = None
     """URDF file for the live page, relative to the robot file."""
     wires: dict[str, Annotated[tuple[Via, ...], Field(min_length=2)]] = Field(default_factory=dict)
@@ -244,7 +259,7 @@ class RobotConfig(Section):
         signals = ", ".join(self.signals)
         if self.command.signal not in self.signals:
             raise ValueError(f"command.signal '{self.command.signal}' is not a signal. Known: {signals}.")
-        if not self.signals[self.command.signal].is_measured:
+        if self.command.signal not in self.measured:
             raise ValueError(f"command.signal '{self.command.signal}' must be measured by devices, to start from it.")
         for name, signal in self.signals.items():
             twice = [element for element, count in Counter(signal.elements).items() if count > 1]
@@ -253,7 +268,7 @@ class RobotConfig(Section):
             self._computed_fits(name)
             if signal.plausible is not None:
                 signal.plausible.check(signal.size, f"signals.{name}.plausible")
-                if not signal.is_measured:
+                if name not in self.measured:
                     raise ValueError(f"signals.{name}.plausible: no device measures this signal. Check its inputs.")
         for name, limit in self.limits.items():
             if name not in self.signals:
@@ -273,11 +288,11 @@ class RobotConfig(Section):
                 if element in elements:
                     raise ValueError(f"devices '{elements[element]}' and '{name}' both claim element '{element}'.")
                 elements[element] = name
-        if self.devices:
-            missing = [e for e in self.element_names(self.measured) if e not in elements]
+        if self.devices or self.has_topics:
+            missing = [e for e in self.element_names(self._on_buses) if e not in elements]
             if missing:
                 raise ValueError(
-                    f"no device measures {', '.join(missing)}. Add one, remove the element, or set `source: vision`."
+                    f"no device measures {', '.join(missing)}. Add one, remove the element, or set another `source`."
                 )
         return self
 
@@ -295,7 +310,7 @@ class RobotConfig(Section):
 
     def _limits_fit(self, name: str, limit: LimitConfig) -> None:
         limit.check(self.signals[name].size, f"limits.{name}", name == self.command.signal)
-        if self.signals[name].source != "hal" and limit.is_watched:
+        if name in self.seen and limit.is_watched:
             raise ValueError(f"limits.{name}: soft and trip limits are the HAL's, which does not see this signal.")
 
     def _park_fits(self) -> None:
@@ -314,7 +329,7 @@ class RobotConfig(Section):
             raise ValueError(f"device '{name}' is of kind '{device.kind}'. Known kinds: {', '.join(self.kinds)}.")
         if device.bus not in self.buses:
             raise ValueError(f"device '{name}' is on bus '{device.bus}'. Known buses: {', '.join(self.buses)}.")
-        known = self.element_names(self.measured)
+        known = self.element_names(self._on_buses)
         for element in device.served:
             if element not in known:
                 which = "a device cannot measure" if element in self.element_names() else "no signal has"
@@ -324,13 +339,30 @@ class RobotConfig(Section):
 
     @property
     def measured(self) -> tuple[str, ...]:
-        """Names of the signals that devices measure."""
-        return tuple(name for name, signal in self.signals.items() if signal.is_measured)
+        """Names of the signals that the HAL's devices measure; without a bus, nodes of ROS 2 are its devices."""
+        return tuple(
+            name
+            for name, signal in self.signals.items()
+            if signal.computed is None and (signal.source == "hal" or (signal.source == "ros2" and not self.buses))
+        )
 
     @property
     def seen(self) -> tuple[str, ...]:
-        """Names of the signals that the process of a camera publishes."""
-        return tuple(name for name, signal in self.signals.items() if signal.source == "vision")
+        """Names of the signals that another process than the HAL publishes: a camera, or the bridge to ROS 2."""
+        return tuple(
+            name
+            for name, signal in self.signals.items()
+            if signal.source == "vision" or (signal.source == "ros2" and self.buses)
+        )
+
+    @property
+    def has_topics(self) -> bool:
+        """Whether nodes of ROS 2 are the devices of the HAL."""
+        return not self.buses and any(signal.source == "ros2" for signal in self.signals.values())
+
+    @property
+    def _on_buses(self) -> list[str]:
+        return [name for name in self.measured if self.signals[name].source == "hal"]
 
     def element_names(self, signals: Iterable[str] | None = None) -> list[str]:
         """Return `signal.element` of every element of the given signals, or of all, in order."""

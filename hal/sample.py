@@ -20,7 +20,7 @@ class Sample:
     Attributes:
         cycle: Number of the cycle, from 1.
         stamp_ns: Wall clock at the SYNC of the cycle [ns since 1970].
-        source: `can` or `simulated`.
+        source: `can`, `simulated`, or `ros2` if nodes of ROS 2 are its devices.
         complete: Whether every device answered in this cycle.
         values: Signal -> values [the signal's unit], shape (n,); NaN where not valid.
         age: Signal -> age of each value [s], shape (n,); inf before the first measurement.

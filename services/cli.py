@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from services.verbs import deployment, describe, endpoint, hardware, init, page, recording
+from services.verbs import deployment, describe, endpoint, hardware, init, metrics, page, recording, ros2
 from services.verbs.verb import CommandLine, Connect, RobotFile, load, report_errors, robot_name, robot_path
 
 app = typer.Typer(
@@ -81,9 +81,11 @@ def hal(robot: RobotFile, connect: Connect = None) -> int:
     from services.process.realtime import starting
 
     with starting():
-        from services.hardware.hal_service import run_hal
-
         config = load(robot)
+        if config.has_topics:
+            from services.ros2.hardware import run_ros_hal as run_hal
+        else:
+            from services.hardware.hal_service import run_hal
     return run_hal(config, connect or ())
 
 
@@ -92,12 +94,19 @@ def hal(robot: RobotFile, connect: Connect = None) -> int:
 def vision(robot: RobotFile, variant: Variant = None, seed: Seed = 0, connect: Connect = None) -> None:
     """Run the camera of a simulated robot until Ctrl-C: compute the vision signals from the simulator's truth.
 
+    Of a robot with signals of ROS 2 beside a CAN bus: read their topics.
+
     The camera of a real robot publishes on the same key instead. To cover the simulated one: `gemuco query ROBOT fault
     camera_covered`.
     """
+    config = load(robot)
+    if any(config.signals[name].source == "ros2" for name in config.seen):
+        from services.ros2.vision import run_ros_vision
+
+        return run_ros_vision(config, connect or ())
     from services.hardware.vision_service import run_vision
 
-    run_vision(load(robot), variant, seed, connect or ())
+    return run_vision(config, variant, seed, connect or ())
 
 
 @app.command()
@@ -317,7 +326,7 @@ def reproduce(
     typer.echo(f"Figures and tables are in {out / robot}.")
 
 
-for verbs in (init, describe, hardware, deployment, endpoint, recording, page):
+for verbs in (init, describe, hardware, deployment, endpoint, recording, page, ros2, metrics):
     verbs.register(app)
 
 

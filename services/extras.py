@@ -12,6 +12,7 @@ EXTRAS = {
     "viser": "view",
     "yourdfpy": "view",
     "pyarrow": "parquet",
+    "prometheus_client": "metrics",
     "joblib": "studies",
 }
 """Each of these packages is brought by this extra of pyproject.toml."""

@@ -3,7 +3,7 @@
 import socket
 import struct
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -37,16 +37,21 @@ _LISTENING = {"tcp": "0A", "udp": "07"}
 """In /proc/net, a listening socket has this state."""
 
 
-def run_doctor(robot: str, connect: Iterable[str] = ()) -> int:
+More = Callable[[RobotConfig], Iterable[Finding]]
+"""A function of this type yields further findings on a robot."""
+
+
+def run_doctor(robot: str, connect: Iterable[str] = (), more: More = lambda _: ()) -> int:
     """Print all findings and return the exit code: 1 if anything is bad.
 
     Args:
         robot: Name or file.
         connect: Endpoints, such as a router's, and role files.
+        more: Checks of what this room does not know, such as topics of ROS 2.
     """
     counts = dict.fromkeys(Severity, 0)
     console = show.console()
-    for finding in _findings(robot, tuple(connect)):
+    for finding in _findings(robot, tuple(connect), more):
         counts[finding.verdict] += 1
         if console.is_terminal:
             row = Table.grid(padding=(0, 2))
@@ -60,7 +65,7 @@ def run_doctor(robot: str, connect: Iterable[str] = ()) -> int:
     return 1 if counts[Severity.BAD] else 0
 
 
-def _findings(robot: str, connect: tuple[str, ...]) -> Iterator[Finding]:
+def _findings(robot: str, connect: tuple[str, ...], more: More) -> Iterator[Finding]:
     try:
         config = load_robot(robot_file(robot))
     except ConfigError as error:
@@ -71,7 +76,9 @@ def _findings(robot: str, connect: tuple[str, ...]) -> Iterator[Finding]:
     is_sound = all(finding.what != "robot file" or finding.verdict is Severity.OK for finding in findings)
     if is_sound:
         yield from check_interfaces(config)
-        yield from _devices(config, connect)
+        if not config.has_topics:
+            yield from _devices(config, connect)
+        yield from more(config)
     yield from host_checks.clocks()
     yield from host_checks.real_time()
     yield from host_checks.other_users(bool(split_connect(connect)[1]))

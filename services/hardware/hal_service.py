@@ -236,7 +236,11 @@ def _problem(health: dict[str, Any]) -> str:
 def _describe(config: RobotConfig) -> dict[str, Any]:
     """Return the description for clients: signals with units and elements, command, limits, rates, devices."""
     signals = {
-        name: {"unit": signal.unit, "elements": list(signal.elements), "source": signal.source}
+        name: {
+            "unit": signal.unit,
+            "elements": list(signal.elements),
+            "source": "vision" if name in config.seen else signal.source,
+        }
         for name, signal in config.signals.items()
     }
     return {
@@ -250,13 +254,19 @@ def _describe(config: RobotConfig) -> dict[str, Any]:
     }
 
 
-def run_hal(config: RobotConfig, connect: Iterable[str] = (), stop: threading.Event | None = None) -> int:
+def run_hal(
+    config: RobotConfig,
+    connect: Iterable[str] = (),
+    stop: threading.Event | None = None,
+    make: Callable[[RobotConfig], Robot] = open_robot,
+) -> int:
     """Run the hardware service of a robot until SIGTERM, SIGINT or `stop`.
 
     Args:
         config: The robot file.
         connect: Endpoints, such as a router's, and role files.
         stop: Ends the service in place of the signals.
+        make: Makes the robot, not open yet, of the robot file.
 
     Returns:
         The process's exit code.
@@ -267,7 +277,7 @@ def run_hal(config: RobotConfig, connect: Iterable[str] = (), stop: threading.Ev
         ServiceError: No session opens.
     """
     realtime.prepare_process()
-    robot = open_robot(config)
+    robot = make(config)
     with until_stopped(stop) as end, Service(config.robot, "hal", connect, lambda: _describe(config)) as service:
         log.info("HAL of robot '%s' runs (boot %d)", config.robot, service.boot)
         HalService(config, robot, service).run(end)

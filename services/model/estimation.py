@@ -144,7 +144,10 @@ class _Source:
     """The usable values of the samples of one process."""
 
     def __init__(self, robot: RobotConfig, elements: Elements, source: str) -> None:
-        self._elements, self._names = elements, [n for n in elements.counts if robot.signals[n].source == source]
+        self._elements, self._names = (
+            elements,
+            [n for n in elements.counts if (n in robot.seen) == (source == "vision")],
+        )
         stale = [np.full(count, robot.signals[name].stale_after) for name, count in elements.counts.items()]
         self._stale_after = np.concatenate(stale)
         self._limits = sorted({robot.signals[name].stale_after for name in self._names})

@@ -60,14 +60,15 @@ def scan(
 
 @report_errors
 def doctor(robot: RobotFile, connect: Connect = None) -> int:
-    """Check buses, nodes, clocks, role files and network of a robot: one line per check, with its remedy.
+    """Check buses, nodes, topics, clocks, role files and network of a robot: one line per check, with its remedy.
 
     Reads the status of the HAL if it runs, otherwise opens the buses with the motors off. Exit code 1 if anything is
     bad.
     """
     from services.hardware.doctor import run_doctor
+    from services.ros2.hardware import check_topics
 
-    return run_doctor(robot, connect or ())
+    return run_doctor(robot, connect or (), check_topics)
 
 
 @calibrate.command()
@@ -161,6 +162,8 @@ def _buses(robot: str | None, interface: str | None, channel: str | None, bitrat
         )
     if robot is not None:
         config = load(robot)
+        if not config.buses:
+            raise BadArguments(f"Robot '{config.robot}' has no bus. `gemuco top` shows what its HAL reads.")
         return config, dict(config.buses)
     if channel is None:
         raise BadArguments(f"--interface {interface} needs a --channel, such as can0.")

@@ -1,4 +1,4 @@
-"""The verb `init`: a robot file with a simulator, from a URDF or MJCF file, from vendors' files, or from a bus."""
+"""The verb `init`: a robot file with a simulator, from a URDF or MJCF file, from vendors' files, a bus, or ROS 2."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from services.verbs.verb import report_errors
+from services.verbs.verb import Distribution, Domain, RosRouter, report_errors
 
 DESCRIBE = "simulators.robots.urdf_arm:describe"
 """The function that reads a URDF is named by this text, because services know simulators by name only."""
@@ -37,28 +37,65 @@ def init(
         typer.Option(metavar="CHANNEL", help="Use the nodes on this bus: can0 of SocketCAN, or INTERFACE:CHANNEL."),
     ] = None,
     bitrate: Annotated[int, typer.Option(min=10_000, help="Bit rate of the scanned bus \\[bit/s].")] = 1_000_000,
+    ros2: Annotated[bool, typer.Option("--ros2", help="Draft the file from the topics of a ROS 2 network.")] = False,
+    router: RosRouter = None,
+    domain: Domain = None,
+    distribution: Distribution = None,
 ) -> None:
     """Write a robot file, with a simulator, for an arm in a URDF or MJCF file, or for the devices that you have.
 
     For an arm the file has joints, limits and torques; drives, encoders and a camera stand in for the hardware. `gemuco
     demo FILE` then collects, trains, runs, and loses an encoder and the camera. For a folder or a bus it has the
     devices, on a bench; complete what no file knows: gears, zeros, limits.
-    """
-    from services.errors import BadArguments, ServiceError
 
+    With [bold]--ros2[/] the robot is one whose drivers are ROS 2 nodes: its topics are listed and become signals.
+    """
+    from services.errors import BadArguments
+
+    if ros2 and (source is not None or scan is not None):
+        raise BadArguments("--ros2 reads the topics of a network; give neither a file nor --scan with it.")
+    if ros2:
+        _of_topics(name, out, {"router": router, "domain": domain, "distribution": distribution})
+        return
     if source is None and scan is None:
-        raise BadArguments("Give a URDF or MJCF file, a folder with EDS, DCF and DBC files, or --scan can0.")
+        raise BadArguments("Give a URDF or MJCF file, a folder with EDS, DCF and DBC files, --scan can0, or --ros2.")
     if tip is not None and (scan is not None or (source is not None and source.is_dir())):
         raise BadArguments("--tip is for a URDF or MJCF file; devices have no chain of links.")
-    file = out or Path(f"{_stem(source, scan)}.yaml")
-    if file.suffix not in (".yaml", ".yml"):
-        raise ServiceError(f"A robot file ends in .yaml, not as '{file}'. Name another one by --out.")
-    if file.exists():
-        raise ServiceError(f"'{file}' exists. Remove it, or name another file by --out.")
+    file = _new_file(out or Path(f"{_stem(source, scan)}.yaml"))
     if scan is not None or (source is not None and source.is_dir()):
         _of_devices(source, scan, bitrate, name, file)
     elif source is not None:
         _of_arm(source, tip, name, file)
+
+
+def _new_file(file: Path) -> Path:
+    """Return a path at which a robot file can be written."""
+    from services.errors import ServiceError
+
+    if file.suffix not in (".yaml", ".yml"):
+        raise ServiceError(f"A robot file ends in .yaml, not as '{file}'. Name another one by --out.")
+    if file.exists():
+        raise ServiceError(f"'{file}' exists. Remove it, or name another file by --out.")
+    return file
+
+
+def _of_topics(name: str | None, out: Path | None, given: dict[str, Any]) -> None:
+    from services.errors import ServiceError
+    from services.ros2.draft import draft
+    from services.ros2.settings import network_with
+
+    file = _new_file(out or Path(f"{name or 'ros_robot'}.yaml"))
+    robot = name or file.stem
+    _check_name(robot)
+    made = draft(network_with({}, **given), robot)
+    urdf = file.with_name(f"{robot}.urdf")
+    if made.urdf and urdf.exists():
+        raise ServiceError(f"'{urdf}' exists. Remove it, or give another --name.")
+    _write(file, made.text, {urdf.name: made.urdf.encode()} if made.urdf else {})
+    typer.echo(f"{file}: {made.summary}")
+    for note in made.notes:
+        typer.echo(f"  {note}")
+    typer.echo(f"Next: gemuco hal {file}, and gemuco top {file}")
 
 
 def _stem(source: Path | None, scan: str | None) -> str:

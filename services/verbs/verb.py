@@ -21,6 +21,26 @@ Connect = Annotated[
     ),
 ]
 
+RosRouter = Annotated[
+    str | None,
+    typer.Option(
+        "--ros-router",
+        metavar="ENDPOINT",
+        help="Router of ROS 2 (rmw_zenohd, or `gemuco router`); that of the robot file, or tcp/127.0.0.1:7447.",
+    ),
+]
+Domain = Annotated[
+    int | None, typer.Option(envvar="ROS_DOMAIN_ID", help="Domain of ROS 2; that of the robot file, or 0.")
+]
+Distribution = Annotated[
+    str | None,
+    typer.Option(
+        "--ros-distro",
+        envvar="ROS_DISTRO",
+        help="ROS distribution of the other nodes: types have no hashes in humble. That of the robot file, or jazzy.",
+    ),
+]
+
 OURS = ("gemuco", "hal", "services", "simulators")
 """These packages are always installed; others may be missing, as in the small image."""
 
@@ -130,3 +150,20 @@ def load(text: str) -> Any:
 def robot_name(text: str) -> str:
     """Return the name of a robot; a client needs no robot file."""
     return str(load(text).robot) if Path(text).suffix in (".yaml", ".yml") else text
+
+
+def known_robot(robot: str) -> Any:
+    """Return the robot file; None without one, which a client does not need."""
+    from hal.config import load_robot
+    from hal.errors import ConfigError
+
+    try:
+        return load_robot(robot_path(robot))
+    except ConfigError:
+        return None
+
+
+def urdf_of(robot: str) -> Path | None:
+    """Return the URDF in the robot file; None without a robot file, or if it has none."""
+    config = known_robot(robot)
+    return None if config is None or config.urdf is None else config.folder / config.urdf

@@ -134,7 +134,7 @@ class Sample(OfSignals, frozen=True, kw_only=True):
 
     Attributes:
         cycle: The HAL's cycle number, or the number of the frame.
-        source: `can`, `camera`, `simulated`, `truth` or `replay`.
+        source: `can`, `camera`, `ros2`, `simulated`, `truth` or `replay`.
         complete: Whether every device answered in this cycle.
         values: Signal -> values [the signal's unit], shape (n,); NaN where not valid.
         age: Signal -> age of each value when published [s], shape (n,); inf if never measured.

@@ -104,7 +104,7 @@ WORDS = [
     (("scan", "--interface", "sockectan", "--channel", "can0"), "is not known to python-can. Known: "),
     (("calibrate", "joint", "good.yaml", "elbow"), "Devices: elbow_drive, wrist_drive."),
     (("calibrate", "cell", "good.yaml", "elbow_drive"), "Is it `gemuco calibrate joint`?"),
-    (("init",), "Give a URDF or MJCF file, a folder with EDS, DCF and DBC files, or --scan can0."),
+    (("init",), "Give a URDF or MJCF file, a folder with EDS, DCF and DBC files, --scan can0, or --ros2."),
     (("init", "nothing"), "has no EDS, DCF or DBC file. Give the folder with the files of your devices"),
     (("init", "none.urdf"), "There is no file 'none.urdf'. Is its folder right?"),
     (("init", "arm.urdf"), "is not XML: mismatched tag"),
