@@ -141,7 +141,7 @@ def signals_with(name, **changes):
         ),
         (signals_with("center_of_gravity", source="vision"), "is computed by the HAL"),
         (signals_with("joint_position", source="vision"), "must be measured by devices"),
-        (signals_with("tool_tip_pixel", source="radar"), "'hal' or 'vision'"),
+        (signals_with("tool_tip_pixel", source="radar"), "'hal', 'vision' or 'ros2'"),
         ({"limits": {"tool_tip_pixel": {"trip_high": 600}}}, "the HAL's, which does not see this signal"),
         ({"conditions": ["plain", "plain"]}, "conditions must be names that differ"),
     ],

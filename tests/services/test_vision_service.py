@@ -203,7 +203,8 @@ def test_any_program_may_be_the_camera(robot: str) -> None:
 
 @pytest.mark.long
 def test_the_frame_of_the_documentation_is_one(robot: str) -> None:
-    program = (EXAMPLE.parents[1] / "docs" / "keys.md").read_text().split("```python\n")[-1].split("```")[0]
+    blocks = (EXAMPLE.parents[1] / "docs" / "keys.md").read_text().split("```python\n")[1:]
+    (program,) = [block.split("```")[0] for block in blocks if "vision/sample" in block.split("```")[0]]
     program = program.replace("ENDPOINT", endpoint(robot, "model")).replace("gemuco/kxr_humanoid/", f"gemuco/{robot}/")
     with Service(robot, "model") as model:
         frames = model.newest(keys.vision(robot), Sample)
