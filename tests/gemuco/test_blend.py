@@ -37,8 +37,8 @@ def test_what_is_linear_is_as_exact_as_a_regression_also_outside(schema):
     assert not shares["encoder"].any() and shares["height"].all()
     for reach, tolerance in ((1.0, 1e-3), (5.0, 5e-3)):  # rad
         fresh = body(200, 100, reach)
-        told = estimate(schema, {"motor": fresh["motor"], "current": fresh["current"]})["encoder"].value
-        assert np.abs(told - fresh["encoder"]).max() < tolerance
+        estimated = estimate(schema, {"motor": fresh["motor"], "current": fresh["current"]})["encoder"].value
+        assert np.abs(estimated - fresh["encoder"]).max() < tolerance
 
 
 def test_what_is_not_linear_is_left_to_the_network(schema):

@@ -202,8 +202,8 @@ def test_a_region_knows_its_edges_and_its_holes(schema, arm):
 
 def test_growth_is_interpolated_and_rises_with_the_square_behind_its_end():
     knots, growth = np.array([1.0, 2.0, 4.0]), np.array([[0.1], [0.4], [1.0]])
-    told = [grown(knots, growth, 0, distance) for distance in (0.5, 1.0, 3.0, 4.0, 8.0)]
-    np.testing.assert_allclose(told, [0.05, 0.1, 0.7, 1.0, 4.0])
+    prediction = [grown(knots, growth, 0, distance) for distance in (0.5, 1.0, 3.0, 4.0, 8.0)]
+    np.testing.assert_allclose(prediction, [0.05, 0.1, 0.7, 1.0, 4.0])
 
 
 def test_a_model_from_a_file_and_an_updated_one_need_no_other_compiled_code(schema, arm, tmp_path):

@@ -36,8 +36,8 @@ def followed(schema: BodySchema, arm: ToolArm, count: int = 40) -> Updater:
 def tip(schema: BodySchema, arm: ToolArm) -> tuple[np.ndarray, np.ndarray, str, str]:
     """Error and std of the hidden tip on other postures [m], shape (n, 2), and the state and reason of the first."""
     values = arm.sample(200, 77)
-    told = estimate(schema, {"joint_position": values["joint_position"]})["tool_tip_position"]
-    return told.value - values["tool_tip_position"], told.std, told.state[0], told.reason[0]
+    prediction = estimate(schema, {"joint_position": values["joint_position"]})["tool_tip_position"]
+    return prediction.value - values["tool_tip_position"], prediction.std, prediction.state[0], prediction.reason[0]
 
 
 def test_a_trained_tool_is_settled_and_known(grips):
@@ -95,8 +95,8 @@ def test_elements_that_were_not_measured_since_the_change_are_doubtful(grips):
             updater.add({name: values[name][index] for name in names})
             updater.step()
     given = {"joint_position": after["joint_position"][0], "tool_tip_position": after["tool_tip_position"][0]}
-    told = estimate(updater.schema, given)["center_of_gravity"]
-    assert told.state == "doubtful"
-    assert told.reason == "the body changed, and center_of_gravity.0 was not measured since"
+    prediction = estimate(updater.schema, given)["center_of_gravity"]
+    assert prediction.state == "doubtful"
+    assert prediction.reason == "the body changed, and center_of_gravity.0 was not measured since"
     given = {"joint_position": after["joint_position"][0], "center_of_gravity": after["center_of_gravity"][0]}
     assert estimate(updater.schema, given)["tool_tip_position"].state == "known"

@@ -79,10 +79,10 @@ def test_goes_on_after_a_kill(whole, tmp_path):
 def test_a_finished_training_is_not_done_again(whole, tmp_path):
     path = tmp_path / "draft"
     same(fit(two_bodies(), CONFIG, MASKS, resume=path), whole)
-    told = []
-    again = fit(two_bodies(), CONFIG, MASKS, lambda *step: told.append(step), resume=path)
+    prediction = []
+    again = fit(two_bodies(), CONFIG, MASKS, lambda *step: prediction.append(step), resume=path)
     same(again, whole)
-    assert (again[1].resumed, told) == (CONFIG.epochs, [])
+    assert (again[1].resumed, prediction) == (CONFIG.epochs, [])
 
 
 def test_goes_on_after_many_interruptions(whole, tmp_path):

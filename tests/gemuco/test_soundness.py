@@ -127,8 +127,8 @@ def test_a_blinded_detector_is_refused(case, folder):
     forge(folder, change, facts)
     with pytest.raises(CheckpointError) as caught:
         load(folder)
-    told = str(caught.value)
-    assert "is damaged" in told and "KeyError" not in told and "\n" not in told
+    prediction = str(caught.value)
+    assert "is damaged" in prediction and "KeyError" not in prediction and "\n" not in prediction
 
 
 @pytest.mark.parametrize(

@@ -20,10 +20,10 @@ def test_the_same_seed_gives_the_same_model(data):
 
 
 def test_tells_its_progress_and_its_history(data):
-    told = []
-    _, history = fit(data, TINY, MASKS, lambda share, text: told.append((share, text)))
-    assert [share for share, _ in told] == pytest.approx([1 / 3, 2 / 3, 1.0])
-    assert "held-out loss" in told[-1][1]
+    prediction = []
+    _, history = fit(data, TINY, MASKS, lambda share, text: prediction.append((share, text)))
+    assert [share for share, _ in prediction] == pytest.approx([1 / 3, 2 / 3, 1.0])
+    assert "held-out loss" in prediction[-1][1]
     assert len(history.train) == len(history.held_out) == 3
     assert history.best_epoch == int(np.argmin(history.held_out))
 

@@ -32,8 +32,8 @@ def joint_error(schema, arm):
     """Root mean square error of the joint angles told from tensions and lengths [rad]."""
     values = arm.sample(500, 77)
     x = schema.normalise({name: values[name] for name in ("muscle_tension", "muscle_length")})
-    told = schema.scaler.restore(np.pad(schema.infer(x, frozenset(MASKS[1])), ((0, 0), (0, 0))))
-    return float(np.sqrt(np.mean((told[:, :2] - values["joint_position"]) ** 2)))
+    prediction = schema.scaler.restore(np.pad(schema.infer(x, frozenset(MASKS[1])), ((0, 0), (0, 0))))
+    return float(np.sqrt(np.mean((prediction[:, :2] - values["joint_position"]) ** 2)))
 
 
 def wild(values, random):
@@ -115,10 +115,10 @@ def test_dead_channels_are_named_and_do_no_harm(arm):
     values["muscle_tension"][3] += 5.0  # the stuck sensor comes alive
     values["muscle_length"][1] += 0.1
     for mask in schema.masks:
-        told = schema.infer(schema.normalise(values), mask)
+        prediction = schema.infer(schema.normalise(values), mask)
         if mask == schema.masks[0]:
-            np.testing.assert_array_equal(told, quiet)
-        assert schema.scaler.restore(told)[5] == pytest.approx(12.5)
+            np.testing.assert_array_equal(prediction, quiet)
+        assert schema.scaler.restore(prediction)[5] == pytest.approx(12.5)
     assert joint_error(schema, arm) < 0.25
 
 
@@ -142,8 +142,8 @@ def test_a_signal_that_never_varies_is_named(arm):
 
     schema, history = fit(episodes(arm, change=still), replace(SMALL, epochs=3), MASKS)
     assert history.dead == ("joint_position.shoulder", "joint_position.elbow")
-    told = schema.scaler.restore(schema.infer(np.zeros(LAYOUT.size), schema.masks[1]))
-    np.testing.assert_allclose(told[:2], [0.4, 1.1])
+    prediction = schema.scaler.restore(schema.infer(np.zeros(LAYOUT.size), schema.masks[1]))
+    np.testing.assert_allclose(prediction[:2], [0.4, 1.1])
     noisy = schema.normalise({"joint_position": np.array([0.41, 1.1])})
     assert abs(noisy[0]) < 0.1  # a little noise stays little
 

@@ -249,8 +249,8 @@ def _counts(place, size, change):
 
         def lie(data, now):
             number = int.from_bytes(data[place : place + size], "little", signed=True)
-            told = change(number, run, state)
-            return data[:place] + told.to_bytes(size, "little", signed=True) + data[place + size :]
+            report = change(number, run, state)
+            return data[:place] + report.to_bytes(size, "little", signed=True) + data[place + size :]
 
         return lie
 

@@ -38,7 +38,7 @@ class Master:
             [sys.executable, str(MASTER), str(path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
         )
         self._lines = queue.SimpleQueue()
-        self.told = deque(maxlen=1000)
+        self.report = deque(maxlen=1000)
         threading.Thread(target=lambda: [self._lines.put(line) for line in self._process.stdout], daemon=True).start()
 
     def say(self, order):
@@ -53,10 +53,10 @@ class Master:
                 self.say(order)
             with contextlib.suppress(queue.Empty):
                 line = json.loads(self._lines.get(timeout=0.2))
-                self.told.append(line)
+                self.report.append(line)
                 if condition(line):
                     return line
-        raise AssertionError(f"the HAL's process did not tell what was waited for: {list(self.told)[-3:]}")
+        raise AssertionError(f"the HAL's process did not report what was waited for: {list(self.report)[-3:]}")
 
     def signal(self, number):
         self._process.send_signal(number)
@@ -159,9 +159,9 @@ def _watch(stage, outcome, duration):
 def _thaw(stage, master, outcome):
     rises = len(stage.world.rises)
     master.signal(signal.SIGCONT)
-    told = [master.until(lambda line: "at" in line) for _ in range(3)]
+    report = [master.until(lambda line: "at" in line) for _ in range(3)]
     ahead = stage.world.time - time.time()
-    for line in told:
+    for line in report:
         if line["tension"] is not None:
             age = line["at"] + ahead - (line["tension"] - 20.0) / TENSION_RAMP
             if age > OLD:
@@ -176,4 +176,4 @@ def _thaw(stage, master, outcome):
 
 
 def _is_in_fault(master):
-    return [line["mode"] for line in master.told if "mode" in line][-1] == "fault"
+    return [line["mode"] for line in master.report if "mode" in line][-1] == "fault"

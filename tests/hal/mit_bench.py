@@ -48,13 +48,13 @@ def description(**changes):
 
 def elements(joint, tells_driver=False):
     """What a drive of a joint measures."""
-    told = {
+    report = {
         "position": f"joint_position.{joint}",
         "velocity": f"joint_velocity.{joint}",
         "effort": f"joint_effort.{joint}",
         "temperature": f"motor_temperature.{joint}",
     }
-    return {**told, "temperature_driver": f"driver_temperature.{joint}"} if tells_driver else told
+    return {**report, "temperature_driver": f"driver_temperature.{joint}"} if tells_driver else report
 
 
 def hardware():

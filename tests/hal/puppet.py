@@ -88,7 +88,7 @@ def driven(driver, elements, settings, objects, is_open=True):
         puppet.close()
 
 
-def told(device, puppet, data, cob_id=0x180 + NODE):
+def report(device, puppet, data, cob_id=0x180 + NODE):
     """What the driver makes of a TPDO, by value."""
     before = device.read().received.copy()
     puppet.send(0x700 + NODE, "05")

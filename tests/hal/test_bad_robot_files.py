@@ -36,23 +36,23 @@ def is_one_sentence(text):
 def test_two_devices_with_one_node_id(tmp_path):
     body = description()
     body["devices"]["biceps_cell"]["node"] = 1
-    told = refused(body, tmp_path)
-    assert "'biceps_cell' and 'biceps_drive' both claim node 1 on bus 'can0'" in told
-    assert is_one_sentence(told)
+    report = refused(body, tmp_path)
+    assert "'biceps_cell' and 'biceps_drive' both claim node 1 on bus 'can0'" in report
+    assert is_one_sentence(report)
 
 
 @pytest.mark.parametrize(
-    ("signal", "unit", "told"),
+    ("signal", "unit", "report"),
     [
         ("muscle_length", "rad", "Device 'biceps_drive' has its position in m, and the unit of muscle_length is rad."),
         ("joint_position", "m", "has its position in rad, and the unit of joint_position is m. Change the unit"),
     ],
 )
-def test_a_signal_in_another_unit_than_its_device(tmp_path, signal, unit, told):
+def test_a_signal_in_another_unit_than_its_device(tmp_path, signal, unit, report):
     body = description(limits={})
     body["signals"][signal]["unit"] = unit
     text = refused(body, tmp_path)
-    assert told in text
+    assert report in text
 
 
 def test_a_wire_without_a_spool(tmp_path):
@@ -66,14 +66,14 @@ def test_a_wire_without_a_spool(tmp_path):
 def test_a_gear_of_zero(tmp_path):
     body = description()
     body["kinds"]["drive"]["settings"] = {**body["kinds"]["drive"]["settings"], "gear": 0}
-    told = refused(body, tmp_path)
-    assert "'biceps_drive'" in told
-    assert "gear" in told
-    assert is_one_sentence(told)
+    report = refused(body, tmp_path)
+    assert "'biceps_drive'" in report
+    assert "gear" in report
+    assert is_one_sentence(report)
 
 
 @pytest.mark.parametrize(
-    ("kind", "eds", "told"),
+    ("kind", "eds", "report"),
     [
         ("drive", "load_cell.eds", "404"),
         ("cell", "joint_encoder.eds", "406"),
@@ -81,11 +81,11 @@ def test_a_gear_of_zero(tmp_path):
         ("drive", "none.eds", "There is no EDS file"),
     ],
 )
-def test_an_eds_that_does_not_fit(tmp_path, kind, eds, told):
+def test_an_eds_that_does_not_fit(tmp_path, kind, eds, report):
     body = description()
     body["kinds"][kind]["settings"] = {**body["kinds"][kind]["settings"], "eds": f"eds/{eds}"}
     found = refused(body, tmp_path)
-    assert told in found
+    assert report in found
     assert is_one_sentence(found)
 
 
@@ -101,9 +101,9 @@ def test_an_eds_of_another_maker_is_found_when_the_device_answers(tmp_path):
     bench = Bench(RobotConfig.model_validate(body)).open()
     try:
         bench.cycle(5)
-        told = bench.device("biceps_drive")["text"]
-        assert "vendor" in told
-        assert is_one_sentence(told)
+        report = bench.device("biceps_drive")["text"]
+        assert "vendor" in report
+        assert is_one_sentence(report)
         with pytest.raises(CommandRefused):
             bench.robot.enable()
         assert not any(enabled for _, enabled in bench.world.drives.values())
@@ -185,7 +185,7 @@ def load_from(body):
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "report"),
     [
         ("[" * 20_000, "nested too deeply"),
         ("robot: a\nrates: {hal: 1" + "0" * 5000 + "}", "A value cannot be read"),
@@ -194,10 +194,10 @@ def load_from(body):
     ],
     ids=["nested", "number", "date", "object"],
 )
-def test_a_text_that_is_no_yaml_is_one_sentence(tmp_path, text, told):
+def test_a_text_that_is_no_yaml_is_one_sentence(tmp_path, text, report):
     path = tmp_path / "robot.yaml"
     path.write_text(text)
-    with pytest.raises(ConfigError, match=told) as caught:
+    with pytest.raises(ConfigError, match=report) as caught:
         load_robot(path)
     assert "\n" not in str(caught.value)
     config = RobotConfig.model_validate({**description(), "folder": tmp_path})

@@ -44,7 +44,7 @@ def test_finds_drivers_by_name_and_by_module():
 
 
 @pytest.mark.parametrize(
-    ("name", "told"),
+    ("name", "report"),
     [
         ("nonsense", "not of the form 'module:name'"),
         (":x", "not of the form"),
@@ -54,8 +54,8 @@ def test_finds_drivers_by_name_and_by_module():
         ("hal.robot:Robbot", "has no 'Robbot'. It has: .*Robot"),
     ],
 )
-def test_names_that_stand_for_nothing(name, told):
-    with pytest.raises(ConfigError, match=told):
+def test_names_that_stand_for_nothing(name, report):
+    with pytest.raises(ConfigError, match=report):
         registry.load_object(name)
 
 
@@ -109,8 +109,8 @@ def test_a_device_may_name_the_quantities_that_it_measures():
 
 
 def test_a_quantity_that_a_driver_does_not_have_is_told():
-    told = refused(devices=devices(element=None, elements={"colour": "muscle_length.biceps"}))
-    assert "Device 'biceps_drive' has no quantity colour. With these settings it has position" in told
+    report = refused(devices=devices(element=None, elements={"colour": "muscle_length.biceps"}))
+    assert "Device 'biceps_drive' has no quantity colour. With these settings it has position" in report
 
 
 def test_a_node_id_that_canopen_does_not_have_is_told():

@@ -168,14 +168,14 @@ def test_an_interface_that_hangs_while_sending_is_shut_and_opened_again(bus, int
 
 
 def test_a_frame_that_is_too_long_is_refused_and_no_fault_of_the_interface(bus, interface):
-    told = []
-    sender = Sender({"sent": 0, "send_failures": 0}, told.append)
+    report = []
+    sender = Sender({"sent": 0, "send_failures": 0}, report.append)
     sender.use(bus._can)
     for _ in range(2 * FAILED_SENDS):
         assert not sender.send(frame(data=bytes(9)))
     assert interface.tries == 0
     assert not sender.problem
-    assert told[0] == "Frame 201h has 9 data bytes; a classic frame has at most 8."
+    assert report[0] == "Frame 201h has 9 data bytes; a classic frame has at most 8."
 
 
 def test_what_canopen_sends_raises_nothing_and_may_wait(bus, interface):

@@ -18,7 +18,7 @@ def frame(kind, detail=0, transmit=0, receive=0, more=()):
 
 
 @pytest.mark.parametrize(
-    ("kind", "data", "controller", "told"),
+    ("kind", "data", "controller", "report"),
     [
         (0x001, "", None, "could not send a frame in time"),
         (0x002, "1d", None, ""),
@@ -45,11 +45,11 @@ def frame(kind, detail=0, transmit=0, receive=0, more=()):
         (0x000, "", None, "class 0h"),
     ],
 )
-def test_error_frames_of_every_class(kind, data, controller, told):
+def test_error_frames_of_every_class(kind, data, controller, report):
     found = error_frame(kind, bytes.fromhex(data))
     assert found.controller is controller
-    assert told in found.text
-    assert bool(found.text) == bool(told)
+    assert report in found.text
+    assert bool(found.text) == bool(report)
 
 
 def test_error_counters_are_told_where_the_frame_has_them():
@@ -119,15 +119,15 @@ THERE = (opened, heard(0.0))
     ],
 )
 def test_every_estimate_latency_the_states(events, state, losses):
-    told = []
-    watch = BusWatch(lambda state, text: told.append(state))
+    report = []
+    watch = BusWatch(lambda state, text: report.append(state))
     for event in events:
         event(watch)
     assert watch.state == state
     assert watch.losses == losses
     assert bool(watch.text) == (watch.state is not BusState.OK)
-    assert (told or ["gone"])[-1] == state
-    assert all(one is not two for one, two in itertools.pairwise(told)), "a change to the same state"
+    assert (report or ["gone"])[-1] == state
+    assert all(one is not two for one, two in itertools.pairwise(report)), "a change to the same state"
 
 
 def test_the_last_loss_is_told_after_the_bus_is_back():

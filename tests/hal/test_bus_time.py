@@ -56,11 +56,11 @@ def test_setting_the_wall_clock_makes_no_frame_newer_or_older(clock, step):
         frames.received(stamp(clock, DELAY), clock.monotonic())
     before = stamp(clock, DELAY)
     clock.set_wall(1.7e9 + step)
-    for number, told in enumerate((before, before, *[None] * 100)):  # two were stamped before, and read after
+    for number, report in enumerate((before, before, *[None] * 100)):  # two were stamped before, and read after
         now = clock.monotonic()
-        received = frames.received(stamp(clock, DELAY) if told is None else told, now)
+        received = frames.received(stamp(clock, DELAY) if report is None else report, now)
         assert received == pytest.approx(now - DELAY, abs=1e-6), number
-        if told is None:
+        if report is None:
             clock.advance(0.001)
     assert frames.counters["clock_steps"] == 1
     assert frames.counters["bad_stamps"] == 0
@@ -161,9 +161,9 @@ def test_frames_without_stamps_that_waited_are_told_as_old_as_they_can_be(tmp_pa
         time.sleep(0.1)
         send(b"new", 7)
     bus.close()
-    told = dict(ages)
-    assert told[b"fresh"] < FROZEN
+    report = dict(ages)
+    assert report[b"fresh"] < FROZEN
     assert all(age > FROZEN for data, age in ages if data == b"waits")
-    assert told[b"new"] < FROZEN
+    assert report[b"new"] < FROZEN
     assert bus.health()["counters"]["waited"] == 5
     assert bus.health()["stamps"] == "arrival"

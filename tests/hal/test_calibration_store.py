@@ -219,8 +219,8 @@ def test_a_cell_tells_the_truth_after_three_weights_and_keeps_its_gain_at_a_tare
     assert (what.device, what.unit) == ("biceps_cell", "N")
     points = []
     with Measurement(what) as device:
-        for known, told in ((0.0, 2.0), (10.0, 14.5), (20.0, 27.0)):  # N
-            settle(rig, tension=told)
+        for known, report in ((0.0, 2.0), (10.0, 14.5), (20.0, 27.0)):  # N
+            settle(rig, tension=report)
             points.append(device.measure(known, 0.2, 0.1))
         line = cell_line(points, device.now.factor, 0.1)
         store.save(config, device.record(line, tuple(points)))

@@ -72,15 +72,15 @@ def test_a_short_or_long_frame_is_counted_and_not_used(joint):
 
 
 @pytest.mark.parametrize(
-    ("statusword", "told"), [(0x0050, "is controlled from its own panel"), (0x02D0, "warns (bit 7"), (0x0250, "")]
+    ("statusword", "report"), [(0x0050, "is controlled from its own panel"), (0x02D0, "warns (bit 7"), (0x0250, "")]
 )
-def test_bits_of_the_statusword_that_a_person_should_know(joint, statusword, told):
+def test_bits_of_the_statusword_that_a_person_should_know(joint, statusword, report):
     bench = joint("csp", quantities=("position",)).open()
     bench.cycle(3)
     bench.rig.fault("sensor_silent elbow")
     bench.send("can0", 0x180 + NODE, struct.pack("<Hi", statusword, 0))
     bench.flush()
-    assert told in text(bench) if told else not text(bench)
+    assert report in text(bench) if report else not text(bench)
 
 
 @pytest.mark.parametrize("timing", [{"every": 10}, {"event_time": 0.05}])
@@ -240,13 +240,13 @@ def test_inspection_finds_what_somebody_changed(joint):
     bench.objects[0x6072, 0] = 3000
     bench.objects[0x6060, 0] = 9
     wrong = [f"{check.what}: {check.text}" for check in inspected(bench) if not check.is_good]
-    told = "\n".join(wrong)
-    assert "TPDO1 carries 6041h:0 (16 bit), 6062h:0 (32 bit), 6077h:0 (16 bit), and should carry 6041h:0" in told
-    assert "TPDO2 has transmission type 5, and should have 1." in told
-    assert "heartbeat: 0 ms (1017h:0), and should be 100 ms." in told
-    assert "watchdog: expects no heartbeat (1016h:1)" in told
-    assert "object 6072h:0: 3000 (6072h:0), and should be 700." in told
-    assert "mode: The drive is in mode cyclic synchronous velocity. Open it again" in told
+    report = "\n".join(wrong)
+    assert "TPDO1 carries 6041h:0 (16 bit), 6062h:0 (32 bit), 6077h:0 (16 bit), and should carry 6041h:0" in report
+    assert "TPDO2 has transmission type 5, and should have 1." in report
+    assert "heartbeat: 0 ms (1017h:0), and should be 100 ms." in report
+    assert "watchdog: expects no heartbeat (1016h:1)" in report
+    assert "object 6072h:0: 3000 (6072h:0), and should be 700." in report
+    assert "mode: The drive is in mode cyclic synchronous velocity. Open it again" in report
     assert all(line[-1] == "." for line in wrong)
 
 
@@ -326,10 +326,10 @@ def test_of_pdos_that_are_fixed_by_the_data_sheet_the_right_ones_are_used(joint,
 
 def test_what_fixed_pdos_do_not_carry_is_told(tmp_path):
     sheet = fixed_sheet(tmp_path)
-    told = refused(sheet=sheet, quantities=("position", "effort"))
-    assert "cannot send 6077h:0 (16 bit): its mapping is fixed by its data sheet. Its PDOs: 1: 6041h:0" in told
-    told = refused("cst", sheet=sheet, quantities=("effort",))
-    assert "cannot receive 6071h:0 (16 bit): its mapping is fixed" in told
+    report = refused(sheet=sheet, quantities=("position", "effort"))
+    assert "cannot send 6077h:0 (16 bit): its mapping is fixed by its data sheet. Its PDOs: 1: 6041h:0" in report
+    report = refused("cst", sheet=sheet, quantities=("effort",))
+    assert "cannot receive 6071h:0 (16 bit): its mapping is fixed" in report
 
 
 def test_a_mapping_that_is_not_taken_is_told_with_both_layouts(joint):
@@ -368,9 +368,9 @@ def refused(mode="csp", sheet=None, node=NODE, quantities=("position",), **setti
     body["devices"]["elbow"]["node"] = node
     with pytest.raises(ConfigError) as caught:
         open_robot(RobotConfig.model_validate(body))
-    told = str(caught.value)
-    assert "'elbow'" in told
-    return told
+    report = str(caught.value)
+    assert "'elbow'" in report
+    return report
 
 
 def without(tmp_path, *indices):
@@ -387,7 +387,7 @@ def without(tmp_path, *indices):
 
 
 @pytest.mark.parametrize(
-    ("gone", "how", "told"),
+    ("gone", "how", "report"),
     [
         ("60FF", {"mode": "csv", "quantities": ("velocity",)}, "cannot receive 60FFh:0 by PDO: its data sheet has no"),
         ("606C", {"quantities": ("position", "velocity")}, "cannot send 606Ch:0 by PDO: its data sheet has no such"),
@@ -399,8 +399,8 @@ def without(tmp_path, *indices):
         ("1802", {"quantities": ("position", "velocity", "temperature")}, "would need TPDO3 to send 2200h:1 (16 bit)"),
     ],
 )
-def test_a_data_sheet_that_lacks_something_is_told_before_anything_is_opened(tmp_path, gone, how, told):
-    assert told in refused(sheet=without(tmp_path, gone), **how)
+def test_a_data_sheet_that_lacks_something_is_told_before_anything_is_opened(tmp_path, gone, how, report):
+    assert report in refused(sheet=without(tmp_path, gone), **how)
 
 
 def test_another_devices_data_sheet_is_told():
@@ -408,7 +408,7 @@ def test_another_devices_data_sheet_is_told():
 
 
 @pytest.mark.parametrize(
-    ("how", "told"),
+    ("how", "report"),
     [
         ({"gear": 0}, "gear: Input should be greater than 0"),
         ({"counts_per_turn": 0}, "counts_per_turn: Input should be greater than 0"),
@@ -434,7 +434,7 @@ def test_another_devices_data_sheet_is_told():
         ),
     ],
 )
-def test_settings_that_cannot_be_are_told_in_a_sentence(how, told):
+def test_settings_that_cannot_be_are_told_in_a_sentence(how, report):
     how = dict(how)
     mode = how.pop("mode", "csp")
     if mode == "jog":
@@ -443,7 +443,7 @@ def test_settings_that_cannot_be_are_told_in_a_sentence(how, told):
         with pytest.raises(ConfigError, match="mode: Input should be"):
             open_robot(RobotConfig.model_validate(body))
         return
-    assert told in refused(mode, **how)
+    assert report in refused(mode, **how)
 
 
 def test_a_mode_that_the_drive_does_not_have_is_told(joint):

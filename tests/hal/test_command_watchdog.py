@@ -19,11 +19,11 @@ def test_a_command_lives_from_the_cycle_it_answers(watchdog):
 
 
 @pytest.mark.parametrize(
-    ("cycle", "told"),
+    ("cycle", "report"),
     [(301, "has not been"), (0, "has not been"), (-5, "has not been"), (279, "105 ms"), (1, "299 cycles")],
 )
-def test_commands_from_no_known_cycle_are_refused(watchdog, cycle, told):
-    with pytest.raises(CommandRefused, match=told):
+def test_commands_from_no_known_cycle_are_refused(watchdog, cycle, report):
+    with pytest.raises(CommandRefused, match=report):
         watchdog.expiry(cycle, 10.0 + 0.005 * 300)
 
 

@@ -110,7 +110,7 @@ def test_what_a_camera_sees_is_served_only_where_a_device_measures_it(clock):
 
 
 @pytest.mark.parametrize(
-    ("computed", "told"),
+    ("computed", "report"),
     [
         ({"by": "hal.computed:center_of_mass"}, "has no 'center_of_mass'"),
         ({"settings": {}}, "cannot be computed by hal.computed:center_of_pressure from 4 values of foot_force"),
@@ -118,11 +118,11 @@ def test_what_a_camera_sees_is_served_only_where_a_device_measures_it(clock):
         ({"settings": {"points": [[*point, 0.0] for point in POINTS]}}, "has shape (3,), but the signal has 2"),
     ],
 )
-def test_what_cannot_be_computed_is_told_before_anything_opens(clock, computed, told):
+def test_what_cannot_be_computed_is_told_before_anything_opens(clock, computed, report):
     config = feet(computed=computed)
     with pytest.raises(ConfigError) as caught:
         Robot(config, [Sole(clock, config)], clock=clock)
-    assert told in str(caught.value)
+    assert report in str(caught.value)
 
 
 def signals_with(name, **changes):
@@ -132,7 +132,7 @@ def signals_with(name, **changes):
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "report"),
     [
         (signals_with("center_of_gravity", computed=PRESSURE | {"from": "feet"}), "joint_position, foot_force"),
         (
@@ -146,10 +146,10 @@ def signals_with(name, **changes):
         ({"conditions": ["plain", "plain"]}, "conditions must be names that differ"),
     ],
 )
-def test_mistakes_are_told_in_one_sentence(changes, told):
+def test_mistakes_are_told_in_one_sentence(changes, report):
     with pytest.raises(ValidationError) as caught:
         feet(**changes)
-    assert told in str(caught.value)
+    assert report in str(caught.value)
 
 
 def test_every_measured_element_needs_a_device_and_no_other_may_have_one():

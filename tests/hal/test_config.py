@@ -72,7 +72,7 @@ def test_files_that_are_no_robot_are_refused(tmp_path, text):
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "report"),
     [
         ({"robbot": 1}, "unknown key 'robbot'. Known keys there: robot, description, signals"),
         (
@@ -98,14 +98,14 @@ def test_files_that_are_no_robot_are_refused(tmp_path, text):
         ({"robot": "Bench Robot"}, "robot"),
     ],
 )
-def test_mistakes_are_told_in_one_sentence(written, changes, told):
+def test_mistakes_are_told_in_one_sentence(written, changes, report):
     message = refused(written(**changes))
-    assert told in message
+    assert report in message
     assert "\n" not in message
 
 
 @pytest.mark.parametrize(
-    ("unit", "told"),
+    ("unit", "report"),
     [
         ("deg", "'deg' is not an SI unit; write unit: rad, and written_in: deg beside its numbers in limits, stop"),
         ("degrees", "write unit: rad, and written_in: deg"),
@@ -116,9 +116,9 @@ def test_mistakes_are_told_in_one_sentence(written, changes, told):
         (None, "a signal needs a unit, such as rad"),
     ],
 )
-def test_a_unit_is_one_of_a_list(written, unit, told):
+def test_a_unit_is_one_of_a_list(written, unit, report):
     text = refused(written(**changed("signals", ["joint_position", "unit"], unit)))
-    assert "signals.joint_position.unit: " in text and told in text
+    assert "signals.joint_position.unit: " in text and report in text
     assert "\n" not in text
 
 
@@ -150,7 +150,7 @@ def test_limits_and_stop_are_converted_where_they_are_written(written):
 
 
 @pytest.mark.parametrize(
-    ("signal", "unit", "told"),
+    ("signal", "unit", "report"),
     [
         (
             "joint_position",
@@ -161,8 +161,8 @@ def test_limits_and_stop_are_converted_where_they_are_written(written):
         ("muscle_tension", "deg", "'deg' cannot be converted to 'N'; to 'N' can be converted: mN, kN, kgf"),
     ],
 )
-def test_numbers_in_a_unit_that_does_not_fit(written, signal, unit, told):
-    assert told in refused(written(limits={signal: {"trip_high": 1.0, "written_in": unit}}))
+def test_numbers_in_a_unit_that_does_not_fit(written, signal, unit, report):
+    assert report in refused(written(limits={signal: {"trip_high": 1.0, "written_in": unit}}))
     assert "stop" in refused(written(stop={"behaviour": "park", "park": [1, 1], "speed": 1, "written_in": "deg"}))
 
 

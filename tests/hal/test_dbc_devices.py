@@ -196,10 +196,10 @@ def test_raw_frames(inbox):
         {"frame": {"id": 0x7DF, "broadcast": True, "remote": True}},
         {"frame": {"id": 0x12345, "data": [3]}},
     )
-    told = [
+    answer = [
         (s.frame.arbitration_id, bytes(s.frame.data), s.frame.is_remote_frame, s.frame.is_extended_id) for s in found
     ]
-    assert told == [
+    assert answer == [
         (0x18, b"\1\2", False, False),
         (0x7DF, b"", True, False),
         (0x1234D, b"\3", False, True),

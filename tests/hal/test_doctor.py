@@ -206,10 +206,10 @@ def test_an_interface_that_is_not_there():
 
 
 def test_interfaces_that_are_no_hardware_say_so():
-    told = verdicts(check_interfaces(RobotConfig.model_validate(description())))
-    assert told == {"interface can0": Severity.WARNING, "interface can1": Severity.WARNING}
-    told = verdicts(check_interfaces(RobotConfig.model_validate(description(interface="hub"))))
-    assert set(told.values()) == {Severity.OK}
+    report = verdicts(check_interfaces(RobotConfig.model_validate(description())))
+    assert report == {"interface can0": Severity.WARNING, "interface can1": Severity.WARNING}
+    report = verdicts(check_interfaces(RobotConfig.model_validate(description(interface="hub"))))
+    assert set(report.values()) == {Severity.OK}
 
 
 def asked(**changes):
@@ -219,7 +219,7 @@ def asked(**changes):
 
 
 @pytest.mark.parametrize(
-    ("limits", "told"),
+    ("limits", "report"),
     [
         ({"joint_position": {"trip_high": 2.0}}, "Likely for joint_position"),
         (
@@ -230,10 +230,10 @@ def asked(**changes):
         ({"muscle_length": {"low": 0.1, "high": 0.5, "rate": 250}}, "may move at 250 m/s. Are these mm?"),
     ],
 )
-def test_limits_that_are_unlikely_are_asked_about(limits, told):
+def test_limits_that_are_unlikely_are_asked_about(limits, report):
     found = asked(limits=limits)["limits"]
-    assert told in found.text
-    assert (found.verdict is Severity.OK) == told.startswith("Likely")
+    assert report in found.text
+    assert (found.verdict is Severity.OK) == report.startswith("Likely")
 
 
 def test_a_rate_that_the_drive_cannot_reach_is_asked_about():

@@ -111,12 +111,12 @@ def test_velocity_starts_from_rest_whatever_was_asked_before(joint):
 def test_a_drive_that_may_be_moving_slows_down_before_it_is_let_go(joint, mode, words):
     bench = joint(mode)
     bench.enable()
-    told = []
+    report = []
     bench.robot.disable()
     for _ in range(20):
         bench.cycle()
-        told.append(bench.objects[0x6040, 0])
-    assert list(dict.fromkeys(told)) == words
+        report.append(bench.objects[0x6040, 0])
+    assert list(dict.fromkeys(report)) == words
     assert bench.device("elbow")["state"] == "ready"
 
 
@@ -125,12 +125,12 @@ def test_a_drive_that_does_not_slow_down_is_let_go_all_the_same(joint):
     bench.enable()
     bench.node._obey = lambda: None  # deaf to controlwords
     bench.robot.disable()
-    told = []
+    report = []
     for _ in range(180):
         bench.cycle()
-        told.append(bench.objects[0x6040, 0])
-    assert list(dict.fromkeys(told)) == [0x07, 0x06]
-    assert told.count(0x07) / RATE == pytest.approx(0.8, abs=0.02)
+        report.append(bench.objects[0x6040, 0])
+    assert list(dict.fromkeys(report)) == [0x07, 0x06]
+    assert report.count(0x07) / RATE == pytest.approx(0.8, abs=0.02)
 
 
 def test_torque_pushes_the_joint_and_ends_with_its_commands(joint):

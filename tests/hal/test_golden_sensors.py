@@ -8,7 +8,7 @@ StrainLink prints.
 import math
 
 import pytest
-from puppet import NODE, driven, told
+from puppet import NODE, driven, report
 
 from hal.drivers.canopen.analog import Cia401Input, Cia404Cell
 from hal.drivers.canopen.cia406 import Cia406Encoder
@@ -110,19 +110,19 @@ def test_a_cell_maps_its_value_and_its_status(preset, entry):
 )
 def test_what_a_cell_tells(preset, data, newtons):
     with cell(preset=preset) as (device, puppet):
-        assert told(device, puppet, data) == [pytest.approx(newtons, nan_ok=True)]
+        assert report(device, puppet, data) == [pytest.approx(newtons, nan_ok=True)]
 
 
 def test_gain_zero_and_direction_of_a_cell():
     with cell(gain=-2.0, zero=1.5) as (device, puppet):
-        assert told(device, puppet, "E8 03 00 00 00") == [pytest.approx(1.5 - 2.0 * 10.0)]
+        assert report(device, puppet, "E8 03 00 00 00") == [pytest.approx(1.5 - 2.0 * 10.0)]
 
 
 def test_kilonewton_and_kilogram_become_newton():
     with cell({**CELL, "6131:1": "00 00 21 03", "6132:1": "05"}) as (device, puppet):
-        assert told(device, puppet, "39 30 00 00 00") == [pytest.approx(123.45)]
+        assert report(device, puppet, "39 30 00 00 00") == [pytest.approx(123.45)]
     with cell({**CELL, "6131:1": "00 00 02 00", "6132:1": "01"}) as (device, puppet):
-        assert told(device, puppet, "64 00 00 00 00") == [pytest.approx(98.0665)]
+        assert report(device, puppet, "64 00 00 00 00") == [pytest.approx(98.0665)]
 
 
 def test_four_channels_have_a_status_each():
@@ -131,8 +131,8 @@ def test_four_channels_have_a_status_each():
     with cell(objects, elements, channels=[1, 2, 4], preset="int16") as (device, puppet):
         assert "23 00 1A 05 10 04 30 71" not in puppet.requests, "the third pair does not fit into eight bytes"
         assert "23 01 1A 01 10 04 30 71" in puppet.requests
-        told(device, puppet, "64 00 00 C8 00 02")
-        values = told(device, puppet, "2C 01 00", cob_id=0x280 + NODE)
+        report(device, puppet, "64 00 00 C8 00 02")
+        values = report(device, puppet, "2C 01 00", cob_id=0x280 + NODE)
         assert values == [pytest.approx(1.0), pytest.approx(math.nan, nan_ok=True), pytest.approx(3.0)]
 
 
@@ -150,16 +150,16 @@ def test_the_strain_link_of_its_manual():
     with pytest.raises(DeviceRefused, match=r"FA010100h.*no force"), cell(told_by_manual, preset="int16"):
         raise AssertionError("strain was taken for a force")
     with cell(told_by_manual, preset="strain_link", gain=0.4) as (device, puppet):
-        assert told(device, puppet, "10 27 00") == [pytest.approx(0.4 * 100.0)]  # 100 um/m
+        assert report(device, puppet, "10 27 00") == [pytest.approx(0.4 * 100.0)]  # 100 um/m
 
 
 def test_torque_and_pressure_need_their_own_units():
     torque = {"torque": "joint_torque.elbow"}
     with cell(elements=torque, measures="torque", unit="mN m", digits=0) as (device, puppet):
-        assert told(device, puppet, "D2 04 00 00 00") == [pytest.approx(1.234)]
+        assert report(device, puppet, "D2 04 00 00 00") == [pytest.approx(1.234)]
     pressure = {"pressure": "air.bellows"}
     with cell({**CELL, "6131:1": "00 00 22 03"}, pressure, measures="pressure") as (device, puppet):
-        assert told(device, puppet, "D2 04 00 00 00") == [pytest.approx(12_340.0)]
+        assert report(device, puppet, "D2 04 00 00 00") == [pytest.approx(12_340.0)]
     with pytest.raises(DeviceRefused, match="no torque"), cell(elements=torque, measures="torque"):
         raise AssertionError("newton was taken for newton metre")
     with pytest.raises(ConfigError, match="'N' is no unit of torque"), cell(measures="torque", unit="N"):
@@ -179,19 +179,19 @@ def test_analogue_inputs(preset, entry, data, number):
     with inputs(preset=preset, gain=0.25, zero=-1.0) as (device, puppet):
         assert f"23 00 1A 01 {entry}" in puppet.requests
         assert "2F 23 64 00 01 00 00 00" in puppet.requests  # global interrupt enable
-        assert told(device, puppet, data) == [pytest.approx(0.25 * number - 1.0)]
+        assert report(device, puppet, data) == [pytest.approx(0.25 * number - 1.0)]
 
 
 @pytest.mark.parametrize(("resolution", "data"), [(None, "FF 7F"), (None, "00 80"), (12, "F0 7F"), (14, "FC 7F")])
 def test_an_input_at_its_end_is_an_overload(resolution, data):
     with inputs(gain=1.0, resolution=resolution) as (device, puppet):
-        assert told(device, puppet, data) == [pytest.approx(math.nan, nan_ok=True)]
+        assert report(device, puppet, data) == [pytest.approx(math.nan, nan_ok=True)]
         assert "overload" in device.health().text
 
 
 def test_an_input_of_fewer_bits_just_below_its_end():
     with inputs(gain=1.0, resolution=12) as (device, puppet):
-        assert told(device, puppet, "E0 7F") == [2046 << 4]
+        assert report(device, puppet, "E0 7F") == [2046 << 4]
 
 
 def test_a_makers_status_object_for_all_channels():
@@ -199,8 +199,8 @@ def test_a_makers_status_object_for_all_channels():
     settings = {"channels": [1, 2], "gain": [1.0, -1.0], "status": "2120h:0 uint16", "bad_status": 0x24}
     with inputs(elements, **settings) as (device, puppet):
         assert "23 00 1A 01 10 00 20 21" in puppet.requests
-        assert told(device, puppet, "01 00 0A 00 14 00") == [10.0, -20.0]
-        assert all(math.isnan(value) for value in told(device, puppet, "04 00 0A 00 14 00"))
+        assert report(device, puppet, "01 00 0A 00 14 00") == [10.0, -20.0]
+        assert all(math.isnan(value) for value in report(device, puppet, "04 00 0A 00 14 00"))
 
 
 def test_counts_need_a_gain():
@@ -232,13 +232,13 @@ TURN = 2.0 * math.pi
 def test_positions(settings, data, angle):
     """4096 counts per turn, 16 turns; position, alarms, warnings."""
     with encoder(**settings) as (device, puppet):
-        assert told(device, puppet, data) == [pytest.approx(angle, nan_ok=True)]
+        assert report(device, puppet, data) == [pytest.approx(angle, nan_ok=True)]
 
 
 def test_scaling_that_is_on_counts():
     with encoder({**ENCODER, "6000:0": "04 00"}, around=0.0) as (device, puppet):
-        assert told(device, puppet, "08 07 00 00 00 00 00 00") == [pytest.approx(TURN / 2)]  # 1800 of 3600
-        assert told(device, puppet, "FF E0 00 00 00 00 00 00") == [pytest.approx(-TURN / 3600)]  # of 16 * 3600
+        assert report(device, puppet, "08 07 00 00 00 00 00 00") == [pytest.approx(TURN / 2)]  # 1800 of 3600
+        assert report(device, puppet, "FF E0 00 00 00 00 00 00") == [pytest.approx(-TURN / 3600)]  # of 16 * 3600
 
 
 def test_an_encoder_maps_speed_where_it_is_wanted():
@@ -246,16 +246,16 @@ def test_an_encoder_maps_speed_where_it_is_wanted():
     with encoder(elements=elements, direction=-1) as (device, puppet):
         mapped = [request[12:] for request in puppet.requests if request.startswith("23 00 1A")]
         assert mapped == ["20 00 04 60", "10 00 03 65", "10 01 30 60"]
-        values = told(device, puppet, "00 08 00 00 00 00 00 04")
+        values = report(device, puppet, "00 08 00 00 00 00 00 04")
         assert values == [pytest.approx(-TURN / 2), pytest.approx(-TURN / 4)]  # 1024 counts/s
-        assert math.isnan(told(device, puppet, "00 08 00 00 00 00 FF 7F")[1]), "the end of the range is no speed"
+        assert math.isnan(report(device, puppet, "00 08 00 00 00 00 FF 7F")[1]), "the end of the range is no speed"
         assert not any("03 60" in request[3:8] for request in puppet.requests), "the preset is never touched"
 
 
 def test_a_speed_divider_of_0_divides_by_nothing():
     elements = {"position": "joint_position.elbow", "velocity": "joint_velocity.elbow"}
     with encoder({**ENCODER, "6031:3": "00 00", "6031:4": "00 00"}, elements) as (device, puppet):
-        assert told(device, puppet, "00 08 00 00 00 00 00 04")[1] == pytest.approx(TURN / 4)
+        assert report(device, puppet, "00 08 00 00 00 00 00 04")[1] == pytest.approx(TURN / 4)
 
 
 @pytest.mark.parametrize(("data", "counts"), [("FE 7F", 32766), ("FF 7F", None), ("02 80", -32766), ("01 80", None)])
@@ -263,7 +263,7 @@ def test_a_speed_at_the_end_of_its_range_is_not_known(data, counts):
     """INTEGER16: 32767 and below -32766 may be a speed that does not fit."""
     elements = {"position": "joint_position.elbow", "velocity": "joint_velocity.elbow"}
     with encoder(elements=elements) as (device, puppet):
-        velocity = told(device, puppet, f"00 08 00 00 00 00 {data}")[1]
+        velocity = report(device, puppet, f"00 08 00 00 00 00 {data}")[1]
         expected = math.nan if counts is None else counts / 4096 * TURN
         assert velocity == pytest.approx(expected, nan_ok=True)
 
@@ -272,12 +272,12 @@ def test_speed_in_turns_per_minute():
     elements = {"position": "joint_position.elbow", "velocity": "joint_velocity.elbow"}
     objects = {**ENCODER, "6031:3": "3C 00", "6031:4": "00 10"}  # times 60, divided by 4096
     with encoder(objects, elements) as (device, puppet):
-        assert told(device, puppet, "00 08 00 00 00 00 1E 00")[1] == pytest.approx(30 / 60 * TURN)
+        assert report(device, puppet, "00 08 00 00 00 00 1E 00")[1] == pytest.approx(30 / 60 * TURN)
 
 
 def test_a_warning_is_told_and_the_position_is_good():
     with encoder() as (device, puppet):
-        told(device, puppet, "00 08 00 00 00 00 10 00")
+        report(device, puppet, "00 08 00 00 00 00 10 00")
         device.missed = 0
         assert "battery charge too low" in device.health().text
 

@@ -125,8 +125,8 @@ def test_what_is_moved_far_out_of_its_range_trips(full):
 
 def test_limits_that_exclude_where_the_robot_is_are_told(full):
     assert full.excluded(at(0.093, 0.507)) == ""
-    told = full.excluded(at(0.05, 0.55))
-    assert "Far outside limits.muscle_length: biceps 0.05 (allowed: 0.1 to 0.5), triceps 0.55" in told
+    report = full.excluded(at(0.05, 0.55))
+    assert "Far outside limits.muscle_length: biceps 0.05 (allowed: 0.1 to 0.5), triceps 0.55" in report
     assert "over its trip limit" in full.excluded(tense(500.0, 20.0))
     assert limiter().excluded(at(-99.0, 99.0)) == ""
 
@@ -153,19 +153,19 @@ def test_two_signals_may_each_have_a_soft_limit():
 
 
 @pytest.mark.parametrize(
-    ("limits", "told"),
+    ("limits", "report"),
     [
         ({"muscle_length": {"soft_high": 1}}, "the signal is commanded"),
         ({"joint_position": {"soft_high": 1}}, "nothing to relax"),
     ],
 )
-def test_a_soft_limit_that_cannot_act_is_refused(limits, told):
-    with pytest.raises(ConfigError, match=told):
+def test_a_soft_limit_that_cannot_act_is_refused(limits, report):
+    with pytest.raises(ConfigError, match=report):
         limiter(**limits)
 
 
 @pytest.mark.parametrize(
-    ("limits", "told"),
+    ("limits", "report"),
     [
         ({"muscle_length": {"low": 1, "high": 0}}, "low must be below high"),
         ({"muscle_length": {"low": 0.1, "trip_low": 0.2}}, "trip_low must be below low"),
@@ -178,13 +178,13 @@ def test_a_soft_limit_that_cannot_act_is_refused(limits, told):
         ({"muscle_length": {"rate": [1, 2, 3]}}, "rate has 3 values"),
     ],
 )
-def test_limits_that_contradict_each_other_are_refused_at_load(limits, told):
-    with pytest.raises(ValueError, match=told):
+def test_limits_that_contradict_each_other_are_refused_at_load(limits, report):
+    with pytest.raises(ValueError, match=report):
         RobotConfig.model_validate(description(limits=limits))
 
 
 @pytest.mark.parametrize(
-    ("stop", "told"),
+    ("stop", "report"),
     [
         ({"behaviour": "park"}, "needs a posture"),
         ({"behaviour": "park", "park": [0.3, 0.3]}, "and a `speed`"),
@@ -194,8 +194,8 @@ def test_limits_that_contradict_each_other_are_refused_at_load(limits, told):
         ({"behaviour": "dance"}, "'hold', 'damp', 'park' or 'off'"),
     ],
 )
-def test_a_stop_that_does_not_fit_is_refused_at_load(stop, told):
-    with pytest.raises(ValueError, match=told):
+def test_a_stop_that_does_not_fit_is_refused_at_load(stop, report):
+    with pytest.raises(ValueError, match=report):
         RobotConfig.model_validate(description(stop=stop))
 
 

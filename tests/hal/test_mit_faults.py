@@ -154,10 +154,10 @@ def test_a_position_beyond_the_range_is_never_believed(bench):
 
 def test_another_motor_than_said_is_refused(open_mit):
     bench = open_mit(*only("elbow", DAMIAO, MitConstants(velocity=8.0)), OneJoint())
-    told = bench.device("elbow_drive")
-    assert told["state"] == "opening"
-    assert "velocity range of 8" in told["text"]
-    assert "ranges: {velocity: 8}" in told["text"]
+    report = bench.device("elbow_drive")
+    assert report["state"] == "opening"
+    assert "velocity range of 8" in report["text"]
+    assert "ranges: {velocity: 8}" in report["text"]
 
 
 def test_identifier_zero_is_not_shared_with_canopen():

@@ -84,7 +84,7 @@ def test_a_layout_from_the_robot_file():
 
 
 @pytest.mark.parametrize(
-    ("entries", "told"),
+    ("entries", "report"),
     [
         ([{"number": 1, "objects": ["6041h"]}], "'6041h': '' is not a type of an object"),
         ([{"number": 1, "objects": ["status uint16"]}], "'status' is not an object such as 6064h or 2200h:1"),
@@ -95,8 +95,8 @@ def test_a_layout_from_the_robot_file():
         ([{"number": 1, "objects": ["6041h uint16"]}] * 2, "pdo.sends names a number twice: 1, 1"),
     ],
 )
-def test_a_layout_that_makes_no_sense_is_told(entries, told):
-    with pytest.raises(ConfigError, match=told):
+def test_a_layout_that_makes_no_sense_is_told(entries, report):
+    with pytest.raises(ConfigError, match=report):
         PdoSettings.model_validate({"sends": entries}).map("'elbow'")
 
 
@@ -111,7 +111,7 @@ def test_a_layout_that_the_data_sheet_allows(sheet):
 
 
 @pytest.mark.parametrize(
-    ("receives", "sends", "told"),
+    ("receives", "sends", "report"),
     [
         ((), (MappedObject(0x6099, 9, 32),), "'elbow' cannot send 6099h:9 by PDO: its data sheet has no such object"),
         (
@@ -127,8 +127,8 @@ def test_a_layout_that_the_data_sheet_allows(sheet):
         ((STATUS,), (), "'elbow' cannot receive 6041h:0 by PDO: .* 'Statusword' is read only"),
     ],
 )
-def test_a_layout_that_the_data_sheet_does_not_allow_names_the_object(sheet, receives, sends, told):
-    with pytest.raises(ConfigError, match=told):
+def test_a_layout_that_the_data_sheet_does_not_allow_names_the_object(sheet, receives, sends, report):
+    with pytest.raises(ConfigError, match=report):
         check_map(PdoMap(lay_out(receives), lay_out(sends)), sheet, "'elbow'")
 
 

@@ -38,9 +38,9 @@ def test_the_emergency_stop_says_that_it_has_not_stopped(hot):
         hot.cycle()
     (emergency,) = found
     assert not emergency.is_complete
-    told = {one.device: one for one in emergency.devices}
-    assert told["biceps_drive"].text == "is still under power, in fault; cut the power"
-    assert told["triceps_drive"].has_stopped
+    report = {one.device: one for one in emergency.devices}
+    assert report["biceps_drive"].text == "is still under power, in fault; cut the power"
+    assert report["triceps_drive"].has_stopped
 
 
 def test_after_a_silence_the_robot_starts_from_where_it_was_moved_to(bench):

@@ -107,7 +107,7 @@ def test_a_command_given_while_off_is_refused(bench):
 
 
 @pytest.mark.parametrize(
-    ("values", "back", "told"),
+    ("values", "back", "report"),
     [
         ([0.3], 0, "2 values"),
         ([[0.3, 0.3]], 0, "2 values"),
@@ -117,11 +117,11 @@ def test_a_command_given_while_off_is_refused(bench):
         ([0.3, 0.3], 25, "125 ms"),
     ],
 )
-def test_bad_commands_are_refused_and_move_nothing(bench, values, back, told):
+def test_bad_commands_are_refused_and_move_nothing(bench, values, back, report):
     bench.enable()
     bench.cycle(30)
     before = bench.world.length.copy()
-    with pytest.raises(CommandRefused, match=told):
+    with pytest.raises(CommandRefused, match=report):
         bench.robot.command(np.array(values), bench.sample.cycle - back)
     bench.cycle(10)
     assert bench.robot.mode == "hold"

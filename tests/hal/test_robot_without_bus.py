@@ -170,7 +170,7 @@ def test_what_opening_raises_is_passed_on(clock, device):
 
 
 @pytest.mark.parametrize(
-    ("measures", "commands", "told"),
+    ("measures", "commands", "report"),
     [
         (CONFIG.element_names()[1:], None, "fails for joint_position.elbow"),
         ([*CONFIG.element_names(), "joint_position.elbow"], None, "fails for joint_position.elbow"),
@@ -179,9 +179,9 @@ def test_what_opening_raises_is_passed_on(clock, device):
         (None, ("muscle_length.biceps",) * 2, "fails for muscle_length.triceps"),
     ],
 )
-def test_devices_must_fit_the_robot_file(clock, measures, commands, told):
+def test_devices_must_fit_the_robot_file(clock, measures, commands, report):
     device = Everything(clock, measures, commands or ("muscle_length.biceps", "muscle_length.triceps"))
-    with pytest.raises(ConfigError, match=told):
+    with pytest.raises(ConfigError, match=report):
         Robot(CONFIG, [device], clock=clock)
 
 

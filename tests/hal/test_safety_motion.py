@@ -110,14 +110,14 @@ def test_a_loaded_joint_is_moved_towards_relief_in_either_direction():
 
 
 @pytest.mark.parametrize(
-    ("attribute", "value", "told"),
+    ("attribute", "value", "report"),
     [
         ("temperature", 91.0, "joint_temperature.shoulder is 91, over its trip limit of 90"),
         ("effort", -12.0, "joint_effort.shoulder is -12, under its trip limit of -10"),
         ("position", 2.2, "joint_position.shoulder is 2.2, beyond its range of -1 to 2. What moves it"),
     ],
 )
-def test_any_signal_may_trip_the_robot_within_one_cycle_of_its_measurement(attribute, value, told):
+def test_any_signal_may_trip_the_robot_within_one_cycle_of_its_measurement(attribute, value, report):
     limits = {
         "joint_position": {"low": -1, "high": 2, "rate": 1.0},
         "joint_temperature": {"trip_high": 90},
@@ -129,7 +129,7 @@ def test_any_signal_may_trip_the_robot_within_one_cycle_of_its_measurement(attri
     assert bench.robot.mode == "hold"
     bench.cycle()
     assert bench.robot.mode == "fault"
-    assert told in bench.robot.fault_text
+    assert report in bench.robot.fault_text
     assert all("quick_stop" in joint.asked for joint in bench.joints)
 
 
@@ -152,7 +152,7 @@ def test_a_robot_that_would_trip_is_not_enabled():
 
 
 @pytest.mark.parametrize(
-    ("quantity", "stop", "told"),
+    ("quantity", "stop", "report"),
     [
         ("effort", {"behaviour": "hold"}, "with effort commands use damp or off"),
         ("effort", {"behaviour": "park", "park": [0, 0], "speed": 1}, "with effort commands use damp or off"),
@@ -160,9 +160,9 @@ def test_a_robot_that_would_trip_is_not_enabled():
         ("position", {"behaviour": "damp"}, "shoulder_drive, elbow_drive cannot damp"),
     ],
 )
-def test_a_stop_that_the_drives_cannot_do_is_refused_at_start(quantity, stop, told, monkeypatch):
+def test_a_stop_that_the_drives_cannot_do_is_refused_at_start(quantity, stop, report, monkeypatch):
     monkeypatch.setattr("safety_bench.Joint.can_damp", False)
-    with pytest.raises(ConfigError, match=told):
+    with pytest.raises(ConfigError, match=report):
         SafetyBench(quantity, stop=stop)
 
 

@@ -107,9 +107,9 @@ def test_missing_unexpected_and_wrong_nodes_are_told():
         hardware()[3],
     ]
     with running(nodes) as config, Tap("can1", config.buses["can1"]) as tap:
-        told = compare(scan(tap, listen=0.1, patience=PATIENCE), config)
-    text = " ".join(told)
-    assert len(told) == 3
+        report = compare(scan(tap, listen=0.1, patience=PATIENCE), config)
+    text = " ".join(report)
+    assert len(report) == 3
     assert "node 2 ('triceps_drive') is a measuring device (404), the robot file says cia402" in text
     assert "node 21 ('elbow_encoder') was not found" in text
     assert "node 33 is not in the robot file" in text
@@ -242,8 +242,8 @@ def test_nodes_with_a_dbc_file_are_known_by_their_messages_and_sent_nothing():
         found = scan(tap, listen=0.2, ask=False, devices=devices)
     assert [(one.node, one.kind, one.state) for one in found.nodes] == [(5, "node of a DBC file", "sends Force")]
     assert not found.unknown
-    told = [text for text in compare(found, config) if "Force" in text or "left" in text]
-    assert told == [
+    report = [text for text in compare(found, config) if "Force" in text or "left" in text]
+    assert report == [
         "can1: node 6 ('right') was not heard: none of Force came. Is it powered, is its node id right, is it set to "
         "send?"
     ]

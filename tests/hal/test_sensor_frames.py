@@ -5,7 +5,7 @@ import math
 import time
 
 import pytest
-from puppet import NODE, ROBOTS, driven, told
+from puppet import NODE, ROBOTS, driven, report
 
 from hal.device import DeviceState
 from hal.drivers.canopen import analog as channels
@@ -234,7 +234,7 @@ def test_gains_and_zeros_are_one_for_all_or_one_per_channel():
     given = {"channels": [2, 4], "preset": "counts16"}
     for gain, zero, values in ((2.0, 1.0, [21.0, 41.0]), ([2.0, 3.0], [0.5, -1.0], [20.5, 59.0])):
         with cell(quantities, gain=gain, zero=zero, **given) as (device, puppet):
-            assert told(device, puppet, "0A 00 00 14 00 00") == pytest.approx(values)
+            assert report(device, puppet, "0A 00 00 14 00 00") == pytest.approx(values)
     for wrong in ([1.0], [1.0, 2.0, 3.0]):
         with (
             pytest.raises(ConfigError, match=rf"gain has {len(wrong)} numbers for 2 channels"),
@@ -244,7 +244,7 @@ def test_gains_and_zeros_are_one_for_all_or_one_per_channel():
     with pytest.raises(ConfigError, match="a gain of zero"), cell(quantities, gain=[1.0, 0.0], **given):
         raise AssertionError
     with cell(preset="int32", digits=0, unit="kN") as (device, puppet):  # without a gain it is 1
-        assert told(device, puppet, "02 00 00 00 00") == [pytest.approx(2000.0)]
+        assert report(device, puppet, "02 00 00 00 00") == [pytest.approx(2000.0)]
 
 
 def test_traffic_of_the_channels_in_use():
@@ -257,9 +257,9 @@ def test_traffic_of_the_channels_in_use():
 
 def test_units_and_digits_of_a_cell():
     with cell(digits=1) as (device, puppet):
-        assert told(device, puppet, GOOD.hex()) == [pytest.approx(100.0)]
+        assert report(device, puppet, GOOD.hex()) == [pytest.approx(100.0)]
     with cell(value="6130h float32") as (device, puppet):  # a whole number has digits, a float has not
-        assert told(device, puppet, "00 00 C0 3F 00") == [pytest.approx(1.5)]
+        assert report(device, puppet, "00 00 C0 3F 00") == [pytest.approx(1.5)]
     with pytest.raises(DeviceRefused, match="unit 00220000h"), cell(objects=CELL | {"6131:1": "00 00 22 00"}):
         raise AssertionError
     with pytest.raises(ConfigError, match=r"'lb' is no unit of force\. Known: N, mN, kN, kg, g"), cell(unit="lb"):
@@ -270,7 +270,7 @@ def test_a_status_that_cannot_be_mapped_is_left_out():
     """By the data sheet 6150h:5 exists and cannot be mapped."""
     with cell(channels=[5], value="7130h:1 int16", digits=0, unit="N") as (device, puppet):
         assert [str(item) for item in device.pdos.sends[0].objects] == ["7130h:1"]
-        assert told(device, puppet, "07 00") == [7.0]
+        assert report(device, puppet, "07 00") == [7.0]
 
 
 def test_a_tare_is_restored_when_the_cell_is_commissioned_again():
@@ -393,5 +393,5 @@ def test_faults_of_an_encoder_in_words():
 def test_the_unit_code_of_a_cell_is_that_of_its_channel():
     objects = CELL | {"6131:2": "00 00 21 03", "6132:2": "00"}
     with cell(("force_1", "force_2"), objects, channels=[1, 2], preset="int16") as (device, puppet):
-        assert told(device, puppet, "64 00 00 02 00 00") == pytest.approx([1.0, 2000.0])
+        assert report(device, puppet, "64 00 00 02 00 00") == pytest.approx([1.0, 2000.0])
     assert analog.unit(0x03210000).scale == pytest.approx(1e3)

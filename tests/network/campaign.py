@@ -55,7 +55,7 @@ def run(stack: Stack, case: Case, number: int) -> dict[str, Any]:
     client = stack.here.records.read(begun - 1.0)
     seen |= commanded(hal, times)
     seen |= estimated(everything["hal"], [row for row in everything["model"] if row[0] >= begun], times)
-    seen["gone"], seen["there"] = told(client, case.gone, times) if case.gone else (None, None)
+    seen["gone"], seen["there"] = report(client, case.gone, times) if case.gone else (None, None)
     seen["viewers"] = None
     if seen["mode_after"] == "fault":
         seen["fault"] = ((stack.here.status("hal") or {}).get("facts") or {}).get("fault", "")
@@ -117,7 +117,7 @@ def estimated(hal: list[list[Any]], model: list[list[Any]], times: Times) -> dic
     return {"fresh": fresh, "oldest_measured": oldest}
 
 
-def told(client: list[list[Any]], service: str, times: Times) -> tuple[float, float]:
+def report(client: list[list[Any]], service: str, times: Times) -> tuple[float, float]:
     """How soon a client was told that a service is gone, and that it is there again; infinite if never."""
     news = [(row[1], row[3]) for row in client if row[0] == "alive" and row[2] == service]
     gone = min((at - times.broken for at, is_there in news if not is_there and at >= times.broken), default=math.inf)

@@ -173,8 +173,8 @@ def forward(first: str, second: str, seed: int) -> None:
                 for line in lines:
                     for name, wanted in json.loads(line).items():
                         ways[name].change(wanted)
-                    told = {name: way.counters for name, way in ways.items()}
-                    print(json.dumps({"at": time.monotonic(), **told}), flush=True)
+                    report = {name: way.counters for name, way in ways.items()}
+                    print(json.dumps({"at": time.monotonic(), **report}), flush=True)
                 continue
             for _ in range(BURST):
                 try:

@@ -26,9 +26,9 @@ VERBS = (
 
 @pytest.mark.parametrize("verb", VERBS.split(", "))
 def test_every_verb_explains_itself(verb: str) -> None:
-    told = gemuco(*verb.split(), "--help")
-    assert told.returncode == 0
-    assert "ROBOT" in told.stdout
+    completed = gemuco(*verb.split(), "--help")
+    assert completed.returncode == 0
+    assert "ROBOT" in completed.stdout
 
 
 def test_the_endpoint_of_a_service_is_printed_for_programs() -> None:
@@ -54,10 +54,10 @@ def test_a_wrong_robot_file_is_one_sentence_and_exit_code_2(tmp_path: Path) -> N
         (("collect", str(tmp_path / "none.yaml")), "There is no robot file"),
         (("collect", "musashi_arm", "--variant", "golden"), "no variant 'golden'. Known variants: geometric, actual."),
     ):
-        told = gemuco(*words)
-        assert told.returncode == 2
-        assert sentence in told.stderr.replace("\n", " ")
-        assert "Traceback" not in told.stderr
+        completed = gemuco(*words)
+        assert completed.returncode == 2
+        assert sentence in completed.stderr.replace("\n", " ")
+        assert "Traceback" not in completed.stderr
 
 
 @pytest.mark.long
@@ -70,8 +70,8 @@ def test_a_simulator_that_is_none_is_one_sentence(tmp_path: Path) -> None:
     ):
         robot = tmp_path / "wrong.yaml"
         robot.write_text(text.replace(line, f"simulator: {name}"))
-        told = gemuco("collect", str(robot))
-        assert told.returncode == 2 and sentence in told.stderr and "Traceback" not in told.stderr
+        completed = gemuco("collect", str(robot))
+        assert completed.returncode == 2 and sentence in completed.stderr and "Traceback" not in completed.stderr
 
 
 def _because(text: str) -> OSError:
@@ -93,9 +93,11 @@ def test_a_want_of_memory_is_one_sentence(error: Exception, capsys: pytest.Captu
 
     with pytest.raises(typer.Exit) as caught:
         verb()
-    told = capsys.readouterr().err
+    completed = capsys.readouterr().err
     assert (
-        caught.value.exit_code == 1 and told.startswith("gemuco: there is not enough memory.") and told.count("\n") == 1
+        caught.value.exit_code == 1
+        and completed.startswith("gemuco: there is not enough memory.")
+        and completed.count("\n") == 1
     )
 
 
@@ -117,10 +119,10 @@ def test_what_is_missing_is_said(tmp_path: Path) -> None:
         (("query", "nobody_here", "estimate", "joint_position"), "Is `gemuco serve` running?"),
         (("query", "nobody_here", "engage"), "Is `gemuco serve` running?"),
     ):
-        told = gemuco(*words, folder=tmp_path)
-        assert told.returncode == 1
-        assert sentence in told.stderr.replace("\n", " ")
-        assert "Traceback" not in told.stderr
+        completed = gemuco(*words, folder=tmp_path)
+        assert completed.returncode == 1
+        assert sentence in completed.stderr.replace("\n", " ")
+        assert "Traceback" not in completed.stderr
 
 
 def test_the_service_does_not_import_torch() -> None:
@@ -147,6 +149,6 @@ def test_collect_and_train_make_a_model(tmp_path: Path) -> None:
 
 
 def test_the_version_is_told() -> None:
-    told = gemuco("--version")
-    assert told.returncode == 0
-    assert told.stdout.strip() == f"gemuco {metadata.version('gemuco')}"
+    completed = gemuco("--version")
+    assert completed.returncode == 0
+    assert completed.stdout.strip() == f"gemuco {metadata.version('gemuco')}"

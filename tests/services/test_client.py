@@ -117,9 +117,9 @@ def test_verbs_and_readers_may_be_used_from_several_threads(robot: str) -> None:
 
         def use(number: int) -> None:
             for turn in range(20):
-                told = {"n": number, "turn": turn}
-                if client.ask("model", "echo", told, timeout=20.0) != told:
-                    failed.append(told)
+                report = {"n": number, "turn": turn}
+                if client.ask("model", "echo", report, timeout=20.0) != report:
+                    failed.append(report)
                 client.sample(), client.status("hal"), client.alive()
 
         threads = [threading.Thread(target=use, args=(number,)) for number in range(4)]

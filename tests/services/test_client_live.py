@@ -139,20 +139,20 @@ def test_messages_of_another_version_are_an_error_and_not_silence(client: Client
 
 
 def test_an_iterator_without_a_deadline_ends_when_the_client_is_closed(robot: str) -> None:
-    told: list[str] = []
+    report: list[str] = []
 
     def listen(client: Client) -> None:
         try:
             next(client.anomalies(deadline=None))
         except ServiceUnavailable as error:
-            told.append(str(error))
+            report.append(str(error))
 
     with Client(robot) as client:
         thread = threading.Thread(target=listen, args=(client,))
         thread.start()
         eventually(lambda: any(one.name == f"newest {keys.anomaly(robot)}" for one in threading.enumerate()))
     thread.join(20.0)
-    assert told == [f"The client of robot '{robot}' was closed."]
+    assert report == [f"The client of robot '{robot}' was closed."]
 
 
 def _status(text: str) -> Status:

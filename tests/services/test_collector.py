@@ -109,7 +109,7 @@ def test_a_start_outside_of_the_constraints_may_come_in_but_go_no_further_out() 
 
 
 @pytest.mark.parametrize(
-    ("collect", "error", "told"),
+    ("collect", "error", "report"),
     [
         ({"constraints": {"center_of_gravity": {"low": [0.9, 0.9]}}}, NowhereToGo, "center_of_gravity refused 100%"),
         ({"forecast": None}, ConfigError, "'constraints' need a 'forecast'"),
@@ -120,11 +120,11 @@ def test_a_start_outside_of_the_constraints_may_come_in_but_go_no_further_out() 
         ({"sped": 1.0}, ConfigError, "unknown key 'sped'"),
     ],
 )
-def test_a_collect_section_that_cannot_be_followed_is_told_in_a_sentence(collect, error, told) -> None:
+def test_a_collect_section_that_cannot_be_followed_is_told_in_a_sentence(collect, error, report) -> None:
     robot = config(collect=config().collect | collect)
     with pytest.raises(error) as caught:
         collected(robot)
-    assert told in str(caught.value)
+    assert report in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
@@ -171,7 +171,7 @@ def test_without_a_hold_column_the_robot_files_hold_counts(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "report"),
     [
         ("", "must name shoulder, elbow, each once, and may name hold; it names nothing"),
         ("shoulder,elbo\n0,0\n", "it names shoulder, elbo."),
@@ -187,10 +187,10 @@ def test_without_a_hold_column_the_robot_files_hold_counts(tmp_path: Path) -> No
         ("shoulder,elbow,hold\n0.1,0.2,-1\n", "hold is -1; it must be a time"),
     ],
 )
-def test_bad_postures_are_refused_before_anything_moves(tmp_path: Path, text: str, told: str) -> None:
+def test_bad_postures_are_refused_before_anything_moves(tmp_path: Path, text: str, report: str) -> None:
     with pytest.raises(BadPostures) as caught:
         collected(None, "short", postures=written(tmp_path, text))
-    assert told in str(caught.value)
+    assert report in str(caught.value)
 
 
 def test_a_file_of_postures_that_cannot_be_read_is_told(tmp_path: Path) -> None:
@@ -216,13 +216,13 @@ def test_from_the_command_line_to_a_model_that_knows_every_condition(
     monkeypatch.chdir(tmp_path)
 
     def gemuco(*words: str) -> tuple[int, str]:
-        told = CliRunner().invoke(app, words)
-        return told.exit_code, told.output.replace("\n", " ")
+        report = CliRunner().invoke(app, words)
+        return report.exit_code, report.output.replace("\n", " ")
 
-    code, told = gemuco("collect", str(robot), "--condition", "short", "--condition", "long", "--samples", "150")
-    assert (code, "300 samples in runs/small_hand/data.npz" in told) == (0, True), told
-    code, told = gemuco("train", str(robot))
-    assert code == 0, told
+    code, report = gemuco("collect", str(robot), "--condition", "short", "--condition", "long", "--samples", "150")
+    assert (code, "300 samples in runs/small_hand/data.npz" in report) == (0, True), report
+    code, report = gemuco("train", str(robot))
+    assert code == 0, report
     assert tuple(load(tmp_path / "runs" / "small_hand" / "model").biases) == ("short", "long")
-    code, told = gemuco("collect", str(robot), "--condition", "middle")
-    assert (code, "has no condition 'middle'. Known conditions: short, long" in told) == (2, True), told
+    code, report = gemuco("collect", str(robot), "--condition", "middle")
+    assert (code, "has no condition 'middle'. Known conditions: short, long" in report) == (2, True), report

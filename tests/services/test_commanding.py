@@ -262,8 +262,8 @@ def test_whatever_comes_to_a_verb_is_answered_and_only_what_stops_is_done(
 
 def test_who_looks_at_everything_sets_nothing_off(hal: Hal, anna: Client) -> None:
     anna.sample(timeout=10.0)
-    told = [reply.ok for reply in anna.session.get(f"gemuco/{anna.robot}/hal/do/*", timeout=5.0)]
-    answers = [msgpack.unpackb(one.payload.to_bytes()) for one in told if one is not None]
+    report = [reply.ok for reply in anna.session.get(f"gemuco/{anna.robot}/hal/do/*", timeout=5.0)]
+    answers = [msgpack.unpackb(one.payload.to_bytes()) for one in report if one is not None]
     assert len(answers) >= 10
     assert all("asks several verbs at once" in answer["text"] for answer in answers)
     assert hal.body.mode == "off"

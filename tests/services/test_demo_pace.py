@@ -153,7 +153,7 @@ def test_a_machine_that_does_not_keep_the_rate_plays_at_half_of_it(
         assert cast.robot.rates.hal == rates[-1]
         assert processes.stopped == len(rates) - 1
     assert processes.rates == rates
-    told = console.export_text()
-    assert [sentence for sentence in sentences if sentence not in told] == []
-    assert bool(told) is bool(sentences)
+    report = console.export_text()
+    assert [sentence for sentence in sentences if sentence not in report] == []
+    assert bool(report) is bool(sentences)
     assert list(arm.parent.glob("*.yaml")) == [arm]

@@ -27,14 +27,14 @@ FACTS = {
 LOOP = {"rate": 200.0, "rate_wanted": 200.0, "late_p99": 0.0002}
 
 
-def told(**changes: object) -> dict[str, tuple[Severity, str]]:
+def report(**changes: object) -> dict[str, tuple[Severity, str]]:
     loops = {"hal": {**LOOP, **changes.pop("loop", {})}}  # type: ignore[dict-item]
     status = Status(service="hal", state="running", loops=loops, facts={**FACTS, **changes})
     return {found.what: (found.verdict, found.text) for found in doctor.from_status(status)}
 
 
 def test_a_hal_that_is_well() -> None:
-    found = told()
+    found = report()
     assert {verdict for verdict, _ in found.values()} == {Severity.OK}
     assert "All 2 answer" in found["nodes"][1]
 
@@ -54,7 +54,7 @@ def test_a_hal_that_is_well() -> None:
     ],
 )
 def test_a_hal_that_is_not(changes: dict[str, object], what: str, verdict: Severity, said: str) -> None:
-    found = told(**changes)
+    found = report(**changes)
     assert found[what][0] is verdict
     assert said in found[what][1]
 

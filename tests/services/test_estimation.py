@@ -29,43 +29,43 @@ class Bench:
 def test_measured_values_pass_through_unmarked() -> None:
     bench = Bench()
     bench.newest = fresh(3, bench.clock.monotonic(), cycle=42)
-    told = bench.tick()
-    assert told.cycle == 42
-    assert set(told.method.values()) == {"measured"}
-    assert not any(part.any() for part in told.estimated.values())
+    report = bench.tick()
+    assert report.cycle == 42
+    assert set(report.method.values()) == {"measured"}
+    assert not any(part.any() for part in report.estimated.values())
     for name, value in bench.newest.message.values.items():
-        np.testing.assert_array_equal(told.values[name], value)
+        np.testing.assert_array_equal(report.values[name], value)
 
 
 def test_a_silent_encoder_is_estimated_and_marked() -> None:
     bench = Bench()
     bench.newest = fresh(3, bench.clock.monotonic(), silent=("joint_position.elbow_pitch",))
-    told = bench.tick()
-    assert told.method["joint_position"] == "mask"
-    assert told.mask["joint_position"] == "muscle_tension+muscle_length"
-    assert told.estimated["joint_position"].tolist() == [False, False, False, True, False]
+    report = bench.tick()
+    assert report.method["joint_position"] == "mask"
+    assert report.mask["joint_position"] == "muscle_tension+muscle_length"
+    assert report.estimated["joint_position"].tolist() == [False, False, False, True, False]
     truth = sample_of(3).values["joint_position"]
-    assert abs(told.values["joint_position"][3] - truth[3]) < 0.2  # rad
-    np.testing.assert_array_equal(told.values["joint_position"][:3], truth[:3])
-    assert 0 < told.std["joint_position"][3] < 0.3
-    assert told.residual["joint_position"] > 0
+    assert abs(report.values["joint_position"][3] - truth[3]) < 0.2  # rad
+    np.testing.assert_array_equal(report.values["joint_position"][:3], truth[:3])
+    assert 0 < report.std["joint_position"][3] < 0.3
+    assert report.residual["joint_position"] > 0
 
 
 def test_no_sample_gives_nothing_and_no_old_values() -> None:
     bench = Bench()
-    told = bench.tick()
-    assert told.cycle == -1
-    assert set(told.method.values()) == {"none"}
-    assert all(np.isnan(value).all() for value in told.values.values())
+    report = bench.tick()
+    assert report.cycle == -1
+    assert set(report.method.values()) == {"none"}
+    assert all(np.isnan(value).all() for value in report.values.values())
 
 
 def test_a_sample_that_waited_too_long_is_no_sample() -> None:
     bench = Bench()
     bench.newest = fresh(3, bench.clock.monotonic())
     bench.clock.advance(0.021)
-    told = bench.tick()
-    assert told.cycle == -1
-    assert all(np.isnan(value).all() for value in told.values.values())
+    report = bench.tick()
+    assert report.cycle == -1
+    assert all(np.isnan(value).all() for value in report.values.values())
 
 
 def test_a_sample_of_wrong_shape_is_as_good_as_silent() -> None:
@@ -84,10 +84,10 @@ def test_values_come_in_the_order_of_the_model() -> None:
     bench.newest = fresh(3, bench.clock.monotonic(), silent=("joint_position.elbow_pitch",))
     names = tuple(reversed(small_model().layout.names))
     other = Freshness(arm(), lambda: bench.newest, bench.clock, names=names)
-    _, told = other.take()
-    assert tuple(told) == names
+    _, report = other.take()
+    assert tuple(report) == names
     for name, value in bench.freshness.take()[1].items():
-        np.testing.assert_array_equal(told[name], value)
+        np.testing.assert_array_equal(report[name], value)
     estimation = Estimation(other, small_model, bench.published.append, bench.clock)  # puts them right by itself
     estimation.tick()
     for name, value in bench.tick().values.items():
@@ -108,8 +108,8 @@ def test_nothing_is_computed_twice_while_nothing_changes() -> None:
 
 def test_an_anomaly_must_last() -> None:
     bench = Bench()
-    told: list[Anomaly] = []
-    watch = AnomalyWatch(bench.freshness, small_model, 0.05, told.append, bench.clock)
+    report: list[Anomaly] = []
+    watch = AnomalyWatch(bench.freshness, small_model, 0.05, report.append, bench.clock)
     sample = sample_of(5)
     tension = sample.values["muscle_tension"].copy()
     tension[1] += 150.0  # N
@@ -119,20 +119,20 @@ def test_an_anomaly_must_last() -> None:
         watch.tick()
         watch.judge()
         bench.clock.advance(0.02)
-    assert all(one.score > one.threshold for one in told)
-    assert [one.is_anomaly for one in told] == [False, False, False, False, True]
-    assert [one.verdict for one in told] == ["", "", "", "", "anomaly"]
-    assert told[-1].blamed.split(".")[0] in arm().signals
+    assert all(one.score > one.threshold for one in report)
+    assert [one.is_anomaly for one in report] == [False, False, False, False, True]
+    assert [one.verdict for one in report] == ["", "", "", "", "anomaly"]
+    assert report[-1].blamed.split(".")[0] in arm().signals
     bench.newest = fresh(5, bench.clock.monotonic())
     watch.tick()
-    assert not told[-1].is_anomaly
-    assert told[-1].verdict == "normal"
+    assert not report[-1].is_anomaly
+    assert report[-1].verdict == "normal"
 
 
 def test_a_verdict_is_of_what_is_odd_now_and_never_of_what_was() -> None:
     bench = Bench()
-    told: list[Anomaly] = []
-    watch = AnomalyWatch(bench.freshness, small_model, 0.05, told.append, bench.clock)
+    report: list[Anomaly] = []
+    watch = AnomalyWatch(bench.freshness, small_model, 0.05, report.append, bench.clock)
     sample = sample_of(5)
     tension = sample.values["muscle_tension"] + 150.0  # N
     odd = replace(sample, values=sample.values | {"muscle_tension": tension})
@@ -141,7 +141,7 @@ def test_a_verdict_is_of_what_is_odd_now_and_never_of_what_was() -> None:
         bench.clock.advance(0.06)
         bench.newest = Arrival(sample, bench.clock.monotonic())
         watch.tick()
-        return told[-1]
+        return report[-1]
 
     tick(odd)
     tick(odd)
@@ -149,16 +149,16 @@ def test_a_verdict_is_of_what_is_odd_now_and_never_of_what_was() -> None:
     assert tick(odd).verdict == "anomaly"
     assert tick(sample).verdict == "normal"
     assert tick(odd).verdict == ""
-    assert not told[-1].is_anomaly
+    assert not report[-1].is_anomaly
     bench.clock.advance(1.0)  # nobody judges: it is told all the same
     assert tick(odd).is_anomaly
-    assert told[-1].verdict == ""
+    assert report[-1].verdict == ""
 
 
 def test_without_a_sample_nothing_is_judged() -> None:
     bench = Bench()
-    told: list[Anomaly] = []
-    AnomalyWatch(bench.freshness, small_model, 0.05, told.append, bench.clock).tick()
-    assert math.isnan(told[0].score)
-    assert not told[0].is_anomaly
-    assert told[0].blamed == ""
+    report: list[Anomaly] = []
+    AnomalyWatch(bench.freshness, small_model, 0.05, report.append, bench.clock).tick()
+    assert math.isnan(report[0].score)
+    assert not report[0].is_anomaly
+    assert report[0].blamed == ""

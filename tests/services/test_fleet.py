@@ -137,8 +137,8 @@ def router() -> Iterator[str]:
     thread.join()
 
 
-def run(service: Service, told: threading.Event) -> threading.Thread:
-    thread = threading.Thread(target=service.run, args=(lambda: status(service.name, boot=service.boot), told))
+def run(service: Service, report: threading.Event) -> threading.Thread:
+    thread = threading.Thread(target=service.run, args=(lambda: status(service.name, boot=service.boot), report))
     thread.start()
     return thread
 
@@ -169,31 +169,31 @@ def test_all_robots_of_a_router_are_seen_and_one_that_vanishes_stays_listed(robo
 
 
 def test_without_a_router_the_robots_of_this_machine_are_found(robot: str) -> None:
-    told = threading.Event()
+    report = threading.Event()
     with Service(robot, "hal") as service:
         assert (robot, "hal") in services_here()
-        thread = run(service, told)
+        thread = run(service, report)
         with FleetWatch() as fleet:
             eventually(lambda: any(one.robot == robot and one.alive == {"hal"} for one in fleet.snapshots()))
-        told.set()
+        report.set()
         thread.join()
 
 
 @pytest.mark.long
 def test_printed_once_the_exit_code_tells(robot: str, router: str) -> None:
-    told = threading.Event()
+    report = threading.Event()
     console = Console(width=160)
     with console.capture() as shown:
         assert fleet_top.watch_fleet(True, [router], console) == 1
     assert "No robot is seen" in shown.get()
     with Service(robot, "hal", [router]) as hal, Service(robot, "model", [router]) as model:
-        threads = [run(service, told) for service in (hal, model)]
+        threads = [run(service, report) for service in (hal, model)]
         try:
             with console.capture() as shown:
                 assert fleet_top.watch_fleet(True, [router], console) == 0
             assert robot in shown.get()
         finally:
-            told.set()
+            report.set()
             for thread in threads:
                 thread.join()
 

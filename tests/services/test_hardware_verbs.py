@@ -40,10 +40,10 @@ class Stage:
     def doctor(self, wanted: str) -> Result:
         """What the doctor says; asked again if this machine was too busy for the nodes to answer in time."""
         for _ in range(5):
-            told = self.gemuco("doctor")
-            if wanted in told.output:
+            report = self.gemuco("doctor")
+            if wanted in report.output:
                 break
-        return told
+        return report
 
     def calibrate(self, kind: str, device: str, *words: str) -> Result:
         command = ["calibrate", kind, str(self.path), device, *words, "--seconds", "0.2"]
@@ -109,27 +109,27 @@ def stage(tmp_path: Path, robot: str) -> Iterator[Stage]:
 
 @pytest.mark.long
 def test_scan_tells_who_is_there_and_who_is_not(stage: Stage) -> None:
-    told = stage.gemuco("scan", "--seconds", "0.2")
-    assert told.exit_code == 0, told.output
-    assert "servo drive (402)" in told.output and "biceps_drive" in told.output
+    report = stage.gemuco("scan", "--seconds", "0.2")
+    assert report.exit_code == 0, report.output
+    assert "servo drive (402)" in report.output and "biceps_drive" in report.output
     stage.rig.fault("node_silent biceps_cell")
-    told = stage.gemuco("scan", "--seconds", "0.2")
-    assert told.exit_code == 1
-    assert "node 11 ('biceps_cell') was not found" in told.output
+    report = stage.gemuco("scan", "--seconds", "0.2")
+    assert report.exit_code == 1
+    assert "node 11 ('biceps_cell') was not found" in report.output
 
 
 def test_scan_of_an_interface_needs_no_robot(stage: Stage) -> None:
     channel = stage.config.buses["can0"].channel
-    told = stage.gemuco("scan", "--interface", "virtual", "--channel", channel, "--seconds", "0.2", robot=False)
-    assert told.exit_code == 0
-    assert "encoder (406)" in told.output
+    report = stage.gemuco("scan", "--interface", "virtual", "--channel", channel, "--seconds", "0.2", robot=False)
+    assert report.exit_code == 0
+    assert "encoder (406)" in report.output
 
 
 def test_scan_sends_no_requests_while_the_hal_runs(stage: Stage) -> None:
     wire = can.Bus(interface="virtual", channel=stage.config.buses["can0"].channel)
     with instead_of(stage.config.robot, "hal"):
-        told = stage.gemuco("scan", "--seconds", "0.2", "--mit")
-    assert "The HAL of this robot runs. The scan sends no requests" in told.output
+        report = stage.gemuco("scan", "--seconds", "0.2", "--mit")
+    assert "The HAL of this robot runs. The scan sends no requests" in report.output
     assert wire.recv(0.0) is None
     wire.shutdown()
 
@@ -148,18 +148,18 @@ def test_scan_sends_no_requests_while_the_hal_runs(stage: Stage) -> None:
     ],
 )
 def test_what_is_asked_wrongly_is_one_sentence(words: tuple[str, ...], said: str) -> None:
-    told = CliRunner().invoke(app, list(words), catch_exceptions=False)
-    assert told.exit_code in (1, 2)
-    assert said in " ".join(told.output.replace("│", " ").split())
+    report = CliRunner().invoke(app, list(words), catch_exceptions=False)
+    assert report.exit_code in (1, 2)
+    assert said in " ".join(report.output.replace("│", " ").split())
 
 
 @pytest.mark.parametrize(
     "words", [("scan",), ("doctor",), ("calibrate", "joint"), ("calibrate", "cell"), ("can", "dump")]
 )
 def test_every_verb_explains_itself(words: tuple[str, ...]) -> None:
-    told = CliRunner().invoke(app, [*words, "--help"])
-    assert told.exit_code == 0
-    assert "ROBOT" in told.output
+    report = CliRunner().invoke(app, [*words, "--help"])
+    assert report.exit_code == 0
+    assert "ROBOT" in report.output
 
 
 def test_help_shows_units() -> None:
@@ -169,22 +169,22 @@ def test_help_shows_units() -> None:
 
 @pytest.mark.long
 def test_doctor_finds_what_is_wrong(stage: Stage) -> None:
-    told = stage.doctor(", 0 bad.")
-    assert told.exit_code == 0, told.output
-    assert "ok       nodes                    All 3 answer." in told.output
-    assert all(line.split()[0] in ("ok", "warning", "bad") for line in told.output.splitlines()[:-1])
+    report = stage.doctor(", 0 bad.")
+    assert report.exit_code == 0, report.output
+    assert "ok       nodes                    All 3 answer." in report.output
+    assert all(line.split()[0] in ("ok", "warning", "bad") for line in report.output.splitlines()[:-1])
     stage.rig.fault("node_silent elbow_encoder")
-    told = stage.gemuco("doctor")
-    assert told.exit_code == 1
-    assert "bad      node elbow_encoder" in told.output
+    report = stage.gemuco("doctor")
+    assert report.exit_code == 1
+    assert "bad      node elbow_encoder" in report.output
 
 
 def test_doctor_tells_what_is_wrong_with_the_file(tmp_path: Path) -> None:
     wrong = tmp_path / "wrong.yaml"
     wrong.write_text("robot: wrong\ncolour: blue\n")
-    told = CliRunner().invoke(app, ["doctor", str(wrong)], catch_exceptions=False)
-    assert told.exit_code == 1
-    assert "unknown key 'colour'" in told.output
+    report = CliRunner().invoke(app, ["doctor", str(wrong)], catch_exceptions=False)
+    assert report.exit_code == 1
+    assert "unknown key 'colour'" in report.output
 
 
 @pytest.mark.long
@@ -197,13 +197,13 @@ def test_doctor_asks_a_hal_that_runs(stage: Stage) -> None:
             deadline = time.monotonic() + 20.0
             while (status := client.status("hal", timeout=1.0)) is None or status.state == "starting":
                 assert time.monotonic() < deadline
-        told = stage.gemuco("doctor")
+        report = stage.gemuco("doctor")
         refused = stage.calibrate("cell", "biceps_cell", "--weight", "0", "--yes")
     finally:
         stop.set()
         hal.join()
-    assert "Runs, mode 'off'. It reports its state; the buses are not opened here." in told.output
-    assert "All 3 answer" in told.output
+    assert "Runs, mode 'off'. It reports its state; the buses are not opened here." in report.output
+    assert "All 3 answer" in report.output
     assert refused.exit_code == 1
     assert "already has a 'hal' service" in refused.output
 
@@ -213,12 +213,12 @@ def test_a_cell_is_calibrated_with_weights(stage: Stage, monkeypatch: pytest.Mon
     loads = iter([2.0, 14.0, 26.0])
     monkeypatch.setattr(typer, "prompt", lambda *_, **__: stage.set("muscle_tension.biceps", next(loads)))
     monkeypatch.setattr(typer, "confirm", lambda *_, **__: True)
-    told = stage.calibrate("cell", "biceps_cell", "--unit", "N", *(w for n in "036" for w in ("--weight", f"{n}")))
-    assert told.exit_code == 0, told.output
-    assert "residual" in told.output and "samples" in told.output
+    report = stage.calibrate("cell", "biceps_cell", "--unit", "N", *(w for n in "036" for w in ("--weight", f"{n}")))
+    assert report.exit_code == 0, report.output
+    assert "residual" in report.output and "samples" in report.output
     assert stage.stored("biceps_cell") == pytest.approx({"zero": -0.5, "gain": 0.25}, abs=0.01)
-    told = stage.calibrate("cell", "muscle_tension.biceps", "--weight", "0", "--yes")
-    assert told.exit_code == 0
+    report = stage.calibrate("cell", "muscle_tension.biceps", "--weight", "0", "--yes")
+    assert report.exit_code == 0
     assert stage.stored("biceps_cell") == pytest.approx({"zero": -6.5, "gain": 0.25}, abs=0.01)
     assert "calibration              1 devices" in stage.gemuco("doctor").output
 
@@ -233,8 +233,8 @@ def test_a_joint_is_calibrated_at_two_positions(stage: Stage, monkeypatch: pytes
     angles = iter([0.2, -0.3])
     monkeypatch.setattr(typer, "prompt", lambda *_, **__: stage.set("joint_position.elbow", next(angles)))
     monkeypatch.setattr(typer, "confirm", lambda *_, **__: True)
-    told = stage.calibrate("joint", "elbow_encoder", "--at", "-0.1", "--at", "0.4")
-    assert told.exit_code == 0, told.output
+    report = stage.calibrate("joint", "elbow_encoder", "--at", "-0.1", "--at", "0.4")
+    assert report.exit_code == 0, report.output
     assert stage.stored("elbow_encoder") == pytest.approx({"zero": 3.1, "direction": -1}, abs=1e-3)
 
 
@@ -242,9 +242,9 @@ def test_a_calibration_is_asked_for_and_may_be_dropped(stage: Stage, monkeypatch
     answers = iter(["much", "0.25", ""])
     monkeypatch.setattr(typer, "prompt", lambda *_, **__: next(answers))
     monkeypatch.setattr(typer, "confirm", lambda *_, **__: False)
-    told = stage.calibrate("joint", "elbow_encoder")
-    assert told.exit_code == 1
-    assert "'much' is not a number" in told.output and "Not stored." in told.output
+    report = stage.calibrate("joint", "elbow_encoder")
+    assert report.exit_code == 1
+    assert "'much' is not a number" in report.output and "Not stored." in report.output
     assert not list(stage.path.parent.glob("*.calibration.yaml"))
 
 
@@ -283,6 +283,6 @@ def test_can_dump_says_what_frames_mean(stage: Stage) -> None:
 
 
 def test_can_dump_of_a_silent_bus_says_so(stage: Stage) -> None:
-    told = stage.gemuco("can", "dump", "--seconds", "0.2")
-    assert told.exit_code == 0
-    assert "No frame came." in told.output
+    report = stage.gemuco("can", "dump", "--seconds", "0.2")
+    assert report.exit_code == 0
+    assert "No frame came." in report.output

@@ -100,7 +100,7 @@ def written(**changed: object) -> None:
 
 
 @pytest.mark.parametrize(
-    ("changed", "told"),
+    ("changed", "report"),
     [
         ({}, "is healthy"),
         ({"boot": "another"}, "before this machine started"),
@@ -110,10 +110,10 @@ def written(**changed: object) -> None:
         ({"loops": None}, "cannot be read"),
     ],
 )
-def test_what_an_earlier_life_wrote_counts_for_nothing(changed: dict[str, object], told: str) -> None:
+def test_what_an_earlier_life_wrote_counts_for_nothing(changed: dict[str, object], report: str) -> None:
     written(**changed)
     is_healthy, text = health.check("hal", "arm")
-    assert told in text
+    assert report in text
     assert is_healthy == (changed == {})
 
 

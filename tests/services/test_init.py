@@ -29,10 +29,10 @@ def named(folder: Path, name: str) -> Path:
 
 
 def test_a_robot_file_is_written_with_its_data_sheets(tmp_path: Path) -> None:
-    told = gemuco(tmp_path, "init", str(named(tmp_path, "My Arm")))
-    assert told.returncode == 0, told.stderr
-    assert told.stdout.startswith("arm.yaml: 3 joints from base to tool0, reach 0.90 m")
-    assert told.stdout.endswith("Next: gemuco demo arm.yaml\n")
+    completed = gemuco(tmp_path, "init", str(named(tmp_path, "My Arm")))
+    assert completed.returncode == 0, completed.stderr
+    assert completed.stdout.startswith("arm.yaml: 3 joints from base to tool0, reach 0.90 m")
+    assert completed.stdout.endswith("Next: gemuco demo arm.yaml\n")
     assert sorted(path.name for path in (tmp_path / "eds").iterdir()) == ["joint_encoder.eds", "servo_drive.eds"]
     robot = load_robot(tmp_path / "arm.yaml")
     assert (robot.robot, robot.urdf) == ("my_arm", Path("arm.urdf"))
@@ -42,7 +42,7 @@ def test_a_robot_file_is_written_with_its_data_sheets(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "code", "told"),
+    ("words", "code", "completed"),
     [
         (("none.urdf",), 2, "There is no file 'none.urdf'. Is its folder right?"),
         (("arm.urdf", "--tip", "nose"), 2, "has no link 'nose'. Known links, ends of chains first: tool0"),
@@ -51,12 +51,14 @@ def test_a_robot_file_is_written_with_its_data_sheets(tmp_path: Path) -> None:
         (("arm.xacro",), 2, "is a xacro file. Convert it first: xacro arm.xacro > robot.urdf"),
     ],
 )
-def test_what_cannot_be_is_refused_in_a_sentence(tmp_path: Path, words: tuple[str, ...], code: int, told: str) -> None:
+def test_what_cannot_be_is_refused_in_a_sentence(
+    tmp_path: Path, words: tuple[str, ...], code: int, completed: str
+) -> None:
     named(tmp_path, "My Arm")
     written(tmp_path, ARM, "arm.xacro")
     answer = gemuco(tmp_path, "init", *words)
     assert answer.returncode == code
-    assert told in answer.stderr
+    assert completed in answer.stderr
     assert len(answer.stderr.splitlines()) == 1
     assert not list(tmp_path.glob("*.yaml"))
 
@@ -65,10 +67,10 @@ def test_a_folder_of_files_becomes_a_robot_file(tmp_path: Path) -> None:
     (tmp_path / "vendors").mkdir()
     for name in ("eds/servo_drive.eds", "dbc/load_cell.dbc"):
         (tmp_path / "vendors" / Path(name).name).write_bytes((ROOT / "robots" / name).read_bytes())
-    told = gemuco(tmp_path, "init", "vendors")
-    assert told.returncode == 0, told.stderr
-    assert told.stdout.startswith("vendors.yaml: 2 devices, 1 of them drives, 3 elements; 3 lines to set.\n")
-    assert "Next: complete the lines with 'set' in vendors.yaml; then gemuco simulate vendors.yaml" in told.stdout
+    completed = gemuco(tmp_path, "init", "vendors")
+    assert completed.returncode == 0, completed.stderr
+    assert completed.stdout.startswith("vendors.yaml: 2 devices, 1 of them drives, 3 elements; 3 lines to set.\n")
+    assert "Next: complete the lines with 'set' in vendors.yaml; then gemuco simulate vendors.yaml" in completed.stdout
     robot = load_robot(tmp_path / "vendors.yaml")
     assert sorted(robot.devices) == ["cell", "servo_drive"]
     again = gemuco(tmp_path, "init", "vendors")
@@ -80,10 +82,10 @@ def test_an_mjcf_file_becomes_a_robot_file_with_its_urdf(tmp_path: Path) -> None
     from test_mjcf import SCENE
 
     (tmp_path / "arm.xml").write_text(SCENE)
-    told = gemuco(tmp_path, "init", "arm.xml")
-    assert told.returncode == 0, told.stderr
-    assert told.stdout.startswith("arm.yaml: 4 joints from base to tool_center")
-    assert "Left out, because no motor moves it: cube." in told.stdout
+    completed = gemuco(tmp_path, "init", "arm.xml")
+    assert completed.returncode == 0, completed.stderr
+    assert completed.stdout.startswith("arm.yaml: 4 joints from base to tool_center")
+    assert "Left out, because no motor moves it: cube." in completed.stdout
     robot = load_robot(tmp_path / "arm.yaml")
     assert (robot.urdf, robot.tip) == (Path("arm.urdf"), "tool_center")
     assert arm_story.reach_of(robot) > 0.7
@@ -124,9 +126,9 @@ def test_the_demo_plays_an_arm_that_it_has_never_seen(tmp_path: Path) -> None:
     body["collect"]["samples"] = 1000
     body["model"]["structure"] |= {"epochs": 30, "splits": 1}
     (tmp_path / "arm.yaml").write_text(yaml.safe_dump(body, sort_keys=False))
-    told = gemuco(tmp_path, "demo", "arm.yaml", timeout=350.0)
-    assert told.returncode == 0, told.stdout + told.stderr
+    completed = gemuco(tmp_path, "demo", "arm.yaml", timeout=350.0)
+    assert completed.returncode == 0, completed.stdout + completed.stderr
     for stage in ("moves to postures", "loses an encoder", "loses its sight"):
-        assert stage in told.stdout
+        assert stage in completed.stdout
     assert (tmp_path / "runs" / "demo" / "story.png").exists()
     assert (tmp_path / "runs" / f"arm_{os.getpid()}" / "model" / "manifest.json").exists()

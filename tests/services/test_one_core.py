@@ -46,8 +46,8 @@ def test_a_process_is_kept_on_the_core_where_others_run_least(machine: Machine) 
 
 
 def test_every_thread_is_kept_there_and_let_go_at_the_end(machine: Machine) -> None:
-    stop, told = threading.Event(), []
-    thread = threading.Thread(target=lambda: (stop.wait(10.0), told.append(os.sched_getaffinity(0))))
+    stop, report = threading.Event(), []
+    thread = threading.Thread(target=lambda: (stop.wait(10.0), report.append(os.sched_getaffinity(0))))
     thread.start()
     machine.second()
     where = machine.second()
@@ -56,7 +56,7 @@ def test_every_thread_is_kept_there_and_let_go_at_the_end(machine: Machine) -> N
     assert os.sched_getaffinity(thread.native_id or 0) == set(ALLOWED)
     stop.set()
     thread.join()
-    assert told == [set(ALLOWED)]
+    assert report == [set(ALLOWED)]
 
 
 def test_it_moves_where_others_crowd_its_core_and_its_own_work_is_no_crowd(machine: Machine) -> None:
@@ -95,6 +95,6 @@ def test_two_looks_at_nearly_the_same_moment_are_one(machine: Machine) -> None:
 
 
 def test_the_kernel_tells_of_every_core() -> None:
-    told = busy()
-    assert set(ALLOWED) <= set(told)
-    assert min(told.values()) >= 0.0
+    report = busy()
+    assert set(ALLOWED) <= set(report)
+    assert min(report.values()) >= 0.0

@@ -49,7 +49,7 @@ class Told:
 
 
 @pytest.fixture
-def told(session: zenoh.Session, robot: str) -> Told:
+def report(session: zenoh.Session, robot: str) -> Told:
     return Told(session, robot)
 
 
@@ -57,82 +57,82 @@ def anna(cycle: int = 500) -> Caller:
     return Caller("anna", ANNA, 0, HAL, cycle)
 
 
-def test_while_nobody_commands_anybody_may(told: Told) -> None:
-    told.permission.check(Caller())
-    told.holder("", 0, left=0.0)
-    told.permission.check(Caller())
+def test_while_nobody_commands_anybody_may(report: Told) -> None:
+    report.permission.check(Caller())
+    report.holder("", 0, left=0.0)
+    report.permission.check(Caller())
 
 
-def test_while_somebody_commands_only_that_one_may(told: Told) -> None:
-    told.holder("anna", ANNA)
-    told.permission.check(anna())
+def test_while_somebody_commands_only_that_one_may(report: Told) -> None:
+    report.holder("anna", ANNA)
+    report.permission.check(anna())
     for other in (Caller("bert", BERT), Caller()):
         with pytest.raises(CommandHeld, match="anna commands this robot"):
-            told.permission.check(other)
+            report.permission.check(other)
 
 
-def test_while_the_model_itself_commands_anybody_may(told: Told) -> None:
-    told.holder("model service", MODEL)
-    told.permission.check(Caller("bert", BERT))
+def test_while_the_model_itself_commands_anybody_may(report: Told) -> None:
+    report.holder("model service", MODEL)
+    report.permission.check(Caller("bert", BERT))
 
 
 @pytest.mark.parametrize(("left", "waited"), [(5.0, HEARD_WITHIN + 0.01), (1.0, 1.01)])
-def test_what_the_hal_told_is_believed_for_as_long_as_it_holds(told: Told, left: float, waited: float) -> None:
-    told.holder("anna", ANNA, left=left)
-    told.clock.advance(waited - 0.02)
+def test_what_the_hal_told_is_believed_for_as_long_as_it_holds(report: Told, left: float, waited: float) -> None:
+    report.holder("anna", ANNA, left=left)
+    report.clock.advance(waited - 0.02)
     with pytest.raises(CommandHeld):
-        told.permission.check(Caller("bert", BERT))
-    told.clock.advance(0.02)
-    told.permission.check(Caller("bert", BERT))
+        report.permission.check(Caller("bert", BERT))
+    report.clock.advance(0.02)
+    report.permission.check(Caller("bert", BERT))
 
 
-def test_what_moves_the_robot_is_done_at_once_or_never(told: Told) -> None:
+def test_what_moves_the_robot_is_done_at_once_or_never(report: Told) -> None:
     with pytest.raises(TooLate):
-        told.permission.may_move(anna())
-    told.sample(500)
-    told.permission.may_move(anna(500))
-    told.permission.may_move(anna(401))
+        report.permission.may_move(anna())
+    report.sample(500)
+    report.permission.may_move(anna(500))
+    report.permission.may_move(anna(401))
     for caller in (anna(399), Caller("anna", ANNA), Caller("anna", ANNA, 0, HAL + 1, 500), anna(700)):
         with pytest.raises(TooLate):
-            told.permission.may_move(caller)
-    told.clock.advance(1.01)
+            report.permission.may_move(caller)
+    report.clock.advance(1.01)
     with pytest.raises(TooLate, match=r"1\.0 s old"):
-        told.permission.may_move(anna(500))
+        report.permission.may_move(anna(500))
 
 
-def test_a_published_target_is_judged_by_who_sent_it(told: Told) -> None:
-    told.sample(500)
-    told.holder("anna", ANNA)
-    told.permission.may_set(Target(boot=ANNA, cycle=499, hal_boot=HAL, signal="s", values=np.zeros(1)))
+def test_a_published_target_is_judged_by_who_sent_it(report: Told) -> None:
+    report.sample(500)
+    report.holder("anna", ANNA)
+    report.permission.may_set(Target(boot=ANNA, cycle=499, hal_boot=HAL, signal="s", values=np.zeros(1)))
     with pytest.raises(CommandHeld):
-        told.permission.may_set(Target(boot=BERT, cycle=499, hal_boot=HAL, signal="s", values=np.zeros(1)))
+        report.permission.may_set(Target(boot=BERT, cycle=499, hal_boot=HAL, signal="s", values=np.zeros(1)))
     with pytest.raises(TooLate):
-        told.permission.may_set(Target(boot=ANNA, cycle=300, hal_boot=HAL, signal="s", values=np.zeros(1)))
+        report.permission.may_set(Target(boot=ANNA, cycle=300, hal_boot=HAL, signal="s", values=np.zeros(1)))
 
 
-def test_the_controller_lets_go_with_the_lease_that_it_was_engaged_under(told: Told) -> None:
-    told.permission.begin(anna())
-    assert told.permission.ended() == "", "the HAL has not told yet"
-    told.holder("anna", ANNA, through=MODEL)
-    assert told.permission.ended() == ""
-    assert "engaged by anna" in told.permission.name
-    told.clock.advance(HEARD_WITHIN + 0.01)
-    assert told.permission.ended() == "The lease of anna has ended, so the controller was disengaged."
-    told.permission.begin(anna())
-    assert told.permission.ended() == "", "engaged anew"
+def test_the_controller_lets_go_with_the_lease_that_it_was_engaged_under(report: Told) -> None:
+    report.permission.begin(anna())
+    assert report.permission.ended() == "", "the HAL has not told yet"
+    report.holder("anna", ANNA, through=MODEL)
+    assert report.permission.ended() == ""
+    assert "engaged by anna" in report.permission.name
+    report.clock.advance(HEARD_WITHIN + 0.01)
+    assert report.permission.ended() == "The lease of anna has ended, so the controller was disengaged."
+    report.permission.begin(anna())
+    assert report.permission.ended() == "", "engaged anew"
 
 
-def test_the_controller_lets_go_when_somebody_else_commands(told: Told) -> None:
-    told.permission.begin(anna())
-    told.holder("model service", MODEL)
-    assert told.permission.ended() == ""
-    told.holder("bert", BERT)
-    assert told.permission.ended() == "bert commands the robot now, so the controller was disengaged."
+def test_the_controller_lets_go_when_somebody_else_commands(report: Told) -> None:
+    report.permission.begin(anna())
+    report.holder("model service", MODEL)
+    assert report.permission.ended() == ""
+    report.holder("bert", BERT)
+    assert report.permission.ended() == "bert commands the robot now, so the controller was disengaged."
 
 
-def test_it_asks_the_hal_for_whoever_asked_it_with_what_it_has_seen_itself(told: Told) -> None:
-    told.sample(640)
-    assert told.permission.on_behalf(anna(500)) == Caller("anna", ANNA, MODEL, HAL, 640)
+def test_it_asks_the_hal_for_whoever_asked_it_with_what_it_has_seen_itself(report: Told) -> None:
+    report.sample(640)
+    assert report.permission.on_behalf(anna(500)) == Caller("anna", ANNA, MODEL, HAL, 640)
 
 
 def test_targets_come_in_their_order_and_what_is_none_is_counted(session: zenoh.Session, robot: str) -> None:

@@ -23,13 +23,13 @@ names = [one.name for one in pkgutil.iter_modules(gemuco.compiled.__path__, "gem
 modules = [importlib.import_module(name) for name in names]
 kernels = {one for module in modules for one in vars(module).values() if hasattr(one, "signatures")}
 before = {one: list(one.signatures) for one in kernels}
-schema, clock, told = small_model(), ManualClock(), []
+schema, clock, published = small_model(), ManualClock(), []
 normal = Normal(np.zeros(schema.out_layout.size), np.eye(schema.out_layout.size), 1.0, 1e-3)
 schema = schema.with_normal(normal)
 newest = None
 freshness = Freshness(arm(), lambda: newest, clock)
-estimation = Estimation(freshness, lambda: schema, told.append, clock)
-anomaly = AnomalyWatch(freshness, lambda: schema, 0.5, told.append, clock)
+estimation = Estimation(freshness, lambda: schema, published.append, clock)
+anomaly = AnomalyWatch(freshness, lambda: schema, 0.5, published.append, clock)
 silences = ((), ("joint_position.elbow_pitch",), ("muscle_tension.biceps", "muscle_length.biceps"))
 for number, silent in enumerate(silences):
     sample = messages.decode(messages.encode(fresh(number, 0.0, silent=silent).message), messages.Sample)
@@ -38,7 +38,7 @@ for number, silent in enumerate(silences):
     anomaly.tick()
 clock.advance(0.015)
 estimation.tick()
-assert any(one.estimated.flat.any() for one in told if hasattr(one, "estimated"))
+assert any(one.estimated.flat.any() for one in published if hasattr(one, "estimated"))
 new = {one.__name__: one.signatures[len(before[one]):] for one in kernels if len(one.signatures) > len(before[one])}
 assert not new, new
 """

@@ -164,9 +164,9 @@ def test_who_comes_goes_and_commands_is_in_the_log(robot: str, session: zenoh.Se
 
 
 def test_the_hal_tells_what_elements_are_called(robot: str, tmp_path: Path) -> None:
-    told = {"signals": ARM.plain(), "rates": {"hal": 200.0}}
+    report = {"signals": ARM.plain(), "rates": {"hal": 200.0}}
     path = tmp_path / "run.mcap"
-    with Service(robot, "hal", describe=lambda: told) as hal:
+    with Service(robot, "hal", describe=lambda: report) as hal:
         client = open_session(robot, "recorder")
         with recorder.recording(client, robot, path) as found:
             samples = Publisher(hal.session, keys.sample(robot), Sample, 1)
@@ -222,8 +222,8 @@ def test_losses_are_counted_and_written_into_the_file(robot: str, session: zenoh
         _eventually(lambda: writer.written == 6)
     assert [entry.message.seq for entry in read(path)] == [0, 1, 5, 6, 7, 0]
     assert losses(path) == {"dropped": 2, "missed": 3, "malformed": 0}
-    told = {line["kind"]: (line["key"], line["count"]) for line in log_lines(path) if "count" in line}
-    assert told == {"dropped": (keys.update(robot), 2), "missed": (keys.update(robot), 3)}
+    report = {line["kind"]: (line["key"], line["count"]) for line in log_lines(path) if "count" in line}
+    assert report == {"dropped": (keys.update(robot), 2), "missed": (keys.update(robot), 3)}
     assert recorder.missing(found.counters()) == ("Of the messages, 2 could not be written, 3 never arrived here.")
 
 
@@ -298,10 +298,10 @@ def test_a_recording_without_limits_begins_a_new_file_every_hour(robot: str, tmp
 def test_a_recording_never_replaces_a_file(robot: str, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     path.write_text("precious")
-    told = threading.Event()
-    told.set()
+    report = threading.Event()
+    report.set()
     for name in ("run-000002.mcap", "run-000003.mcap"):
-        assert run_recorder(robot, path, stop=told) == 0
+        assert run_recorder(robot, path, stop=report) == 0
         assert losses(tmp_path / name) == {"dropped": 0, "missed": 0, "malformed": 0}
     assert path.read_text() == "precious"
 

@@ -163,9 +163,9 @@ def test_truncated_messages_are_told(record: type[Message]) -> None:
 
 def test_a_signal_that_nobody_described_gets_numbers_for_names() -> None:
     sample = a_message(Sample)
-    with pytest.raises(OtherLayout) as told:
+    with pytest.raises(OtherLayout) as report:
         Form(Sample, Catalogue({"muscle_tension": ARM.signals["muscle_tension"]})).write(messages.encode(sample))
-    assert (told.value.signal, told.value.size) == ("joint_position", 2)
+    assert (report.value.signal, report.value.size) == ("joint_position", 2)
     back, plain, _ = through(sample, Catalogue({}).with_unknown("joint_position", 2).with_unknown("muscle_tension", 1))
     assert list(plain["values"]["joint_position"]) == ["element_1", "element_2"]
     assert messages.encode(back) == messages.encode(sample)
@@ -188,6 +188,6 @@ def test_a_sample_that_does_not_agree_with_itself_is_not_recorded_as_one(field: 
 @pytest.mark.parametrize("counts", [{"flood": 10**12}, {"flood": 10**12, "ebb": 3 - 10**12}, {"flood": 1e300}])
 def test_elements_that_did_not_come_are_not_taken_for_a_new_signal(counts: dict[str, float]) -> None:
     body = _body(Sample) | {"elements": counts}
-    with pytest.raises(MessageError) as told:
+    with pytest.raises(MessageError) as report:
         Form(Sample, ARM).write(msgpack.packb(body))
-    assert not isinstance(told.value, OtherLayout)  # it would be listed with a name for each element
+    assert not isinstance(report.value, OtherLayout)  # it would be listed with a name for each element

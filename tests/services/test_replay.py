@@ -78,8 +78,8 @@ def test_step_by_step_everything_comes_once_in_order_as_a_replay(robot: str, tmp
         session = open_session(robot, "client")
         _eventually(lambda: heard)  # a status: who listens is linked
         assert _ask(session, robot, "step", count=10)["samples"] == 10
-        told = _ask(session, robot, "describe")
-        assert told["signals"] == ARM.plain() and len(told["replay"]) == len(files) and told["robot"] == robot
+        report = _ask(session, robot, "describe")
+        assert report["signals"] == ARM.plain() and len(report["replay"]) == len(files) and report["robot"] == robot
         assert _ask(session, robot, "step", count=40)["samples"] == 50
         assert not stop.is_set()
         _ask(session, robot, "step", count=100)
@@ -127,9 +127,9 @@ def test_a_replay_is_paused_stepped_and_goes_on_from_another_place(robot: str, t
         session = open_session(robot, "client")
         _eventually(lambda: heard)
         assert _ask(session, robot, "step", count=3)["samples"] == 3
-        told = _ask(session, robot, "seek", to=2.0)
-        assert told["paused"] and told["samples"] > 3  # the other place is shown
-        assert abs(told["position"] - 2.0) < 0.2
+        report = _ask(session, robot, "seek", to=2.0)
+        assert report["paused"] and report["samples"] > 3  # the other place is shown
+        assert abs(report["position"] - 2.0) < 0.2
         _ask(session, robot, "step", count=2)
         _ask(session, robot, "seek", to=0.5)
         shown = _ask(session, robot, "pause")["samples"]

@@ -68,10 +68,10 @@ def test_a_role_is_for_its_robots(tmp_path: Path) -> None:
     assert not Member("gardener", ("*",)).may_subscribe("b", "hal/sample")
 
 
-@pytest.mark.parametrize("told", ['"viewer"', '{"role": 1, "robots": []}', '{"role": "viewer"}'])
-def test_metadata_that_says_no_role_is_told(tmp_path: Path, told: str) -> None:
+@pytest.mark.parametrize("report", ['"viewer"', '{"role": 1, "robots": []}', '{"role": "viewer"}'])
+def test_metadata_that_says_no_role_is_told(tmp_path: Path, report: str) -> None:
     file = tmp_path / "viewer.json"
-    file.write_text(f'{{"metadata": {{"gemuco": {told}}}}}')
+    file.write_text(f'{{"metadata": {{"gemuco": {report}}}}}')
     with pytest.raises(ServiceError, match=r"must be \{role: NAME, robots"):
         member_of([str(file)])
 
@@ -86,5 +86,5 @@ def test_the_documents_table_is_the_table() -> None:
         row = next(line for line in text.splitlines() if line.startswith(f"| {role.name}: "))
         cells = row.split("|")[2:5]
         for names, cell in zip((role.publishes, role.subscribes, role.asks), cells, strict=True):
-            told = set(re.findall(r"`([^`]+)`", cell)) | (set(OPEN) if "*open*" in cell else set())
-            assert told == set(names)
+            report = set(re.findall(r"`([^`]+)`", cell)) | (set(OPEN) if "*open*" in cell else set())
+            assert report == set(names)

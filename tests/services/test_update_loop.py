@@ -24,7 +24,7 @@ class Bench:
         self.clock = ManualClock()
         self.newest: Arrival[Sample] | None = None
         self.engaged = False
-        self.told: list[Update] = []
+        self.report: list[Update] = []
         self.living = LivingModel(schema or small_model())
         self.update = OnlineUpdate(
             Freshness(arm(), lambda: self.newest, self.clock),
@@ -32,7 +32,7 @@ class Bench:
             UpdateConfig(window=window, interval=interval),
             lambda schema: Updater(schema, Learning(window=window, minimum=10, batch=10)),
             lambda: self.engaged,
-            self.told.append,
+            self.report.append,
             self.clock,
         )
 
@@ -40,7 +40,7 @@ class Bench:
         self.clock.advance(0.1)
         self.newest = fresh(index, self.clock.monotonic(), silent=silent)
         self.update.tick()
-        return self.told[-1]
+        return self.report[-1]
 
 
 def test_the_window_is_bounded_and_the_oldest_go() -> None:
@@ -48,10 +48,10 @@ def test_the_window_is_bounded_and_the_oldest_go() -> None:
     bench.turn(0)
     bench.update.adapt(True)
     for index in range(1, 31):
-        told = bench.turn(index)
-    assert (told.active, told.window, told.dropped) == (True, 20, 10)
-    assert told.model_version > 0
-    assert np.isfinite(told.loss)
+        report = bench.turn(index)
+    assert (report.active, report.window, report.dropped) == (True, 20, 10)
+    assert report.model_version > 0
+    assert np.isfinite(report.loss)
 
 
 def test_a_model_is_swapped_whole_and_can_be_rolled_back() -> None:
@@ -83,7 +83,7 @@ def test_a_useless_sample_is_not_learned_from(why: str) -> None:
             bench.update.tick()
         else:
             bench.turn(0 if why == "rest" else 1, ("muscle_length.biceps",) if why == "silent" else ())
-    assert bench.told[-1].window == 0
+    assert bench.report[-1].window == 0
     assert bench.living.version == 0
 
 
@@ -133,8 +133,8 @@ def test_the_interval_is_between_samples_that_are_learned_from() -> None:
     assert bench.update.learn_normal() == 80
     bench.update.adapt(True)
     for index in range(80, 100):
-        told = bench.turn(index)
-    assert told.window == 5
+        report = bench.turn(index)
+    assert report.window == 5
 
 
 def test_learning_gives_way_and_goes_on() -> None:
@@ -146,13 +146,13 @@ def test_learning_gives_way_and_goes_on() -> None:
     for index in range(1, 15):
         bench.turn(index)
     may[0] = False
-    version, window = bench.living.version, bench.told[-1].window
+    version, window = bench.living.version, bench.report[-1].window
     for index in range(15, 20):
-        told = bench.turn(index)
-    assert (told.active, bench.living.version, bench.update.waited) == (True, version, 5)
+        report = bench.turn(index)
+    assert (report.active, bench.living.version, bench.update.waited) == (True, version, 5)
     may[0] = True
-    told = bench.turn(20)
-    assert told.window == window + 6
+    report = bench.turn(20)
+    assert report.window == window + 6
     assert bench.living.version > version
 
 

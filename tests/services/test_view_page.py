@@ -248,10 +248,10 @@ def test_a_foreign_name_for_this_machine_is_refused(robot: str):
 def test_the_link_is_printed_and_new_each_time(robot: str, capsys: pytest.CaptureFixture[str]):
     with Viewing(robot) as page:
         deadline = time.monotonic() + 10.0
-        told = ""
-        while "Ctrl-C" not in told and time.monotonic() < deadline:
-            told += capsys.readouterr().out
-    assert f"http://127.0.0.1:{page.port}/{TOKEN}  With buttons: who has this link commands the robot." in told
+        report = ""
+        while "Ctrl-C" not in report and time.monotonic() < deadline:
+            report += capsys.readouterr().out
+    assert f"http://127.0.0.1:{page.port}/{TOKEN}  With buttons: who has this link commands the robot." in report
     assert new_token() != new_token() and len(new_token()) >= 32
 
 

@@ -161,9 +161,9 @@ def test_top_and_the_recorder_show_what_is_seen(robot: str, tmp_path: Path, caps
         ):
             assert client.vision(timeout=10.0) is not None
             watch(robot, True, ())
-        told = capsys.readouterr().out
-        assert "tool_tip_position" in told
-        assert "2/2" in told
+        report = capsys.readouterr().out
+        assert "tool_tip_position" in report
+        assert "2/2" in report
     assert len(list(read(tmp_path / "seen.mcap", [keys.vision(robot)]))) > 0
 
 

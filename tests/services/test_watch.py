@@ -52,8 +52,8 @@ def test_a_lost_sensor_is_estimated_and_its_sources_are_named():
 
 
 def test_an_estimate_outside_of_what_was_learned_is_said():
-    told = msgspec_replace(estimates(True), state={"joint_position": "unknown"}, reason={"joint_position": "too far"})
-    moment = replace(seen(silent=True), estimate=Newest(told, 0.01))
+    report = msgspec_replace(estimates(True), state={"joint_position": "unknown"}, reason={"joint_position": "too far"})
+    moment = replace(seen(silent=True), estimate=Newest(report, 0.01))
     row = signal_rows(moment)[1]
     assert (row.state, row.reason) == ("unknown", "too far")
     assert Trouble(Level.DEGRADED, "Estimate unknown", "joint_position (elbow): too far.") in troubles(

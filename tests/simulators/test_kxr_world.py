@@ -189,8 +189,8 @@ def test_the_forecast_is_the_nominal_world():
     drive(world, command)
     run(world, 2.0)
     truth = world.truth()
-    for name, told in forecast(CONFIG, "short_heavy", command[None]).items():
-        assert told[0] == pytest.approx(truth[name], rel=1e-3, abs=1e-4)
+    for name, report in forecast(CONFIG, "short_heavy", command[None]).items():
+        assert report[0] == pytest.approx(truth[name], rel=1e-3, abs=1e-4)
     stiff = simulator.geometric("short_heavy", command[None])["tool_tip_position"][0]
     assert 0.02 < np.linalg.norm(stiff - truth["tool_tip_position"]) < 0.25
 

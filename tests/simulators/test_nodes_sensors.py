@@ -65,8 +65,8 @@ def test_cell_scaling_is_the_masters_to_set(b):
 
 @pytest.mark.parametrize(("tension", "status"), [(600.0, 2), (-600.0, 4), (math.nan, 1)])
 def test_cell_status_tells_what_is_not_a_measurement(b, tension, status):
-    value, told = cell_at(b, tension)
-    assert told == status
+    value, report = cell_at(b, tension)
+    assert report == status
     assert abs(value) <= 50_000
     assert cell_at(b, 10.0) == (1150, 0)
 

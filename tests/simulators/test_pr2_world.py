@@ -91,8 +91,8 @@ def test_pybullet_and_the_designers_model_agree():
         run(world, 2.0)
         truth = world.truth()
         world.close()
-        told = forecast(CONFIG, condition, truth["joint_position"][None])["tool_tip_position"]
-        assert truth["tool_tip_position"] == pytest.approx(told[0], abs=1e-5)
+        report = forecast(CONFIG, condition, truth["joint_position"][None])["tool_tip_position"]
+        assert truth["tool_tip_position"] == pytest.approx(report[0], abs=1e-5)
 
 
 def test_noise_and_errors_are_the_actual_arms_alone():

@@ -71,7 +71,7 @@ def robot(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "report"),
     [
         (f"<robot {XACRO}><xacro:macro name='a'/><link name='a'/></robot>", "is a xacro file. Convert it first"),
         ("<robot><link name='${prefix}a'/></robot>", "is a xacro file"),
@@ -94,16 +94,16 @@ def robot(tmp_path):
          "both lead to the link 'b'"),
     ],
 )  # fmt: skip
-def test_what_is_no_arm_is_refused_in_a_sentence(tmp_path, text, told):
+def test_what_is_no_arm_is_refused_in_a_sentence(tmp_path, text, report):
     with pytest.raises(ConfigError) as caught:
         choose_arm(read_tree(written(tmp_path, text)))
-    assert told in str(caught.value)
+    assert report in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
 def test_a_file_that_is_not_there_or_a_folder(tmp_path):
-    for path, told in ((tmp_path / "none.urdf", "There is no file"), (tmp_path, "is a folder")):
-        with pytest.raises(ConfigError, match=told):
+    for path, report in ((tmp_path / "none.urdf", "There is no file"), (tmp_path, "is a folder")):
+        with pytest.raises(ConfigError, match=report):
             read_tree(path)
 
 

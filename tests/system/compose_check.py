@@ -102,8 +102,8 @@ def kill(container: str) -> float:
     name = container_of(container)
     pid, image = docker("inspect", "-f", "{{.State.Pid}} {{.Image}}", name).split()
     rights = ("--pid", "host", "--network", "none", "--user", "0:0", "--cap-drop", "ALL", "--cap-add", "KILL")
-    told = docker("run", "--rm", *rights, "--entrypoint", "python", image, "-c", KILL.format(pid=pid))
-    return float(told)
+    report = docker("run", "--rm", *rights, "--entrypoint", "python", image, "-c", KILL.format(pid=pid))
+    return float(report)
 
 
 def lose(container: str, client: Client) -> dict[str, Any]:

@@ -215,7 +215,7 @@ class Stage:
         self._model = folder / "model"
         light_model.make(file, self._model)
         self.device = Watched(self._config, light_robot.LightWorld(0))
-        self.told = threading.Event()
+        self.report = threading.Event()
         self.died: list[str] = []
         self.logged: list[str] = []
         self.jobs: dict[str, threading.Thread] = {}
@@ -227,14 +227,14 @@ class Stage:
             stack.enter_context(self._watching())
             where = (f"tcp/127.0.0.1:{free_port()}",)
             stack.callback(self._end)
-            self._start("router", lambda: run_router(where, (), self.told))
+            self._start("router", lambda: run_router(where, (), self.report))
             eventually(lambda: is_served(where[0]))
             robot = Robot(self._config, [self.device], source="simulated")
             self.hal = HalService(self._config, robot, stack.enter_context(Service(self.robot, "hal", where)))
             stack.callback(self._end)  # before the HAL's session is closed
-            self._start("hal", lambda: self.hal.run(self.told))
-            self._start("model", lambda: serve.serve(self._config, self._model, where, self.told))
-            self._start("recorder", lambda: run_recorder(self.robot, self._folder / "fuzz.mcap", where, self.told))
+            self._start("hal", lambda: self.hal.run(self.report))
+            self._start("model", lambda: serve.serve(self._config, self._model, where, self.report))
+            self._start("recorder", lambda: run_recorder(self.robot, self._folder / "fuzz.mcap", where, self.report))
             self.client = stack.enter_context(Client(self.robot, where, name="who looks on"))
             self.holder = stack.enter_context(Client(self.robot, where, name="who holds"))
             eventually(lambda: self.client.alive() >= {"hal", "model", "recorder"})
@@ -303,14 +303,14 @@ class Stage:
 
     def _attachment(self, draw: random.Random, mutator: Mutator) -> bytes | None:
         """Who asks, told badly; or not at all."""
-        told = {"v": 2, "name": "fuzz", "boot": 7}
+        report = {"v": 2, "name": "fuzz", "boot": 7}
         chance = draw.random()
         if chance < 0.3:
             return None
         if chance < 0.5:
             return mutator.message("target")
         return msgpack.packb(
-            told | {draw.choice(("v", "name", "boot", "through", "hal_boot", "cycle")): mutator.value()}
+            report | {draw.choice(("v", "name", "boot", "through", "hal_boot", "cycle")): mutator.value()}
         )
 
     def _strange(self) -> None:
@@ -367,7 +367,7 @@ class Stage:
                 thread.join()
                 self.holder.disable()
         eventually(
-            lambda: self.mode() == "off", told=lambda: f"mode '{self.mode()}', {self.hal.status().facts['mode']}"
+            lambda: self.mode() == "off", report=lambda: f"mode '{self.mode()}', {self.hal.status().facts['mode']}"
         )
 
     def mode(self) -> str:
@@ -428,7 +428,7 @@ class Stage:
             logging.getLogger().removeHandler(handler)
 
     def _end(self) -> None:
-        self.told.set()
+        self.report.set()
         for job in self.jobs.values():
             job.join(PATIENCE)
 
@@ -439,10 +439,10 @@ def is_served(where: str) -> bool:
         return probe.connect_ex(("127.0.0.1", int(where.rpartition(":")[2]))) == 0
 
 
-def eventually(happened: Callable[[], bool], told: Callable[[], str] = str) -> None:
+def eventually(happened: Callable[[], bool], report: Callable[[], str] = str) -> None:
     deadline = time.monotonic() + PATIENCE
     while not happened():
-        assert time.monotonic() < deadline, f"it did not happen in time; {told()}"
+        assert time.monotonic() < deadline, f"it did not happen in time; {report()}"
         time.sleep(0.01)
 
 

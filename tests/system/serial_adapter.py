@@ -75,8 +75,8 @@ class SerialAdapter:
 
     def kernel_state(self) -> str:
         """What the kernel holds of the controller, as in `ERROR-PASSIVE`."""
-        told = subprocess.run(["ip", "-d", "link", "show", self.name], capture_output=True, text=True).stdout.split()
-        return told[told.index("can", told.index("link/can")) + 2]
+        answer = subprocess.run(["ip", "-d", "link", "show", self.name], capture_output=True, text=True).stdout.split()
+        return answer[answer.index("can", answer.index("link/can")) + 2]
 
     def _to_wire(self) -> None:
         rest = b""

@@ -61,7 +61,7 @@ def test_the_commanded_signal_moves_without_a_model(robot: str) -> None:
 
 
 def test_what_cannot_move_is_refused_before_the_drives_are_enabled(robot: str) -> None:
-    for words, told in (
+    for words, completed in (
         (("joint_position", "2"), "joint_position.elbow of 2 rad is outside of its limits, -1.5 to 1.5."),
         (("joint_position", "0", "0"), "'joint_position' has 1 elements: elbow."),
         (
@@ -73,7 +73,7 @@ def test_what_cannot_move_is_refused_before_the_drives_are_enabled(robot: str) -
     ):
         answer = ask(robot, "move", *words)
         assert answer.returncode == 1
-        assert told in answer.stderr
+        assert completed in answer.stderr
     with Client(robot) as client:
         now = client.applied(timeout=2.0)
         assert now is not None
@@ -88,6 +88,6 @@ def test_another_client_that_commands_is_named(robot: str) -> None:
 
 
 def test_enabled_drives_without_commands_are_said_to_switch_off(robot: str) -> None:
-    told = ask(robot, "enable")
-    assert told.stdout.startswith("The drives are enabled and hold their position. They switch off after 0.5 s,")
+    completed = ask(robot, "enable")
+    assert completed.stdout.startswith("The drives are enabled and hold their position. They switch off after 0.5 s,")
     assert ask(robot, "disable").stdout.startswith("The drives switch off. The mode is '")

@@ -29,8 +29,10 @@ def pair(folder: Path, near: str, far: str):
 
 def facts(channel: str) -> dict:
     """What the kernel holds of an interface."""
-    told = subprocess.run(["ip", "-j", "-d", "-s", "link", "show", channel], capture_output=True, text=True, check=True)
-    return json.loads(told.stdout)[0]
+    completed = subprocess.run(
+        ["ip", "-j", "-d", "-s", "link", "show", channel], capture_output=True, text=True, check=True
+    )
+    return json.loads(completed.stdout)[0]
 
 
 @pytest.fixture(scope="module")

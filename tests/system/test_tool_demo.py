@@ -69,9 +69,9 @@ def test_an_interrupted_demo_of_tools_leaves_no_process(tmp_path: Path, monkeypa
             assert played.poll() is None, log.read_text()
             assert time.monotonic() < deadline
             time.sleep(0.02)
-        told = log.read_text()
-        told = told[told.rindex("Processes:") : told.index("(a)")]  # the last ones, if a lower rate was needed
-        words = told.partition("remote client:")[0].partition("This machine")[0].replace(",", " ").split()
+        report = log.read_text()
+        report = report[report.rindex("Processes:") : report.index("(a)")]  # the last ones, if a lower rate was needed
+        words = report.partition("remote client:")[0].partition("This machine")[0].replace(",", " ").split()
         assert [word for word in words if word.isalpha()] == [
             "simulator", "hal", "vision", "model", "recorder", "client",
         ]  # fmt: skip

@@ -94,8 +94,8 @@ def test_robots_and_their_files_are_in_the_wheel(wheel: Path) -> None:
 @pytest.mark.long
 @pytest.mark.timeout(300)
 def test_the_wheel_collects_trains_and_plays_in_an_empty_folder(fresh: Path, tmp_path: Path) -> None:
-    told = gemuco(fresh, tmp_path, "simulate", "no_such_robot")
-    assert "Known robots: kxr_humanoid, musashi_arm, pr2_duster" in told.stderr
+    completed = gemuco(fresh, tmp_path, "simulate", "no_such_robot")
+    assert "Known robots: kxr_humanoid, musashi_arm, pr2_duster" in completed.stderr
     where = subprocess.run(
         [fresh, "-c", "import services.model.artifacts as a; print(a.SHIPPED)"],
         capture_output=True, text=True, check=True, cwd=tmp_path, env=environment(),
@@ -138,18 +138,19 @@ def test_a_missing_extra_is_named_in_one_sentence(fresh: Path, light: Path) -> N
         (("demo",), "train,sim"),
         (("view", "musashi_arm"), "view"),
     ):
-        told = subprocess.run(
+        completed = subprocess.run(
             [fresh.with_name("gemuco"), *words], capture_output=True, text=True, timeout=60, check=False, cwd=light,
             env=environment() | {"PYTHONPATH": str(light)},
         )  # fmt: skip
-        assert f"pip install 'gemuco[{extra}]'" in told.stderr, told.stderr
-        assert told.returncode == 1
-        assert len(told.stderr.strip().splitlines()) == 1
+        assert f"pip install 'gemuco[{extra}]'" in completed.stderr, completed.stderr
+        assert completed.returncode == 1
+        assert len(completed.stderr.strip().splitlines()) == 1
     code = "import gemuco\ntry: gemuco.fit\nexcept ModuleNotFoundError as error: print(error)"
-    told = subprocess.run(
+    completed = subprocess.run(
         [fresh, "-c", code], capture_output=True, text=True, timeout=60, check=False, cwd=light,
         env=environment() | {"PYTHONPATH": str(light)},
     )  # fmt: skip
     assert (
-        told.stdout.strip() == "gemuco.fit needs the package 'torch', not installed here: pip install 'gemuco[train]'."
+        completed.stdout.strip()
+        == "gemuco.fit needs the package 'torch', not installed here: pip install 'gemuco[train]'."
     )
