@@ -42,7 +42,7 @@ def test_a_robot_file_is_written_with_its_data_sheets(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "code", "completed"),
+    ("words", "code", "sentence"),
     [
         (("none.urdf",), 2, "There is no file 'none.urdf'. Is its folder right?"),
         (("arm.urdf", "--tip", "nose"), 2, "has no link 'nose'. Known links, ends of chains first: tool0"),
@@ -52,13 +52,13 @@ def test_a_robot_file_is_written_with_its_data_sheets(tmp_path: Path) -> None:
     ],
 )
 def test_what_cannot_be_is_refused_in_a_sentence(
-    tmp_path: Path, words: tuple[str, ...], code: int, completed: str
+    tmp_path: Path, words: tuple[str, ...], code: int, sentence: str
 ) -> None:
     named(tmp_path, "My Arm")
     written(tmp_path, ARM, "arm.xacro")
     answer = gemuco(tmp_path, "init", *words)
     assert answer.returncode == code
-    assert completed in answer.stderr
+    assert sentence in answer.stderr
     assert len(answer.stderr.splitlines()) == 1
     assert not list(tmp_path.glob("*.yaml"))
 
