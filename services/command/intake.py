@@ -2,7 +2,6 @@
 
 import logging
 import math
-import threading
 import time
 from collections import OrderedDict, deque
 from collections.abc import Callable
@@ -26,10 +25,14 @@ log = logging.getLogger(__name__)
 
 DEPTH = 8
 """At most this many messages of a sender wait for a tick: a bad one must not displace a good one."""
-SENDERS = 16
-"""At most this many senders have a ring of their own; the one that was silent longest loses it."""
+SENDERS = 64
+"""At most this many senders have a ring of their own; the one that was silent longest loses it to a new one."""
+NEW_SENDERS = 64
+"""At most this many senders get a ring in a tick; messages of more are only counted."""
 PER_TICK = 16
 """At most this many messages are followed in a tick, of all senders in turn, so that a flood stays short."""
+WAITING = 2048
+"""At most this many messages of a key wait for a tick, in a ring that the session fills without running Python."""
 LARGE = 1 << 14
 """Messages of more bytes than this share the ring of messages without a sender."""
 LOG_EVERY = 1.0
@@ -50,7 +53,7 @@ class Intake(Generic[M]):
 
     Attributes:
         counters: Numbers of messages that were `accepted`, `refused`, `malformed`, or dropped because their sender
-            sends too many (`flooded`).
+            sends too many (`flooded`; without those that more than `WAITING` in a tick have displaced).
     """
 
     def __init__(self, session: zenoh.Session, key: str, record: type[M], use: Callable[[M], None]) -> None:
@@ -60,10 +63,12 @@ class Intake(Generic[M]):
         self._refused_at = self._logged_at = -math.inf
         self._order = Order()
         self._rings = Rings()
-        self._subscriber = session.declare_subscriber(key, zenoh.handlers.Callback(self._rings.put, indirect=False))
+        # a callback would run for each message of a flood, and keep the interpreter from the cycle
+        self._subscriber = session.declare_subscriber(key, zenoh.handlers.RingChannel(WAITING))
 
     def take(self) -> None:
         """Follow the waiting messages; never wait, and never raise because of a message."""
+        self._collect()
         flooded = self._rings.dropped
         if flooded != self.counters["flooded"]:
             self.counters["flooded"] = flooded
@@ -72,6 +77,13 @@ class Intake(Generic[M]):
             )
         for sample in self._rings.take(PER_TICK):
             self._follow(sample)
+
+    def _collect(self) -> None:
+        handler = self._subscriber.handler
+        for _ in range(WAITING):
+            if (sample := handler.try_recv()) is None:
+                return
+            self._rings.put(sample)
 
     def _follow(self, sample: zenoh.Sample) -> None:
         try:
@@ -124,48 +136,47 @@ class Rings:
 
     Attributes:
         dropped: Number of messages that newer ones of the same sender, or other senders, have displaced.
-        kept: Sender who keeps its ring and comes first, because its last message was accepted; 0 for none.
+        kept: Sender who keeps its ring and comes first, because its last message was accepted; None before the first.
     """
 
     def __init__(self) -> None:
-        self.dropped = self.kept = 0
+        self.dropped = self._new = 0
+        self.kept: int | None = None
         self._rings: OrderedDict[int, deque[zenoh.Sample]] = OrderedDict()
-        self._lock = threading.Lock()
 
     def put(self, sample: zenoh.Sample) -> None:
-        """Add a message; called by the session's thread."""
+        """Add a message."""
         sender = 0
         if len(sample.payload) <= LARGE:
             try:
                 sender = _sender_of(sample.payload.to_bytes()).boot
             except UNREADABLE:  # the tick will count it
                 sender = 0
-        with self._lock:
-            ring = self._rings.get(sender)
-            if ring is None:
-                if len(self._rings) >= SENDERS:
-                    oldest = next(known for known in self._rings if known != self.kept)
-                    self.dropped += len(self._rings.pop(oldest))
-                ring = self._rings[sender] = deque(maxlen=DEPTH)
-            self._rings.move_to_end(sender)
-            self.dropped += len(ring) == DEPTH
-            ring.append(sample)
+        ring = self._rings.get(sender)
+        if ring is None:
+            self._new += 1
+            if self._new > NEW_SENDERS:
+                self.dropped += 1
+                return
+            if len(self._rings) >= SENDERS:
+                oldest = next(known for known in self._rings if known != self.kept)
+                self.dropped += len(self._rings.pop(oldest))
+            ring = self._rings[sender] = deque(maxlen=DEPTH)
+        self._rings.move_to_end(sender)
+        self.dropped += len(ring) == DEPTH
+        ring.append(sample)
 
     def take(self, most: int) -> list[zenoh.Sample]:
-        """Remove and return at most this number of messages, the oldest of each sender first; never waits."""
-        if not self._lock.acquire(blocking=False):  # the next tick takes them
-            return []
-        try:
-            taken: list[zenoh.Sample] = []
-            rings = self._rings
-            first = [rings[self.kept]] if self.kept in rings else []
-            waiting = [ring for ring in first + [rings[one] for one in rings if one != self.kept] if ring]
-            while waiting and len(taken) < most:
-                taken.extend(ring.popleft() for ring in waiting[: most - len(taken)])
-                waiting = [ring for ring in waiting if ring]
-            return taken
-        finally:
-            self._lock.release()
+        """Remove and return at most this number of messages, the oldest of each sender first."""
+        self._new = 0
+        taken: list[zenoh.Sample] = []
+        rings = self._rings
+        first = [rings[self.kept]] if self.kept is not None and self.kept in rings else []
+        waiting = [ring for ring in first + [rings[one] for one in rings if one != self.kept] if ring]
+        while waiting and len(taken) < most:
+            taken.extend(ring.popleft() for ring in waiting[: most - len(taken)])
+            waiting = [ring for ring in waiting if ring]
+        return taken
 
 
 class Commands:
