@@ -274,6 +274,25 @@ def test_homing_begins_from_ready_and_is_counted():
         assert drive.health().state is DeviceState.READY
 
 
+def test_a_fault_is_reset_by_rising_edges_until_it_is_gone_and_not_again():
+    with joint() as elbow:
+        elbow.state(FAULT)
+        elbow.device.reset()
+        words = [elbow.idle()[0][:5] for _ in range(9)]
+        assert words == ["80 00", *["00 00"] * 3] * 2 + ["80 00"]
+        elbow.state(DISABLED)
+        elbow.idle()
+        elbow.state(FAULT)  # a new fault is for an operator
+        assert {elbow.idle()[0][:5] for _ in range(9)} == {"00 00"}
+
+
+def test_a_fault_that_stays_is_reset_for_two_seconds():
+    with joint() as elbow:
+        elbow.state(FAULT)
+        elbow.device.reset()
+        assert [elbow.idle()[0][:5] for _ in range(300)].count("80 00") == 50
+
+
 def test_homing_that_takes_too_long_or_is_stopped_says_so():
     with joint(homing={**HOMING, "timeout": 0.5}) as elbow:
         drive = elbow.device

@@ -249,6 +249,25 @@ def test_it_is_on_in_the_robots_that_come_along(robot):
         assert np.isinf(high[place]) or bounds.high[index] > high[place]
 
 
+@pytest.mark.parametrize(
+    ("quantity", "limits", "low"),
+    [
+        ("force", {"soft_high": 200, "trip_high": 400}, -8.0),  # a wire pulls: 2 % of the load that stops
+        ("force", {"soft_high": 200}, -8.0),
+        ("force", {"trip_high": 400, "soft_high": 200, "trip_low": 0.5}, -8.0),  # this trip can act as it is
+        ("force", {"trip_high": 400, "soft_high": 200, "trip_low": -100}, -500.0),
+        ("effort", {"trip_high": 400, "soft_high": 200}, -800.0),  # a torque has two directions
+    ],
+)
+def test_the_bounds_of_a_load(monkeypatch, quantity, limits, low):
+    monkeypatch.setattr(Quantities, "served", {"position": "joint_position.elbow", quantity: "cell.elbow"})
+    config = RobotConfig.model_validate({**ONE, "limits": {**ONE["limits"], "cell": limits}})
+    bounds = possible(config, ("cell",), [Quantities(), Other()])
+    assert (bounds.low[0], bounds.high[0]) == (low, 800.0)
+    assert bounds.rate[0] == 0.25 * 400 / PERIOD / 2  # a quarter of it in two cycles
+    assert bounds.return_after[0] == 0.0
+
+
 def test_what_is_not_plausible_still_trips_the_robot():
     limits = {**LIMITS["position"], "joint_temperature": {"trip_high": 80}}
     bench = SafetyBench("position", limits=limits, signals={
