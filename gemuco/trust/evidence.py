@@ -28,7 +28,7 @@ class Evidence:
         age: Age of the most likely change [blocks].
         step: Result of the step test [standard deviations].
         is_noise: Whether noise is the strongest evidence.
-        level: Usual error of the columns that are not hidden [that of a healthy body when it was learned], a scalar.
+        level: Usual error of the columns that are not hidden [that of this body while it was healthy], a scalar.
     """
 
     ratio: np.ndarray
@@ -74,13 +74,16 @@ class Judge:
         strength = np.where(is_noise, 10.0 * noise, strength)
         hidden = list(view.hidden)
         ratio[hidden] = strength[hidden] = 0.0
-        return Evidence(ratio, strength, age, step, is_noise, _level(view))
+        return Evidence(ratio, strength, age, step, is_noise, _level(view, self.scale))
 
 
-def _level(view: View) -> float:
-    """Return the median over the columns in use of the root mean square error of the newest blocks; 0 if unknown."""
+def _level(view: View, scale: np.ndarray) -> float:
+    """Return the median over the columns in use of the root mean square error of the newest blocks; 0 if unknown.
+
+    It is in units of `scale`, the standard deviation of the errors on this body, shape (columns,).
+    """
     used = np.ones(view.z.shape[1], bool)
     used[list(view.hidden)] = False
-    z = view.z[:, used][-RECENT:]
+    z = (view.z / scale)[:, used][-RECENT:]
     z = z[np.isfinite(z).all(axis=1)]
     return float(np.median(np.sqrt(np.mean(z**2, axis=0)))) if z.size else 0.0

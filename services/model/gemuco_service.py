@@ -188,6 +188,7 @@ class GemucoService:
             self._stop_for,
             self.acquaintance.is_known,
             self._forget,
+            settings.stops,
         )
 
     def _make_loops(self) -> list[Loop]:

@@ -1,5 +1,6 @@
 """The `model` and `collect` sections of a robot file, which only the services read."""
 
+import difflib
 from typing import Annotated, Literal, TypeVar
 
 from pydantic import Field, ValidationError
@@ -116,6 +117,9 @@ class TrustSettings(Section):
     """The same for single signals: signal -> size; it replaces `size`."""
     pairs: Literal["hide", "use"] = "hide"
     """Elements that look alike: `hide` all of them, or `use` them all."""
+    stops: tuple[str, ...] | None = None
+    """Signals, or single elements such as `joint_position.elbow`, without which the robot stops and is not engaged. By
+    default the commanded signal, and limited elements of the same name."""
 
     def config(self) -> TrustConfig:
         """Return the settings for the library."""
@@ -186,6 +190,13 @@ def model_config(robot: RobotConfig) -> ModelConfig:
             raise ConfigError(
                 f"Robot '{robot.robot}': model.trust.sizes '{name}' is not a signal of the model. "
                 f"Known: {', '.join(names)}."
+            )
+    choices = [*names, *robot.element_names(names)]
+    for name in model.trust.stops or ():
+        if name not in choices:
+            raise ConfigError(
+                f"Robot '{robot.robot}': model.trust.stops '{name}' is neither a signal of the model nor one of its "
+                f"elements. Near it: {', '.join(difflib.get_close_matches(name, choices, 3, 0.0))}."
             )
     for section in ("control", "simulation"):
         part = getattr(model, section)

@@ -4,7 +4,7 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -52,6 +52,7 @@ class Trust:
         stop: Callable[[str], None] = lambda reason: None,
         is_known: Callable[[BodySchema], bool] = lambda schema: True,
         changed: Callable[[float], None] = lambda since: None,
+        stops: Iterable[str] | None = None,
     ) -> None:
         """Prepare.
 
@@ -65,6 +66,7 @@ class Trust:
             is_known: Whether a model's normal errors are known to be those of this body.
             changed: Called when other elements are hidden, with the time [s] since when samples are not to be learned
                 from.
+            stops: Signals or elements that motion needs; None for those that follow from the robot file.
         """
         self._freshness, self._schema, self._clock = freshness, schema, clock
         self._stop, self._is_known, self._changed = stop, is_known, changed
@@ -76,7 +78,7 @@ class Trust:
         place = self._place = {name: index for index, name in enumerate(self._names)}
         devices = {name: [place[e] for e in one.served if e in place] for name, one in robot.devices.items()}
         self._device = {index: name for name, indices in devices.items() for index in indices}
-        self.needed = _needed(robot, place)
+        self.needed = _needed(robot, place, stops)
         """Positions of the elements without which the robot must not move."""
         self._lock = threading.Lock()
         groups = [frozenset(indices) for indices in devices.values() if len(indices) > 1]
@@ -265,8 +267,17 @@ class Trust:
         return time.strftime("%H:%M:%S", time.localtime(wall))
 
 
-def _needed(robot: RobotConfig, place: dict[str, int]) -> frozenset[int]:
-    """Return the elements that motion needs: commanded ones, and limited ones of the same name."""
+def _needed(robot: RobotConfig, place: dict[str, int], stops: Iterable[str] | None) -> frozenset[int]:
+    """Return the elements that motion needs.
+
+    Args:
+        robot: The robot file.
+        place: Element -> position.
+        stops: Signals or elements; None for the commanded elements, and limited ones of the same name.
+    """
+    if stops is not None:
+        named = set(stops)
+        return frozenset(at for name, at in place.items() if {name, name.partition(".")[0]} & named)
     command = robot.command.signal
     moved = robot.signals[command].elements
     signals = {command, *robot.limits}

@@ -10,6 +10,7 @@ from gemuco.anomaly.healthy import learn_normal
 from gemuco.schema import BodySchema
 from gemuco.trust.config import TrustConfig
 from hal.clock import ManualClock
+from hal.errors import ConfigError
 from services.errors import BadArguments
 from services.model.estimation import Estimation, Freshness
 from services.model.model_config import model_config
@@ -48,13 +49,13 @@ def model() -> BodySchema:
 class Bench:
     """Freshness, trust and estimation on samples in hand."""
 
-    def __init__(self, config: TrustConfig | None = None) -> None:
+    def __init__(self, config: TrustConfig | None = None, stops: tuple[str, ...] | None = None) -> None:
         self.clock, self.stops, self.changes = ManualClock(), list[str](), list[float]()
         self.newest: Arrival[Sample] | None = None
         self.freshness = Freshness(arm(), lambda: self.newest, self.clock)
         self.trust = Trust(
             arm(), self.freshness, model, config or TrustConfig(), self.clock, self.stops.append,
-            changed=self.changes.append,
+            changed=self.changes.append, stops=stops,
         )  # fmt: skip
         self.published: list[Estimates] = []
         self.estimation = Estimation(self.freshness, model, self.published.append, self.clock)
@@ -123,6 +124,21 @@ def test_a_robot_stops_without_an_element_that_motion_needs() -> None:
     assert len(bench.stops) == 1, "an encoder of a joint can be estimated, and the arm goes on"
 
 
+@pytest.mark.parametrize(
+    ("stops", "stopping"), [((), []), (("joint_position.elbow_pitch",), [ELBOW]), (("joint_position",), [ELBOW])]
+)
+def test_the_robot_file_says_without_which_elements_the_robot_stops(
+    stops: tuple[str, ...], stopping: list[str]
+) -> None:
+    bench = Bench(stops=stops)
+    bench.feed(motion(1, 3)[0])
+    bench.trust.distrust("muscle_length.biceps")
+    assert not bench.stops and not bench.trust.refusal()
+    bench.trust.distrust(ELBOW)
+    assert [ELBOW in text for text in bench.stops] == [True for _ in stopping]
+    assert bool(bench.trust.refusal()) is bool(stopping)
+
+
 def test_the_line_of_an_estimate_gives_the_reason() -> None:
     reply = {
         "signal": "joint_position", "unit": "rad", "elements": ["a", "b"], "values": [1.0, 2.0], "std": [0.1, 0.0],
@@ -137,3 +153,12 @@ def test_settings_of_the_robot_file() -> None:
     robot = arm().model_copy(update={"model": arm().model | {"trust": given}})
     assert model_config(robot).trust.config() == TrustConfig(1.0, 5.0, {"muscle_tension": 8.0}, "use")
     assert model_config(arm()).trust.config() == TrustConfig()
+    assert model_config(arm()).trust.stops is None
+
+
+def test_an_unknown_element_that_is_to_stop_the_robot_is_refused() -> None:
+    robot = arm().model_copy(update={"model": arm().model | {"trust": {"stops": ["joint_position.elbow_pich"]}}})
+    with pytest.raises(
+        ConfigError, match=r"stops 'joint_position\.elbow_pich' is neither .* joint_position\.elbow_pitch"
+    ):
+        model_config(robot)
