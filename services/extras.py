@@ -13,6 +13,7 @@ EXTRAS = {
     "yourdfpy": "view",
     "pyarrow": "parquet",
     "prometheus_client": "metrics",
+    "foxglove": "foxglove",
     "joblib": "studies",
 }
 """Each of these packages is brought by this extra of pyproject.toml."""

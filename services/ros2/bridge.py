@@ -13,9 +13,9 @@ from services.process.loop import Loop
 from services.process.service import until_stopped
 from services.ros2 import messages
 from services.ros2.diagnostics import DIAGNOSTIC_ARRAY, DIAGNOSTICS, OK, WARN, diagnostics, element_status, states
-from services.ros2.frames import Frames
 from services.ros2.node import Network, Node
 from services.ros2.outgoing import Outgoing
+from services.watch.frames import Frames
 from services.watch.robot_watch import RobotWatch
 from services.watch.signal_rows import Kind, SignalRow, signal_rows
 from services.watch.snapshot import RobotSnapshot

@@ -6,10 +6,10 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from services.ros2 import messages
-from services.ros2.frames import Frames
 from services.ros2.messages import Message
 from services.ros2.names import ros_name
 from services.ros2.node import Node, Publisher
+from services.watch.frames import Frames
 from services.watch.signal_rows import Kind, SignalRow
 from services.watch.snapshot import RobotSnapshot, fresh
 

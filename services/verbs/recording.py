@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from services.verbs.verb import Connect, RobotFile, load, report_errors, robot_name, robot_path
+from services.verbs.verb import Connect, RobotFile, known_robot, load, report_errors, robot_name, robot_path, urdf_of
 
 Files = Annotated[list[Path], typer.Argument(metavar="FILE...", help="Recordings (.mcap) of one robot, in any order.")]
 
@@ -76,12 +76,35 @@ def replay(
 def export(
     files: Files,
     out: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder for the tables.")],
-    form: Annotated[str, typer.Option("--format", help="csv or parquet.")] = "csv",
+    form: Annotated[str, typer.Option("--format", help="csv, parquet or foxglove.")] = "csv",
+    urdf: Annotated[
+        Path | None, typer.Option(help="URDF for foxglove; that of the robot file of this name if not given.")
+    ] = None,
 ) -> None:
-    """Write recordings as tables: one per key, with a column per element and its unit, and a row per message."""
+    """Write recordings as tables: one per key, with a column per element and its unit, and a row per message.
+
+    The format foxglove is one file (FILE.foxglove.mcap) with the channels of `gemuco foxglove`: the robot in 3D,
+    measured and estimated values, states, log and health.
+    """
+    if form == "foxglove":
+        _export_foxglove(files, out, urdf)
+        return
     from services.recording.export import run_export
 
     run_export(files, out, form)
+
+
+def _export_foxglove(files: list[Path], out: Path, urdf: Path | None) -> None:
+    from services.foxglove.file import write_foxglove
+    from services.recording.reading import facts_of, one_robot
+    from services.watch.frames import Frames
+
+    robot = one_robot(facts_of(files))
+    config = known_robot(robot)
+    path = urdf or urdf_of(robot)
+    wires = None if config is None else config.wires
+    file, count = write_foxglove(files, out, None if path is None else Frames(path), wires)
+    typer.echo(f"{count} moments in {file}")
 
 
 def _signals(robot: str) -> Any:

@@ -12,8 +12,8 @@ import zenoh
 from services.process.router import routing
 from services.ros2 import cdr, names
 from services.ros2.bridge import run_bridge
-from services.ros2.frames import Frames
 from services.ros2.node import Network, open_session
+from services.watch.frames import Frames
 from services.wire.session import close_session
 
 

@@ -12,9 +12,9 @@ from talking_robot import TalkingRobot
 from services.process.router import routing
 from services.ros2 import cdr, names
 from services.ros2.bridge import run_bridge
-from services.ros2.frames import Frames
 from services.ros2.names import Kind, read_token
 from services.ros2.node import NameTaken, Network, Node
+from services.watch.frames import Frames
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"

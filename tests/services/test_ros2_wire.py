@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from services.ros2 import cdr, names
 from services.ros2.cdr import BadBytes
 from services.ros2.definitions import DEFINITIONS, UnknownType, type_hash
-from services.ros2.frames import Frames
 from services.ros2.names import Entity, Kind
+from services.watch.frames import Frames
 
 HASHES = {
     "sensor_msgs/msg/JointState": "a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e",

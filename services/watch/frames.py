@@ -1,4 +1,4 @@
-"""The frames of a URDF as ROS 2 transforms: one per joint, from its parent link to its child link."""
+"""The frames of a URDF as transforms: one per joint, from its parent link to its child link."""
 
 import math
 import xml.etree.ElementTree as Tree
@@ -11,7 +11,7 @@ from services.errors import ServiceError
 
 Numbers = tuple[float, ...]
 MOVING = ("revolute", "continuous", "prismatic")
-IDENTITY = (0.0, 0.0, 0.0, 1.0)
+ZERO, IDENTITY = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +47,8 @@ class Frames:
 
     Attributes:
         text: Its text, for `robot_description`.
+        joints: Its joints.
+        links: Names of its links; the first is the root.
 
     Raises:
         ServiceError: The file cannot be read, or is not a URDF.
@@ -56,24 +58,68 @@ class Frames:
         try:
             self.text = path.read_text()
             root = Tree.fromstring(self.text)
-            self._joints = [_joint(element) for element in root.findall("joint")]
+            self.joints = tuple(_joint(element) for element in root.findall("joint"))
+            names = [element.get("name", "") for element in root.findall("link")]
         except OSError as error:
             raise ServiceError(f"The URDF '{path}' cannot be read: {error.strerror}.") from None
         except (Tree.ParseError, ValueError, AttributeError) as error:
             raise ServiceError(f"The URDF '{path}' cannot be read: {error}.") from None
+        children = {joint.child for joint in self.joints}
+        self.links = tuple(sorted(dict.fromkeys(names), key=lambda link: link in children))
 
     def fixed(self) -> Iterator[dict[str, Any]]:
         """Return the transforms that never change, without a header."""
-        for joint in self._joints:
+        for joint in self.joints:
             if joint.kind == "fixed":
                 yield _transform(joint, 0.0)
 
     def moved(self, positions: Mapping[str, float]) -> Iterator[dict[str, Any]]:
         """Return the transforms of the joints whose positions [rad or m] are given, without a header."""
-        for joint in self._joints:
+        for joint in self.joints:
             source = joint.mimics or joint.name
             if joint.kind in MOVING and source in positions:
                 yield _transform(joint, joint.factor * positions[source] + joint.offset)
+
+    def carriers(self) -> dict[str, frozenset[str]]:
+        """Return link -> movable joints between the root and it, of which each has a position of its own."""
+        above = {joint.child: joint for joint in self.joints}
+        carriers: dict[str, frozenset[str]] = {}
+
+        def of(link: str) -> frozenset[str]:
+            if link not in carriers:
+                carriers[link] = frozenset()  # ends a circle of links
+                if (joint := above.get(link)) is not None:
+                    own = {joint.mimics or joint.name} if joint.kind in MOVING else set()
+                    carriers[link] = of(joint.parent) | own
+            return carriers[link]
+
+        return {link: of(link) for link in self.links}
+
+    def poses(self, positions: Mapping[str, float]) -> dict[str, tuple[Numbers, Numbers]]:
+        """Return link -> its place [m] and its rotation x, y, z, w in the frame of the root.
+
+        Args:
+            positions: Joint -> position [rad or m]; the others are at zero.
+        """
+        poses: dict[str, tuple[Numbers, Numbers]] = dict.fromkeys(self.links[:1], (ZERO, IDENTITY))
+        waiting = list(self.joints)
+        while waiting:
+            ready = [joint for joint in waiting if joint.parent in poses]
+            if not ready:
+                break  # these joints hang on no link of the tree
+            for joint in ready:
+                place, turn = poses[joint.parent]
+                source = joint.mimics or joint.name
+                own, rotation = _moved(joint, joint.factor * positions.get(source, 0.0) + joint.offset)
+                shift = _rotated(turn, own)
+                poses[joint.child] = tuple(map(sum, zip(place, shift, strict=True))), _product(turn, rotation)
+            waiting = [joint for joint in waiting if joint.child not in poses]
+        return poses
+
+    def point(self, poses: Mapping[str, tuple[Numbers, Numbers]], link: str, place: Numbers) -> Numbers:
+        """Return a point of a link's frame in the frame of the root [m], shape (3,)."""
+        origin, turn = poses[link]
+        return tuple(map(sum, zip(origin, _rotated(turn, place), strict=True)))
 
 
 def _joint(element: Tree.Element) -> Joint:
@@ -102,15 +148,21 @@ def _joint(element: Tree.Element) -> Joint:
     )
 
 
-def _transform(joint: Joint, position: float) -> dict[str, Any]:
-    """Return the transform of a joint at a position [rad or m]."""
+def _moved(joint: Joint, position: float) -> tuple[Numbers, Numbers]:
+    """Return place [m] and rotation of a joint's child in the frame of its parent at a position [rad or m]."""
     place, turn = joint.place, joint.turn
     if joint.kind == "prismatic":
-        moved = _rotated(turn, joint.axis)
-        place = tuple(at + position * step for at, step in zip(place, moved, strict=True))
-    elif joint.kind != "fixed":
+        step = _rotated(turn, joint.axis)
+        place = tuple(at + position * along for at, along in zip(place, step, strict=True))
+    elif joint.kind in MOVING:
         half = 0.5 * position
-        turn = _product(turn, (*(math.sin(half) * one for one in joint.axis), math.cos(half)))
+        turn = _product(turn, (*(math.sin(half) * part for part in joint.axis), math.cos(half)))
+    return place, turn
+
+
+def _transform(joint: Joint, position: float) -> dict[str, Any]:
+    """Return the transform of a joint at a position [rad or m]."""
+    place, turn = _moved(joint, position)
     return {
         "parent": joint.parent,
         "child_frame_id": joint.child,

@@ -1,0 +1,1 @@
+"""Robots and recordings in Foxglove."""
