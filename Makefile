@@ -15,7 +15,7 @@ wait $$beside || failed=1; cat build/clockless.log; exit $$failed
 endef
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo reproduce test test-all check format faults fuzz mutation peers bench test-socketcan test-controllers results clean test-compose wheel wheels lock test-network test-ros2 docs
+.PHONY: help setup demo reproduce test test-all check format faults fuzz mutation peers bench test-socketcan test-controllers results clean test-compose wheel wheels lock test-network test-ros2 test-lerobot docs
 
 help:            ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 18
@@ -64,11 +64,18 @@ test-controllers: $(STAMP)  ## drivers on two CAN controllers at 1 Mbit/s: can0 
 	elif [ -x "$(VMCAN)" ] && command -v qemu-system-x86_64 >/dev/null; then VMCAN_HW=1 "$(VMCAN)" -b qemu -t 580 "$(CURDIR)" $(BIN)/python -m pytest -p no:cacheprovider tests/system/test_socketcan_states.py; \
 	else echo "skipped: no controllers can0 and can1 here, and no '$(VMCAN)' with qemu-system-x86_64 to boot a machine that has them"; fi
 
+PYTHON312 ?= python3.12
+LEROBOT_HANDS := lerobot[dataset]==0.6.1 lerobot-doctor==0.2.0 lerobot-lint==0.1.1
 ROS2_HANDS := zenoh-ros2-sdk==0.1.8 rosbags==0.11.9 ros2-pyterfaces[cydr]==0.3.0 numpy==2.4.6 eclipse-zenoh==1.10.2
 
 test-ros2: $(STAMP)  ## the bridge to ROS 2 against programs of other authors, installed in build/ros2
 	@[ -x build/ros2/bin/zenoh-ros2 ] || { $(BIN)/python -m venv build/ros2 && build/ros2/bin/pip install --quiet --disable-pip-version-check $(ROS2_HANDS); }
 	$(BIN)/python -m pytest tests/ros2
+
+test-lerobot: $(STAMP)  ## the plugin and the export against LeRobot itself, installed in build/lerobot; needs Python 3.12
+	@[ -x build/lerobot/bin/lelint ] || { $(PYTHON312) -m venv build/lerobot && build/lerobot/bin/pip install --quiet --disable-pip-version-check $(LEROBOT_HANDS) .; }
+	build/lerobot/bin/pip install --quiet --disable-pip-version-check --no-deps --force-reinstall . ./integrations/lerobot
+	$(BIN)/python tests/lerobot/record_proof.py build/lerobot
 
 test-compose: $(STAMP)  ## the simulated stack in containers: up, a client, each container killed once, down; needs Docker
 	$(BIN)/python tests/system/compose_check.py

@@ -8,6 +8,7 @@ import numpy as np
 
 from gemuco.errors import DatasetError
 from services.measured.column_groups import Column
+from services.measured.lerobot_files import data_files
 from services.measured.table import Table
 from services.measured.table_files import TABLES, read_table
 from services.measured.text_style import guess_style
@@ -103,6 +104,8 @@ def _places(path: Path) -> list[Path]:
         )
     if path.is_file():
         return [path]
+    if dataset := data_files(path):
+        return dataset
     files = _tables(path)
     if not files:
         inner = sorted(place for place in path.iterdir() if place.is_dir() and _tables(place))

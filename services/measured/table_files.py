@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from gemuco.errors import DatasetError
+from services.measured.lerobot_files import without_estimates
 from services.measured.table import Table, place_of
 from services.measured.text_table import TextStyle, TextTable
 
@@ -138,4 +139,4 @@ def _parquet(path: Path) -> dict[str, np.ndarray]:
             rows = column.to_pylist()
             if rows and len({len(row) if row is not None else -1 for row in rows}) == 1:
                 columns |= _split(name, np.array(rows, float))
-    return columns
+    return without_estimates(path, columns)

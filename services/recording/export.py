@@ -149,7 +149,7 @@ def _maker(form: str) -> Callable[[Path, list[str], list[Any]], Table]:
     if form == "csv":
         return CsvTable
     if form != "parquet":
-        raise RecordingError(f"'{form}' is not a format of tables. Known formats: csv, parquet, foxglove.")
+        raise RecordingError(f"'{form}' is not a format of tables. Known formats: csv, parquet, foxglove, lerobot.")
     try:
         import pyarrow
     except ImportError:

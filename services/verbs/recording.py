@@ -76,16 +76,24 @@ def replay(
 def export(
     files: Files,
     out: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder for the tables.")],
-    form: Annotated[str, typer.Option("--format", help="csv, parquet or foxglove.")] = "csv",
+    form: Annotated[str, typer.Option("--format", help="csv, parquet, foxglove or lerobot.")] = "csv",
     urdf: Annotated[
         Path | None, typer.Option(help="URDF for foxglove; that of the robot file of this name if not given.")
     ] = None,
+    fps: Annotated[int, typer.Option(min=1, max=1000, help="Frames per second for lerobot.")] = 30,
+    task: Annotated[str, typer.Option(help="What the robot does, in words, for lerobot.")] = "move",
 ) -> None:
     """Write recordings as tables: one per key, with a column per element and its unit, and a row per message.
 
     The format foxglove is one file (FILE.foxglove.mcap) with the channels of `gemuco foxglove`: the robot in 3D,
-    measured and estimated values, states, log and health.
+    measured and estimated values, states, log and health. The format lerobot is a LeRobotDataset (v3.0) in FOLDER,
+    in which observation.estimated marks what was not measured.
     """
+    if form == "lerobot":
+        from services.lerobot.export import export_lerobot
+
+        typer.echo(str(export_lerobot(files, out, fps, task)))
+        return
     if form == "foxglove":
         _export_foxglove(files, out, urdf)
         return

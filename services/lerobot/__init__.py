@@ -1,0 +1,1 @@
+"""Recordings as datasets of LeRobot, and such datasets as measured data."""
