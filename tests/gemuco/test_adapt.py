@@ -70,6 +70,7 @@ def test_a_body_that_has_not_changed_is_left_alone(schema, arm):
         assert joint_error(adapted, arm) < 1.1 * before
 
 
+@pytest.mark.long
 def test_samples_that_teach_nothing_move_nothing(schema):
     """In pure noise no part of the list helps to predict another."""
     random = np.random.default_rng(3)

@@ -24,6 +24,7 @@ def cut(values, muscle):
 
 
 @pytest.mark.parametrize("muscle", range(5))
+@pytest.mark.long
 def test_finds_a_cut_muscle_and_blames_it(schema, arm, muscle):
     healthy, broken = arm.sample(300, 77), cut(arm.sample(300, 78), muscle)
     normal = np.array([score(schema, row).score for row in rows(healthy)])

@@ -79,6 +79,7 @@ def test_given_values_of_no_body_are_not_known(schema, arm):
     assert (judged(schema, values, "joint_position")[2] != "known").mean() > 0.9
 
 
+@pytest.mark.long
 def test_what_is_not_declared_unknown_is_right_beyond_the_learned_half_of_a_joint(arm):
     learned = arm.sample(6000, 9)
     half = learned["joint_position"][:, 1] < 0.9

@@ -43,6 +43,7 @@ def joint_error(schema, body):
     return float(np.sqrt(np.mean(miss**2)))
 
 
+@pytest.mark.long
 def test_few_samples_are_enough(simulated, tuned):
     schema, history = tuned
     before = joint_error(simulated.under("heavy"), REAL)

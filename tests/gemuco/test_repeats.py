@@ -55,6 +55,7 @@ def test_one_long_motion_is_not_grouped_with_its_own_neighbours():
     assert len(groups(repeated([Piece(0, part) for part in np.array_split(rows, 20)]))) == 20
 
 
+@pytest.mark.long
 def test_independent_samples_are_not_a_motion():
     random = np.random.default_rng(0)
     for count in (20, 250):

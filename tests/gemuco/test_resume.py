@@ -65,6 +65,7 @@ fit(two_bodies(), CONFIG, MASKS, tell, resume=sys.argv[2])
 """
 
 
+@pytest.mark.long
 def test_goes_on_after_a_kill(whole, tmp_path):
     path = tmp_path / "deep" / "training.draft"
     here = str(Path(__file__).parent)

@@ -30,6 +30,7 @@ def test_finds_the_structure_of_a_muscle_driven_arm(structure):
     assert "x_in  = joint_position, muscle_tension, muscle_length" in report
 
 
+@pytest.mark.long
 def test_measure_and_outputs_are_options(data, structure):
     options = Thresholds(out=1.0, into=1.0, measure="rmse", over="all")
     config = TrainConfig(hidden=(60, 20), latent=7, epochs=30, batch=100)
@@ -50,6 +51,7 @@ def test_says_what_is_wrong_with_thresholds(data):
         Thresholds(out=float("nan"))
 
 
+@pytest.mark.long
 def test_an_output_that_no_mask_infers_is_remarked(data):
     found = determine(data, SHORT, Thresholds(out=1.0, into=0.15))
     remark = next(r for r in found.remarks if r.startswith("'muscle_tension' is an output, but every feasible mask"))
@@ -117,6 +119,7 @@ def test_each_sample_is_judged_under_the_bias_of_its_condition():
     assert determine(data, config, Thresholds(out=0.9, into=0.9)).L_i["tip"] < 0.05
 
 
+@pytest.mark.long
 def test_more_splits_average_over_what_is_held_out(data):
     one = determine(data, SHORT, Thresholds(1.0, 1.0), splits=1)
     two = determine(data, replace(SHORT, seed=1), Thresholds(1.0, 1.0), splits=1)
@@ -165,6 +168,7 @@ def every_mask(layout: Layout) -> np.ndarray:
     return np.array([bits(m, layout.names) > 0 for m in all_masks(layout.names)])
 
 
+@pytest.mark.long
 def test_errors_of_masks_are_those_of_the_network(measured):
     layout, (errors, *_) = measured
     masks = every_mask(layout)
@@ -202,6 +206,7 @@ def test_error_of_a_mask_is_that_of_its_outputs(measured, measure, over):
 
 
 @pytest.mark.parametrize("share", [0.2, 0.4, 0.7])
+@pytest.mark.long
 def test_feasible_are_the_masks_below_the_threshold(measured, share):
     layout, errors = measured
     judge = Judge(layout.names, errors, Thresholds(1.0, 1.0))

@@ -78,6 +78,7 @@ def test_a_step_is_tested_with_its_likeness():
     assert (1, 2, 3, 5)[age[0]] == 5
 
 
+@pytest.mark.long
 def test_a_healthy_body_is_trusted(model, arm):
     for seed in range(2):
         monitor, hidden = watch(model, move(arm, 600, seed))

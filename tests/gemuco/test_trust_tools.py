@@ -73,6 +73,7 @@ def judged(model, rows, recognised=None):
 
 
 @pytest.mark.parametrize("seed", range(5))
+@pytest.mark.long
 def test_another_tool_is_named_and_no_sensor_is_hidden_for_it(model, seed):
     position = walk(500, seed)
     rows = np.r_[body(position[: CHANGE * SAMPLES], TOOLS["short"]), body(position[CHANGE * SAMPLES :], TOOLS["long"])]
@@ -82,6 +83,7 @@ def test_another_tool_is_named_and_no_sensor_is_hidden_for_it(model, seed):
 
 
 @pytest.mark.parametrize("seed", range(5))
+@pytest.mark.long
 def test_an_encoder_that_lies_is_not_taken_for_a_tool(model, seed):
     rows = body(walk(400, 20 + seed), TOOLS["short"])
     rows[CHANGE * SAMPLES :, 0] += 0.5

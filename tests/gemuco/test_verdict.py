@@ -29,6 +29,7 @@ def rows(values: dict[str, np.ndarray]) -> list[dict[str, np.ndarray]]:
     return [{name: array[i] for name, array in values.items()} for i in range(len(values["joint_position"]))]
 
 
+@pytest.mark.long
 def test_the_tool_in_use_is_normal(grips):
     found = judge(grips, rows(TOOLS[HELD].walk(10, 5)))
     assert found.kind == "normal"

@@ -155,6 +155,7 @@ def test_elimination_finds_the_signal_that_matters(monkeypatch):
     assert found.shares[:, 0] == pytest.approx([0.05, 0.05])
 
 
+@pytest.mark.long
 def test_nothing_is_refused_above_the_thresholds(data):
     found = determine(data, TINY, Thresholds(out=1e-9, into=1e-9), splits=2)
     assert found.is_poor

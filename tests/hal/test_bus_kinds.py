@@ -11,6 +11,7 @@ def kind(request):
     return request.param
 
 
+@pytest.mark.long
 def test_every_length_arrives_both_ways_and_in_order(kind):
     with both_ends(kind) as ends:
         for here, there in (ends, ends[::-1]):

@@ -85,6 +85,7 @@ def is_moving(bench):
 
 
 @pytest.mark.parametrize("way", WAYS)
+@pytest.mark.long
 def test_a_bus_that_goes_and_comes_back_while_the_robot_follows(bench, way):
     bench.enable()
     start = bench.world.length.copy()

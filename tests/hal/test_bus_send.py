@@ -118,6 +118,7 @@ def test_a_full_interface_that_makes_room_within_the_pauses_takes_the_frame(bus,
     ],
     ids=lambda error: type(error).__name__ + str(getattr(error, "error_code", "")),
 )
+@pytest.mark.long
 def test_whatever_sending_raises_is_counted_told_and_no_reason_to_wait(bus, interface, trouble):
     interface.trouble = trouble
     bus.begin()

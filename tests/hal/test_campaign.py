@@ -13,6 +13,7 @@ NAMED = {fault.name: fault for fault in LIES}
 
 
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
+@pytest.mark.long
 def test_no_rule_is_broken_by(fault):
     outcome = Run(fault, 0).play()
     assert not outcome.violated
@@ -20,12 +21,14 @@ def test_no_rule_is_broken_by(fault):
 
 
 @pytest.mark.parametrize("name", ["encoder at random places", "sensor's answer frozen", "cell with the other sign"])
+@pytest.mark.long
 def test_the_referee_sees_it_when_nothing_is_doubted(name, monkeypatch):
     monkeypatch.setattr(Plausibility, "check", lambda self, values, received, valid: valid)
     assert "stale" in Run(NAMED[name], 0).play().violated
 
 
 @pytest.mark.parametrize("name", ["drive says enabled and is off", "drive's encoder jumps 30 mm or more"])
+@pytest.mark.long
 def test_the_referee_sees_it_when_nobody_looks_whether_drives_follow(name, monkeypatch):
     monkeypatch.setattr(Following, "problem", lambda self, measured, now: "")
     assert "reaction" in Run(NAMED[name], 0).play().violated

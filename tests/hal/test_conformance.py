@@ -50,6 +50,7 @@ def test_measures_si_units_in_the_right_direction(stage):
 
 
 @every_kind
+@pytest.mark.long
 def test_what_cannot_be_is_not_measured_whatever_the_driver(stage):
     kind, name = stage.kind, f"{stage.kind.main}.one"
     bounds = stage.robot._assembler.plausibility._bounds
@@ -68,6 +69,7 @@ def test_what_cannot_be_is_not_measured_whatever_the_driver(stage):
 
 
 @every_kind
+@pytest.mark.long
 def test_silence_is_noticed_told_and_over_when_it_is_back(stage):
     stage.cycle(5)
     stage.rig.fault(f"node_silent {NAME}")
@@ -93,6 +95,7 @@ def test_silence_is_noticed_told_and_over_when_it_is_back(stage):
 
 
 @every_kind
+@pytest.mark.long
 def test_a_reboot_is_noticed_and_the_device_configured_again(stage):
     before = dict(stage.health["counters"])
     stage.rig.fault(f"node_reboot {NAME}")
@@ -142,6 +145,7 @@ def _lengths(wire, stage):
 
 
 @every_kind
+@pytest.mark.long
 def test_closing_and_opening_twice_is_safe(stage):
     device = stage.robot._devices[0]
     stage.while_time_passes(device.open)

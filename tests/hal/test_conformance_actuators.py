@@ -49,6 +49,7 @@ def let_go(stage):
 
 
 @every_actuator
+@pytest.mark.long
 def test_enabling_does_not_move_following_does_and_an_old_command_is_forgotten(stage):
     start = place(stage)
     stage.cycle(50)
@@ -90,6 +91,7 @@ def test_set_points_are_clipped_and_what_is_no_number_is_refused(stage):
 
 
 @every_actuator
+@pytest.mark.long
 def test_a_fault_ends_in_no_power_until_reset_and_enable(stage):
     stage.enable()
     forward(stage, 10)
@@ -114,6 +116,7 @@ def test_a_fault_ends_in_no_power_until_reset_and_enable(stage):
 
 
 @every_actuator
+@pytest.mark.long
 def test_a_reboot_while_enabled_ends_in_no_power(stage):
     stage.enable()
     stage.rig.fault(f"node_reboot {NAME}")

@@ -288,6 +288,7 @@ def test_too_large_a_following_error_is_the_drives_fault(joint):
 @pytest.mark.parametrize(
     ("method", "home"), [(17, -0.1), (18, 0.9), (37, 0.3), (33, None), (34, None), (1, None), (2, None)]
 )
+@pytest.mark.long
 def test_homing_finds_the_zero(joint, method, home):
     settings = {"method": method, "speed": 2.0, "slow_speed": 0.3, "acceleration": 10.0}
     bench = joint("csp", homing=settings, zero=0.0, hardware={"switches": (-0.1, 0.9)})

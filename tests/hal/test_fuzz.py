@@ -19,6 +19,7 @@ BYTES = 20_000
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=str)
+@pytest.mark.long
 def test_random_frames_raise_nothing_move_nothing_and_enable_nothing(kind):
     assert fuzz(kind, FRAMES) == FRAMES
 

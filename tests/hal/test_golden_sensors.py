@@ -108,6 +108,7 @@ def test_a_cell_maps_its_value_and_its_status(preset, entry):
         ("int16", "00 80 00", math.nan),
     ],
 )
+@pytest.mark.long
 def test_what_a_cell_tells(preset, data, newtons):
     with cell(preset=preset) as (device, puppet):
         assert report(device, puppet, data) == [pytest.approx(newtons, nan_ok=True)]
@@ -229,6 +230,7 @@ TURN = 2.0 * math.pi
         ({}, "00 08 00 00 00 00 10 00", TURN / 2),
     ],
 )
+@pytest.mark.long
 def test_positions(settings, data, angle):
     """4096 counts per turn, 16 turns; position, alarms, warnings."""
     with encoder(**settings) as (device, puppet):

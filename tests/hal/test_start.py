@@ -18,6 +18,7 @@ def forged(statusword, counts):
 
 @pytest.mark.parametrize("cycle", range(8))
 @pytest.mark.parametrize("statusword", [SWITCHED_ON, OPERATION_ENABLED])
+@pytest.mark.long
 def test_a_frame_in_the_name_of_a_drive_moves_nothing_while_it_is_enabled(bench, cycle, statusword):
     bench.cycle(3)
     before = bench.world.length.copy()

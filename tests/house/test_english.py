@@ -30,6 +30,7 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
 @pytest.mark.parametrize("path", MODULES, ids=_name)
+@pytest.mark.long
 def test_code_is_in_plain_english(path: Path) -> None:
     faults = list(code_faults(path.read_text()))
     assert not faults, "\n".join(faults)

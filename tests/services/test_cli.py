@@ -25,6 +25,7 @@ VERBS = (
 
 
 @pytest.mark.parametrize("verb", VERBS.split(", "))
+@pytest.mark.long
 def test_every_verb_explains_itself(verb: str) -> None:
     completed = gemuco(*verb.split(), "--help")
     assert completed.returncode == 0
@@ -130,6 +131,7 @@ def test_the_service_does_not_import_torch() -> None:
     assert subprocess.run([sys.executable, "-c", program], timeout=60, check=False, cwd=ROOT).returncode == 0
 
 
+@pytest.mark.long
 def test_collect_and_train_make_a_model(tmp_path: Path) -> None:
     text = (ROOT / "robots" / "musashi_arm.yaml").read_text()
     robot = tmp_path / "small_arm.yaml"

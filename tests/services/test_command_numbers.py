@@ -547,6 +547,7 @@ def test_a_lease_is_asked_of_the_hal_and_ends_a_length_after_the_request(monkeyp
     ("error", "is_lost"),
     [(NoAnswer("no answer"), False), (TooLate("late"), False), (LeaseLost("gone"), True), (ValueError("odd"), True)],
 )
+@pytest.mark.long
 def test_errors_that_end_a_lease_at_once_and_those_that_do_not(error: Exception, is_lost: bool) -> None:
     link = Link()
     with ClientLease(link, 0.6) as lease:

@@ -240,6 +240,7 @@ NASTY = {
 
 
 @pytest.mark.parametrize("verb", ["enable", "disable", "reset", "home", "tare", "lease", "release", "stop", "estop"])
+@pytest.mark.long
 def test_whatever_comes_to_a_verb_is_answered_and_only_what_stops_is_done(
     hal: Hal, anna: Client, verb: str, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -77,6 +77,7 @@ def test_a_range_is_that_of_the_robot_file_or_what_was_seen() -> None:
 
 
 @pytest.mark.parametrize(("width", "height"), [(80, 24), (160, 50)])
+@pytest.mark.long
 def test_the_view_of_a_robot_fits_its_terminal(robot: str, width: int, height: int) -> None:
     sink = io.StringIO()
     console = Console(file=sink, force_terminal=True, width=width, height=height, color_system=None)

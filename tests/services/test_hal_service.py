@@ -72,6 +72,7 @@ def test_every_cycle_is_published_with_age_and_validity(arm: Processes) -> None:
     }
 
 
+@pytest.mark.long
 def test_status_and_description_tell_what_runs(arm: Processes) -> None:
     status = arm.client.status("hal", timeout=10.0)
     assert status is not None
@@ -130,6 +131,7 @@ def test_a_killed_commander_is_followed_no_longer_than_its_time_to_live(arm: Pro
     eventually(lambda: arm.mode() == "off")
 
 
+@pytest.mark.long
 def test_bad_commands_are_counted_and_move_nothing(arm: Processes) -> None:
     before = arm.refused()
     _enable(arm)
@@ -228,6 +230,7 @@ def test_truth_comes_from_the_simulator(arm: Processes) -> None:
     assert truth.values["joint_position"].tolist() == [0.3]
 
 
+@pytest.mark.long
 def test_a_killed_hal_is_missed_at_once_and_comes_back_disabled(arm: Processes) -> None:
     _enable(arm)
     before = arm.client.next_sample()
@@ -244,6 +247,7 @@ def test_a_killed_hal_is_missed_at_once_and_comes_back_disabled(arm: Processes) 
     assert arm.mode() == "off"
 
 
+@pytest.mark.long
 def test_a_killed_simulator_makes_all_invalid_and_comes_back_without_a_restart_of_the_hal(arm: Processes) -> None:
     _enable(arm)
     boot = arm.client.describe("hal")["boot"]

@@ -102,6 +102,7 @@ def test_an_estop_answers_per_drive_and_is_latched(arm: Processes) -> None:
             arm.client.enable()
 
 
+@pytest.mark.long
 def test_gemuco_estop_says_what_every_drive_did(arm: Processes) -> None:
     with Mover(arm):
         said = _gemuco("estop", arm.robot)

@@ -1,6 +1,7 @@
 """Errors on measured signals, which widen the intervals of lost ones."""
 
 import numpy as np
+import pytest
 from arm_model import arm, fresh, sample_of, small_model, states
 from msgspec.structs import replace
 
@@ -54,6 +55,7 @@ class Bench:
         return float(abs(values[3] - truth[3])), float(std[3]), message
 
 
+@pytest.mark.long
 def test_on_the_learned_body_the_std_stays_about_as_it_is() -> None:
     bench = Bench()
     _, before, message = bench.estimate(0)
@@ -64,6 +66,7 @@ def test_on_the_learned_body_the_std_stays_about_as_it_is() -> None:
     assert 0.5 * before <= after < 2.5 * before
 
 
+@pytest.mark.long
 def test_on_another_body_the_interval_of_a_lost_joint_is_honest_and_it_is_said() -> None:
     bench = Bench(offset=0.3)
     bench.look(range(300))
@@ -79,6 +82,7 @@ def test_on_another_body_the_interval_of_a_lost_joint_is_honest_and_it_is_said()
     assert all(message.state["muscle_length"] == "known" for message in said)  # it is measured
 
 
+@pytest.mark.long
 def test_a_robot_at_rest_shows_nothing() -> None:
     bench = Bench(offset=0.3)
     for _ in range(50):

@@ -107,6 +107,7 @@ def test_rows_that_are_overwritten_meanwhile_are_left_out() -> None:
     assert ring.page(0, 40, ["joint_position"])["begin"] == ring.page(0, 40, ["joint_position"])["end"]
 
 
+@pytest.mark.long
 def test_a_reader_never_gets_a_torn_row() -> None:
     ring, done = filled(6000), threading.Event()
 

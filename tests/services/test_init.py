@@ -51,6 +51,7 @@ def test_a_robot_file_is_written_with_its_data_sheets(tmp_path: Path) -> None:
         (("arm.xacro",), 2, "is a xacro file. Convert it first: xacro arm.xacro > robot.urdf"),
     ],
 )
+@pytest.mark.long
 def test_what_cannot_be_is_refused_in_a_sentence(
     tmp_path: Path, words: tuple[str, ...], code: int, sentence: str
 ) -> None:
@@ -77,6 +78,7 @@ def test_a_folder_of_files_becomes_a_robot_file(tmp_path: Path) -> None:
     assert again.stderr == "gemuco: 'vendors.yaml' exists. Remove it, or name another file by --out.\n"
 
 
+@pytest.mark.long
 def test_an_mjcf_file_becomes_a_robot_file_with_its_urdf(tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
     from test_mjcf import SCENE

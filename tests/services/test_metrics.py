@@ -45,6 +45,7 @@ def scraped(url: str) -> dict[str, float]:
     return {line.rpartition(" ")[0]: float(line.rpartition(" ")[2]) for line in lines if not line.startswith("#")}
 
 
+@pytest.mark.long
 def test_a_lost_sensor_is_in_the_metrics_and_goes(robot: str):
     element = f'{{element="elbow",robot="{robot}",signal="joint_position"}}'
     with TalkingRobot(robot) as talking, metrics(robot) as url:

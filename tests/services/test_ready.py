@@ -5,6 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 TICKS = """
 import importlib, pkgutil
 import numpy as np
@@ -44,6 +46,7 @@ assert not new, new
 """
 
 
+@pytest.mark.long
 def test_the_ticks_of_a_service_find_everything_compiled() -> None:
     here = Path(__file__).parent
     paths = os.pathsep.join([str(here), *sys.path])

@@ -114,6 +114,7 @@ def _hears(made: Secured) -> bool:
         return False
 
 
+@pytest.mark.long
 def test_an_operator_commands_and_a_viewer_looks_on(secured: Secured) -> None:
     with Client(secured.robot, secured.role("viewer")) as viewer:
         assert viewer.sample(timeout=5.0) is not None

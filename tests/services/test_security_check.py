@@ -49,6 +49,7 @@ def test_without_any_defence_every_attack_is_told(tmp_path: Path) -> None:
     ]  # fmt: skip
 
 
+@pytest.mark.long
 def test_the_password_is_what_counts(tmp_path: Path) -> None:
     folder = made(tmp_path / "keys", "quic", "a")
 

@@ -176,6 +176,7 @@ class SlowLearner:
 
 
 @pytest.mark.parametrize("duration", [0.5e-3, 5e-3])
+@pytest.mark.long
 def test_steps_for_rare_samples_leave_most_of_a_tick_free(duration: float) -> None:
     bench = Bench()
     learner = SlowLearner(bench.living.schema, bench.clock, duration, round(1.6 / duration))

@@ -77,6 +77,7 @@ def talking(robot: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iter
         yield found
 
 
+@pytest.mark.long
 def test_the_page_shows_every_state_and_recovers(talking: TalkingRobot):
     with Viewing(talking.robot) as page, Browser(page.port, token=TOKEN) as browser:
         browser.until(lambda b: "Healthy" in b.text() and "joint_position" in b.text())

@@ -91,6 +91,7 @@ def test_a_step_goes_so_far_and_no_further(arm: Processes, teacher: Teacher):
     assert teacher.set_point == pytest.approx(np.add(start, (0.008, 0.0)), abs=1e-6)
 
 
+@pytest.mark.long
 def test_the_robot_is_let_go_when_the_page_is_closed(arm: Processes, teacher: Teacher):
     taken(arm, teacher)
     teacher.let_go("The page was closed.", OTHER)

@@ -79,6 +79,7 @@ def joint(folder: Path, sheet: str, **settings: object) -> dict:
         ),
     ],
 )
+@pytest.mark.long
 def test_a_makers_file_with_gaps_is_simulated(tmp_path: Path, name: str, text: str) -> None:
     (tmp_path / name).write_bytes(text.encode("cp1252"))
     with running(virtual(joint(tmp_path, name))) as (robot, _):

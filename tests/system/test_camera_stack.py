@@ -127,6 +127,7 @@ def test_what_the_camera_sees_and_the_hal_computes_is_measured(stack: Stack) -> 
     assert "tool_tip_position" not in hal.values
 
 
+@pytest.mark.long
 def test_without_its_camera_the_tool_tip_is_estimated_and_marked_until_it_is_back(stack: Stack) -> None:
     stack.supervisor.kill("vision")
     eventually(lambda: stack.method() == "mask")

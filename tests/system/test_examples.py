@@ -40,6 +40,7 @@ def test_lost_sensor_is_estimated() -> None:
     assert words(page) <= words(done.stdout)
 
 
+@pytest.mark.long
 def test_a_tool_that_was_never_held_is_recognised() -> None:
     done = run("another_tool.py")
     assert done.returncode == 0, done.stderr
@@ -107,6 +108,7 @@ class SmallRobot:
             self._ring.add(found, time.monotonic())
 
 
+@pytest.mark.long
 def test_estimates_are_watched_and_plotted_and_samples_read_from_the_wire(tmp_path: Path) -> None:
     robot = f"examples_{os.getpid()}"
     with SmallRobot(robot):

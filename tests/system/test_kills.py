@@ -202,6 +202,7 @@ def killed_at(line: int, work: Callable[[], None]) -> None:
 
 
 @pytest.mark.parametrize("writer", QUICK, ids=name_of)
+@pytest.mark.long
 def test_killed_at_any_line_a_writer_leaves_the_file_before_or_the_new_one(writer: Any, tmp_path: Path) -> None:
     writer.write(tmp_path, 1)
     number, line, seen = 1, 0, set()
@@ -267,6 +268,7 @@ def test_a_hundred_kills_at_random_times(writer: Any, tmp_path: Path) -> None:
     assert last > 100  # writes were finished between the kills
 
 
+@pytest.mark.long
 def test_a_recording_killed_at_any_line_is_read_up_to_its_last_commit(tmp_path: Path) -> None:
     line, killed = 0, True
     while killed:

@@ -47,6 +47,7 @@ def ask(robot: str, *words: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
 
 
+@pytest.mark.long
 def test_the_commanded_signal_moves_without_a_model(robot: str) -> None:
     for goal in ("0.4", "-0.25"):
         moved = ask(robot, "move", "joint_position", goal)
@@ -60,6 +61,7 @@ def test_the_commanded_signal_moves_without_a_model(robot: str) -> None:
             eventually(lambda client=client: (now := client.applied(timeout=0.5)) is not None and now.mode == "off")
 
 
+@pytest.mark.long
 def test_what_cannot_move_is_refused_before_the_drives_are_enabled(robot: str) -> None:
     for words, completed in (
         (("joint_position", "2"), "joint_position.elbow of 2 rad is outside of its limits, -1.5 to 1.5."),
@@ -87,6 +89,7 @@ def test_another_client_that_commands_is_named(robot: str) -> None:
         assert "anna commands this robot for another" in answer.stderr
 
 
+@pytest.mark.long
 def test_enabled_drives_without_commands_are_said_to_switch_off(robot: str) -> None:
     completed = ask(robot, "enable")
     assert completed.stdout.startswith("The drives are enabled and hold their position. They switch off after 0.5 s,")

@@ -106,6 +106,7 @@ def test_the_remote_client_of_the_front_page_moves_the_arm(stack: Stack) -> None
     eventually(lambda: stack.mode() == "off")
 
 
+@pytest.mark.long
 def test_the_arm_follows_and_stops_when_the_model_is_killed(stack: Stack) -> None:
     stack.engage()
     pose = [-0.3, -0.2, 0.1, -0.9, 0.1]
@@ -126,6 +127,7 @@ def test_the_arm_follows_and_stops_when_the_model_is_killed(stack: Stack) -> Non
 
 
 @pytest.mark.parametrize("name", ["hal", "simulator"])
+@pytest.mark.long
 def test_a_killed_process_comes_back_and_state_flows_again(stack: Stack, name: str) -> None:
     stack.supervisor.kill(name)
     eventually(lambda: stack.method() in ("none", ""))
@@ -134,6 +136,7 @@ def test_a_killed_process_comes_back_and_state_flows_again(stack: Stack, name: s
     assert stack.mode() == "off"
 
 
+@pytest.mark.long
 def test_a_client_gets_the_lease_after_somebody_engaged_by_a_query(stack: Stack) -> None:
     engaged = ask(stack, "engage")
     assert "The controller is engaged and holds joint_position." in engaged.stdout, engaged.stderr
@@ -147,6 +150,7 @@ def test_a_client_gets_the_lease_after_somebody_engaged_by_a_query(stack: Stack)
     assert idle.stdout.startswith("Nothing moves: the controller is not engaged.")
 
 
+@pytest.mark.long
 def test_a_target_is_reached_by_one_command_line(stack: Stack) -> None:
     eventually(lambda: stack.mode() == "off")
     answer = ask(stack, "move", "joint_position", "0.2", "-0.3", "0.0", "-0.9", "0.1")
