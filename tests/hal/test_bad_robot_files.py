@@ -194,6 +194,7 @@ def load_from(body):
     ],
     ids=["nested", "number", "date", "object"],
 )
+@pytest.mark.long
 def test_a_text_that_is_no_yaml_is_one_sentence(tmp_path, text, report):
     path = tmp_path / "robot.yaml"
     path.write_text(text)

@@ -313,6 +313,7 @@ def test_what_cannot_be_calibrated_is_told(config):
         subject(config, "biceps_cell", "direction")
 
 
+@pytest.mark.long
 def test_a_device_that_is_silent_is_told(config):
     with (
         pytest.raises(DeviceSilent, match="'elbow_encoder'"),

@@ -37,6 +37,7 @@ def test_every_driver_is_put_to_the_test():
 
 
 @every_kind
+@pytest.mark.long
 def test_measures_si_units_in_the_right_direction(stage):
     kind = stage.kind
     for value in (kind.value, kind.value + 0.3, kind.value - 0.5):
@@ -109,6 +110,7 @@ def test_a_reboot_is_noticed_and_the_device_configured_again(stage):
 
 
 @every_kind
+@pytest.mark.long
 def test_frames_of_another_length_or_sort_change_nothing(stage):
     draw = random.Random(1)
     wire, before = stage.wires["can0"], stage.health["counters"]["malformed"]

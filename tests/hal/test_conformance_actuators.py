@@ -75,6 +75,7 @@ def test_enabling_does_not_move_following_does_and_an_old_command_is_forgotten(s
 
 
 @every_actuator
+@pytest.mark.long
 def test_set_points_are_clipped_and_what_is_no_number_is_refused(stage):
     stage.enable()
     for bad in (math.nan, math.inf):
@@ -133,6 +134,7 @@ def test_a_reboot_while_enabled_ends_in_no_power(stage):
 
 
 @every_actuator
+@pytest.mark.long
 def test_a_quick_stop_ends_in_rest_without_power(stage):
     stage.enable()
     forward(stage, 15)
@@ -146,6 +148,7 @@ def test_a_quick_stop_ends_in_rest_without_power(stage):
 
 
 @every_actuator
+@pytest.mark.long
 def test_it_stops_by_itself_when_the_hal_falls_silent_or_says_that_it_cannot(stage):
     stage.enable()
     forward(stage, 5)

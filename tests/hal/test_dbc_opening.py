@@ -77,6 +77,7 @@ def open_wire(tmp_path):
 @pytest.mark.parametrize(
     ("answered", "requests", "identity"), [(1, 1, "dbc:node-5-1"), (2, 2, "dbc:node-5-1"), (3, 2, "")]
 )
+@pytest.mark.long
 def test_an_identity_is_requested_at_most_twice(open_wire, answered, requests, identity):
     wire = open_wire(DbcNode, {**SENSOR, "identity": IDENTITY})
     count = 0

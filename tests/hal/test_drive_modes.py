@@ -389,6 +389,7 @@ def moving(bench):
 
 
 @pytest.mark.parametrize("mode", MODES)
+@pytest.mark.long
 def test_a_drive_whose_hal_died_stops_by_itself(joint, mode):
     bench = joint(mode)
     moving(bench)

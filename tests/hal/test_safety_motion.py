@@ -35,6 +35,7 @@ def test_position_commands_keep_range_velocity_and_acceleration(wanted, each):
 
 @settings(max_examples=25, deadline=None)
 @given(wishes, st.integers(10, 90))
+@pytest.mark.long
 def test_velocity_commands_keep_velocity_acceleration_and_the_range_of_the_position(wanted, each):
     bench = SafetyBench("velocity").enable()
     before = bench.velocities

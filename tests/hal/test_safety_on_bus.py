@@ -45,6 +45,7 @@ def joint():
 
 
 @pytest.mark.parametrize(("mode", "wanted"), [("csp", 9.0), ("csp", -9.0), ("csv", 1.5), ("csv", -1.5)])
+@pytest.mark.long
 def test_whatever_is_commanded_the_motor_stays_in_its_range(joint, mode, wanted):
     bench = joint(mode)
     places = []

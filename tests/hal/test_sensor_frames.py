@@ -158,6 +158,7 @@ def test_values_during_a_fault_are_not_valid(how):
     ("status", "text"),
     [(0x00, None), (0x01, "value not valid"), (0x06, "positive overload, negative overload"), (0x10, "status 10h")],
 )
+@pytest.mark.long
 def test_a_status_in_words(status, text):
     with cell() as (device, _):
         hear(device, GOOD[:4] + bytes((status,)))
@@ -205,6 +206,7 @@ def test_the_ends_of_a_type_are_an_overload(value, kind, low, high):
     ("resolution", "bits", "high"),
     [(12, 16, 0x7FF0), (16, 16, 0x7FFF), (24, 16, 0x7FFF), (2, 16, 0x4000), (24, 32, 0x7FFFFF00), (None, 16, 0x7FFF)],
 )
+@pytest.mark.long
 def test_an_input_of_fewer_bits_is_shifted_to_the_left(resolution, bits, high):
     settings = {"eds": "eds/analog_input.eds", "gain": 1.0, "preset": f"int{bits}", "resolution": resolution}
     with driven(Cia401Input, {"force": "f.a"}, settings, INPUTS, is_open=False) as (device, _):

@@ -32,6 +32,7 @@ def test_every_verb_explains_itself(verb: str) -> None:
     assert "ROBOT" in completed.stdout
 
 
+@pytest.mark.long
 def test_the_endpoint_of_a_service_is_printed_for_programs() -> None:
     assert gemuco("endpoint", "some_arm", "hal").stdout == f"{endpoint('some_arm', 'hal')}\n"
     whole = gemuco("endpoint", "some_arm").stdout

@@ -85,6 +85,7 @@ def test_a_slow_consumer_skips_to_the_newest(client: Client, robot: str) -> None
         assert (min(after - before for before, after in itertools.pairwise(seen))) >= 25
 
 
+@pytest.mark.long
 def test_a_fast_consumer_gets_each_message_once(client: Client, robot: str) -> None:
     with Model(robot, 0.02) as model:
         live = client.anomalies(deadline=20.0)

@@ -270,6 +270,7 @@ def test_who_looks_at_everything_sets_nothing_off(hal: Hal, anna: Client) -> Non
     assert hal.body.mode == "off"
 
 
+@pytest.mark.long
 def test_whatever_comes_as_a_command_moves_nothing_and_the_cycle_turns(hal: Hal, anna: Client) -> None:
     anna.enable()
     eventually(lambda: hal.body.mode == "hold")

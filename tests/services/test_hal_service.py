@@ -119,6 +119,7 @@ with Client(sys.argv[1]) as client:
 """
 
 
+@pytest.mark.long
 def test_a_killed_commander_is_followed_no_longer_than_its_time_to_live(arm: Processes) -> None:
     commander = subprocess.Popen([sys.executable, "-c", _COMMANDER, arm.robot], stdout=subprocess.PIPE, text=True)
     assert commander.stdout is not None

@@ -149,6 +149,7 @@ def test_a_hal_that_was_frozen_moves_nothing_when_it_goes_on(arm: Processes, fro
     assert "did not turn for" in status.text
 
 
+@pytest.mark.long
 def test_the_drives_of_a_killed_hal_stop_by_themselves(arm: Processes) -> None:
     with Mover(arm):
         before = _length(arm)

@@ -248,6 +248,7 @@ def test_a_calibration_is_asked_for_and_may_be_dropped(stage: Stage, monkeypatch
     assert not list(stage.path.parent.glob("*.calibration.yaml"))
 
 
+@pytest.mark.long
 def test_what_makes_no_calibration_is_refused(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(typer, "prompt", lambda *_, **__: "")
     same = stage.calibrate("cell", "biceps_cell", "--weight", "0", "--weight", "1", "--yes")

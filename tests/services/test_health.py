@@ -140,6 +140,7 @@ def test_a_full_disk_is_logged_once_and_stops_nothing(
     assert "No heartbeat in" in caplog.text
 
 
+@pytest.mark.long
 def test_systemd_hears_of_the_start_of_life_and_of_nothing_while_stuck(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, held: threading.Event
 ) -> None:

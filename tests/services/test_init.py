@@ -64,6 +64,7 @@ def test_what_cannot_be_is_refused_in_a_sentence(
     assert not list(tmp_path.glob("*.yaml"))
 
 
+@pytest.mark.long
 def test_a_folder_of_files_becomes_a_robot_file(tmp_path: Path) -> None:
     (tmp_path / "vendors").mkdir()
     for name in ("eds/servo_drive.eds", "dbc/load_cell.dbc"):

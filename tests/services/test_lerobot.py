@@ -206,6 +206,7 @@ def plugin(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
         del sys.modules[name]
 
 
+@pytest.mark.long
 def test_the_plugin_marks_what_is_estimated_and_returns_nothing_old(robot: str, plugin: Any) -> None:
     with TalkingRobot(robot) as talking:
         arm = plugin.Gemuco(plugin.GemucoConfig(robot=robot, moves=False, timeout=20.0))

@@ -183,6 +183,7 @@ def test_the_hal_tells_what_elements_are_called(robot: str, tmp_path: Path) -> N
     assert one.form.catalogue == ARM
 
 
+@pytest.mark.long
 def test_without_anybody_who_names_them_elements_have_numbers(
     robot: str, session: zenoh.Session, tmp_path: Path
 ) -> None:

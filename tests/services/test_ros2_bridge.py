@@ -90,6 +90,7 @@ def test_messages_are_numbered_and_come_from_one_source(robot: str, network: Net
     assert all(0 <= sent - stamp < 60 * 10**9 for sent, stamp in zip(times, stamps, strict=True))
 
 
+@pytest.mark.long
 def test_tokens_describe_the_node_and_go_with_it(robot: str, network: Network, frames: Frames):
     with Listener(network) as ros, TalkingRobot(robot):
         with bridge(robot, network, frames):
@@ -117,6 +118,7 @@ def test_the_description_waits_for_late_subscribers(robot: str, network: Network
         subscriber.undeclare()
 
 
+@pytest.mark.long
 def test_humble_reads_a_key_without_a_hash(robot: str):
     with ros_network("humble") as network, Listener(network) as ros, TalkingRobot(robot):
         heard = ros.listen(f"/{robot}/joint_states", JOINT_STATE)

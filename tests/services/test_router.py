@@ -165,6 +165,7 @@ def test_a_router_ends_when_told(number: signal.Signals) -> None:
         (("--listen", "tcp/192.0.2.1:7447"), "Cannot assign requested address"),
     ],
 )
+@pytest.mark.long
 def test_a_router_that_cannot_start_says_why(endpoint: str, words: tuple[str, str], says: str) -> None:
     option, value = words
     listen, connect = ([value.format(taken=endpoint)], []) if option == "--listen" else ([], [value])

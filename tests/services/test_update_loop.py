@@ -43,6 +43,7 @@ class Bench:
         return self.report[-1]
 
 
+@pytest.mark.long
 def test_the_window_is_bounded_and_the_oldest_go() -> None:
     bench = Bench(window=20)
     bench.turn(0)

@@ -106,6 +106,7 @@ def test_buttons_ask_the_robot(talking: TalkingRobot):
         assert talking.asked == ["stop", "estop"]
 
 
+@pytest.mark.long
 def test_a_posture_is_recorded_from_the_page(talking: TalkingRobot, tmp_path: Path):
     with Viewing(talking.robot) as page, Browser(page.port, token=TOKEN) as browser:
         browser.until(lambda b: "[rad]" in b.text() and "condition" in b.labels())

@@ -141,6 +141,7 @@ def test_a_client_that_gives_up_and_short_frames_get_no_answer():
         assert b.send(0x67F, bytes(8)) == []
 
 
+@pytest.mark.long
 def test_a_process_value_read_by_sdo_is_of_now():
     with bench() as b:
         b.world.angle = 1.0

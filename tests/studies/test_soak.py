@@ -130,6 +130,7 @@ def test_without_a_sample_nothing_may_be_called_measured(stage: Stage) -> None:
     stage.until(lambda: stage.referee.baseless == 1)
 
 
+@pytest.mark.long
 def test_an_estimate_that_is_played_again_is_not_judged_twice(stage: Stage) -> None:
     stage.play(1.0, 0.0)
     stage.judged()

@@ -49,6 +49,7 @@ def test_a_tool_that_was_never_held_is_recognised() -> None:
     assert after < 30
 
 
+@pytest.mark.long
 def test_arm_moves_without_a_bus() -> None:
     pytest.importorskip("pybullet", reason="the extra 'sim' is not installed")
     done = run("move_without_bus.py")

@@ -35,6 +35,7 @@ def test_measurements_flow_from_the_wire_to_the_estimate(stack: Stack) -> None:
     assert estimate.cycle > 0
 
 
+@pytest.mark.long
 def test_a_silent_encoder_is_estimated_by_another_process_too(stack: Stack) -> None:
     stack.client.fault("sensor_silent elbow_pitch_encoder")
     eventually(lambda: stack.method() == "mask")
@@ -96,6 +97,7 @@ def test_a_second_model_service_is_refused(stack: Stack) -> None:
     assert "Traceback" not in second.stderr
 
 
+@pytest.mark.long
 def test_the_remote_client_of_the_front_page_moves_the_arm(stack: Stack) -> None:
     snippets = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
     program = snippets[1].replace('"musashi_arm"', repr(stack.robot), 1) + "            break\n"
