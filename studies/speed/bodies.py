@@ -6,6 +6,7 @@ from itertools import pairwise
 import numpy as np
 import torch
 from torch import nn
+from typing_extensions import override
 
 from gemuco.layers import Chain, Layer, Weights
 from gemuco.scaler import Scaler
@@ -63,11 +64,27 @@ def modules(schema: BodySchema) -> tuple[nn.Sequential, nn.Sequential]:
     return module(schema.weights.encoder), module(schema.weights.decoder)
 
 
+class PartTanh(nn.Module):
+    """The activation of a hidden layer whose last columns carry the linear path."""
+
+    def __init__(self, bent: int) -> None:
+        super().__init__()
+        self.bent = bent
+
+    @override
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Apply tanh to the first columns, shape (..., n)."""
+        return torch.cat([torch.tanh(x[..., : self.bent]), x[..., self.bent :]], dim=-1)
+
+
 def module(chain: Chain) -> nn.Sequential:
     """Return a chain of layers in torch."""
     parts: list[nn.Module] = []
-    for matrix, offset, activation, _ in chain:
-        linear = nn.Linear(*matrix.shape)
-        linear.weight.data, linear.bias.data = torch.from_numpy(matrix.T.copy()), torch.from_numpy(offset.copy())
-        parts += [linear] if activation == "linear" else [linear, nn.Tanh()]
+    for layer in chain:
+        linear = nn.Linear(*layer.matrix.shape)
+        linear.weight.data = torch.from_numpy(layer.matrix.T.copy())
+        linear.bias.data = torch.from_numpy(layer.offset.copy())
+        parts.append(linear)
+        if layer.bent:
+            parts.append(PartTanh(layer.bent) if layer.straight else nn.Tanh())
     return nn.Sequential(*parts)

@@ -37,12 +37,15 @@ def rows() -> Iterator[Row]:
     def by_torch() -> np.ndarray:
         measured = []
         for mask in masks:
-            gate = torch.from_numpy(np.repeat(mask, sizes).astype(np.float32))
+            through = np.repeat(mask, sizes).astype(np.float32)
+            gate, line = torch.from_numpy(through), torch.from_numpy(errors.path.map(through).astype(np.float32))
             tail = torch.from_numpy(mask.astype(np.float32))
-            squared = [
-                (network(torch.cat([part * gate, tail.expand(len(part), -1)], dim=1)) - part) ** 2
-                for part in data.split(BATCH)
-            ]
+            squared = []
+            for part in data.split(BATCH):
+                given = part * gate
+                code = given @ line[:-1] + line[-1]
+                inputs = torch.cat([given, code, tail.expand(len(part), -1)], dim=1)
+                squared.append((network(inputs) - part) ** 2)
             outputs = torch.from_numpy(np.repeat(judge.outputs & ~mask, sizes))
             measured.append(float(torch.cat(squared)[:, outputs].mean()))
         return np.array(measured)
