@@ -15,7 +15,7 @@ wait $$beside || failed=1; cat build/clockless.log; exit $$failed
 endef
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo reproduce test test-all check format faults fuzz mutation peers bench test-socketcan test-controllers results clean test-compose wheel wheels lock test-network test-ros2 test-lerobot docs
+.PHONY: help setup demo reproduce test test-all check format faults fuzz mutation peers bench test-socketcan test-controllers results clean test-compose wheel wheels lock test-network test-ros2 test-lerobot test-servos docs
 
 help:            ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 18
@@ -65,7 +65,7 @@ test-controllers: $(STAMP)  ## drivers on two CAN controllers at 1 Mbit/s: can0 
 	else echo "skipped: no controllers can0 and can1 here, and no '$(VMCAN)' with qemu-system-x86_64 to boot a machine that has them"; fi
 
 PYTHON312 ?= python3.12
-LEROBOT_HANDS := lerobot[dataset]==0.6.1 lerobot-doctor==0.2.0 lerobot-lint==0.1.1
+LEROBOT_HANDS := lerobot[dataset,feetech,dynamixel]==0.6.1 lerobot-doctor==0.2.0 lerobot-lint==0.1.1
 ROS2_HANDS := zenoh-ros2-sdk==0.1.8 rosbags==0.11.9 ros2-pyterfaces[cydr]==0.3.0 numpy==2.4.6 eclipse-zenoh==1.10.2
 
 test-ros2: $(STAMP)  ## the bridge to ROS 2 against programs of other authors, installed in build/ros2
@@ -76,6 +76,13 @@ test-lerobot: $(STAMP)  ## the plugin and the export against LeRobot itself, ins
 	@[ -x build/lerobot/bin/lelint ] || { $(PYTHON312) -m venv build/lerobot && build/lerobot/bin/pip install --quiet --disable-pip-version-check $(LEROBOT_HANDS) .; }
 	build/lerobot/bin/pip install --quiet --disable-pip-version-check --no-deps --force-reinstall . ./integrations/lerobot
 	$(BIN)/python tests/lerobot/record_proof.py build/lerobot
+
+SERVO_HANDS := feetech-servo-sdk==1.0.0 dynamixel-sdk==4.1.0 rustypot==1.13.1 damiao-motor==1.0.6 motorbridge==0.5.6
+
+test-servos: $(STAMP)  ## simulated servos and MIT drives under masters of other authors, installed in build/servos; LeRobot's if `make test-lerobot` ran
+	@[ -x build/servos/bin/motorbridge-cli ] || { $(BIN)/python -m venv build/servos && build/servos/bin/pip install --quiet --disable-pip-version-check $(SERVO_HANDS); }
+	$(BIN)/python -m pytest tests/servos
+	@if [ ! -e /sys/class/net/vcan0 ] && [ -x "$(VMCAN)" ]; then "$(VMCAN)" -t 300 "$(CURDIR)" $(BIN)/python -m pytest -p no:cacheprovider tests/servos -k motorbridge; fi
 
 test-compose: $(STAMP)  ## the simulated stack in containers: up, a client, each container killed once, down; needs Docker
 	$(BIN)/python tests/system/compose_check.py

@@ -10,16 +10,18 @@ from hal.calibration.line import Calibration
 from hal.clock import BusClock
 from hal.config import DeviceConfig, RobotConfig
 from hal.device import Device
-from hal.drivers.can_device import Place
+from hal.drivers.bus_device import Place
 from hal.errors import ConfigError
+from hal.line import SERIAL, SerialLine
 from hal.wire import budget
 from hal.wire.bus import Bus
+from hal.wire.contract import Wire
 
 
 def build(
     config: RobotConfig, clock: BusClock, calibrations: Mapping[str, Calibration] | None = None
-) -> tuple[list[Bus], list[Device]]:
-    """Build every bus and every device of a robot.
+) -> tuple[list[Wire], list[Device]]:
+    """Build every bus, every serial line and every device of a robot.
 
     Args:
         config: The robot file.
@@ -33,19 +35,38 @@ def build(
     if calibrations is None:
         calibrations = store.load(config)
     budget.check(config)
-    buses = {name: Bus(name, bus, clock) for name, bus in config.buses.items()}
+    buses: dict[str, Wire] = {
+        name: (SerialLine if bus.interface in SERIAL else Bus)(name, bus, clock) for name, bus in config.buses.items()
+    }
     devices: list[Device] = []
     for name, entry in config.devices.items():
         calibration = calibrations.get(name)
         driver, settings = registry.equipment(config, name, calibration.settings if calibration else None)
+        _check_wire(driver, config, entry, name)
         elements = _elements(driver, settings, entry, name)
         _check_units(config, driver, settings, elements, name)
         bounds = _bounds(config, elements.get(driver.commanded(settings)))
-        place = Place(
+        place: Place[Any] = Place(
             name, elements, buses[entry.bus], entry.node, config.folder, config.rates.hal, calibration, bounds
         )
         devices.append(driver(place, settings))
     return list(buses.values()), devices
+
+
+def _check_wire(driver: Any, config: RobotConfig, entry: DeviceConfig, name: str) -> None:
+    """Check that a device is on the kind of wire that it has a plug for.
+
+    Raises:
+        ConfigError: It is a servo of a serial line on a CAN bus, or the other way round.
+    """
+    interface = config.buses[entry.bus].interface
+    is_serial = getattr(driver, "IS_SERIAL", False)
+    if is_serial != (interface in SERIAL):
+        kind, wanted = ("a serial line", "serial") if is_serial else ("a CAN bus", "socketcan")
+        raise ConfigError(
+            f"Device '{name}' (driver '{config.kinds[entry.kind].driver}') is for {kind}, and the interface of bus "
+            f"'{entry.bus}' is '{interface}'. Set `interface: {wanted}`, or another bus."
+        )
 
 
 def _elements(driver: Any, settings: Any, entry: DeviceConfig, name: str) -> dict[str, str]:

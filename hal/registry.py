@@ -20,6 +20,8 @@ DRIVERS = {
     "dbc": "hal.drivers.dbc:DbcNode",
     "dbc_servo": "hal.drivers.dbc:DbcServo",
     "odrive": "hal.drivers.odrive:Odrive",
+    "feetech": "hal.drivers.serial:FeetechServo",
+    "dynamixel": "hal.drivers.serial:DynamixelServo",
 }
 
 

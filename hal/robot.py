@@ -7,6 +7,7 @@ from typing import Any, Self
 import numpy as np
 
 from hal.actuators import Actuators, find
+from hal.calibration.store import SIMULATED
 from hal.caretaker import Caretaker
 from hal.clock import BusClock, Clock, SystemClock
 from hal.config import RobotConfig
@@ -21,7 +22,7 @@ from hal.safety.limiter import Limiter
 from hal.safety.start import Start
 from hal.safety.watchdog import CommandWatchdog, CycleWatchdog, checked
 from hal.sample import Applied, Assembler, Sample
-from hal.wire.bus import Bus
+from hal.wire.contract import Wire
 
 __all__ = ["Applied", "Robot", "Sample", "open_robot"]
 
@@ -44,7 +45,7 @@ class Robot:
         self,
         config: RobotConfig,
         devices: Sequence[Device],
-        buses: Sequence[Bus] = (),
+        buses: Sequence[Wire] = (),
         clock: Clock | None = None,
         source: str = "can",
     ) -> None:
@@ -364,5 +365,5 @@ def open_robot(config: RobotConfig, clock: BusClock | None = None) -> Robot:
         ConfigError: A driver or interface is unknown, settings do not fit, or the load of a bus is too high.
     """
     buses, devices = build(config, clock := clock or SystemClock())
-    simulated = bool(config.buses) and all(bus.interface in ("hub", "virtual") for bus in config.buses.values())
+    simulated = bool(config.buses) and all(bus.interface in SIMULATED for bus in config.buses.values())
     return Robot(config, devices, buses, clock, "simulated" if simulated else "can")

@@ -14,6 +14,7 @@ EXTRAS = {
     "pyarrow": "parquet",
     "prometheus_client": "metrics",
     "foxglove": "foxglove",
+    "serial": "serial",
     "joblib": "studies",
 }
 """Each of these packages is brought by this extra of pyproject.toml."""

@@ -10,7 +10,8 @@ import can
 import numpy as np
 
 from hal.config import BusConfig, RobotConfig
-from hal.errors import BusGone
+from hal.errors import BusGone, ConfigError
+from hal.line.port import SERIAL
 from simulators.faults import TOOL_CHANGED
 from simulators.hub import HubServer
 from simulators.lies import LIES, SWAPPED, TRUE, known_lies, lie_of
@@ -18,6 +19,7 @@ from simulators.nodes.canopen.segment import Segment
 from simulators.nodes.canopen.spec import NodeSpec
 from simulators.nodes.node import SimulatedDrive, SimulatedNode
 from simulators.nodes.plant import Plant, Snapshot
+from simulators.nodes.serial.segment import LineSegment
 from simulators.world import World
 
 _log = logging.getLogger(__name__)
@@ -64,11 +66,19 @@ class Rig:
         }
         self._plant = Plant(places, Snapshot(world.time, world.measure()))
         self._servers: dict[str, HubServer] = {}
-        self._segments: dict[str, Segment] = {}
+        self._segments: dict[str, Segment | LineSegment] = {}
         for name, bus in config.buses.items():
             if bus.interface == "hub":
                 self._servers[name] = HubServer(bus.channel, bus.bitrate if bus.options.get("bit_timing") else None)
             specs = [spec for spec in hardware if spec.bus == name]
+            if bus.interface == "serial":
+                raise ConfigError(
+                    f"Bus '{name}' is a real serial line. For simulated servos set `interface: pty` and a name as "
+                    f"`channel`, such as {config.robot}_{name}."
+                )
+            if bus.interface in SERIAL:
+                self._segments[name] = LineSegment(name, specs, self._plant, bus)
+                continue
             self._segments[name] = Segment(name, specs, self._plant, _opener(bus))
         self._drives = [node for node in self._nodes().values() if isinstance(node, SimulatedDrive)]
         self._threads: list[threading.Thread] = []

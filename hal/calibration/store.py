@@ -23,7 +23,7 @@ from hal.config import RobotConfig, Section
 from hal.errors import ConfigError
 from hal.reading.mistakes import explain, parse_yaml
 
-SIMULATED = ("hub", "virtual")
+SIMULATED = ("hub", "virtual", "pty")
 """Devices on these interfaces are simulated and need no calibration."""
 KEPT = ".before"
 """A copy of the file before the last change has this suffix."""

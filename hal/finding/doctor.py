@@ -3,10 +3,12 @@
 No drive is enabled: the devices are opened, cycled for a second with their motors off, read back, and closed.
 """
 
+import os
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from enum import StrEnum
+from pathlib import Path
 
 from hal import registry
 from hal.calibration import store
@@ -14,13 +16,13 @@ from hal.calibration.line import Calibration
 from hal.clock import SystemClock
 from hal.config import BusConfig, RobotConfig
 from hal.device import Device
-from hal.drivers.can_device import CanDevice
+from hal.drivers.bus_device import BusDevice
 from hal.errors import ConfigError, HalError
 from hal.finding import link
 from hal.finding.plausible import drive_questions, position_questions
 from hal.fleet import build
 from hal.wire import budget
-from hal.wire.bus import Bus
+from hal.wire.contract import Wire
 from hal.wire.pulse import pulse
 from hal.wire.state import BusState
 
@@ -173,7 +175,7 @@ def _open(device: Device) -> str:
 
 
 def _cycle(
-    config: RobotConfig, buses: Sequence[Bus], devices: Iterable[Device], clock: SystemClock, duration: float
+    config: RobotConfig, buses: Sequence[Wire], devices: Iterable[Device], clock: SystemClock, duration: float
 ) -> tuple[float, dict[str, float]]:
     """Cycle with the motors off; return the share of complete cycles, and that of missed cycles per device."""
     period, devices = 1.0 / config.rates.hal, list(devices)
@@ -193,7 +195,7 @@ def _cycle(
         for bus in buses:
             bus.wait(start + 0.8 * period)
         if number >= 0:
-            late = [device for device in devices if isinstance(device, CanDevice) and device.missed > device.patience]
+            late = [device for device in devices if isinstance(device, BusDevice) and device.missed > device.patience]
             for device in late:
                 missed[device.name] += 1
             whole += not late
@@ -202,7 +204,7 @@ def _cycle(
     return whole / cycles, {name: count / cycles for name, count in missed.items()}
 
 
-def _buses(buses: Sequence[Bus], opened: set[str], config: RobotConfig) -> Iterator[Finding]:
+def _buses(buses: Sequence[Wire], opened: set[str], config: RobotConfig) -> Iterator[Finding]:
     planned = {bus_budget.bus: bus_budget.load for bus_budget in budget.budgets(config)}
     for bus in buses:
         what, settings = f"bus {bus.name}", config.buses[bus.name]
@@ -300,10 +302,28 @@ def check_interfaces(config: RobotConfig) -> Iterator[Finding]:
             yield warning(
                 what, "'virtual' works inside one process, for tests. For two processes use `interface: hub`."
             )
+        elif bus.interface == "serial":
+            yield from check_serial(what, bus)
+        elif bus.interface == "pty":
+            yield ok(what, f"pseudo-terminal '{bus.channel}', for simulated servos.")
         elif bus.interface == "hub":
             yield ok(what, f"hub '{bus.channel}', for simulated nodes: it has no bit rate and no errors of its own.")
         else:
             yield warning(what, f"{bus.interface} {bus.channel}: the settings of its adapter cannot be read here.")
+
+
+def check_serial(what: str, bus: BusConfig) -> Iterator[Finding]:
+    """Check that the adapter of a serial line is there, and that this user may open it."""
+    if not Path(bus.channel).exists():
+        known = ", ".join(sorted(str(p) for kind in ("ttyACM*", "ttyUSB*") for p in Path("/dev").glob(kind))) or "none"
+        yield bad(what, f"There is no '{bus.channel}'. Adapters here: {known}. Is it plugged in?")
+    elif not os.access(bus.channel, os.R_OK | os.W_OK):
+        yield bad(
+            what,
+            f"This user may not open '{bus.channel}': sudo usermod -aG dialout $USER, then log out and in again.",
+        )
+    else:
+        yield ok(what, f"Adapter '{bus.channel}' at {bus.bitrate} bit/s.")
 
 
 def check_socketcan(what: str, bus: BusConfig, state: link.Interface | None, commands: int) -> Iterator[Finding]:

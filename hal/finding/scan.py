@@ -50,7 +50,15 @@ _PROFILES = {
     419: "charger",
 }
 
-_OTHERS = {"ODrive": "servo drive (ODrive)", "MIT": "servo drive (MIT mode)", "DBC": "node of a DBC file"}
+_OTHERS = {
+    "ODrive": "servo drive (ODrive)",
+    "MIT": "servo drive (MIT mode)",
+    "DBC": "node of a DBC file",
+    "Feetech": "servo (Feetech)",
+    "Dynamixel": "servo (Dynamixel)",
+}
+_SERIAL = ("feetech", "dynamixel")
+"""Drivers of servos on a serial line; the protocol of their nodes has the same name."""
 
 
 @dataclass(slots=True)
@@ -59,7 +67,8 @@ class Node:
 
     Attributes:
         node: Node id.
-        protocol: `CANopen`, `ODrive`, `MIT`, or `DBC` for a node that only the robot file knows.
+        protocol: `CANopen`, `ODrive`, `MIT`, `Feetech`, `Dynamixel`, or `DBC` for a node that only the robot file
+            knows.
         state: NMT state in words, or other received information.
         objects: (index, sub-index) -> answer, for the objects that the node answered.
         is_doubled: Whether more than one node answers under this id.
@@ -405,6 +414,8 @@ def compare(result: Scan, config: RobotConfig) -> list[str]:
             continue
         node = nodes[number]
         if driver.startswith("cia") and node.profile is not None and str(node.profile) != driver.removeprefix("cia"):
+            differences.append(f"{place} is a {node.kind}, the robot file says {driver}.")
+        if driver in _SERIAL and node.protocol.lower() != driver:
             differences.append(f"{place} is a {node.kind}, the robot file says {driver}.")
     for node in nodes.values():
         if node.node not in devices:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from hal.clock import Clock
 from hal.config import RobotConfig
 from hal.device import Device, DeviceState
-from hal.wire.bus import Bus
+from hal.wire.contract import Wire
 from hal.wire.state import UNUSABLE
 
 log = logging.getLogger(__name__)
@@ -67,7 +67,7 @@ class EmergencyStop:
     """The stop waits at most this time [s] for the running cycle, so that the cycle sends no set-points after it."""
 
     def __init__(
-        self, config: RobotConfig, devices: Sequence[Device], buses: Sequence[Bus], clock: Clock, period: float
+        self, config: RobotConfig, devices: Sequence[Device], buses: Sequence[Wire], clock: Clock, period: float
     ) -> None:
         self.latched = ""
         self._devices = tuple(devices)

@@ -2,7 +2,7 @@
 
 Source: classic CAN (ISO 11898-1). A frame has 44 bits beside the data with an 11-bit identifier, 64 with a 29-bit
 identifier. In 34 or 54 of these bits and in the data, every fourth bit after the first may be followed by a stuff bit.
-The space between frames has 3 bits.
+The space between frames has 3 bits. On a serial line packets are counted as frames.
 """
 
 from dataclasses import dataclass
@@ -10,10 +10,14 @@ from dataclasses import dataclass
 from hal import registry
 from hal.config import RobotConfig
 from hal.errors import ConfigError
+from hal.line.port import SERIAL
 
 OWN_HEARTBEAT_RATE = 50.0
 """The HAL sends its heartbeat at this rate [Hz]. A drive stops after 0.15 s without one, and a machine under load may
 sleep for most of this time."""
+
+BITS_PER_BYTE = 10
+"""A byte on a serial line has 8 bits, a start bit and a stop bit."""
 
 
 def frame_bits(size: int, is_extended: bool = False) -> int:
@@ -64,18 +68,24 @@ def _budget(config: RobotConfig, bus: str) -> BusBudget:
     cyclic: list[int] = []
     beside = 0.0
     has_sync = False
+    is_serial = config.buses[bus].interface in SERIAL
+    states: list[int] = []
     for device, entry in config.devices.items():
         if entry.bus != bus:
             continue
         driver, settings = registry.equipment(config, device)
         has_sync |= driver.NEEDS_SYNC
+        if is_serial and driver.state is not None:
+            states.append(BITS_PER_BYTE * (2 * driver.packets.OVERHEAD + driver.state[1]))
         quantities = tuple(entry.elements) or driver.quantities(settings)[:1]
         for size, times, *extended in driver.traffic_of(settings, rate, quantities):
-            bits = frame_bits(size, any(extended))
+            bits = BITS_PER_BYTE * size if is_serial else frame_bits(size, any(extended))
             if times == rate:
                 cyclic.append(bits)
             else:
                 beside += times * bits
+    if states:  # that of one servo per cycle
+        cyclic.append(max(states))
     if has_sync:
         cyclic.append(frame_bits(0))
         beside += OWN_HEARTBEAT_RATE * frame_bits(1)

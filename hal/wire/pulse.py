@@ -6,14 +6,14 @@ from contextlib import contextmanager
 
 from hal.clock import SystemClock
 from hal.wire.budget import OWN_HEARTBEAT_RATE
-from hal.wire.bus import Bus
+from hal.wire.contract import Wire
 
 PATIENCE = 0.01
 """Nodes have this time [s] to answer a SYNC; an answer after the next SYNC would look like that of a second node."""
 
 
 @contextmanager
-def pulse(buses: Sequence[Bus]) -> Iterator[threading.Lock]:
+def pulse(buses: Sequence[Wire]) -> Iterator[threading.Lock]:
     """Send SYNC and heartbeat on open buses while the context lasts; hold the yielded lock to run own cycles."""
     lock, stopping, clock = threading.Lock(), threading.Event(), SystemClock()
 

@@ -11,7 +11,9 @@ from hal.config import BusConfig, RobotConfig
 from hal.errors import BusGone
 from hal.finding.dbc_nodes import dbc_devices
 from hal.finding.scan import EXTENDED, Node, Scan, compare, scan
+from hal.finding.serial_scan import scan_line
 from hal.finding.tap import Tap
+from hal.line import SERIAL
 from services import show
 from services.errors import AlreadyRunning
 from services.process.lock import instead_of
@@ -52,6 +54,8 @@ def _scan_all(
 
     def scan_bus(name: str) -> Scan | BusGone:
         try:
+            if buses[name].interface in SERIAL:
+                return scan_line(name, buses[name]) if ask else BusGone(f"Line '{name}' is in use: see `gemuco top`.")
             with Tap(name, buses[name]) as tap:
                 return scan(tap, listen, ask, mit, devices=devices[name])
         except BusGone as error:

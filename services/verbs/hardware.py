@@ -141,6 +141,8 @@ def dump(
 
     Sends nothing, and may run while a HAL runs.
     """
+    from hal.line import SERIAL
+    from services.errors import BadArguments
     from services.hardware.dump import DumpOptions, run_dump
 
     config, buses = _buses(robot, interface, channel, bitrate)
@@ -148,6 +150,8 @@ def dump(
         if bus not in buses:
             raise typer.BadParameter(f"There is no bus '{bus}'. Known: {', '.join(buses)}.")
         buses = {bus: buses[bus]}
+    if lines := [name for name, entry in buses.items() if entry.interface in SERIAL]:
+        raise BadArguments(f"{', '.join(lines)} is a serial line, without CAN frames. `gemuco scan` lists its servos.")
     return run_dump(buses, config, DumpOptions(node, count, seconds, summary))
 
 

@@ -93,7 +93,7 @@ def record(config: RobotConfig) -> tuple[list[Bus], list[Device], dict[str, list
         recorded[name] = list(newest.values())
         tap.shutdown()
     rig.stop()
-    return buses, devices, recorded
+    return [bus for bus in buses if isinstance(bus, Bus)], devices, recorded
 
 
 def ours(bus: Bus, devices: Sequence[CanDevice], cycle: Sequence[can.Message]) -> float:

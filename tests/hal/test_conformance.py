@@ -33,7 +33,8 @@ every_kind = pytest.mark.parametrize("stage", KINDS, ids=str, indirect=True)
 
 
 def test_every_driver_is_put_to_the_test():
-    assert {kind.driver for kind in KINDS} == set(DRIVERS)
+    on_lines = {name for name, where in DRIVERS.items() if "serial" in where}  # test_serial_servos
+    assert {kind.driver for kind in KINDS} == set(DRIVERS) - on_lines
 
 
 @every_kind

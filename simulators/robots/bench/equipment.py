@@ -13,6 +13,7 @@ from simulators.nodes.canopen.spec import CellConstants, Constants, DriveConstan
 from simulators.nodes.dbc.sensor import DbcConstants
 from simulators.nodes.mit_drive import MitConstants
 from simulators.nodes.odrive import OdriveConstants
+from simulators.nodes.serial.node import SerialConstants
 
 FULL_SCALE = {"int16": 2**15, "int32": 2**31, "float32": 10.0, "zc_sg": 10.0}
 """Preset -> reading of an analogue input at its end."""
@@ -100,6 +101,29 @@ def _odrive(settings: Any) -> Constants:
     )
 
 
+def _feetech(settings: Any) -> Constants:
+    return SerialConstants(
+        gear=settings.gear,
+        spool_radius=settings.spool_radius,
+        direction=settings.direction,
+        zero=settings.zero,
+        stall_current=2.4,
+    )
+
+
+def _dynamixel(settings: Any) -> Constants:
+    return SerialConstants(
+        "dynamixel",
+        model=settings.kind.number,
+        gear=settings.gear,
+        spool_radius=settings.spool_radius,
+        direction=settings.direction,
+        zero=settings.zero,
+        fastest=8.0,
+        has_dead_watchdog=not settings.kind.stops_alone,
+    )
+
+
 CONSTANTS: dict[str, Callable[[Any], Constants]] = {
     "cia401": _cia401,
     "cia402": _cia402,
@@ -107,6 +131,8 @@ CONSTANTS: dict[str, Callable[[Any], Constants]] = {
     "cia406": _cia406,
     "mit": _mit,
     "odrive": _odrive,
+    "feetech": _feetech,
+    "dynamixel": _dynamixel,
 }
 """Driver of `hal.registry` -> constants of its simulated counterpart: one line per kind."""
 
