@@ -22,10 +22,11 @@ _numbers = itertools.count()
 
 
 def virtual(body: dict[str, Any]) -> RobotConfig:
-    """Return the robot of a robot file, on virtual buses that no other test has."""
+    """Return the robot of a robot file, on virtual buses and pseudo-terminals that no other test has."""
     number = next(_numbers)
     for name, bus in body["buses"].items():
-        bus.update(interface="virtual", channel=f"on_bench_{os.getpid()}_{number}_{name}")
+        kind = "pty" if bus.get("interface") == "serial" else "virtual"
+        bus.update(interface=kind, channel=f"on_bench_{os.getpid()}_{number}_{name}")
     return RobotConfig.model_validate(body)
 
 
