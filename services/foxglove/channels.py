@@ -8,9 +8,11 @@ import foxglove
 from foxglove.channels import FrameTransformsChannel, JointStatesChannel, LogChannel, SceneUpdateChannel
 from foxglove.messages import JointState, JointStates, Log, LogLevel, Timestamp
 
-from services.foxglove.scene import RobotScene, Wires
+from services.foxglove.scene import RobotScene
+from services.watch.fields import element, known, tension_limits
 from services.watch.frames import Frames
 from services.watch.service_rows import Level, service_rows
+from services.watch.shapes import Wires
 from services.watch.signal_rows import Kind, SignalRow, signal_rows
 from services.watch.snapshot import RobotSnapshot, fresh
 from services.watch.trouble import HEALTHY, Trouble, troubles, verdict
@@ -29,8 +31,6 @@ ELEMENT = {
     "reason": {**TEXT, "description": "why it is hidden or doubtful"},
 }
 """An element of a signal has these fields; a number that is not known is absent, and plots show a gap."""
-INTERVAL = 1.645
-"""An estimate is within this number of std in 90 % of the cases."""
 JOINTS = {"joint_position": "position", "joint_velocity": "velocity", "joint_effort": "effort"}
 """These signals are fields of joint states."""
 SCENE_EVERY, HEALTH_EVERY = 1.0, 0.5
@@ -76,9 +76,9 @@ class RobotChannels:
         is_other = kinds != self._kinds
         if is_new or is_other:
             self._put_values(snapshot, rows, now_ns)
-        if is_other or 1e-9 * now_ns - self._scene_at >= SCENE_EVERY or (is_new and self._scene.has_wires):
+        if is_other or 1e-9 * now_ns - self._scene_at >= SCENE_EVERY or (is_new and self._scene.shapes.has_wires):
             self._scene_at = 1e-9 * now_ns
-            self._shapes.log(self._scene.update(rows, now_ns, _limits(snapshot)), log_time=now_ns)
+            self._shapes.log(self._scene.update(rows, now_ns, tension_limits(snapshot)), log_time=now_ns)
         self._put_events(snapshot, rows, now_ns)
         self._kinds = kinds
         if 1e-9 * now_ns - self._health_at >= HEALTH_EVERY:
@@ -98,7 +98,7 @@ class RobotChannels:
         return is_new
 
     def _put_values(self, snapshot: RobotSnapshot, rows: Sequence[SignalRow], now_ns: int) -> None:
-        self._scene.follow(rows)
+        self._scene.shapes.follow(rows)
         self._transforms.log(self._scene.transforms(now_ns), log_time=now_ns)
         for channel, kinds in ((self._measured, {Kind.MEASURED}), (self._estimated, {Kind.MEASURED, Kind.ESTIMATED})):
             channel.log(_joint_states([row for row in rows if row.kind in kinds], now_ns), log_time=now_ns)
@@ -174,38 +174,17 @@ def health(snapshot: RobotSnapshot, rows: Sequence[SignalRow]) -> dict[str, Any]
         "motors": snapshot.motors or "not known",
         "lease": snapshot.lease_holder,
         "anomaly": {} if judged is None else {
-            **_known({"score": judged.score, "threshold": judged.threshold}),
+            **known({"score": judged.score, "threshold": judged.threshold}),
             "kind": judged.kind, "blamed": judged.blamed,
         },
         "elements": {kind.value: sum(row.kind is kind for row in rows) for kind in Kind},
         "loops": [
-            {"name": f"{service.name}.{loop.name}", **_known({
+            {"name": f"{service.name}.{loop.name}", **known({
                 "rate": loop.rate, "wanted": loop.wanted, "late_p99": loop.p99, "skipped": float(loop.skipped),
             })}
             for service in service_rows(snapshot) if service.is_present for loop in service.loops
         ],
     }  # fmt: skip
-
-
-def element(row: SignalRow) -> dict[str, Any]:
-    """Return the fields of an element; a value that is neither measured nor estimated now is absent."""
-    is_estimated = row.kind is Kind.ESTIMATED
-    value = row.value if row.kind in (Kind.MEASURED, Kind.ESTIMATED) else math.nan
-    reach = INTERVAL * row.std
-    numbers = {
-        "value": value,
-        "measured": value if row.kind is Kind.MEASURED else math.nan,
-        "estimated": value if is_estimated else math.nan,
-        "low": value - reach if is_estimated else math.nan,
-        "high": value + reach if is_estimated else math.nan,
-        "std": row.std if is_estimated else math.nan,
-        "age": row.age,
-    }
-    return {**_known(numbers), "kind": row.kind.value, "state": row.state, "reason": row.distrust or row.reason}
-
-
-def _known(numbers: Mapping[str, float]) -> dict[str, float]:
-    return {name: number for name, number in numbers.items() if math.isfinite(number)}
 
 
 def _joint_states(rows: Iterable[SignalRow], now_ns: int) -> JointStates:
@@ -219,16 +198,6 @@ def _joint_states(rows: Iterable[SignalRow], now_ns: int) -> JointStates:
         JointState(name=name, **fields) for name, fields in joints.items() if "position" in fields or not has_positions
     ]
     return JointStates(timestamp=Timestamp(now_ns // 1_000_000_000, now_ns % 1_000_000_000), joints=states)
-
-
-def _limits(snapshot: RobotSnapshot) -> dict[str, float]:
-    """Return signal -> its `soft_high` in the HAL's description."""
-    limits = snapshot.hal.get("limits")
-    return {
-        str(signal): float(about["soft_high"])
-        for signal, about in (limits.items() if isinstance(limits, Mapping) else ())
-        if isinstance(about, Mapping) and isinstance(about.get("soft_high"), int | float) and about["soft_high"] > 0
-    }
 
 
 def _json_channel(topic: str, title: str, schema: Mapping[str, Any], context: foxglove.Context) -> foxglove.Channel:

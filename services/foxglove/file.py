@@ -7,10 +7,10 @@ import foxglove
 from gemuco.writing import PART
 from services.errors import RecordingError
 from services.foxglove.channels import RobotChannels
-from services.foxglove.scene import Wires
 from services.moments import moments
 from services.recording.reading import Paths, facts_of, one_robot
 from services.watch.frames import Frames
+from services.watch.shapes import Wires
 
 SUFFIX = ".foxglove.mcap"
 

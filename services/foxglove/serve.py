@@ -12,11 +12,11 @@ from typing_extensions import override
 
 from services.errors import ServiceError
 from services.foxglove.channels import RobotChannels
-from services.foxglove.scene import Wires
 from services.process.loop import Loop
 from services.process.service import until_stopped
 from services.watch.frames import Frames
 from services.watch.robot_watch import RobotWatch
+from services.watch.shapes import Wires
 from services.wire.session import is_loopback
 
 BACKLOG = 512

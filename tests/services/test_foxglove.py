@@ -25,12 +25,14 @@ pytest.importorskip("foxglove", reason="the extra `foxglove` is not installed")
 import foxglove
 from websockets.sync.client import connect
 
-from services.foxglove.channels import RobotChannels, element, health
+from services.foxglove.channels import RobotChannels, health
 from services.foxglove.file import write_foxglove
 from services.foxglove.layout import layout, write_layout
-from services.foxglove.scene import AMBER, BLUE, GREY, UNKNOWN, RobotScene, rod_pose
+from services.foxglove.scene import RobotScene, rod_pose
 from services.foxglove.serve import run_foxglove
+from services.watch.fields import element
 from services.watch.frames import Frames
+from services.watch.shapes import AMBER, BLUE, GREY, UNKNOWN, Shapes
 from services.watch.signal_rows import Kind, signal_rows
 from services.watch.trouble import troubles
 
@@ -178,7 +180,7 @@ def test_a_taken_port_is_one_sentence(robot: str) -> None:
 
 
 def test_links_have_the_color_of_what_is_known_of_their_joints(frames: Frames) -> None:
-    scene = RobotScene(frames)
+    scene = Shapes(frames)
     for snapshot, upper, lower in (
         (seen(), BLUE, BLUE), (seen(silent=True), BLUE, AMBER), (seen(age=3.0), UNKNOWN, UNKNOWN)
     ):  # fmt: skip
@@ -189,11 +191,11 @@ def test_links_have_the_color_of_what_is_known_of_their_joints(frames: Frames) -
 
 def test_a_joint_that_is_not_known_stays_where_it_was(frames: Frames) -> None:
     scene = RobotScene(frames)
-    scene.follow(signal_rows(seen()))
+    scene.shapes.follow(signal_rows(seen()))
     before = repr(scene.transforms(1))
-    scene.follow(signal_rows(seen(age=3.0)))
+    scene.shapes.follow(signal_rows(seen(age=3.0)))
     assert repr(scene.transforms(1)) == before
-    scene.follow(signal_rows(seen(silent=True)))
+    scene.shapes.follow(signal_rows(seen(silent=True)))
     assert repr(scene.transforms(1)) != before
 
 
