@@ -15,6 +15,7 @@ EXTRAS = {
     "prometheus_client": "metrics",
     "foxglove": "foxglove",
     "serial": "serial",
+    "rerun": "rerun",
     "joblib": "studies",
 }
 """Each of these packages is brought by this extra of pyproject.toml."""

@@ -1,4 +1,4 @@
-"""The verbs of other programs: a robot in ROS 2, in Foxglove, and its metrics for Prometheus."""
+"""The verbs of other programs: a robot in ROS 2, in Foxglove, in rerun, and its metrics for Prometheus."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -22,6 +22,7 @@ def register(app: typer.Typer) -> None:
     """Add the verbs to the command line."""
     app.command()(ros2)
     app.command()(foxglove)
+    app.command()(rerun)
     app.command()(metrics)
 
 
@@ -81,6 +82,32 @@ def foxglove(
 
     wires = None if config is None else config.wires
     run_foxglove(robot_name(robot), host, port, connect or (), frames, wires, rate)
+
+
+@report_errors
+def rerun(
+    robot: RobotFile,
+    viewer: Annotated[
+        str, typer.Option(metavar="URL", help="Viewer to send to, as `rerun` opens it.")
+    ] = "rerun+http://127.0.0.1:9876/proxy",
+    rate: Annotated[float, typer.Option(min=0.1, max=200, help="Moments per second \\[Hz].")] = 15.0,
+    urdf: Annotated[Path | None, typer.Option(help="URDF of the robot; that of the robot file if not given.")] = None,
+    connect: Connect = None,
+) -> None:
+    r"""Show a running robot in an open rerun viewer: the robot in 3D, values with their intervals, log, health.
+
+    Needs the extra packages: pip install 'gemuco\[rerun]'.
+    """
+    from services.extras import require
+    from services.watch.frames import Frames
+
+    require("rerun")
+    from services.rerun.live import run_rerun
+
+    path, config = urdf or urdf_of(robot), known_robot(robot)
+    signals = {name: unit for name, (unit, _) in _signals(robot, config, connect).items()}
+    frames = None if path is None else Frames(path)
+    run_rerun(robot_name(robot), signals, viewer, connect or (), frames, None if config is None else config.wires, rate)
 
 
 def _signals(robot: str, config: Any, connect: Any) -> dict[str, tuple[str, tuple[str, ...]]]:

@@ -76,9 +76,9 @@ def replay(
 def export(
     files: Files,
     out: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder for the tables.")],
-    form: Annotated[str, typer.Option("--format", help="csv, parquet, foxglove or lerobot.")] = "csv",
+    form: Annotated[str, typer.Option("--format", help="csv, parquet, foxglove, rerun or lerobot.")] = "csv",
     urdf: Annotated[
-        Path | None, typer.Option(help="URDF for foxglove; that of the robot file of this name if not given.")
+        Path | None, typer.Option(help="URDF for foxglove and rerun; that of the robot file of this name if not given.")
     ] = None,
     fps: Annotated[int, typer.Option(min=1, max=1000, help="Frames per second for lerobot.")] = 30,
     task: Annotated[str, typer.Option(help="What the robot does, in words, for lerobot.")] = "move",
@@ -86,32 +86,38 @@ def export(
     """Write recordings as tables: one per key, with a column per element and its unit, and a row per message.
 
     The format foxglove is one file (FILE.foxglove.mcap) with the channels of `gemuco foxglove`: the robot in 3D,
-    measured and estimated values, states, log and health. The format lerobot is a LeRobotDataset (v3.0) in FOLDER,
-    in which observation.estimated marks what was not measured.
+    measured and estimated values, states, log and health; rerun is the same for rerun (FILE.rrd). The format lerobot
+    is a LeRobotDataset (v3.0) in FOLDER, in which observation.estimated marks what was not measured.
     """
     if form == "lerobot":
         from services.lerobot.export import export_lerobot
 
         typer.echo(str(export_lerobot(files, out, fps, task)))
         return
-    if form == "foxglove":
-        _export_foxglove(files, out, urdf)
+    if form in ("foxglove", "rerun"):
+        _export_picture(form, files, out, urdf)
         return
     from services.recording.export import run_export
 
     run_export(files, out, form)
 
 
-def _export_foxglove(files: list[Path], out: Path, urdf: Path | None) -> None:
-    from services.foxglove.file import write_foxglove
+def _export_picture(form: str, files: list[Path], out: Path, urdf: Path | None) -> None:
     from services.recording.reading import facts_of, one_robot
     from services.watch.frames import Frames
 
+    if form == "foxglove":
+        from services.foxglove.file import write_foxglove as write
+    else:
+        from services.extras import require
+
+        require("rerun")
+        from services.rerun.file import write_rerun as write
     robot = one_robot(facts_of(files))
     config = known_robot(robot)
     path = urdf or urdf_of(robot)
     wires = None if config is None else config.wires
-    file, count = write_foxglove(files, out, None if path is None else Frames(path), wires)
+    file, count = write(files, out, None if path is None else Frames(path), wires)
     typer.echo(f"{count} moments in {file}")
 
 
