@@ -114,26 +114,38 @@ class LinearPath:
             return result
         moments, cross = self.moments[:, known[:, None], known], self.cross[:, known]
         whole, total = moments.sum(axis=0), cross.sum(axis=0)
-        losses = np.zeros((len(RIDGES), self.width))
-        for part, product in zip(moments, cross, strict=True):
-            lines = _regressions(whole - part, total - product)
-            losses += np.einsum("ruw,ruw->rw", lines, part @ lines - 2.0 * product)
+        # one regression without each part, and one of all parts
+        lines = _regressions(
+            np.concatenate([whole - moments, whole[None]]), np.concatenate([total - cross, total[None]])
+        )
+        without = lines[:-1]
+        losses = ((moments[:, None] @ without - 2.0 * cross[:, None]) * without).sum(axis=(0, 2))
         best = losses.argmin(axis=0)
-        result[known] = _regressions(whole, total)[best, :, np.arange(self.width)].T
+        result[known] = lines[-1][best, :, np.arange(self.width)].T
         return result
 
 
 def _regressions(moments: np.ndarray, cross: np.ndarray) -> np.ndarray:
-    """Return the regressions of all strengths, shape (strengths, n + 1, width); the last row is the constant."""
-    count = moments[-1, -1]
-    mean, center = moments[-1, :-1] / count, cross[-1] / count
-    covariance = moments[:-1, :-1] / count - np.outer(mean, mean)
-    is_alive = np.diag(covariance) > STILL
-    weight = np.where(is_alive, 1.0 / np.sqrt(np.where(is_alive, np.diag(covariance), 1.0)), 0.0)
-    values, turns = np.linalg.eigh(covariance * np.outer(weight, weight))
-    along = turns.T @ ((cross[:-1] / count - np.outer(mean, center)) * weight[:, None])
-    lines = turns @ (along / (np.maximum(values, 0.0) + RIDGES[:, None])[:, :, None]) * weight[:, None]
-    return np.concatenate([lines, (center - mean @ lines)[:, None]], axis=1)
+    """Return the regressions of all strengths on several sets of data; the last row of each is the constant.
+
+    Args:
+        moments: Sums of the products of the elements and 1, shape (sets, n + 1, n + 1).
+        cross: Sums of their products with the code, shape (sets, n + 1, width).
+
+    Returns:
+        Shape (sets, strengths, n + 1, width).
+    """
+    count = moments[:, -1:, -1:]
+    mean, center = moments[:, :-1, -1:] / count, cross[:, -1:] / count  # (sets, n, 1), (sets, 1, width)
+    covariance = moments[:, :-1, :-1] / count - mean * mean.transpose(0, 2, 1)
+    variance = np.einsum("...ii->...i", covariance)
+    is_alive = variance > STILL
+    weight = np.where(is_alive, 1.0 / np.sqrt(np.where(is_alive, variance, 1.0)), 0.0)[..., None]
+    values, turns = np.linalg.eigh(covariance * weight * weight.transpose(0, 2, 1))
+    along = turns.transpose(0, 2, 1) @ ((cross[:, :-1] / count - mean * center) * weight)
+    shrunk = along[:, None] / (np.maximum(values, 0.0)[:, None] + RIDGES[:, None])[..., None]
+    lines = (turns[:, None] @ shrunk) * weight[:, None]
+    return np.concatenate([lines, center[:, None] - mean.transpose(0, 2, 1)[:, None] @ lines], axis=2)
 
 
 def basis(x_out: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
