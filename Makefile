@@ -85,7 +85,7 @@ test-servos: $(STAMP)  ## simulated servos and MIT drives under masters of other
 	@if [ ! -e /sys/class/net/vcan0 ] && [ -x "$(VMCAN)" ]; then "$(VMCAN)" -t 300 "$(CURDIR)" $(BIN)/python -m pytest -p no:cacheprovider tests/servos -k motorbridge; fi
 
 test-rerun: $(STAMP)  ## files and live views in rerun, whose package (half a gigabyte) is put into build/rerun
-	@[ -d build/rerun/rerun ] || $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --target build/rerun rerun-sdk==0.41.0 psutil attrs
+	@[ -d build/rerun/rerun ] || $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --target build/rerun --constraint constraints.txt rerun-sdk psutil attrs
 	PYTHONPATH=build/rerun $(BIN)/python -m pytest tests/services/test_rerun.py
 
 test-compose: $(STAMP)  ## the simulated stack in containers: up, a client, each container killed once, down; needs Docker

@@ -422,6 +422,8 @@ class SerialLine:
             if request.is_dropped:
                 continue
             request.status = self._ask(port, request.packet, request.node, request.size)
+            if request.status is None:
+                port.read(self._answer_time)  # an answer that is late must not be taken for that to the next request
             request.done.set()
             return
 

@@ -6,7 +6,9 @@ from pathlib import Path
 from hal.config import BusConfig
 from hal.finding.draft.draft import Draft, draft_bus, draft_folder
 from hal.finding.scan import scan
+from hal.finding.serial_scan import scan_line
 from hal.finding.tap import Tap
+from hal.line import SERIAL
 from services.model.artifacts import SHIPPED
 
 
@@ -15,7 +17,8 @@ def draft_devices(source: Path | None, channel: str | None, bitrate: int, name: 
 
     Args:
         source: Folder with EDS, DCF and DBC files; None without one.
-        channel: Channel of SocketCAN, or `INTERFACE:CHANNEL` of python-can, to scan; None to use the folder only.
+        channel: Channel of SocketCAN, `INTERFACE:CHANNEL` of python-can, or `serial:/dev/ttyACM0` for a line of servos,
+            to scan; None to use the folder only.
         bitrate: Bit rate of the bus [bit/s].
         name: Name of the robot; None for that of the robot file.
         file: Robot file to be written.
@@ -31,8 +34,11 @@ def draft_devices(source: Path | None, channel: str | None, bitrate: int, name: 
     interface, colon, place = channel.rpartition(":")
     bus = BusConfig(interface=interface if colon else "socketcan", channel=place, bitrate=bitrate)
     label = re.sub(r"\W+", "_", Path(place).name) or "can0"
-    with Tap(label, bus) as tap:
-        result = scan(tap)
+    if bus.interface in SERIAL:
+        result = scan_line(label, bus)
+    else:
+        with Tap(label, bus) as tap:
+            result = scan(tap)
     real = f"interface: {bus.interface}, channel: {place}"
     return draft_bus(result, real, bitrate, source, robot, file.parent, SHIPPED)
 

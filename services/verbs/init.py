@@ -34,7 +34,10 @@ def init(
     ] = None,
     scan: Annotated[
         str | None,
-        typer.Option(metavar="CHANNEL", help="Use the nodes on this bus: can0 of SocketCAN, or INTERFACE:CHANNEL."),
+        typer.Option(
+            metavar="CHANNEL",
+            help="Use the nodes on this bus: can0 of SocketCAN, INTERFACE:CHANNEL, or serial:/dev/ttyACM0.",
+        ),
     ] = None,
     bitrate: Annotated[int, typer.Option(min=10_000, help="Bit rate of the scanned bus \\[bit/s].")] = 1_000_000,
     ros2: Annotated[bool, typer.Option("--ros2", help="Draft the file from the topics of a ROS 2 network.")] = False,

@@ -10,18 +10,21 @@ import tty
 
 import numpy as np
 import pytest
+import yaml
 from serial_bench import NAMES, SETTINGS, SerialBench, path, robot_file
 
 from hal.clock import SystemClock
-from hal.config import BusConfig
+from hal.config import BusConfig, RobotConfig
 from hal.errors import BusGone, CommandRefused, ConfigError
 from hal.finding.doctor import Severity, check_devices, check_interfaces
+from hal.finding.draft.draft import draft_bus
 from hal.finding.scan import compare
 from hal.finding.serial_scan import scan_line
 from hal.fleet import build
 from hal.line import SerialLine
 from hal.registry import DRIVERS
 from hal.robot import open_robot
+from simulators.robots.bench import simulator
 
 by_make = pytest.mark.parametrize("make", SETTINGS)
 GOAL = np.array([0.5, -0.4, 0.3])
@@ -471,3 +474,34 @@ def test_the_doctor_names_the_adapters_that_are_there():
     (finding,) = check_interfaces(config)
     assert finding.verdict is Severity.BAD
     assert finding.text.startswith("There is no '/dev/ttyNONE'. Adapters here: ")
+
+
+@by_make
+@pytest.mark.long
+def test_a_scan_becomes_a_robot_file_that_runs(make, tmp_path):
+    bench = SerialBench(make, robot_file(make))
+    bench.plug()
+    try:
+        result = scan_line("arm", bench.config.buses["arm"])
+    finally:
+        bench.unplug()
+    draft = draft_bus(result, "interface: serial, channel: /dev/ttyACM0", 1_000_000, None, "mine", tmp_path, tmp_path)
+    body = yaml.safe_load(draft.text)
+    assert body["buses"]["arm"]["interface"] == "pty"
+    body["buses"]["arm"]["channel"] = str(tmp_path / "line")
+    config = RobotConfig.model_validate(body)
+    rig = simulator.rig(config, "bench", 0)
+    rig.start()
+    try:
+        with open_robot(config) as robot:
+            end = time.monotonic() + 20.0
+            while time.monotonic() < end:
+                sample, _ = robot.cycle()
+                if sample.complete and all(valid.all() for valid in sample.valid.values()):
+                    break
+                time.sleep(robot.period)
+            assert {device["state"] for device in robot.health()["devices"].values()} == {"ready"}
+    finally:
+        rig.stop()
+    if make == "feetech":
+        assert len(draft.notes) == 1 and "no watchdog" in draft.notes[0]

@@ -8,6 +8,7 @@ from pathlib import Path
 from hal.errors import ConfigError
 from hal.finding.draft import dbc_parts, sheets
 from hal.finding.draft.parts import Measure, Names, Part
+from hal.finding.draft.servo_parts import servo_part
 from hal.finding.draft.sheets import FIRST_NODES, PROFILES, Sheet
 from hal.finding.draft.text import robot_text
 from hal.finding.scan import Node, Scan
@@ -227,6 +228,11 @@ def _add_node(work: _Draughtsman, node: Node, known: Sequence[Sheet]) -> None:
                 path, work.names, node.node, f"ODrive, node {node.node}", work.moved, f"axis_{node.node}"
             )
         )
+        return
+    if node.protocol in ("Feetech", "Dynamixel"):
+        if (servo := servo_part(node, work.names, work.notes)) is not None:
+            work.nodes.add(node.node)
+            work.parts.append(servo)
         return
     label = f"node {node.node}" + (f" '{node.text(0x1008)}'" if node.text(0x1008) else "")
     if node.protocol == "MIT":

@@ -25,7 +25,7 @@ rates: {{hal: 100, estimation: 100, control: 25, anomaly: 25, update: 5}}
 
 # From the bench to real hardware: {real}
 buses:
-  {bus}: {{interface: hub, channel: {robot}_{bus}, bitrate: {bitrate}}}
+  {bus}: {{interface: {simulated}, channel: {robot}_{bus}, bitrate: {bitrate}}}
 
 kinds:
 {kinds}
@@ -58,6 +58,7 @@ def robot_text(
         signals="".join(_signals(parts)),
         command=next(part.measures[0].signal for part in parts if part.is_drive),
         real=real,
+        simulated="pty" if real.startswith(("interface: serial", "interface: pty")) else "hub",
         bus=bus,
         bitrate=bitrate,
         kinds="".join(_kind(part) for part in parts),
