@@ -15,7 +15,7 @@ wait $$beside || failed=1; cat build/clockless.log; exit $$failed
 endef
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo reproduce test test-all check format faults fuzz mutation peers bench test-socketcan test-controllers results clean test-compose wheel wheels lock test-network test-ros2 test-lerobot test-servos test-rerun docs
+.PHONY: help setup demo reproduce test test-all check format faults fuzz mutation peers bench test-socketcan test-controllers results clean test-compose wheel wheels lock test-network test-ros2 test-lerobot test-servos test-foxglove test-rerun docs
 
 help:            ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 18
@@ -83,6 +83,10 @@ test-servos: $(STAMP)  ## simulated servos and MIT drives under masters of other
 	@[ -x build/servos/bin/motorbridge-cli ] || { $(BIN)/python -m venv build/servos && build/servos/bin/pip install --quiet --disable-pip-version-check $(SERVO_HANDS); }
 	$(BIN)/python -m pytest tests/servos
 	@if [ ! -e /sys/class/net/vcan0 ] && [ -x "$(VMCAN)" ]; then "$(VMCAN)" -t 300 "$(CURDIR)" $(BIN)/python -m pytest -p no:cacheprovider tests/servos -k motorbridge; fi
+
+test-foxglove: $(STAMP)  ## the live server under Foxglove's own client and protobufjs, installed in build/foxglove; needs node and npm
+	@[ -d build/foxglove/node_modules ] || npm install --silent --no-fund --no-audit --prefix build/foxglove @foxglove/ws-protocol@0.8.0 ws@8.18.3 protobufjs@7.5.4
+	$(BIN)/python -m pytest tests/foxglove
 
 test-rerun: $(STAMP)  ## files and live views in rerun, whose package (half a gigabyte) is put into build/rerun
 	@[ -d build/rerun/rerun ] || $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --target build/rerun --constraint constraints.txt rerun-sdk psutil attrs
