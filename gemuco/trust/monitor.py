@@ -246,7 +246,7 @@ class TrustMonitor:
             for since in ages:
                 z = np.concatenate([now.z[:-since], other.z[-since:]])
                 z[-since - 1] = np.nan  # the tool was changed within this block
-                changed.append(judge(replace(now, z=z, noise=unknown)))
+                changed.append(judge(replace(now, z=z, noises=unknown[None])))
             best = min(changed, key=lambda evidence: float(evidence.ratio.max(initial=0.0)))
             yield name, best, not _is_another(schema, bias, self._biases).all()
 
@@ -394,7 +394,7 @@ class TrustMonitor:
         return ""
 
     def _learn(self, view: View, evidence: Evidence, motion: float) -> None:
-        noise = view.newest.copy()
+        noise = view.noises[-1].copy()
         z = view.z.copy()
         z[:, list(view.hidden)], noise[list(view.hidden)] = np.nan, np.nan
         if np.isfinite(z[-1]).any():

@@ -24,16 +24,23 @@ class View:
     Attributes:
         z: Errors [those of a healthy body], oldest first, shape (LONGEST, n); NaN where a used element was missing.
         healthy: Errors of a healthy body [standard deviations of the signal], shape (LONGEST, n).
-        noise: Median variance of the noise within the newest blocks [squared errors of a healthy body], shape (n,).
-        newest: The same of the newest block alone, shape (n,).
+        noises: Variance of the noise within each of the `NOISY` newest blocks [squared errors of a healthy body], shape
+            (blocks, n); NaN where unknown.
         hidden: The hidden columns.
     """
 
     z: np.ndarray
     healthy: np.ndarray
-    noise: np.ndarray
-    newest: np.ndarray
+    noises: np.ndarray
     hidden: Hidden
+
+    @property
+    def noise(self) -> np.ndarray:
+        """Median of `noises`, shape (n,); NaN if half of a column is unknown; a step within one block is no noise."""
+        count, ordered = np.isfinite(self.noises).sum(axis=0), np.sort(self.noises, axis=0)  # NaN is the last
+        columns, middle = np.arange(len(count)), np.maximum(count - 1, 0)
+        median = 0.5 * (ordered[middle // 2, columns] + ordered[(middle + 1) // 2, columns])
+        return np.where(2 * count > len(ordered), median, np.nan)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,7 +113,7 @@ class Recent:
 
     def view(self, relations: Relations, hidden: Hidden, before: View | None = None) -> View:
         """Return the errors with some columns hidden; `before` is the same view without the newest block."""
-        relation, used = relations.without(hidden), np.ones(len(relations.columns), bool)
+        used = np.ones(len(relations.columns), bool)
         used[list(hidden)] = False
         fresh = before is not None and before.hidden == hidden
         blocks = [self.blocks[-1]] if fresh else list(self.blocks)
@@ -122,10 +129,16 @@ class Recent:
         elif len(z) < LONGEST:
             lacking = np.full((LONGEST - len(z), z.shape[1]), np.nan)
             z, healthy = np.concatenate([lacking, z]), np.concatenate([lacking, healthy])
-        newest = list(self.blocks)[-NOISY:]
+        noises = self._noises(relations, hidden, 1 if fresh else NOISY)
+        if before is not None and fresh:
+            noises = np.concatenate([before.noises, noises])[-NOISY:]
+        return View(z, healthy, noises, hidden)
+
+    def _noises(self, relations: Relations, hidden: Hidden, count: int) -> np.ndarray:
+        """Return `View.noises` of a number of the newest blocks."""
+        relation, newest = relations.without(hidden), list(self.blocks)[-count:]
         usual = relation.healthy(np.array([block.features for block in newest]))
-        noise = np.array([_noise(block.each, relation.maps) for block in newest]) / usual**2
-        return View(z, healthy, _median(noise), noise[-1], hidden)
+        return np.array([_noise(block.each, relation.maps) for block in newest]) / usual**2
 
     def clear(self) -> None:
         """Forget all blocks."""
@@ -144,13 +157,3 @@ def _noise(features: np.ndarray, maps: np.ndarray) -> np.ndarray:
     error = bends @ maps
     predicted = bends[:, 1 : 1 + maps.shape[1]] - error
     return np.asarray(np.maximum(np.mean(error**2 - JERKS * predicted**2, axis=0), 0.0) / 6.0)
-
-
-def _median(values: np.ndarray) -> np.ndarray:
-    """Return the median of every column, NaN if half of it is unknown; a step within one block is no noise."""
-    known = np.isfinite(values)
-    result = np.full(values.shape[1], np.nan)
-    enough = 2 * known.sum(axis=0) > len(values)
-    if enough.any():
-        result[enough] = np.nanmedian(values[:, enough], axis=0)
-    return result

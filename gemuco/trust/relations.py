@@ -60,14 +60,17 @@ class Relation:
 
         It grows with the distance of the other columns from the known samples: a wrong value does not excuse itself.
         """
-        factor = (NEAR * self.distance + self.far(features)) / ((1.0 + NEAR) * self.distance)
-        return np.asarray(np.sqrt(factor) * self.std)
+        return np.asarray(self.growth(self.far(features)) * self.std)
+
+    def growth(self, far: np.ndarray) -> np.ndarray:
+        """Return how much larger the errors are at a distance from the known samples, shape (n, columns)."""
+        return np.asarray(np.sqrt((NEAR * self.distance + far) / ((1.0 + NEAR) * self.distance)))
 
     def far(self, features: np.ndarray) -> np.ndarray:
         """Return the distance of the other columns from the known samples, shape (n, columns)."""
         scaled = features @ self.spread
-        own = scaled[:, self.places]
-        removed = np.einsum("nck,ckl,ncl->nc", own, self.removal, own, optimize=True)
+        own = np.ascontiguousarray(scaled.T[self.places].transpose(0, 2, 1))
+        removed = np.einsum("cnk,cnk->nc", own @ self.removal, own)
         return np.asarray((np.einsum("ij,ij->i", features, scaled)[:, None] - removed).clip(min=0.0))
 
 
@@ -145,18 +148,15 @@ class Relations:
         spread = next(iter(kept.values()))
         places = np.array([np.flatnonzero(self._holds[:, index]) for index in range(inputs)])
         removal = np.array([_removal(spread, own, outside) for own in places])
-        rows = self._rows.copy()
-        rows[:, outside] = 0.0
         zero, one = np.zeros(inputs), np.ones(inputs)
         draft = Relation(maps, zero, one, spread, places, removal, one, zero > 0.0, one)
-        distance = np.maximum(draft.far(rows).mean(axis=0), 1e-9)
-        draft = replace(draft, distance=distance)
-        errors = draft.errors(self._rows)
+        far = draft.far(self._rows)
+        draft = replace(draft, distance=np.maximum(far.mean(axis=0), 1e-9))
+        growth, errors = draft.growth(far), draft.errors(self._rows)
         mean = errors.mean(axis=0)
-        std = np.sqrt(np.mean(((errors - mean) / draft.healthy(self._rows)) ** 2, axis=0)) * self._inflation
+        std = np.sqrt(np.mean(((errors - mean) / growth) ** 2, axis=0)) * self._inflation
         std = np.maximum(std, self._least)
-        factor = np.maximum(1.0, draft.healthy(rows))
-        network, calibration = self._by_network(hidden, std, factor)
+        network, calibration = self._by_network(hidden, std, np.maximum(1.0, growth))
         return replace(draft, mean=mean, std=std, network=network, calibration=calibration)
 
     def _by_network(self, hidden: Hidden, std: np.ndarray, factor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -11,6 +11,7 @@ import numpy as np
 
 from gemuco.anomaly.prediction import judging_masks, prediction_errors
 from gemuco.layers import push, trace
+from gemuco.masks import Mask
 from gemuco.schema import BodySchema
 from gemuco.trust.config import Hidden
 
@@ -34,6 +35,33 @@ class Sensed(NamedTuple):
     slopes: np.ndarray
 
 
+class _Judging(NamedTuple):
+    """Outputs that are judged by one mask.
+
+    Attributes:
+        mask: The mask.
+        outputs: Positions of the outputs, shape (n,).
+        columns: Judged columns that the mask contains, by their number, shape (k,).
+        places: Their positions in the network's input, shape (k,).
+    """
+
+    mask: Mask
+    outputs: np.ndarray
+    columns: np.ndarray
+    places: np.ndarray
+
+    @classmethod
+    def of(cls, schema: BodySchema, mask: Mask, columns: np.ndarray) -> "_Judging":
+        """Return what is judged by a mask; the columns are positions in the layout, then p."""
+        size, through = schema.layout.size, schema.gate(mask).through
+        place = {int(at): number for number, at in enumerate(schema.in_index) if through[number] > 0}
+        place |= {size + number: number - len(schema.bias) for number in range(len(schema.bias))}
+        known = [number for number, column in enumerate(columns) if int(column) in place]
+        names = [name for name, own in schema.derived(judging_masks).items() if own == mask]
+        places = np.array([place[int(columns[number])] for number in known], int)
+        return cls(mask, schema.out_layout.indices(names), np.array(known, int), places)
+
+
 class Sensitivity:
     """The errors of those outputs that the network predicts better than the watch does."""
 
@@ -46,6 +74,8 @@ class Sensitivity:
         place = np.ix_(self._index, self._index)
         covariance = schema.normal.covariance[:outputs, :outputs] / np.outer(std, std)
         self._mean = schema.normal.mean[:outputs][self._index] / std[self._index]
+        self._masks = [_Judging.of(schema, mask, columns) for mask in set(schema.derived(judging_masks).values())]
+        self._own = [np.flatnonzero(schema.out_index == column) for column in columns]
         self._precision = np.linalg.inv(covariance[place]) if len(self._index) else np.zeros((0, 0))
 
     def sense(self, schema: BodySchema, rows: np.ndarray) -> Sensed:
@@ -67,27 +97,15 @@ class Sensitivity:
             return Sensed(np.zeros((len(x), 0)), np.zeros((len(x), 0, len(self._columns))))
         errors = prediction_errors(schema, x)[:, self._index] / self._std[self._index] - self._mean
         slopes = np.zeros((len(x), schema.out_layout.size, len(self._columns)))
-        for mask in set(schema.derived(judging_masks).values()):
-            outputs = [n for n, m in schema.derived(judging_masks).items() if m == mask]
-            index = schema.out_layout.indices(outputs)
-            inputs = schema.network_input(np.nan_to_num(x), mask)
-            values, through = trace(schema.chain(mask), inputs), schema.gate(mask).through
-            for number, column in enumerate(self._columns):
-                place = self._place(schema, int(column), through)
-                if place is not None:
-                    tangent = np.zeros_like(inputs)
-                    tangent[:, place] = 1.0
-                    slopes[:, index, number] = -push(schema.chain(mask), values, tangent)[:, index]
-        for number, column in enumerate(self._columns):
-            slopes[:, schema.out_index == column, number] += 1.0
+        for judging in self._masks:
+            chain, inputs = schema.chain(judging.mask), schema.network_input(np.nan_to_num(x), judging.mask)
+            tangents = np.zeros((len(judging.places), *inputs.shape), inputs.dtype)
+            tangents[np.arange(len(judging.places)), :, judging.places] = 1.0
+            pushed = push(chain, trace(chain, inputs), tangents)[:, :, judging.outputs]
+            slopes[np.ix_(np.arange(len(x)), judging.outputs, judging.columns)] = -pushed.transpose(1, 2, 0)
+        for number, own in enumerate(self._own):
+            slopes[:, own, number] += 1.0
         return Sensed(np.nan_to_num(errors), slopes[:, self._index])
-
-    def _place(self, schema: BodySchema, column: int, through: np.ndarray) -> int | None:
-        """Return the position of a judged column in the network's input; None if the mask does not contain it."""
-        if column >= schema.layout.size:
-            return column - schema.layout.size - len(schema.bias)
-        places = np.flatnonzero(schema.in_index == column)
-        return int(places[0]) if len(places) and through[places[0]] > 0 else None
 
     def lies(self, sensed: Sensed, hidden: Hidden) -> tuple[np.ndarray, np.ndarray]:
         """Return the lie of every column that alone would explain the errors, and its standard deviation.

@@ -26,6 +26,8 @@ log = logging.getLogger(__name__)
 
 RATE = 50.0
 """Samples are taken at most this often [Hz]."""
+JUDGED_AT = 0.02
+"""Blocks are judged this time [s] after the multiples of their length on the clock, when the update does not learn."""
 BEFORE = 1.0
 """A lie may have begun this long [s] before it was noticed."""
 CAUSES = {
@@ -86,7 +88,8 @@ class Trust:
         self._rows: list[np.ndarray] = []
         self._last: Numbers | None = None
         self._aligned, self._hal, self._camera = Aligned(), np.zeros(0), np.zeros(0)
-        self._began = -math.inf
+        self._block = -math.inf
+        """This is the number of the last judged block, counted from the zero of the clock."""
         self._stopped_for: frozenset[int] = frozenset()
         self.findings: tuple[Finding, ...] = ()
 
@@ -97,10 +100,11 @@ class Trust:
             self._last = self._freshness.measured()[1]
             fresh = self._new_rows(now)
             self._rows += [schema.scaler.normalise(in_order(schema, row).flat) for row in fresh]
-            if now - self._began < 0.99 * BLOCK:
+            block = math.floor((now - JUDGED_AT) / BLOCK)
+            if block == self._block:
                 return
-            is_late = now - self._began > 5.0 * BLOCK
-            rows, self._rows, self._began = self._rows, [], now
+            is_late = block > self._block + 5
+            rows, self._rows, self._block = self._rows, [], block
             if is_late or not rows or not self._is_active:
                 return
             if self._is_known(schema):
