@@ -1,4 +1,4 @@
-"""The update loop: it learns p and W online from a bounded window, and replaces the whole model after each step."""
+"""The update loop: it learns p and W online from a bounded window, and replaces the whole model."""
 
 import logging
 import math
@@ -30,6 +30,9 @@ LEAST_COST = 1e-4
 """A gradient step takes at least this time [s]."""
 COST_MEMORY = 0.2
 """Each tick moves the measured time of a gradient step by this share."""
+APART = 0.25
+"""A model with another W but the same p replaces the one in use after at least this time [s]: every replacement costs
+the other loops a search and new statistics, and W moves little in this time."""
 NORMAL_AFTER = 200
 """After an update of W normal errors are learned anew as soon as this number of samples came, or the window is full."""
 
@@ -99,7 +102,7 @@ class OnlineUpdate:
         """Times [s] and samples since the model changed."""
         self._last: np.ndarray | None = None
         self._awaits_first = False
-        self._taken_at = -math.inf
+        self._taken_at = self._swapped_at = -math.inf
         self._state = Update(active=False, model_version=0, window=0, dropped=0, loss=math.nan)
 
     @property
@@ -116,6 +119,7 @@ class OnlineUpdate:
                 # One sample may determine p, even of a robot at rest.
                 self._awaits_first = len(self._living.schema.bias) > 0
             elif not active:
+                self._use(self._learner)
                 before = self._living.before
                 if self._learner is not None and before is not None:
                     self._awaits_normal |= before.weights is not self._living.schema.weights
@@ -227,9 +231,9 @@ class OnlineUpdate:
         if result.steps:
             cost = (self._clock.monotonic() - started) / result.steps
             self._cost = max(LEAST_COST, self._cost + COST_MEMORY * (cost - self._cost))
-        if learner.schema is not self._living.schema and result.window:
-            self._living.swap(learner.schema)
-            self._since_change.clear()
+        is_due = started - self._swapped_at >= 0.99 * APART
+        if result.window and (is_due or not np.array_equal(learner.schema.bias, self._living.schema.bias)):
+            self._use(learner)
         return Update(
             stamp_ns=self._clock.now_ns(),
             active=True,
@@ -241,6 +245,13 @@ class OnlineUpdate:
             settled=bool(result.settled),
             rolled_back=int(result.rolled_back),
         )
+
+    def _use(self, learner: BodyUpdater | None) -> None:
+        """Let the learned model replace the one in use."""
+        if learner is not None and learner.schema is not self._living.schema:
+            self._living.swap(learner.schema)
+            self._swapped_at = self._clock.monotonic()
+            self._since_change.clear()
 
 
 def _is_complete(sample: Mapping[str, np.ndarray]) -> bool:

@@ -73,6 +73,24 @@ def test_a_model_is_swapped_whole_and_can_be_rolled_back() -> None:
     assert bench.living.schema is first
 
 
+def test_another_w_is_used_four_times_a_second_at_most_and_the_last_one_stays() -> None:
+    bench, used = Bench(), []
+    bench.turn(0)
+    bench.update.adapt(True)
+    learner = bench.update._learner
+    assert learner is not None
+    for index in range(1, 21):
+        before = bench.living.version
+        bench.turn(index)
+        if bench.living.version > before:
+            used.append(index)
+    assert len(used) >= 6
+    assert np.diff(used).min() == 3, "ticks are 0.1 s apart"
+    assert bench.living.schema is not learner.schema
+    bench.update.adapt(False)
+    assert bench.living.schema is learner.schema
+
+
 @pytest.mark.parametrize("why", ["rest", "silent", "stale"])
 def test_a_useless_sample_is_not_learned_from(why: str) -> None:
     bench = Bench()
