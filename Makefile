@@ -2,6 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 VMCAN ?= ../shared/tools/vmcan.sh
+PACKAGES := .venv/packages
 STAMP := .venv/installed
 CLOCKLESS := tests/gemuco tests/house tests/hal/test_campaign.py tests/hal/test_fuzz.py
 SOCKETCAN := $(addprefix tests/system/test_socketcan,.py _bus.py _drivers.py _states.py)
@@ -20,18 +21,17 @@ endef
 help:            ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 18
 
-# requirements.lock has hashes for CPython 3.11 on Linux, x86_64. Elsewhere, and for torch, versions alone are pinned (docs/design.md).
-$(STAMP): pyproject.toml constraints.txt requirements.lock
-	$(PYTHON) -m venv .venv
-	@if $(BIN)/python -c 'import sys, platform; sys.exit((sys.version_info[:2], platform.system(), platform.machine()) != ((3, 11), "Linux", "x86_64"))'; then \
-	    $(BIN)/python deploy/requirements.py --locked +dev +build | $(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes --no-deps --requirement /dev/stdin; fi
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[all,dev]'
+$(PACKAGES): pyproject.toml constraints.txt requirements.lock deploy/setup.sh
+	deploy/setup.sh $(PYTHON) dev
+	@touch $(PACKAGES)
+
+$(STAMP): $(PACKAGES)
 	$(BIN)/python -m gemuco.warm
 	@touch $(STAMP)
 
 setup: $(STAMP)  ## make .venv with the exact versions of constraints.txt
 
-demo: $(STAMP)   ## one minute with a muscle-driven arm that loses a sensor and a muscle
+demo: $(PACKAGES)  ## two minutes with a muscle-driven arm that loses a sensor and a muscle
 	$(BIN)/gemuco demo
 
 reproduce: $(STAMP)  ## the paper's experiments on three simulated robots, its figures beside ours

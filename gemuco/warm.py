@@ -147,12 +147,18 @@ def warm(report: Callable[[float, str], None] | None = None, is_service: bool = 
 
 
 def main() -> None:
-    """Compile everything and show a progress bar."""
+    """Compile everything and show a progress bar; lines if the output is no terminal."""
     from rich.progress import BarColumn, Progress, TextColumn
 
     with Progress(TextColumn("compiling"), BarColumn(), TextColumn("{task.description}"), transient=True) as bar:
-        task = bar.add_task("", total=1.0)
-        duration = warm(lambda share, step: bar.update(task, completed=share, description=step))
+        task, is_terminal = bar.add_task("", total=1.0), bar.console.is_terminal
+
+        def show(share: float, step: str) -> None:
+            bar.update(task, completed=share, description=step)
+            if not is_terminal:
+                print(f"Compiling, {share:.0%}: {step}", flush=True)
+
+        duration = warm(show)
     print(f"Compiled code is ready after {duration:.1f} s, {f'saved in {FOLDER}' if FOLDER else 'not saved'}.")
 
 

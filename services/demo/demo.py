@@ -1,6 +1,8 @@
 """`gemuco demo`: make a model, start all processes, play a story of one minute, and end every process."""
 
 import contextlib
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
@@ -234,13 +236,27 @@ def make_model(robot: RobotConfig, console: Console) -> None:
         console.print(f"Using the model in {folder}.")
         return
     console.print("No model yet: the body schema is learned from random motion of the designer's model.")
-    with progress("collecting") as show:
-        collection = collector.collect_direct(robot, None, 0, progress=show)
-    console.print(f"{len(collection.dataset)} samples, {collection.speed:.0f} times faster than real time.")
+    with compiling() as compiler:
+        with progress("collecting") as show:
+            collection = collector.collect_direct(robot, None, 0, progress=show)
+        console.print(f"{len(collection.dataset)} samples, {collection.speed:.0f} times faster than real time.")
+        with waiting(console, "compiling"):
+            compiler.wait()
     with progress("training") as show:
         result = trainer.train(robot, collection.dataset, 0, show)
     trainer.show(result, console)
     trainer.save(result, folder)
+
+
+@contextmanager
+def compiling() -> Iterator[subprocess.Popen[bytes]]:
+    """Compile, on a new machine for a minute, in a process beside the block; it ends with the block."""
+    process = subprocess.Popen([sys.executable, "-m", "gemuco.warm"], stdout=subprocess.DEVNULL)
+    try:
+        yield process
+    finally:
+        process.terminate()
+        process.wait()
 
 
 def start(

@@ -26,6 +26,8 @@ MOST_POSES = 24
 """At most this many further poses are used to collect samples, because a machine may be slow."""
 CALM_TIME = 2.0
 """No anomaly may be reported for this long [s] before the muscle is cut."""
+SETTLING = 0.5
+"""New statistics are in use, and all verdicts of the old ones have arrived, after this time [s]."""
 CALM_TRIES = 3
 """The statistics of normal errors are learned at most this often, each time from more poses."""
 SILENT_POSES = 3
@@ -248,6 +250,7 @@ class Story:
     def _become_calm(self) -> None:
         """Wait until the whole arm has no anomaly; if it has one, learn normal errors from more motion."""
         for tries_left in reversed(range(CALM_TRIES)):
+            self._actor.wait(lambda: False, SETTLING)
             start = self._timeline.now()
             self._actor.wait(lambda: False, CALM_TIME)
             if not self._timeline.between("is_anomaly", start, self._timeline.now()).any() or not tries_left:

@@ -95,6 +95,8 @@ class AnomalyWatch:
         fresh, values = self._freshness.take()
         schema, known = self._schema(), self._scored
         now = self._clock.monotonic()
+        if known is not None and known[0].normal is not schema.normal:
+            self._begin()
         if known is None or known[0] is not schema or known[1] is not values:  # a sample is scored once
             deviation = self._score(schema, in_order(schema, values).flat)
             known = self._scored = schema, values, deviation, deviation.largest(schema)
@@ -112,6 +114,12 @@ class AnomalyWatch:
             self._keep(schema, values, is_odd, now)
         self._last_cycle = cycle
         self._report(schema, deviation, known[3], cycle, now)
+
+    def _begin(self) -> None:
+        """Begin anew, because other statistics say what is normal."""
+        self._above_since = self._lasting_since = math.inf
+        self._judged = None
+        self._odd.clear()
 
     def judge(self) -> None:
         """Make a verdict if the body has been odd for long enough and the last verdict is old."""

@@ -1,3 +1,5 @@
+import dataclasses
+
 import numpy as np
 import pytest
 from arm_model import arm, sample_of, small_model
@@ -92,3 +94,9 @@ def test_a_small_shift_that_lasts_becomes_an_anomaly() -> None:
     above = np.mean([state.score > state.threshold for state in shifted])
     assert any(state.is_anomaly for state in shifted)
     assert above < 0.5
+    normal = bench.schema.normal
+    assert normal is not None and shifted[-1].is_anomaly
+    bench.schema = bench.schema.with_normal(dataclasses.replace(normal, windows=None))
+    bench.acquaintance.learned(bench.schema)
+    bench.watch.tick()
+    assert not bench.published[-1].is_anomaly, "a verdict ends with the statistics that it came from"

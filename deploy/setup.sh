@@ -1,0 +1,35 @@
+#!/bin/sh
+# setup.sh PYTHON EXTRA...: make .venv with this package and these extras, in the exact versions of constraints.txt, and with
+# the hashes of requirements.lock where they hold. uv installs if it can be had, because pip takes ten times as long. torch
+# comes by pip, which a machine may give a folder or an index of builds without CUDA.
+set -eu
+python=$1
+shift
+bin=.venv/bin
+[ -x $bin/python ] || "$python" -m venv .venv
+mkdir -p build
+pip() { $bin/python -m pip --disable-pip-version-check "$@"; }
+is_locked() { # requirements.lock is of CPython 3.11 on Linux, x86_64
+    $bin/python -c 'import sys, platform as p; sys.exit((sys.version_info[:2], p.system(), p.machine()) != ((3, 11), "Linux", "x86_64"))'
+}
+
+if is_locked; then
+    how="--require-hashes --no-deps"
+    list() { $bin/python deploy/requirements.py --locked "$@"; }
+else
+    how="--constraint constraints.txt"
+    list() { $bin/python deploy/requirements.py "$@" | grep -v '^torch'; }
+fi
+index=$(pip config list | sed -n "s/^.*\.index-url='\(.*\)'$/\1/p" | tail -n 1)
+[ -z "$index" ] || export UV_DEFAULT_INDEX="${UV_DEFAULT_INDEX:-$index}"
+
+list +dev =uv >build/uv.txt
+list $(printf '+%s ' "$@") +build >build/wanted.txt
+if ! { pip install --quiet $how --requirement build/uv.txt && $bin/uv pip install --python $bin/python $how --requirement build/wanted.txt; }; then
+    echo "uv did not install; pip does it, which takes longer."
+    pip install $how --requirement build/wanted.txt
+fi
+if $bin/python deploy/requirements.py $(printf '+%s ' "$@") | grep -q '^torch'; then
+    pip install --constraint constraints.txt torch
+fi
+pip install --quiet --no-deps --no-build-isolation --editable .
