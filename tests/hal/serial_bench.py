@@ -20,9 +20,10 @@ NAMES = ("pan", "lift", "elbow")
 NODES = (1, 2, 5)
 PATIENCE = 20.0
 SETTINGS = {
-    "feetech": {"allow_no_watchdog": True},
-    "dynamixel": {"model": "XM430-W350"},
+    "feetech": {"allow_no_watchdog": True, "silent_after": 0.6},
+    "dynamixel": {"model": "XM430-W350", "silent_after": 0.6},
 }
+"""A busy machine may stop the simulated servos for longer than the 0.15 s after which a servo counts as silent."""
 DIRECTIONS, ZEROS = (1, -1, 1), (0.0, 0.1, -0.2)
 _numbers = itertools.count()
 

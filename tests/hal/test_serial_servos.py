@@ -85,7 +85,7 @@ def test_enabling_does_not_move_a_joint(make):
 @pytest.mark.long
 def test_a_silent_servo_is_stale_alone_and_comes_back(make):
     """Servos answer in a chain, which a silent one breaks; the others must be measured all the same."""
-    with SerialBench(make) as bench:
+    with SerialBench(make, robot_file(make, {"silent_after": 0.15})) as bench:
         bench.settle()
         bench.rig.fault("node_silent pan_servo")  # the first in the chain
         bench.cycle(12)
@@ -256,7 +256,7 @@ def test_another_model_is_refused():
 @by_make
 @pytest.mark.long
 def test_a_mode_that_is_wrong_is_written_once_and_kept(make):
-    with SerialBench(make) as bench:
+    with SerialBench(make, robot_file(make, {"silent_after": 0.15})) as bench:
         with bench.memory("pan") as node:
             node.table[11 if make == "dynamixel" else 33] = 1
         bench.rig.fault("node_reboot pan_servo")
