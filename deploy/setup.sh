@@ -25,7 +25,7 @@ index=$(pip config list | sed -n "s/^.*\.index-url='\(.*\)'$/\1/p" | tail -n 1)
 
 list +dev =uv >build/uv.txt
 list $(printf '+%s ' "$@") +build >build/wanted.txt
-if ! { pip install --quiet $how --requirement build/uv.txt && $bin/uv pip install --python $bin/python $how --requirement build/wanted.txt; }; then
+if ! { pip install --quiet $how --requirement build/uv.txt && $bin/uv pip install --compile-bytecode --python $bin/python $how --requirement build/wanted.txt; }; then
     echo "uv did not install; pip does it, which takes longer."
     pip install $how --requirement build/wanted.txt
 fi
