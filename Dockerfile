@@ -42,6 +42,7 @@ ENTRYPOINT ["gemuco"]
 CMD ["--help"]
 
 FROM packages AS heavy
+ARG TORCH_INDEX=https://download.pytorch.org/whl/cpu
 # Only what the first image lacks, in a folder of its own: both images share all the layers below it.
 RUN deploy/install.sh --target /opt/workshop =torch =matplotlib =pybullet =joblib +train +sim +studies \
     && python deploy/sbom.py /opt/workshop/sbom.json /opt/gemuco/lib/python3.*/site-packages /opt/workshop
