@@ -74,7 +74,8 @@ class Sensitivity:
         place = np.ix_(self._index, self._index)
         covariance = schema.normal.covariance[:outputs, :outputs] / np.outer(std, std)
         self._mean = schema.normal.mean[:outputs][self._index] / std[self._index]
-        self._masks = [_Judging.of(schema, mask, columns) for mask in set(schema.derived(judging_masks).values())]
+        self._judging: dict[str, Mask] = {}
+        self._judgings: list[_Judging] = []
         self._own = [np.flatnonzero(schema.out_index == column) for column in columns]
         self._precision = np.linalg.inv(covariance[place]) if len(self._index) else np.zeros((0, 0))
 
@@ -97,7 +98,7 @@ class Sensitivity:
             return Sensed(np.zeros((len(x), 0)), np.zeros((len(x), 0, len(self._columns))))
         errors = prediction_errors(schema, x)[:, self._index] / self._std[self._index] - self._mean
         slopes = np.zeros((len(x), schema.out_layout.size, len(self._columns)))
-        for judging in self._masks:
+        for judging in self._judgings_of(schema):
             chain, inputs = schema.chain(judging.mask), schema.network_input(np.nan_to_num(x), judging.mask)
             tangents = np.zeros((len(judging.places), *inputs.shape), inputs.dtype)
             tangents[np.arange(len(judging.places)), :, judging.places] = 1.0
@@ -106,6 +107,14 @@ class Sensitivity:
         for number, own in enumerate(self._own):
             slopes[:, own, number] += 1.0
         return Sensed(np.nan_to_num(errors), slopes[:, self._index])
+
+    def _judgings_of(self, schema: BodySchema) -> list[_Judging]:
+        """Return what each mask judges; an update of W may choose other masks."""
+        judging = schema.derived(judging_masks)
+        if judging != self._judging:
+            self._judging = judging
+            self._judgings = [_Judging.of(schema, mask, self._columns) for mask in set(judging.values())]
+        return self._judgings
 
     def lies(self, sensed: Sensed, hidden: Hidden) -> tuple[np.ndarray, np.ndarray]:
         """Return the lie of every column that alone would explain the errors, and its standard deviation.

@@ -1,9 +1,12 @@
 """Lies of sensors: found, named, hidden, and trusted again; and a healthy body is left alone."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from gemuco.anomaly.healthy import learn_normal
+from gemuco.anomaly.prediction import judging_masks
 from gemuco.learning.config import TrainConfig
 from gemuco.learning.train import fit
 from gemuco.normal.watch import Watch
@@ -11,6 +14,7 @@ from gemuco.trust.changes import LONGEST, Likeness, StepTest
 from gemuco.trust.config import BLOCK, TrustConfig
 from gemuco.trust.monitor import TrustMonitor
 from gemuco.trust.relations import Relations, rows_of
+from gemuco.trust.sensitivity import Sensitivity
 
 SAMPLES = 5
 """Samples in a block."""
@@ -45,6 +49,26 @@ def watch(model, samples, monitor=None, config=None):
         monitor.add(block, index * BLOCK)
         hidden.append(monitor.hidden)
     return monitor, hidden
+
+
+def test_derivatives_are_those_of_the_errors_also_after_an_update_chose_other_masks(model, arm):
+    columns, normal = Relations.of(model).columns, model.normal
+    assert np.isnan(normal.mean).any(), "those of the tension, which the watch predicts better"
+    every = replace(normal, mean=np.nan_to_num(normal.mean), covariance=np.eye(len(normal.covariance)))
+    sensitivity = Sensitivity(model.with_normal(every), columns)
+    x = model.scaler.normalise(move(arm, 8, 1)[:, 0])
+    chosen = judging_masks(model)["muscle_tension"]
+    errors = {way: 100.0 * error if way[1] == chosen else error for way, error in model.errors.items()}
+    updated = model.with_weights(model.weights, errors)
+    assert judging_masks(updated)["muscle_tension"] != chosen
+    for schema in (model, updated, model):
+        before, step = sensitivity.sense(schema, rows_of(schema, x)), 0.01
+        assert before.slopes.any(axis=(0, 1)).all()
+        for element in range(12):
+            moved = x.copy()
+            moved[:, element] += step
+            change = sensitivity.sense(schema, rows_of(schema, moved)).errors - before.errors
+            assert np.allclose(change / step, before.slopes[:, :, element], atol=0.05)
 
 
 def test_a_relation_is_the_prediction_of_the_watch(model, arm):
