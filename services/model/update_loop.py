@@ -98,6 +98,8 @@ class OnlineUpdate:
         self._make_learner, self._publish, self._clock = learner, publish, clock
         self._lock = threading.Lock()
         self._learner: BodyUpdater | None = None
+        self._used = living.schema
+        """The learner's model when it began, or when it last replaced the one in use."""
         self._since_change: deque[tuple[float, Values]] = deque(maxlen=config.window)
         """Times [s] and samples since the model changed."""
         self._last: np.ndarray | None = None
@@ -115,7 +117,7 @@ class OnlineUpdate:
         with self._lock:
             if active and self._learner is None:
                 self._living.keep()
-                self._learner = self._make_learner(self._living.schema)
+                self._learner, self._used = self._make_learner(self._living.schema), self._living.schema
                 # One sample may determine p, even of a robot at rest.
                 self._awaits_first = len(self._living.schema.bias) > 0
             elif not active:
@@ -247,8 +249,9 @@ class OnlineUpdate:
         )
 
     def _use(self, learner: BodyUpdater | None) -> None:
-        """Let the learned model replace the one in use."""
-        if learner is not None and learner.schema is not self._living.schema:
+        """Let a learner's model replace the one in use, if it learned something since the last time."""
+        if learner is not None and learner.schema is not self._used:
+            self._used = learner.schema
             self._living.swap(learner.schema)
             self._swapped_at = self._clock.monotonic()
             self._since_change.clear()

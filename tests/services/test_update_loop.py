@@ -91,6 +91,17 @@ def test_another_w_is_used_four_times_a_second_at_most_and_the_last_one_stays() 
     assert bench.living.schema is learner.schema
 
 
+def test_normal_errors_learned_meanwhile_stay_if_the_update_learned_nothing() -> None:
+    bench = Bench(window=200)
+    for index in range(150):
+        bench.turn(index)
+    bench.update.adapt(True)
+    bench.update.learn_normal()
+    learned = bench.living.schema
+    bench.update.adapt(False)
+    assert bench.living.schema is learned
+
+
 @pytest.mark.parametrize("why", ["rest", "silent", "stale"])
 def test_a_useless_sample_is_not_learned_from(why: str) -> None:
     bench = Bench()
