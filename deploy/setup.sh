@@ -6,7 +6,7 @@ set -eu
 python=$1
 shift
 bin=.venv/bin
-[ -x $bin/python ] || "$python" -m venv .venv
+"$python" -m venv .venv # also if it is there: without python3-venv it is made without pip
 mkdir -p build
 pip() { $bin/python -m pip --disable-pip-version-check "$@"; }
 is_locked() { # requirements.lock is of CPython 3.11 on Linux, x86_64

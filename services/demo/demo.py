@@ -250,8 +250,13 @@ def make_model(robot: RobotConfig, console: Console) -> None:
 
 @contextmanager
 def compiling() -> Iterator[subprocess.Popen[bytes]]:
-    """Compile, on a new machine for a minute, in a process beside the block; it ends with the block."""
-    process = subprocess.Popen([sys.executable, "-m", "gemuco.warm"], stdout=subprocess.DEVNULL)
+    """Compile, on a new machine for a minute, in a process beside the block; it ends with the block.
+
+    What it cannot compile is compiled later, so its output is not shown, nor how it ends after Ctrl-C.
+    """
+    process = subprocess.Popen(
+        [sys.executable, "-m", "gemuco.warm"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
     try:
         yield process
     finally:
