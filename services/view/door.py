@@ -50,6 +50,8 @@ class Door:
 
     def __init__(self, host: str, token: str = "", elsewhere: Callable[[], int] | None = None) -> None:
         self._is_local, self._token, self._elsewhere = is_loopback(host), token, elsewhere
+        self.is_open = False
+        """Whether requests are answered at all. viser accepts browsers before it can serve them."""
         self._page: tuple[bytes, bytes] = b"", b""
         """The last page as viser sends it, and as it is sent from here."""
 
@@ -88,6 +90,8 @@ class Door:
         host = request.headers.get("Host", "")
         if self._is_local and not LOOPBACK.fullmatch(host):  # a foreign name that was made to mean this machine
             return connection.respond(HTTPStatus.FORBIDDEN, "This page is served to this machine under its own name.\n")
+        if not self.is_open:
+            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, "The page starts. Try again in a second.\n")
         is_socket = request.headers.get("Upgrade", "").lower() == "websocket"
         origin = request.headers.get("Origin")
         if is_socket and origin is not None and origin.partition("://")[2] != host:

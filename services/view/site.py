@@ -33,8 +33,7 @@ def open_site(host: str, port: int, title: str, door: Door) -> "viser.ViserServe
 
     _check_free(host, port)
     rich.get_console().quiet = True  # viser prints a table to stdout
-    for name in ("websockets", "websockets.server"):  # else one traceback per browser that disconnects
-        logging.getLogger(name).setLevel(logging.CRITICAL)
+    logging.getLogger("websockets.server").addFilter(is_news)
     with _behind(door):
         site = viser.ViserServer(host=host, port=port, label=title, verbose=False)
     if port and site.get_port() != port:  # viser takes the next free one
@@ -42,7 +41,16 @@ def open_site(host: str, port: int, title: str, door: Door) -> "viser.ViserServe
         raise ServiceError(_taken(host, port))
     # This request of a browser would publish the page on the internet.
     site._websock_server.unregister_handler(_messages.ShareUrlRequest)
+    door.is_open = True
     return site
+
+
+def is_news(record: logging.LogRecord) -> bool:
+    """Whether a record of the server reports more than a browser that went away or is none."""
+    from websockets.exceptions import WebSocketException
+
+    error = record.exc_info[1] if record.exc_info else None
+    return record.levelno >= logging.WARNING and not isinstance(error, WebSocketException | OSError | EOFError)
 
 
 @contextmanager

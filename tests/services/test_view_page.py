@@ -1,7 +1,9 @@
 """The page over a real socket: what a browser gets, what it may press, and what it cannot do."""
 
+import contextlib
 import gzip
 import http.client
+import logging
 import os
 import resource
 import socket
@@ -12,6 +14,7 @@ import urllib.request
 from collections.abc import Iterator
 from email.message import Message
 from pathlib import Path
+from typing import Any
 
 import pytest
 import viser
@@ -27,7 +30,7 @@ from services.view import run
 from services.view.controls import Controls, why_read_only
 from services.view.door import Door, new_token
 from services.view.scene import Looks
-from services.view.site import open_site
+from services.view.site import is_news, open_site
 from services.wire.member import Member
 
 BUTTONS = {"Engage", "Disengage", "Reset", "Stop", "EMERGENCY STOP", "Record this posture", "Take over and hold"}
@@ -59,10 +62,11 @@ class Viewing:
         self._thread.start()
         deadline = time.monotonic() + 60.0
         while True:
-            with socket.socket() as probe:
-                if probe.connect_ex(("127.0.0.1", self.port)) == 0:
+            with contextlib.suppress(OSError):
+                if fetch(self.port, "/")[0] != 503:
                     return self
             assert time.monotonic() < deadline
+            time.sleep(0.01)
 
     def __exit__(self, *_: object) -> None:
         self._stop.set()
@@ -265,6 +269,33 @@ def test_nothing_can_be_published_on_the_internet(robot: str):
         assert not site._websock_server._incoming_handlers.get(_messages.ShareUrlRequest)
     finally:
         site.stop()
+
+
+def test_a_browser_is_refused_before_the_page_can_serve(robot: str):
+    """viser accepts a browser at once and, while it is being made, serves it an internal error or nothing at all."""
+    door, whole, refused = Door("127.0.0.1"), viser.ViserServer.__init__, list[int]()
+
+    def slow(self: viser.ViserServer, *arguments: Any, **options: Any) -> None:
+        whole(self, *arguments, **options)  # it listens now, and its maker has not returned
+        with pytest.raises(InvalidStatus) as caught:
+            Browser(self.get_port())
+        refused.append(caught.value.response.status_code)
+        refused.append(fetch(self.get_port())[0])
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(viser.ViserServer, "__init__", slow)
+        site = open_site("127.0.0.1", 0, "x", door)
+    try:
+        assert refused == [503, 503]
+        Browser(site.get_port()).close()
+    finally:
+        site.stop()
+
+
+@pytest.mark.parametrize(("error", "is_shown"), [(AttributeError("x"), True), (ConnectionResetError(), False)])
+def test_only_a_browser_that_went_away_is_not_logged(error: Exception, is_shown: bool):
+    record = logging.LogRecord("websockets.server", logging.ERROR, "", 0, "x", (), (type(error), error, None))
+    assert is_news(record) is is_shown
 
 
 def test_the_page_needs_nothing_from_elsewhere(robot: str):
