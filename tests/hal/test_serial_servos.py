@@ -95,11 +95,11 @@ def test_a_silent_servo_is_stale_alone_and_comes_back(make):
         assert bench.health("pan")["state"] == "silent"
         assert bench.health("lift")["state"] == "ready"
         ages = []
-        for _ in range(30):
+        for _ in range(100):
             bench.cycle()
             assert bench.sample.valid["joint_position"].tolist() == [False, True, True]
             ages.append(bench.sample.age["joint_position"][1:].max())
-        assert np.quantile(ages, 0.8) < 0.03, "a machine that was stopped is not meant"
+        assert np.quantile(ages, 0.95) < 0.03, "a busy machine is late now and then"
         with pytest.raises(CommandRefused, match="pan"):
             bench.robot.enable()
         bench.rig.fault("node_back pan_servo")
