@@ -15,6 +15,8 @@ NOTICED_WITHIN = 3.0
 ENGAGED_WITHIN = 1.0
 FOLLOWS_WITHIN = 15.0
 """The robot must follow within this time [s], in which nodes restart and refused requests are repeated."""
+STEADY = 0.3
+"""An event is noticed when it is reported for this long [s]: on a busy machine one late message looks like it."""
 TRIES = 3
 """A target is sent at most this often if the HAL stops the robot before the end."""
 
@@ -88,6 +90,15 @@ class Actor:
             self._idle()
             time.sleep(0.01)
         return True
+
+    def notice(self, is_reported: Callable[[], bool]) -> tuple[bool, float]:
+        """Return whether an event is reported, and stays reported for a while, and the delay until then [s]."""
+        start = time.monotonic()
+        while (left := start + NOTICED_WITHIN - time.monotonic()) > 0 and self.wait(is_reported, left):
+            delay = time.monotonic() - start
+            if not self.wait(lambda: not is_reported(), STEADY):
+                return True, delay
+        return False, time.monotonic() - start
 
     def truth(self, signal: str) -> np.ndarray:
         """Return the true value of a signal now [its unit], shape (n,).

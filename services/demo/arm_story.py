@@ -114,8 +114,7 @@ class ArmStory:
         index = self._robot.signals[self._signal].elements.index(marks.element)
         start = self._joints.now()
         self._client.fault(f"sensor_silent {marks.encoder}")
-        noticed = self._actor.wait(lambda: self._estimated(self._signal, index), NOTICED_WITHIN)
-        delay = self._joints.now() - start
+        noticed, delay = self._actor.notice(lambda: self._estimated(self._signal, index))
         for _ in range(MOVES):
             self._go()
         end = self._joints.now()
@@ -137,8 +136,7 @@ class ArmStory:
         self._report("[bold](c)[/] The camera is covered. The tip is estimated from the arm.")
         start = self._tip.now()
         self._client.fault("camera_covered", "vision")
-        noticed = self._actor.wait(lambda: self._estimated(self._seen, 0), NOTICED_WITHIN)
-        delay = self._tip.now() - start
+        noticed, delay = self._actor.notice(lambda: self._estimated(self._seen, 0))
         for _ in range(MOVES):
             self._go()
         end = self._tip.now()
@@ -146,7 +144,7 @@ class ArmStory:
         returned = self._actor.wait(lambda: not self._estimated(self._seen, 0), NOTICED_WITHIN)
         self.marks.covered = (start, end)
         value, truth = (self._tip.between(name, start + delay, end) for name in ("value", "truth"))
-        marked = bool((self._tip.between("estimated", start + delay, end) > 0).all())
+        marked = bool((self._tip.between("estimated", start + delay, end) > 0)[np.isfinite(value)].all())
         error = np.linalg.norm(value - truth, axis=1)
         mean, share = float(np.nanmean(error)), float(np.nanmean(error)) / self.marks.reach
         figures = (

@@ -108,8 +108,7 @@ class Story:
         index = self._elements.index(SILENT_ELEMENT)
         start = self._timeline.now()
         self._client.fault(f"sensor_silent {ENCODER}")
-        noticed = self._actor.wait(lambda: self._is_estimated(index), NOTICED_WITHIN)
-        delay = self._timeline.now() - start
+        noticed, delay = self._actor.notice(lambda: self._is_estimated(index))
         for _ in range(SILENT_POSES):
             self._go(self._pose(), LEARNING_TIME)
         end = self._timeline.now()

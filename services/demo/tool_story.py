@@ -104,8 +104,7 @@ class ToolStory:
         )
         start = self._timeline.now()
         self._client.fault("camera_covered", "vision")
-        noticed = self._actor.wait(lambda: self._is_estimated(True), NOTICED_WITHIN)
-        delay = self._timeline.now() - start
+        noticed, delay = self._actor.notice(lambda: self._is_estimated(True))
         for target in self._learning[::-1]:
             self._go(target, SHORT_REST)
         end = self._timeline.now()
@@ -113,7 +112,7 @@ class ToolStory:
         returned = self._actor.wait(lambda: self._is_estimated(False), NOTICED_WITHIN)
         self.marks.covered = (start, end)
         value, truth = (self._timeline.between(name, start + delay, end) for name in ("value", "truth"))
-        marked = self._timeline.between("estimated", start + delay, end) > 0
+        marked = (self._timeline.between("estimated", start + delay, end) > 0)[np.isfinite(value)]
         error = np.linalg.norm(value - truth, axis=1)
         mean = float(np.nanmean(error)) if np.isfinite(error).any() else float("nan")
         source = mode(self._timeline.between("source", start + delay, end).tolist() or [""])
@@ -121,7 +120,7 @@ class ToolStory:
         figures = (
             f"marked as estimated after {1e3 * delay:.0f} ms, {source}",
             f"true error of the tip meanwhile: mean {1e3 * mean:.0f} mm, worst {1e3 * np.nanmax(error):.0f} mm",
-            f"{marked.all(axis=1).mean():.0%} of the values published meanwhile are marked as estimated",
+            f"{marked.mean():.0%} of the values published meanwhile are marked as estimated",
             "measured again when the camera was uncovered"
             if returned
             else "not measured again after the camera was uncovered",

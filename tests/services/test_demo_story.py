@@ -8,7 +8,7 @@ import pytest
 
 from hal.config import load_robot
 from services.demo import actor as actor_module
-from services.demo.actor import TRIES, Actor
+from services.demo.actor import NOTICED_WITHIN, TRIES, Actor
 from services.demo.story import CALM_TRIES, LEARNED, LEARNING_POSES, MOST_POSES, NORMAL, Story
 from services.wire.messages import Applied, Status, Update
 
@@ -113,3 +113,38 @@ def test_a_target_is_given_again_when_the_hal_stopped_the_arm_on_the_way(
     mover.go("joint_position", np.zeros(5), 0.02)
     assert (robot.targets, mover.stops) == (targets, counted)
     assert sum("Life guard" in sentence for sentence in said) == counted
+
+
+class Reporting:
+    """A clock that advances by what is slept, and a report that is true in some spans of it [s]."""
+
+    def __init__(self, *spans: tuple[float, float]) -> None:
+        self.now, self.spans = 0.0, spans
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def sleep(self, duration: float) -> None:
+        self.now += duration
+
+    def is_reported(self) -> bool:
+        return any(start <= self.now < end for start, end in self.spans)
+
+
+@pytest.mark.parametrize(
+    ("spans", "expected"),
+    [
+        ([(0.1, 9.0)], (True, 0.1)),
+        ([(0.1, 0.14), (0.5, 9.0)], (True, 0.5)),  # one late message looked like the event
+        ([(0.1, 0.14)], (False, NOTICED_WITHIN)),
+        ([], (False, NOTICED_WITHIN)),
+        ([(NOTICED_WITHIN + 0.5, 9.0)], (False, NOTICED_WITHIN)),
+    ],
+)
+def test_an_event_is_noticed_when_its_report_stays(
+    monkeypatch: pytest.MonkeyPatch, spans: list[tuple[float, float]], expected: tuple[bool, float]
+) -> None:
+    reporting = Reporting(*spans)
+    monkeypatch.setattr(actor_module, "time", reporting)
+    noticed, delay = Actor(None, lambda: None, print).notice(reporting.is_reported)  # type: ignore[arg-type]
+    assert (noticed, delay) == (expected[0], pytest.approx(expected[1], abs=0.02))
