@@ -52,7 +52,7 @@ class Actor:
         """Stages played so far."""
 
     def engage(self) -> None:
-        """Engage the controller, after a reset if there is a fault; try again after a refusal.
+        """Engage the controller, after a reset if the robot or a drive has a fault; try again after a refusal.
 
         Raises:
             ServiceError: The robot does not follow.
@@ -63,7 +63,7 @@ class Actor:
             if time.monotonic() > deadline:
                 raise ServiceError(f"The arm did not begin to follow. {refusal or 'See the logs beside the plot.'}")
             try:
-                if self._mode() == "fault":
+                if self._mode() == "fault" or not self._is_healthy():
                     self._client.reset()
                     self.wait(lambda: self._mode() == "off" and self._is_healthy(), ENGAGED_WITHIN)
                 self._client.engage()

@@ -118,6 +118,9 @@ def test_a_fault_is_reset_by_a_rising_edge_in_every_fourth_of_200_cycles(joint):
     assert words(joint, State.FAULT, 3) == [0, 0, 0x80]
     assert words(joint, State.SWITCH_ON_DISABLED, 1) == [0x00]
     assert words(joint, State.FAULT, 8) == [0] * 8  # one reset does not clear the next fault
+    joint.drive.reset()
+    assert words(joint, State.NOT_READY, 4) == [0] * 4  # it was lost, and its fault is not known yet
+    assert 0x80 in words(joint, State.FAULT, 4)
 
 
 def test_a_quick_stop_lasts_at_most_08_s_and_then_the_power_is_taken_off(joint):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from hal.config import load_robot
+from hal.errors import CommandRefused
 from services.demo import actor as actor_module
 from services.demo.actor import NOTICED_WITHIN, TRIES, Actor
 from services.demo.story import CALM_TRIES, LEARNED, LEARNING_POSES, MOST_POSES, NORMAL, Story
@@ -113,6 +114,33 @@ def test_a_target_is_given_again_when_the_hal_stopped_the_arm_on_the_way(
     mover.go("joint_position", np.zeros(5), 0.02)
     assert (robot.targets, mover.stops) == (targets, counted)
     assert sum("Life guard" in sentence for sentence in said) == counted
+
+
+class Lost(Stopping):
+    """A robot whose drives were lost when it was reset, and return with a fault while it is off."""
+
+    def __init__(self) -> None:
+        super().__init__(0)
+        self.mode, self.resets = "fault", 0
+
+    def status(self, service: str, timeout: float = 0.0) -> Status:
+        return Status(service="hal", state="running" if self.resets > 1 else "degraded")
+
+    def reset(self) -> None:
+        super().reset()
+        self.resets += 1
+
+    def engage(self) -> None:
+        if self.resets < 2:
+            raise CommandRefused("'elbow_drive' is fault, not ready, so nothing was enabled.")
+        super().engage()
+
+
+def test_drives_that_return_with_a_fault_are_reset_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(actor_module, "ENGAGED_WITHIN", 0.02)
+    robot = Lost()
+    Actor(robot, lambda: None, print).engage()  # type: ignore[arg-type]
+    assert (robot.mode, robot.resets) == ("follow", 2)
 
 
 class Reporting:

@@ -99,6 +99,8 @@ RESET_CYCLES = 200
 """A fault reset is tried for this number of cycles."""
 RESET_PERIOD = 4
 """A fault reset has one rising edge in this number of cycles."""
+RESETTABLE = (State.FAULT, State.FAULT_REACTION, State.NOT_READY)
+"""A fault reset goes on in these states; a drive that was lost is in the last one until its first statusword."""
 STOPPING = 0.8
 """After this time [s] for a quick stop, or for slowing down, the drive is powered off."""
 RAMPED = (OperationMode.PROFILE_POSITION, OperationMode.CYCLIC_SYNCHRONOUS_VELOCITY)
@@ -375,7 +377,7 @@ class Cia402Drive(CanopenNode):
         if self._resetting:
             if state is State.FAULT and self._resetting % RESET_PERIOD == 0:
                 word = cia402.FAULT_RESET
-            self._resetting = self._resetting - 1 if state in (State.FAULT, State.FAULT_REACTION) else 0
+            self._resetting = self._resetting - 1 if state in RESETTABLE else 0
         self._send(word, self._rest(), self._mode)
 
     @override
