@@ -14,6 +14,7 @@ from rich.console import Console
 from gemuco.warm import warm
 from hal.config import RobotConfig, load_robot
 from hal.errors import ConfigError
+from hal.robot import open_robot
 from services.client import Client
 from services.demo import arm_story, pace, report, story, tool_story
 from services.demo.actor import Actor
@@ -217,10 +218,12 @@ def check_start(robot: RobotConfig, with_page: bool = False) -> None:
     """Check, before work that takes minutes, that nothing is missing and no service of this robot runs here.
 
     Raises:
+        ConfigError: The devices of the robot file cannot be built, for example without their data sheets.
         MissingExtra: A package for simulation, training or the page is not installed.
         AlreadyRunning: A service of a robot with this name runs on this machine.
     """
     require("torch", "matplotlib", engine_of(robot.physics), *(("viser", "yourdfpy") if with_page else ()))
+    open_robot(robot)  # builds the devices, and opens nothing
     running = [service for name, service in services_here() if name == robot.robot]
     if running:
         raise AlreadyRunning(
@@ -274,7 +277,7 @@ def start(
     client: Client,
     console: Console,
 ) -> None:
-    """Start the processes, each after the previous one is ready; the last one prints estimates of `target`.
+    """Start the simulator, then the others at once; the last one, when all are ready, prints estimates of `target`.
 
     Raises:
         ChildDied: A process ended.
@@ -288,12 +291,20 @@ def start(
         "recorder": ("record", str(path), str(recording)),
     }
     for name, command in commands.items():
-        with waiting(console, f"starting {name}"):
-            supervisor.start(name, gemuco_command(*command))
-            supervisor.wait_ready(name, _is_running(client, name), READY_WITHIN)
+        supervisor.start(name, gemuco_command(*command))
+        if name == "simulator":  # the others look for its buses
+            await_ready(name, supervisor, client, console)
+    for name in commands:
+        await_ready(name, supervisor, client, console)
     supervisor.start("client", gemuco_command("query", robot.robot, "estimate", target, "--watch"))
     names = ", ".join(f"{child.name} {child.process.pid}" for child in supervisor.children.values())
     console.print(f"[bold]Processes:[/] {names}")
+
+
+def await_ready(name: str, supervisor: Supervisor, client: Client, console: Console) -> None:
+    """Wait until a process publishes that it runs."""
+    with waiting(console, f"starting {name}"):
+        supervisor.wait_ready(name, _is_running(client, name), READY_WITHIN)
 
 
 def _is_running(client: Client, name: str) -> Callable[[], bool]:

@@ -11,6 +11,7 @@ from rich.console import Console
 from talking_robot import TalkingRobot
 
 from hal.config import load_robot
+from hal.errors import ConfigError
 from services import extras
 from services.client import Client
 from services.demo import demo, report
@@ -127,6 +128,13 @@ def test_a_missing_page_is_found_before_anything_is_collected(monkeypatch: pytes
     monkeypatch.setattr(extras, "is_missing", lambda name: name == "viser" or missing(name))
     with pytest.raises(MissingExtra, match=r"gemuco\[view\]"):
         demo.play(ROBOT.model_copy(update={"robot": "unseen"}), tmp_path / "unseen.yaml", 1, tmp_path, with_page=True)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_missing_data_sheet_is_found_before_anything_is_collected(tmp_path: Path) -> None:
+    robot = ROBOT.model_copy(update={"robot": "unseen", "folder": tmp_path})
+    with pytest.raises(ConfigError, match="There is no EDS file"):
+        demo.play(robot, tmp_path / "unseen.yaml", 1, tmp_path)
     assert not list(tmp_path.iterdir())
 
 
