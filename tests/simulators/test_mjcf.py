@@ -14,6 +14,7 @@ from simulators.robots.urdf_arm import describe
 from simulators.robots.urdf_arm.body import arm_in
 from simulators.robots.urdf_arm.body_file import physics_urdf
 from simulators.robots.urdf_arm.choice import choose_arm
+from simulators.robots.urdf_arm.kinematics import TipKinematics
 from simulators.robots.urdf_arm.mjcf import convert, is_mjcf
 from simulators.robots.urdf_arm.robot_file import draft
 from simulators.robots.urdf_arm.tree import read_tree, tree_of
@@ -133,7 +134,7 @@ def test_it_moves_and_weighs_as_the_file_does_in_mujoco(tree, scene: Path) -> No
         data.qpos[places] = posture + reference
         mujoco.mj_forward(model, data)
         place = data.site("tool_center").xpos
-        np.testing.assert_allclose(arm.tips(posture[None])[0], place, atol=1e-9)
+        np.testing.assert_allclose(TipKinematics(arm).tips(posture[None])[0], place, atol=1e-9)
         for body in bodies.values():
             torque, _ = body.torques(posture)
             np.testing.assert_allclose(torque, data.qfrc_bias[speeds], rtol=0.01, atol=0.02)

@@ -13,6 +13,7 @@ from simulators.physics.bullet_arm import BulletArm
 from simulators.robots.urdf_arm import describe, simulator
 from simulators.robots.urdf_arm.body_file import find_mesh, physics_urdf, possible
 from simulators.robots.urdf_arm.choice import arm_of, choose_arm
+from simulators.robots.urdf_arm.kinematics import TipKinematics
 from simulators.robots.urdf_arm.motion import free_postures
 from simulators.robots.urdf_arm.survey import neutral, survey
 from simulators.robots.urdf_arm.tree import read_tree
@@ -169,7 +170,7 @@ def test_the_places_of_the_tip_are_those_of_bullet(arm, tmp_path):
         for one, angle in zip(arm.joints, posture, strict=True):
             pybullet.resetJointState(body, index[one.name], angle, physicsClientId=client)
         seen = pybullet.getLinkState(body, index["to tool0"], computeForwardKinematics=1, physicsClientId=client)[4]
-        np.testing.assert_allclose(arm.tips(posture[None])[0], seen, atol=1e-6)
+        np.testing.assert_allclose(TipKinematics(arm).tips(posture[None])[0], seen, atol=1e-6)
     pybullet.disconnect(physicsClientId=client)
 
 

@@ -131,7 +131,7 @@ def _behind(pose: Pose, joint: Joint, is_held: bool) -> Pose:
     if is_held and joint.kind == "prismatic":
         place = place + turn @ (joint.axis * joint.rest)
     elif is_held and joint.kind in ("revolute", "continuous"):
-        turn = turn @ turned(joint.axis, np.array([joint.rest]))[0]
+        turn = turn @ turned(joint.axis, joint.rest)
     return turn, place
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hal.errors import ConfigError
-from simulators.robots.urdf_arm.tree import Joint, Tree, numbers, turned
+from simulators.robots.urdf_arm.tree import Joint, Tree, numbers
 
 MOST_JOINTS = 16
 """An arm has at most this many joints: two buses carry the drives and encoders of these."""
@@ -49,21 +49,6 @@ class Arm:
             name = element_name(joint.name)
             names.append(name if name not in names else f"{name}_{len(names)}")
         return tuple(names)
-
-    def tips(self, positions: np.ndarray) -> np.ndarray:
-        """Return places of the tip in the root's frame [m], shape (k, 3), at joint positions [rad], shape (k, n)."""
-        count = len(positions)
-        turn, place = np.broadcast_to(np.eye(3), (count, 3, 3)), np.zeros((count, 3))
-        index = {joint.name: number for number, joint in enumerate(self.joints)}
-        for joint in self.tree.way(self.tip):
-            place = place + turn @ joint.shift
-            turn = turn @ joint.turn
-            angles = positions[:, index[joint.name]] if joint.name in index else np.full(count, joint.rest)
-            if joint.kind in ("revolute", "continuous"):
-                turn = turn @ turned(joint.axis, angles)
-            elif joint.kind == "prismatic":
-                place = place + turn @ (joint.axis * joint.rest)
-        return place + turn @ self.offset
 
     @property
     def offset(self) -> np.ndarray:

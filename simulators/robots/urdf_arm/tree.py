@@ -224,9 +224,13 @@ def rotation(rpy: np.ndarray) -> np.ndarray:
     )
 
 
-def turned(axis: np.ndarray, angles: np.ndarray) -> np.ndarray:
-    """Return the rotations by angles [rad], shape (k,), around a unit vector, shape (k, 3, 3)."""
-    cross = np.cross(np.eye(3), axis)
-    sines, cosines = np.sin(angles)[:, None, None], np.cos(angles)[:, None, None]
-    turns: np.ndarray = np.eye(3) + sines * cross + (1.0 - cosines) * cross @ cross
-    return turns
+def cross_matrix(axis: np.ndarray) -> np.ndarray:
+    """Return the matrix of the cross product with a vector, shape (3, 3)."""
+    return np.cross(np.eye(3), axis)
+
+
+def turned(axis: np.ndarray, angle: float) -> np.ndarray:
+    """Return the rotation by an angle [rad] around a unit vector, shape (3, 3)."""
+    cross = cross_matrix(axis)
+    turn: np.ndarray = np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * cross @ cross
+    return turn

@@ -13,6 +13,7 @@ from simulators.physics.scene import STEP
 from simulators.robots.urdf_arm.body import EFFORT, JOINT, MOTOR, TIP, Body, arm_in
 from simulators.robots.urdf_arm.body_file import physics_urdf
 from simulators.robots.urdf_arm.camera import TipCamera
+from simulators.robots.urdf_arm.kinematics import TipKinematics
 from simulators.robots.urdf_arm.survey import needs, neutral
 from simulators.world import World, servo_index
 
@@ -37,7 +38,8 @@ class ArmWorld(World):
         """
         self.time = 0.0
         self._config, self._made = config, body
-        self._arm = arm = arm_in(config)
+        arm = arm_in(config)
+        self._kinematics = TipKinematics(arm)
         low, high = config.bounds(MOTOR)
         middle = 0.5 * (low + high)
         text, _ = physics_urdf(arm, dict(zip(arm.names, body.weights, strict=True)))
@@ -88,7 +90,7 @@ class ArmWorld(World):
             MOTOR: position + self._twist * self._effort,
             JOINT: position.copy(),
             EFFORT: self._effort.copy(),
-            TIP: self._arm.tips(position[None])[0],
+            TIP: self._kinematics.tips(position[None])[0],
         }
         return {name: value for name, value in values.items() if name in self._config.signals}
 
