@@ -66,6 +66,16 @@ def test_a_folder_becomes_devices_with_what_the_files_state(folder: Path, tmp_pa
     assert collect_config(robot).samples == 2000
 
 
+def test_a_drive_that_cannot_watch_the_hal_has_a_line_to_set(folder: Path, tmp_path: Path) -> None:
+    files = tmp_path / "files"
+    files.mkdir()
+    (files / "plain.eds").write_text(DRIVE.replace("[1016", "[2016"))
+    draft = draft_folder(files, "arm", tmp_path, SHIPPED)
+    assert draft.summary == "1 device, 1 of them drives, 1 element; 2 lines to set."
+    assert "allow_no_watchdog: true (without 1016h it goes on when the HAL is gone)" in draft.text
+    assert "allow_no_watchdog: true (" not in draft_folder(folder, "arm", tmp_path, SHIPPED).text
+
+
 @pytest.mark.long
 def test_a_drafted_folder_runs_on_the_bench(folder: Path, tmp_path: Path) -> None:
     file = written(draft_folder(folder, "arm", tmp_path, SHIPPED), tmp_path)

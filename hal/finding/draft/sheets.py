@@ -102,6 +102,8 @@ def part_of(sheet: Sheet, eds: str, names: Names, node: int, moved: str, name: s
         signal, unit = moved, "rad"
         settings |= {"mode": _mode(sheet), "counts_per_turn": _counts(sheet, 0x608F) or 4096, "gear": 1.0}
         to_set = "gear" if _counts(sheet, 0x608F) else "counts_per_turn, gear"
+        if sheet.dictionary.get_variable(cia301.CONSUMER_HEARTBEAT, 1) is None:
+            to_set += ", and allow_no_watchdog: true (without 1016h it goes on when the HAL is gone)"
     elif sheet.profile == 406:
         signal, unit = "joint_position", "rad"
         to_set = "zero, direction"
