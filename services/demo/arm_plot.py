@@ -7,6 +7,7 @@ from matplotlib.axes import Axes
 
 from hal.config import RobotConfig
 from services.demo.arm_story import ArmMarks
+from services.demo.score_plot import draw_score
 from services.demo.timeline import Timeline
 from services.learning.plots import picture
 
@@ -55,10 +56,7 @@ def _tip(axis: Axes, tip: Timeline, marks: ArmMarks) -> None:
 
 
 def _anomaly(axis: Axes, joints: Timeline) -> None:
-    time, score, threshold = _rows(joints, "time", "score", "threshold")
-    axis.semilogy(time, score, color=BLUE, linewidth=1, label="anomaly score")
-    axis.semilogy(time, threshold, color=RED, linewidth=1.5, linestyle="--", label="threshold")
-    axis.set_ylabel("Mahalanobis distance")
+    draw_score(axis, joints, BLUE)
     axis.legend(loc="lower left", fontsize=8)
 
 

@@ -18,6 +18,8 @@ from services.model.control_config import ControlConfig
 
 MOVES = 4
 """The arm goes to this many postures in every stage."""
+NORMAL_TRIES, MORE_MOVES = 4, 2
+"""Normal errors are learned in at most this many tries, with this many more moves between two of them."""
 SETTLE = 0.8
 """The arm rests for this time [s] in every posture."""
 REST = 0.1
@@ -165,11 +167,16 @@ class ArmStory:
 
     def _learn_normal(self) -> str:
         """Learn what is normal for this body, which is not the designer's; return a sentence on it."""
-        try:
-            reply = self._client.ask("model", "normal")
-        except NotEnoughData as error:
-            return f"statistics of normal errors not learned: {error}"
-        return f"statistics of normal errors learned anew from {reply['samples']} samples"
+        for tries_left in reversed(range(NORMAL_TRIES)):
+            try:
+                reply = self._client.ask("model", "normal")
+                return f"statistics of normal errors learned anew from {reply['samples']} samples"
+            except NotEnoughData as error:
+                refusal = f"statistics of normal errors not learned: {error}"
+            if tries_left:  # an arm of many joints needs more samples
+                for _ in range(MORE_MOVES):
+                    self._go()
+        return refusal
 
     def _estimated(self, signal: str, index: int) -> bool:
         estimate = self._client.estimate()

@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from hal.config import RobotConfig
+from services.demo.score_plot import draw_score
 from services.demo.story import MUSCLE, SILENT_ELEMENT, Marks
 from services.demo.timeline import Timeline
 from services.learning.plots import picture
@@ -65,13 +66,9 @@ def _hidden_error(axis: Axes, timeline: Timeline, marks: Marks) -> None:
 
 
 def _anomaly(axis: Axes, timeline: Timeline, marks: Marks) -> None:
-    time, score, threshold = (timeline.column(name) for name in ("time", "score", "threshold"))
-    rows = min(map(len, (time, score, threshold)))
-    axis.semilogy(time[:rows], score[:rows], color=BLUE, linewidth=1, label="anomaly score")
-    axis.semilogy(time[:rows], threshold[:rows], color=RED, linewidth=1.5, linestyle="--", label="threshold")
+    draw_score(axis, timeline, BLUE)
     blamed = f"{MUSCLE} cut; muscle with the largest part: {marks.blamed or 'none'}"
     axis.annotate(blamed, (marks.cut, 0.92), xycoords=axis.get_xaxis_transform(), ha="right", color=RED, fontsize=9)
-    axis.set_ylabel("Mahalanobis distance")
     axis.legend(loc="lower left", fontsize=8)
 
 

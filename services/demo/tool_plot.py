@@ -8,6 +8,7 @@ from matplotlib.axes import Axes
 from gemuco.adaption.recognise import Prior
 from gemuco.schema import BodySchema
 from hal.config import RobotConfig
+from services.demo.score_plot import draw_score
 from services.demo.timeline import Timeline
 from services.demo.tool_story import ToolMarks
 from services.learning.plots import picture
@@ -104,12 +105,10 @@ def _bias(axis: Axes, schema: BodySchema, timeline: Timeline, marks: ToolMarks) 
 
 
 def _anomaly(axis: Axes, timeline: Timeline) -> None:
-    time, score, threshold, verdict = (timeline.column(name) for name in ("time", "score", "threshold", "verdict"))
-    rows = min(map(len, (time, score, threshold, verdict)))
-    axis.semilogy(time[:rows], score[:rows], color=GREY, linewidth=1, label="anomaly score")
-    axis.semilogy(time[:rows], threshold[:rows], color=RED, linewidth=1.5, linestyle="--", label="threshold")
+    time, score, verdict = (timeline.column(name) for name in ("time", "score", "verdict"))
+    rows = min(map(len, (time, score, verdict)))
+    draw_score(axis, timeline, GREY)
     for word, color in (("environment", BLUE), ("anomaly", RED)):
         at = verdict[:rows] == word
         axis.plot(time[:rows][at], score[:rows][at], ".", color=color, markersize=4, label=f"verdict {word}")
-    axis.set_ylabel("Mahalanobis distance")
     axis.legend(loc="lower left", ncols=4, fontsize=8)

@@ -1,4 +1,4 @@
-"""Arms that nobody here chose: `gemuco init FILE`, then `gemuco demo` of the robot file, without an edit.
+"""Arms from descriptions that were not chosen here: `gemuco init FILE`, then `gemuco demo` without an edit.
 
     python -m studies.stack.foreign_arms FOLDER --count 12 --seed 0
 

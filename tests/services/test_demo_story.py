@@ -6,10 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from gemuco.errors import NotEnoughData
 from hal.config import load_robot
 from hal.errors import CommandRefused
 from services.demo import actor as actor_module
 from services.demo.actor import NOTICED_WITHIN, TRIES, Actor
+from services.demo.arm_story import ArmStory
 from services.demo.story import CALM_TRIES, LEARNED, LEARNING_POSES, MOST_POSES, NORMAL, Story
 from services.wire.messages import Applied, Status, Update
 
@@ -75,6 +77,37 @@ def test_what_is_normal_is_learned_from_more_until_the_whole_arm_is_calm(alarms:
     assert machine.normals == sorted(machine.normals)
     assert machine.poses == learned * LEARNING_POSES
     assert sum("An anomaly is reported for the whole arm" in sentence for sentence in machine.said) == learned
+
+
+class ManyJoints:
+    """Model of an arm whose normal errors need more samples than the first moves give, and the arm's moves."""
+
+    def __init__(self, needed: int) -> None:
+        self.needed, self.moves = needed, 0
+
+    def ask(self, service: str, verb: str) -> dict[str, Any]:
+        assert (service, verb) == ("model", "normal")
+        if self.moves < self.needed:
+            raise NotEnoughData("Normal statistics of 73 errors need 73 complete samples; there are 68.")
+        return {"samples": 68 + 20 * self.moves}
+
+    def go(self) -> None:
+        self.moves += 1
+
+
+@pytest.mark.parametrize(
+    ("needed", "moves", "words"),
+    [(0, 0, "anew from 68 samples"), (3, 4, "anew from 148 samples"), (99, 6, "not learned: Normal statistics of 73")],
+)
+def test_an_arm_of_many_joints_moves_on_until_its_normal_errors_are_learned(
+    monkeypatch: pytest.MonkeyPatch, needed: int, moves: int, words: str
+) -> None:
+    model = ManyJoints(needed)
+    story = ArmStory.__new__(ArmStory)
+    story._client = model  # type: ignore[assignment]
+    monkeypatch.setattr(ArmStory, "_go", lambda _: model.go())
+    assert words in story._learn_normal()
+    assert model.moves == moves
 
 
 class Stopping:

@@ -1,4 +1,4 @@
-"""Drawing and judging of arms that nobody chose."""
+"""Drawing and judging of arms from descriptions that were not chosen here."""
 
 import subprocess
 from pathlib import Path
