@@ -1,6 +1,7 @@
 """The verbs of the model service."""
 
 from collections.abc import Mapping
+from functools import wraps
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,8 @@ from services.errors import BadArguments, NotEngaged
 from services.model.control_config import controller_of, simulator_of
 from services.model.control_loop import Control
 from services.model.estimation import widened
-from services.model.gemuco_service import GemucoService
+from services.model.gemuco_service import PRIORITIES, GemucoService
+from services.process.realtime import at_most
 from services.process.service import Service
 from services.wire.caller import Caller
 from services.wire.messages import Target
@@ -22,6 +24,21 @@ from services.wire.query import Guard, Handler
 
 MOST_STEPS = 200
 """A query may simulate at most this many commands; a step takes about 10 ms."""
+
+
+def below_loops(handler: Handler) -> Handler:
+    """Return a handler of a verb that computes for long, at the lowest priority of a loop.
+
+    Queries arrive in threads of the network, whose priority is above that of the loops: computing there would delay
+    every estimate.
+    """
+
+    @wraps(handler)
+    def answer(arguments: dict[str, Any]) -> Any:
+        with at_most(min(PRIORITIES.values())):
+            return handler(arguments)
+
+    return answer
 
 
 class ModelVerbs:
@@ -34,8 +51,8 @@ class ModelVerbs:
         """Return verb -> handler; `describe` comes with every service."""
         return {
             "estimate": self.estimate,
-            "control": self.solve,
-            "simulate": self.simulate,
+            "control": below_loops(self.solve),
+            "simulate": below_loops(self.simulate),
             "anomaly": self.anomaly,
             "history": self.history,
             "engage": self.engage,
@@ -43,7 +60,7 @@ class ModelVerbs:
             "target": self.target,
             "adapt": self.adapt,
             "rollback": self.rollback,
-            "normal": self.normal,
+            "normal": below_loops(self.normal),
             "trust": self.trust,
             "distrust": self.distrust,
         }

@@ -97,6 +97,20 @@ def promote_rest(priority: int) -> None:
                 _use_fifo(int(entry.name), priority)
 
 
+@contextlib.contextmanager
+def at_most(priority: int) -> Iterator[None]:
+    """Run a block with at most this SCHED_FIFO priority; a thread in normal scheduling stays there."""
+    policy, before = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK, os.sched_getparam(0).sched_priority
+    if policy != os.SCHED_FIFO or before <= priority:
+        yield
+        return
+    _use_fifo(0, priority)
+    try:
+        yield
+    finally:
+        _use_fifo(0, before)
+
+
 def _use_fifo(thread: int, priority: int) -> bool:
     try:
         os.sched_setscheduler(thread, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))

@@ -1,16 +1,18 @@
 """What the model service can be asked, near and far: the same verbs, the same numbers, the same exceptions."""
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
 from arm_model import arm, small_model, states
 
 from gemuco.anomaly.score import score
-from gemuco.errors import NotFinite, NotObservable, UnknownSignal, WrongSize
+from gemuco.errors import NotEnoughData, NotFinite, NotObservable, UnknownSignal, WrongSize
 from gemuco.estimation import estimate
 from services.client import Client
 from services.errors import BadArguments
+from services.model import model_verbs
 from services.model.control_config import controller_of, simulator_of
 from services.model.gemuco_service import GemucoService
 from services.model.model_verbs import ModelVerbs
@@ -72,6 +74,27 @@ def test_solves_for_a_command_without_moving(
     assert far["residual"] == pytest.approx(near.residual)
     low, high = model.robot.bounds("muscle_length")
     assert ((low <= far["values"]) & (far["values"] <= high)).all()
+
+
+def test_verbs_that_compute_for_long_run_below_the_loops(
+    client: Client, sample: dict[str, np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lowered: list[int] = []
+
+    @contextmanager
+    def at_most(priority: int) -> Iterator[None]:
+        lowered.append(priority)
+        yield
+
+    monkeypatch.setattr(model_verbs, "at_most", at_most)
+    client.estimate(sample)
+    client.anomaly(sample)
+    assert not lowered  # they take less than a millisecond
+    client.control({"joint_position": sample["joint_position"]}, sample)
+    client.simulate([sample["muscle_length"]], values=sample)
+    with pytest.raises(NotEnoughData):
+        client.ask("model", "normal")
+    assert lowered == [10, 10, 10]
 
 
 def test_simulates_commands_step_after_step(

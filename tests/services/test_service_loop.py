@@ -170,6 +170,40 @@ def test_a_start_without_permission_is_a_start(monkeypatch: pytest.MonkeyPatch) 
         assert _scheduling() == os.SCHED_OTHER
 
 
+class Kernel:
+    """A system that allows real-time scheduling, with the priorities that the calling thread asked for."""
+
+    def __init__(self, policy: int, priority: int) -> None:
+        self.policy, self.asked = policy | os.SCHED_RESET_ON_FORK, [priority]
+
+    def sched_getscheduler(self, thread: int) -> int:
+        return self.policy
+
+    def sched_getparam(self, thread: int) -> os.sched_param:
+        return os.sched_param(self.asked[-1])
+
+    def sched_setscheduler(self, thread: int, policy: int, param: os.sched_param) -> None:
+        assert (thread, policy) == (0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK)
+        self.asked.append(param.sched_priority)
+
+
+@pytest.mark.parametrize(
+    ("policy", "priority", "asked"),
+    [(os.SCHED_FIFO, 45, [45, 10, 45]), (os.SCHED_FIFO, 10, [10]), (os.SCHED_OTHER, 0, [0])],
+)
+def test_long_work_runs_below_the_loops_and_then_as_before(
+    policy: int, priority: int, asked: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kernel = Kernel(policy, priority)
+    for name in ("sched_getscheduler", "sched_getparam", "sched_setscheduler"):
+        monkeypatch.setattr(realtime.os, name, getattr(kernel, name))
+    inside: list[int] = []
+    with pytest.raises(RuntimeError), realtime.at_most(10):
+        inside.append(kernel.asked[-1])
+        raise RuntimeError("The work failed.")
+    assert (inside, kernel.asked) == ([min(priority, 10)], asked)
+
+
 def test_real_time_is_tried_and_a_refusal_is_no_error() -> None:
     found: list[str] = []
     ready, done = threading.Event(), threading.Event()
