@@ -14,8 +14,8 @@ NOISE = 8.0
 """A burst of noise has at least this multiple of the healthy variance."""
 RECENT = 20
 """The usual error is that of this number of blocks."""
-QUIET = 0.5
-"""It has at least this multiple of the variance of healthy errors."""
+QUIET = 0.7
+"""Its standard deviation is at least this share of the size of a lie that matters."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,7 +56,7 @@ class Judge:
         self.time = likeness.time
         self._steps, self._limit = StepTest(likeness), np.maximum(healthy.limit(chance), least)
         self._sum = -math.log(chance)
-        self._noise = np.maximum(NOISE * healthy.noise, QUIET * self.scale**2)
+        self._noise = np.maximum(NOISE * healthy.noise, (QUIET * least * self.scale) ** 2)
 
     def __call__(self, view: View, lasting: LastingTest | None = None) -> Evidence:
         """Return the evidence in a view; without `lasting` from its blocks alone."""

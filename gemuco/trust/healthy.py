@@ -26,6 +26,8 @@ TAIL, EXCESSES = 0.4, 20.0
 """Mean excess above `COMMON` that is assumed at the start, and the number of excesses that this counts as."""
 TAILS = (0.3, 0.7)
 """The mean excess is at least and at most this; 0.28 for normal errors."""
+NOISE_KNOWN = 20
+"""The usual noise of a column is known after this number of blocks in which it was measured."""
 RESTS = 0.2
 """Slower than this share of its usual pace the body is at rest."""
 
@@ -39,7 +41,7 @@ class Healthy:
         self._near, self._far = np.full(size, 0.85), np.full(size, 0.5)
         self._excess, self._exceeding = np.full(size, TAIL * EXCESSES), np.full(size, EXCESSES)
         self._pace = LEAST_PACE
-        self._noise, self._noise_count = np.full(size, 1e-6), 0
+        self._noise, self._noise_count = np.full(size, 1e-6), np.zeros(size)
 
     def add(self, z: np.ndarray, steps: np.ndarray, noise: np.ndarray, motion: float) -> None:
         """Learn from one block; columns whose newest error is NaN keep what they have.
@@ -65,11 +67,10 @@ class Healthy:
         self._excess = self._excess * fade + np.where(above, steps - COMMON, 0.0)
         self._exceeding = self._exceeding * fade + above
         is_noise = np.isfinite(noise)
-        if is_noise.any():
-            self._noise_count += 1
-            share = 1.0 / min(self._noise_count, MEMORY)
-            change = np.clip(np.where(is_noise, noise, self._noise), 0.0, 9.0 * self._noise + 1e-4)
-            self._noise += share * (change - self._noise)
+        self._noise_count += is_noise
+        share = is_noise / np.clip(self._noise_count, 1.0, MEMORY)
+        change = np.clip(np.where(is_noise, noise, self._noise), 0.0, 9.0 * self._noise + 1e-4)
+        self._noise += share * (change - self._noise)
 
     def motion(self, moved: float) -> float:
         """Return how much of a look at a new posture a block is, from 0 at rest to 1.
@@ -88,8 +89,8 @@ class Healthy:
 
     @property
     def noise(self) -> np.ndarray:
-        """Variance of the noise within a block, in units of the learned errors, shape (n,)."""
-        return self._noise
+        """Variance of the noise within a block, in units of the learned errors, shape (n,); infinite if unknown."""
+        return np.where(self._noise_count >= NOISE_KNOWN, self._noise, np.inf)
 
     @property
     def likeness(self) -> Likeness:

@@ -12,7 +12,10 @@ from gemuco.learning.train import fit
 from gemuco.normal.watch import Watch
 from gemuco.trust.changes import LONGEST, Likeness, StepTest
 from gemuco.trust.config import BLOCK, TrustConfig
+from gemuco.trust.evidence import Judge
+from gemuco.trust.healthy import NOISE_KNOWN, Healthy
 from gemuco.trust.monitor import TrustMonitor
+from gemuco.trust.recent import View
 from gemuco.trust.relations import Relations, rows_of
 from gemuco.trust.sensitivity import Sensitivity
 
@@ -100,6 +103,33 @@ def test_a_step_is_tested_with_its_likeness():
     expected = np.sqrt(step @ np.linalg.inv(covariance) @ step)
     assert found[0] == pytest.approx(expected, rel=1e-6)
     assert (1, 2, 3, 5)[age[0]] == 5
+
+
+def test_the_usual_noise_of_an_element_is_that_since_it_is_measured():
+    """An encoder that was lost at the start and returns is not called noisy for its usual noise."""
+    healthy, random = Healthy(2), np.random.default_rng(4)
+    for block in range(400):
+        noise = 0.9 * random.chisquare(3, 2) / 3
+        noise[1] = np.nan if block < 200 else noise[1]
+        healthy.add(np.zeros((LONGEST, 2)), np.zeros(2), noise, 1.0)
+        assert healthy.noise[0] == (np.inf if block < NOISE_KNOWN - 1 else pytest.approx(0.9, abs=0.5))
+        if block < 200 + NOISE_KNOWN - 1:
+            assert healthy.noise[1] == np.inf
+        else:
+            assert healthy.noise[1] == pytest.approx(0.9, abs=0.5)
+
+
+@pytest.mark.parametrize(("share", "is_noise"), [(0.6, False), (0.8, True)])
+def test_noise_matters_from_a_share_of_the_size_on(share, is_noise):
+    healthy = Healthy(2)
+    for _ in range(100):
+        healthy.add(np.ones((LONGEST, 2)), np.zeros(2), np.full(2, 1e-3), 1.0)
+    size = 3.0
+    judge = Judge(healthy, 0.006, np.full(2, size))
+    noises = np.array([[(share * size) ** 2, 1e-3]] * 5) * judge.scale**2
+    evidence = judge(View(np.zeros((LONGEST, 2)), np.ones((LONGEST, 2)), noises, frozenset()))
+    assert evidence.is_noise.tolist() == [is_noise, False]
+    assert (evidence.ratio[0] >= 1.0) == is_noise
 
 
 @pytest.mark.long
