@@ -27,6 +27,7 @@ from services.process.supervisor import gemuco_command
 LIMIT = 600.0
 """A demo is ended after this time [s]."""
 JOINTS = re.compile(r": (\d+) joints from")
+VERDICT = re.compile(r"(?:is|are) distrusted:")
 TIP = re.compile(r"true error of the tip meanwhile: mean ([\d.]+) mm \(([\d.]+)% of the reach")
 
 
@@ -39,6 +40,7 @@ class Played:
         joints: Number of joints; 0 if it was refused.
         seconds: Duration of both commands [s].
         tip: Mean error of the tip while its camera is covered [mm], and in per cent of the reach; empty if unknown.
+        accused: Number of verdicts against a sensor; none of them lies, so all are wrong.
         end: `green`, `refused: ` with the sentence, or `NOT GREEN: ` with the last line.
     """
 
@@ -46,6 +48,7 @@ class Played:
     joints: int
     seconds: float
     tip: tuple[float, float] | tuple[()]
+    accused: int
     end: str
 
 
@@ -66,17 +69,19 @@ def play(path: Path, folder: Path) -> Played:
         made = _run(Path(work), "init", str(path.resolve()), "--out", "arm.yaml")
         name = str(path.relative_to(folder))
         if made.returncode:
-            return Played(name, 0, time.monotonic() - began, (), f"refused: {made.stderr.strip()}")
+            return Played(name, 0, time.monotonic() - began, (), 0, f"refused: {made.stderr.strip()}")
         demo = _run(Path(work), "demo", "arm.yaml")
         seconds = time.monotonic() - began
         joints, text = JOINTS.search(made.stdout), " ".join(demo.stdout.split())
         tip = TIP.search(text)
+        log = Path(work) / "runs/demo/model.log"
         last = (demo.stderr.strip() or demo.stdout.strip()).splitlines()[-1:]
         return Played(
             name,
             int(joints[1]) if joints else 0,
             seconds,
             (float(tip[1]), float(tip[2])) if tip else (),
+            len(VERDICT.findall(log.read_text())) if log.exists() else 0,
             "green" if demo.returncode == 0 else f"NOT GREEN: {' '.join(last)}",
         )
 
@@ -93,11 +98,11 @@ def _run(work: Path, *words: str) -> subprocess.CompletedProcess[str]:
 def table(tried: list[Played]) -> Table:
     """Return the arms as a table."""
     shown = Table(title=f"{sum(arm.end == 'green' for arm in tried)} of {len(tried)} green")
-    for column in ("arm", "joints", "time [s]", "tip, mean error [mm]", "% of the reach", "end"):
+    for column in ("arm", "joints", "time [s]", "tip, mean error [mm]", "% of the reach", "wrongly distrusted", "end"):
         shown.add_column(column)
     for arm in tried:
         tip = [f"{value:g}" for value in arm.tip] or ["", ""]
-        shown.add_row(arm.name, str(arm.joints or ""), f"{arm.seconds:.0f}", *tip, arm.end)
+        shown.add_row(arm.name, str(arm.joints or ""), f"{arm.seconds:.0f}", *tip, str(arm.accused), arm.end)
     return shown
 
 

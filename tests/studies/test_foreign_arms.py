@@ -10,6 +10,7 @@ from studies.stack.foreign_arms import Played, drawn, play, table
 
 SENTENCE = "arm.yaml: 6 joints from base to tip, reach 0.90 m, largest torque 40 N m.\n"
 STORY = "true error of the tip meanwhile: mean 17.2 mm (1.6% of the reach of 1.07 m),\nworst 50.1 mm\n"
+VERDICTS = "joint_position.elbow is distrusted: noise since 9:00.\nx and y are distrusted: offset since 9:01.\nReady.\n"
 
 
 @pytest.fixture
@@ -46,14 +47,17 @@ def test_an_arm_is_green_refused_or_neither(
         code = left.pop(0)
         if words[0] == "init":
             return subprocess.CompletedProcess(words, code, SENTENCE, "gemuco: it has no joint.\n" if code else "")
+        (work / "runs/demo").mkdir(parents=True)
+        (work / "runs/demo/model.log").write_text(VERDICTS)
         return subprocess.CompletedProcess(words, code, STORY, "")
 
     monkeypatch.setattr(foreign_arms, "_run", run)
     played = play(folder / "b/robots/three.urdf", folder)
     assert (played.name, played.joints, played.tip, played.end) == ("b/robots/three.urdf", joints, tip, end)
+    assert played.accused == (2 if joints else 0)
     assert not left
 
 
 def test_the_table_counts_the_green_ones() -> None:
-    tried = [Played("a", 6, 90.0, (3.0, 0.5), "green"), Played("b", 0, 1.0, (), "refused: no arm")]
+    tried = [Played("a", 6, 90.0, (3.0, 0.5), 0, "green"), Played("b", 0, 1.0, (), 0, "refused: no arm")]
     assert table(tried).title == "1 of 2 green"
