@@ -229,6 +229,7 @@ def smooth_arm(rows: int) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.long
+@pytest.mark.timeout(400)
 def test_seeds_give_the_same_verdict():
     units = {"joint": "rad", "cable": "m", "other": "1"}
     verdicts = [determine(smooth_arm(900), replace(SHORT, seed=100 * seed), units=units).x_out for seed in range(5)]
