@@ -356,6 +356,10 @@ class Client:
         """Return to the model before the online update."""
         return self.ask("model", "rollback", timeout=SLOW_TIMEOUT)
 
+    def learn_normal(self) -> dict[str, Any]:
+        """Learn the normal errors from the samples since the model last changed; return `samples`, their number."""
+        return self.ask("model", "normal", timeout=SLOW_TIMEOUT)
+
     def trust(self, element: str) -> dict[str, Any]:
         """Let the model use an element (`joint_position.elbow_pitch`) as measured again; return what is distrusted."""
         return self.ask("model", "trust", {"element": element})

@@ -169,7 +169,7 @@ class ArmStory:
         """Learn what is normal for this body, which is not the designer's; return a sentence on it."""
         for tries_left in reversed(range(NORMAL_TRIES)):
             try:
-                reply = self._client.ask("model", "normal")
+                reply = self._client.learn_normal()
                 return f"statistics of normal errors learned anew from {reply['samples']} samples"
             except NotEnoughData as error:
                 refusal = f"statistics of normal errors not learned: {error}"

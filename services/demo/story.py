@@ -179,11 +179,11 @@ class Story:
         at, hidden = (self._timeline.between(name, start, end) for name in ("time", "estimated"))
         hidden = hidden[:, index] > 0
         error = np.abs(self._silent_error(index, start, end))
-        wrong = error[hidden]
-        if not reason or not hidden.any():
+        wrong = error[hidden & np.isfinite(error)]
+        if not reason or not wrong.size:
             return f"{element} {words}: not noticed", False
         delay = float(at[np.argmax(hidden)]) - start
-        late = ~hidden & (at > start + LEAKS_AFTER)
+        late = ~hidden & (at > start + LEAKS_AFTER) & np.isfinite(error)  # without an estimate nothing is passed on
         leak = f", wrong as measured later by {error[late].max():.3f} rad" if late.any() else ""
         is_back = not self._is_estimated(index)
         back = f"trusted again {returned:.0f} s after it was right" if is_back else "not trusted again"
@@ -244,7 +244,7 @@ class Story:
     def _learn_normal(self) -> int:
         """Learn the statistics of normal errors since the model changed; return the number of samples."""
         self._gather(NORMAL)
-        return int(self._client.ask("model", "normal")["samples"])
+        return int(self._client.learn_normal()["samples"])
 
     def _become_calm(self) -> None:
         """Wait until the whole arm has no anomaly; if it has one, learn normal errors from more motion."""

@@ -89,7 +89,7 @@ class ToolStory:
         self._first_error = self._measure()
         for target in self._learning:
             self._go(target, SHORT_REST)
-        normal = self._client.ask("model", "normal")
+        normal = self._client.learn_normal()
         figures = (
             *sentences,
             f"{TARGETS} targets, tip {1e3 * self._first_error:.0f} mm away from them on average",

@@ -149,6 +149,8 @@ def _answer(client: Client, verb: str, words: Sequence[str], hide: Sequence[str]
         return {"holder": holder.name or "none", "left": round(holder.left, 1)}
     if verb == "anomaly":
         return client.ask("model", "anomaly", {"hide": list(hide)}, SLOW_TIMEOUT)
+    if verb in ("normal", "rollback"):
+        return client.learn_normal() if verb == "normal" else client.rollback()
     return client.ask(WITHOUT_WORDS[verb], verb)
 
 

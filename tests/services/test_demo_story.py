@@ -33,8 +33,7 @@ class Machine:
     def update(self, timeout: float = 0.0) -> Update:
         return Update(active=True, model_version=1, window=self.window, dropped=0, loss=0.0)
 
-    def ask(self, service: str, verb: str) -> dict[str, Any]:
-        assert (service, verb) == ("model", "normal")
+    def learn_normal(self) -> dict[str, Any]:
         self.normals.append(self.window)
         return {"samples": self.window}
 
@@ -79,14 +78,57 @@ def test_what_is_normal_is_learned_from_more_until_the_whole_arm_is_calm(alarms:
     assert sum("An anomaly is reported for the whole arm" in sentence for sentence in machine.said) == learned
 
 
+class Lie(Machine):
+    """Rows of a timeline, one a second, while an encoder is wrong by 0.5 rad: those estimated are right."""
+
+    def __init__(self, states: str) -> None:
+        """Take a letter for each row: measured, estimated, or nothing was published."""
+        super().__init__(0)
+        self.states, self.rows = states, np.arange(float(len(states)))
+
+    def fault(self, text: str) -> None:
+        self.poses = 0
+
+    def between(self, name: str, start: float, end: float) -> np.ndarray:
+        values = {"m": 0.5, "e": 0.01, "n": np.nan}
+        marks = {"m": 0.0, "e": 1.0, "n": np.nan}
+        columns = {
+            "time": self.rows,
+            "estimated": np.array([[marks[state]] * 5 for state in self.states]),
+            "value": np.array([[values[state]] * 5 for state in self.states]),
+            "truth": np.zeros((len(self.states), 5)),
+        }
+        return columns[name]
+
+
+@pytest.mark.parametrize(
+    ("states", "is_seen", "words"),
+    [
+        ("mmeeee", True, "hidden after 2.0 s, estimate wrong by 0.010 rad"),
+        ("mmeene", True, "hidden after 2.0 s, estimate wrong by 0.010 rad"),  # a moment without a value
+        ("mmeeme", False, "wrong as measured later by 0.500 rad"),
+        ("mmmmmm", False, "not noticed"),
+    ],
+)
+def test_a_lie_is_passed_on_only_where_a_value_is(
+    monkeypatch: pytest.MonkeyPatch, states: str, is_seen: bool, words: str
+) -> None:
+    story = Lie(states).story()
+    monkeypatch.setattr(story, "_reason", lambda element: "frozen")
+    monkeypatch.setattr(story, "_is_estimated", lambda index: False)
+    text, seen = story._lying("elbow_pitch", "sensor_frozen elbow_pitch_encoder", "frozen")
+    assert words in text
+    assert seen == is_seen
+    assert "nan" not in text
+
+
 class ManyJoints:
     """Model of an arm whose normal errors need more samples than the first moves give, and the arm's moves."""
 
     def __init__(self, needed: int) -> None:
         self.needed, self.moves = needed, 0
 
-    def ask(self, service: str, verb: str) -> dict[str, Any]:
-        assert (service, verb) == ("model", "normal")
+    def learn_normal(self) -> dict[str, Any]:
         if self.moves < self.needed:
             raise NotEnoughData("Normal statistics of 73 errors need 73 complete samples; there are 68.")
         return {"samples": 68 + 20 * self.moves}

@@ -10,7 +10,7 @@ from arm_model import arm, small_model, states
 from gemuco.anomaly.score import score
 from gemuco.errors import NotEnoughData, NotFinite, NotObservable, UnknownSignal, WrongSize
 from gemuco.estimation import estimate
-from services.client import Client
+from services.client import SLOW_TIMEOUT, Client
 from services.errors import BadArguments
 from services.model import model_verbs
 from services.model.control_config import controller_of, simulator_of
@@ -93,8 +93,21 @@ def test_verbs_that_compute_for_long_run_below_the_loops(
     client.control({"joint_position": sample["joint_position"]}, sample)
     client.simulate([sample["muscle_length"]], values=sample)
     with pytest.raises(NotEnoughData):
-        client.ask("model", "normal")
+        client.learn_normal()
     assert lowered == [10, 10, 10]
+
+
+@pytest.mark.parametrize("verb", ["normal", "rollback"])
+def test_what_takes_long_is_waited_for(verb: str, robot: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    waited: dict[str, float] = {}
+
+    def ask(client: Client, service: str, verb: str, arguments: object = None, timeout: float = 2.0) -> dict[str, int]:
+        waited[f"{service} {verb}"] = timeout
+        return {"samples": 100, "model_version": 1}
+
+    monkeypatch.setattr(Client, "ask", ask)
+    assert ask_robot(robot, verb, [], (), False, ()) == 0
+    assert waited == {f"model {verb}": SLOW_TIMEOUT}
 
 
 def test_simulates_commands_step_after_step(
