@@ -71,7 +71,7 @@ def test_a_drive_that_cannot_watch_the_hal_has_a_line_to_set(folder: Path, tmp_p
     files.mkdir()
     (files / "plain.eds").write_text(DRIVE.replace("[1016", "[2016"))
     draft = draft_folder(files, "arm", tmp_path, SHIPPED)
-    assert draft.summary == "1 device, 1 of them drives, 1 element; 2 lines to set."
+    assert draft.summary == "devices: 1, of them drives: 1, elements: 1; lines to set: 2."
     assert "allow_no_watchdog: true (without 1016h it goes on when the HAL is gone)" in draft.text
     assert "allow_no_watchdog: true (" not in draft_folder(folder, "arm", tmp_path, SHIPPED).text
 

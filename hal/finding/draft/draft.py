@@ -1,7 +1,7 @@
 """A whole draft: from a folder with the files of vendors, or from a scanned bus and such a folder."""
 
 import os
-from collections.abc import Iterator, Mapping, Sequence, Sized
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -267,12 +267,7 @@ def _finished(work: _Draughtsman, name: str, source: str, bus: str, real: str, b
     drives = sum(part.is_drive for part in parts)
     to_set = sum(bool(part.to_set) for part in parts)
     summary = (
-        f"{_counted(parts, 'device')}, {drives} of them drives, "
-        f"{_counted([measure for part in parts for measure in part.measures], 'element')}; "
-        f"{to_set + 1} lines to set."
+        f"devices: {len(parts)}, of them drives: {drives}, elements: {sum(len(part.measures) for part in parts)}; "
+        f"lines to set: {to_set + 1}."
     )
     return Draft(name, text, work.copies, summary, tuple(work.notes))
-
-
-def _counted(things: Sized, noun: str) -> str:
-    return f"{len(things)} {noun}{'' if len(things) == 1 else 's'}"
