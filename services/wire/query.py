@@ -290,11 +290,12 @@ def describe_presence(session: zenoh.Session, robot: str) -> str:
 def _no_answer(session: zenoh.Session, key: str, timeout: float, late: bool) -> NoAnswer:
     robot, service, verb = keys.parse(key)
     verb = verb.removeprefix("do/")
-    if late:
+    services = alive(session, robot)
+    if late and service in services:  # while other programs come and go, zenoh waits for one that is not there too
         return TooSlow(
             f"The '{service}' service of robot '{robot}' did not answer '{verb}' within {timeout:.3g} s. Is it busy?"
         )
-    if service in alive(session, robot):
+    if service in services:
         return ServiceUnavailable(
             f"The '{service}' service of robot '{robot}' runs, but has no verb '{verb}' (yet), or the router does not "
             "let this client ask it."

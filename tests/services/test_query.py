@@ -97,8 +97,17 @@ def test_a_verb_that_a_service_lacks_is_told(pair: Pair) -> None:
 
 
 def test_a_verb_that_takes_too_long_is_told(pair: Pair) -> None:
+    token = pair.far.liveliness().declare_token(keys.alive(pair.robot, "hal"))
     key = pair.serve("slow", lambda _: time.sleep(0.6))
     with pytest.raises(TooSlow, match=r"did not answer 'slow' within 0.2 s. Is it busy\?"):
+        pair.ask(key, timeout=0.2)
+    token.undeclare()
+
+
+def test_a_service_that_is_not_there_is_not_called_busy(pair: Pair) -> None:
+    """Zenoh waits also for a queryable whose program does not answer any more, which is no service then."""
+    key = pair.serve("slow", lambda _: time.sleep(0.6))
+    with pytest.raises(ServiceUnavailable, match=r"answered within 0.2 s. Is `gemuco hal` running\?"):
         pair.ask(key, timeout=0.2)
 
 
