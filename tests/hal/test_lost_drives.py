@@ -30,6 +30,19 @@ def test_a_drive_without_a_heartbeat_is_taken_out_of_operation_though_it_answers
     bench.enable()
 
 
+def test_a_drive_that_was_lost_when_the_robot_was_reset_is_reset_when_it_returns(bench):
+    """The HAL stood still: the drive tripped for want of its heartbeat, and answers again after the reset only."""
+    lose(bench, 0x701, 0x181, 0x581)
+    bench.rig.fault("emcy biceps_drive")
+    bench.cycle(30)
+    assert bench.robot.mode == "fault"
+    bench.robot.reset()
+    bench.cycle(2)
+    lose(bench)
+    bench.until(lambda: bench.states() == {"ready"}, "the fault's reset")
+    bench.enable()
+
+
 def test_a_drive_that_is_taken_for_rebooted_by_a_forged_heartbeat_comes_to_rest(bench):
     lose(bench, 0x581)
     bench.faulty["can0"].say(0x701, b"\x7f")
