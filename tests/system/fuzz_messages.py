@@ -347,7 +347,10 @@ class Stage:
 
     @contextlib.contextmanager
     def held(self) -> Iterator[None]:
-        """Motors enabled, and kept at `HERE` by the holder of the lease; ends with the motors off."""
+        """Motors enabled, and kept at `HERE` by the holder of the lease; ends with the motors off.
+
+        If the machine stood still for longer than the watchdog of the cycle allows, a fault has ended it before.
+        """
         stop = threading.Event()
 
         def stream() -> None:
@@ -367,11 +370,15 @@ class Stage:
                 thread.join()
                 self.holder.disable()
         eventually(
-            lambda: self.mode() == "off", report=lambda: f"mode '{self.mode()}', {self.hal.status().facts['mode']}"
+            lambda: self.mode() == "off" or (self.mode() == "fault" and "Was the HAL frozen?" in self.fault()),
+            report=lambda: f"mode '{self.mode()}', {self.fault()}",
         )
 
     def mode(self) -> str:
         return str(self.hal.status().facts["mode"])
+
+    def fault(self) -> str:
+        return str(self.hal.status().facts["fault"])
 
     def facts(self, service: str) -> dict[str, Any]:
         """What a service counts, newer than this call; forged ones with other boots are passed by."""
