@@ -27,6 +27,8 @@ WEIGHT, STIFFNESS = 30.0, 150.0
 """Load of an outstretched joint [N], and the load that bends its spring by 1 rad [N]."""
 SPEED = 20.0
 """Speed of a motor per distance from its set-point [rad/s per rad]."""
+SINKING = 0.05
+"""Speed at which a released joint sinks to where it hangs, at zero [rad/s]."""
 NOISE = {MOTOR: 0.002, JOINT: 0.002, LOAD: 0.1}
 
 
@@ -37,7 +39,7 @@ def body(motor: np.ndarray) -> dict[str, np.ndarray]:
 
 
 class LightWorld:
-    """The robot's body (`simulators.world.World`); it swings slowly until a motor is driven."""
+    """The robot's body (`simulators.world.World`); it swings until a motor is driven and sinks when released."""
 
     def __init__(self, seed: int) -> None:
         self.time = 0.0
@@ -54,6 +56,9 @@ class LightWorld:
         for index, target in self._targets.items():
             wanted[index] = target
         self._motor = self._motor + (1.0 - math.exp(-SPEED * duration)) * (wanted - self._motor)
+        if not self._swings:
+            released = [index for index in range(len(JOINTS)) if index not in self._targets]
+            self._motor[released] -= np.clip(self._motor[released], -SINKING * duration, SINKING * duration)
 
     def measure(self) -> Mapping[str, np.ndarray]:
         """Return all signals with noise."""
