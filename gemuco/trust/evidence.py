@@ -8,12 +8,14 @@ import numpy as np
 from gemuco.trust.changes import AGES, LastingTest, StepTest
 from gemuco.trust.config import BLOCK
 from gemuco.trust.healthy import Healthy
-from gemuco.trust.recent import View
+from gemuco.trust.recent import SETTLING, View
 
 NOISE = 8.0
 """A burst of noise has at least this multiple of the healthy variance."""
 RECENT = 20
 """The usual error is that of this number of blocks."""
+NEWEST = 5
+"""At rest, the mean of this number of the newest errors is held against those when the body had settled."""
 QUIET = 0.7
 """Its standard deviation is at least this share of the size of a lie that matters."""
 
@@ -55,7 +57,7 @@ class Judge:
         likeness = healthy.likeness
         self.time = likeness.time
         self._steps, self._limit = StepTest(likeness), np.maximum(healthy.limit(chance), least)
-        self._sum = -math.log(chance)
+        self._sum, self._likeness, self._size = -math.log(chance), likeness, least
         self._noise = np.maximum(NOISE * healthy.noise, (QUIET * least * self.scale) ** 2)
 
     def __call__(self, view: View, lasting: LastingTest | None = None) -> Evidence:
@@ -68,6 +70,10 @@ class Judge:
             ratio = np.where(is_longer, likelihood / self._sum, ratio)
             strength = np.maximum(strength, likelihood)
             age = np.where(is_longer, AGES[-1], age)
+        rest = self._at_rest(view)
+        is_rest = rest > ratio
+        ratio, age = np.where(is_rest, rest, ratio), np.where(is_rest, AGES[-1], age)
+        strength = np.maximum(strength, 0.5 * (rest * self._limit) ** 2)
         noise = np.nan_to_num(view.noise) / self._noise
         is_noise = (noise >= 1.0) & (np.sqrt(noise) > ratio)
         ratio = np.where(is_noise, np.sqrt(noise), ratio)
@@ -75,6 +81,17 @@ class Judge:
         hidden = list(view.hidden)
         ratio[hidden] = strength[hidden] = 0.0
         return Evidence(ratio, strength, age, step, is_noise, _level(view, self.scale))
+
+    def _at_rest(self, view: View) -> np.ndarray:
+        """Return the evidence in errors that change while the body rests, shape (columns,); 0 in motion.
+
+        The slow part of the errors is that of the posture, so as good as none of it changes.
+        """
+        change = np.nan_to_num(np.abs(view.z[-NEWEST:].mean(axis=0) - view.settled) / self.scale)
+        slow, white = self._likeness.slow, self._likeness.white
+        posture = self._limit**2 * 2.0 * (1.0 - white) * (1.0 - slow**view.away)
+        noise = 2.0 * self._sum * white * (1.0 / SETTLING + 1.0 / NEWEST)  # normal, so without a tail
+        return np.asarray(change / np.maximum(np.sqrt(posture + noise), self._size))
 
 
 def _level(view: View, scale: np.ndarray) -> float:

@@ -80,7 +80,11 @@ class Healthy:
         """
         if moved > RESTS * self._pace:
             self._pace = max(LEAST_PACE, self._pace + (moved - self._pace) / min(1.0 + self.count, MEMORY))
-        return min(1.0, moved / self._pace)
+        return self.looks(moved)
+
+    def looks(self, distance: float) -> float:
+        """Return how many looks at a new posture a distance [standard deviations] is worth, at most 1."""
+        return min(1.0, distance / self._pace)
 
     @property
     def scale(self) -> np.ndarray:

@@ -190,14 +190,17 @@ class TrustMonitor:
             return
         self._count, self._now = self._count + 1, now
         self._recent.add(self._schema, self._relations, samples)
+        motion = self._motion = self._healthy.motion(self._recent.moved())
+        self._recent.rest(self._healthy.looks)
         hidden = self._hidden_columns() | self._recent.missing()
         before = self._view
+        if before is not None and before.hidden - hidden:
+            self._recent.unsettle()  # one that returns may have lied when the body settled
         view = self._view = self._recent.view(self._relations, hidden, before)
         if before is None or before.hidden != hidden:
             self._lasting = LastingTest(len(self._relations.columns))
         if self._count % REFRESH == 0:
             self._judge = self._fresh_judge()
-        motion = self._motion = self._healthy.motion(self._recent.moved())
         self._lasting.add(view.z[-1] / self._judge.scale, self._judge.least, motion / self._judge.time)
         evidence = self._judge(view, self._lasting)
         if self._healthy.is_known:
@@ -324,6 +327,8 @@ class TrustMonitor:
         assert self._relations is not None
         rest = (self._hidden_columns() - case.cause.columns) | self._recent.missing()
         shown = self._recent.view(self._relations, rest)
+        if self._recent.resting <= self._count - case.first:  # it lied already when the body settled
+            shown = replace(shown, settled=np.full_like(shown.settled, np.nan))
         evidence = self._judge(shown)
         columns = sorted(case.cause.columns - self._recent.missing())
         if not columns:

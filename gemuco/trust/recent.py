@@ -1,6 +1,7 @@
 """The newest blocks of samples, and their errors under any hypothesis about which columns are wrong."""
 
 from collections import deque
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,6 +16,8 @@ JERKS = 0.5
 """Noise of an element exceeds this share of the noise in what the others predict of it."""
 NOISY = 5
 """The noise is the median of this number of the newest blocks."""
+SETTLING = 10
+"""The errors of a posture are the mean of the first this many blocks at rest."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,12 +30,17 @@ class View:
         noises: Variance of the noise within each of the `NOISY` newest blocks [squared errors of a healthy body], shape
             (blocks, n); NaN where unknown.
         hidden: The hidden columns.
+        settled: Errors when the body had come to the posture in which it rests, in the unit of `z`, shape (n,); NaN
+            where unknown, and in motion.
+        away: Distance from that posture [looks at a new posture].
     """
 
     z: np.ndarray
     healthy: np.ndarray
     noises: np.ndarray
     hidden: Hidden
+    settled: np.ndarray
+    away: float
 
     @property
     def noise(self) -> np.ndarray:
@@ -60,6 +68,11 @@ class Recent:
 
     def __init__(self) -> None:
         self.blocks: deque[_Block] = deque(maxlen=LONGEST)
+        self._settling: list[_Block] = []
+        self._settled: _Block | None = None
+        self._away = 0.0
+        self.resting = 0
+        """This number of blocks ago the body had settled at its posture; 0 in motion."""
 
     def add(self, schema: BodySchema, relations: Relations, samples: np.ndarray) -> None:
         """Add the samples of one block [standard deviations], shape (n, size), NaN where missing."""
@@ -76,6 +89,34 @@ class Recent:
         features = relations.features(full)
         sensed = relations.sensitivity.sense(schema, full[:1])
         self.blocks.append(_Block(mean, features[0], features[1:], span, missing, sensed))
+
+    def rest(self, looks: Callable[[float], float]) -> None:
+        """Notice whether the body rests at one posture since the newest block was added.
+
+        The column that changed most does not count: it may be a sensor that drifts.
+
+        Args:
+            looks: Returns how many looks at a new posture a distance [standard deviations] is worth.
+        """
+        newest = self.blocks[-1]
+        if self._settling:
+            change = np.sort(np.abs(newest.mean - self._settling[0].mean))  # NaN is the last
+            known = change[np.isfinite(change)][:-1]
+            self._away = looks(float(np.sqrt(np.mean(known**2)))) if len(known) else 1.0
+            if self._away >= 1.0:
+                self.unsettle()
+        if self._settled is not None:
+            self.resting += 1
+        elif self._settling and not np.array_equal(newest.missing, self._settling[0].missing):
+            self._settling = [newest]
+        else:
+            self._settling.append(newest)
+            if len(self._settling) == SETTLING:
+                self._settled = _mean(self._settling)
+
+    def unsettle(self) -> None:
+        """Forget the posture in which the body rests."""
+        self._settling, self._settled, self._away, self.resting = [], None, 0.0, 0
 
     def under(self, schema: BodySchema, relations: Relations) -> "Recent":
         """Return the same blocks with the p of another schema; their noise is unknown."""
@@ -132,7 +173,17 @@ class Recent:
         noises = self._noises(relations, hidden, 1 if fresh else NOISY)
         if before is not None and fresh:
             noises = np.concatenate([before.noises, noises])[-NOISY:]
-        return View(z, healthy, noises, hidden)
+        is_same = fresh and before is not None and self.resting > 0
+        settled = before.settled if is_same and before else self._errors_when_settled(relations, hidden, used)
+        return View(z, healthy, noises, hidden, settled, self._away)
+
+    def _errors_when_settled(self, relations: Relations, hidden: Hidden, used: np.ndarray) -> np.ndarray:
+        """Return `View.settled`; `used` are the columns that are not hidden."""
+        settled = self._settled
+        if settled is None or (settled.missing & used).any():
+            return np.full(len(used), np.nan)
+        errors, healthy = relations.judged(hidden, settled.features[None], settled.sensed)
+        return np.where(settled.missing, np.nan, (errors / healthy)[0])
 
     def _noises(self, relations: Relations, hidden: Hidden, count: int) -> np.ndarray:
         """Return `View.noises` of a number of the newest blocks."""
@@ -143,6 +194,16 @@ class Recent:
     def clear(self) -> None:
         """Forget all blocks."""
         self.blocks.clear()
+        self.unsettle()
+
+
+def _mean(blocks: Sequence[_Block]) -> _Block:
+    """Return the mean of blocks at one posture with the same missing columns, without single samples."""
+    features = np.mean([block.features for block in blocks], axis=0)
+    parts = zip(*(block.sensed for block in blocks), strict=True)
+    sensed = Sensed(*(np.mean(part, axis=0) for part in parts))
+    mean = np.mean([block.mean for block in blocks], axis=0)
+    return replace(blocks[-1], mean=mean, features=features, each=np.zeros((0, len(features))), sensed=sensed)
 
 
 def _noise(features: np.ndarray, maps: np.ndarray) -> np.ndarray:

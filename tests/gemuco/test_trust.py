@@ -127,7 +127,8 @@ def test_noise_matters_from_a_share_of_the_size_on(share, is_noise):
     size = 3.0
     judge = Judge(healthy, 0.006, np.full(2, size))
     noises = np.array([[(share * size) ** 2, 1e-3]] * 5) * judge.scale**2
-    evidence = judge(View(np.zeros((LONGEST, 2)), np.ones((LONGEST, 2)), noises, frozenset()))
+    unknown = np.full(2, np.nan)
+    evidence = judge(View(np.zeros((LONGEST, 2)), np.ones((LONGEST, 2)), noises, frozenset(), unknown, 0.0))
     assert evidence.is_noise.tolist() == [is_noise, False]
     assert (evidence.ratio[0] >= 1.0) == is_noise
 
@@ -176,6 +177,53 @@ def test_a_lying_encoder_is_hidden_and_returns(model, arm, kind, names):
         kinds += [finding.kind for finding in monitor.findings]
     assert kinds[-1] in names
     assert not monitor.hidden
+
+
+def resting(arm, model, seed, blocks):
+    """Return samples of 30 s of motion and of `blocks` blocks at rest after it, and the monitor after 35 s."""
+    samples, random = move(arm, 300 + blocks, seed), np.random.default_rng(seed)
+    samples[300:] = samples[300, 0] + random.normal(0.0, 1.0, samples[300:].shape) * NOISE
+    monitor, hidden = watch(model, samples[:350])
+    assert not any(hidden)
+    return samples[350:], monitor
+
+
+@pytest.mark.parametrize("element", [JOINT, TENSION, LENGTH])
+@pytest.mark.parametrize("rate", [0.3, 1.0])
+def test_a_slow_drift_at_rest_is_hidden_and_an_end_of_it_is_seen(model, arm, element, rate):
+    """At rest the errors of one posture do not change; a drift of 0.3 healthy errors per second was never found."""
+    samples, monitor = resting(arm, model, 51, 450)
+    column = list(monitor._relations.columns).index(element)
+    healthy = (monitor._view.healthy[-1] * monitor._judge.scale)[column] * model.scaler.std[element]
+    found = 200
+    samples[:200, :, element] += healthy * rate * BLOCK * np.arange(200)[:, None]
+    for index, block in enumerate(model.scaler.normalise(samples)):
+        monitor.add(block, 35.0 + index * BLOCK)
+        if element in monitor.hidden:
+            found = min(found, index)
+    assert 2.0 < found * BLOCK * rate < 6.5
+    assert not monitor.hidden
+
+
+def test_a_body_at_rest_is_trusted_also_if_it_creeps(model, arm):
+    samples = move(arm, 600, 61)
+    moving = samples[290:590].reshape(-1, 12).T
+    slow, random = np.linspace(0.0, 12.0, moving.shape[1]), np.random.default_rng(1)
+    creeping = np.stack([np.interp(slow, np.arange(len(slow)), column) for column in moving], 1)
+    samples[300:] = creeping.reshape(300, SAMPLES, 12) + random.normal(0.0, 1.0, samples[300:].shape) * NOISE
+    monitor, hidden = watch(model, samples)
+    assert monitor._recent.resting > 10
+    assert not any(hidden)
+
+
+def test_an_encoder_whose_lie_ends_at_rest_is_used_again(model, arm):
+    """It lied when the body settled, so its return to the truth is no change to accuse it of."""
+    samples, random = move(arm, 500, 71), np.random.default_rng(71)
+    samples[300:] = samples[300, 0] + random.normal(0.0, 1.0, samples[300:].shape) * NOISE
+    samples[150:400, :, JOINT] += 0.3
+    _, hidden = watch(model, samples)
+    assert hidden[399] == {JOINT}
+    assert not any(hidden[440:])
 
 
 def test_elements_that_look_alike_are_both_named(model, arm):
