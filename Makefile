@@ -7,9 +7,9 @@ STAMP := .venv/installed
 CLOCKLESS := tests/gemuco tests/house tests/hal/test_campaign.py tests/hal/test_fuzz.py
 SOCKETCAN := $(addprefix tests/system/test_socketcan,.py _bus.py _drivers.py _states.py)
 
-# Tests that need no clock run beside the others, at the lowest priority, and are printed at the end.
+# Tests that need no clock run beside the others, at the lowest priority and so with more time, and are printed at the end.
 define RUN_TESTS
-@mkdir -p build; nice -n 19 $(BIN)/python -m pytest -p no:cacheprovider $(TESTS) $(CLOCKLESS) >build/clockless.log 2>&1 & beside=$$!; \
+@mkdir -p build; nice -n 19 $(BIN)/python -m pytest -p no:cacheprovider --timeout=600 $(TESTS) $(CLOCKLESS) >build/clockless.log 2>&1 & beside=$$!; \
 trap 'kill $$beside; exit 130' INT TERM; \
 $(BIN)/python -m pytest $(TESTS) $(addprefix --ignore=,$(CLOCKLESS)); failed=$$?; \
 wait $$beside || failed=1; cat build/clockless.log; exit $$failed

@@ -88,7 +88,7 @@ def body_of(name: str) -> Body:
         others = np.c_[np.delete(every, index, axis=1), np.ones(len(every))]
         solved = np.linalg.solve(others.T @ others + 1e-3 * np.eye(others.shape[1]), others.T @ every[:, index])
         ridge[:, index] = np.insert(solved, index, 0.0)
-    limit = np.abs(_ridge(ridge, np.concatenate(list(rows.values()))[:, columns])).max(axis=0)
+    limit = np.abs(ridge_errors(ridge, np.concatenate(list(rows.values()))[:, columns])).max(axis=0)
     return Body(schema, rows, columns, error, ridge, limit)
 
 
@@ -97,7 +97,7 @@ def under(schema: BodySchema, condition: str) -> BodySchema:
     return schema.under(condition) if condition in schema.biases else schema
 
 
-def _ridge(ridge: np.ndarray, rows: np.ndarray) -> np.ndarray:
+def ridge_errors(ridge: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Return the errors of ridge regression of block means, shape (blocks, elements)."""
     means = rows[: len(rows) // PART * PART].reshape(-1, PART, rows.shape[1]).mean(axis=1)
     return means - np.c_[means, np.ones(len(means))] @ ridge
@@ -185,7 +185,7 @@ def play(body: Body, kind: str, size: int, seed: int) -> Outcome | None:
             named = hidden
         is_wrong = error[min((number + 1) * PART, len(error) - 1)] > 3.0
         leaked |= now > begin + LATE and is_wrong and not lying <= hidden
-    multiple = np.abs(_ridge(body.ridge, wrong[BEFORE * RATE :, body.columns])) / body.limit
+    multiple = np.abs(ridge_errors(body.ridge, wrong[BEFORE * RATE :, body.columns])) / body.limit
     alarm = np.flatnonzero(multiple.max(axis=1) > 1.0)
     blamed = {int(body.columns[multiple[alarm[0]].argmax()])} if len(alarm) else set()
     return Outcome(
