@@ -1,17 +1,18 @@
 """Arms from descriptions that were not chosen here: `gemuco init FILE`, then `gemuco demo` without an edit.
 
-    python -m studies.stack.foreign_arms FOLDER --count 12 --seed 0
+    python -m studies.stack.foreign_arms FOLDER --count 12 --seed 0 [--keep FOLDER]
 
 FOLDER has URDF files anywhere below it, as an unpacked package of robot descriptions. One file is drawn from each of
 `count` of its description folders. Every arm has a folder and a home of its own. An arm is refused if `gemuco init`
 ends with one sentence, and green if its demo ends with 0: the tip is within 3 % of the reach while its camera is
-covered, and every event was observed.
+covered, and every event was observed. With `--keep` all that an arm which is not green has written is kept.
 """
 
 import argparse
 import os
 import random
 import re
+import shutil
 import subprocess
 import tempfile
 import time
@@ -62,8 +63,8 @@ def drawn(folder: Path, count: int, seed: int) -> list[Path]:
     return [random_numbers.choice(groups[group]) for group in chosen]
 
 
-def play(path: Path, folder: Path) -> Played:
-    """Try one arm, its files in a folder beside those of other arms."""
+def play(path: Path, folder: Path, keep: Path | None) -> Played:
+    """Try one arm, in a home of its own that is copied into a folder if the arm is not green."""
     with tempfile.TemporaryDirectory(prefix="arm") as work:
         began = time.monotonic()
         made = _run(Path(work), "init", str(path.resolve()), "--out", "arm.yaml")
@@ -74,6 +75,9 @@ def play(path: Path, folder: Path) -> Played:
         seconds = time.monotonic() - began
         joints, text = JOINTS.search(made.stdout), " ".join(demo.stdout.split())
         tip = TIP.search(text)
+        if demo.returncode and keep is not None:
+            Path(work, "demo.txt").write_text(demo.stdout + demo.stderr)
+            shutil.copytree(work, keep / path.stem, symlinks=True, dirs_exist_ok=True)
         log = Path(work) / "runs/demo/model.log"
         last = (demo.stderr.strip() or demo.stdout.strip()).splitlines()[-1:]
         return Played(
@@ -112,11 +116,12 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--count", type=int, default=12)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--keep", type=Path, help="Folder for the files of arms that are not green.")
     options = parser.parse_args()
     console = Console(width=180)
     tried = []
     for path in drawn(options.folder, options.count, options.seed):
-        tried.append(play(path, options.folder))
+        tried.append(play(path, options.folder, options.keep))
         console.print(f"{tried[-1].name}: {tried[-1].end}, {tried[-1].seconds:.0f} s")
     console.print(table(tried))
 

@@ -52,7 +52,9 @@ def test_an_arm_is_green_refused_or_neither(
         return subprocess.CompletedProcess(words, code, STORY, "")
 
     monkeypatch.setattr(foreign_arms, "_run", run)
-    played = play(folder / "b/robots/three.urdf", folder)
+    kept = folder / "kept"
+    played = play(folder / "b/robots/three.urdf", folder, kept)
+    assert (kept / "three/demo.txt").exists() == end.startswith("NOT")
     assert (played.name, played.joints, played.tip, played.end) == ("b/robots/three.urdf", joints, tip, end)
     assert played.accused == (2 if joints else 0)
     assert not left
