@@ -26,7 +26,7 @@ from services.demo.report import CLIENT, Ending
 from services.demo.story import MUSCLE, Story
 from services.demo.timeline import Timeline
 from services.demo.tool_story import ToolStory
-from services.errors import AlreadyRunning
+from services.errors import AlreadyRunning, ServiceUnavailable
 from services.extras import engine_of, require
 from services.learning import collector, trainer
 from services.model import artifacts
@@ -123,7 +123,11 @@ def running(
             if not counts.is_kept:
                 console.print(too_slow(counts, halvings_left))
             if counts.is_kept or not halvings_left:
-                yield Cast(load_robot(file), client, actor, remote, screen)
+                try:
+                    yield Cast(load_robot(file), client, actor, remote, screen)
+                except ServiceUnavailable:
+                    supervisor.check()  # the last words of a process that ended say more
+                    raise
                 return
             supervisor.stop_all()
         rates = pace.halved(rates)

@@ -13,8 +13,9 @@ from rich.console import Console
 from hal.config import RobotConfig, load_robot
 from services.demo import demo, pace
 from services.demo.pace import CycleCounts, at_rates, count_cycles, halved
-from services.errors import ServiceError
+from services.errors import ServiceError, ServiceUnavailable
 from services.model.artifacts import fingerprint
+from services.process.supervisor import ChildDied
 from services.wire.messages import Status
 
 ARM = Path(__file__).parents[2] / "robots" / "musashi_arm.yaml"
@@ -157,3 +158,20 @@ def test_a_machine_that_does_not_keep_the_rate_plays_at_half_of_it(
     assert [sentence for sentence in sentences if sentence not in report] == []
     assert bool(report) is bool(sentences)
     assert list(arm.parent.glob("*.yaml")) == [arm]
+
+
+@pytest.mark.parametrize("has_ended", [True, False])
+def test_a_process_that_ended_is_named_before_what_it_did_not_answer(
+    monkeypatch: pytest.MonkeyPatch, arm: Path, has_ended: bool
+) -> None:
+    def check() -> None:
+        if has_ended:
+            raise ChildDied("'vision' ended with -11.")
+
+    processes = Processes(monkeypatch, 200)
+    monkeypatch.setattr(processes, "check", check)
+    with (
+        pytest.raises(ChildDied if has_ended else ServiceUnavailable),
+        demo.running(load_robot(arm), arm, 1, "joint_position", arm.parent, processes, Console()),  # type: ignore[arg-type]
+    ):
+        raise ServiceUnavailable("No 'vision' service answered.")
