@@ -16,6 +16,8 @@ RECENT = 20
 """The usual error is that of this number of blocks."""
 NEWEST = 5
 """At rest, the mean of this number of the newest errors is held against those when the body had settled."""
+LATELY, SLOWLY = 15, 0.5
+"""A change is slow if within the first number of blocks the error has changed by less than the second share of it."""
 QUIET = 0.7
 """Its standard deviation is at least this share of the size of a lie that matters."""
 
@@ -30,6 +32,7 @@ class Evidence:
         age: Age of the most likely change [blocks].
         step: Result of the step test [standard deviations].
         is_noise: Whether noise is the strongest evidence.
+        is_slow: Whether the body rests and the error has changed so slowly since that no other tool explains it.
         level: Usual error of the columns that are not hidden [that of this body while it was healthy], a scalar.
     """
 
@@ -38,6 +41,7 @@ class Evidence:
     age: np.ndarray
     step: np.ndarray
     is_noise: np.ndarray
+    is_slow: np.ndarray
     level: float
 
 
@@ -70,7 +74,7 @@ class Judge:
             ratio = np.where(is_longer, likelihood / self._sum, ratio)
             strength = np.maximum(strength, likelihood)
             age = np.where(is_longer, AGES[-1], age)
-        rest = self._at_rest(view)
+        rest, is_slow = self._at_rest(view)
         is_rest = rest > ratio
         ratio, age = np.where(is_rest, rest, ratio), np.where(is_rest, AGES[-1], age)
         strength = np.maximum(strength, 0.5 * (rest * self._limit) ** 2)
@@ -80,18 +84,20 @@ class Judge:
         strength = np.where(is_noise, 10.0 * noise, strength)
         hidden = list(view.hidden)
         ratio[hidden] = strength[hidden] = 0.0
-        return Evidence(ratio, strength, age, step, is_noise, _level(view, self.scale))
+        return Evidence(ratio, strength, age, step, is_noise, is_rest & is_slow, _level(view, self.scale))
 
-    def _at_rest(self, view: View) -> np.ndarray:
-        """Return the evidence in errors that change while the body rests, shape (columns,); 0 in motion.
+    def _at_rest(self, view: View) -> tuple[np.ndarray, np.ndarray]:
+        """Return the evidence in errors that change while the body rests, 0 in motion; and whether they change slowly.
 
-        The slow part of the errors is that of the posture, so as good as none of it changes.
+        The slow part of the errors is that of the posture, so as good as none of it changes. Shapes (columns,).
         """
-        change = np.nan_to_num(np.abs(view.z[-NEWEST:].mean(axis=0) - view.settled) / self.scale)
+        newest = view.z[-NEWEST:].mean(axis=0)
+        change = np.nan_to_num(np.abs(newest - view.settled) / self.scale)
+        lately = np.abs(newest - view.z[-LATELY : NEWEST - LATELY].mean(axis=0)) / self.scale
         slow, white = self._likeness.slow, self._likeness.white
         posture = self._limit**2 * 2.0 * (1.0 - white) * (1.0 - slow**view.away)
         noise = 2.0 * self._sum * white * (1.0 / SETTLING + 1.0 / NEWEST)  # normal, so without a tail
-        return np.asarray(change / np.maximum(np.sqrt(posture + noise), self._size))
+        return change / np.maximum(np.sqrt(posture + noise), self._size), lately < SLOWLY * change
 
 
 def _level(view: View, scale: np.ndarray) -> float:

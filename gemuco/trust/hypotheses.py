@@ -84,6 +84,8 @@ def explain(
 
     single = [column for column in singles if solves(frozenset({column}))]
     best = float(evidence.strength[single[0]]) if single else 0.0
+    if evidence.is_slow[lead]:  # another tool is there at once
+        environment = frozenset()
     if environment and not evidence.is_noise[lead]:
         rest = min((float(without(frozenset({c})).ratio.max(initial=0.0)) for c in single), default=1.0)
         for name, other, is_known in conditions():

@@ -91,6 +91,31 @@ def test_an_encoder_that_lies_is_not_taken_for_a_tool(model, seed):
     assert hidden == {"joint_position.shoulder"}
 
 
+def at_rest(seed):
+    """Return joint positions [rad] that move for 30 s and then rest for 15 s, with noise."""
+    moving = walk(CHANGE, seed)
+    rest = np.repeat(moving[-1:], 150 * SAMPLES, axis=0)
+    return np.r_[moving, rest] + np.random.default_rng(seed).normal(0.0, 0.001, (len(moving) + len(rest), 2))
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.long
+def test_no_sensor_is_hidden_for_another_tool_at_rest(model, seed):
+    position, change = at_rest(60 + seed), (CHANGE + 50) * SAMPLES
+    rows = np.r_[body(position[:change], TOOLS["short"]), body(position[change:], TOOLS["long"])]
+    hidden, _ = judged(model, rows, recognised=CHANGE + 80)
+    assert not hidden
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_an_encoder_that_drifts_at_rest_is_not_taken_for_a_tool(model, seed):
+    rows, begin = body(at_rest(60 + seed), TOOLS["short"]), (CHANGE + 30) * SAMPLES
+    rows[begin:, 0] += 0.01 * BLOCK / SAMPLES * np.arange(len(rows) - begin)
+    hidden, _ = judged(model, rows)
+    assert "joint_position.shoulder" in hidden
+    assert len(hidden) <= 2
+
+
 def test_a_pair_of_an_element_and_p_is_described_by_the_element(model):
     monitor, rows = TrustMonitor(model), body(walk(60, 40), TOOLS["short"])
     rows[200:, 0] += 0.5

@@ -95,6 +95,8 @@ class Run:
         with bench.referee as referee:
             try:
                 bench.open()
+                bench.cycle()
+                bench.until(lambda: bench.sample.complete, "a whole sample")
                 bench.enable()
                 self._move(self.chance.randint(5, 60))
                 self._break()
