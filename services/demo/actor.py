@@ -8,11 +8,13 @@ import numpy as np
 
 from hal.errors import CommandRefused
 from services.client import Client
-from services.errors import NotEngaged, ServiceError
+from services.errors import NoAnswer, NotEngaged, ServiceError
 
 NOTICED_WITHIN = 3.0
 """An event must be reported within this time [s]."""
 ENGAGED_WITHIN = 1.0
+REACHED_WITHIN = 10.0
+"""A service must be reached within this time [s]: after the machine stood still, all connections are made anew."""
 FOLLOWS_WITHIN = 15.0
 """The robot must follow within this time [s], in which nodes restart and refused requests are repeated."""
 STEADY = 0.3
@@ -76,10 +78,14 @@ class Actor:
         for _ in range(TRIES):
             if not self._follows():
                 self._recover()
-            self._client.ask("model", "target", {"signal": signal, "values": values.tolist()})
+            self._insist(lambda: self._client.ask("model", "target", {"signal": signal, "values": values.tolist()}))
             self.wait(lambda: False, duration)
             if self._follows():
                 return
+
+    def fault(self, text: str, service: str = "simulator") -> None:
+        """Break a part of the simulated robot, or mend it; see `Client.fault`."""
+        self._insist(lambda: self._client.fault(text, service))
 
     def wait(self, condition: Callable[[], bool], duration: float) -> bool:
         """Wait until the condition is true, at most `duration` [s]; return whether it became true."""
@@ -129,6 +135,19 @@ class Actor:
         self._report(f"    [yellow]The HAL stopped the arm {reason} It is reset and engaged again.[/]")
         self.stops += 1
         self.engage()
+
+    def _insist(self, ask: Callable[[], object]) -> None:
+        """Ask again while the service does not answer, at most `REACHED_WITHIN`; `idle` notices if it has ended."""
+        deadline = time.monotonic() + REACHED_WITHIN
+        while True:
+            try:
+                ask()
+            except NoAnswer:
+                if time.monotonic() > deadline:
+                    raise
+                self._idle()
+            else:
+                return
 
     def _is_healthy(self) -> bool:
         status = self._client.status("hal")

@@ -107,12 +107,12 @@ class Story:
         self._report(f"[bold](b)[/] The node of {ENCODER} falls silent. The arm continues with an estimate.")
         index = self._elements.index(SILENT_ELEMENT)
         start = self._timeline.now()
-        self._client.fault(f"sensor_silent {ENCODER}")
+        self._actor.fault(f"sensor_silent {ENCODER}")
         noticed, delay = self._actor.notice(lambda: self._is_estimated(index))
         for _ in range(SILENT_POSES):
             self._go(self._pose(), LEARNING_TIME)
         end = self._timeline.now()
-        self._client.fault(f"node_back {ENCODER}")
+        self._actor.fault(f"node_back {ENCODER}")
         returned = self._actor.wait(lambda: not self._is_estimated(index), NOTICED_WITHIN)
         self.marks.silent = (start, end)
         error = np.abs(self._silent_error(index, start + delay, end))
@@ -164,12 +164,12 @@ class Story:
     def _lying(self, element: str, fault: str, words: str) -> tuple[str, bool]:
         """Let an encoder lie and be right again; return a sentence, and whether it was hidden and trusted again."""
         index, start = self._elements.index(element), self._timeline.now()
-        self._client.fault(fault)
+        self._actor.fault(fault)
         reason = ""
         for _ in range(LYING_POSES):
             self._go(self._pose(), LEARNING_TIME)
             reason = self._reason(element) or reason
-        self._client.fault(f"sensor_true {element}_encoder")
+        self._actor.fault(f"sensor_true {element}_encoder")
         end = self._timeline.now()
         for _ in range(TRUE_POSES):
             if not self._is_estimated(index):
@@ -207,7 +207,7 @@ class Story:
         calm = self._timeline.between("is_anomaly", start - CALM_TIME, start)
         score = float(np.nanmedian(self._timeline.between("score", start - CALM_TIME, start)))
         alarms = float(np.mean(self._timeline.between("is_anomaly", 0.0, self.marks.lies)))
-        self._client.fault(f"muscle_cut {MUSCLE}")
+        self._actor.fault(f"muscle_cut {MUSCLE}")
         self.marks.cut = start
         alarmed = self._actor.wait(self._is_alarmed, NOTICED_WITHIN)
         self.marks.alarm = self._timeline.now()

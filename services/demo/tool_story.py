@@ -103,12 +103,12 @@ class ToolStory:
             "[bold](b)[/] The camera is covered. The tip is estimated from the joints and marked as estimated."
         )
         start = self._timeline.now()
-        self._client.fault("camera_covered", "vision")
+        self._actor.fault("camera_covered", "vision")
         noticed, delay = self._actor.notice(lambda: self._is_estimated(True))
         for target in self._learning[::-1]:
             self._go(target, SHORT_REST)
         end = self._timeline.now()
-        self._client.fault("camera_back", "vision")
+        self._actor.fault("camera_back", "vision")
         returned = self._actor.wait(lambda: self._is_estimated(False), NOTICED_WITHIN)
         self.marks.covered = (start, end)
         value, truth = (self._timeline.between(name, start + delay, end) for name in ("value", "truth"))
@@ -133,7 +133,7 @@ class ToolStory:
         old, new = self.marks.conditions
         self._report(f"[bold](c)[/] The tool is changed, {old} for {new}, without a message to the model.")
         start = self.marks.changed = self._timeline.now()
-        self._client.fault(f"tool_changed {new}")
+        self._actor.fault(f"tool_changed {new}")
         self._new_error = self._measure()
         end = self._timeline.now()
         verdict, share = self._verdict(start)

@@ -10,9 +10,10 @@ from gemuco.errors import NotEnoughData
 from hal.config import load_robot
 from hal.errors import CommandRefused
 from services.demo import actor as actor_module
-from services.demo.actor import NOTICED_WITHIN, TRIES, Actor
+from services.demo.actor import NOTICED_WITHIN, REACHED_WITHIN, TRIES, Actor
 from services.demo.arm_story import ArmStory
 from services.demo.story import CALM_TRIES, LEARNED, LEARNING_POSES, MOST_POSES, NORMAL, Story
+from services.errors import NoAnswer, ServiceUnavailable, TooSlow
 from services.wire.messages import Applied, Status, Update
 
 ROBOT = load_robot(Path(__file__).parents[2] / "robots" / "musashi_arm.yaml")
@@ -251,3 +252,38 @@ def test_an_event_is_noticed_when_its_report_stays(
     monkeypatch.setattr(actor_module, "time", reporting)
     noticed, delay = Actor(None, lambda: None, print).notice(reporting.is_reported)  # type: ignore[arg-type]
     assert (noticed, delay) == (expected[0], pytest.approx(expected[1], abs=0.02))
+
+
+class Unreachable:
+    """A client whose camera cannot be reached for so many questions of 2 s, on a clock of its own."""
+
+    def __init__(self, misses: int) -> None:
+        self.now, self.misses, self.faults = 0.0, misses, []  # type: ignore[var-annotated]
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def fault(self, text: str, service: str) -> None:
+        if self.misses:
+            self.misses -= 1
+            self.now += 2.0
+            kind = TooSlow if self.misses % 2 else ServiceUnavailable
+            raise kind(f"No '{service}' service answered within 2 s.")
+        self.faults.append((service, text))
+
+
+@pytest.mark.parametrize(("misses", "is_reached"), [(0, True), (2, True), (9, False)])
+def test_a_camera_that_is_out_of_reach_for_a_moment_is_asked_again(
+    monkeypatch: pytest.MonkeyPatch, misses: int, is_reached: bool
+) -> None:
+    client, idled = Unreachable(misses), []
+    monkeypatch.setattr(actor_module, "time", client)
+    actor = Actor(client, lambda: idled.append(client.now), print)  # type: ignore[arg-type]
+    if is_reached:
+        actor.fault("camera_covered", "vision")
+        assert client.faults == [("vision", "camera_covered")]
+        assert len(idled) == misses
+    else:
+        with pytest.raises(NoAnswer, match="No 'vision' service"):
+            actor.fault("camera_covered", "vision")
+        assert client.now <= REACHED_WITHIN + 2.0
