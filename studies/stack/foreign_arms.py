@@ -28,7 +28,7 @@ from services.process.supervisor import gemuco_command
 LIMIT = 600.0
 """A demo is ended after this time [s]."""
 JOINTS = re.compile(r": (\d+) joints from")
-VERDICT = re.compile(r"(?:is|are) distrusted:")
+VERDICT = re.compile(r"^(?:.*: )?(.+?) (?:is|are) (distrusted: \w+)", re.MULTILINE)
 TIP = re.compile(r"true error of the tip meanwhile: mean ([\d.]+) mm \(([\d.]+)% of the reach")
 
 
@@ -41,7 +41,7 @@ class Played:
         joints: Number of joints; 0 if it was refused.
         seconds: Duration of both commands [s].
         tip: Mean error of the tip while its camera is covered [mm], and in per cent of the reach; empty if unknown.
-        accused: Number of verdicts against a sensor; none of them lies, so all are wrong.
+        accused: Verdicts against sensors; none of them lies, so all are wrong.
         end: `green`, `refused: ` with the sentence, or `NOT GREEN: ` with the last line.
     """
 
@@ -49,7 +49,7 @@ class Played:
     joints: int
     seconds: float
     tip: tuple[float, float] | tuple[()]
-    accused: int
+    accused: tuple[str, ...]
     end: str
 
 
@@ -70,7 +70,7 @@ def play(path: Path, folder: Path, keep: Path | None) -> Played:
         made = _run(Path(work), "init", str(path.resolve()), "--out", "arm.yaml")
         name = str(path.relative_to(folder))
         if made.returncode:
-            return Played(name, 0, time.monotonic() - began, (), 0, f"refused: {made.stderr.strip()}")
+            return Played(name, 0, time.monotonic() - began, (), (), f"refused: {made.stderr.strip()}")
         demo = _run(Path(work), "demo", "arm.yaml")
         seconds = time.monotonic() - began
         joints, text = JOINTS.search(made.stdout), " ".join(demo.stdout.split())
@@ -85,7 +85,7 @@ def play(path: Path, folder: Path, keep: Path | None) -> Played:
             int(joints[1]) if joints else 0,
             seconds,
             (float(tip[1]), float(tip[2])) if tip else (),
-            len(VERDICT.findall(log.read_text())) if log.exists() else 0,
+            tuple(map(" ".join, VERDICT.findall(log.read_text()))) if log.exists() else (),
             "green" if demo.returncode == 0 else f"NOT GREEN: {' '.join(last)}",
         )
 
@@ -106,7 +106,7 @@ def table(tried: list[Played]) -> Table:
         shown.add_column(column)
     for arm in tried:
         tip = [f"{value:g}" for value in arm.tip] or ["", ""]
-        shown.add_row(arm.name, str(arm.joints or ""), f"{arm.seconds:.0f}", *tip, str(arm.accused), arm.end)
+        shown.add_row(arm.name, str(arm.joints or ""), f"{arm.seconds:.0f}", *tip, "; ".join(arm.accused), arm.end)
     return shown
 
 
