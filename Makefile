@@ -4,7 +4,8 @@ BIN := .venv/bin
 VMCAN ?= ../shared/tools/vmcan.sh
 PACKAGES := .venv/packages
 STAMP := .venv/installed
-CLOCKLESS := tests/gemuco tests/house tests/hal/test_campaign.py tests/hal/test_fuzz.py
+CLOCKLESS := tests/gemuco tests/house tests/hal/test_campaign.py tests/hal/test_fuzz.py tests/simulators/test_physics.py tests/system/test_kills.py \
+  $(addprefix tests/services/test_,collector.py trainer.py) $(addprefix tests/studies/test_,kxr.py musashi.py paper.py peers.py pr2.py)
 SOCKETCAN := $(addprefix tests/system/test_socketcan,.py _bus.py _drivers.py _states.py)
 
 # Tests that need no clock run beside the others, at the lowest priority and so with more time, and are printed at the end.
@@ -16,7 +17,7 @@ wait $$beside || failed=1; cat build/clockless.log; exit $$failed
 endef
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo reproduce test test-all check format faults fuzz mutation peers bench test-socketcan test-controllers results clean test-compose wheel wheels lock test-network test-ros2 test-lerobot test-servos test-foxglove test-rerun docs
+.PHONY: help setup demo reproduce test test-ci test-all check format faults fuzz mutation peers bench test-socketcan test-controllers results clean test-compose wheel wheels lock test-network test-ros2 test-lerobot test-servos test-foxglove test-rerun docs
 
 help:            ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 18
@@ -37,11 +38,15 @@ demo: $(PACKAGES)  ## two minutes with a muscle-driven arm that loses a sensor a
 reproduce: $(STAMP)  ## the paper's experiments on three simulated robots, its figures beside ours
 	for robot in pr2 musashi kxr; do $(BIN)/gemuco reproduce $$robot || exit 1; done
 
-test: TESTS := -m "not long"
+test: TESTS := -m "not long and not slow"
 test: $(STAMP)   ## every promise once, a few minutes: what a change needs
 	$(RUN_TESTS)
 
-test-all: $(STAMP)  ## all tests, a quarter of an hour; CI runs these
+test-ci: TESTS := -m "not slow"
+test-ci: $(STAMP)  ## those and the longer ones without the slow ones, ten minutes; CI runs these
+	$(RUN_TESTS)
+
+test-all: $(STAMP)  ## all tests, a quarter of an hour to half an hour
 	$(RUN_TESTS)
 
 check: $(STAMP)  ## formatting, lint, types, import contracts

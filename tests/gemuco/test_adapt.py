@@ -53,7 +53,7 @@ def test_hundred_samples_are_learned_until_the_error_stops_falling(schema):
     assert facts["error_after"] < 0.5 * facts["error_before"]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [4, 6, 9, 20])
 def test_few_samples_never_make_it_worse(schema, count):
     before = joint_error(schema, WORN)
@@ -96,7 +96,7 @@ def test_one_sample_moves_p_and_never_w(two_bodies):
     assert same.weights is two_bodies.weights
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["bias", "bias_then_weights", "both"])
 def test_expected_errors_are_of_the_body_as_it_is(two_bodies, what):
     """The softness of this body is between those of the training and beyond."""

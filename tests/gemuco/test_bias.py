@@ -138,7 +138,7 @@ def test_gradient_descent_is_the_slow_way(grips):
     assert np.isnan(results[-1].bias_std).all()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_p_first_then_w_and_the_others_are_kept(grips):
     bent = ToolArm(0.35, 0.8, 0.8, bend=0.05)
     slow = Updater(grips.under(LONG), UpdateConfig(steps=5, rate=3e-4))

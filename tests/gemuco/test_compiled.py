@@ -258,7 +258,7 @@ def test_the_compiler_gives_its_memory_back_and_comes_again_when_it_is_needed():
     assert not done.returncode, done.stderr
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_nothing_is_left_to_compile_after_the_warm_up():
     done = subprocess.run([sys.executable, "-c", ALL_WAYS], capture_output=True, text=True, timeout=110)
     assert not done.returncode, done.stderr

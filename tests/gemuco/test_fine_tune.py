@@ -114,7 +114,7 @@ def slow(body, count, seed):
     return mixed | {"muscle_length": body.length(mixed["joint_position"], mixed["muscle_tension"])}
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("motion", [MuscleArm.sample, slow])
 def test_two_standard_deviations_cover_fresh_samples_after_100_rows(simulated, motion):
     shares = []

@@ -30,7 +30,7 @@ def test_finds_the_structure_of_a_muscle_driven_arm(structure):
     assert "x_in  = joint_position, muscle_tension, muscle_length" in report
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_measure_and_outputs_are_options(data, structure):
     options = Thresholds(out=1.0, into=1.0, measure="rmse", over="all")
     config = TrainConfig(hidden=(60, 20), latent=7, epochs=30, batch=100)
@@ -119,7 +119,7 @@ def test_each_sample_is_judged_under_the_bias_of_its_condition():
     assert determine(data, config, Thresholds(out=0.9, into=0.9)).L_i["tip"] < 0.05
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_more_splits_average_over_what_is_held_out(data):
     one = determine(data, SHORT, Thresholds(1.0, 1.0), splits=1)
     two = determine(data, replace(SHORT, seed=1), Thresholds(1.0, 1.0), splits=1)

@@ -189,7 +189,7 @@ def test_p_that_follows_one_condition_is_of_length_0_and_of_many_of_length_3():
     assert [TrainConfig().bias_for(count) for count in (1, 2, 3, 4, 9)] == [0, 1, 2, 3, 3]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_errors_are_measured_under_each_p(arm):
     soft = type(arm)(softness=3.0)
     parts = [Episode(n, b.sample(400, s)) for s in range(5) for n, b in (("new", arm), ("worn", soft))]

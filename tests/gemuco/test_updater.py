@@ -27,7 +27,7 @@ def live(updater, arm, count, seed=0):
 
 
 @pytest.mark.parametrize("config", [UpdateConfig(), UpdateConfig(optimiser="sgd", rate=0.02)])
-@pytest.mark.long
+@pytest.mark.slow
 def test_learns_a_body_that_changed(schema, config):
     updater = Updater(schema, config)
     before = joint_error(schema, WORN)
@@ -37,7 +37,7 @@ def test_learns_a_body_that_changed(schema, config):
     assert after < 0.5 * before
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_errors_are_those_of_the_body_of_today(schema):
     updater = Updater(schema)
     live(updater, WORN, 400)
@@ -74,7 +74,7 @@ def test_rolls_back(schema):
     assert updater.schema is schema
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_replay_remembers_the_old_body(schema, arm):
     forgetful, mindful = Updater(schema, UpdateConfig(replay=0)), Updater(schema, UpdateConfig(replay=1000))
     live(forgetful, WORN, 300)

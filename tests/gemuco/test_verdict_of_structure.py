@@ -155,7 +155,7 @@ def test_elimination_finds_the_signal_that_matters(monkeypatch):
     assert found.shares[:, 0] == pytest.approx([0.05, 0.05])
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_nothing_is_refused_above_the_thresholds(data):
     found = determine(data, TINY, Thresholds(out=1e-9, into=1e-9), splits=2)
     assert found.is_poor
@@ -228,7 +228,7 @@ def smooth_arm(rows: int) -> dict[str, np.ndarray]:
     return {"joint": q, "cable": cables + 0.05 * random.normal(size=cables.shape), "other": other - other.mean()}
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.timeout(400)
 def test_seeds_give_the_same_verdict():
     units = {"joint": "rad", "cable": "m", "other": "1"}

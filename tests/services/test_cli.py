@@ -46,7 +46,7 @@ def test_the_extra_of_the_page_is_named() -> None:
     assert "gemuco[view]" in gemuco("view", "--help").stdout
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_wrong_robot_file_is_one_sentence_and_exit_code_2(tmp_path: Path) -> None:
     wrong = tmp_path / "wrong.yaml"
     wrong.write_text((ROOT / "robots" / "musashi_arm.yaml").read_text() + "\ncolour: blue\n")
@@ -112,7 +112,7 @@ def test_another_error_of_these_kinds_is_not_hidden() -> None:
         verb()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_what_is_missing_is_said(tmp_path: Path) -> None:
     robot = str(ROOT / "robots" / "musashi_arm.yaml")
     for words, sentence in (
@@ -132,7 +132,7 @@ def test_the_service_does_not_import_torch() -> None:
     assert subprocess.run([sys.executable, "-c", program], timeout=60, check=False, cwd=ROOT).returncode == 0
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_collect_and_train_make_a_model(tmp_path: Path) -> None:
     text = (ROOT / "robots" / "musashi_arm.yaml").read_text()
     robot = tmp_path / "small_arm.yaml"

@@ -202,7 +202,7 @@ def test_a_file_of_postures_that_cannot_be_read_is_told(tmp_path: Path) -> None:
         collected(None, "short", postures=binary)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_from_the_command_line_to_a_model_that_knows_every_condition(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -145,7 +145,7 @@ def test_a_viewer_sees_what_is_measured_and_what_is_estimated(robot: str, frames
         eventually(lambda: viewer.json(f"/{robot}/health").get("severity") == 5.0)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_viewer_that_comes_late_gets_the_scene_and_one_that_never_reads_delays_none(
     robot: str, frames: Frames
 ) -> None:

@@ -167,7 +167,7 @@ def test_help_shows_units() -> None:
     assert "[s]" in text and "[rad" in text
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_doctor_finds_what_is_wrong(stage: Stage) -> None:
     report = stage.doctor(", 0 bad.")
     assert report.exit_code == 0, report.output

@@ -55,7 +55,7 @@ class Bench:
         return float(abs(values[3] - truth[3])), float(std[3]), message
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_on_the_learned_body_the_std_stays_about_as_it_is() -> None:
     bench = Bench()
     _, before, message = bench.estimate(0)
@@ -66,7 +66,7 @@ def test_on_the_learned_body_the_std_stays_about_as_it_is() -> None:
     assert 0.5 * before <= after < 2.5 * before
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_on_another_body_the_interval_of_a_lost_joint_is_honest_and_it_is_said() -> None:
     bench = Bench(offset=0.3)
     bench.look(range(300))

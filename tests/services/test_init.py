@@ -118,7 +118,7 @@ def test_the_story_fits_arms_with_encoders_of_their_own(tmp_path: Path) -> None:
         assert not arm_story.fits(other, model_config(other).control)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.timeout(400)
 def test_the_demo_plays_an_arm_that_it_has_never_seen(tmp_path: Path) -> None:
     assert (

@@ -208,7 +208,7 @@ def test_a_missing_package_is_named_with_its_extra(
     assert extra in sentence
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_question_to_a_robot_that_does_not_run_says_what_to_start(folder: Path) -> None:
     assert "Is `gemuco serve` running?" in refusal("query", "good.yaml", "estimate", "joint_position")
     result = CliRunner().invoke(app, ["estop", "good.yaml"])

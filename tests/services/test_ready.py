@@ -46,7 +46,7 @@ assert not new, new
 """
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_ticks_of_a_service_find_everything_compiled() -> None:
     here = Path(__file__).parent
     paths = os.pathsep.join([str(here), *sys.path])

@@ -115,7 +115,7 @@ def test_twice_as_fast_takes_half_the_time_on_an_absolute_grid(robot: str, tmp_p
     assert np.allclose(np.diff(stamps), 5e6, atol=1e3)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_replay_is_paused_stepped_and_goes_on_from_another_place(robot: str, tmp_path: Path) -> None:
     files = record(tmp_path / "run.mcap", "arm", 600, limits=Limits(max_seconds=0.7))
     assert len(files) > 2

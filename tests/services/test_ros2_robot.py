@@ -67,7 +67,7 @@ def command(client: Client, values: np.ndarray) -> None:
         client.command("joint_position", values, sample)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_topics_are_signals_and_commands_move_the_driver_behind_the_limits(robot: str, network: Network):
     with Driver(network) as driver, hal(config_of(robot, network)), Client(robot) as client:
         samples: list[Sample] = []
@@ -152,7 +152,7 @@ def test_bad_messages_are_counted_said_and_not_used(counter: str, robot: str, ne
         eventually(lambda: valid(client))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_another_type_and_a_missing_router_are_said_and_end(robot: str):
     network = Network(f"tcp/127.0.0.1:{free_port()}")
 
@@ -339,7 +339,7 @@ def test_a_robot_without_a_bus_has_nothing_to_scan(tmp_path: Path):
     assert result.stderr.startswith("gemuco: Robot 'ros_arm' has no bus.")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_doctor_checks_topics(robot: str, network: Network):
     config = config_of(robot, network)
 

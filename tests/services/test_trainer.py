@@ -46,7 +46,7 @@ def straight(robot, dataset):
 
 
 @pytest.mark.parametrize("share", [0.3, 0.8])
-@pytest.mark.long
+@pytest.mark.slow
 def test_goes_on_after_an_interruption(robot, dataset, straight, tmp_path, share):
     folder = tmp_path / "model"
 
@@ -96,7 +96,7 @@ def test_what_a_person_should_know_is_said():
     assert trainer.remarks(History((1.0,), (1.0,), 1.0, 0)) == []
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_model_is_fine_tuned_on_few_samples_of_another_body(robot, dataset, straight, tmp_path):
     longer = {name: values + (0.03 if name == "muscle_length" else 0.0) for name, values in states(count=300).items()}
     parts = np.split(np.arange(300), 6)

@@ -14,7 +14,7 @@ TEXT = (ROOT / "docs" / "tutorial.md").read_text()
 BLOCKS = re.findall(r"^```(sh|python)\n(.*?)^```$", TEXT, re.MULTILINE | re.DOTALL)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.timeout(400)
 def test_blocks_run_in_an_empty_folder(tmp_path):
     program = f'gemuco() {{ "{sys.executable}" -m services.cli "$@"; }}\n'

@@ -81,7 +81,7 @@ def talking(robot: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iter
         yield found
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_page_shows_every_state_and_recovers(talking: TalkingRobot):
     with Viewing(talking.robot) as page, Browser(page.port, token=TOKEN) as browser:
         browser.until(lambda b: "Healthy" in b.text() and "joint_position" in b.text())
@@ -322,7 +322,7 @@ def test_a_missing_package_is_one_sentence(monkeypatch: pytest.MonkeyPatch):
         open_site("127.0.0.1", 0, "x", Door("127.0.0.1"))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_browser_that_never_reads_holds_nothing_up(talking: TalkingRobot):
     with Viewing(talking.robot) as page, Browser(page.port, token=TOKEN) as browser:
         browser.until(lambda b: "Healthy" in b.text())

@@ -201,7 +201,7 @@ def test_any_program_may_be_the_camera(robot: str) -> None:
         program.wait()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_frame_of_the_documentation_is_one(robot: str) -> None:
     blocks = (EXAMPLE.parents[1] / "docs" / "keys.md").read_text().split("```python\n")[1:]
     (program,) = [block.split("```")[0] for block in blocks if "vision/sample" in block.split("```")[0]]

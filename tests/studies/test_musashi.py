@@ -63,7 +63,7 @@ def test_geometric_data_are_random_states_in_episodes(monkeypatch):
     assert 175.0 < tension.max() <= 180.0
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_structure_of_a_training_is_read_from_its_model(monkeypatch):
     monkeypatch.setattr(model, "SAMPLES", 1000)
     trained = train(ROBOT, model.geometric_data(ROBOT, 0), 0, lambda done, text: None)

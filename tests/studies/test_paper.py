@@ -112,7 +112,7 @@ def _each_seed(robot: str, seeds: list[int], folder: Path, progress: Progress) -
     return each_seed(config, seeds, folder, progress, False, _seed_and_process)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_results_are_in_the_order_of_the_seeds_and_progress_is_reported(tmp_path, monkeypatch):
     monkeypatch.setattr(runs, "cpu_count", lambda: 2)
     reports: list[tuple[float, str]] = []
@@ -129,7 +129,7 @@ def test_an_error_in_one_seed_is_raised(tmp_path):
         _each_seed("broken", [0, 1], tmp_path, lambda share, text: None)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_killed_process_is_one_sentence(tmp_path, monkeypatch):
     monkeypatch.setattr(runs, "cpu_count", lambda: 2)
     with pytest.raises(RunKilled, match="was killed"):

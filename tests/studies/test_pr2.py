@@ -62,7 +62,7 @@ def test_the_flexible_duster_has_six_grasps_that_the_file_does_not_list():
     assert not set(flexible_grasps(ROBOT)) & set(ROBOT.conditions)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_both_experiments_run_and_have_all_figures(tmp_path, monkeypatch):
     monkeypatch.setattr(pr2_arm, "STROKES", 2)
     monkeypatch.setattr(pr2_trials, "SEARCH", DescentConfig(0.5, 10, 10))

@@ -40,7 +40,7 @@ def test_lost_sensor_is_estimated() -> None:
     assert words(page) <= words(done.stdout)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_tool_that_was_never_held_is_recognised() -> None:
     done = run("another_tool.py")
     assert done.returncode == 0, done.stderr

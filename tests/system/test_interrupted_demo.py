@@ -11,7 +11,7 @@ from arm_stack import PATIENCE, Stack, eventually
 from services.process.supervisor import gemuco_command
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_demo_leaves_no_process(tmp_path: Path, number: signal.Signals) -> None:
     stack = Stack(tmp_path, f"demo_{number.name.lower()}_{os.getpid()}")

@@ -47,7 +47,7 @@ def ask(robot: str, *words: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_commanded_signal_moves_without_a_model(robot: str) -> None:
     for goal in ("0.4", "-0.25"):
         moved = ask(robot, "move", "joint_position", goal)

@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[2]
 TEXT = (ROOT / "README.md").read_text()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_first_program_prints_what_the_page_shows() -> None:
     program, shown = re.search(r"```python\n(.*?)```\n\n```\n(.*?)```", TEXT, re.DOTALL).groups()
     done = subprocess.run(

@@ -67,7 +67,7 @@ def test_what_cannot_be_is_refused_in_one_sentence(stack: Stack) -> None:
     assert stack.mode() == "off"
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_model_can_be_asked_what_it_is_and_does(stack: Stack) -> None:
     described = ask(stack, "describe", "model")
     assert "muscle_tension+muscle_length" in described.stdout
@@ -152,7 +152,7 @@ def test_a_client_gets_the_lease_after_somebody_engaged_by_a_query(stack: Stack)
     assert idle.stdout.startswith("Nothing moves: the controller is not engaged.")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_target_is_reached_by_one_command_line(stack: Stack) -> None:
     eventually(lambda: stack.mode() == "off")
     answer = ask(stack, "move", "joint_position", "0.2", "-0.3", "0.0", "-0.9", "0.1")

@@ -55,7 +55,7 @@ def robot_with_model(folder: Path) -> Path:
     return file
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_an_interrupted_demo_of_tools_leaves_no_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTHONPATH", str(SERVICES_TESTS))
     file, log = robot_with_model(tmp_path), tmp_path / "demo.log"

@@ -93,7 +93,7 @@ def test_robots_and_their_files_are_in_the_wheel(wheel: Path) -> None:
     assert not any(name.startswith(("tests/", "docs/")) for name in names)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_the_wheel_collects_trains_and_plays_in_an_empty_folder(fresh: Path, tmp_path: Path) -> None:
     completed = gemuco(fresh, tmp_path, "simulate", "no_such_robot")
@@ -133,7 +133,7 @@ def light(fresh: Path, tmp_path: Path) -> Iterator[Path]:
     yield tmp_path
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_missing_extra_is_named_in_one_sentence(fresh: Path, light: Path) -> None:
     for words, extra in (
         (("collect", "musashi_arm", "--samples", "10"), "sim"),
