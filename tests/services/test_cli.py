@@ -62,7 +62,7 @@ def test_a_wrong_robot_file_is_one_sentence_and_exit_code_2(tmp_path: Path) -> N
         assert "Traceback" not in completed.stderr
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_simulator_that_is_none_is_one_sentence(tmp_path: Path) -> None:
     text = (ROOT / "robots" / "musashi_arm.yaml").read_text()
     line = next(line for line in text.splitlines() if line.startswith("simulator:"))

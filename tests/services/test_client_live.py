@@ -258,7 +258,7 @@ def test_a_robot_that_is_not_there_is_told_with_those_that_are(robot: str, route
                 near.ask("model", "engage", timeout=0.2)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_no_router_is_told_at_once(robot: str, tmp_path: Path) -> None:
     with pytest.raises(ServiceUnavailable, match="gemuco router"):
         Client(robot, f"unixsock-stream/{tmp_path}/nobody").__enter__()

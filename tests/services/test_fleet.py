@@ -143,7 +143,7 @@ def run(service: Service, report: threading.Event) -> threading.Thread:
     return thread
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_all_robots_of_a_router_are_seen_and_one_that_vanishes_stays_listed(robot: str, router: str) -> None:
     names = [f"{robot}_a", f"{robot}_b"]
     with (
@@ -179,7 +179,7 @@ def test_without_a_router_the_robots_of_this_machine_are_found(robot: str) -> No
         thread.join()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_printed_once_the_exit_code_tells(robot: str, router: str) -> None:
     report = threading.Event()
     console = Console(width=160)

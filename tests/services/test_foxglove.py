@@ -304,7 +304,7 @@ def test_a_gap_in_a_recording_is_shown_as_old(tmp_path: Path) -> None:
     assert "old" in kinds
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_verbs_write_a_layout_and_a_file(tmp_path: Path) -> None:
     answer = gemuco("foxglove", "pr2_duster", "--layout", str(tmp_path / "pr2.json"))
     assert answer.returncode == 0, answer.stderr

@@ -187,7 +187,7 @@ def test_doctor_tells_what_is_wrong_with_the_file(tmp_path: Path) -> None:
     assert "unknown key 'colour'" in report.output
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_doctor_asks_a_hal_that_runs(stage: Stage) -> None:
     stop = threading.Event()
     hal = threading.Thread(target=run_hal, args=(stage.config, (), stop))
@@ -208,7 +208,7 @@ def test_doctor_asks_a_hal_that_runs(stage: Stage) -> None:
     assert "already has a 'hal' service" in refused.output
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_cell_is_calibrated_with_weights(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
     loads = iter([2.0, 14.0, 26.0])
     monkeypatch.setattr(typer, "prompt", lambda *_, **__: stage.set("muscle_tension.biceps", next(loads)))

@@ -181,7 +181,7 @@ def free_port() -> int:
         return int(found.getsockname()[1])
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_router_that_lives_is_frozen_and_dies() -> None:
     command = gemuco_command("router", "--listen", f"tcp/127.0.0.1:{free_port()}")
     with subprocess.Popen(command, stdout=subprocess.DEVNULL) as router:

@@ -82,7 +82,7 @@ def test_on_another_body_the_interval_of_a_lost_joint_is_honest_and_it_is_said()
     assert all(message.state["muscle_length"] == "known" for message in said)  # it is measured
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_robot_at_rest_shows_nothing() -> None:
     bench = Bench(offset=0.3)
     for _ in range(50):

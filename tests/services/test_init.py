@@ -79,7 +79,7 @@ def test_a_folder_of_files_becomes_a_robot_file(tmp_path: Path) -> None:
     assert again.stderr == "gemuco: 'vendors.yaml' exists. Remove it, or name another file by --out.\n"
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_an_mjcf_file_becomes_a_robot_file_with_its_urdf(tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
     from test_mjcf import SCENE

@@ -98,7 +98,7 @@ def test_step_by_step_everything_comes_once_in_order_as_a_replay(robot: str, tmp
     assert keys.command(robot) not in heard
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_twice_as_fast_takes_half_the_time_on_an_absolute_grid(robot: str, tmp_path: Path) -> None:
     files = record(tmp_path / "run.mcap", "arm", 600)
     with _listening(robot) as heard, _replaying(files, robot=robot, speed=2.0) as stop:

@@ -40,7 +40,7 @@ def statuses(message: dict[str, Any]) -> dict[str, tuple[int, str]]:
     return {one["name"].partition(": ")[2]: (one["level"], one["message"]) for one in message["status"]}
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_lost_joint_is_absent_where_it_is_not_measured(robot: str, network: Network, frames: Frames):
     with Listener(network) as ros, TalkingRobot(robot) as talking:
         measured = ros.listen(f"/{robot}/joint_states", JOINT_STATE)
@@ -127,13 +127,13 @@ def test_humble_reads_a_key_without_a_hash(robot: str):
             assert all("RIHS01" not in token for token in ros.tokens)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_name_that_is_taken_is_refused(robot: str, network: Network):
     with Node(f"/{robot}/gemuco", network), pytest.raises(NameTaken, match=f"a node '/{robot}/gemuco' already"):
         run_bridge(robot, network)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_topic_of_another_node_is_left_to_it(robot: str, network: Network):
     topic = f"/{robot}/joint_states"
     with Listener(network) as ros, TalkingRobot(robot), Node("/driver", network) as driver:

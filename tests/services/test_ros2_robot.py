@@ -262,7 +262,7 @@ def test_only_positions_are_commanded(robot: str):
                             command={"signal": "joint_velocity", "topic": COMMANDS}))  # fmt: skip
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_topics_beside_a_bus_come_from_a_process_of_their_own(robot: str, network: Network):
     signals = description(robot, network)["signals"]
     signals = {"angle": {"unit": "rad", "elements": ["knee"]}, "skin": signals["skin"]}
@@ -292,7 +292,7 @@ def test_topics_beside_a_bus_come_from_a_process_of_their_own(robot: str, networ
     assert not thread.is_alive()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_drafted_robot_file_runs(robot: str, network: Network, tmp_path: Path):
     urdf = """<robot name="arm"><link name="a"/><link name="b"/>
     <joint name="shoulder" type="revolute"><parent link="a"/><child link="b"/><axis xyz="0 0 1"/>

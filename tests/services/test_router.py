@@ -189,7 +189,7 @@ def test_a_router_listens_on_this_machine_only_unless_told() -> None:
     assert router_settings()["listen"]["endpoints"] == list(LISTEN) == ["tcp/127.0.0.1:7447"]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_client_without_a_router_is_told(robot: str) -> None:
     where = f"tcp/127.0.0.1:{free_port()}"
     with pytest.raises(ServiceUnavailable, match=r"Is `gemuco router` running\?"), Client(robot, where):

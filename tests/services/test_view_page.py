@@ -152,7 +152,7 @@ def test_a_read_only_page_asks_nothing_even_if_it_is_told_to():
     assert "no button 'dance'" in outcome.text
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_without_a_robot_a_button_says_why(robot: str):
     with Viewing(robot) as page, Browser(page.port, token=TOKEN) as browser:
         browser.until(lambda b: "No robot" in b.text() and "Engage" in b.labels())

@@ -152,7 +152,7 @@ def test_a_robot_without_a_camera_is_told(robot: str) -> None:
         run_vision(config(robot), "best")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_top_and_the_recorder_show_what_is_seen(robot: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with Truth(robot), camera_of(config(robot)), Service(robot, "recorder") as service:
         with (

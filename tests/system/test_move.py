@@ -89,7 +89,7 @@ def test_another_client_that_commands_is_named(robot: str) -> None:
         assert "anna commands this robot for another" in answer.stderr
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_enabled_drives_without_commands_are_said_to_switch_off(robot: str) -> None:
     completed = ask(robot, "enable")
     assert completed.stdout.startswith("The drives are enabled and hold their position. They switch off after 0.5 s,")
