@@ -15,6 +15,7 @@ import zenoh
 
 from services.process.heartbeat import Activity, Heartbeat
 from services.process.lock import ServiceLock
+from services.process.realtime import share_heaps
 from services.wire import keys, query
 from services.wire.messages import Message, Status
 from services.wire.session import close_session, new_boot, open_session
@@ -80,6 +81,7 @@ class Service:
     def __enter__(self) -> Self:
         self._lock.acquire()
         try:
+            share_heaps()
             self._lock.check_router(self._connect)
             self.session = open_session(self.robot, self.name, self._connect)
             self._lock.check_network(self.session)
