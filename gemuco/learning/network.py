@@ -1,5 +1,6 @@
 """The network as torch sees it: z = h_enc(x_in, m, p), x_out = h_dec(z); and the first weights of a training."""
 
+import threading
 from collections.abc import Sequence
 from itertools import pairwise
 
@@ -9,6 +10,7 @@ from torch import nn
 
 from gemuco.layers import LINEAR, Chain, Layer, Weights, check_activation
 
+_drawing = threading.Lock()
 MODULES: dict[str, type[nn.Module]] = {
     "tanh": nn.Tanh,
     "sigmoid": nn.Sigmoid,
@@ -72,6 +74,13 @@ class Network(nn.Module):
             )
 
         return Weights(export(self.encoder), export(self.decoder))
+
+
+def first_weights(seed: int, inputs: int, outputs: int, hidden: Sequence[int], latent: int, activation: str) -> Weights:
+    """Draw W; see `Network` for the sizes. Two trainings at once draw one after the other: torch has one source."""
+    with _drawing:
+        torch.manual_seed(seed)
+        return Network(inputs, outputs, hidden, latent, activation).weights()
 
 
 def with_linear_path(weights: Weights, outputs: np.ndarray, place: int) -> Weights:

@@ -5,7 +5,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from gemuco.dataset import Data, Dataset, as_dataset
 from gemuco.errors import NotEnoughData, check_kind
@@ -18,7 +17,7 @@ from gemuco.learning.draft import Draft, key_of
 from gemuco.learning.history import History
 from gemuco.learning.learner import Learner, Progress
 from gemuco.learning.material import Material
-from gemuco.learning.network import Network, with_linear_path
+from gemuco.learning.network import first_weights, with_linear_path
 from gemuco.learning.task import Task
 from gemuco.linear import LinearPath
 from gemuco.masks import Mask, label, mask
@@ -77,10 +76,9 @@ def fit(
     frozen = np.full(len(conditions), len(conditions) == 1)
     bias_size = config.bias_for(len(conditions))
     notes += _bias_notes(config, conditions)
-    torch.manual_seed(config.seed)
     size = len(task.in_index) + len(task.x_in) + bias_size
     latent = config.latent_for(len(task.out_index))
-    weights = Network(size, len(task.out_index), config.hidden, latent, config.activation).weights()
+    weights = first_weights(config.seed, size, len(task.out_index), config.hidden, latent, config.activation)
     weights = with_linear_path(weights, task.path.outputs, len(task.in_index))
     unused = bias_size if frozen.all() else 0
     _mute(weights, task, scaler.dead, unused)

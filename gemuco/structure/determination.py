@@ -21,10 +21,10 @@ from gemuco.masks import Mask, all_masks, bits
 from gemuco.scaler import Scaler
 from gemuco.schema import BodySchema
 from gemuco.signals import Layout
-from gemuco.structure.mask_errors import LISTED, MaskErrors
+from gemuco.structure.mask_errors import LISTED
 from gemuco.structure.mask_judge import Judge, Thresholds
 from gemuco.structure.mask_search import choose, find_border
-from gemuco.structure.mask_training import train_split
+from gemuco.structure.mask_training import train_masks, train_split
 from gemuco.structure.result import Structure
 
 __all__ = ["Judge", "Structure", "Thresholds", "determine", "learn", "search", "select"]
@@ -76,14 +76,12 @@ def determine(
         config = replace(config, epochs=max(1, config.epochs_for(len(dataset)) // 4))
     alive, notes = _alive(dataset)
     judge = Judge(alive.layout.names, (), thresholds)
-    most, fresh = MOST_SPLITS if splits is None else splits, list[MaskErrors]()
-    for split in range(most):
-        fresh.append(train_split(alive, config, split, _share(progress, split, most), drafts))
-        if split + 1 == most or (splits is None and split + 1 >= FIRST_SPLITS):
-            judge.add(*fresh)
-            fresh.clear()
-            if splits is None and _is_decided(judge):
-                break
+    first, most = (FIRST_SPLITS, MOST_SPLITS) if splits is None else (splits, splits)
+    judge.add(*train_masks(alive, config, first, _share(progress, 0, most, first), drafts))
+    for split in range(first, most):
+        if _is_decided(judge):
+            break
+        judge.add(train_split(alive, config, split, _share(progress, split, most), drafts))
     if progress is not None:
         progress(1.0, "structure")
     if len(alive.layout.names) <= LISTED:
@@ -198,9 +196,9 @@ def _alive(dataset: Dataset) -> tuple[Dataset, list[str]]:
     return dataset if len(alive) == len(layout.names) else dataset.with_layout(layout.subset(alive)), notes
 
 
-def _share(progress: Progress | None, split: int, most: int) -> Progress | None:
-    """Return the progress of one split as a share of all."""
-    return None if progress is None else lambda done, text: progress((split + done) / most, text)
+def _share(progress: Progress | None, split: int, most: int, count: int = 1) -> Progress | None:
+    """Return the progress of `count` splits from `split` as a share of all."""
+    return None if progress is None else lambda done, text: progress((split + count * done) / most, text)
 
 
 def _is_decided(judge: Judge) -> bool:

@@ -1,10 +1,14 @@
 """Training of a network that infers every signal from any mask. `mask_errors` measures it without torch."""
 
+import os
+import threading
+from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from gemuco.compiled.blas import one_thread
 from gemuco.dataset import Dataset
 from gemuco.learning.config import TrainConfig
 from gemuco.learning.learner import Progress
@@ -16,6 +20,10 @@ TRAINED = 2000
 """With more signals the network is trained under this many random masks, and generalises to the others."""
 
 
+class _Stopped(Exception):
+    """A training ends because one beside it failed or was interrupted."""
+
+
 def train_masks(
     dataset: Dataset,
     config: TrainConfig,
@@ -25,14 +33,31 @@ def train_masks(
 ) -> tuple[MaskErrors, ...]:
     """Train one network under all masks per split of the data, and return each with its held-out rows.
 
+    The trainings run beside each other, one per core. If one fails, or Ctrl-C comes, the others end with their epoch.
+
     Raises:
         NotEnoughData: There are too few samples.
     """
+    shares, stop = np.zeros(splits), threading.Event()
 
-    def share(split: int) -> Progress | None:
-        return None if progress is None else lambda done, text: progress((split + done) / splits, text)
+    def train(split: int) -> MaskErrors:
+        def report(done: float, text: str) -> None:
+            if stop.is_set():
+                raise _Stopped
+            shares[split] = done
+            if progress is not None:
+                progress(float(shares.mean()), text)
 
-    return tuple(train_split(dataset, config, split, share(split), drafts) for split in range(splits))
+        return train_split(dataset, config, split, report, drafts)
+
+    with one_thread(), ThreadPoolExecutor(min(splits, len(os.sched_getaffinity(0)))) as pool:
+        jobs = [pool.submit(train, split) for split in range(splits)]
+        try:
+            ended, _ = wait(jobs, return_when=FIRST_EXCEPTION)
+            return tuple(job.result() for job in sorted(ended, key=jobs.index))
+        finally:
+            stop.set()
+            pool.shutdown(wait=False, cancel_futures=True)
 
 
 def train_split(

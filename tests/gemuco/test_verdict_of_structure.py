@@ -14,7 +14,7 @@ from gemuco.learning.config import TrainConfig
 from gemuco.learning.network import Network
 from gemuco.linear import LinearPath
 from gemuco.signals import Layout, Signal
-from gemuco.structure import determination
+from gemuco.structure import determination, mask_training
 from gemuco.structure.determination import Judge, Thresholds, determine
 from gemuco.structure.inference import Split, infer_best
 from gemuco.structure.mask_errors import MaskErrors
@@ -77,7 +77,8 @@ def splits(monkeypatch):
             asked.append(split)
             return split_with(errors(split))
 
-        monkeypatch.setattr(determination, "train_split", train_split)
+        for module in (determination, mask_training):
+            monkeypatch.setattr(module, "train_split", train_split)
         return asked
 
     return with_errors
