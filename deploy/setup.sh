@@ -20,16 +20,18 @@ else
     how="--constraint constraints.txt"
     list() { $bin/python deploy/requirements.py "$@" | grep -v '^torch'; }
 fi
+# Python compiles the files that it imports, a sixth of all, and keeps them; if it may not, all are compiled now.
+if [ -n "${PYTHONDONTWRITEBYTECODE:-}" ]; then kept=--compile-bytecode compile=--compile; else kept= compile=--no-compile; fi
 index=$(pip config list | sed -n "s/^.*\.index-url='\(.*\)'$/\1/p" | tail -n 1)
 [ -z "$index" ] || export UV_DEFAULT_INDEX="${UV_DEFAULT_INDEX:-$index}"
 
 list +dev =uv >build/uv.txt
 list $(printf '+%s ' "$@") +build >build/wanted.txt
-if ! { pip install --quiet $how --requirement build/uv.txt && $bin/uv pip install --compile-bytecode --python $bin/python $how --requirement build/wanted.txt; }; then
+if ! { pip install --quiet $how --requirement build/uv.txt && $bin/uv pip install $kept --python $bin/python $how --requirement build/wanted.txt; }; then
     echo "uv did not install; pip does it, which takes longer."
     pip install $how --requirement build/wanted.txt
 fi
 if $bin/python deploy/requirements.py $(printf '+%s ' "$@") | grep -q '^torch'; then
-    pip install --constraint constraints.txt torch
+    pip install $compile --constraint constraints.txt torch
 fi
 pip install --quiet --no-deps --no-build-isolation --editable .
