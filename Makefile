@@ -43,10 +43,10 @@ test: $(STAMP)   ## every promise once, a few minutes: what a change needs
 	$(RUN_TESTS)
 
 test-ci: TESTS := -m "not slow"
-test-ci: $(STAMP)  ## those and the longer ones without the slow ones, ten minutes; CI runs these
+test-ci: $(STAMP)  ## those and the longer ones without the slow ones, a quarter of an hour; CI runs these
 	$(RUN_TESTS)
 
-test-all: $(STAMP)  ## all tests, a quarter of an hour to half an hour
+test-all: $(STAMP)  ## all tests, half an hour
 	$(RUN_TESTS)
 
 check: $(STAMP)  ## formatting, lint, types, import contracts

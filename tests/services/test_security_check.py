@@ -23,7 +23,7 @@ def verdicts(found: list[Attempt], *words: str) -> set[str]:
     return {one.verdict for one in found if any(word in one.what for word in words)}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("protocol", ["quic", "tls"])
 def test_everything_is_refused(tmp_path: Path, protocol: str, capsys: pytest.CaptureFixture[str]) -> None:
     folder = made(tmp_path / "keys", protocol, "a", "b")
@@ -34,7 +34,7 @@ def test_everything_is_refused(tmp_path: Path, protocol: str, capsys: pytest.Cap
         assert not [secret for secret in _passwords(path) if secret in said]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_without_any_defence_every_attack_is_told(tmp_path: Path) -> None:
     """A check that cannot fail is worthless: each of its lines fails here."""
     folder = made(tmp_path / "keys", "quic", "a", "b")
@@ -71,7 +71,7 @@ def test_the_password_is_what_counts(tmp_path: Path) -> None:
         assert stage.enters(viewer)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_each_defence_by_itself_is_proved(tmp_path: Path) -> None:
     """Without access control at the HAL, and without certificates at the router: those lines fail, and no others."""
     folder = made(tmp_path / "keys", "quic", "a")

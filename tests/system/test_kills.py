@@ -202,7 +202,7 @@ def killed_at(line: int, work: Callable[[], None]) -> None:
 
 
 @pytest.mark.parametrize("writer", QUICK, ids=name_of)
-@pytest.mark.slow
+@pytest.mark.long
 def test_killed_at_any_line_a_writer_leaves_the_file_before_or_the_new_one(writer: Any, tmp_path: Path) -> None:
     writer.write(tmp_path, 1)
     number, line, seen = 1, 0, set()
@@ -228,7 +228,7 @@ def test_a_model_killed_before_the_first_is_whole_is_no_model(tmp_path: Path) ->
     assert checkpoint.load(tmp_path).manifest == {"number": 2}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_keys_killed_at_any_line_are_completed_by_the_next_init(tmp_path: Path) -> None:
     """From an empty folder, each time: the authority and its key, then each role file, then the plan."""
     folder, made, line = tmp_path, SavedRoles(), 1
@@ -244,7 +244,7 @@ def test_keys_killed_at_any_line_are_completed_by_the_next_init(tmp_path: Path) 
         line += 3
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("writer", QUICK, ids=name_of)
 def test_a_hundred_kills_at_random_times(writer: Any, tmp_path: Path) -> None:
     chance = random.Random(8)
@@ -268,7 +268,7 @@ def test_a_hundred_kills_at_random_times(writer: Any, tmp_path: Path) -> None:
     assert last > 100  # writes were finished between the kills
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_recording_killed_at_any_line_is_read_up_to_its_last_commit(tmp_path: Path) -> None:
     line, killed = 0, True
     while killed:

@@ -35,7 +35,7 @@ def test_measurements_flow_from_the_wire_to_the_estimate(stack: Stack) -> None:
     assert estimate.cycle > 0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_silent_encoder_is_estimated_by_another_process_too(stack: Stack) -> None:
     stack.client.fault("sensor_silent elbow_pitch_encoder")
     eventually(lambda: stack.method() == "mask")
