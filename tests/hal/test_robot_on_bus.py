@@ -1,8 +1,10 @@
 """The three drivers against the simulated nodes: what is measured, commanded and refused."""
 
+import time
+
 import numpy as np
 import pytest
-from hal_bench import Bench
+from hal_bench import REAL_TIME_LIMIT, Bench
 
 from hal.errors import CommandRefused
 
@@ -182,13 +184,15 @@ def test_a_fault_is_latched(bench):
 
 
 def test_enabling_before_the_first_cycle_is_refused():
-    """A busy machine may not have made the drives ready by then, which is refused too."""
     bench = Bench().open()
-    try:
-        with pytest.raises(CommandRefused, match=r"No valid muscle_length of biceps, triceps|not ready"):
-            bench.robot.enable()
-    finally:
-        bench.close()
+    deadline = time.monotonic() + REAL_TIME_LIMIT
+    while bench.states() != {"ready"}:  # without a cycle, also if a node needs a second try
+        assert time.monotonic() < deadline, bench.robot.health()
+        bench.pass_time()
+        bench.flush()
+    with pytest.raises(CommandRefused, match="No valid muscle_length of biceps, triceps"):
+        bench.robot.enable()
+    bench.close()
 
 
 def test_reset_is_refused_while_enabled(bench):

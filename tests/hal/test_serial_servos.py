@@ -89,15 +89,12 @@ def test_a_silent_servo_is_stale_alone_and_comes_back(make):
         bench.cycle(20)
         assert bench.health("pan")["state"] == "silent"
         assert bench.health("lift")["state"] == "ready"
-        ages, valid = [], []
+        ages = []
         for _ in range(100):
             bench.cycle()
+            assert bench.sample.valid["joint_position"].tolist() == [False, True, True]
             ages.append(bench.sample.age["joint_position"][1:].max())
-            valid.append(bench.sample.valid["joint_position"])
-        assert not np.any(valid, axis=0)[0], "the silent one is never measured"
-        # A busy machine may stop the simulated servos for a tenth of a second.
-        assert np.mean(valid, axis=0)[1:].min() >= 0.8
-        assert np.quantile(ages, 0.75) < 0.02
+        assert np.quantile(ages, 0.95) < 0.03, "a busy machine is late now and then"
         with pytest.raises(CommandRefused, match="pan"):
             bench.robot.enable()
         bench.rig.fault("node_back pan_servo")
