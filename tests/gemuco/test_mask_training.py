@@ -1,3 +1,5 @@
+import os
+import threading
 import time
 
 import numpy as np
@@ -10,6 +12,7 @@ from gemuco.structure import mask_training
 from gemuco.structure.mask_training import train_masks, train_split
 
 TINY = TrainConfig(hidden=(20,), latent=5, epochs=3, batch=100)
+STEPS = 5000
 
 
 def test_networks_trained_beside_each_other_are_those_trained_alone(data):
@@ -20,15 +23,17 @@ def test_networks_trained_beside_each_other_are_those_trained_alone(data):
         np.testing.assert_array_equal(one.from_others(), other.from_others())
 
 
-def test_all_end_when_one_fails(monkeypatch):
-    ended = []
+def test_the_others_end_when_one_fails(monkeypatch):
+    begun, ended = threading.Event(), []
 
     def train(_data, _config, split, report, _drafts):
-        if split == 1:
+        if split == 0:
+            begun.wait(1.0)  # on one core the other never begins
             raise NotEnoughData("Too few samples.")
+        begun.set()
         try:
-            for step in range(5000):
-                report(step / 5000, "")
+            for step in range(STEPS):
+                report(step / STEPS, "")
                 time.sleep(0.001)
         finally:
             ended.append(step)
@@ -36,4 +41,5 @@ def test_all_end_when_one_fails(monkeypatch):
     monkeypatch.setattr(mask_training, "train_split", train)
     with pytest.raises(NotEnoughData, match="Too few"):
         train_masks(None, TINY, 2)
-    assert len(ended) == 1
+    assert begun.is_set() == (len(os.sched_getaffinity(0)) > 1)
+    assert all(step < STEPS - 1 for step in ended)

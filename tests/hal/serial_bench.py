@@ -2,6 +2,7 @@
 
 import contextlib
 import itertools
+import os
 import tempfile
 import time
 from pathlib import Path
@@ -78,6 +79,9 @@ class SerialBench:
         self.sample = self.applied = None
 
     def __enter__(self):
+        # Real servos have processors of their own; other programs must not delay the simulated ones.
+        with contextlib.suppress(PermissionError):
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
         self.plug()
         self.robot.open()
         self._due = time.monotonic()
