@@ -19,6 +19,7 @@ START_PRIORITY = 1
 STARTS_WITHIN = 5.0
 """A start has this priority for at most this time [s]."""
 MOST_HEAPS = 2
+"""All threads of a process share this number of heaps of the C library."""
 _PR_SET_TIMERSLACK, _M_ARENA_MAX = 29, -8
 _is_refusal_logged = threading.Event()
 
@@ -31,8 +32,8 @@ def prepare_process() -> None:
 def share_heaps() -> None:
     """Let all threads allocate from at most `MOST_HEAPS` heaps of the C library, where it knows this setting.
 
-    By default it makes up to eight heaps per core. A flood of messages fills those of the threads that received it, and
-    the next one fills others, so a process grew with every flood, although nothing was kept.
+    By default it makes up to eight heaps per core, and each keeps the most that its threads ever needed: in a flood of
+    messages a recorder grew for several floods (docs/results.md).
     """
     with contextlib.suppress(AttributeError):  # not the GNU library
         ctypes.CDLL(None).mallopt(_M_ARENA_MAX, MOST_HEAPS)
