@@ -102,8 +102,7 @@ class HubServer:
 
     def _serve(self) -> None:
         while True:
-            full = self._wire is not None and len(self._wire) >= _QUEUE
-            senders = {} if full else {client.socket: client for client in self._clients}
+            senders = {} if self._is_full() else {client.socket: client for client in self._clients}
             readers = [client.socket for client in self._clients if client.outbox]
             ready, _, _ = select.select([self._wake, self._listener, *senders], readers, [], self._pause())
             if self._wake in ready:
@@ -118,6 +117,9 @@ class HubServer:
                     self._share(sender, self._restamp(record, end))
             for client in list(self._clients):
                 self._flush(client)
+
+    def _is_full(self) -> bool:
+        return self._wire is not None and len(self._wire) >= _QUEUE
 
     def _pause(self) -> float | None:
         if self._wire is None or (due := self._wire.due()) is None:
@@ -134,6 +136,8 @@ class HubServer:
 
     def _take(self, client: _Client) -> None:
         for _ in range(64):  # then serve the other clients
+            if self._is_full():
+                return
             try:
                 packet = client.socket.recv(PACKET)
             except BlockingIOError:
