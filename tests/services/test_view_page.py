@@ -253,10 +253,8 @@ def test_a_foreign_name_for_this_machine_is_refused(robot: str):
 
 def test_the_link_is_printed_and_new_each_time(robot: str, capsys: pytest.CaptureFixture[str]):
     with Viewing(robot) as page:
-        deadline = time.monotonic() + 10.0
-        report = ""
-        while "Ctrl-C" not in report and time.monotonic() < deadline:
-            report += capsys.readouterr().out
+        pass
+    report = capsys.readouterr().out  # once, when the page has ended: what is printed during a read is lost
     assert f"http://127.0.0.1:{page.port}/{TOKEN}  With buttons: who has this link commands the robot." in report
     assert new_token() != new_token() and len(new_token()) >= 32
 
