@@ -281,8 +281,8 @@ class Bus:
             if now >= receiver.statistics_due:
                 receiver.has_master = self.needs_sync and self._config.interface not in ECHOING
                 receiver.update_statistics(now, sender.bits, self._kernel.received())
-            if sender.problem:
-                raise ConnectionError(sender.problem)
+            if problem := sender.problem():
+                raise ConnectionError(problem)
             if message is not None:
                 continue
             silent = now - max(receiver.heard, opened)

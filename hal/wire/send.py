@@ -27,6 +27,8 @@ FAILED_SENDS = 3
 """The interface is opened again after this number of failures of one identifier in sequence."""
 STUCK = 1.0
 """An interface that does not return from sending for this time [s] is blocked; a busy machine needs less."""
+BETWEEN_LOOKS = 0.2
+"""Of the time between two looks at most this much counts [s]: a machine that stands still stops both threads."""
 
 _BITS = tuple(frame_bits(size) for size in range(9))
 _FULL = (None, errno.ENOBUFS, errno.EAGAIN)
@@ -51,6 +53,7 @@ class Sender:
         self._failures: dict[int, int] = {}
         self._failure = ""
         self._since: float | None = None
+        self._watched, self._looked, self._waited = 0.0, 0.0, 0.0
 
     def use(self, interface: can.BusABC | None) -> None:
         """Send through a new interface, or through none, and forget earlier failures."""
@@ -63,12 +66,18 @@ class Sender:
         """Begin a cycle, which has all its pauses again."""
         self._pauses, self._turn = PAUSES, TURN
 
-    @property
     def problem(self) -> str:
-        """Reason to open the interface again; empty without a reason."""
+        """Return the reason to open the interface again, empty without one; for one thread, which looks regularly."""
         since = self._since
-        if since is not None and time.monotonic() - since > STUCK:
-            return f"The interface has not returned from sending a frame for {STUCK:g} s."
+        if since is not None:
+            now = time.monotonic()
+            if since != self._watched:
+                self._watched, self._waited = since, 0.0
+            else:
+                self._waited += min(now - self._looked, BETWEEN_LOOKS)
+            self._looked = now
+            if self._waited > STUCK:
+                return f"The interface has not returned from sending a frame for {STUCK:g} s."
         return self._failure
 
     def send(self, message: can.Message, patience: float = 0.0) -> bool:

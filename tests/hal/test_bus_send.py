@@ -6,6 +6,7 @@ import socket
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import can
 import pytest
@@ -168,6 +169,26 @@ def test_an_interface_that_hangs_while_sending_is_shut_and_opened_again(bus, int
     wait_for(lambda: bus.counters["opened"] >= 2 and bus.send(frame()), "reopening")
 
 
+def test_an_interface_is_not_blocked_while_the_whole_machine_stands_still(bus, interface, monkeypatch):
+    sender = Sender({"sent": 0, "send_failures": 0}, print)
+    sender.use(bus._can)
+    interface.is_stuck.set()
+    sending = threading.Thread(target=sender.send, args=(frame(),))
+    sending.start()
+    wait_for(lambda: interface.tries, "the frame that hangs")
+    clock = SimpleNamespace(monotonic=time.monotonic, sleep=time.sleep)
+    monkeypatch.setattr("hal.wire.send.time", clock)
+    start, problems = time.monotonic(), []
+    for later in (0.0, 5.0, 5.1, 6.5, *(7.0 + 0.1 * look for look in range(12))):
+        clock.monotonic = lambda later=later: start + later
+        problems.append(sender.problem())
+    assert not any(problems[:4])
+    assert "has not returned" in problems[-1]
+    monkeypatch.undo()
+    interface.is_stuck.clear()
+    sending.join(LIMIT)
+
+
 def test_a_frame_that_is_too_long_is_refused_and_no_fault_of_the_interface(bus, interface):
     report = []
     sender = Sender({"sent": 0, "send_failures": 0}, report.append)
@@ -175,7 +196,7 @@ def test_a_frame_that_is_too_long_is_refused_and_no_fault_of_the_interface(bus, 
     for _ in range(2 * FAILED_SENDS):
         assert not sender.send(frame(data=bytes(9)))
     assert interface.tries == 0
-    assert not sender.problem
+    assert not sender.problem()
     assert report[0] == "Frame 201h has 9 data bytes; a classic frame has at most 8."
 
 
