@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+pytest_plugins = ["standstill"]
 SWITCH_INTERVAL = sys.getswitchinterval()
 
 
