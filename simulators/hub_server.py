@@ -22,7 +22,8 @@ _log = logging.getLogger(__name__)
 _BACKLOG = 100_000 * RECORD.size
 """A client with more waiting bytes than this is disconnected: ten seconds of a full 1 Mbit/s bus."""
 _QUEUE = 256
-"""The server accepts no frames while this many frames wait for a timed bus."""
+"""A timed bus accepts no frames of a program while this number of its frames waits. Each program has its own queue, as
+each controller has: one that talks all the time does not keep urgent frames of others from the arbitration."""
 _GRAIN = 3e-4
 """While frames wait, a timed bus sleeps at least this time [s]. Two or three frames then leave together, at half the
 cost."""
@@ -102,7 +103,7 @@ class HubServer:
 
     def _serve(self) -> None:
         while True:
-            senders = {} if self._is_full() else {client.socket: client for client in self._clients}
+            senders = {client.socket: client for client in self._clients if not self._is_full(client)}
             readers = [client.socket for client in self._clients if client.outbox]
             ready, _, _ = select.select([self._wake, self._listener, *senders], readers, [], self._pause())
             if self._wake in ready:
@@ -118,8 +119,8 @@ class HubServer:
             for client in list(self._clients):
                 self._flush(client)
 
-    def _is_full(self) -> bool:
-        return self._wire is not None and len(self._wire) >= _QUEUE
+    def _is_full(self, client: _Client) -> bool:
+        return self._wire is not None and self._wire.waiting_of(client) >= _QUEUE
 
     def _pause(self) -> float | None:
         if self._wire is None or (due := self._wire.due()) is None:
@@ -136,7 +137,7 @@ class HubServer:
 
     def _take(self, client: _Client) -> None:
         for _ in range(64):  # then serve the other clients
-            if self._is_full():
+            if self._is_full(client):
                 return
             try:
                 packet = client.socket.recv(PACKET)

@@ -1,6 +1,8 @@
 """Duration of frames on a real CAN bus, and their arbitration (ISO 11898-1, classic frames)."""
 
 import heapq
+from collections import Counter
+from collections.abc import Hashable
 from dataclasses import dataclass
 
 EXTENDED, REMOTE, ERROR = 1 << 31, 1 << 30, 1 << 29
@@ -88,7 +90,7 @@ def arbitration(identifier: int) -> int:
 
 @dataclass(frozen=True, slots=True)
 class _Waiting:
-    sender: object
+    sender: Hashable
     frame: bytes
     arrived: float
     duration: float
@@ -104,6 +106,7 @@ class Wire:
         self._bit = 1.0 / bitrate
         self._waiting: list[tuple[int, int, _Waiting]] = []
         self._count = 0
+        self._count_of: Counter[Hashable] = Counter()
         self._flying: _Waiting | None = None
         self._free_at = 0.0
         self.busy = 0.0
@@ -112,10 +115,15 @@ class Wire:
     def __len__(self) -> int:
         return len(self._waiting)
 
-    def push(self, now: float, sender: object, identifier: int, data: bytes, length: int, frame: bytes) -> None:
+    def waiting_of(self, sender: Hashable) -> int:
+        """Return the number of a sender's waiting frames."""
+        return self._count_of[sender]
+
+    def push(self, now: float, sender: Hashable, identifier: int, data: bytes, length: int, frame: bytes) -> None:
         """Add a frame to the waiting frames."""
         entry = _Waiting(sender, frame, now, frame_bits(identifier, data, length) * self._bit)
         self._count += 1
+        self._count_of[sender] += 1
         heapq.heappush(self._waiting, (arbitration(identifier), self._count, entry))
 
     def advance(self, now: float) -> list[tuple[object, bytes, float]]:
@@ -126,6 +134,9 @@ class Wire:
                 if not self._waiting:
                     return done
                 self._flying = heapq.heappop(self._waiting)[2]
+                self._count_of[self._flying.sender] -= 1
+                if not self._count_of[self._flying.sender]:
+                    del self._count_of[self._flying.sender]
                 start = max(self._free_at, self._flying.arrived)
                 self._free_at = start + self._flying.duration
                 self.busy += self._flying.duration

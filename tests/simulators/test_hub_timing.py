@@ -116,6 +116,17 @@ def test_on_a_timed_hub_an_urgent_frame_overtakes(tmp_path):
     assert order.index(0x080) <= 3
 
 
+def test_a_program_that_fills_its_queue_does_not_keep_others_from_the_arbitration(tmp_path):
+    channel = str(tmp_path / "bus.can")
+    with HubServer(channel, 20_000) as server, HubBus(channel) as babbler, HubBus(channel) as b, HubBus(channel) as ear:
+        babbler.send_frames([(0x700, bytes(8))] * 1000)
+        ear.recv(20)
+        assert server.stats()["frames"] < 1000  # the rest waits in the socket
+        b.send_frames([(0x080, b"")])
+        order = [ear.recv(20).arbitration_id for _ in range(20)]
+    assert order.index(0x080) <= 3
+
+
 def test_a_timed_hub_that_is_overloaded_holds_its_senders_back(tmp_path):
     channel = str(tmp_path / "bus.can")
     with HubServer(channel, 10_000) as server, HubBus(channel) as bus:
