@@ -16,7 +16,7 @@ MAKES: tuple[Packets, ...] = (feetech, dynamixel)
 
 
 def scan_line(name: str, config: BusConfig) -> Scan:
-    """Find the servos of a line; takes about three seconds.
+    """Find the servos of a line; takes about five seconds, since ids that did not answer are asked a second time.
 
     Args:
         name: Name of the line.
@@ -41,16 +41,19 @@ def scan_line(name: str, config: BusConfig) -> Scan:
 
 def _servos(port: Port, packets: Packets) -> list[Node]:
     reader = packets.reader()
-    nodes = []
-    for number in range(packets.HIGHEST_NODE + 1):
+    nodes: dict[int, Node] = {}
+    numbers = range(packets.HIGHEST_NODE + 1)
+    for number in (*numbers, *numbers):
+        if number in nodes:
+            continue
         malformed = reader.malformed
         status = _ask(port, packets.ping(number), number, reader)
         is_garbled = status is None and reader.malformed > malformed
         if status is None and not is_garbled:
             continue
         state = "its answer is garbled" if status is None else _describe(port, packets, status, reader)
-        nodes.append(Node(number, packets.NAME, state, is_doubled=is_garbled))
-    return nodes
+        nodes[number] = Node(number, packets.NAME, state, is_doubled=is_garbled)
+    return [nodes[number] for number in sorted(nodes)]
 
 
 def _ask(port: Port, packet: bytes, node: int, reader: StatusReader) -> Status | None:
@@ -71,7 +74,8 @@ def _describe(port: Port, packets: Packets, pinged: Status, reader: StatusReader
     """Return model, firmware, voltage and temperature of a servo in words."""
 
     def get(address: int, size: int) -> bytes:
-        status = _ask(port, packets.read(pinged.node, address, size), pinged.node, reader)
+        packet = packets.read(pinged.node, address, size)
+        status = _ask(port, packet, pinged.node, reader) or _ask(port, packet, pinged.node, reader)
         return status.data if status is not None and len(status.data) == size else b""
 
     if packets.NAME == dynamixel.NAME:

@@ -1,6 +1,7 @@
 """Servos on a serial line are found: by the scan, by the doctor, and for a drafted robot file."""
 
 import time
+from collections import Counter
 
 import pytest
 import yaml
@@ -8,10 +9,12 @@ from serial_bench import NAMES, SETTINGS, SerialBench, robot_file
 
 from hal.config import RobotConfig
 from hal.errors import BusGone
+from hal.finding import serial_scan
 from hal.finding.doctor import Severity, check_devices, check_interfaces
 from hal.finding.draft.draft import draft_bus
 from hal.finding.scan import compare
 from hal.finding.serial_scan import scan_line
+from hal.protocols import feetech
 from hal.robot import open_robot
 from simulators.robots.bench import simulator
 
@@ -42,6 +45,27 @@ def test_a_scan_lists_the_servos_and_compares_them(make):
             scan_line("arm", bench.config.buses["arm"])
     finally:
         bench.unplug()
+
+
+@pytest.mark.slow
+def test_a_servo_whose_answer_is_lost_once_is_found_all_the_same(monkeypatch):
+    asked, ask = Counter(), serial_scan._ask
+
+    def lossy(port, packet, node, reader):
+        asked[packet] += 1
+        status = ask(port, packet, node, reader)
+        return None if packet == feetech.ping(2) and asked[packet] == 1 else status
+
+    monkeypatch.setattr(serial_scan, "_ask", lossy)
+    bench = SerialBench("feetech", robot_file("feetech"))
+    bench.plug()
+    try:
+        result = scan_line("arm", bench.config.buses["arm"])
+    finally:
+        bench.unplug()
+    assert [node.node for node in result.nodes] == [1, 2, 5]
+    assert asked[feetech.ping(1)] == 1
+    assert asked[feetech.ping(2)] == 2
 
 
 @by_make
