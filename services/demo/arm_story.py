@@ -116,6 +116,7 @@ class ArmStory:
         index = self._robot.signals[self._signal].elements.index(marks.element)
         start = self._joints.now()
         self._actor.fault(f"sensor_silent {marks.encoder}")
+        lost = self._joints.now()
         noticed, delay = self._actor.notice(lambda: self._estimated(self._signal, index))
         for _ in range(MOVES):
             self._go()
@@ -123,11 +124,11 @@ class ArmStory:
         self._actor.fault(f"node_back {marks.encoder}")
         returned = self._actor.wait(lambda: not self._estimated(self._signal, index), NOTICED_WITHIN)
         marks.silent = (start, end)
-        value, truth = (self._joints.between(name, start + delay, end)[:, index] for name in ("value", "truth"))
+        value, truth = (self._joints.between(name, lost + delay, end)[:, index] for name in ("value", "truth"))
         error = np.abs(value - truth)
         mean = float(np.nanmean(error))
         figures = (
-            f"marked as estimated after {1e3 * delay:.0f} ms, {self._source(self._joints, start + delay, end)}",
+            f"marked as estimated after {1e3 * delay:.0f} ms, {self._source(self._joints, lost + delay, end)}",
             f"true error of {marks.element} meanwhile: mean {mean:.4f} rad, worst {np.nanmax(error):.4f} rad",
             "measured again when the node came back" if returned else "not measured again after the node came back",
         )
@@ -138,19 +139,21 @@ class ArmStory:
         self._report("[bold](c)[/] The camera is covered. The tip is estimated from the arm.")
         start = self._tip.now()
         self._actor.fault("camera_covered", "vision")
+        lost = self._tip.now()
         noticed, delay = self._actor.notice(lambda: self._estimated(self._seen, 0))
+        first = self._tip.stamp()
         for _ in range(MOVES):
             self._go()
-        end = self._tip.now()
+        end, last = self._tip.now(), self._tip.stamp()
         self._actor.fault("camera_back", "vision")
         returned = self._actor.wait(lambda: not self._estimated(self._seen, 0), NOTICED_WITHIN)
         self.marks.covered = (start, end)
-        value, truth = (self._tip.between(name, start + delay, end) for name in ("value", "truth"))
-        marked = bool((self._tip.between("estimated", start + delay, end) > 0)[np.isfinite(value)].all())
+        value, truth = (self._tip.between(name, lost + delay, end) for name in ("value", "truth"))
+        marked = bool(self._tip.marked(first, last).all())
         error = np.linalg.norm(value - truth, axis=1)
         mean, share = float(np.nanmean(error)), float(np.nanmean(error)) / self.marks.reach
         figures = (
-            f"marked as estimated after {1e3 * delay:.0f} ms, {self._source(self._tip, start + delay, end)}",
+            f"marked as estimated after {1e3 * delay:.0f} ms, {self._source(self._tip, lost + delay, end)}",
             f"true error of the tip meanwhile: mean {1e3 * mean:.1f} mm ({share:.1%} of the reach of "
             f"{self.marks.reach:.2f} m), worst {1e3 * np.nanmax(error):.1f} mm",
             "every value published meanwhile is marked" if marked else "NOT every value published meanwhile is marked",

@@ -108,6 +108,7 @@ class Story:
         index = self._elements.index(SILENT_ELEMENT)
         start = self._timeline.now()
         self._actor.fault(f"sensor_silent {ENCODER}")
+        lost = self._timeline.now()
         noticed, delay = self._actor.notice(lambda: self._is_estimated(index))
         for _ in range(SILENT_POSES):
             self._go(self._pose(), LEARNING_TIME)
@@ -115,8 +116,8 @@ class Story:
         self._actor.fault(f"node_back {ENCODER}")
         returned = self._actor.wait(lambda: not self._is_estimated(index), NOTICED_WITHIN)
         self.marks.silent = (start, end)
-        error = np.abs(self._silent_error(index, start + delay, end))
-        source = mode(self._timeline.between("source", start + delay, end).tolist() or [""])
+        error = np.abs(self._silent_error(index, lost + delay, end))
+        source = mode(self._timeline.between("source", lost + delay, end).tolist() or [""])
         source = "method " + source.replace(" ", ", from ").replace("+", ", ")
         worst = float(np.nanmax(error)) if error.size else float("nan")
         mean = float(np.nanmean(error)) if error.size else float("nan")

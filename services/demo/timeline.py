@@ -23,8 +23,8 @@ HIDDEN_EVERY = 4
 class Timeline:
     """Columns of a story, sampled in a thread.
 
-    Columns are `time` [s since the start], `truth`, `value`, `estimated` and `source` (method and signals) of one
-    signal, `applied` command, `score`, `threshold`, `is_anomaly` and `verdict`; and on a time axis of their own
+    Columns are `time` [s since the start], `truth`, `value`, `estimated`, `source` (method and signals) and `stamp` [s
+    since 1970] of the estimate of one signal, `applied` command, `score`, `threshold`, `is_anomaly` and `verdict`; and on a time axis of their own
     `hidden_time` and `hidden_error`, the norm of the model's estimate of the hidden signal minus the truth [its unit].
     Missing values are NaN.
     """
@@ -65,6 +65,19 @@ class Timeline:
         at = self.column(axis)[: len(column)]
         return column[: len(at)][(at >= start) & (at < end)]
 
+    def stamp(self) -> float:
+        """Return when the newest estimate was made [s since 1970]; 0 without one."""
+        estimate = self._client.estimate()
+        return 0.0 if estimate is None else 1e-9 * estimate.stamp_ns
+
+    def marked(self, first: float, last: float) -> np.ndarray:
+        """Return whether each value was marked as estimated, of those made in a span of time [s since 1970].
+
+        A row may be late on a busy machine. What it shows was made at its stamp.
+        """
+        value, estimated = (self.between(name, first, last, "stamp") for name in ("value", "estimated"))
+        return (estimated > 0)[np.isfinite(value)]
+
     def _run(self) -> None:
         row = 0
         while not self._stop.wait(max(0.0, row * EVERY - self.now())):
@@ -80,6 +93,7 @@ class Timeline:
             "truth": self._no_value if truth is None else truth.values[self._signal],
             "value": self._no_value if estimate is None else estimate.values[self._signal],
             "estimated": self._no_value if estimate is None else estimate.estimated[self._signal].astype(float),
+            "stamp": math.nan if estimate is None else 1e-9 * estimate.stamp_ns,
             "source": "" if estimate is None else f"{estimate.method[self._signal]} {estimate.mask[self._signal]}",
             "applied": self._no_command if applied is None else applied.values,
             "score": math.nan if anomaly is None else anomaly.score,

@@ -104,18 +104,20 @@ class ToolStory:
         )
         start = self._timeline.now()
         self._actor.fault("camera_covered", "vision")
+        lost = self._timeline.now()
         noticed, delay = self._actor.notice(lambda: self._is_estimated(True))
+        first = self._timeline.stamp()
         for target in self._learning[::-1]:
             self._go(target, SHORT_REST)
-        end = self._timeline.now()
+        end, last = self._timeline.now(), self._timeline.stamp()
         self._actor.fault("camera_back", "vision")
         returned = self._actor.wait(lambda: self._is_estimated(False), NOTICED_WITHIN)
         self.marks.covered = (start, end)
-        value, truth = (self._timeline.between(name, start + delay, end) for name in ("value", "truth"))
-        marked = (self._timeline.between("estimated", start + delay, end) > 0)[np.isfinite(value)]
+        value, truth = (self._timeline.between(name, lost + delay, end) for name in ("value", "truth"))
+        marked = self._timeline.marked(first, last)
         error = np.linalg.norm(value - truth, axis=1)
         mean = float(np.nanmean(error)) if np.isfinite(error).any() else float("nan")
-        source = mode(self._timeline.between("source", start + delay, end).tolist() or [""])
+        source = mode(self._timeline.between("source", lost + delay, end).tolist() or [""])
         source = "method " + source.replace(" ", ", from ", 1).replace("+", ", ")
         figures = (
             f"marked as estimated after {1e3 * delay:.0f} ms, {source}",
