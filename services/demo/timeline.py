@@ -24,9 +24,9 @@ class Timeline:
     """Columns of a story, sampled in a thread.
 
     Columns are `time` [s since the start], `truth`, `value`, `estimated`, `source` (method and signals) and `stamp` [s
-    since 1970] of the estimate of one signal, `applied` command, `score`, `threshold`, `is_anomaly` and `verdict`; and on a time axis of their own
-    `hidden_time` and `hidden_error`, the norm of the model's estimate of the hidden signal minus the truth [its unit].
-    Missing values are NaN.
+    since 1970] of the estimate of one signal, `applied` command, `score`, `threshold`, `is_anomaly` and `verdict`; and
+    on a time axis of their own `hidden_time` and `hidden_error`, the norm of the model's estimate of the hidden signal
+    minus the truth [its unit]. Missing values are NaN.
     """
 
     def __init__(self, client: Client, signal: str, size: int, commands: int, hide: Sequence[str]) -> None:
