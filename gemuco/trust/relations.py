@@ -19,6 +19,9 @@ KEPT = 64
 """At most this number of relations is kept."""
 FLOOR = 0.002
 """A healthy error is at least this share of the spread of its column in the known samples."""
+HARDLY = 0.1
+"""An element hardly varies if its spread is below this share of the largest one of its signal. `FLOOR` is then a share
+of that one: sensors of one signal resolve alike, and the element may stay within one of their steps."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,7 +102,8 @@ class Relations:
         self._rows = self.features(rows)
         self.sensitivity = Sensitivity(schema, self.columns)
         self._sensed = self.sensitivity.sense(schema, rows)
-        self._least = FLOOR * np.maximum(rows[:, self.columns].std(axis=0), 1e-3)
+        self._coarse = FLOOR * _signal_spreads(schema, rows, self.columns, watch.signal)
+        self._least = np.maximum(FLOOR * np.maximum(rows[:, self.columns].std(axis=0), 1e-3), self._coarse)
         self._kept: dict[Hidden, Relation] = {}
         self._inflation = np.ones(inputs)
         outputs = schema.out_layout.size
@@ -184,7 +188,7 @@ class Relations:
         errors, healthy = relation.errors(features), relation.healthy(features)
         if relation.network.any():
             lies, spread = self.sensitivity.lies(sensed, hidden)
-            spread = spread * relation.calibration * np.maximum(1.0, healthy / relation.std)
+            spread = np.maximum(spread * relation.calibration * np.maximum(1.0, healthy / relation.std), self._coarse)
             better = relation.network & np.isfinite(spread)
             errors, healthy = np.where(better, lies, errors), np.where(better, spread, healthy)
         return errors, healthy
@@ -201,6 +205,24 @@ class Relations:
 def rows_of(schema: BodySchema, x: np.ndarray) -> np.ndarray:
     """Return samples [standard deviations], shape (n, size), followed by the schema's p."""
     return with_bias(schema, x)
+
+
+def _signal_spreads(schema: BodySchema, rows: np.ndarray, columns: np.ndarray, signal: np.ndarray) -> np.ndarray:
+    """Return the largest spread in the signal of columns that hardly vary [their standard deviations]; 0 for others.
+
+    Args:
+        schema: The schema.
+        rows: Known samples with their p [standard deviations], shape (n, size + bias_size).
+        columns: Positions of the columns in a row, shape (columns,).
+        signal: Number of each column's signal; negative for p, shape (columns,).
+    """
+    result = np.zeros(len(columns))
+    for number in set(signal[signal >= 0].tolist()):
+        own = signal == number
+        std = schema.scaler.std[columns[own]]
+        spread = rows[:, columns[own]].std(axis=0) * std
+        result[own] = np.where(spread < HARDLY * spread.max(), spread.max() / std, 0.0)
+    return result
 
 
 def _without(inverse: np.ndarray, outside: np.ndarray) -> np.ndarray:

@@ -7,6 +7,7 @@ import pytest
 
 from gemuco.anomaly.healthy import learn_normal
 from gemuco.anomaly.prediction import judging_masks
+from gemuco.dataset import as_dataset
 from gemuco.learning.config import TrainConfig
 from gemuco.learning.train import fit
 from gemuco.normal.watch import Watch
@@ -224,6 +225,35 @@ def test_an_encoder_whose_lie_ends_at_rest_is_used_again(model, arm):
     _, hidden = watch(model, samples)
     assert hidden[399] == {JOINT}
     assert not any(hidden[440:])
+
+
+def coarse(blocks, seed):
+    """Return samples of two angles and two torques, of which the second stays within half a step of its sensor."""
+    random, count = np.random.default_rng(seed), blocks * SAMPLES
+    angle = np.sin(random.uniform(0, 6.0, 2) + np.arange(count)[:, None] * random.uniform(0.01, 0.03, 2))
+    torque = np.stack([4.0 * angle[:, 0] + angle[:, 1], 0.0045 * angle[:, 1]], axis=1)
+    angle = angle + random.normal(0.0, 0.002, angle.shape)
+    return {"angle": angle, "torque": torque + np.c_[random.normal(0.0, 0.02, count), np.zeros(count)]}
+
+
+def test_an_element_that_hardly_varies_does_not_lie_by_a_step_of_its_sensor():
+    """The torque of a wrist, simulated without a bus for the training, is one count or none on the bus."""
+    schema = fit(
+        as_dataset(coarse(600, 1), {"angle": "rad", "torque": "N m"}),
+        TrainConfig(hidden=(20,), latent=3, epochs=20),
+        [("angle",)],
+    )[0]
+
+    def on_the_bus(blocks, seed, away):
+        values = coarse(blocks, seed)
+        values["torque"][:, 1] = 0.01 * np.round((values["torque"][:, 1] + away) / 0.01)
+        return schema.layout.join(values)
+
+    schema = schema.with_normal(learn_normal(schema, on_the_bus(600, 2, 0.0)))
+    steps = on_the_bus(300, 3, 0.003)
+    assert len(np.unique(steps[:, 3])) == 2
+    _, hidden = watch(schema, steps.reshape(300, SAMPLES, 4))
+    assert not any(hidden)
 
 
 def test_elements_that_look_alike_are_both_named(model, arm):
