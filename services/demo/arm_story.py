@@ -149,7 +149,7 @@ class ArmStory:
         returned = self._actor.wait(lambda: not self._estimated(self._seen, 0), NOTICED_WITHIN)
         self.marks.covered = (start, end)
         value, truth = (self._tip.between(name, lost + delay, end) for name in ("value", "truth"))
-        marked = bool(self._tip.marked(first, last).all())
+        marked = self._tip.marked(first, last) == 1.0
         error = np.linalg.norm(value - truth, axis=1)
         mean, share = float(np.nanmean(error)), float(np.nanmean(error)) / self.marks.reach
         figures = (

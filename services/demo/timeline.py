@@ -70,13 +70,14 @@ class Timeline:
         estimate = self._client.estimate()
         return 0.0 if estimate is None else 1e-9 * estimate.stamp_ns
 
-    def marked(self, first: float, last: float) -> np.ndarray:
-        """Return whether each value was marked as estimated, of those made in a span of time [s since 1970].
+    def marked(self, first: float, last: float) -> float:
+        """Return the share of the values made in a span of time [s since 1970] that was marked as estimated, 0 of none.
 
         A row may be late on a busy machine. What it shows was made at its stamp.
         """
         value, estimated = (self.between(name, first, last, "stamp") for name in ("value", "estimated"))
-        return (estimated > 0)[np.isfinite(value)]
+        seen = estimated[np.isfinite(value)]
+        return float((seen > 0).mean()) if seen.size else 0.0
 
     def _run(self) -> None:
         row = 0

@@ -122,12 +122,12 @@ class ToolStory:
         figures = (
             f"marked as estimated after {1e3 * delay:.0f} ms, {source}",
             f"true error of the tip meanwhile: mean {1e3 * mean:.0f} mm, worst {1e3 * np.nanmax(error):.0f} mm",
-            f"{marked.mean():.0%} of the values published meanwhile are marked as estimated",
+            f"{marked:.0%} of the values published meanwhile are marked as estimated",
             "measured again when the camera was uncovered"
             if returned
             else "not measured again after the camera was uncovered",
         )
-        seen = noticed and returned and bool(marked.all()) and mean < FOLLOWS
+        seen = noticed and returned and marked == 1.0 and mean < FOLLOWS
         return self._stage(NAMES[1], start, figures, seen)
 
     def change_tool(self) -> Stage:

@@ -230,7 +230,7 @@ def test_a_broken_servo_is_off_until_it_is_reset(tmp_path: Path) -> None:
         robot.reset()
         cycle_until(robot, lambda one: states(robot) == {"axis": "ready"})
         cycle_until(robot, arrives("joint_position", np.array([0.3])), np.array([0.3]))
-        before = robot._devices[0]._counters["boots"]  # a long silence counts as one
+        before = robot._devices[0]._counters["boots"]  # its start counts as one if the driver saw it
         rig.fault("node_reboot axis")
         cycle_until(robot, lambda one: robot._devices[0]._counters["boots"] > before)
 
