@@ -24,6 +24,8 @@ fi
 if [ -n "${PYTHONDONTWRITEBYTECODE:-}" ]; then kept=--compile-bytecode compile=--compile; else kept= compile=--no-compile; fi
 index=$(pip config list | sed -n "s/^.*\.index-url='\(.*\)'$/\1/p" | tail -n 1)
 [ -z "$index" ] || export UV_DEFAULT_INDEX="${UV_DEFAULT_INDEX:-$index}"
+cert=$(pip config list | sed -n "s/^.*\.cert='\(.*\)'$/\1/p" | tail -n 1) # of a proxy, say
+[ -z "$cert" ] || export SSL_CERT_FILE="${SSL_CERT_FILE:-$cert}"
 
 list +dev =uv >build/uv.txt
 list $(printf '+%s ' "$@") +build >build/wanted.txt

@@ -15,6 +15,7 @@ import pytest
 import typer
 import yaml
 from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
 
 from services.hardware.hal_service import AT_REST_WITHIN
 from services.verbs.verb import report_errors
@@ -99,6 +100,14 @@ def test_the_lock_has_a_hash_for_every_version_that_is_pinned() -> None:
         name: pins[name] for name in set(pins) & set(locked)
     }
     assert set(locked) <= set(pins)
+
+
+def test_every_pinned_package_runs_on_the_oldest_python_that_is_promised() -> None:
+    oldest = "3.11.2"  # Debian 12's; the tests may run on a newer one, on which pip would take anything
+    installed = [metadata.distribution(name) for name in PINS if _installed(name)]
+    assert len(installed) > 60
+    too_new = [one.name for one in installed if oldest not in SpecifierSet(one.metadata["Requires-Python"] or "")]
+    assert not too_new
 
 
 def _not_needed(pins: dict[str, str], locked: dict[str, str]) -> set[str]:
