@@ -34,7 +34,7 @@ class Hindsight:
         size = schema().layout.size
         self._errors = RecentErrors(size)
         self._last, self._looked_at = np.full(size, np.nan), -np.inf
-        self._bias = schema().bias
+        self._bias, self._expected = schema().bias, schema().errors
         self._recipes: tuple[BodySchema, ByPattern[Recipe]] | None = None
 
     @property
@@ -53,7 +53,7 @@ class Hindsight:
         if np.isfinite(moved).any() and not np.nanmax(moved) >= SPREAD:
             return
         self._last, self._looked_at = joined, now
-        self._forget_another_body(schema)
+        self._forget_another_model(schema)
         missed, std = np.full(len(joined), np.nan), np.full(len(joined), np.nan)
         for name in schema.x_out:
             self._predict(schema, joined, schema.layout.slice(name), missed, std)
@@ -81,8 +81,9 @@ class Hindsight:
             kept = self._recipes = schema, ByPattern(partial(Recipe.of, schema))
         return kept[1]
 
-    def _forget_another_body(self, schema: BodySchema) -> None:
-        """Begin anew if p is that of another body."""
-        if len(schema.bias) and Prior.of(schema).between(self._bias, schema.bias.astype(float)) > ANOTHER:
+    def _forget_another_model(self, schema: BodySchema) -> None:
+        """Begin anew if p is that of another body, or if the update has measured the expected errors on this one."""
+        is_other = len(schema.bias) and Prior.of(schema).between(self._bias, schema.bias.astype(float)) > ANOTHER
+        if is_other or schema.errors is not self._expected:
             self._errors.forget()
-            self._bias = schema.bias
+            self._bias, self._expected = schema.bias, schema.errors

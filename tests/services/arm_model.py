@@ -18,6 +18,7 @@ ROBOT = Path(__file__).parents[2] / "robots" / "musashi_arm.yaml"
 MASKS = (("muscle_tension", "muscle_length"), ("joint_position", "muscle_tension"))
 
 
+@cache
 def arm() -> RobotConfig:
     return load_robot(ROBOT)
 

@@ -40,7 +40,7 @@ class Bench:
         return self.published[-1]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_body_that_was_never_normal_is_unknown_and_nothing_is_blamed() -> None:
     bench = Bench()
     for index in range(80):
@@ -84,7 +84,7 @@ def test_the_first_sample_without_an_element_waits_for_its_statistics() -> None:
     assert not second.is_anomaly
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_small_shift_that_lasts_becomes_an_anomaly() -> None:
     bench = Bench()
     for index in range(100):

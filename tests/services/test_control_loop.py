@@ -93,7 +93,7 @@ def test_the_reference_reaches_the_target_at_the_robot_files_speed() -> None:
     np.testing.assert_array_equal(bench.control.facts()["reference"], target)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_settled_command_is_what_the_model_says_of_the_posture() -> None:
     bench = Bench()
     bench.control.engage(bench.enable)
@@ -208,7 +208,7 @@ def test_another_model_is_used_at_once_and_a_reference_that_moves_keeps_the_layo
 
 
 @pytest.mark.parametrize("unknown", ["slow", "hold", "ignore"])
-@pytest.mark.slow
+@pytest.mark.long
 def test_where_the_body_is_unknown_the_reference_is_slow_or_holds_and_says_so(unknown: str) -> None:
     bench = Bench(unknown=unknown, edge=-0.8)
     bench.control.engage(bench.enable)

@@ -5,6 +5,7 @@ import pytest
 from arm_model import arm, fresh, sample_of, small_model, states
 from msgspec.structs import replace
 
+from gemuco.adaption.seen import SeenErrors
 from gemuco.certainty.certainty import NINETY
 from gemuco.intervals.widening import NARROWEST
 from hal.clock import ManualClock
@@ -24,9 +25,10 @@ class Bench:
         self.newest: Arrival[Sample] | None = None
         self.published: list[Estimates] = []
         self.freshness = Freshness(arm(), lambda: self.newest, self.clock)
-        self.hindsight = Hindsight(self.freshness, small_model, self.clock)
+        self.schema = small_model()
+        self.hindsight = Hindsight(self.freshness, lambda: self.schema, self.clock)
         self.estimation = Estimation(
-            self.freshness, small_model, self.published.append, self.clock, lambda: self.hindsight.factor
+            self.freshness, lambda: self.schema, self.published.append, self.clock, lambda: self.hindsight.factor
         )
 
     def sample(self, index: int, silent: tuple[str, ...] = ()) -> np.ndarray:
@@ -55,7 +57,7 @@ class Bench:
         return float(abs(values[3] - truth[3])), float(std[3]), message
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_on_the_learned_body_the_std_stays_about_as_it_is() -> None:
     bench = Bench()
     _, before, message = bench.estimate(0)
@@ -66,7 +68,7 @@ def test_on_the_learned_body_the_std_stays_about_as_it_is() -> None:
     assert 0.5 * before <= after < 2.5 * before
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_on_another_body_the_interval_of_a_lost_joint_is_honest_and_it_is_said() -> None:
     bench = Bench(offset=0.3)
     bench.look(range(300))
@@ -82,7 +84,26 @@ def test_on_another_body_the_interval_of_a_lost_joint_is_honest_and_it_is_said()
     assert all(message.state["muscle_length"] == "known" for message in said)  # it is measured
 
 
-@pytest.mark.slow
+@pytest.mark.long
+def test_errors_that_the_update_measured_too_do_not_count_twice() -> None:
+    bench, learned = Bench(offset=0.3), small_model()
+    seen = SeenErrors(learned)
+    bench.look(range(300))
+    for index in range(300):
+        joints = bench.sample(index)
+        values = sample_of(index, index, seed=1).values | {"joint_position": joints}
+        seen.see(learned, learned.normalise_one(values))
+    before = bench.hindsight.factor[3]
+    bench.schema = seen.renewed(learned)
+    bench.look(range(300, 320))
+    assert before > 4.0 > 2.0 > bench.hindsight.factor[3]
+    missed, std, _ = np.array([bench.estimate(index) for index in range(320, 420)], object).T
+    hits = np.mean(missed <= NINETY * std)
+    assert hits > 0.8
+    assert np.median(std) < 3.0 * np.median(missed)
+
+
+@pytest.mark.long
 def test_a_robot_at_rest_shows_nothing() -> None:
     bench = Bench(offset=0.3)
     for _ in range(50):

@@ -154,7 +154,7 @@ def test_the_normal_is_learned_from_samples_since_the_model_changed() -> None:
         bench.update.learn_normal()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_interval_is_between_samples_that_are_learned_from() -> None:
     bench = Bench(window=200, interval=0.4)
     bench.engaged = True
@@ -206,7 +206,7 @@ class SlowLearner:
 
 
 @pytest.mark.parametrize("duration", [0.5e-3, 5e-3])
-@pytest.mark.slow
+@pytest.mark.long
 def test_steps_for_rare_samples_leave_most_of_a_tick_free(duration: float) -> None:
     bench = Bench()
     learner = SlowLearner(bench.living.schema, bench.clock, duration, round(1.6 / duration))
