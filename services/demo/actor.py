@@ -73,10 +73,15 @@ class Actor:
                 refusal = str(error)
             self.wait(self._follows, ENGAGED_WITHIN)
 
-    def go(self, signal: str, values: np.ndarray, duration: float) -> None:
-        """Send a target [its unit], shape (n,), and wait `duration` [s]; repeat if the HAL stopped the robot."""
+    def go(self, signal: str, values: np.ndarray, duration: float, stays: Callable[[], bool] = lambda: False) -> None:
+        """Send a target [its unit], shape (n,), and wait `duration` [s]; repeat if the HAL stopped the robot.
+
+        Nothing is sent to a robot that was stopped if `stays` says within a moment that it stays so.
+        """
         for _ in range(TRIES):
             if not self._follows():
+                if self.wait(stays, STEADY):
+                    return
                 self._recover()
             self._insist(lambda: self._client.ask("model", "target", {"signal": signal, "values": values.tolist()}))
             self.wait(lambda: False, duration)
@@ -130,8 +135,9 @@ class Actor:
     def _recover(self) -> None:
         """Continue after the HAL stopped the arm: report the reason, reset and engage again."""
         mode, status = self._mode(), self._client.status("hal", timeout=1.0)
-        fault = status.facts.get("fault") if status else ""
-        reason = f"({mode}). {fault or 'Commands came too late.'}"
+        fault, estimate = status.facts.get("fault") if status else "", self._client.estimate()
+        lies = [] if estimate is None else [f"{name} is {why}." for name, why in estimate.distrusted.items()]
+        reason = f"({mode}). {fault or ' '.join(lies) or 'Commands came too late.'}"
         self._report(f"    [yellow]The HAL stopped the arm {reason} It is reset and engaged again.[/]")
         self.stops += 1
         self.engage()

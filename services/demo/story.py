@@ -213,7 +213,7 @@ class Story:
         alarmed = self._actor.wait(self._is_alarmed, NOTICED_WITHIN)
         self.marks.alarm = self._timeline.now()
         for _ in range(CUT_POSES):
-            self._go(self._pose(), LEARNING_TIME)
+            self._actor.go(self._signal, self._pose(), LEARNING_TIME, lambda: bool(self._distrusted_of_muscle()))
         early = [anomaly for at, anomaly in self._timeline.anomalies if start <= at < self.marks.alarm + 1.0]
         element = mode([anomaly.blamed for anomaly in early] or [""])
         self.marks.blamed = self._blamed_muscle(early)
@@ -225,10 +225,17 @@ class Story:
             f"reported after {1e3 * (self.marks.alarm - start):.0f} ms; blamed element {element or 'none'}",
             f"muscle with the largest part in the score: {self.marks.blamed or 'none'}",
             f"before anything was wrong an anomaly was reported {alarms:.1%} of the time",
+            *(f"{name} is {why}; motion needs it, so the arm stays off" for name, why in self._distrusted_of_muscle()),
         )
         right = self.marks.blamed == MUSCLE
         self._client.disengage()
         return Stage(NAMES[4], start, end, figures, alarmed and right and not calm.any())
+
+    def _distrusted_of_muscle(self) -> list[tuple[str, str]]:
+        """Return the elements of the cut muscle that are not used as measured, and why."""
+        estimate = self._client.estimate()
+        known = {} if estimate is None else estimate.distrusted
+        return [(name, why) for name, why in known.items() if name.partition(".")[2] == MUSCLE]
 
     def _gather(self, samples: int) -> int:
         """Go to more poses until the update's window has this many samples; return its number of samples."""

@@ -9,7 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from gemuco.anomaly.blame import parts
 from gemuco.estimation import recipes
+from gemuco.intervals.sureness import MARGIN
 from gemuco.normal import Normal
 from gemuco.schema import BodySchema
 from gemuco.trust.aligned import Aligned
@@ -244,7 +246,25 @@ class Trust:
         others = [self._names[other] for other in finding.elements if other != index]
         if finding.cause == "either" and others:
             return f"it or {' or '.join(others)} is {words}"
+        if self._changed_part(finding):
+            return f"{words}, or {_part_of(self._names[index])} itself has changed"
         return words
+
+    def _changed_part(self, finding: Finding) -> str:
+        """Return the element that shows that not a sensor but a part of the body may have changed; empty if none does.
+
+        It belongs to the same part, as tension and length of a muscle do, and has left its learned range: that of a
+        wire that is cut, or slack.
+        """
+        schema, last = self._schema(), self._last
+        if finding.cause != "element" or finding.by_hand or schema.certainty is None or last is None:
+            return ""
+        low, high = schema.certainty.low, schema.certainty.high
+        x, room = schema.scaler.normalise(in_order(schema, last).flat), MARGIN * (high - low)
+        outside = (x < low - room) | (x > high + room)
+        lying = finding.elements[0]
+        part = next((part for part in parts(schema, list(range(len(x)))) if lying in part), ())
+        return next((self._names[other] for other in part if other != lying and outside[other]), "")
 
     def _sentence(self, finding: Finding) -> str:
         since, names = self._wall_time(finding.since), [self._names[index] for index in finding.elements]
@@ -260,8 +280,10 @@ class Trust:
         text += f": {kind}since {since}"
         if finding.kind in SIZED and math.isfinite(finding.size):
             text += f", off by {finding.size:.3g} {self._units[finding.elements[0]]}"
-        device = self._device.get(finding.elements[0])
-        if finding.kind in CALIBRATED and device is not None and len(names) == 1:
+        device, other = self._device.get(finding.elements[0]), self._changed_part(finding)
+        if other:
+            text += f", or {_part_of(other)} itself has changed: {other} is outside of what was learned"
+        elif finding.kind in CALIBRATED and device is not None and len(names) == 1:
             text += f"; `gemuco calibrate` measures {device} anew"
         return f"{text} (still used: {finding.reason})." if finding.reason else f"{text}."
 
@@ -291,6 +313,10 @@ def _needed(robot: RobotConfig, place: dict[str, int], stops: Iterable[str] | No
 
 def _is_same(one: Finding, other: Finding) -> bool:
     return one.elements == other.elements and one.is_distrusted == other.is_distrusted and one.kind == other.kind
+
+
+def _part_of(element: str) -> str:
+    return element.partition(".")[2]
 
 
 def _kind(reason: str) -> str:

@@ -1,6 +1,7 @@
 """What the demo waits for where a fast machine would have been ready by itself."""
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -173,6 +174,9 @@ class Stopping:
         self.stops_left -= 1
         self.mode = "fault" if self.stops_left >= 0 else "follow"
 
+    def estimate(self) -> SimpleNamespace | None:
+        return None
+
     def reset(self) -> None:
         self.mode = "off"
 
@@ -190,6 +194,29 @@ def test_a_target_is_given_again_when_the_hal_stopped_the_arm_on_the_way(
     mover.go("joint_position", np.zeros(5), 0.02)
     assert (robot.targets, mover.stops) == (targets, counted)
     assert sum("Life guard" in sentence for sentence in said) == counted
+
+
+class Cut(Stopping):
+    """A robot that the HAL stops because an element of a cut muscle is distrusted, a moment after it has stopped."""
+
+    def __init__(self) -> None:
+        super().__init__(1)
+        self.looks = 0
+
+    def estimate(self) -> SimpleNamespace:
+        self.looks += 1
+        reasons = {"muscle_length.deltoid_side": "distrusted: offset since 12:03:11"} if self.looks > 3 else {}
+        return SimpleNamespace(distrusted=reasons)
+
+    def engage(self) -> None:
+        raise CommandRefused("muscle_length.deltoid_side is distrusted, and motion needs it.")
+
+
+def test_an_arm_with_a_cut_muscle_may_stay_off() -> None:
+    robot, said = Cut(), []
+    mover = Actor(robot, lambda: None, said.append)  # type: ignore[arg-type]
+    mover.go("joint_position", np.zeros(5), 0.02, lambda: bool(robot.estimate().distrusted))
+    assert (robot.targets, mover.stops, said) == (1, 0, [])
 
 
 class Lost(Stopping):

@@ -98,6 +98,27 @@ def test_a_lying_encoder_is_estimated_and_marked_until_it_agrees() -> None:
     assert not estimates.estimated.flat.any()
 
 
+@pytest.mark.parametrize(("tension", "is_cut"), [(None, False), (0.0, True)])
+def test_a_wire_that_is_cut_is_not_taken_for_an_encoder_alone(tension: float | None, is_cut: bool) -> None:
+    bench, samples = Bench(), motion(500, 2)
+    place = arm().signals["muscle_length"].elements.index("deltoid_side")
+    for sample in samples[:300]:
+        bench.feed(sample)
+    for sample in samples[300:400]:
+        wrong = {name: value.copy() for name, value in sample.items()}
+        wrong["muscle_length"][place] -= 0.0127
+        if tension is not None:
+            wrong["muscle_tension"][place] = tension
+        told = bench.feed(wrong).distrusted
+        if told:
+            break
+    (name, reason), text = *told.items(), bench.trust.text()
+    assert name == "muscle_length.deltoid_side"
+    assert reason.endswith(", or deltoid_side itself has changed") == is_cut
+    assert ("muscle_tension.deltoid_side is outside of what was learned" in text) == is_cut
+    assert ("gemuco calibrate" in text) == (not is_cut)
+
+
 def test_an_operator_distrusts_and_trusts() -> None:
     bench, samples = Bench(), motion(60, 2)
     bench.feed(samples[0])
