@@ -76,11 +76,12 @@ class Actor:
     def go(self, signal: str, values: np.ndarray, duration: float, stays: Callable[[], bool] = lambda: False) -> None:
         """Send a target [its unit], shape (n,), and wait `duration` [s]; repeat if the HAL stopped the robot.
 
-        Nothing is sent to a robot that was stopped if `stays` says within a moment that it stays so.
+        A robot that was stopped is left as it is for this time if `stays` says within a moment that it stays so.
         """
         for _ in range(TRIES):
             if not self._follows():
                 if self.wait(stays, STEADY):
+                    self.wait(lambda: False, duration)
                     return
                 self._recover()
             self._insist(lambda: self._client.ask("model", "target", {"signal": signal, "values": values.tolist()}))

@@ -201,7 +201,7 @@ class Story:
         return status.text.rstrip(".") if status is not None and name in status.text else ""
 
     def lose_muscle(self) -> Stage:
-        """Play (e): a muscle is cut, and the anomaly detection names it."""
+        """Play (e): a muscle is cut, and the anomaly detection names it, or an element of it is distrusted."""
         self._become_calm()
         self._report(f"[bold](e)[/] The wire of {MUSCLE} is cut.")
         start = self._timeline.now()
@@ -210,26 +210,26 @@ class Story:
         alarms = float(np.mean(self._timeline.between("is_anomaly", 0.0, self.marks.lies)))
         self._actor.fault(f"muscle_cut {MUSCLE}")
         self.marks.cut = start
-        alarmed = self._actor.wait(self._is_alarmed, NOTICED_WITHIN)
+        noticed = self._actor.wait(lambda: self._is_alarmed() or bool(self._distrusted_of_muscle()), NOTICED_WITHIN)
         self.marks.alarm = self._timeline.now()
         for _ in range(CUT_POSES):
             self._actor.go(self._signal, self._pose(), LEARNING_TIME, lambda: bool(self._distrusted_of_muscle()))
         early = [anomaly for at, anomaly in self._timeline.anomalies if start <= at < self.marks.alarm + 1.0]
         element = mode([anomaly.blamed for anomaly in early] or [""])
-        self.marks.blamed = self._blamed_muscle(early)
-        end = self._timeline.now()
+        verdicts, end = self._distrusted_of_muscle(), self._timeline.now()
+        self.marks.blamed = self._blamed_muscle(early) or (MUSCLE if verdicts else "")
         after = float(np.nanmedian(self._timeline.between("score", self.marks.alarm, end)))
         limit = float(np.nanmedian(self._timeline.between("threshold", start, end)))
         figures = (
             f"anomaly score {score:.1f} before the cut, {after:.1f} after it, threshold {limit:.1f}",
             f"reported after {1e3 * (self.marks.alarm - start):.0f} ms; blamed element {element or 'none'}",
-            f"muscle with the largest part in the score: {self.marks.blamed or 'none'}",
+            f"muscle with the largest part in the score: {self._blamed_muscle(early) or 'none'}",
             f"before anything was wrong an anomaly was reported {alarms:.1%} of the time",
-            *(f"{name} is {why}; motion needs it, so the arm stays off" for name, why in self._distrusted_of_muscle()),
+            *(f"{name} is {why}; motion needs it, so the arm stays off" for name, why in verdicts),
         )
         right = self.marks.blamed == MUSCLE
         self._client.disengage()
-        return Stage(NAMES[4], start, end, figures, alarmed and right and not calm.any())
+        return Stage(NAMES[4], start, end, figures, noticed and right and not calm.any())
 
     def _distrusted_of_muscle(self) -> list[tuple[str, str]]:
         """Return the elements of the cut muscle that are not used as measured, and why."""
