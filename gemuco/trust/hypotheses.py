@@ -24,9 +24,10 @@ CLOSE = 0.8
 MOST = 3
 """At most this number of columns is named as alternatives."""
 AGREES = 0.6
-"""Another trained p explains an alarm if under it the evidence against all elements is below this share of one."""
+"""Another trained p, or two elements exchanged, explain an alarm if the evidence that is left is below this share of
+one."""
 RIVALS = 0.1
-"""And if no single element explains it better by more than this share of an alarm."""
+"""And p if no single element explains it better by more than this share of an alarm."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,12 +39,14 @@ class Cause:
         cause: As in `Finding`.
         lead: The column with the most evidence.
         condition: The trained condition whose p explains the alarm; empty if none does.
+        is_exchange: Whether they are two elements that agree with all others in each other's place.
     """
 
     columns: Hidden
     cause: str
     lead: int
     condition: str = ""
+    is_exchange: bool = False
 
 
 def explain(
@@ -53,6 +56,7 @@ def explain(
     parts: Sequence[Hidden],
     environment: Hidden,
     conditions: Callable[[], Iterable[tuple[str, Evidence, bool]]] = lambda: (),
+    exchanges: Iterable[tuple[Hidden, Evidence]] = (),
 ) -> Cause:
     """Return the most likely cause of an alarm.
 
@@ -65,6 +69,7 @@ def explain(
         conditions: Returns each other trained condition, the evidence under its p, and whether the healthy errors
             under it are known; if not, a doubt is in favour
             of the sensors.
+        exchanges: Pairs of elements, and the evidence if they are exchanged back.
     """
     order = np.argsort(-evidence.strength)
     lead = int(order[0])
@@ -84,10 +89,15 @@ def explain(
 
     single = [column for column in singles if solves(frozenset({column}))]
     best = float(evidence.strength[single[0]]) if single else 0.0
+    rest = min((float(without(frozenset({c})).ratio.max(initial=0.0)) for c in single), default=1.0)
+    if not evidence.is_noise.any():  # which an exchange does not explain
+        calmer = ((pair, other) for pair, other in exchanges if other.level <= evidence.level)
+        left, pair = min(((float(o.ratio.max(initial=0.0)), sorted(p)) for p, o in calmer), default=(1.0, []))
+        if left < min(AGREES, rest):
+            return Cause(frozenset(pair), "all", max(pair, key=lambda c: evidence.strength[c]), is_exchange=True)
     if evidence.is_slow[lead]:  # another tool is there at once
         environment = frozenset()
     if environment and not evidence.is_noise[lead]:
-        rest = min((float(without(frozenset({c})).ratio.max(initial=0.0)) for c in single), default=1.0)
         for name, other, is_known in conditions():
             if float(other.ratio.max(initial=0.0)) < (min(AGREES, rest + RIVALS) if is_known else EXPLAINED):
                 return Cause(environment, "environment", lead, name)

@@ -8,7 +8,8 @@ import numpy as np
 
 from gemuco.anomaly.blame import parts
 from gemuco.schema import BodySchema
-from gemuco.trust.changes import AGES, LONGEST, LastingTest
+from gemuco.trust.alternatives import Alternatives
+from gemuco.trust.changes import LONGEST, LastingTest
 from gemuco.trust.config import BLOCK, Finding, Hidden, TrustConfig
 from gemuco.trust.evidence import Evidence, Judge
 from gemuco.trust.healthy import Healthy
@@ -128,7 +129,7 @@ class TrustMonitor:
         self._recent.clear()
         self._other = self._motion = 0.0
         self._healthy, self._lasting = Healthy(size), LastingTest(size)
-        self._least = self._sizes(schema, self._relations)
+        self._least = self._relations.sizes(schema, self._config)
         self._judge = self._fresh_judge()
         place = {int(position): column for column, position in enumerate(self._relations.columns)}
         self._place = place
@@ -213,7 +214,7 @@ class TrustMonitor:
 
     def _decide(self, evidence: Evidence, hidden: Hidden) -> None:
         immune = [self._place[p] for p in self._immune if p in self._place]
-        ratio = evidence.ratio.copy()
+        ratio = self._left(evidence, hidden)
         ratio[immune] = 0.0
         highest = float(ratio.max(initial=0.0))
         body = next((case for case in self._cases if case.cause.cause == "body"), None)
@@ -223,6 +224,7 @@ class TrustMonitor:
             cause = explain(
                 evidence, self._without(hidden), self._joined, self._parts, self._environment - hidden,
                 lambda: self._conditions(hidden, int(evidence.age.flat[evidence.strength.argmax()])),
+                self._alternatives(hidden).exchanges(evidence),
             )  # fmt: skip
             self._suspect(cause, evidence, hidden)
         else:
@@ -236,22 +238,31 @@ class TrustMonitor:
 
     def _conditions(self, hidden: Hidden, age: int) -> Iterator[tuple[str, Evidence, bool]]:
         """Yield each other trained condition, the evidence if it holds since about `age` blocks, and if it is known."""
-        schema, relations, judge = self._schema, self._relations, self._judge
+        schema, alternatives = self._schema, self._alternatives(hidden)
         assert schema is not None
-        assert relations is not None
-        place, now = AGES.index(age), self._recent.view(relations, hidden)
-        ages = range(AGES[max(place - 1, 0)], min(AGES[min(place + 1, len(AGES) - 1)] + 1, LONGEST))
-        unknown = np.full(now.z.shape[1], np.nan)
         for name, bias in schema.biases.items():
-            if np.array_equal(bias, schema.bias):
-                continue
-            other, changed = self._recent.under(schema.under(name), relations).view(relations, hidden), []
-            for since in ages:
-                z = np.concatenate([now.z[:-since], other.z[-since:]])
-                z[-since - 1] = np.nan  # the tool was changed within this block
-                changed.append(judge(replace(now, z=z, noises=unknown[None])))
-            best = min(changed, key=lambda evidence: float(evidence.ratio.max(initial=0.0)))
-            yield name, best, not _is_another(schema, bias, self._biases).all()
+            if not np.array_equal(bias, schema.bias):
+                is_known = not _is_another(schema, bias, self._biases).all()
+                yield name, alternatives.condition(name, age), is_known
+
+    def _left(self, evidence: Evidence, hidden: Hidden) -> np.ndarray:
+        """Return the evidence, or less if it is less with exchanged elements read in each other's place, shape (n,)."""
+        ratio = evidence.ratio.copy()
+        for case in self._cases:
+            if case.is_hidden and case.cause.is_exchange and ratio.max() >= DOUBTFUL:
+                ratio = np.minimum(ratio, self._rest(case, hidden - case.cause.columns).ratio)
+        return ratio
+
+    def _rest(self, case: _Case, hidden: Hidden) -> Evidence:
+        """Return the evidence without the elements of a case, or with exchanged ones in each other's place."""
+        if case.cause.is_exchange:
+            since = self._count - case.began + 1
+            return self._alternatives(hidden).exchanged(case.cause.columns, since)
+        return self._without(hidden)(case.cause.columns)
+
+    def _alternatives(self, hidden: Hidden) -> Alternatives:
+        assert self._schema is not None and self._relations is not None
+        return Alternatives(self._schema, self._relations, self._recent, self._judge, hidden)
 
     def _suspect(self, cause: Cause, evidence: Evidence, hidden: Hidden) -> None:
         """Suspect a cause, or hide it if it has been suspected before."""
@@ -312,7 +323,7 @@ class TrustMonitor:
         if case.cause.cause == "either" and self._config.pairs == "use":
             return "they look alike, and the settings say to use them"
         elements = self._at(case)
-        rest = self._without(self._hidden_columns() | self._recent.missing())(case.cause.columns)
+        rest = self._rest(case, self._hidden_columns() | self._recent.missing())
         is_gross = ratio >= GROSS and case.moved >= LONG and rest.level < LIKE
         if rest.level > STRANGE or not (self._is_known_body or is_gross):
             return "what is normal is not known on this body"
@@ -337,6 +348,8 @@ class TrustMonitor:
             is_silent = (
                 np.abs(shown.z[:, columns] / self._judge.scale[columns]).max() < self._judge.least[columns].max()
             )
+            if case.cause.is_exchange and self._count - case.first < LONGEST:
+                return  # where the two cross they seem to agree
             if is_silent and np.isfinite(shown.z[:, columns]).all() and self._has_moved(case, shown):
                 self._cases.remove(case)
             return
@@ -383,20 +396,14 @@ class TrustMonitor:
             values, error, spans, healthy = values[first:], error[first:], spans[first:], healthy[first:]
             case.began = self._count - len(values) + 1
         position = int(self._relations.columns[lead])
-        std, unit = float(self._schema.scaler.std[position]), self._unit(position)
+        std, layout = float(self._schema.scaler.std[position]), self._schema.layout
+        unit = layout.signal(layout.element(position).partition(".")[0]).unit
         others = [c for c in columns if c != lead]
-        case.kind = kind_of(
+        case.kind = "swapped" if case.cause.is_exchange else kind_of(
             values[:, lead], error[:, lead], float(healthy.mean()), std, unit, is_noise,
             values[:, others] - error[:, others] if case.cause.cause == "all" else None, float(spans[:, lead].max()),
         )  # fmt: skip
         case.size = float(np.sqrt(np.mean(error[:, lead] ** 2))) * std
-
-    def _unit(self, position: int) -> str:
-        assert self._schema is not None
-        for signal, span in zip(self._schema.layout.signals, self._schema.layout.slices.values(), strict=True):
-            if span.start <= position < span.stop:
-                return signal.unit
-        return ""
 
     def _learn(self, view: View, evidence: Evidence, motion: float) -> None:
         noise = view.noises[-1].copy()
@@ -431,13 +438,6 @@ class TrustMonitor:
             tuple(at), case.cause.cause, case.kind, since, case.size, case.is_hidden,
             reason=case.reason, condition=case.cause.condition,
         )  # fmt: skip
-
-    def _sizes(self, schema: BodySchema, relations: Relations) -> np.ndarray:
-        least = np.full(len(relations.columns), self._config.size)
-        for name, size in self._config.sizes.items():
-            span = schema.layout.slice(name)
-            least[(relations.columns >= span.start) & (relations.columns < span.stop)] = size
-        return least
 
 
 def _is_another(schema: BodySchema, bias: np.ndarray, others: np.ndarray) -> np.ndarray:

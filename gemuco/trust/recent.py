@@ -120,9 +120,21 @@ class Recent:
 
     def under(self, schema: BodySchema, relations: Relations) -> "Recent":
         """Return the same blocks with the p of another schema; their noise is unknown."""
+        return self._read_as(schema, relations, self.values())
+
+    def exchanged(self, schema: BodySchema, relations: Relations, one: int, other: int) -> "Recent":
+        """Return the same blocks with the values of two columns exchanged; their noise is unknown."""
+        values, pair, swapped = self.values(), [one, other], [other, one]
+        at = relations.columns[pair]
+        std, mean = schema.scaler.std[at], schema.scaler.mean[at]
+        values[:, swapped] = (values[:, pair] * std + mean - mean[::-1]) / std[::-1]
+        return self._read_as(schema, relations, values)
+
+    def _read_as(self, schema: BodySchema, relations: Relations, values: np.ndarray) -> "Recent":
+        """Return the same blocks with other means [standard deviations], shape (blocks, columns), and a schema's p."""
         other = Recent()
         full = np.full((len(self.blocks), schema.layout.size + len(schema.bias)), np.nan)
-        full[:, relations.columns] = self.values()
+        full[:, relations.columns] = values
         full[:, schema.layout.size :] = schema.bias
         features, sensed = relations.features(full), relations.sensitivity.sense(schema, full)
         none = np.zeros((0, features.shape[1]))

@@ -10,7 +10,7 @@ import numpy as np
 
 from gemuco.anomaly.prediction import with_bias
 from gemuco.schema import BodySchema
-from gemuco.trust.config import Hidden
+from gemuco.trust.config import Hidden, TrustConfig
 from gemuco.trust.sensitivity import Sensed, Sensitivity
 
 NEAR = 0.2
@@ -89,6 +89,8 @@ class Relations:
         """This is the number of judged elements; the columns after them are p."""
         self.columns = watch.inputs
         """Positions of all judged columns: elements in the layout, ascending, then p behind the layout's size."""
+        self.signals = watch.signal
+        """Number of the signal of each column; negative for p."""
         inputs = len(watch.inputs)
         first, second = watch.reading(None, maps=False).pairs
         self._holds = np.zeros((len(watch.moments), inputs), bool)
@@ -122,6 +124,14 @@ class Relations:
     def features(self, rows: np.ndarray) -> np.ndarray:
         """Return the features of samples and their p, zero where an element is not finite: (n, features)."""
         return np.asarray(np.nan_to_num(self._watch.reading(None, maps=False).features(rows)))
+
+    def sizes(self, schema: BodySchema, config: TrustConfig) -> np.ndarray:
+        """Return from which size on a lie of each column matters [errors of a healthy prediction], shape (columns,)."""
+        sizes = np.full(len(self.columns), config.size)
+        for name, size in config.sizes.items():
+            span = schema.layout.slice(name)
+            sizes[(self.columns >= span.start) & (self.columns < span.stop)] = size
+        return sizes
 
     def without(self, hidden: Hidden) -> Relation:
         """Return the relation that uses none of the hidden columns."""

@@ -269,11 +269,25 @@ def test_elements_that_look_alike_are_both_named(model, arm):
         assert "alike" in used.findings[0].reason
 
 
-def test_two_swapped_elements_are_both_hidden(model, arm):
-    samples = move(arm, 240, 12)
-    samples[150:, :, [0, 1]] = samples[150:, :, [1, 0]]
-    _, hidden = watch(model, samples)
-    assert hidden[-1] == {0, 1}
+@pytest.mark.parametrize("pair", [(0, 1), (2, 4), (7, 8), (9, 11)])
+def test_two_swapped_elements_are_both_hidden_until_they_are_put_back(model, arm, pair):
+    """They are told from two that are wrong: in each other's place they agree with all others."""
+    samples, swapped = move(arm, 320, 41), slice(150, 240)
+    samples[swapped, :, pair] = samples[swapped, :, pair[::-1]]
+    monitor, hidden = watch(model, samples[:240])
+    assert hidden[-1] == set(pair)
+    assert [(finding.kind, finding.cause) for finding in monitor.findings] == [("swapped", "all")]
+    _, hidden = watch(model, samples[240:], monitor)
+    assert not hidden[-1]
+
+
+@pytest.mark.parametrize(("element", "other"), [(0, 1), (1, 0), (8, 10), (10, 8), (11, 7)])
+def test_an_element_that_reads_another_is_not_taken_for_two_swapped(model, arm, element, other):
+    samples = move(arm, 240, 41)
+    samples[150:, :, element] = samples[150:, :, other]
+    monitor, hidden = watch(model, samples)
+    assert element in hidden[-1]
+    assert all(finding.kind != "swapped" for finding in monitor.findings)
 
 
 def test_never_more_than_the_model_can_replace(model, arm):

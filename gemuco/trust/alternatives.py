@@ -1,0 +1,69 @@
+"""Evidence that is left if the newest blocks are read otherwise: with another p, or with two elements exchanged."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+
+from gemuco.schema import BodySchema
+from gemuco.trust.changes import AGES, LONGEST
+from gemuco.trust.config import Hidden
+from gemuco.trust.evidence import Evidence, Judge
+from gemuco.trust.recent import Recent, View
+from gemuco.trust.relations import Relations
+
+WATCHED = 6
+"""Exchanges are tried of this many elements with the most evidence."""
+APART = 2.0
+"""The values of both differ by this much [healthy errors]; else any lie of one would do as the other's value."""
+
+
+class Alternatives:
+    """Other readings of the newest blocks.
+
+    Args:
+        schema: The model in use.
+        relations: Its relations.
+        recent: The newest blocks.
+        judge: Limits and tests.
+        hidden: The hidden columns.
+    """
+
+    def __init__(self, schema: BodySchema, relations: Relations, recent: Recent, judge: Judge, hidden: Hidden) -> None:
+        self._schema, self._relations, self._recent = schema, relations, recent
+        self._judge, self._hidden = judge, hidden
+        self._now = recent.view(relations, hidden)
+
+    def condition(self, name: str, age: int) -> Evidence:
+        """Return the evidence if a trained condition holds since about `age` blocks."""
+        return self._since(self._recent.under(self._schema.under(name), self._relations), age)
+
+    def exchanges(self, evidence: Evidence) -> Iterator[tuple[Hidden, Evidence]]:
+        """Yield pairs of elements of one signal with much evidence, and the evidence if they are exchanged back."""
+        order = [int(c) for c in np.argsort(-evidence.strength)[:WATCHED] if evidence.ratio[c] > 0.0]
+        signals, age = self._relations.signals, int(evidence.age.flat[evidence.strength.argmax()])
+        error = self._now.healthy[-1] * self._judge.scale
+        for one, other in combinations(order, 2):
+            if signals[one] == signals[other] >= 0:
+                exchanged, pair = self._recent.exchanged(self._schema, self._relations, one, other), [one, other]
+                apart = np.abs(exchanged.values() - self._recent.values())[-age:, pair].mean(axis=0)
+                if (apart > APART * error[pair]).all():
+                    yield frozenset(pair), self._since(exchanged, age)
+
+    def exchanged(self, pair: Hidden, since: int) -> Evidence:
+        """Return the evidence if the values of two elements are exchanged since a number of blocks."""
+        view = self._recent.exchanged(self._schema, self._relations, *pair).view(self._relations, self._hidden)
+        return self._mixed(self._now, view, since) if since < LONGEST else self._judge(view)
+
+    def _since(self, other: Recent, age: int) -> Evidence:
+        """Return the least evidence if the errors are those of other blocks since about `age` blocks."""
+        now, place = self._now, AGES.index(age)
+        last, view = AGES[min(place + 1, len(AGES) - 1)], other.view(self._relations, self._hidden)
+        changed = [self._mixed(now, view, since) for since in range(AGES[max(place - 1, 0)], min(last + 1, LONGEST))]
+        return min(changed, key=lambda evidence: float(evidence.ratio.max(initial=0.0)))
+
+    def _mixed(self, now: View, other: View, since: int) -> Evidence:
+        z = np.concatenate([now.z[:-since], other.z[-since:]])
+        z[-since - 1] = np.nan  # the change was within this block
+        return self._judge(replace(now, z=z, noises=np.full((1, z.shape[1]), np.nan)))
