@@ -1,6 +1,7 @@
 """Sensors that lie: how many are found, how soon, which element is hidden, and what an ordinary threshold finds.
 
-    python -m studies.accuracy.lies [--robots kxr_humanoid pr2_duster musashi_arm kuka] [--seeds 6] [--healthy]
+    python -m studies.accuracy.lies [--robots kxr_humanoid pr2_duster musashi_arm kuka] [--kinds swapped] [--seeds 6]
+        [--first 1000] [--healthy]
 
 Each robot moves at random: the humanoid and the PR2 by the designer's forecast with the noise of their sensors, the
 muscle-driven arm in simulated physics with friction; the KUKA is a recording of a real robot, five times slower. Models
@@ -14,7 +15,7 @@ threshold (so it raises no false alarm in it), and the largest multiple of it as
 import argparse
 import pickle
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -193,18 +194,16 @@ def play(body: Body, kind: str, size: int, seed: int) -> Outcome | None:
     )
 
 
-def rows_of_table(name: str, seeds: int) -> Iterator[tuple[str, ...]]:
+def rows_of_table(name: str, kinds: Sequence[str], seeds: range) -> Iterator[tuple[str, ...]]:
     """Yield the rows of one robot."""
     body, outcomes = body_of(name), defaultdict(list)
-    for kind in (*SIZED, *WHOLE):
+    for kind in kinds:
         for size in SIZES if kind in SIZED else (0,):
-            for seed in range(seeds):
-                if (outcome := play(body, kind, size, 1000 + seed)) is not None:
+            for seed in seeds:
+                if (outcome := play(body, kind, size, seed)) is not None:
                     outcomes[kind, size].append(outcome)
     groups = {f"size {size}": [o for (_, s), os in outcomes.items() if s == size for o in os] for size in SIZES}
-    groups |= {
-        kind: [o for (k, s), os in outcomes.items() if k == kind and s != 3 for o in os] for kind in (*SIZED, *WHOLE)
-    }
+    groups |= {kind: [o for (k, s), os in outcomes.items() if k == kind and s != 3 for o in os] for kind in kinds}
     groups["all from size 5"] = [o for (_, s), os in outcomes.items() if s != 3 for o in os]
     for group, played in groups.items():
         if played:
@@ -235,7 +234,9 @@ def healthy(name: str) -> str:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--robots", nargs="+", default=list(BODIES), choices=list(BODIES))
+    parser.add_argument("--kinds", nargs="+", default=[*SIZED, *WHOLE], choices=[*SIZED, *WHOLE])
     parser.add_argument("--seeds", type=int, default=6)
+    parser.add_argument("--first", type=int, default=1000, help="The first seed.")
     parser.add_argument("--healthy", action="store_true", help="Only count wrong verdicts during healthy motion.")
     options = parser.parse_args()
     console = Console(width=160)
@@ -244,6 +245,6 @@ if __name__ == "__main__":
         console.print(healthy(robot))
         if not options.healthy:
             table = Table(*heads)
-            for row in rows_of_table(robot, options.seeds):
+            for row in rows_of_table(robot, options.kinds, range(options.first, options.first + options.seeds)):
                 table.add_row(*row)
             console.print(table)
