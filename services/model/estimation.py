@@ -43,7 +43,7 @@ class Distrust:
     @property
     def is_empty(self) -> bool:
         """Whether no element is hidden."""
-        return not self.reasons
+        return not self.hidden.any()
 
 
 class Dated(NamedTuple):

@@ -32,6 +32,10 @@ JUDGED_AT = 0.02
 """Blocks are judged this time [s] after the multiples of their length on the clock, when the update does not learn."""
 BEFORE = 1.0
 """A lie may have begun this long [s] before it was noticed."""
+AWAY, BACK = 0.3, 2
+"""An element that was away for the first time [s] is compared with the others for the second number of blocks before it
+is used again. The HAL, for example, takes a value that has jumped, and stays there, for five seconds only."""
+WAITS = "distrusted: it is back, and first compared with the others"
 CAUSES = {
     "environment": "another tool or load than the model takes to be in use",
     "body": "no sensor explains what is measured; the body has changed",
@@ -90,9 +94,11 @@ class Trust:
         self._rows: list[np.ndarray] = []
         self._last: Numbers | None = None
         self._aligned, self._hal, self._camera = Aligned(), np.zeros(0), np.zeros(0)
+        self._returns = Returns(np.array([name.partition(".")[0] not in robot.seen for name in self._names]))
         self._block = -math.inf
         """This is the number of the last judged block, counted from the zero of the clock."""
         self._stopped_for: frozenset[int] = frozenset()
+        self._lying: frozenset[str] = frozenset()
         self.findings: tuple[Finding, ...] = ()
 
     def tick(self) -> None:
@@ -100,6 +106,8 @@ class Trust:
         now, schema = self._clock.monotonic(), self._schema()
         with self._lock:
             self._last = self._freshness.measured()[1]
+            if self._is_active and self._returns.see(np.isfinite(in_order(schema, self._last).flat), now):
+                self._publish()
             fresh = self._new_rows(now)
             self._rows += [schema.scaler.normalise(in_order(schema, row).flat) for row in fresh]
             block = math.floor((now - JUDGED_AT) / BLOCK)
@@ -114,6 +122,8 @@ class Trust:
             self._monitor.use(schema)
             self._monitor.is_known = self._known is schema.normal
             self._monitor.add(np.array(rows), now)
+            named = [index for finding in self._monitor.findings for index in finding.elements]
+            self._returns.judge(named if self._monitor.is_ready else None)
             self._publish()
         self._stop_if_needed()
 
@@ -201,17 +211,17 @@ class Trust:
             if finding.is_distrusted
             for index in finding.elements
         }
-        before = self._freshness.distrust
-        if reasons.keys() == before.reasons.keys() and all(
-            _kind(a) == _kind(before.reasons[n]) for n, a in reasons.items()
-        ):
-            return
-        hidden = np.zeros(len(self._names), bool)
-        hidden[list(self._monitor.hidden)] = True
-        if reasons.keys() != before.reasons.keys():
+        if reasons.keys() != self._lying:
+            self._lying = frozenset(reasons)
             since = min((finding.since for finding in findings if finding.is_distrusted), default=math.inf)
             self._changed(since - BEFORE)
-        self._freshness.distrust = Distrust(self._in_robot_order(hidden), reasons)
+        hidden = self._returns.waiting.copy()
+        hidden[list(self._monitor.hidden)] = True
+        reasons = {self._names[index]: WAITS for index in np.flatnonzero(self._returns.back)} | reasons
+        before, hidden = self._freshness.distrust, self._in_robot_order(hidden)
+        is_same = np.array_equal(hidden, before.hidden) and reasons.keys() == before.reasons.keys()
+        if not is_same or any(_kind(a) != _kind(before.reasons[n]) for n, a in reasons.items()):
+            self._freshness.distrust = Distrust(hidden, reasons)
 
     def _in_robot_order(self, hidden: np.ndarray) -> np.ndarray:
         """Return truth values of the model's layout in the order of the freshness."""
@@ -291,6 +301,42 @@ class Trust:
         """Return a monotonic time as the local time of day."""
         wall = 1e-9 * self._clock.now_ns() - (self._clock.monotonic() - since)
         return time.strftime("%H:%M:%S", time.localtime(wall))
+
+
+class Returns:
+    """Elements that were away while most others were measured, and are not used before they are judged.
+
+    Args:
+        watched: Whether each element is watched, shape (n,).
+
+    Attributes:
+        waiting: Whether each is away, or back and not judged yet, shape (n,).
+        back: Whether it waits and is measured again, shape (n,).
+    """
+
+    def __init__(self, watched: np.ndarray) -> None:
+        size = len(watched)
+        self._watched, self._left = watched, np.full(size, math.inf)
+        self.waiting, self.back = np.zeros(size, bool), np.zeros(size, bool)
+        self._blocks = np.zeros(size, int)
+
+    def see(self, measured: np.ndarray, now: float) -> bool:
+        """Note at a time [s] which elements are measured, shape (n,); return whether `waiting` or `back` changed."""
+        before, missing = (self.waiting, self.back), self._watched & ~measured
+        if 2 * np.count_nonzero(missing) > np.count_nonzero(self._watched):  # all are late, or the HAL is away
+            missing = missing & self.waiting
+        self._left = np.where(missing, np.minimum(self._left, now), math.inf)
+        self.waiting = before[0] | (now - self._left >= AWAY)
+        self._blocks[missing] = 0
+        self.back = self.waiting & measured
+        return not (np.array_equal(before[0], self.waiting) and np.array_equal(before[1], self.back))
+
+    def judge(self, named: list[int] | None) -> None:
+        """Use those again that are back for `BACK` blocks and not named as wrong; all if nothing can be judged."""
+        self._blocks += self.back
+        right = self.back & (self._blocks >= BACK) if named is not None else self.back.copy()
+        right[named or []] = False
+        self.waiting, self.back = self.waiting & ~right, self.back & ~right
 
 
 def _needed(robot: RobotConfig, place: dict[str, int], stops: Iterable[str] | None) -> frozenset[int]:

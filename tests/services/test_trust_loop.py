@@ -49,13 +49,15 @@ def model() -> BodySchema:
 class Bench:
     """Freshness, trust and estimation on samples in hand."""
 
-    def __init__(self, config: TrustConfig | None = None, stops: tuple[str, ...] | None = None) -> None:
+    def __init__(
+        self, config: TrustConfig | None = None, stops: tuple[str, ...] | None = None, is_known: bool = True
+    ) -> None:
         self.clock, self.stops, self.changes = ManualClock(), list[str](), list[float]()
         self.newest: Arrival[Sample] | None = None
         self.freshness = Freshness(arm(), lambda: self.newest, self.clock)
         self.trust = Trust(
             arm(), self.freshness, model, config or TrustConfig(), self.clock, self.stops.append,
-            changed=self.changes.append, stops=stops,
+            is_known=lambda schema: is_known, changed=self.changes.append, stops=stops,
         )  # fmt: skip
         self.published: list[Estimates] = []
         self.estimation = Estimation(self.freshness, model, self.published.append, self.clock)
@@ -117,6 +119,40 @@ def test_a_wire_that_is_cut_is_not_taken_for_an_encoder_alone(tension: float | N
     assert reason.endswith(", or deltoid_side itself has changed") == is_cut
     assert ("muscle_tension.deltoid_side is outside of what was learned" in text) == is_cut
     assert ("gemuco calibrate" in text) == (not is_cut)
+
+
+@pytest.mark.parametrize(("is_wrong", "is_known"), [(False, True), (True, True), (True, False)])
+def test_an_element_that_returns_is_used_when_it_agrees(is_wrong: bool, is_known: bool) -> None:
+    """The HAL takes a value that has jumped by a radian, and stays there, for five seconds only."""
+    bench, samples = Bench(is_known=is_known), motion(800, 3)
+    place = arm().signals["joint_position"].elements.index("elbow_pitch")
+    for sample in samples[:300]:
+        bench.feed(sample)
+    for sample in samples[300:400]:
+        bench.feed(sample | {"joint_position": np.where(np.arange(5) == place, np.nan, sample["joint_position"])})
+    shown = []
+    for sample in samples[400:]:
+        estimates = bench.feed(sample | {"joint_position": sample["joint_position"] + is_wrong * np.eye(5)[place]})
+        if not estimates.estimated["joint_position"][place]:
+            shown.append(estimates)
+        else:
+            assert estimates.distrusted[ELBOW].startswith("distrusted: ")
+    if is_wrong:
+        assert not shown
+    else:
+        assert len(shown) >= 400 - 20  # within 0.4 s
+        assert not bench.stops
+
+
+def test_elements_that_were_all_late_are_used_at_once() -> None:
+    bench, samples = Bench(), motion(400, 3)
+    for sample in samples[:300]:
+        bench.feed(sample)
+    for sample in samples[300:350]:
+        bench.feed({name: np.full_like(value, np.nan) for name, value in sample.items()})
+    for sample in samples[350:]:
+        estimates = bench.feed(sample)
+        assert not any(marks.any() for marks in estimates.estimated.values())
 
 
 def test_an_operator_distrusts_and_trusts() -> None:
