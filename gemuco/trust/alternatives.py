@@ -10,11 +10,16 @@ from gemuco.schema import BodySchema
 from gemuco.trust.changes import AGES, LONGEST
 from gemuco.trust.config import Hidden
 from gemuco.trust.evidence import Evidence, Judge
-from gemuco.trust.recent import Recent, View
+from gemuco.trust.recent import Recent, View, exchanged
 from gemuco.trust.relations import Relations
 
 WATCHED = 6
 """Exchanges are tried of this many elements with the most evidence."""
+TRIED = 2
+"""At most this number of exchanges is looked at closely, which costs as much as judging a block: those that make the
+errors of the watch in the newest block smallest."""
+AGES_TRIED = 4
+"""With at most this number of ages near that of the alarm."""
 APART = 2.0
 """The values of both differ by this much [healthy errors]; else any lie of one would do as the other's value."""
 
@@ -41,26 +46,42 @@ class Alternatives:
 
     def exchanges(self, evidence: Evidence) -> Iterator[tuple[Hidden, Evidence]]:
         """Yield pairs of elements of one signal with much evidence, and the evidence if they are exchanged back."""
-        order = [int(c) for c in np.argsort(-evidence.strength)[:WATCHED] if evidence.ratio[c] > 0.0]
-        signals, age = self._relations.signals, int(evidence.age.flat[evidence.strength.argmax()])
+        age = int(evidence.age.flat[evidence.strength.argmax()])
         error = self._now.healthy[-1] * self._judge.scale
-        for one, other in combinations(order, 2):
-            if signals[one] == signals[other] >= 0:
-                exchanged, pair = self._recent.exchanged(self._schema, self._relations, one, other), [one, other]
-                apart = np.abs(exchanged.values() - self._recent.values())[-age:, pair].mean(axis=0)
-                if (apart > APART * error[pair]).all():
-                    yield frozenset(pair), self._since(exchanged, age)
+        for pair in self._promising(evidence):
+            exchanged = self._recent.exchanged(self._schema, self._relations, *pair)
+            apart = np.abs(exchanged.values() - self._recent.values())[-age:, pair].mean(axis=0)
+            if (apart > APART * error[pair]).all():
+                yield frozenset(pair), self._since(exchanged, age, AGES_TRIED)
+
+    def _promising(self, evidence: Evidence) -> list[list[int]]:
+        """Return the pairs of one signal whose exchange makes the newest errors of the watch smallest."""
+        order = [int(c) for c in np.argsort(-evidence.strength)[:WATCHED] if evidence.ratio[c] > 0.0]
+        signals, relations = self._relations.signals, self._relations
+        pairs = [list(pair) for pair in combinations(order, 2) if signals[pair[0]] == signals[pair[1]] >= 0]
+        newest = self._recent.values()[-1:]
+        if not pairs or np.isnan(newest).any():
+            return []
+        read = [newest, *(exchanged(self._schema, relations, newest, *pair) for pair in pairs)]
+        features = relations.features(relations.rows(self._schema, np.concatenate(read)))
+        relation = relations.without(self._hidden)
+        used = np.delete(relation.errors(features) / relation.std, list(self._hidden), axis=1)
+        size = (used**2).reshape(len(read), -1).sum(axis=1)
+        return [pairs[k] for k in np.argsort(size[1:])[:TRIED] if size[1 + k] < size[0]]
 
     def exchanged(self, pair: Hidden, since: int) -> Evidence:
         """Return the evidence if the values of two elements are exchanged since a number of blocks."""
         view = self._recent.exchanged(self._schema, self._relations, *pair).view(self._relations, self._hidden)
         return self._mixed(self._now, view, since) if since < LONGEST else self._judge(view)
 
-    def _since(self, other: Recent, age: int) -> Evidence:
-        """Return the least evidence if the errors are those of other blocks since about `age` blocks."""
-        now, place = self._now, AGES.index(age)
-        last, view = AGES[min(place + 1, len(AGES) - 1)], other.view(self._relations, self._hidden)
-        changed = [self._mixed(now, view, since) for since in range(AGES[max(place - 1, 0)], min(last + 1, LONGEST))]
+    def _since(self, other: Recent, age: int, most: int = LONGEST) -> Evidence:
+        """Return the least evidence if the errors are those of other blocks since about `age` blocks.
+
+        At most this number of ages is tried.
+        """
+        place, view = AGES.index(age), other.view(self._relations, self._hidden)
+        first, last = AGES[max(place - 1, 0)], min(AGES[min(place + 1, len(AGES) - 1)], LONGEST - 1)
+        changed = [self._mixed(self._now, view, since) for since in range(first, last + 1, 1 + (last - first) // most)]
         return min(changed, key=lambda evidence: float(evidence.ratio.max(initial=0.0)))
 
     def _mixed(self, now: View, other: View, since: int) -> Evidence:

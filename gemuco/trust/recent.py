@@ -124,18 +124,12 @@ class Recent:
 
     def exchanged(self, schema: BodySchema, relations: Relations, one: int, other: int) -> "Recent":
         """Return the same blocks with the values of two columns exchanged; their noise is unknown."""
-        values, pair, swapped = self.values(), [one, other], [other, one]
-        at = relations.columns[pair]
-        std, mean = schema.scaler.std[at], schema.scaler.mean[at]
-        values[:, swapped] = (values[:, pair] * std + mean - mean[::-1]) / std[::-1]
-        return self._read_as(schema, relations, values)
+        return self._read_as(schema, relations, exchanged(schema, relations, self.values(), one, other))
 
     def _read_as(self, schema: BodySchema, relations: Relations, values: np.ndarray) -> "Recent":
         """Return the same blocks with other means [standard deviations], shape (blocks, columns), and a schema's p."""
         other = Recent()
-        full = np.full((len(self.blocks), schema.layout.size + len(schema.bias)), np.nan)
-        full[:, relations.columns] = values
-        full[:, schema.layout.size :] = schema.bias
+        full = relations.rows(schema, values)
         features, sensed = relations.features(full), relations.sensitivity.sense(schema, full)
         none = np.zeros((0, features.shape[1]))
         for number, block in enumerate(self.blocks):
@@ -207,6 +201,14 @@ class Recent:
         """Forget all blocks."""
         self.blocks.clear()
         self.unsettle()
+
+
+def exchanged(schema: BodySchema, relations: Relations, values: np.ndarray, one: int, other: int) -> np.ndarray:
+    """Return values [standard deviations], shape (n, columns), with those of two columns in each other's place."""
+    result, pair = values.copy(), [one, other]
+    std, mean = schema.scaler.std[relations.columns[pair]], schema.scaler.mean[relations.columns[pair]]
+    result[:, pair[::-1]] = (values[:, pair] * std + mean - mean[::-1]) / std[::-1]
+    return result
 
 
 def _mean(blocks: Sequence[_Block]) -> _Block:

@@ -121,6 +121,13 @@ class Relations:
         is_possible = normal is not None and normal.watch is not None and len(normal.rows) > 0
         return cls(schema) if is_possible else None
 
+    def rows(self, schema: BodySchema, values: np.ndarray) -> np.ndarray:
+        """Return samples with a schema's p from values of the judged columns, NaN elsewhere [standard deviations]."""
+        rows = np.full((len(values), schema.layout.size + len(schema.bias)), np.nan)
+        rows[:, self.columns] = values
+        rows[:, schema.layout.size :] = schema.bias
+        return rows
+
     def features(self, rows: np.ndarray) -> np.ndarray:
         """Return the features of samples and their p, zero where an element is not finite: (n, features)."""
         return np.asarray(np.nan_to_num(self._watch.reading(None, maps=False).features(rows)))

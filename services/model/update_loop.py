@@ -175,7 +175,8 @@ class OnlineUpdate:
                 self.waited += 1
                 if moved and sample is not None:
                     self._learner.add(sample)
-                self._state = replace(self._state, stamp_ns=self._clock.now_ns(), active=True)
+                count = len(self._learner.samples)
+                self._state = replace(self._state, stamp_ns=self._clock.now_ns(), active=True, window=count)
             elif self._learner is None:
                 if self._awaits_normal and len(self._since_change) >= min(NORMAL_AFTER, self._config.window):
                     self._try_normal()

@@ -180,6 +180,7 @@ def test_learning_gives_way_and_goes_on() -> None:
     for index in range(15, 20):
         report = bench.turn(index)
     assert (report.active, bench.living.version, bench.update.waited) == (True, version, 5)
+    assert report.window == window + 5
     may[0] = True
     report = bench.turn(20)
     assert report.window == window + 6
