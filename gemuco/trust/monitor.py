@@ -224,7 +224,7 @@ class TrustMonitor:
             cause = explain(
                 evidence, self._without(hidden), self._joined, self._parts, self._environment - hidden,
                 lambda: self._conditions(hidden, int(evidence.age.flat[evidence.strength.argmax()])),
-                self._alternatives(hidden).exchanges(evidence),
+                self._alternatives(hidden).exchanges(evidence) if self._may_be_exchange() else (),
             )  # fmt: skip
             self._suspect(cause, evidence, hidden)
         else:
@@ -242,8 +242,12 @@ class TrustMonitor:
         assert schema is not None
         for name, bias in schema.biases.items():
             if not np.array_equal(bias, schema.bias):
-                is_known = not _is_another(schema, bias, self._biases).all()
-                yield name, alternatives.condition(name, age), is_known
+                yield name, alternatives.condition(name, age), not _is_another(schema, bias, self._biases).all()
+
+    def _may_be_exchange(self) -> bool:
+        """Whether exchanges are looked for in this block: of a new alarm, of one that is one, and now and then."""
+        suspected = [case for case in self._cases if not case.is_hidden]
+        return not suspected or suspected[0].cause.is_exchange or self._count % AGAIN == 0
 
     def _left(self, evidence: Evidence, hidden: Hidden) -> np.ndarray:
         """Return the evidence, or less if it is less with exchanged elements read in each other's place, shape (n,)."""
@@ -256,8 +260,7 @@ class TrustMonitor:
     def _rest(self, case: _Case, hidden: Hidden) -> Evidence:
         """Return the evidence without the elements of a case, or with exchanged ones in each other's place."""
         if case.cause.is_exchange:
-            since = self._count - case.began + 1
-            return self._alternatives(hidden).exchanged(case.cause.columns, since)
+            return self._alternatives(hidden).exchanged(case.cause.columns, self._count - case.began + 1)
         return self._without(hidden)(case.cause.columns)
 
     def _alternatives(self, hidden: Hidden) -> Alternatives:

@@ -189,6 +189,7 @@ class GemucoService:
             self.acquaintance.is_known,
             self._forget,
             settings.stops,
+            lambda: self.hindsight.factor,
         )
 
     def _make_loops(self) -> list[Loop]:

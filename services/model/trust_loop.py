@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from gemuco.anomaly.blame import parts
-from gemuco.estimation import recipes
+from gemuco.estimation import fill, recipes
 from gemuco.intervals.sureness import MARGIN
 from gemuco.normal import Normal
 from gemuco.schema import BodySchema
@@ -35,6 +35,8 @@ BEFORE = 1.0
 AWAY, BACK = 0.3, 2
 """An element that was away for the first time [s] is compared with the others for the second number of blocks before it
 is used again. The HAL, for example, takes a value that has jumped, and stays there, for five seconds only."""
+FAR = 5.0
+"""It stays hidden while it is further from its estimate than this [promised std]."""
 WAITS = "distrusted: it is back, and first compared with the others"
 CAUSES = {
     "environment": "another tool or load than the model takes to be in use",
@@ -61,6 +63,7 @@ class Trust:
         is_known: Callable[[BodySchema], bool] = lambda schema: True,
         changed: Callable[[float], None] = lambda since: None,
         stops: Iterable[str] | None = None,
+        factor: Callable[[], np.ndarray | float] = lambda: 1.0,
     ) -> None:
         """Prepare.
 
@@ -75,7 +78,9 @@ class Trust:
             changed: Called when other elements are hidden, with the time [s] since when samples are not to be learned
                 from.
             stops: Signals or elements that motion needs; None for those that follow from the robot file.
+            factor: Returns the factors on the std of the schema's elements, shape (size,).
         """
+        self._factor = factor
         self._freshness, self._schema, self._clock = freshness, schema, clock
         self._stop, self._is_known, self._changed = stop, is_known, changed
         self._known: Normal | None = None
@@ -122,8 +127,7 @@ class Trust:
             self._monitor.use(schema)
             self._monitor.is_known = self._known is schema.normal
             self._monitor.add(np.array(rows), now)
-            named = [index for finding in self._monitor.findings for index in finding.elements]
-            self._returns.judge(named if self._monitor.is_ready else None)
+            self._returns.judge(self._contradicted(schema) if self._monitor.is_ready else None)
             self._publish()
         self._stop_if_needed()
 
@@ -142,6 +146,19 @@ class Trust:
             rows = self._aligned.take(now)
         return [Numbers(row, self._freshness.elements) for row in rows]
 
+    def _contradicted(self, schema: BodySchema) -> list[int]:
+        """Return the elements that are named as wrong, and those that are back far from what the others say of them."""
+        named = [index for finding in self._monitor.findings for index in finding.elements]
+        if not self._returns.back.any() or self._last is None:
+            return named
+        values = in_order(schema, self._last).flat
+        hidden = np.where(self._returns.back, np.nan, values)
+        hidden.setflags(write=False)
+        completion = fill(schema, hidden)
+        std = completion.std * np.maximum(1.0, self._factor())
+        with np.errstate(invalid="ignore"):
+            return named + np.flatnonzero(np.abs(values - completion.value) > FAR * std).tolist()
+
     def trust(self, element: str) -> int:
         """Use an element again; it is not hidden again before it has agreed with the others once.
 
@@ -151,6 +168,7 @@ class Trust:
         index = self._index(element)
         with self._lock:
             self._monitor.trust(index)
+            self._returns.waiting[index] = self._returns.back[index] = False
             self._publish()
         return index
 

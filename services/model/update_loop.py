@@ -45,6 +45,11 @@ class BodyUpdater(Protocol):
 
     schema: BodySchema
 
+    @property
+    def samples(self) -> np.ndarray:
+        """Samples of the window, oldest first, shape (n, size)."""
+        ...
+
     def add(self, values: Mapping[str, np.ndarray]) -> Any:
         """Add one complete sample [unit]."""
         ...
