@@ -313,8 +313,11 @@ class GemucoService:
         return self.living.schema
 
     def _others_keep_time(self) -> bool:
-        """Whether all loops of higher priority keep their rate; if not, the update does not learn."""
-        return not any(loop.is_slow for loop in self.loops if PRIORITIES[loop.name] > PRIORITIES["update"])
+        """Whether estimation, control and anomaly keep their rates; if not, the update does not learn.
+
+        The trust loop may be slow while no sensor explains what is measured: learning mends that.
+        """
+        return not any(loop.is_slow for loop in self.loops if PRIORITIES[loop.name] > PRIORITIES["trust"])
 
     def _learner(self, schema: BodySchema) -> adapt.Updater:
         config = self.config.update
