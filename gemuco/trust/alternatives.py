@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import cached_property
 from itertools import combinations
 
 import numpy as np
@@ -38,7 +39,10 @@ class Alternatives:
     def __init__(self, schema: BodySchema, relations: Relations, recent: Recent, judge: Judge, hidden: Hidden) -> None:
         self._schema, self._relations, self._recent = schema, relations, recent
         self._judge, self._hidden = judge, hidden
-        self._now = recent.view(relations, hidden)
+
+    @cached_property
+    def _now(self) -> View:
+        return self._recent.view(self._relations, self._hidden)
 
     def condition(self, name: str, age: int) -> Evidence:
         """Return the evidence if a trained condition holds since about `age` blocks."""
@@ -49,10 +53,10 @@ class Alternatives:
         age = int(evidence.age.flat[evidence.strength.argmax()])
         error = self._now.healthy[-1] * self._judge.scale
         for pair in self._promising(evidence):
-            exchanged = self._recent.exchanged(self._schema, self._relations, *pair)
-            apart = np.abs(exchanged.values() - self._recent.values())[-age:, pair].mean(axis=0)
+            other = self._recent.exchanged(self._schema, self._relations, *pair)
+            apart = np.abs(other.values() - self._recent.values())[-age:, pair].mean(axis=0)
             if (apart > APART * error[pair]).all():
-                yield frozenset(pair), self._since(exchanged, age, AGES_TRIED)
+                yield frozenset(pair), self._since(other, age, AGES_TRIED)
 
     def _promising(self, evidence: Evidence) -> list[list[int]]:
         """Return the pairs of one signal whose exchange makes the newest errors of the watch smallest."""
@@ -72,7 +76,7 @@ class Alternatives:
     def exchanged(self, pair: Hidden, since: int) -> Evidence:
         """Return the evidence if the values of two elements are exchanged since a number of blocks."""
         view = self._recent.exchanged(self._schema, self._relations, *pair).view(self._relations, self._hidden)
-        return self._mixed(self._now, view, since) if since < LONGEST else self._judge(view)
+        return self._mixed(view, since) if since < LONGEST else self._judge(view)
 
     def _since(self, other: Recent, age: int, most: int = LONGEST) -> Evidence:
         """Return the least evidence if the errors are those of other blocks since about `age` blocks.
@@ -81,10 +85,10 @@ class Alternatives:
         """
         place, view = AGES.index(age), other.view(self._relations, self._hidden)
         first, last = AGES[max(place - 1, 0)], min(AGES[min(place + 1, len(AGES) - 1)], LONGEST - 1)
-        changed = [self._mixed(self._now, view, since) for since in range(first, last + 1, 1 + (last - first) // most)]
+        changed = [self._mixed(view, since) for since in range(first, last + 1, 1 + (last - first) // most)]
         return min(changed, key=lambda evidence: float(evidence.ratio.max(initial=0.0)))
 
-    def _mixed(self, now: View, other: View, since: int) -> Evidence:
-        z = np.concatenate([now.z[:-since], other.z[-since:]])
+    def _mixed(self, other: View, since: int) -> Evidence:
+        z = np.concatenate([self._now.z[:-since], other.z[-since:]])
         z[-since - 1] = np.nan  # the change was within this block
-        return self._judge(replace(now, z=z, noises=np.full((1, z.shape[1]), np.nan)))
+        return self._judge(replace(self._now, z=z, noises=np.full((1, z.shape[1]), np.nan)))

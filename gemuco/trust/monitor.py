@@ -127,7 +127,7 @@ class TrustMonitor:
         self._biases = np.unique(schema.normal.rows[:, schema.layout.size :], axis=0)
         size = len(self._relations.columns)
         self._recent.clear()
-        self._other = self._motion = 0.0
+        self._other = self._motion = self._alarmed = 0.0
         self._healthy, self._lasting = Healthy(size), LastingTest(size)
         self._least = self._relations.sizes(schema, self._config)
         self._judge = self._fresh_judge()
@@ -217,6 +217,7 @@ class TrustMonitor:
         ratio = self._left(evidence, hidden)
         ratio[immune] = 0.0
         highest = float(ratio.max(initial=0.0))
+        self._alarmed = self._alarmed + 1 if highest >= 1.0 else 0
         body = next((case for case in self._cases if case.cause.cause == "body"), None)
         if highest >= 1.0 and body is not None and self._count % AGAIN:
             body.last = self._count  # a search without a result costs as much as 50 blocks
@@ -246,8 +247,8 @@ class TrustMonitor:
 
     def _may_be_exchange(self) -> bool:
         """Whether exchanges are looked for in this block: of a new alarm, of one that is one, and now and then."""
-        suspected = [case for case in self._cases if not case.is_hidden]
-        return not suspected or suspected[0].cause.is_exchange or self._count % AGAIN == 0
+        is_one = any(case.cause.is_exchange and not case.is_hidden for case in self._cases)
+        return is_one or self._alarmed <= AGAIN or self._count % AGAIN == 0
 
     def _left(self, evidence: Evidence, hidden: Hidden) -> np.ndarray:
         """Return the evidence, or less if it is less with exchanged elements read in each other's place, shape (n,)."""
@@ -348,9 +349,8 @@ class TrustMonitor:
         if not columns:
             return
         if float(evidence.ratio.max(initial=0.0)) < CALM:
-            is_silent = (
-                np.abs(shown.z[:, columns] / self._judge.scale[columns]).max() < self._judge.least[columns].max()
-            )
+            errors = np.abs(shown.z[:, columns] / self._judge.scale[columns])
+            is_silent = errors.max() < self._judge.least[columns].max()
             if case.cause.is_exchange and self._count - case.first < LONGEST:
                 return  # where the two cross they seem to agree
             if is_silent and np.isfinite(shown.z[:, columns]).all() and self._has_moved(case, shown):
