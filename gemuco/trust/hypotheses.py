@@ -89,15 +89,15 @@ def explain(
 
     single = [column for column in singles if solves(frozenset({column}))]
     best = float(evidence.strength[single[0]]) if single else 0.0
-    if not single and not evidence.is_noise.any():  # which an exchange does not explain
+    rest = min((float(without(frozenset({c})).ratio.max(initial=0.0)) for c in single), default=1.0)
+    if not evidence.is_noise.any():  # which an exchange does not explain
         calmer = ((pair, other) for pair, other in exchanges if other.level <= evidence.level)
         left, pair = min(((float(o.ratio.max(initial=0.0)), sorted(p)) for p, o in calmer), default=(1.0, []))
-        if left < AGREES:
+        if left < min(AGREES, rest):
             return Cause(frozenset(pair), "all", max(pair, key=lambda c: evidence.strength[c]), is_exchange=True)
     if evidence.is_slow[lead]:  # another tool is there at once
         environment = frozenset()
     if environment and not evidence.is_noise[lead]:
-        rest = min((float(without(frozenset({c})).ratio.max(initial=0.0)) for c in single), default=1.0)
         for name, other, is_known in conditions():
             if float(other.ratio.max(initial=0.0)) < (min(AGREES, rest + RIVALS) if is_known else EXPLAINED):
                 return Cause(environment, "environment", lead, name)
