@@ -217,7 +217,8 @@ class Story:
         early = [anomaly for at, anomaly in self._timeline.anomalies if start <= at < self.marks.alarm + 1.0]
         element = mode([anomaly.blamed for anomaly in early] or [""])
         verdicts, end = self._distrusted_of_muscle(), self._timeline.now()
-        self.marks.blamed = self._blamed_muscle(early) or (MUSCLE if verdicts else "")
+        # Without the distrusted length the score is of the other muscles.
+        self.marks.blamed = MUSCLE if verdicts else self._blamed_muscle(early)
         after = float(np.nanmedian(self._timeline.between("score", self.marks.alarm, end)))
         limit = float(np.nanmedian(self._timeline.between("threshold", start, end)))
         figures = (
