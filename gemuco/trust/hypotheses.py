@@ -74,12 +74,16 @@ def explain(
     order = np.argsort(-evidence.strength)
     lead = int(order[0])
     singles = [int(c) for c in order[:CANDIDATES] if evidence.ratio[c] >= PLAUSIBLE and int(c) not in environment]
-    solved: dict[Hidden, bool] = {}
+    known: dict[Hidden, float] = {}
+
+    def left(columns: Hidden) -> float:
+        """Return the largest evidence without some columns."""
+        if columns not in known:
+            known[columns] = float(without(columns).ratio.max(initial=0.0))
+        return known[columns]
 
     def solves(columns: Hidden) -> bool:
-        if columns not in solved:
-            solved[columns] = float(without(columns).ratio.max(initial=0.0)) < EXPLAINED
-        return solved[columns]
+        return left(columns) < EXPLAINED
 
     def partners() -> Iterator[Hidden]:
         """Yield pairs of columns that hide each other: without the first the second stands out."""
@@ -89,11 +93,11 @@ def explain(
 
     single = [column for column in singles if solves(frozenset({column}))]
     best = float(evidence.strength[single[0]]) if single else 0.0
-    rest = min((float(without(frozenset({c})).ratio.max(initial=0.0)) for c in single), default=1.0)
+    rest = min((left(frozenset({column})) for column in single), default=1.0)
     if not evidence.is_noise.any():  # which an exchange does not explain
         calmer = ((pair, other) for pair, other in exchanges if other.level <= evidence.level)
-        left, pair = min(((float(o.ratio.max(initial=0.0)), sorted(p)) for p, o in calmer), default=(1.0, []))
-        if left < min(AGREES, rest):
+        ratio, pair = min(((float(o.ratio.max(initial=0.0)), sorted(p)) for p, o in calmer), default=(1.0, []))
+        if ratio < min(AGREES, rest):
             return Cause(frozenset(pair), "all", max(pair, key=lambda c: evidence.strength[c]), is_exchange=True)
     if evidence.is_slow[lead]:  # another tool is there at once
         environment = frozenset()

@@ -111,10 +111,10 @@ def test_a_wire_that_is_cut_is_not_taken_for_an_encoder_alone(tension: float | N
         wrong["muscle_length"][place] -= 0.0127
         if tension is not None:
             wrong["muscle_tension"][place] = tension
-        told = bench.feed(wrong).distrusted
-        if told:
+        reasons = bench.feed(wrong).distrusted
+        if reasons:
             break
-    (name, reason), text = *told.items(), bench.trust.text()
+    (name, reason), text = *reasons.items(), bench.trust.text()
     assert name == "muscle_length.deltoid_side"
     assert reason.endswith(", or deltoid_side itself has changed") == is_cut
     assert ("muscle_tension.deltoid_side is outside of what was learned" in text) == is_cut
