@@ -37,7 +37,7 @@ AWAY, BACK = 0.3, 2
 is used again. The HAL, for example, takes a value that has jumped, and stays there, for five seconds only."""
 FAR = 5.0
 """It stays hidden while it is further from its estimate than this [promised std]."""
-WAITS = "distrusted: it is back, and first compared with the others"
+WAITS = "distrusted: it is back, and not used before it agrees with its estimate"
 CAUSES = {
     "environment": "another tool or load than the model takes to be in use",
     "body": "no sensor explains what is measured; the body has changed",
@@ -127,7 +127,7 @@ class Trust:
             self._monitor.use(schema)
             self._monitor.is_known = self._known is schema.normal
             self._monitor.add(np.array(rows), now)
-            self._returns.judge(self._contradicted(schema) if self._monitor.is_ready else None)
+            self._returns.judge(self._far(schema) if self._monitor.is_ready else None)
             self._publish()
         self._stop_if_needed()
 
@@ -146,18 +146,17 @@ class Trust:
             rows = self._aligned.take(now)
         return [Numbers(row, self._freshness.elements) for row in rows]
 
-    def _contradicted(self, schema: BodySchema) -> list[int]:
-        """Return the elements that are named as wrong, and those that are back far from what the others say of them."""
-        named = [index for finding in self._monitor.findings for index in finding.elements]
+    def _far(self, schema: BodySchema) -> np.ndarray:
+        """Return whether each element is back far from its estimate, shape (size,); not if it cannot be estimated."""
         if not self._returns.back.any() or self._last is None:
-            return named
+            return self._returns.back
         values = in_order(schema, self._last).flat
         hidden = np.where(self._returns.back, np.nan, values)
         hidden.setflags(write=False)
         completion = fill(schema, hidden)
         std = completion.std * np.maximum(1.0, self._factor())
         with np.errstate(invalid="ignore"):
-            return named + np.flatnonzero(np.abs(values - completion.value) > FAR * std).tolist()
+            return np.asarray(np.abs(values - completion.value) > FAR * std)
 
     def trust(self, element: str) -> int:
         """Use an element again; it is not hidden again before it has agreed with the others once.
@@ -349,11 +348,10 @@ class Returns:
         self.back = self.waiting & measured
         return not (np.array_equal(before[0], self.waiting) and np.array_equal(before[1], self.back))
 
-    def judge(self, named: list[int] | None) -> None:
-        """Use those again that are back for `BACK` blocks and not named as wrong; all if nothing can be judged."""
+    def judge(self, far: np.ndarray | None) -> None:
+        """Use those again that are back for `BACK` blocks and not far off, shape (n,); None: all, nothing is known."""
         self._blocks += self.back
-        right = self.back & (self._blocks >= BACK) if named is not None else self.back.copy()
-        right[named or []] = False
+        right = self.back if far is None else self.back & (self._blocks >= BACK) & ~far
         self.waiting, self.back = self.waiting & ~right, self.back & ~right
 
 

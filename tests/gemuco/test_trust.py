@@ -271,8 +271,10 @@ def test_elements_that_look_alike_are_both_named(model, arm):
 
 @pytest.mark.parametrize("pair", [(0, 1), (2, 4), (7, 8), (9, 11)])
 def test_two_swapped_elements_are_both_hidden_until_they_are_put_back(model, arm, pair):
-    """Two that are wrong would not agree with all others in each other's place. Tensions are predicted worse: of 3 and 5
-    neither is found in every motion."""
+    """Two that are wrong would not agree with all others in each other's place.
+
+    Tensions are predicted worse: 3 and 5 are not found in every motion.
+    """
     samples, swapped = move(arm, 320, 41), slice(150, 240)
     samples[swapped, :, pair] = samples[swapped, :, pair[::-1]]
     monitor, hidden = watch(model, samples[:240])

@@ -139,6 +139,8 @@ def test_an_element_that_returns_is_used_when_it_agrees(is_wrong: bool, is_known
             assert estimates.distrusted[ELBOW].startswith("distrusted: ")
     if is_wrong:
         assert not shown
+        bench.trust.trust(ELBOW)  # an operator knows better
+        assert not bench.feed(samples[-1]).estimated["joint_position"][place]
     else:
         assert len(shown) >= 400 - 20  # within 0.4 s
         assert not bench.stops
