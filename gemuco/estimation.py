@@ -9,7 +9,8 @@ import numpy as np
 
 from gemuco.compiled.inference import infer
 from gemuco.derived import ByPattern
-from gemuco.intervals.sureness import KNOWN, SURE, UNKNOWN, Judge, RangeJudge, Sureness, since_change
+from gemuco.intervals.beyond import Line, line_of
+from gemuco.intervals.sureness import KNOWN, SURE, UNKNOWN, Judge, Judgement, RangeJudge, Sureness, since_change
 from gemuco.layers import run
 from gemuco.masks import Mask, covered_by, label
 from gemuco.schema import BodySchema, check_schema
@@ -20,7 +21,7 @@ from gemuco.search.routes import STARTS, latent_starts
 SEARCH = NewtonConfig()
 
 
-_OF_NOTHING = Sureness(UNKNOWN, "nothing that it could be estimated from was measured")
+_OF_NOTHING = Judgement(Sureness(UNKNOWN, "nothing that it could be estimated from was measured"), 1.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +61,7 @@ class Recipe:
     Attributes:
         steps: Each step: method, mask, the elements to estimate as truth values, shape (size,), and their signals.
         judges: The judge of each step's std and state; None where nothing is estimated.
+        lines: The outputs of each step that follow the linear path beyond what was learned; None without any.
         unseen: The state of an estimate that nothing else speaks against: `SURE` unless the body changed.
         std: Expected error of every element [unit], shape (size,), before a sample is known; see `Estimate`.
         estimated: Whether each element is estimated, shape (size,).
@@ -70,6 +72,7 @@ class Recipe:
 
     steps: tuple[tuple[str, Mask, np.ndarray, tuple[str, ...]], ...]
     judges: tuple[Judge | RangeJudge | None, ...]
+    lines: tuple[Line | None, ...]
     unseen: Sureness
     std: np.ndarray
     estimated: np.ndarray
@@ -104,6 +107,7 @@ class Recipe:
         return cls(
             tuple(steps),
             judges,
+            tuple(line_of(schema, mask) if method == "mask" else None for method, mask, _, _ in steps),
             since_change(schema, ~finite),
             std,
             estimated,
@@ -193,14 +197,16 @@ def fill(schema: BodySchema, joined: np.ndarray, recipe: Recipe | None = None) -
     sureness = dict.fromkeys(recipe.method, SURE)
     if recipe.steps:
         std = std.copy()
-    for (method, mask, missing, names), judge in zip(recipe.steps, recipe.judges, strict=True):
+    for (method, mask, missing, names), judge, line in zip(recipe.steps, recipe.judges, recipe.lines, strict=True):
         own = float("nan")
         if method == "mask":
             error, own = infer(*schema.parts, joined, *schema.gate(mask), missing, value)
         else:
             prediction, error = _search(schema, method, mask, joined)
             np.copyto(value, prediction, where=missing)
-        sure = _OF_NOTHING if judge is None else judge.judge(joined, own, missing, std)
+        sure, inside = _OF_NOTHING if judge is None else judge.judge(joined, own, missing, std)
+        if line is not None and inside < 1.0:
+            line.take_over(joined, inside, missing, value)
         if sure is SURE:
             sure = recipe.unseen
         for name in names:

@@ -51,6 +51,19 @@ SURE = Sureness(KNOWN, "")
 """This is the state of a measured value."""
 
 
+class Judgement(NamedTuple):
+    """Judgement of the estimates of one sample.
+
+    Attributes:
+        sureness: Their state.
+        inside: 1 unless the state is unknown because the sample is outside of what was learned; then it falls with
+            the distance from there to 0.
+    """
+
+    sureness: Sureness
+    inside: float
+
+
 def worse(one: Sureness, other: Sureness) -> Sureness:
     """Return the worse of two states, the first if they are equal."""
     return one if STATES.index(one.state) >= STATES.index(other.state) else other
@@ -101,8 +114,8 @@ class Judge:
             np.asarray(expected, float), variance, knots, growth, np.stack([schema.scaler.mean, std]),
         )  # fmt: skip
 
-    def judge(self, joined: np.ndarray, residual: float, requested: np.ndarray, std: np.ndarray) -> Sureness:
-        """Write the std of the requested elements and return their state.
+    def judge(self, joined: np.ndarray, residual: float, requested: np.ndarray, std: np.ndarray) -> Judgement:
+        """Write the std of the requested elements, and return their state and whether the sample is as learned.
 
         Args:
             joined: Every element of the layout [its unit], shape (size,).
@@ -111,12 +124,15 @@ class Judge:
             std: Result for the requested elements [unit], shape (size,).
         """
         far, odd, unfit, _, _, worst, over = spread(*self._parts, joined, residual, requested, std).tolist()
-        if over > MARGIN:
-            k = int(worst)
-            text = _range_text(self._layout, int(self._elements[k]), joined, tuple(self._ranges[:, k].tolist()))
-            return Sureness(UNKNOWN, text)
         measures = [max(far, 0.0), max(odd, 0.0), max(unfit, 0.0)]
         length = math.hypot(*measures)
+        inside = min(_fades(over, MARGIN), _fades(length, float(self._limits[1])))
+        return Judgement(self._sureness(measures, length, int(worst), over, joined), inside)
+
+    def _sureness(self, measures: list[float], length: float, worst: int, over: float, joined: np.ndarray) -> Sureness:
+        if over > MARGIN:
+            edges = tuple(self._ranges[:, worst].tolist())
+            return Sureness(UNKNOWN, _range_text(self._layout, int(self._elements[worst]), joined, edges))
         if length > self._limits[0]:
             state = UNKNOWN if length > self._limits[1] else DOUBTFUL
             return worse(Sureness(state, WORDS[measures.index(max(measures))]), self.about_p)
@@ -140,14 +156,20 @@ class RangeJudge:
         self._low, self._high = schema.scaler.low[self._elements], schema.scaler.high[self._elements]
         self._room = MARGIN * (self._high - self._low)
 
-    def judge(self, joined: np.ndarray, residual: float, requested: np.ndarray, std: np.ndarray) -> Sureness:
-        """Return the state; the arguments are those of `Judge.judge`, and the std is not changed."""
+    def judge(self, joined: np.ndarray, residual: float, requested: np.ndarray, std: np.ndarray) -> Judgement:
+        """Return the judgement; the arguments are those of `Judge.judge`, and the std is not changed."""
         values = joined[self._elements]
         over = np.maximum(self._low - values, values - self._high) - self._room
         if not len(over) or over[worst := int(over.argmax())] <= 0.0:
-            return SURE
+            return Judgement(SURE, 1.0)
         edges = float(self._low[worst]), float(self._high[worst])
-        return Sureness(UNKNOWN, _range_text(self._layout, int(self._elements[worst]), joined, edges))
+        sureness = Sureness(UNKNOWN, _range_text(self._layout, int(self._elements[worst]), joined, edges))
+        return Judgement(sureness, _fades(float(over[worst] / max(self._room[worst], 1e-12)) + 1.0, 1.0))
+
+
+def _fades(distance: float, limit: float) -> float:
+    """Return 1 up to a limit, 0 from twice the limit on, and the straight line between them."""
+    return 1.0 if distance <= limit else max(0.0, 2.0 - distance / limit)
 
 
 def _range_text(layout: Layout, element: int, joined: np.ndarray, edges: tuple[float, float]) -> str:

@@ -32,8 +32,8 @@ class TrainConfig:
         rate: Peak of the one-cycle learning rate of W (SOAP).
         bias_rate: Peak of the one-cycle learning rate of p.
         held_out: Share of every condition's episodes (or time blocks) that is held out of the training to measure it.
-        patience: The training stops after this many epochs without a better held-out loss; None if it follows the
-            number of epochs.
+        patience: The training stops after this many epochs without a better held-out loss, once the loss on the
+            training data is lower; None if it follows the number of epochs.
         outliers: A measured signal is rejected while the model, which does not see it, misses it by more than this
             many robust standard deviations of its misses. Infinite: nothing is rejected, and the loss is the square.
         replay: Fine-tuning only: number of old training samples per new sample.

@@ -144,9 +144,15 @@ class Learner:
 
     @property
     def is_done(self) -> bool:
-        """Whether all epochs are done, or the held-out loss has not fallen for `patience` epochs."""
-        patience = self.config.patience_for(self.epochs)
-        return self.epoch >= self.epochs or self.epoch - max(self.course.best_epoch, 0) > patience
+        """Whether all epochs are done, or the held-out loss has not fallen for `patience` epochs.
+
+        While the loss is as large on the training data as on the held-out data, W only swings at a high learning rate.
+        """
+        if self.epoch >= self.epochs:
+            return True
+        course, patience = self.course, self.config.patience_for(self.epochs)
+        has_stalled = self.epoch - max(course.best_epoch, 0) > patience
+        return has_stalled and not course.train[-1] > course.held_out[-1]
 
     def _epoch(self) -> None:
         """Learn from every sample once, and measure the loss on the held-out samples."""

@@ -1,3 +1,5 @@
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -5,6 +7,7 @@ from muscle_arm import LAYOUT
 
 from gemuco.dataset import Dataset, Episode
 from gemuco.errors import NotEnoughData, SchemaError, UnknownSignal
+from gemuco.learning.learner import Course, Learner
 from gemuco.learning.train import TrainConfig, fit
 
 MASKS = [{"joint_position", "muscle_tension"}, {"muscle_tension", "muscle_length"}]
@@ -31,6 +34,23 @@ def test_tells_its_progress_and_its_history(data):
 def test_stops_early(data):
     config = TrainConfig(hidden=(20,), latent=5, epochs=50, batch=100, rate=0.0, patience=2)
     assert len(fit(data, config, MASKS)[1].train) == 3
+
+
+@pytest.mark.parametrize(
+    ("train", "held_out", "ends"),
+    [
+        ([0.5, 0.3, 0.2, 0.1, 0.08], [0.4, 0.5, 0.55, 0.6, 0.65], True),  # learns by heart
+        ([0.5, 0.6, 0.5, 0.6, 0.5], [0.2, 0.3, 0.25, 0.3, 0.25], False),  # W swings at a high rate
+        ([0.5, 0.3, 0.2, 0.1, 0.08], [0.4, 0.3, 0.2, 0.15, 0.12], False),  # goes on falling
+        ([0.5] * 9, [0.2, *[0.3] * 8], True),  # all epochs are done
+    ],
+)
+def test_a_loss_that_has_stopped_falling_ends_the_training_only_if_that_on_the_training_data_is_lower(
+    train, held_out, ends
+):
+    course = Course(train=train, held_out=held_out, least=min(held_out), best_epoch=int(np.argmin(held_out)))
+    state = SimpleNamespace(epoch=len(train), epochs=9, course=course, config=TrainConfig(patience=3))
+    assert Learner.is_done.fget(state) == ends
 
 
 def test_leaves_the_number_of_threads_alone(data):
