@@ -73,10 +73,23 @@ class Actor:
                 refusal = str(error)
             self.wait(self._follows, ENGAGED_WITHIN)
 
-    def go(self, signal: str, values: np.ndarray, duration: float, stays: Callable[[], bool] = lambda: False) -> None:
-        """Send a target [its unit], shape (n,), and wait `duration` [s]; repeat if the HAL stopped the robot.
+    def go(
+        self,
+        signal: str,
+        values: np.ndarray,
+        duration: float,
+        stays: Callable[[], bool] = lambda: False,
+        ends: Callable[[], bool] = lambda: False,
+    ) -> None:
+        """Send a target [its unit], shape (n,), and wait; repeat if the HAL stopped the robot.
 
-        A robot that was stopped is left as it is for this time if `stays` says within a moment that it stays so.
+        Args:
+            signal: The signal of the target.
+            values: The target.
+            duration: Longest wait [s].
+            stays: Whether a robot that was stopped stays so; if it is true within a moment, the robot is left as it is
+                for the duration.
+            ends: Whether the wait ends.
         """
         for _ in range(TRIES):
             if not self._follows():
@@ -85,7 +98,7 @@ class Actor:
                     return
                 self._recover()
             self._insist(lambda: self._client.ask("model", "target", {"signal": signal, "values": values.tolist()}))
-            self.wait(lambda: False, duration)
+            self.wait(ends, duration)
             if self._follows():
                 return
 

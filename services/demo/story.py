@@ -1,5 +1,6 @@
 """Story of the demo: an arm moves, loses a sensor, learns its body, has sensors that lie, and loses a muscle."""
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from statistics import mode
@@ -13,7 +14,11 @@ from services.demo.timeline import Timeline, hidden_error
 from services.wire.messages import Anomaly
 
 POSE_TIME = 2.5
-"""The arm has this time for one pose [s]."""
+"""The arm has at most this time for a test pose [s]."""
+SETS_OFF = 0.7
+"""From this time [s] on an arm that stands still has reached its pose."""
+RESTING, STILL = 0.3, 0.01
+"""An arm rests if no joint moved by more than `STILL` [rad] within this time [s]."""
 POSES = 6
 """The model's error is measured at this many test poses before and after the update, which does not use them."""
 LEARNING_POSES = 8
@@ -30,7 +35,7 @@ SETTLING = 0.5
 """New statistics are in use, and all verdicts of the old ones have arrived, after this time [s]."""
 CALM_TRIES = 3
 """The statistics of normal errors are learned at most this often, each time from more poses."""
-SILENT_POSES = 3
+SILENT_POSES = 2
 CUT_POSES = 3
 INSIDE = 0.15
 """The distance of targets from the limits is at least this share of the range."""
@@ -282,7 +287,7 @@ class Story:
         """Return, for every test pose, target minus truth and estimate with hidden encoders minus truth [rad]."""
         misses, errors = [], []
         for pose in self._poses:
-            self._go(pose, POSE_TIME)
+            self._actor.go(self._signal, pose, POSE_TIME, ends=self._at_rest())
             misses.append(pose - self._actor.truth(self._signal))
             errors.append(self._hidden_error())
         return misses, errors
@@ -297,6 +302,20 @@ class Story:
 
         self._actor.wait(is_complete, NOTICED_WITHIN)
         return errors[-1]
+
+    def _at_rest(self) -> Callable[[], bool]:
+        """Return a function that returns whether the arm has reached a pose for which it sets off now."""
+        begun = time.monotonic()
+        moved, rest = begun, self._actor.truth(self._signal)
+
+        def is_at_rest() -> bool:
+            nonlocal moved, rest
+            now, joints = time.monotonic(), self._actor.truth(self._signal)
+            if np.abs(joints - rest).max() > STILL:
+                moved, rest = now, joints
+            return now - begun > SETS_OFF and now - moved > RESTING
+
+        return is_at_rest
 
     def _go(self, pose: np.ndarray, duration: float) -> None:
         self._actor.go(self._signal, pose, duration)

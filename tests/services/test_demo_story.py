@@ -11,9 +11,10 @@ from gemuco.errors import NotEnoughData
 from hal.config import load_robot
 from hal.errors import CommandRefused
 from services.demo import actor as actor_module
+from services.demo import story as story_module
 from services.demo.actor import NOTICED_WITHIN, REACHED_WITHIN, TRIES, Actor
 from services.demo.arm_story import ArmStory
-from services.demo.story import CALM_TRIES, LEARNED, LEARNING_POSES, MOST_POSES, NORMAL, Story
+from services.demo.story import CALM_TRIES, LEARNED, LEARNING_POSES, MOST_POSES, NORMAL, POSE_TIME, Story
 from services.errors import NoAnswer, ServiceUnavailable, TooSlow
 from services.wire.messages import Applied, Status, Update
 
@@ -194,6 +195,35 @@ def test_a_target_is_given_again_when_the_hal_stopped_the_arm_on_the_way(
     mover.go("joint_position", np.zeros(5), 0.02)
     assert (robot.targets, mover.stops) == (targets, counted)
     assert sum("Life guard" in sentence for sentence in said) == counted
+
+
+class Creeping:
+    """An arm that begins to move after 0.3 s and arrives after `arrives` [s]; the waits are not waited."""
+
+    def __init__(self, arrives: float) -> None:
+        self.arrives, self.now, self.waited = arrives, 100.0, 0.0
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def truth(self, signal: str) -> np.ndarray:
+        share = np.clip((self.now - 100.0 - 0.3) / (self.arrives - 0.3), 0.0, 1.0)
+        return share * np.array([0.0, 1.0, -0.5, 0.0, 0.2])
+
+    def go(self, signal: str, values: np.ndarray, duration: float, ends: Any) -> None:
+        end = self.now + duration
+        while self.now < end and not ends():
+            self.now += 0.01
+        self.waited = self.now - 100.0
+
+
+@pytest.mark.parametrize(("arrives", "waited"), [(0.31, 0.71), (1.2, 1.5), (9.0, POSE_TIME)])
+def test_a_test_pose_lasts_until_the_arm_rests(monkeypatch: pytest.MonkeyPatch, arrives: float, waited: float) -> None:
+    arm = Creeping(arrives)
+    monkeypatch.setattr(story_module, "time", arm)
+    played = Story(ROBOT, arm, arm, 0, arm, print)  # type: ignore[arg-type]
+    played._actor.go("joint_position", np.zeros(5), POSE_TIME, ends=played._at_rest())
+    assert arm.waited == pytest.approx(waited, abs=0.03)
 
 
 class Cut(Stopping):
