@@ -40,33 +40,48 @@ class Likeness:
         """Number of blocks that are worth one independent block, shape (n,)."""
         return 1.0 + (1.0 - self.white) * 2.0 * self.slow / (1.0 - self.slow)
 
-    def precisions(self, count: int) -> np.ndarray:
-        """Return the inverse covariances of `count` successive errors of variance 1, shape (n, count, count)."""
+    def covariances(self, count: int) -> np.ndarray:
+        """Return the covariances of `count` successive errors of variance 1, shape (n, count, count)."""
         lag = np.abs(np.subtract.outer(np.arange(count), np.arange(count)))
         slow = (1.0 - self.white)[:, None, None] * self.slow[:, None, None] ** lag
-        return np.linalg.inv(slow + self.white[:, None, None] * np.eye(count))
+        return np.asarray(slow + self.white[:, None, None] * np.eye(count))
 
 
 class StepTest:
-    """Likelihood ratio of a step of any size and one of several ages against no step, for every element."""
+    """Likelihood ratio of a step of any size and one of several ages against no step, for every element.
+
+    A missing error may have been any: the first one after a gap is no step because it is not zero.
+    """
 
     def __init__(self, likeness: Likeness) -> None:
-        precision = likeness.precisions(LONGEST)
-        steps = (np.arange(LONGEST)[None, :] >= LONGEST - np.array(AGES)[:, None]).astype(float)
-        scaled = np.einsum("ab,nbc->nac", steps, precision)
-        information = np.einsum("nac,ac->na", scaled, steps)
-        self._weights = scaled / np.sqrt(information)[..., None]
-        self.precision = precision
+        self._covariances = likeness.covariances(LONGEST)
+        self._steps = (np.arange(LONGEST)[None, :] >= LONGEST - np.array(AGES)[:, None]).astype(float)
+        self._weights: dict[bytes, np.ndarray] = {}
 
     def __call__(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the largest deviation over all ages [standard deviations], and its index into `AGES`, shapes (n,).
 
         Args:
-            z: The newest errors [their standard deviations], oldest first, shape (LONGEST, n); missing ones are 0.
+            z: The newest errors [their standard deviations], oldest first, shape (LONGEST, n); NaN where missing.
         """
-        each = np.abs(np.einsum("nab,bn->na", self._weights, z))
+        known = np.isfinite(z)
+        each = np.zeros((z.shape[1], len(AGES)))
+        for pattern in np.unique(known, axis=1).T:
+            own = (known == pattern[:, None]).all(axis=0)
+            each[own] = np.abs(np.einsum("nab,bn->na", self._weights_of(pattern)[own], z[:, own][pattern]))
         best = each.argmax(axis=1)
         return each[np.arange(len(best)), best], best
+
+    def _weights_of(self, known: np.ndarray) -> np.ndarray:
+        """Return the deviations by the known errors, shape (n, ages, number of known ones)."""
+        key = known.tobytes()
+        weights = self._weights.get(key)
+        if weights is None:
+            steps, precisions = self._steps[:, known], np.linalg.inv(self._covariances[:, known][:, :, known])
+            scaled = np.einsum("ab,nbc->nac", steps, precisions)
+            information = np.einsum("nac,ac->na", scaled, steps)
+            weights = self._weights[key] = scaled / np.sqrt(np.maximum(information, 1e-12))[..., None]
+        return weights
 
 
 class LastingTest:

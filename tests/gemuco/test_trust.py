@@ -11,7 +11,7 @@ from gemuco.dataset import as_dataset
 from gemuco.learning.config import TrainConfig
 from gemuco.learning.train import fit
 from gemuco.normal.watch import Watch
-from gemuco.trust.changes import LONGEST, Likeness, StepTest
+from gemuco.trust.changes import AGES, LONGEST, Likeness, StepTest
 from gemuco.trust.config import BLOCK, TrustConfig
 from gemuco.trust.evidence import Judge
 from gemuco.trust.healthy import NOISE_KNOWN, Healthy
@@ -104,6 +104,29 @@ def test_a_step_is_tested_with_its_likeness():
     expected = np.sqrt(step @ np.linalg.inv(covariance) @ step)
     assert found[0] == pytest.approx(expected, rel=1e-6)
     assert (1, 2, 3, 5)[age[0]] == 5
+
+
+@pytest.mark.parametrize(("first", "last"), [(0, LONGEST - 3), (5, 20), (LONGEST - 4, LONGEST - 1)])
+def test_an_error_after_a_gap_is_no_step(first, last):
+    count, lag = 4000, np.abs(np.subtract.outer(np.arange(LONGEST), np.arange(LONGEST)))
+    healthy = np.linalg.cholesky(0.9 * 0.9**lag + 0.1 * np.eye(LONGEST)) @ np.random.default_rng(1).normal(
+        size=(LONGEST, count)
+    )
+    test = StepTest(Likeness(np.full(count, 0.9), np.full(count, 0.1)))
+    usual = np.quantile(test(healthy)[0], 0.999)
+    healthy[first:last] = np.nan
+    assert np.quantile(test(healthy)[0], 0.999) < 1.05 * usual
+
+
+def test_the_age_of_a_step_is_found_across_a_gap():
+    test = StepTest(Likeness(np.full(2, 0.3), np.full(2, 0.9)))
+    z = np.zeros((LONGEST, 2))
+    z[-8:] = 3.0
+    z[-4:-2, 1] = np.nan
+    strength, best = test(z)
+    assert (np.array(AGES)[best] == 8).all()
+    assert strength[1] == pytest.approx(strength[0] * np.sqrt(6 / 8), rel=0.05)
+    assert test(np.full((LONGEST, 2), np.nan))[0] == pytest.approx(0.0)
 
 
 def test_the_usual_noise_of_an_element_is_that_since_it_is_measured():
