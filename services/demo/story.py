@@ -47,8 +47,8 @@ LIES = (("elbow_pitch", "sensor_offset elbow_pitch_encoder 1.0", "one radian off
 LYING_POSES = 2
 TRUE_POSES = 6
 """A lying encoder is trusted again within this number of poses."""
-LEAKS_AFTER = 2.0
-"""After this time [s] no wrong value may be passed on as measured."""
+WRONG, LEAKS_AFTER = 0.1, 2.0
+"""A value is wrong from this error on [rad]; this time [s] after the first one none may be passed on as measured."""
 NAMES = ("moves to targets", "loses an encoder", "learns its own body", "has encoders that lie", "loses a muscle")
 
 
@@ -189,7 +189,7 @@ class Story:
         if not reason or not wrong.size:
             return f"{element} {words}: not noticed", False
         delay = float(at[np.argmax(hidden)]) - start
-        late = ~hidden & (at > start + LEAKS_AFTER) & np.isfinite(error)  # without an estimate nothing is passed on
+        late = leaks(at, hidden, error)
         leak = f", wrong as measured later by {error[late].max():.3f} rad" if late.any() else ""
         is_back = not self._is_estimated(index)
         back = f"trusted again {returned:.0f} s after it was right" if is_back else "not trusted again"
@@ -215,10 +215,14 @@ class Story:
         alarms = float(np.mean(self._timeline.between("is_anomaly", 0.0, self.marks.lies)))
         self._actor.fault(f"muscle_cut {MUSCLE}")
         self.marks.cut = start
-        noticed = self._actor.wait(lambda: self._is_alarmed() or bool(self._distrusted_of_muscle()), NOTICED_WITHIN)
+        noticed = self._actor.wait(self._is_cut_noticed, NOTICED_WITHIN)
+        for _ in range(CUT_POSES if not noticed else 0):  # in some postures the muscle bears nothing
+            self._go_as_cut(ends=self._is_cut_noticed)
+            if noticed := self._is_cut_noticed():
+                break
         self.marks.alarm = self._timeline.now()
         for _ in range(CUT_POSES):
-            self._actor.go(self._signal, self._pose(), LEARNING_TIME, lambda: bool(self._distrusted_of_muscle()))
+            self._go_as_cut()
         early = [anomaly for at, anomaly in self._timeline.anomalies if start <= at < self.marks.alarm + 1.0]
         element = mode([anomaly.blamed for anomaly in early] or [""])
         verdicts, end = self._distrusted_of_muscle(), self._timeline.now()
@@ -236,6 +240,13 @@ class Story:
         right = self.marks.blamed == MUSCLE
         self._client.disengage()
         return Stage(NAMES[4], start, end, figures, noticed and right and not calm.any())
+
+    def _is_cut_noticed(self) -> bool:
+        return self._is_alarmed() or bool(self._distrusted_of_muscle())
+
+    def _go_as_cut(self, ends: Callable[[], bool] = lambda: False) -> None:
+        """Go to a pose, unless the arm is stopped because the cut muscle is distrusted."""
+        self._actor.go(self._signal, self._pose(), LEARNING_TIME, lambda: bool(self._distrusted_of_muscle()), ends)
 
     def _distrusted_of_muscle(self) -> list[tuple[str, str]]:
         """Return the elements of the cut muscle that are not used as measured, and why."""
@@ -335,6 +346,18 @@ class Story:
     def _silent_error(self, index: int, start: float, end: float) -> np.ndarray:
         value, truth = (self._timeline.between(name, start, end) for name in ("value", "truth"))
         return value[:, index] - truth[:, index] if len(value) else np.zeros(0)
+
+
+def leaks(at: np.ndarray, hidden: np.ndarray, error: np.ndarray) -> np.ndarray:
+    """Return where a value is passed on as measured that has been wrong for too long; see `LEAKS_AFTER`.
+
+    Args:
+        at: Times of the estimates [s], shape (n,).
+        hidden: Whether the value was estimated, truth values, shape (n,).
+        error: Size of its error [rad], shape (n,); NaN without an estimate, where nothing is passed on.
+    """
+    wrong = ~hidden & (error > WRONG)
+    return wrong & (at > at[np.argmax(wrong)] + LEAKS_AFTER) if wrong.any() else wrong
 
 
 def _mean_norm(errors: list[np.ndarray]) -> float:

@@ -14,7 +14,7 @@ from services.demo import actor as actor_module
 from services.demo import story as story_module
 from services.demo.actor import NOTICED_WITHIN, REACHED_WITHIN, TRIES, Actor
 from services.demo.arm_story import ArmStory
-from services.demo.story import CALM_TRIES, LEARNED, LEARNING_POSES, MOST_POSES, NORMAL, POSE_TIME, Story
+from services.demo.story import CALM_TRIES, LEARNED, LEARNING_POSES, MOST_POSES, NORMAL, POSE_TIME, Story, leaks
 from services.errors import NoAnswer, ServiceUnavailable, TooSlow
 from services.wire.messages import Applied, Status, Update
 
@@ -195,6 +195,22 @@ def test_a_target_is_given_again_when_the_hal_stopped_the_arm_on_the_way(
     mover.go("joint_position", np.zeros(5), 0.02)
     assert (robot.targets, mover.stops) == (targets, counted)
     assert sum("Life guard" in sentence for sentence in said) == counted
+
+
+@pytest.mark.parametrize(
+    ("first", "hidden", "leaked"),
+    [
+        (0.0, 0.6, 0.0),  # wrong at once, and hidden in time
+        (3.0, 3.6, 0.0),  # frozen while the arm rests: wrong when it moves
+        (3.0, 6.0, 1.0),  # wrong from 3 s on, so a leak from 5 s to 6 s
+        (0.0, 9.0, 6.0),
+    ],
+)
+def test_a_leak_is_counted_from_the_first_wrong_value(first: float, hidden: float, leaked: float) -> None:
+    at = np.arange(0.0, 8.0, 0.01)
+    late = leaks(at, at >= hidden, np.where(at >= first, 0.3, 0.02))
+    assert late.sum() * 0.01 == pytest.approx(leaked, abs=0.02)
+    assert not leaks(at, np.zeros(len(at), bool), np.full(len(at), np.nan)).any()
 
 
 class Creeping:
