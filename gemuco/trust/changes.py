@@ -40,44 +40,51 @@ class Likeness:
         """Number of blocks that are worth one independent block, shape (n,)."""
         return 1.0 + (1.0 - self.white) * 2.0 * self.slow / (1.0 - self.slow)
 
-    def covariances(self, count: int) -> np.ndarray:
-        """Return the covariances of `count` successive errors of variance 1, shape (n, count, count)."""
-        lag = np.abs(np.subtract.outer(np.arange(count), np.arange(count)))
+    def covariances(self, places: np.ndarray) -> np.ndarray:
+        """Return the covariances of errors of variance 1 at some places [blocks], shape (m,): (n, m, m)."""
+        lag = np.abs(np.subtract.outer(places, places))
         slow = (1.0 - self.white)[:, None, None] * self.slow[:, None, None] ** lag
-        return np.asarray(slow + self.white[:, None, None] * np.eye(count))
+        return np.asarray(slow + self.white[:, None, None] * np.eye(len(places)))
 
 
 class StepTest:
     """Likelihood ratio of a step of any size and one of several ages against no step, for every element.
 
-    A missing error may have been any: the first one after a gap is no step because it is not zero.
+    A missing error may have been any: the first one after a gap is no step because it is not zero. And errors at one
+    posture say the same again and again. So two deviations are computed, with errors that forget in time and with
+    errors that forget in motion only, and the smaller one counts.
     """
 
     def __init__(self, likeness: Likeness) -> None:
-        self._covariances = likeness.covariances(LONGEST)
+        self._likeness = likeness
         self._steps = (np.arange(LONGEST)[None, :] >= LONGEST - np.array(AGES)[:, None]).astype(float)
         self._weights: dict[bytes, np.ndarray] = {}
 
-    def __call__(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def __call__(self, z: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the largest deviation over all ages [standard deviations], and its index into `AGES`, shapes (n,).
 
         Args:
             z: The newest errors [their standard deviations], oldest first, shape (LONGEST, n); NaN where missing.
+            moved: Motion of the body up to each of them [blocks of motion at the usual pace], shape (LONGEST,).
         """
         known = np.isfinite(z)
         each = np.zeros((z.shape[1], len(AGES)))
         for pattern in np.unique(known, axis=1).T:
             own = (known == pattern[:, None]).all(axis=0)
-            each[own] = np.abs(np.einsum("nab,bn->na", self._weights_of(pattern)[own], z[:, own][pattern]))
+            both = [
+                np.abs(np.einsum("nab,bn->na", self._weights_of(pattern, places)[own], z[:, own][pattern]))
+                for places in (np.arange(LONGEST, dtype=float), moved)
+            ]
+            each[own] = np.minimum(*both)
         best = each.argmax(axis=1)
         return each[np.arange(len(best)), best], best
 
-    def _weights_of(self, known: np.ndarray) -> np.ndarray:
+    def _weights_of(self, known: np.ndarray, places: np.ndarray) -> np.ndarray:
         """Return the deviations by the known errors, shape (n, ages, number of known ones)."""
-        key = known.tobytes()
+        key = known.tobytes() + places.tobytes()
         weights = self._weights.get(key)
         if weights is None:
-            steps, precisions = self._steps[:, known], np.linalg.inv(self._covariances[:, known][:, :, known])
+            steps, precisions = self._steps[:, known], np.linalg.inv(self._likeness.covariances(places[known]))
             scaled = np.einsum("ab,nbc->nac", steps, precisions)
             information = np.einsum("nac,ac->na", scaled, steps)
             weights = self._weights[key] = scaled / np.sqrt(np.maximum(information, 1e-12))[..., None]

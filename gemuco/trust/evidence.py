@@ -66,7 +66,7 @@ class Judge:
 
     def __call__(self, view: View, lasting: LastingTest | None = None) -> Evidence:
         """Return the evidence in a view; without `lasting` from its blocks alone."""
-        step, best = self._steps(view.z / self.scale)
+        step, best = self._steps(view.z / self.scale, view.moved)
         ratio, strength, age = step / self._limit, 0.5 * step**2, np.array(AGES)[best]
         if lasting is not None:
             likelihood = lasting.likelihood

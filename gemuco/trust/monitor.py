@@ -192,7 +192,7 @@ class TrustMonitor:
         self._count, self._now = self._count + 1, now
         self._recent.add(self._schema, self._relations, samples)
         motion = self._motion = self._healthy.motion(self._recent.moved())
-        self._recent.rest(self._healthy.looks)
+        self._recent.rest(motion, self._healthy.looks)
         hidden = self._hidden_columns() | self._recent.missing()
         before = self._view
         if before is not None and before.hidden - hidden:

@@ -33,6 +33,7 @@ class View:
         settled: Errors when the body had come to the posture in which it rests, in the unit of `z`, shape (n,); NaN
             where unknown, and in motion.
         away: Distance from that posture [looks at a new posture].
+        moved: Motion up to each block [looks at a new posture], shape (LONGEST,).
     """
 
     z: np.ndarray
@@ -41,6 +42,7 @@ class View:
     hidden: Hidden
     settled: np.ndarray
     away: float
+    moved: np.ndarray
 
     @property
     def noise(self) -> np.ndarray:
@@ -68,6 +70,7 @@ class Recent:
 
     def __init__(self) -> None:
         self.blocks: deque[_Block] = deque(maxlen=LONGEST)
+        self._moved: deque[float] = deque([0.0] * LONGEST, maxlen=LONGEST)
         self._settling: list[_Block] = []
         self._settled: _Block | None = None
         self._away = 0.0
@@ -90,15 +93,17 @@ class Recent:
         sensed = relations.sensitivity.sense(schema, full[:1])
         self.blocks.append(_Block(mean, features[0], features[1:], span, missing, sensed))
 
-    def rest(self, looks: Callable[[float], float]) -> None:
+    def rest(self, motion: float, looks: Callable[[float], float]) -> None:
         """Notice whether the body rests at one posture since the newest block was added.
 
         The column that changed most does not count: it may be a sensor that drifts.
 
         Args:
+            motion: Motion in the newest block [looks at a new posture].
             looks: Returns how many looks at a new posture a distance [standard deviations] is worth.
         """
         newest = self.blocks[-1]
+        self._moved.append(self._moved[-1] + motion)
         if self._settling:
             change = np.sort(np.abs(newest.mean - self._settling[0].mean))  # NaN is the last
             known = change[np.isfinite(change)][:-1]
@@ -129,6 +134,7 @@ class Recent:
     def _read_as(self, schema: BodySchema, relations: Relations, values: np.ndarray) -> "Recent":
         """Return the same blocks with other means [standard deviations], shape (blocks, columns), and a schema's p."""
         other = Recent()
+        other._moved = self._moved.copy()
         full = relations.rows(schema, values)
         features, sensed = relations.features(full), relations.sensitivity.sense(schema, full)
         none = np.zeros((0, features.shape[1]))
@@ -181,7 +187,8 @@ class Recent:
             noises = np.concatenate([before.noises, noises])[-NOISY:]
         is_same = fresh and before is not None and self.resting > 0
         settled = before.settled if is_same and before else self._errors_when_settled(relations, hidden, used)
-        return View(z, healthy, noises, hidden, settled, self._away)
+        moved = np.array(self._moved) - self._moved[-1]
+        return View(z, healthy, noises, hidden, settled, self._away, moved)
 
     def _errors_when_settled(self, relations: Relations, hidden: Hidden, used: np.ndarray) -> np.ndarray:
         """Return `View.settled`; `used` are the columns that are not hidden."""

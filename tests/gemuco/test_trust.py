@@ -23,6 +23,8 @@ from gemuco.trust.sensitivity import Sensitivity
 SAMPLES = 5
 """Samples in a block."""
 JOINT, TENSION, LENGTH = 0, 3, 8
+MOVING = np.arange(LONGEST, dtype=float)
+"""Motion up to each block of a body that moves at its usual pace."""
 NOISE = np.r_[np.full(2, 0.002), np.full(5, 0.3), np.full(5, 2e-4)]
 
 
@@ -97,10 +99,10 @@ def test_a_step_is_tested_with_its_likeness():
     covariance = 0.9 * 0.9**lag + 0.1 * np.eye(LONGEST)
     healthy = np.linalg.cholesky(covariance) @ random.normal(size=(LONGEST, 2000))
     test = StepTest(likeness)
-    deviations = np.array([test(column[:, None])[0][0] for column in healthy.T])
+    deviations = np.array([test(column[:, None], MOVING)[0][0] for column in healthy.T])
     assert 0.9 < np.sqrt(np.mean(deviations**2)) < 2.5  # the largest of eight ages
     step = np.where(np.arange(LONGEST) >= LONGEST - 5, 3.0, 0.0)
-    found, age = test(step[:, None])
+    found, age = test(step[:, None], MOVING)
     expected = np.sqrt(step @ np.linalg.inv(covariance) @ step)
     assert found[0] == pytest.approx(expected, rel=1e-6)
     assert (1, 2, 3, 5)[age[0]] == 5
@@ -113,9 +115,22 @@ def test_an_error_after_a_gap_is_no_step(first, last):
         size=(LONGEST, count)
     )
     test = StepTest(Likeness(np.full(count, 0.9), np.full(count, 0.1)))
-    usual = np.quantile(test(healthy)[0], 0.999)
+    usual = np.quantile(test(healthy, MOVING)[0], 0.999)
     healthy[first:last] = np.nan
-    assert np.quantile(test(healthy)[0], 0.999) < 1.05 * usual
+    assert np.quantile(test(healthy, MOVING)[0], 0.999) < 1.05 * usual
+
+
+def test_errors_at_one_posture_say_the_same_again_and_again():
+    """At rest a healthy error stays; the step test must not take 30 equal errors for 30 witnesses."""
+    random, count = np.random.default_rng(2), 20_000
+    test = StepTest(Likeness(np.full(count, 0.9), np.full(count, 0.05)))
+    slow = np.sqrt(0.95) * random.normal(size=count)
+    resting = slow + np.sqrt(0.05) * random.normal(size=(LONGEST, count))
+    arrived = np.minimum(MOVING, 2.0)  # it has moved for two blocks, and then rests
+    assert np.quantile(test(resting, arrived)[0], 0.999) < 4.5 < np.quantile(test(resting, MOVING)[0], 0.999)
+    jump = resting.copy()
+    jump[-5:] += 12.0
+    assert np.median(test(jump, arrived)[0]) == pytest.approx(np.median(test(jump, MOVING)[0]), rel=0.15)
 
 
 def test_the_age_of_a_step_is_found_across_a_gap():
@@ -123,10 +138,10 @@ def test_the_age_of_a_step_is_found_across_a_gap():
     z = np.zeros((LONGEST, 2))
     z[-8:] = 3.0
     z[-4:-2, 1] = np.nan
-    strength, best = test(z)
+    strength, best = test(z, MOVING)
     assert (np.array(AGES)[best] == 8).all()
     assert strength[1] == pytest.approx(strength[0] * np.sqrt(6 / 8), rel=0.05)
-    assert test(np.full((LONGEST, 2), np.nan))[0] == pytest.approx(0.0)
+    assert test(np.full((LONGEST, 2), np.nan), MOVING)[0] == pytest.approx(0.0)
 
 
 def test_the_usual_noise_of_an_element_is_that_since_it_is_measured():
@@ -152,7 +167,7 @@ def test_noise_matters_from_a_share_of_the_size_on(share, is_noise):
     judge = Judge(healthy, 0.006, np.full(2, size))
     noises = np.array([[(share * size) ** 2, 1e-3]] * 5) * judge.scale**2
     unknown = np.full(2, np.nan)
-    evidence = judge(View(np.zeros((LONGEST, 2)), np.ones((LONGEST, 2)), noises, frozenset(), unknown, 0.0))
+    evidence = judge(View(np.zeros((LONGEST, 2)), np.ones((LONGEST, 2)), noises, frozenset(), unknown, 0.0, MOVING))
     assert evidence.is_noise.tolist() == [is_noise, False]
     assert (evidence.ratio[0] >= 1.0) == is_noise
 
