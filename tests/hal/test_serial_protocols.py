@@ -3,7 +3,7 @@
 import random
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from hal.protocols import dynamixel, feetech
@@ -61,6 +61,8 @@ def test_signs_of_feetech_numbers():
 
 
 @by_make
+@example(node=1, data=b"\xff\xff\xfd\xfd", cuts=[])
+@example(node=1, data=b"\xff\xff\xfd\xff\xff\xfd\xfd\xfd", cuts=[])
 @given(node=st.integers(0, 252), data=st.binary(max_size=40), cuts=st.lists(st.integers(1, 12), max_size=30))
 def test_what_is_packed_is_unpacked_by_the_other_side(make, node, data, cuts):
     ours, other = MAKES[make]

@@ -62,11 +62,14 @@ def packets(received: bytearray) -> list[tuple[int, int, bytes]]:
 
 
 def _unstuffed(data: bytes) -> bytes:
-    plain = bytearray()
+    """Return data without the one FDh that the sender put after each FFh FFh FDh; a further FDh is data."""
+    plain, is_stuffed = bytearray(), False
     for byte in data:
-        if byte == 0xFD and plain[-3:] == b"\xff\xff\xfd":
+        if is_stuffed and byte == 0xFD:
+            is_stuffed = False
             continue
         plain.append(byte)
+        is_stuffed = plain[-3:] == b"\xff\xff\xfd"
     return bytes(plain)
 
 
