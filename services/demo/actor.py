@@ -79,7 +79,7 @@ class Actor:
         values: np.ndarray,
         duration: float,
         stays: Callable[[], bool] = lambda: False,
-        ends: Callable[[], bool] = lambda: False,
+        ends: Callable[[], Callable[[], bool]] = lambda: lambda: False,
     ) -> None:
         """Send a target [its unit], shape (n,), and wait; repeat if the HAL stopped the robot.
 
@@ -89,7 +89,7 @@ class Actor:
             duration: Longest wait [s].
             stays: Whether a robot that was stopped stays so; if it is true within a moment, the robot is left as it is
                 for the duration.
-            ends: Whether the wait ends.
+            ends: Called when a target was sent; it returns a function that returns whether the wait ends.
         """
         for _ in range(TRIES):
             if not self._follows():
@@ -98,7 +98,7 @@ class Actor:
                     return
                 self._recover()
             self._insist(lambda: self._client.ask("model", "target", {"signal": signal, "values": values.tolist()}))
-            self.wait(ends, duration)
+            self.wait(ends(), duration)
             if self._follows():
                 return
 

@@ -217,7 +217,7 @@ class Story:
         self.marks.cut = start
         noticed = self._actor.wait(self._is_cut_noticed, NOTICED_WITHIN)
         for _ in range(CUT_POSES if not noticed else 0):  # in some postures the muscle bears nothing
-            self._go_as_cut(ends=self._is_cut_noticed)
+            self._go_as_cut(lambda: self._is_cut_noticed)
             if noticed := self._is_cut_noticed():
                 break
         self.marks.alarm = self._timeline.now()
@@ -244,7 +244,7 @@ class Story:
     def _is_cut_noticed(self) -> bool:
         return self._is_alarmed() or bool(self._distrusted_of_muscle())
 
-    def _go_as_cut(self, ends: Callable[[], bool] = lambda: False) -> None:
+    def _go_as_cut(self, ends: Callable[[], Callable[[], bool]] = lambda: lambda: False) -> None:
         """Go to a pose, unless the arm is stopped because the cut muscle is distrusted."""
         self._actor.go(self._signal, self._pose(), LEARNING_TIME, lambda: bool(self._distrusted_of_muscle()), ends)
 
@@ -298,7 +298,7 @@ class Story:
         """Return, for every test pose, target minus truth and estimate with hidden encoders minus truth [rad]."""
         misses, errors = [], []
         for pose in self._poses:
-            self._actor.go(self._signal, pose, POSE_TIME, ends=self._at_rest())
+            self._actor.go(self._signal, pose, POSE_TIME, ends=self._at_rest)
             misses.append(pose - self._actor.truth(self._signal))
             errors.append(self._hidden_error())
         return misses, errors

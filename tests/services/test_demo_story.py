@@ -228,7 +228,8 @@ class Creeping:
 
     def go(self, signal: str, values: np.ndarray, duration: float, ends: Any) -> None:
         end = self.now + duration
-        while self.now < end and not ends():
+        has_ended = ends()
+        while self.now < end and not has_ended():
             self.now += 0.01
         self.waited = self.now - 100.0
 
@@ -238,8 +239,16 @@ def test_a_test_pose_lasts_until_the_arm_rests(monkeypatch: pytest.MonkeyPatch, 
     arm = Creeping(arrives)
     monkeypatch.setattr(story_module, "time", arm)
     played = Story(ROBOT, arm, arm, 0, arm, print)  # type: ignore[arg-type]
-    played._actor.go("joint_position", np.zeros(5), POSE_TIME, ends=played._at_rest())
+    played._actor.go("joint_position", np.zeros(5), POSE_TIME, ends=played._at_rest)
     assert arm.waited == pytest.approx(waited, abs=0.03)
+
+
+def test_a_wait_begins_anew_with_the_target_that_is_sent_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(actor_module, "ENGAGED_WITHIN", 0.02)
+    robot, begun = Stopping(1), []
+    mover = Actor(robot, lambda: None, print)  # type: ignore[arg-type]
+    mover.go("joint_position", np.zeros(5), 0.02, ends=lambda: begun.append(robot.targets) or (lambda: False))  # type: ignore[func-returns-value]
+    assert begun == [1, 2]
 
 
 class Cut(Stopping):
