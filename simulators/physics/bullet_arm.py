@@ -2,9 +2,10 @@
 
 import itertools
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 
@@ -49,8 +50,6 @@ class BulletArm:
         infos = [pybullet.getJointInfo(self._body, index, **client) for index in range(self._count)]
         indices = {info[1].decode(): info[0] for info in infos}
         self._joints = [indices[name] for name in joints]
-        # Bullet's own order is that of its tree.
-        self._order = [name for _, name in sorted(zip(self._joints, range(len(joints)), strict=True))]
         self._efforts = efforts.tolist()
         self._gains, self._still = [GAIN] * len(joints), [0.0] * len(joints)
         self.position, self.effort = np.array(position, float), np.zeros(len(joints))
@@ -99,12 +98,33 @@ class BulletArm:
 
         All are of shape (n,).
         """
-        ordered = position[self._order].tolist()
-        hold = pybullet.calculateInverseDynamics(self._body, ordered, self._still, self._still, **self._options)
-        mass = pybullet.calculateMassMatrix(self._body, ordered, **self._options)
-        torque, inertia = np.empty(len(ordered)), np.empty(len(ordered))
-        torque[self._order], inertia[self._order] = hold, np.diag(np.array(mass))
+        # Bullet's own inverse dynamics refuses heavy links: their tensors must be symmetric to the last bit.
+        client, kept = self._options, self.position.copy()
+        before = pybullet.saveState(**client)
+        self.place(position)
+        states = pybullet.getLinkStates(self._body, range(self._count), computeForwardKinematics=1, **client)
+        dynamics = [pybullet.getDynamicsInfo(self._body, index, **client) for index in range(self._count)]
+        pybullet.restoreState(before, **client)
+        pybullet.removeState(before, **client)
+        self.position[:] = kept
+        infos = [pybullet.getJointInfo(self._body, index, **client) for index in range(self._count)]
+        torque, inertia = np.zeros(len(self._joints)), np.zeros(len(self._joints))
+        for link, (state, info) in enumerate(zip(states, dynamics, strict=True)):
+            mass, own = info[0], _turned(state[1]) * np.sqrt(info[2])
+            for joint in self._carriers(link, infos):
+                axis = _turned(states[joint][1]) @ infos[joint][13]  # Bullet gives it in the frame of the inertia
+                swing = np.cross(axis, np.subtract(state[0], states[joint][4]))
+                row = self._joints.index(joint)
+                torque[row] += mass * GRAVITY * swing[2]
+                inertia[row] += mass * (swing @ swing) + np.sum((axis @ own) ** 2)
         return torque, inertia
+
+    def _carriers(self, link: int, infos: Sequence[tuple[Any, ...]]) -> Iterator[int]:
+        """Yield the driven joints that move a link."""
+        while link >= 0:
+            if link in self._joints:
+                yield link
+            link = infos[link][16]
 
     def _allow_contacts(self) -> int:
         """Let links collide that do not touch now and are not neighbours; return the number of pairs."""
@@ -121,13 +141,16 @@ class BulletArm:
         return allowed
 
     def _add_floor(self) -> None:
-        """Add a floor below the links that stand still, if they have a shape."""
-        if not pybullet.getCollisionShapeData(self._body, -1, **self._options):
+        """Add a floor below the links that stand still, if they have a shape, and below the arm as it is now."""
+        shaped = [
+            link for link in range(-1, self._count) if pybullet.getCollisionShapeData(self._body, link, **self._options)
+        ]
+        if -1 not in shaped:
             return
-        low, _ = pybullet.getAABB(self._body, -1, **self._options)
+        lowest = min(pybullet.getAABB(self._body, link, **self._options)[0][2] for link in shaped)
         half = [50.0, 50.0, 0.5]
         box = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half, **self._options)
-        place = [0.0, 0.0, float(low[2]) - FLOOR - half[2]]
+        place = [0.0, 0.0, lowest - FLOOR - half[2]]
         pybullet.createMultiBody(0.0, box, basePosition=place, **self._options)
 
     def close(self) -> None:
@@ -135,3 +158,8 @@ class BulletArm:
         if self._client >= 0:
             pybullet.disconnect(physicsClientId=self._client)
             self._client = -1
+
+
+def _turned(quaternion: Sequence[float]) -> np.ndarray:
+    """Return the rotation matrix of Bullet's quaternion, shape (3, 3)."""
+    return np.array(pybullet.getMatrixFromQuaternion(quaternion)).reshape(3, 3)

@@ -32,7 +32,7 @@ class MujocoArm:
         source = with_compiler(ElementTree.fromstring(text))
         spec = mujoco.MjSpec.from_string(source)
         self._load(spec, joints)
-        touching, low = self._touching(), self._lowest_of_base()
+        touching, low = self._touching(), self._lowest()
         spec = mujoco.MjSpec.from_string(source)
         for one, other in touching:
             spec.add_exclude(bodyname1=one, bodyname2=other)
@@ -67,16 +67,17 @@ class MujocoArm:
                 pairs.append((names[one], names[other]))
         return pairs
 
-    def _lowest_of_base(self) -> float | None:
-        """Return the lowest place of the shapes that stand still [m]; None without shapes."""
+    def _lowest(self) -> float | None:
+        """Return the lowest place of all shapes [m]; None if what stands still has none."""
         model, data = self._model, self._data
-        fixed = [geom for geom in range(model.ngeom) if model.geom_bodyid[geom] == 0]
+        if not (model.geom_bodyid == 0).any():
+            return None
         lows = []
-        for geom in fixed:
+        for geom in range(model.ngeom):
             center, half = model.geom_aabb[geom][:3], model.geom_aabb[geom][3:]
             turn = data.geom_xmat[geom].reshape(3, 3)
             lows.append(float(data.geom_xpos[geom][2] + turn[2] @ center - np.abs(turn[2]) @ half))
-        return min(lows) if lows else None
+        return min(lows)
 
     def place(self, position: np.ndarray) -> None:
         """Put the joints at `position` [rad], shape (n,), at rest."""

@@ -211,6 +211,29 @@ def test_an_arm_stops_at_the_floor(arm):
         body.close()
 
 
+def test_an_arm_that_hangs_from_its_base_is_free(tmp_path):
+    """The floor would be 0.07 m below its foot, where its links already are."""
+    hanging = ARM.replace('xyz="0 0 0.5"', 'xyz="0 0 -0.5"').replace('rpy="0.2 0 0"', 'rpy="0 1.5 0"')
+    arm = choose_arm(read_tree(written(tmp_path, hanging)))
+    assert (survey(arm).high > survey(arm).low).all()
+
+
+def test_a_heavy_arm_has_torques(tmp_path):
+    """The second link of a KUKA KR 210: Bullet's inverse dynamics refuses its inertia, which is not round in bits."""
+    heavy = "<inertial><origin xyz='-0.38 -0.03 0.28'/><mass value='958.62'/>"
+    heavy += "<inertia ixx='180.42' iyy='177.68' izz='20.495' ixy='-0.83462' ixz='0.32549' iyz='-20.82'/></inertial>"
+    text = ARM.replace(link("upper", 2.0, BOX), f"<link name='upper'>{heavy}</link>")
+    text, _ = physics_urdf(
+        choose_arm(read_tree(written(tmp_path, text.replace('axis xyz="0 0 1"', 'axis xyz="0 1 0"'))))
+    )
+    body = BulletArm(text, ("shoulder_pan", "elbow", "wrist"), np.zeros(3), np.full(3, 1e5))
+    torque, inertia = body.torques(np.zeros(3))
+    behind = 3.3 * 0.4 + 1.3 * 0.2  # kg m: what the elbow carries, and its centre
+    assert torque[0] == pytest.approx(9.81 * (958.62 * 0.38 - behind), rel=0.01)
+    assert inertia[0] == pytest.approx(177.68 + 958.62 * (0.38**2 + 0.28**2), rel=0.02)
+    body.close()
+
+
 def test_a_mass_that_no_body_has_is_made_possible():
     for wrong in (np.diag([1.0, 0.1, 0.1]), np.diag([0.0, 0.0, 1.0]), np.diag([1e-12, 1e-12, 1e-12])):
         moments = np.linalg.eigvalsh(possible(wrong))
@@ -234,6 +257,7 @@ def test_meshes_of_packages_are_found_above_the_urdf(tmp_path):
     urdf = tmp_path / "my_arm" / "urdf" / "arm.urdf"
     for name in ("package://my_arm/meshes/a.stl", "../meshes/a.stl", f"file://{mesh}", "model://my_arm/meshes/a.stl"):
         assert find_mesh(name, urdf) == mesh.resolve()
+    assert find_mesh("package://another_name/meshes/a.stl", urdf) == mesh.resolve()
     assert find_mesh("package://other/meshes/b.stl", urdf) is None
     missing = BOX.replace("<box size=", "<mesh filename='package://none/x.stl' unused=")
     _, notes = physics_urdf(choose_arm(read_tree(written(tmp_path, ARM.replace(BOX, missing)))))

@@ -223,14 +223,15 @@ def _add_shapes(lump: Lump, pose: Pose, link: Element, path: Path) -> Iterator[s
 def find_mesh(name: str, urdf: Path) -> Path | None:
     """Return the file of a mesh; None if it is not found.
 
-    The package of a `package://` name is a folder beside or above the URDF.
+    The package of a `package://` name is a folder beside or above the URDF, which can have another name there.
     """
     name = name.removeprefix("file://")
     package, _, inner = name.partition("://")[2].partition("/")
     tries = [urdf.parent / name] if "://" not in name else []
-    for folder in urdf.resolve().parents if inner else ():
+    above = urdf.resolve().parents if inner else ()
+    for folder in above:
         tries += [folder / package / inner, folder / inner] if folder.name == package else [folder / package / inner]
-    tries += [urdf.parent / inner] if inner else []
+    tries += [folder / inner for folder in above]
     return next((one.resolve() for one in tries if one.is_file() and one.suffix.lower() in MESHES), None)
 
 
