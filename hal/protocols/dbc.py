@@ -33,11 +33,18 @@ _LARGEST_FLOATS = {16: 65504.0, 32: 3.4e38}
 
 
 class Dbc:
-    """A DBC file. An unknown name is a `ConfigError` that lists the known ones."""
+    """A DBC file. An unknown name is a `ConfigError` that lists the known ones.
+
+    Attributes:
+        path: The file.
+        messages: Its messages.
+        left_out: Name of a message that contradicts itself -> how: signals that overlap, or that do not fit.
+    """
 
     def __init__(self, path: Path, database: Database) -> None:
         self.path = path
-        self.messages = tuple(database.messages)
+        self.left_out = {message.name: wrong for message in database.messages if (wrong := _contradiction(message))}
+        self.messages = tuple(message for message in database.messages if message.name not in self.left_out)
         self._messages = {message.name: message for message in self.messages}
 
     def message(self, name: str) -> Message:
@@ -46,6 +53,8 @@ class Dbc:
         Raises:
             ConfigError: There is no message of that name.
         """
+        if name in self.left_out:
+            raise ConfigError(f"Message '{name}' of DBC file '{self.path}' cannot be used: {self.left_out[name]}")
         if name not in self._messages:
             raise ConfigError(f"DBC file '{self.path}' has no message '{name}'. {_suggest(name, self._messages)}")
         return self._messages[name]
@@ -101,17 +110,28 @@ class Dbc:
 def load(path: Path) -> Dbc:
     """Read a DBC file, once per file.
 
+    Files of vendors have messages that contradict themselves. Only these are left out.
+
     Raises:
         ConfigError: It is missing or not a DBC file.
     """
     if not path.is_file():
         raise ConfigError(f"There is no DBC file '{path}'. The path is relative to the folder of the robot file.")
     try:
-        database = cantools.database.load_file(path, database_format="dbc")
+        database = cantools.database.load_file(path, database_format="dbc", strict=False)
     except Exception as error:  # cantools passes on every exception of its parser
         raise ConfigError(f"'{path}' is not a DBC file that cantools can read: {error}.") from error
     assert isinstance(database, Database)
     return Dbc(path, database)
+
+
+def _contradiction(message: Message) -> str:
+    """Return what is wrong with the layout of a message; empty if nothing is."""
+    try:
+        message.refresh(strict=True)
+    except cantools.Error as error:
+        return str(error)
+    return ""
 
 
 def describe(signal: Signal, raw: float, is_bits: bool = False) -> str:

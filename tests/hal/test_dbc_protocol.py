@@ -183,6 +183,18 @@ def test_a_file_that_is_none_is_told(tmp_path):
         dbc.load(tmp_path / "broken.dbc")
 
 
+def test_a_message_whose_signals_overlap_is_refused_and_no_other(tmp_path):
+    path = tmp_path / "overlap.dbc"
+    path.write_text(
+        'VERSION ""\nBU_: X\nBO_ 5 Right: 8 X\n SG_ Pull : 0|16@1+ (1,0) [0|0] "V" X\n'
+        'BO_ 6 Twice: 8 X\n SG_ A : 0|16@1+ (1,0) [0|0] "V" X\n SG_ B : 8|16@1+ (1,0) [0|0] "V" X\n'
+    )
+    file = dbc.load(path)
+    assert [message.name for message in file.messages] == ["Right"]
+    with pytest.raises(ConfigError, match=r"'Twice' of .* cannot be used: The signals B and A are overlapping"):
+        file.signal("Twice.A")
+
+
 def test_raw_values_in_words():
     errors = dbc.load(FILES / "odrive_cansimple.dbc").signal("Heartbeat.Axis_Error")[1]
     assert dbc.describe(errors, 0, is_bits=True) == "none"

@@ -6,7 +6,7 @@ import can
 import numpy as np
 import pytest
 import yaml
-from on_bench import arrives, cycle_until, running, virtual
+from on_bench import arrives, cycle_until, running, states, virtual
 from test_bench_dbc import SENSOR, SERVO
 from test_bench_devices import DRIVE, UNSTATED, without_defaults
 
@@ -99,6 +99,31 @@ def test_files_without_a_drive_have_one_that_stands_in(tmp_path: Path) -> None:
     assert robot.command.signal == "joint_position"
     assert any("'stand_in' takes its place" in note for note in draft.notes)
     assert any("Pull, Rate have no unit that is known" in note for note in draft.notes)
+
+
+def test_a_drive_keeps_off_the_identifiers_of_a_dbc_file(tmp_path: Path) -> None:
+    """Node 1 would send 081h, 181h and 581h, which are messages of the file."""
+    (tmp_path / "files").mkdir()
+    (tmp_path / "files" / "drive.eds").write_text(DRIVE)
+    messages = [f'BO_ {number} M{number}: 8 X\n SG_ S{number} : 0|16@1+ (1,0) [0|0] "V" X\n'
+                for number in (0x81, 0x182, 0x583)]  # fmt: skip
+    (tmp_path / "files" / "unit.dbc").write_text('VERSION ""\nBU_: X\n' + "".join(messages))
+    file = written(draft_folder(tmp_path / "files", "cells", tmp_path, SHIPPED), tmp_path)
+    assert load_robot(file).devices["drive"].node == 4
+    with running(virtual(body_of(file))) as (robot, _):
+        assert set(states(robot)) == {"drive", "unit"}
+
+
+def test_contradictory_messages_are_left_out_and_said(tmp_path: Path) -> None:
+    (tmp_path / "files").mkdir()
+    (tmp_path / "files" / "unit.dbc").write_text(
+        'VERSION ""\nBU_: X\nBO_ 5 Right: 8 X\n SG_ Pull : 0|16@1+ (1,0) [0|0] "V" X\n'
+        'BO_ 6 Twice: 8 X\n SG_ A : 0|16@1+ (1,0) [0|0] "V" X\n SG_ B : 8|16@1+ (1,0) [0|0] "V" X\n'
+        'BO_ 7 Long: 1 X\n SG_ C : 0|16@1+ (1,0) [0|0] "V" X\n'
+    )
+    draft = draft_folder(tmp_path / "files", "cells", tmp_path, SHIPPED)
+    assert load_robot(written(draft, tmp_path)).signals["voltage"].elements == ("unit_pull",)
+    assert any(note.startswith("'unit.dbc': Twice, Long left out") and "overlapping" in note for note in draft.notes)
 
 
 def test_messages_of_the_host_are_left_out_and_said(tmp_path: Path) -> None:

@@ -75,6 +75,11 @@ def is_odrive(file: Dbc) -> bool:
     return {message.name for message in file.messages} >= ODRIVE
 
 
+def nodes_of(file: Dbc) -> set[int]:
+    """Return the node ids that a CANopen device cannot have, because the file uses identifiers that would be its."""
+    return {message.frame_id & 0x7F for message in file.messages if not message.is_extended_frame}
+
+
 def odrive_part(dbc: str, names: Names, node: int, origin: str, signal: str, name: str = "axis") -> Part:
     """Return an axis of an ODrive, whose position is in `signal`."""
     own = names.new(name)
@@ -110,6 +115,11 @@ def parts_of(
             own.setdefault(sender if not sender.startswith("Vector__") else "", []).append(message)
     parts = [_part(file, dbc, sender, messages, names, node + number, rates, notes)
              for number, (sender, messages) in enumerate(own.items())]  # fmt: skip
+    if file.left_out:
+        notes.append(
+            f"'{file.path.name}': {_listed(list(file.left_out))} left out, whose layout is contradictory: "
+            f"{next(iter(file.left_out.values()))}"
+        )
     if commands:
         notes.append(
             f"'{file.path.name}': the host sends {_listed(commands)}. If a node is a servo, describe it as `dbc_servo` "

@@ -15,6 +15,7 @@ from hal.finding.scan import Node, Scan
 from hal.protocols import dbc
 
 STAND_IN = "stand_in"
+LARGEST_NODE = 127
 SUFFIXES = (".eds", ".dcf", ".dbc")
 DEPTH = 3
 """Files are looked for at most this many folders deep."""
@@ -70,10 +71,12 @@ class _Draughtsman:
         return f"{kind}/{name}"
 
     def node(self, wish: int | None, first: int) -> int:
-        """Return a node id that no other device has: the wished one, or the next from `first` on."""
-        node = wish if wish and wish not in self.nodes else first
-        while node in self.nodes:
-            node += 1
+        """Return a node id that no other device has: the wished one, or the next from `first` on.
+
+        Without a free one it is `first`, and `gemuco doctor` names the two devices.
+        """
+        wishes = (wish or first, *range(first, LARGEST_NODE + 1), *range(1, first))
+        node = next((node for node in wishes if node not in self.nodes), first)
         self.nodes.add(node)
         return node
 
@@ -113,12 +116,12 @@ def draft_folder(source: Path, name: str, folder: Path, shipped: Path) -> Draft:
     work = _Draughtsman(folder, shipped)
     known = list(_sheets(files, work.notes))
     work.has_encoders = any(sheet.profile == 406 for sheet in known)
+    for path in files:  # first, because their identifiers are not free to choose
+        if path.suffix.lower() == ".dbc":
+            _add_dbc(work, path, None)
     for sheet in known:
         node = work.node(sheet.node, FIRST_NODES[sheet.profile])
         work.parts.append(sheets.part_of(sheet, work.path_of(sheet.path), work.names, node, work.moved))
-    for path in files:
-        if path.suffix.lower() == ".dbc":
-            _add_dbc(work, path, None)
     if not work.parts:
         raise ConfigError(f"None of {len(files)} files in '{source}' can be used. {' '.join(work.notes)}")
     work.add_stand_in()
@@ -212,7 +215,7 @@ def _add_dbc(work: _Draughtsman, path: Path, result: Scan | None) -> None:
         return
     rates = None if result is None else result.unknown
     parts = dbc_parts.parts_of(file, own, work.names, work.node(None, 91), work.notes, rates)
-    work.nodes |= {part.node for part in parts}
+    work.nodes |= {part.node for part in parts} | dbc_parts.nodes_of(file)
     work.parts += parts
     if not parts:
         where = "" if result is None else f" that was received on {result.bus}"
