@@ -186,14 +186,14 @@ def identify(sdo: SdoClient, profile: int, label: str) -> str:
             f"{label} has device profile {device_type & 0xFFFF}, not {profile}. Are two node ids swapped?"
         )
     names = []
-    for subindex, what in ((1, "vendor"), (2, "product"), (4, "serial number")):
+    for subindex, what in ((1, "vendor"), (2, "product"), (4, "")):  # a file is for all serial numbers, or states any
         if not sdo.has(cia301.IDENTITY, subindex):
             names.append(0)
             continue
         expected = sdo.default(cia301.IDENTITY, subindex)
         actual = sdo.read(cia301.IDENTITY, subindex)
         names.append(actual)
-        if expected and actual != expected:
+        if what and expected and actual != expected:
             raise WrongDevice(f"{label} has {what} {actual:X}h, its EDS file says {expected:X}h. Is it the right file?")
     return "canopen:" + "-".join(f"{name:08X}" for name in names)
 

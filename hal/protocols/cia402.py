@@ -39,12 +39,16 @@ HOMING_SPEED_SWITCH = MappedObject(0x6099, 1, 32)
 HOMING_SPEED_ZERO = MappedObject(0x6099, 2, 32)
 HOMING_ACCELERATION = MappedObject(0x609A, 0, 32)
 VELOCITY_UNIT = MappedObject(0x60A9, 0, 32)
+INTERPOLATION_SUBMODE = MappedObject(0x60C0, 0, 16, "signed")
+INTERPOLATION_DATA = MappedObject(0x60C1, 1, 32, "signed")
 INTERPOLATION_PERIOD = MappedObject(0x60C2, 1, 8)
 INTERPOLATION_INDEX = MappedObject(0x60C2, 2, 8, "signed")
 FOLLOWING_ERROR = MappedObject(0x60F4, 0, 32, "signed")
 TARGET_VELOCITY = MappedObject(0x60FF, 0, 32, "signed")
 SUPPORTED_MODES = MappedObject(0x6502, 0, 32)
 
+LINEAR = 0
+"""With this value of 60C0h a drive interpolates between set-points along a line."""
 ABORT_QUICK_STOP = 3
 """This value of 6007h makes a lost connection cause a quick stop."""
 QUICK_STOP_AND_OFF = 2
@@ -56,6 +60,7 @@ class OperationMode(IntEnum):
 
     PROFILE_POSITION = 1
     HOMING = 6
+    INTERPOLATED_POSITION = 7
     CYCLIC_SYNCHRONOUS_POSITION = 8
     CYCLIC_SYNCHRONOUS_VELOCITY = 9
     CYCLIC_SYNCHRONOUS_TORQUE = 10
@@ -99,6 +104,8 @@ NEW_SET_POINT = 1 << 4
 """Profile position: the drive takes the target position on the rising edge of this bit."""
 CHANGE_AT_ONCE = 1 << 5
 """Profile position: with this bit a new target position takes effect before the previous one is reached."""
+INTERPOLATE = 1 << 4
+"""Interpolated position: the drive moves along the set-points while this bit is set."""
 START_HOMING = 1 << 4
 """Homing begins with this bit and continues while it is set."""
 

@@ -80,7 +80,8 @@ def _parsed(text: str) -> RawConfigParser:
 
 
 def _complete(file: RawConfigParser) -> None:
-    """Add what canopen insists on, and remove empty entries."""
+    """Add what canopen insists on; remove empty entries, and comments, whose lines need not be as many as they say."""
+    file.remove_section("Comments")
     for section in file.sections():
         for option, value in file.items(section):
             if value is None or not value.strip():

@@ -170,6 +170,8 @@ SERVO_DRIVE = [
     ),
     variable(0x609A, Entry("Homing acceleration", U32, "rw", 1_000_000, low=1)),
     variable(0x60A9, Entry("SI unit velocity", U32, "ro", 0x00B50300)),
+    variable(0x60C0, Entry("Interpolation sub mode select", I16, "rw", 0, low=0, high=0)),
+    array(0x60C1, Entry("Interpolation data record", I32, "rww", pdo=True)),
     record(
         0x60C2,
         "Interpolation time period",
@@ -179,7 +181,7 @@ SERVO_DRIVE = [
     variable(0x60F4, Entry("Following error actual value", I32, "ro", pdo=True)),
     variable(0x60FD, Entry("Digital inputs", U32, "ro", pdo=True)),
     variable(0x60FF, Entry("Target velocity", I32, "rww", pdo=True)),
-    variable(0x6502, Entry("Supported drive modes", U32, "ro", 0x3A1)),
+    variable(0x6502, Entry("Supported drive modes", U32, "ro", 0x3E1)),
 ]
 
 CHANNELS = 4

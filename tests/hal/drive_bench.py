@@ -26,7 +26,7 @@ CONSTANTS = DriveConstants(
 SETTINGS = {"eds": "eds/servo_drive.eds", "counts_per_turn": 4096, "gear": 50, "zero": -0.2}
 TEMPERATURE = {"object": "2200h:1", "type": "int16", "scale": 0.1}
 HOMING = {"method": 17, "speed": 1.0, "slow_speed": 0.1}
-COMMANDED = {"profile_position": "position", "csp": "position", "csv": "velocity", "cst": "effort"}
+COMMANDED = {"profile_position": "position", "ip": "position", "csp": "position", "csv": "velocity", "cst": "effort"}
 
 
 class JointWorld:

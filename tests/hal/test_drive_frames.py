@@ -126,6 +126,18 @@ def test_a_profile_position_is_given_by_a_rising_edge():
         assert "bit 12" in elbow.device.health().text  # after 1 s at 100 Hz
 
 
+def test_an_interpolated_position_needs_bit_4():
+    with joint("ip") as elbow:
+        elbow.state(SWITCHED_ON, 32_595)
+        elbow.device.enable()
+        assert elbow.apply(0.8) == [command(0x0F, 32_595)]
+        elbow.state(ENABLED, 32_595)
+        assert elbow.apply(0.8) == [command(0x1F, 32_595)]
+        assert elbow.apply(-0.2) == [command(0x1F, 0)]
+        elbow.device.disable()
+        assert elbow.idle() == [command(0x06, 32_595)]
+
+
 def test_a_drive_that_left_operation_enabled_stays_off():
     with joint() as elbow:
         elbow.state(ENABLED)

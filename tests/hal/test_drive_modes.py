@@ -25,10 +25,10 @@ def joint():
         bench.close()
 
 
-@pytest.mark.parametrize(("mode", "number"), [("profile_position", 1), ("csp", 8), ("csv", 9), ("cst", 10)])
+@pytest.mark.parametrize(("mode", "number"), [("profile_position", 1), ("ip", 7), ("csp", 8), ("csv", 9), ("cst", 10)])
 def test_each_mode_is_set_and_mapped(joint, mode, number):
     bench = joint(mode)
-    target = {1: 0x607A0020, 8: 0x607A0020, 9: 0x60FF0020, 10: 0x60710010}[number]
+    target = {1: 0x607A0020, 7: 0x60C10120, 8: 0x607A0020, 9: 0x60FF0020, 10: 0x60710010}[number]
     values = bench.objects
     assert values[0x6060, 0] == number
     assert [values[0x1600, sub] for sub in range(3)] == [2, 0x60400010, target]
@@ -210,7 +210,22 @@ def test_a_drive_that_acknowledges_no_set_point_is_told(joint):
     assert "does not acknowledge set-points" in bench.device("elbow")["text"]
 
 
-@pytest.mark.parametrize("mode", ["profile_position", "csp", "csv", "cst"])
+def test_interpolated_position_moves_while_the_drive_is_told_to_interpolate(joint):
+    bench = joint("ip")
+    bench.enable()
+    for _ in range(40):
+        bench.follow([0.35])
+    assert bench.world.position == pytest.approx(0.35, abs=1e-3)
+    assert bench.objects[0x6041, 0] & 1 << 12
+    assert bench.objects[0x607A, 0] == 0
+    node = bench.node
+    node.objects.values[0x60C1, 1] = node.objects.values[0x60C1, 1] + 20_000
+    node._controlword = 0x0F
+    node.follow(node._now + 0.01)
+    assert node._mechanics.target == pytest.approx(0.35, abs=1e-3)
+
+
+@pytest.mark.parametrize("mode", ["profile_position", "ip", "csp", "csv", "cst"])
 def test_quick_stop_brings_each_mode_to_rest_without_power(joint, mode):
     bench = joint(mode)
     bench.enable()
@@ -232,7 +247,7 @@ def test_quick_stop_brings_each_mode_to_rest_without_power(joint, mode):
     assert bench.world.position == pytest.approx(still, abs=2e-3)
 
 
-@pytest.mark.parametrize("mode", ["profile_position", "csp", "csv", "cst"])
+@pytest.mark.parametrize("mode", ["profile_position", "ip", "csp", "csv", "cst"])
 def test_a_fault_is_left_by_an_edge_and_never_enables(joint, mode):
     bench = joint(mode)
     bench.enable()
@@ -377,7 +392,7 @@ def test_the_main_quantity_is_the_commanded_one():
         assert bench.drive.commands == (ELBOW[first],)
 
 
-MODES = ("profile_position", "csp", "csv", "cst")
+MODES = ("profile_position", "ip", "csp", "csv", "cst")
 
 
 def moving(bench):

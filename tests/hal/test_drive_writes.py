@@ -41,9 +41,11 @@ def test_what_every_drive_gets():
     }
 
 
-@pytest.mark.parametrize(("mode", "code"), [("profile_position", 1), ("csp", 8), ("csv", 9), ("cst", 10)])
+@pytest.mark.parametrize(("mode", "code"), [("profile_position", 1), ("ip", 7), ("csp", 8), ("csv", 9), ("cst", 10)])
 def test_modes(mode, code):
-    assert writes(mode=mode)["6060h:0"] == code
+    written = writes(mode=mode)
+    assert written["6060h:0"] == code
+    assert written.get("60C0h:0") == (0 if mode == "ip" else None)
 
 
 def test_homing_has_a_speed_to_the_switch_and_a_slower_one_to_the_zero():

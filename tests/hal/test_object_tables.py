@@ -33,6 +33,8 @@ DRIVE = {
     "HOMING_SPEED_ZERO": "6099h:2 uint32",
     "HOMING_ACCELERATION": "609Ah:0 uint32",
     "VELOCITY_UNIT": "60A9h:0 uint32",
+    "INTERPOLATION_SUBMODE": "60C0h:0 int16",
+    "INTERPOLATION_DATA": "60C1h:1 int32",
     "INTERPOLATION_PERIOD": "60C2h:1 uint8",
     "INTERPOLATION_INDEX": "60C2h:2 int8",
     "FOLLOWING_ERROR": "60F4h:0 int32",
@@ -102,14 +104,15 @@ def test_identifiers_and_communication_objects():
 
 
 def test_bits_of_controlword_and_statusword():
-    """CiA 402-2: the bits that all modes share, those of profile position and of homing."""
+    """CiA 402-2: the bits that all modes share, those of profile position, interpolated position and homing."""
     words = (cia402.DISABLE_VOLTAGE, cia402.QUICK_STOP, cia402.SHUTDOWN, cia402.SWITCH_ON, cia402.ENABLE_OPERATION)
     assert words == (0x00, 0x02, 0x06, 0x07, 0x0F)
     assert (cia402.FAULT_RESET, cia402.NEW_SET_POINT, cia402.CHANGE_AT_ONCE, cia402.START_HOMING) == (128, 16, 32, 16)
     assert (cia402.WARNING, cia402.REMOTE, cia402.TARGET_REACHED) == (0x0080, 0x0200, 0x0400)
     assert (cia402.SET_POINT_TAKEN, cia402.HOMING_ATTAINED, cia402.HOMING_ERROR) == (0x1000, 0x1000, 0x2000)
     assert (cia402.ABORT_QUICK_STOP, cia402.QUICK_STOP_AND_OFF, cia402.PROFILE) == (3, 2, 402)
-    assert sorted(cia402.OperationMode) == [1, 6, 8, 9, 10]
+    assert (cia402.INTERPOLATE, cia402.LINEAR) == (0x0010, 0)
+    assert sorted(cia402.OperationMode) == [1, 6, 7, 8, 9, 10]
 
 
 @pytest.mark.parametrize(

@@ -49,6 +49,15 @@ def without_defaults(text: str, *objects: str, value: str = "") -> str:
     return text
 
 
+def with_lines(text: str, section: str, **lines: str) -> str:
+    """Return an EDS file with other or more lines in a section."""
+    head, part, rest = text.partition(f"[{section}]\n")
+    assert part
+    body, gap, others = rest.partition("\n[")
+    kept = [line for line in body.splitlines() if line and line.partition("=")[0] not in lines]
+    return head + part + "\n".join([*kept, *(f"{name}={value}" for name, value in lines.items())]) + "\n" + gap + others
+
+
 DRIVE = (EDS_FOLDER / "servo_drive.eds").read_text()
 UNSTATED = ("1000", "1018sub1", "1018sub2", "1018sub3", "6502")
 
@@ -68,6 +77,23 @@ def joint(folder: Path, sheet: str, **settings: object) -> dict:
     }
 
 
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("section", "lines"),
+    [
+        ("Comments", {"Lines": "3"}),  # of which it has one
+        ("1016sub1", {"HighLimit": "65535"}),  # as if it were only a time
+        ("1018sub4", {"DefaultValue": "0x5555555"}),  # as a tool writes it
+        ("6065", {"DefaultValue": "0"}),
+    ],
+)
+def test_a_makers_file_with_what_makers_write_is_simulated(tmp_path: Path, section: str, lines: dict[str, str]) -> None:
+    (tmp_path / "odd.eds").write_text(with_lines(DRIVE, section, **lines))
+    with running(virtual(joint(tmp_path, "odd.eds"))) as (robot, _):
+        cycle_until(robot, arrives("joint_position", np.array([0.05])), np.array([0.05]))
+        assert states(robot) == {"joint": "enabled"}
+
+
 @pytest.mark.parametrize(
     ("name", "text"),
     [
@@ -76,7 +102,7 @@ def joint(folder: Path, sheet: str, **settings: object) -> dict:
         ("latin.eds", without_defaults(DRIVE, *UNSTATED).replace("VendorName=", "VendorName=Größe & Söhne ")),
         (
             "empty.eds",
-            DRIVE.replace("DefaultValue=929", "DefaultValue=").replace("[DeviceInfo]", "[DeviceInfo]\nOrderCode="),
+            DRIVE.replace("DefaultValue=993", "DefaultValue=").replace("[DeviceInfo]", "[DeviceInfo]\nOrderCode="),
         ),
     ],
 )
@@ -96,7 +122,7 @@ def test_the_identity_is_that_of_the_file_even_without_defaults(tmp_path: Path) 
 
 
 def test_the_modes_of_a_makers_drive_are_those_of_its_file(tmp_path: Path) -> None:
-    (tmp_path / "old.eds").write_text(DRIVE.replace("DefaultValue=929", "DefaultValue=0x21"))
+    (tmp_path / "old.eds").write_text(DRIVE.replace("DefaultValue=993", "DefaultValue=0x21"))
     with running(virtual(joint(tmp_path, "old.eds"))) as (robot, _):
         device = robot.health()["devices"]["joint"]
         assert "does not have the mode cyclic synchronous position" in device["text"]

@@ -8,7 +8,7 @@ import pytest
 import yaml
 from on_bench import arrives, cycle_until, running, states, virtual
 from test_bench_dbc import SENSOR, SERVO
-from test_bench_devices import DRIVE, UNSTATED, without_defaults
+from test_bench_devices import DRIVE, UNSTATED, with_lines, without_defaults
 
 from hal.config import BusConfig, load_robot
 from hal.errors import ConfigError
@@ -27,7 +27,7 @@ def folder(tmp_path: Path) -> Path:
     """Return a folder of vendors' files, one of them in a folder of its own."""
     folder = tmp_path / "vendors"
     (folder / "acme").mkdir(parents=True)
-    modes = without_defaults(DRIVE, *UNSTATED[:-1]).replace("DefaultValue=929", "DefaultValue=0x21")
+    modes = without_defaults(DRIVE, *UNSTATED[:-1]).replace("DefaultValue=993", "DefaultValue=0x21")
     (folder / "acme" / "Acme-Drive 3.EDS").write_text(modes)
     commissioned = "[DeviceComissioning]\nNodeID=9\n"
     (folder / "encoder.dcf").write_text(ENCODER + commissioned)
@@ -74,6 +74,27 @@ def test_a_drive_that_cannot_watch_the_hal_has_a_line_to_set(folder: Path, tmp_p
     assert draft.summary == "devices: 1, of them drives: 1, elements: 1; lines to set: 2."
     assert "allow_no_watchdog: true (without 1016h it goes on when the HAL is gone)" in draft.text
     assert "allow_no_watchdog: true (" not in draft_folder(folder, "arm", tmp_path, SHIPPED).text
+
+
+@pytest.mark.parametrize(
+    ("modes", "sections", "mode"),
+    [
+        ("0x3E1", (), "csp"),
+        ("0x62", (), "ip"),  # velocity, homing, interpolated position, as Schunk's modules
+        ("0x21", (), "profile_position"),
+        ("", ("607A",), "ip"),  # unstated, and no PDO can carry the other target
+    ],
+)
+def test_a_drive_is_drafted_in_a_mode_that_it_has(
+    tmp_path: Path, modes: str, sections: tuple[str, ...], mode: str
+) -> None:
+    text = with_lines(DRIVE, "6502", DefaultValue=modes)
+    for section in sections:
+        text = with_lines(text, section, PDOMapping="0")
+    (tmp_path / "files").mkdir()
+    (tmp_path / "files" / "drive.eds").write_text(text)
+    file = written(draft_folder(tmp_path / "files", "arm", tmp_path, SHIPPED), tmp_path)
+    assert load_robot(file).kinds["drive"].settings["mode"] == mode
 
 
 @pytest.mark.long

@@ -270,5 +270,5 @@ def test_without_power_the_brake_holds(driver):
 def test_settings_of_the_hardware_can_be_read(driver):
     assert driver.b.read(DRIVE, 0x608F, 1, "I") == 4096
     assert driver.b.read(DRIVE, 0x6091, 1, "I") == 29
-    assert driver.b.read(DRIVE, 0x6502, 0, "I") == 1 << 0 | 1 << 5 | 1 << 7 | 1 << 8 | 1 << 9
+    assert driver.b.read(DRIVE, 0x6502, 0, "I") == 1 << 0 | 1 << 5 | 1 << 6 | 1 << 7 | 1 << 8 | 1 << 9
     assert driver.b.read(DRIVE, 0x6077, 0, "h") == pytest.approx(20.0 * 0.008 / 29 * 10_000, abs=1)

@@ -16,7 +16,7 @@ from hal.device import Check, DeviceState
 from hal.drivers.can_device import Place
 from hal.drivers.canopen.node import HEARTBEAT, CanopenNode, PdoHandler, data_sheet
 from hal.drivers.cia402.modes import HomingRun, SetPointHandshake
-from hal.drivers.cia402.settings import MODES, OBJECTS, TARGETS, DriveSettings, DriveUnits, drive_units
+from hal.drivers.cia402.settings import MODES, OBJECTS, DriveSettings, DriveUnits, drive_units
 from hal.drivers.cia402.writes import Write, check_objects, drive_writes
 from hal.errors import CommandRefused, ConfigError, DeviceRefused
 from hal.protocols import cia301, cia402
@@ -164,8 +164,7 @@ class Cia402Drive(CanopenNode):
         self._text = ""
         self._resetting = self._quick_stopping = self._slowing = 0
         self._stopping_cycles = round(STOPPING * place.rate)
-        target = TARGETS[settings.commanded]
-        self._frames = CommandFrames(self._pdos.receives, place.node, target, str(place))
+        self._frames = CommandFrames(self._pdos.receives, place.node, settings.target, str(place))
 
     @override
     def _watch_time(self) -> float:
@@ -346,6 +345,8 @@ class Cia402Drive(CanopenNode):
         bits = 0
         if self._mode is OperationMode.PROFILE_POSITION:
             bits, target = self._handshake.step(target, self._statusword)
+        elif self._mode is OperationMode.INTERPOLATED_POSITION:
+            bits = cia402.INTERPOLATE
         self._send(cia402.ENABLE_OPERATION | bits, target, self._mode)
 
     @override

@@ -16,12 +16,13 @@ from hal.protocols.cia402 import OperationMode, VelocityUnit
 
 MODES = {
     "profile_position": OperationMode.PROFILE_POSITION,
+    "ip": OperationMode.INTERPOLATED_POSITION,
     "csp": OperationMode.CYCLIC_SYNCHRONOUS_POSITION,
     "csv": OperationMode.CYCLIC_SYNCHRONOUS_VELOCITY,
     "cst": OperationMode.CYCLIC_SYNCHRONOUS_TORQUE,
 }
 """Modes by their names in a robot file."""
-COMMANDED = {"profile_position": "position", "csp": "position", "csv": "velocity", "cst": "effort"}
+COMMANDED = {"profile_position": "position", "ip": "position", "csp": "position", "csv": "velocity", "cst": "effort"}
 TARGETS = {
     "position": cia402.TARGET_POSITION,
     "velocity": cia402.TARGET_VELOCITY,
@@ -97,8 +98,8 @@ class HomingSettings(Section):
 class DriveSettings(NodeSettings):
     """Settings of a drive."""
 
-    mode: Literal["profile_position", "csp", "csv", "cst"] = "csp"
-    """Profile position, or cyclic synchronous position, velocity or torque."""
+    mode: Literal["profile_position", "ip", "csp", "csv", "cst"] = "csp"
+    """Profile position, interpolated position, or cyclic synchronous position, velocity or torque."""
     counts_per_turn: Positive
     """Encoder counts per motor turn."""
     gear: Positive = 1.0
@@ -146,6 +147,11 @@ class DriveSettings(NodeSettings):
         return COMMANDED[self.mode]
 
     @property
+    def target(self) -> MappedObject:
+        """Object of the set-point."""
+        return cia402.INTERPOLATION_DATA if self.mode == "ip" else TARGETS[self.commanded]
+
+    @property
     def quantities(self) -> tuple[str, ...]:
         """Measured quantities, the commanded quantity first."""
         rest = (*OBJECTS, *(("temperature",) if self.temperature else ()))
@@ -165,7 +171,7 @@ class DriveSettings(NodeSettings):
             slow.append(cia402.MODE_DISPLAY)
         if slow:
             sends += self._slow(slow, len(sends) + 1)
-        receives = [cia402.CONTROLWORD, TARGETS[self.commanded]]
+        receives = [cia402.CONTROLWORD, self.target]
         if self.homing:
             receives.insert(1, cia402.MODE_OF_OPERATION)
         return PdoMap(lay_out(receives), sends)

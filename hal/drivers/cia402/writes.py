@@ -80,6 +80,7 @@ def drive_writes(
     """
     value, index = cia402.interpolation(period)
     optional = (
+        *([(cia402.INTERPOLATION_SUBMODE, cia402.LINEAR)] if settings.mode == "ip" else []),
         (cia402.INTERPOLATION_PERIOD, value),
         (cia402.INTERPOLATION_INDEX, index),
         (cia402.ABORT_CONNECTION, cia402.ABORT_QUICK_STOP),

@@ -17,8 +17,9 @@ FIRST_NODES = {402: 1, 406: 31, 404: 51, 401: 71}
 """Node ids of the devices of a profile count from here, if no file states them."""
 SIGNS = ((0x6041, 402), (0x6004, 406), (0x9130, 404), (0x7130, 404), (0x6130, 404), (0x6401, 401), (0x6403, 401))
 """An object that shows the profile of a file which does not state 1000h, the first one first."""
-MODES = ((8, "csp"), (1, "profile_position"))
-"""Modes of operation that a position can be commanded in, and their names, the preferred one first."""
+MODES = ((8, "csp", (0x607A, 0)), (7, "ip", (0x60C1, 1)), (1, "profile_position", (0x607A, 0)))
+"""Modes of operation that a position can be commanded in, names, objects of their set-points, the preferred
+one first."""
 
 INPUT_PRESETS = ((0x6401, "int16"), (0x6402, "int32"), (0x6403, "float32"))
 CELL_PRESETS = ((0x9130, "int32"), (0x6130, "float32"), (0x7130, "int16"), (0x9100, "counts32"), (0x7100, "counts16"))
@@ -122,11 +123,13 @@ def part_of(sheet: Sheet, eds: str, names: Names, node: int, moved: str, name: s
 
 
 def _mode(sheet: Sheet) -> str:
-    """Return the mode by 6502h; cyclic positions if the file does not state it."""
-    modes = sheet.number(0x6502)
-    if modes is None:
-        return MODES[0][1]
-    return next((name for mode, name in MODES if modes >> mode - 1 & 1), MODES[0][1])
+    """Return the first mode that 6502h has, if stated, and whose set-point a PDO can carry; else cyclic positions."""
+    stated = sheet.number(0x6502)
+    for mode, name, place in MODES:
+        target = sheet.dictionary.get_variable(*place)
+        if (stated is None or stated >> mode - 1 & 1) and target is not None and target.pdo_mappable:
+            return name
+    return MODES[0][1]
 
 
 def _counts(sheet: Sheet, index: int) -> int | None:

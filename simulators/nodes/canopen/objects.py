@@ -119,6 +119,10 @@ def as_maker_says(ours: dict[Key, Entry], path: Path, node: int) -> dict[Key, En
         if key not in ours:
             entries[key] = replace(entry, default=entry.default + node) if relative else entry  # type: ignore[operator]
         elif ours[key].format == entry.format:
+            if key[0] == 0x1016:  # some makers limit it to its time, but a node id stands above that
+                entry = replace(entry, low=ours[key].low, high=ours[key].high)
+            if key == (0x6065, 0) and not entry.default:  # no drive moves within a following error of 0
+                entry = replace(entry, is_stated=False)
             stated = entry.default if entry.is_stated else ours[key].default
             entries[key] = replace(entry, default=stated + node if relative else stated)  # type: ignore[operator]
     return entries

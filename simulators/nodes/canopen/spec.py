@@ -38,8 +38,8 @@ class DriveConstants:
         rated_torque: Motor rated torque [N m], a multiple of 1e-3 as object 6076h has it.
         load: `signal.element` of the wire's tension [N] or the joint's torque [N m] that the motor carries; None: no
             load is reported by 6077h.
-        modes: Modes of operation that it has (6502h): 1 profile position, 6 homing, 8, 9, 10 cyclic synchronous
-            position, velocity, torque.
+        modes: Modes of operation that it has (6502h): 1 profile position, 6 homing, 7 interpolated position, 8,
+            9, 10 cyclic synchronous position, velocity, torque.
         velocity_unit: Object 60A9h; 00B50300h is encoder increments per second, 00B44700h revolutions per minute.
         inertia: Inertia of motor, gear and load, seen at the output [kg m2], or [kg] for a wire.
         friction: Viscous friction, seen at the output [N m s/rad], or [N s/m] for a wire.
@@ -57,7 +57,7 @@ class DriveConstants:
     zero: float = 0.0
     rated_torque: float = 0.1
     load: str | None = None
-    modes: tuple[int, ...] = (1, 6, 8, 9, 10)
+    modes: tuple[int, ...] = (1, 6, 7, 8, 9, 10)
     velocity_unit: int = 0x00B50300
     inertia: float = 0.05
     friction: float = 0.5

@@ -5,12 +5,13 @@ from typing_extensions import override
 from simulators.nodes.canopen.node import GENERIC, HARDWARE, HEARTBEAT_LOST, CanopenNode
 from simulators.nodes.canopen.objects import Abort, Refused, Value
 from simulators.nodes.canopen.spec import DriveConstants, NodeSpec
-from simulators.nodes.cia402.mechanics import DriveMechanics
+from simulators.nodes.cia402.mechanics import INTERPOLATE, DriveMechanics
 from simulators.nodes.cia402.motion import (
     CYCLIC_POSITION,
     CYCLIC_TORQUE,
     CYCLIC_VELOCITY,
     HOMING,
+    INTERPOLATED_POSITION,
     PROFILE_POSITION,
 )
 from simulators.nodes.cia402.states import State, following
@@ -186,6 +187,8 @@ class ServoDrive(CanopenNode):
         elif mode == PROFILE_POSITION:
             word |= _SPECIFIC * mechanics.set_points.is_acknowledged | _REACHED * mechanics.is_reached
             word |= _DEVIATES * (self._deviates_since is not None)
+        elif mode == INTERPOLATED_POSITION and self.state is State.OPERATION_ENABLED:
+            word |= _SPECIFIC * bool(self._controlword & INTERPOLATE) | _DEVIATES * (self._deviates_since is not None)
         elif mode in _CYCLIC and self.state is State.OPERATION_ENABLED:
             word |= _SPECIFIC | _DEVIATES * (self._deviates_since is not None)
         return word

@@ -9,6 +9,7 @@ from simulators.nodes.cia402.motion import (
     CYCLIC_TORQUE,
     CYCLIC_VELOCITY,
     HOMING,
+    INTERPOLATED_POSITION,
     PROFILE_POSITION,
     Homing,
     Profile,
@@ -20,7 +21,7 @@ from simulators.nodes.rotor import Rotor
 _INT16, _INT32 = 2**15, 2**31
 _AMBIENT = 25.0
 """The surroundings have this temperature [degC]."""
-_START_HOMING = 1 << 4
+_START_HOMING = INTERPOLATE = 1 << 4
 _NEGATIVE_LIMIT, _POSITIVE_LIMIT = 1, 2
 """These are bits of the digital inputs, object 60FDh."""
 _REVOLUTION, _MINUTE = 0xB4, 0x47
@@ -122,6 +123,9 @@ class DriveMechanics:
         self.is_limited = False
         if mode == CYCLIC_POSITION:
             self._demand = self._limited(int(self._values[0x607A, 0]))
+        elif mode == INTERPOLATED_POSITION:
+            if word & INTERPOLATE:  # otherwise the data record waits
+                self._demand = self._limited(int(self._values[0x60C1, 1]))
         elif mode == PROFILE_POSITION:
             self._go(duration, word)
         elif mode == HOMING:

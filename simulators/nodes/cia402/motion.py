@@ -3,7 +3,8 @@
 import math
 from dataclasses import dataclass, field
 
-PROFILE_POSITION, HOMING, CYCLIC_POSITION, CYCLIC_VELOCITY, CYCLIC_TORQUE = 1, 6, 8, 9, 10
+PROFILE_POSITION, HOMING, INTERPOLATED_POSITION = 1, 6, 7
+CYCLIC_POSITION, CYCLIC_VELOCITY, CYCLIC_TORQUE = 8, 9, 10
 
 _NEW_SET_POINT, _AT_ONCE, _RELATIVE, _HALT = 1 << 4, 1 << 5, 1 << 6, 1 << 8
 """These are bits of the control word in profile position mode."""
