@@ -9,7 +9,7 @@ from gemuco.anomaly import neighbours
 from gemuco.anomaly.prediction import all_errors, with_bias
 from gemuco.compiled.score import Near
 from gemuco.errors import NotEnoughData
-from gemuco.normal.statistics import KEPT, LEAST, SHRINK, Normal, Scale, covariance_of
+from gemuco.normal.statistics import FOLDS, KEPT, LEAST, SHRINK, Normal, Scale, covariance_of
 from gemuco.normal.watch import NO_READING, Watch
 from gemuco.normal.windows import area
 from gemuco.schema import BodySchema
@@ -83,9 +83,13 @@ def learn_normal(
     shrink = trial.shrink(used)
     cloud = np.full((min(len(known), neighbours.MOST), schema.layout.size), np.nan)
     cloud[:, elements] = _thinned(known, neighbours.MOST)[:, elements]
-    weight = trial.weight(neighbours.neighbourhood(cloud, elements), used, shrink)
+    weight = trial.weight(known if training is not None else None, used, shrink)
     kept = np.where(signal >= -1, _thinned(complete, KEPT), np.nan).astype(np.float32)
-    near = neighbours.nearness(neighbours.neighbourhood(cloud, elements), complete) if weight else None
+    near = None
+    if weight and training is None:
+        near = _apart(complete, elements)
+    elif weight:
+        near = neighbours.nearness(neighbours.neighbourhood(cloud, elements), complete)
     normal = Normal.fit(errors, spread, false_alarm, near, weight, shrink)
     return replace(normal, watch=watch, rows=kept, cloud=cloud.astype(np.float32) if weight else normal.cloud)
 
@@ -145,6 +149,7 @@ class _Trial:
         reading = NO_READING if watch is None else watch.reading(None)
         is_judged = (BLOCKS * np.arange(len(rows)) // len(rows)) % 2 == 1
         self._first, self._spread = errors[~is_judged], spread
+        self._others, self._elements = rows[~is_judged], elements
         self._parts = _with_faults(schema, _thinned(rows[is_judged], IMITATED), elements)
         self._errors = [all_errors(schema, reading, part, errors.shape[1]) for part in self._parts]
 
@@ -152,9 +157,10 @@ class _Trial:
         """Choose the regularisation of the covariance of some errors, truth values, shape (errors,)."""
         return self._best(list(SHRINKS), [self._area(self._distances(used, shrink)) for shrink in SHRINKS])
 
-    def weight(self, near: Near, used: np.ndarray, shrink: float) -> float:
-        """Choose the weight of the distance from known samples."""
+    def weight(self, known: np.ndarray | None, used: np.ndarray, shrink: float) -> float:
+        """Choose the weight of the distance from known samples; None: from those that are not judged."""
         distances = self._distances(used, shrink)
+        near = _near(self._others if known is None else known, self._elements)
         nearness = [neighbours.nearness(near, part) for part in self._parts]
         areas = []
         for weight in WEIGHTS:
@@ -194,6 +200,21 @@ def _with_faults(schema: BodySchema, healthy: np.ndarray, elements: np.ndarray) 
         np.where(one, healthy + OFF["element"] * sign, healthy),
         np.where(whole, healthy + OFF["signal"] * sign, healthy),
     ]
+
+
+def _near(rows: np.ndarray, elements: np.ndarray) -> Near:
+    return neighbours.neighbourhood(_thinned(rows, neighbours.MOST), elements)
+
+
+def _apart(rows: np.ndarray, elements: np.ndarray) -> np.ndarray:
+    """Return the distance of every sample from the nearest of other parts of the motion, shape (n,).
+
+    The samples right before and after it are nearly the same, and say nothing of the next posture.
+    """
+    parts = np.array_split(np.arange(len(rows)), FOLDS)
+    return np.concatenate(
+        [neighbours.nearness(_near(np.delete(rows, part, axis=0), elements), rows[part]) for part in parts]
+    )
 
 
 def _thinned(rows: np.ndarray, most: int) -> np.ndarray:

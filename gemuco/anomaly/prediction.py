@@ -179,22 +179,60 @@ class Judgement:
         cls, schema: BodySchema, normal: Normal, reading: Reading, near: Near, index: np.ndarray, finite: np.ndarray,
         element: np.ndarray,
     ) -> "Judgement":  # fmt: skip
-        """Measure the normal samples that were kept as if they lacked the same elements."""
+        """Measure the normal samples that were kept as if they lacked the same elements.
+
+        The closed-form prediction may have learned from them. How much larger the errors of samples are that it did
+        not learn from is known of complete ones, and is taken for the same here.
+        """
         assert normal.scale is not None and normal.windows is not None
-        rows, mean = normal.rows.astype(float), np.full(len(normal.mean), np.nan)
-        rows[:, : len(finite)][:, ~finite] = np.nan
+        mean = np.full(len(normal.mean), np.nan)
         if not len(index):
             nothing = Judged(reading, near, mean, *_NO_PRECISION, Scale(0.0, 1.0), element)
             return cls(nothing, float("nan"), False)
-        errors = all_errors(schema, reading, rows, len(mean))[:, index]
-        spread = np.concatenate([schema.scaler.std[schema.out_index], np.ones(len(mean))])[index]
-        mean[index], precision = errors.mean(axis=0), np.linalg.inv(covariance_of(errors, spread, normal.shrink))
-        away = errors - mean[index]
-        distances = np.sqrt(np.einsum("ij,jk,ik->i", away, precision, away).clip(min=0.0))
+        rows, usual = normal.rows.astype(float), np.flatnonzero(np.isfinite(normal.mean))
+        whole = NO_READING if normal.watch is None else normal.watch.reading(None)
+        all_near = _near(normal, np.ones(len(finite), bool))
+        known = _Measured.of(schema, normal, whole, all_near, usual, rows, np.ones(len(mean)))
+        growth = np.ones(len(mean))
+        growth[usual] = np.sqrt(np.maximum(np.diag(normal.covariance)[usual] / np.diag(known.covariance), 1.0))
+        rows[:, : len(finite)][:, ~finite] = np.nan
+        own = _Measured.of(schema, normal, reading, near, index, rows, growth)
+        mean[index] = own.mean
+        scale = Scale(
+            own.scale.mean + max(normal.scale.mean - known.scale.mean, 0.0),
+            max(own.scale.std, normal.scale.std),
+            own.scale.near_mean + max(normal.scale.near_mean - known.scale.near_mean, 0.0),
+            max(own.scale.near_std, normal.scale.near_std),
+            own.scale.weight,
+        )
+        judged = Judged(reading, near, mean, index, np.linalg.inv(own.covariance), scale, element)
+        return cls(judged, float(scale.distance(normal.windows.limits[0])), False)
+
+
+class _Measured(NamedTuple):
+    """Statistics of the errors of samples that lack the same elements."""
+
+    mean: np.ndarray
+    covariance: np.ndarray
+    scale: Scale
+
+    @classmethod
+    def of(
+        cls, schema: BodySchema, normal: Normal, reading: Reading, near: Near, index: np.ndarray, rows: np.ndarray,
+        growth: np.ndarray,
+    ) -> "_Measured":  # fmt: skip
+        """Measure the errors `index` of samples, shape (n, size + bias_size), all of them times `growth`."""
+        assert normal.scale is not None
+        errors = all_errors(schema, reading, rows, len(normal.mean))[:, index]
+        spread = np.concatenate([schema.scaler.std[schema.out_index], np.ones(len(normal.mean))])[index]
+        mean = errors.mean(axis=0)
+        away = (errors - mean) * growth[index]
+        covariance = covariance_of(away, spread, normal.shrink)
+        distances = np.sqrt(np.einsum("ij,jk,ik->i", away, np.linalg.inv(covariance), away).clip(min=0.0))
         weight = normal.scale.weight if len(near.elements) else 0.0
-        scale = Scale.of(distances, nearness(near, rows) if weight else np.ones(len(rows)), weight)
-        threshold = float(scale.distance(normal.windows.limits[0]))
-        return cls(Judged(reading, near, mean, index, precision, scale, element), threshold, False)
+        return cls(
+            mean, covariance, Scale.of(distances, nearness(near, rows) if weight else np.ones(len(rows)), weight)
+        )
 
 
 def _usable(schema: BodySchema, normal: Normal, reading: Reading, finite: np.ndarray) -> np.ndarray:

@@ -88,6 +88,29 @@ def test_missing_elements_are_judged_by_normal_samples_that_lack_them(walking, a
     assert area(ill, well) > 0.95
 
 
+def rests(arm, count, seed):
+    """Return samples of a body that rests for 17 samples in every posture, as between test poses."""
+    random = np.random.default_rng(seed)
+    theta, tension = random.uniform([-0.6, 0.3], [0.6, 1.5], (count, 2)), random.uniform(10.0, 90.0, (count, 5))
+    theta, tension = np.repeat(theta, 17, axis=0), np.repeat(tension, 17, axis=0)
+    noise = random.normal(0.0, 1.0, (17 * count, 12)) * np.r_[np.full(2, 0.002), np.full(5, 0.3), np.full(5, 2e-4)]
+    return np.concatenate([theta, tension, arm.length(theta, tension)], axis=1) + noise
+
+
+@pytest.mark.parametrize("postures", [6, 20, 60])
+def test_a_new_posture_is_no_anomaly_after_few_postures(poor, arm, postures):
+    """The samples before and after one are nearly equal to it, and say nothing of the next posture."""
+    normal = learn_normal(poor, rests(arm, postures, 8))
+    learned = poor.with_normal(normal)
+    other = rests(arm, 60, 9)
+    lost = other.copy()
+    lost[:, 0] = np.nan
+    for rows in (other, lost):
+        found = scores(learned, learned.scaler.normalise(rows))
+        threshold = judgements(learned)(np.isfinite(rows[0])).threshold
+        assert np.mean(found > threshold) <= normal.bound
+
+
 def test_too_few_samples_are_an_error_and_not_a_guess(poor, arm):
     with pytest.raises(NotEnoughData, match="at least 30 complete samples; there are 20"):
         learn_normal(poor, walk(arm, 20, 7))
