@@ -23,6 +23,9 @@ SYSTEMATIC = 0.1
 """A mean over a window varies by at least this share of the variance of one sample: under another p, or in another part
 of the motion, even a good model is off by a part of its noise."""
 
+PARTS = 5
+"""Shifts of the windows in each of this number of parts of the motion are measured by the windows in the others."""
+
 FEWEST = 8.0
 """Fewer independent samples than this count as this many; the tolerance has no finite value below 5."""
 
@@ -79,6 +82,20 @@ def correlation_time(values: np.ndarray) -> float:
     return time
 
 
+def _shifts(moved: np.ndarray) -> np.ndarray:
+    """Return the mean squared shift of every window, as a multiple of that of windows in other parts of the motion.
+
+    Args:
+        moved: Mean errors over windows, oldest first, shape (n, errors).
+    """
+    shifts = []
+    for part in np.array_split(np.arange(len(moved)), PARTS):
+        others = np.delete(moved, part, axis=0)
+        center, spread = others.mean(axis=0), others.var(axis=0) + 1e-9
+        shifts.append(((moved[part] - center) ** 2 / spread).mean(axis=1))
+    return np.concatenate(shifts)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Windows:
     """Limits of windows of n samples of a healthy body.
@@ -115,14 +132,13 @@ class Windows:
         count = 1
         while count <= max(1, min(LONGEST, len(deviations) // DISJOINT)):
             independent = len(deviations) / max(time, count)
-            moved = means(errors, count) ** 2
-            spread = moved.mean(axis=0) + 1e-9
+            moved = means(errors, count)
             share = false_alarm if count == 1 else false_alarm / 2.0
             sizes.append(count)
-            variance.append(np.maximum(spread, SYSTEMATIC))
+            variance.append(np.maximum((moved**2).mean(axis=0), SYSTEMATIC))
             for values, least, known in (
                 (means(deviations, count), math.sqrt(SYSTEMATIC) * float(deviations.std()), limits),
-                (np.log((moved / spread).mean(axis=1) + 1e-12), 1e-6, shifts),
+                (np.log(_shifts(moved) + 1e-12), 1e-6, shifts),
             ):
                 known.append((limit(values, share, independent, least), max(float(values.std()), least)))
             count *= 2
