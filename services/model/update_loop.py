@@ -107,6 +107,8 @@ class OnlineUpdate:
         """The learner's model when it began, or when it last replaced the one in use."""
         self._since_change: deque[tuple[float, Values]] = deque(maxlen=config.window)
         """Times [s] and samples since the model changed."""
+        self._known = living.schema.normal
+        """What was normal before these samples; what was learned from some of them is no knowledge beside them."""
         self._last: np.ndarray | None = None
         self._awaits_first = False
         self._taken_at = self._swapped_at = -math.inf
@@ -131,14 +133,15 @@ class OnlineUpdate:
                 if self._learner is not None and before is not None:
                     self._awaits_normal |= before.weights is not self._living.schema.weights
                 self._learner, self._awaits_first = None, False
-                self._since_change.clear()
+                self._begin()
 
     def rollback(self) -> int:
         """Stop, and restore the model before adaption began; return the model's version."""
         with self._lock:
             self._learner, self._awaits_first, self._awaits_normal = None, False, False
-            self._since_change.clear()
-            return self._living.rollback()
+            version = self._living.rollback()
+            self._begin()
+            return version
 
     def learn_normal(self) -> int:
         """Learn the normal errors from the samples since the model last changed; return the number of samples.
@@ -155,13 +158,19 @@ class OnlineUpdate:
             while self._since_change and self._since_change[-1][0] >= since:
                 self._since_change.pop()
 
+    def _begin(self) -> None:
+        """Collect samples anew, because the model changed."""
+        self._since_change.clear()
+        self._known = self._living.schema.normal
+
     def _learn_normal(self) -> int:
         samples = [sample for _, sample in self._since_change]
         schema = self._living.schema
         try:
             if not samples:
                 raise NotEnoughData("No complete sample of the moving robot came since the model last changed.")
-            normal = learn_normal(schema, np.array([schema.layout.join_one(sample) for sample in samples]))
+            rows = np.array([schema.layout.join_one(sample) for sample in samples])
+            normal = learn_normal(schema.with_normal(self._known), rows)
         except NotEnoughData as error:
             raise NotEnoughData(f"{error} Let the robot move for a while with the update stopped.") from None
         schema = schema.with_normal(normal)
@@ -260,7 +269,7 @@ class OnlineUpdate:
             self._used = learner.schema
             self._living.swap(learner.schema)
             self._swapped_at = self._clock.monotonic()
-            self._since_change.clear()
+            self._begin()
 
 
 def _is_complete(sample: Mapping[str, np.ndarray]) -> bool:

@@ -154,6 +154,20 @@ def test_the_normal_is_learned_from_samples_since_the_model_changed() -> None:
         bench.update.learn_normal()
 
 
+def test_normal_errors_that_are_learned_twice_from_the_same_samples_are_the_same() -> None:
+    """What the first time left behind is no knowledge beside these samples: they would seem to be predicted by it."""
+    bench = Bench(window=200)
+    bench.engaged = True
+    for index in range(120):
+        bench.turn(index)
+    learned = []
+    for _ in range(2):
+        assert bench.update.learn_normal() == 120
+        learned.append(bench.living.schema.normal)
+    assert learned[1].watch.count == learned[0].watch.count
+    assert learned[1].threshold == learned[0].threshold
+
+
 @pytest.mark.long
 def test_the_interval_is_between_samples_that_are_learned_from() -> None:
     bench = Bench(window=200, interval=0.4)
