@@ -23,10 +23,12 @@ POSES = 6
 """The model's error is measured at this many test poses before and after the update, which does not use them."""
 LEARNING_POSES = 8
 LEARNING_TIME = 2.0
+MOVING_TIME = 1.2
+"""The arm sets off for its next pose before it rests: its samples differ more."""
 LEARNED = 80
 """The online update takes this many samples before it is stopped; eight poses give about a hundred samples."""
-NORMAL = 100
-"""The statistics of normal errors are learned from this many samples; six test poses give about 150."""
+NORMAL = 200
+"""The statistics of normal errors are learned from this many samples; six test poses give about 100."""
 MOST_POSES = 24
 """At most this many further poses are used to collect samples, because a machine may be slow."""
 CALM_TIME = 2.0
@@ -139,7 +141,7 @@ class Story:
         start = self._timeline.now()
         self._client.adapt(True)
         for _ in range(LEARNING_POSES):
-            self._go(self._pose(), LEARNING_TIME)
+            self._go(self._pose(), MOVING_TIME)
         window = self._gather(LEARNED)
         self._client.adapt(False)
         self.marks.learning = (start, self._timeline.now())
@@ -228,10 +230,10 @@ class Story:
         verdicts, end = self._distrusted_of_muscle(), self._timeline.now()
         # Without the distrusted length the score is of the other muscles.
         self.marks.blamed = MUSCLE if verdicts else self._blamed_muscle(early)
-        after = float(np.nanmedian(self._timeline.between("score", self.marks.alarm, end)))
+        peak = float(np.nanmax(self._timeline.between("score", start, self.marks.alarm + 1.0)))
         limit = float(np.nanmedian(self._timeline.between("threshold", start, end)))
         figures = (
-            f"anomaly score {score:.1f} before the cut, {after:.1f} after it, threshold {limit:.1f}",
+            f"anomaly score {score:.1f} before the cut, then up to {peak:.1f}, threshold {limit:.1f}",
             f"reported after {1e3 * (self.marks.alarm - start):.0f} ms; blamed element {element or 'none'}",
             f"muscle with the largest part in the score: {self._blamed_muscle(early) or 'none'}",
             f"before anything was wrong an anomaly was reported {alarms:.1%} of the time",
@@ -259,7 +261,7 @@ class Story:
         for _ in range(MOST_POSES):
             if self._window() >= samples:
                 break
-            self._go(self._pose(), LEARNING_TIME)
+            self._go(self._pose(), MOVING_TIME)
         return self._window()
 
     def _window(self) -> int:
