@@ -1,6 +1,7 @@
 """The verbs for work on the hardware: scan, doctor, calibrate, can dump."""
 
 import math
+import re
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,8 +13,13 @@ calibrate = typer.Typer(no_args_is_help=True, help="Measure and store zero, dire
 can = typer.Typer(no_args_is_help=True, help="Show CAN buses.")
 
 MaybeRobot = Annotated[
-    str | None, typer.Argument(metavar="[ROBOT]", help="A robot file, or the name of one. Otherwise give an interface.")
+    str | None,
+    typer.Argument(
+        metavar="[ROBOT]", help="A robot file or the name of one; or a channel, such as can0 or hub:CHANNEL."
+    ),
 ]
+CHANNEL = re.compile(r"(?:s?l?v?can)\d+|(?P<interface>[a-z]+):(?P<channel>[^\\].*)")
+"""A channel in place of a robot, as `gemuco init --scan` has it; `C:\\` begins a path."""
 Interface = Annotated[
     str | None, typer.Option(help="Instead of a robot: an interface of python-can, such as socketcan.")
 ]
@@ -156,7 +162,7 @@ def dump(
 
 
 def _buses(robot: str | None, interface: str | None, channel: str | None, bitrate: int) -> tuple[Any, dict[str, Any]]:
-    """Return the robot file and its buses; without a robot, None and the bus of the interface."""
+    """Return the robot file and its buses; without a robot, None and the bus of the interface or channel."""
     from hal.config import BusConfig
     from services.errors import BadArguments
 
@@ -164,7 +170,10 @@ def _buses(robot: str | None, interface: str | None, channel: str | None, bitrat
         raise BadArguments(
             "Name either a robot, or --interface and --channel (`--interface socketcan --channel can0`)."
         )
-    if robot is not None:
+    named = None if robot is None or Path(robot).exists() else CHANNEL.fullmatch(robot)
+    if named is not None:
+        interface, channel = named["interface"] or "socketcan", named["channel"] or robot
+    elif robot is not None:
         config = load(robot)
         if not config.buses:
             raise BadArguments(f"Robot '{config.robot}' has no bus. `gemuco top` shows what its HAL reads.")

@@ -64,6 +64,8 @@ def init(
         raise BadArguments("Give a URDF or MJCF file, a folder with EDS, DCF and DBC files, --scan can0, or --ros2.")
     if tip is not None and (scan is not None or (source is not None and source.is_dir())):
         raise BadArguments("--tip is for a URDF or MJCF file; devices have no chain of links.")
+    if source is not None and source.suffix in (".yaml", ".yml"):
+        raise BadArguments(f"'{source}' is not a URDF or MJCF file. A robot file is ready: `gemuco demo {source}`.")
     file = _new_file(out or Path(f"{_stem(source, scan)}.yaml"))
     if scan is not None or (source is not None and source.is_dir()):
         _of_devices(source, scan, bitrate, name, file)

@@ -120,9 +120,10 @@ def test_scan_tells_who_is_there_and_who_is_not(stage: Stage) -> None:
 
 def test_scan_of_an_interface_needs_no_robot(stage: Stage) -> None:
     channel = stage.config.buses["can0"].channel
-    report = stage.gemuco("scan", "--interface", "virtual", "--channel", channel, "--seconds", "0.2", robot=False)
-    assert report.exit_code == 0
-    assert "encoder (406)" in report.output
+    for where in (("--interface", "virtual", "--channel", channel), (f"virtual:{channel}",)):
+        report = stage.gemuco("scan", *where, "--seconds", "0.2", robot=False)
+        assert report.exit_code == 0
+        assert "encoder (406)" in report.output
 
 
 def test_scan_sends_no_requests_while_the_hal_runs(stage: Stage) -> None:
@@ -143,6 +144,7 @@ def test_scan_sends_no_requests_while_the_hal_runs(stage: Stage) -> None:
         (("scan", "--interface", "telepathy", "--channel", "x"), "not known to python-can. Known:"),
         (("scan", "no_such_robot"), "There is no robot 'no_such_robot'"),
         (("can", "dump", "--interface", "hub", "--channel", "nobody_serves_this"), "does not open"),
+        (("can", "dump", "hub:nobody_serves_this"), "does not open"),
         (("can", "dump", "musashi_arm", "--bus", "can7"), "There is no bus 'can7'. Known: can0, can1."),
         (("calibrate", "cell", "musashi_arm", "knee"), "'knee' is neither a device nor an element of one"),
     ],

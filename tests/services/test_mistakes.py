@@ -101,6 +101,7 @@ WORDS = [
     (("describe", "none.csv"), "There is no file or folder 'none.csv'. Give a table"),
     (("scan",), "Name either a robot, or --interface and --channel"),
     (("scan", "--interface", "socketcan"), "needs a --channel, such as can0."),
+    (("init", "arm.yaml"), "is not a URDF or MJCF file. A robot file is ready: `gemuco demo arm.yaml`."),
     (("scan", "--interface", "sockectan", "--channel", "can0"), "is not known to python-can. Known: "),
     (("calibrate", "joint", "good.yaml", "elbow"), "Devices: elbow_drive, wrist_drive."),
     (("calibrate", "cell", "good.yaml", "elbow_drive"), "Is it `gemuco calibrate joint`?"),
