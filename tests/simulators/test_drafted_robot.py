@@ -135,6 +135,14 @@ def test_a_drive_keeps_off_the_identifiers_of_a_dbc_file(tmp_path: Path) -> None
         assert set(states(robot)) == {"drive", "unit"}
 
 
+def test_a_node_id_that_a_dcf_file_states_is_kept_beside_a_dbc_file(folder: Path, tmp_path: Path) -> None:
+    (folder / "unit.dbc").write_text(
+        'VERSION ""\nBU_: X\nBO_ 393 Out: 8 X\n SG_ Pull : 0|16@1+ (1,0) [0|0] "V" X\n'  # 189h, as node 9 sends
+    )
+    robot = load_robot(written(draft_folder(folder, "arm", tmp_path, SHIPPED), tmp_path))
+    assert robot.devices["encoder"].node == 9
+
+
 def test_contradictory_messages_are_left_out_and_said(tmp_path: Path) -> None:
     (tmp_path / "files").mkdir()
     (tmp_path / "files" / "unit.dbc").write_text(

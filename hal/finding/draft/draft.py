@@ -116,12 +116,11 @@ def draft_folder(source: Path, name: str, folder: Path, shipped: Path) -> Draft:
     work = _Draughtsman(folder, shipped)
     known = list(_sheets(files, work.notes))
     work.has_encoders = any(sheet.profile == 406 for sheet in known)
-    for path in files:  # first, because their identifiers are not free to choose
+    _add_sheets(work, [sheet for sheet in known if sheet.node])
+    for path in files:  # before those without a node id, because the identifiers of a DBC file are not free to choose
         if path.suffix.lower() == ".dbc":
             _add_dbc(work, path, None)
-    for sheet in known:
-        node = work.node(sheet.node, FIRST_NODES[sheet.profile])
-        work.parts.append(sheets.part_of(sheet, work.path_of(sheet.path), work.names, node, work.moved))
+    _add_sheets(work, [sheet for sheet in known if not sheet.node])
     if not work.parts:
         raise ConfigError(f"None of {len(files)} files in '{source}' can be used. {' '.join(work.notes)}")
     work.add_stand_in()
@@ -200,6 +199,12 @@ def _sheets(files: Sequence[Path], notes: list[str]) -> Iterator[Sheet]:
             notes.append(
                 f"Left out: '{path.name}' has device profile {sheet.profile}; there are drivers for {drivers}."
             )
+
+
+def _add_sheets(work: _Draughtsman, known: Sequence[Sheet]) -> None:
+    for sheet in known:
+        node = work.node(sheet.node, FIRST_NODES[sheet.profile])
+        work.parts.append(sheets.part_of(sheet, work.path_of(sheet.path), work.names, node, work.moved))
 
 
 def _add_dbc(work: _Draughtsman, path: Path, result: Scan | None) -> None:
