@@ -12,6 +12,12 @@ from hal.line import SERIAL
 from services.model.artifacts import SHIPPED
 
 
+def bus_of(channel: str, bitrate: int) -> BusConfig:
+    """Return the bus of a channel of SocketCAN, or of `INTERFACE:CHANNEL`, with a bit rate [bit/s]."""
+    interface, colon, place = channel.rpartition(":")
+    return BusConfig(interface=interface if colon else "socketcan", channel=place, bitrate=bitrate)
+
+
 def draft_devices(source: Path | None, channel: str | None, bitrate: int, name: str | None, file: Path) -> Draft:
     """Return a robot file of the devices in a folder of vendors' files, or on a bus.
 
@@ -31,8 +37,8 @@ def draft_devices(source: Path | None, channel: str | None, bitrate: int, name: 
     if channel is None:
         assert source is not None
         return draft_folder(source, robot, file.parent, SHIPPED)
-    interface, colon, place = channel.rpartition(":")
-    bus = BusConfig(interface=interface if colon else "socketcan", channel=place, bitrate=bitrate)
+    bus = bus_of(channel, bitrate)
+    place = bus.channel
     label = re.sub(r"\W+", "_", Path(place).name) or "can0"
     if bus.interface in SERIAL:
         result = scan_line(label, bus)

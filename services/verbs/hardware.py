@@ -18,7 +18,7 @@ MaybeRobot = Annotated[
         metavar="[ROBOT]", help="A robot file or the name of one; or a channel, such as can0 or hub:CHANNEL."
     ),
 ]
-CHANNEL = re.compile(r"(?:s?l?v?can)\d+|(?P<interface>[a-z]+):(?P<channel>[^\\].*)")
+CHANNEL = re.compile(r"(?:sl|v)?can\d+|[a-z][a-z0-9_]*:[^\\].*")
 """A channel in place of a robot, as `gemuco init --scan` has it; `C:\\` begins a path."""
 Interface = Annotated[
     str | None, typer.Option(help="Instead of a robot: an interface of python-can, such as socketcan.")
@@ -168,12 +168,14 @@ def _buses(robot: str | None, interface: str | None, channel: str | None, bitrat
 
     if (robot is None) == (interface is None):
         raise BadArguments(
-            "Name either a robot, or --interface and --channel (`--interface socketcan --channel can0`)."
+            "Name either a robot, or --interface and --channel (`--interface socketcan --channel can0`), or can0 alone."
         )
-    named = None if robot is None or Path(robot).exists() else CHANNEL.fullmatch(robot)
-    if named is not None:
-        interface, channel = named["interface"] or "socketcan", named["channel"] or robot
-    elif robot is not None:
+    if robot is not None and not Path(robot).exists() and CHANNEL.fullmatch(robot):
+        from services.hardware.draft import bus_of
+
+        bus = bus_of(robot, bitrate)
+        return None, {Path(str(bus.channel)).name: bus}
+    if robot is not None:
         config = load(robot)
         if not config.buses:
             raise BadArguments(f"Robot '{config.robot}' has no bus. `gemuco top` shows what its HAL reads.")
