@@ -190,9 +190,7 @@ class Judgement:
             nothing = Judged(reading, near, mean, *_NO_PRECISION, Scale(0.0, 1.0), element)
             return cls(nothing, float("nan"), False)
         rows, usual = normal.rows.astype(float), np.flatnonzero(np.isfinite(normal.mean))
-        whole = NO_READING if normal.watch is None else normal.watch.reading(None)
-        all_near = _near(normal, np.ones(len(finite), bool))
-        known = _Measured.of(schema, normal, whole, all_near, usual, rows, np.ones(len(mean)))
+        known = schema.derived(_complete)
         growth = np.ones(len(mean))
         growth[usual] = np.sqrt(np.maximum(np.diag(normal.covariance)[usual] / np.diag(known.covariance), 1.0))
         rows[:, : len(finite)][:, ~finite] = np.nan
@@ -210,7 +208,13 @@ class Judgement:
 
 
 class _Measured(NamedTuple):
-    """Statistics of the errors of samples that lack the same elements."""
+    """Statistics of the errors of samples that lack the same elements.
+
+    Attributes:
+        mean: Mean errors [unit of x_out, then standard deviations], shape (n,).
+        covariance: Their covariance, shape (n, n).
+        scale: Logarithms of the distances of the samples.
+    """
 
     mean: np.ndarray
     covariance: np.ndarray
@@ -233,6 +237,15 @@ class _Measured(NamedTuple):
         return cls(
             mean, covariance, Scale.of(distances, nearness(near, rows) if weight else np.ones(len(rows)), weight)
         )
+
+
+def _complete(schema: BodySchema) -> _Measured:
+    """Return the statistics of the kept normal samples with all their elements."""
+    normal = schema.normal
+    assert normal is not None
+    reading = NO_READING if normal.watch is None else normal.watch.reading(None)
+    near, usual = _near(normal, np.ones(schema.layout.size, bool)), np.flatnonzero(np.isfinite(normal.mean))
+    return _Measured.of(schema, normal, reading, near, usual, normal.rows.astype(float), np.ones(len(normal.mean)))
 
 
 def _usable(schema: BodySchema, normal: Normal, reading: Reading, finite: np.ndarray) -> np.ndarray:
