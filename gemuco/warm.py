@@ -1,11 +1,12 @@
 """Compilation of all code before the first tick of a loop.
 
-    python -m gemuco.warm
+    python -m gemuco.warm [--without-p]
 
 On a new machine this takes a minute. The compiled code is saved (`gemuco.compiled.jit`) and later loaded within two
 seconds. To compile everything, all functions that a service uses are called once with a small body.
 """
 
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from itertools import chain, pairwise
@@ -33,7 +34,7 @@ from gemuco.signals import Layout, Signal
 SIGNALS = {"position": (1, "rad"), "tension": (2, "N"), "length": (2, "m"), "hidden": (1, "m")}
 MASKS = (frozenset({"position", "tension"}), frozenset({"tension", "length", "hidden"}))
 OUTPUTS = ("position", "tension", "length")
-STEPS = {"running": 9, "learning": 2}
+STEPS = {"running": 8, "p": 1, "learning": 2}
 
 
 def body(outputs: tuple[str, ...] = OUTPUTS) -> BodySchema:
@@ -64,8 +65,8 @@ def body(outputs: tuple[str, ...] = OUTPUTS) -> BodySchema:
     )
 
 
-def running(schema: BodySchema) -> Iterator[str]:
-    """Call all functions that a service uses; yield the name of each step before it."""
+def running(schema: BodySchema, has_p: bool) -> Iterator[str]:
+    """Call all functions that a service uses, of a body with p or without; yield the name of each step before it."""
     schema = sure(schema)
     whole = {name: np.zeros(size) for name, (size, _) in SIGNALS.items()}
     yield "samples"
@@ -82,9 +83,10 @@ def running(schema: BodySchema) -> Iterator[str]:
     terms = (Match("position"), TorqueBalance(np.sin, 1.0, "position", "tension", "length"))
     yield "control"
     Controller(schema, terms, "tension").solve(target, whole)
-    yield "recognition of p"
-    for method in ("ekf", "gauss_newton"):
-        follow(schema, whole, UpdateConfig(what="bias", bias_method=method))
+    if has_p:
+        yield "recognition of p"
+        for method in ("ekf", "gauss_newton"):
+            follow(schema, whole, UpdateConfig(what="bias", bias_method=method))
     for optimiser in ("adam", "sgd"):
         yield f"update of W and p by {optimiser}"
         follow(schema, whole, UpdateConfig(what="both", optimiser=optimiser, minimum=1, batch=4, repeats=1))
@@ -127,20 +129,22 @@ def learning(schema: BodySchema) -> Iterator[str]:
     Judge(schema.layout.names, (errors,), Thresholds()).measure(np.eye(len(SIGNALS), dtype=bool))
 
 
-def warm(report: Callable[[float, str], None] | None = None, is_service: bool = False) -> float:
+def warm(report: Callable[[float, str], None] | None = None, is_service: bool = False, has_p: bool = True) -> float:
     """Compile everything.
 
     Args:
         report: Called with the finished share, 0 to 1, and the name of the next step.
         is_service: Whether to leave out code that a service never uses and to unload the compiler, to save memory.
+        has_p: Whether to compile the recognition of p, a quarter of all.
 
     Returns:
         Duration [s].
     """
     start, schema = time.monotonic(), body()
-    for index, step in enumerate(chain(running(schema), () if is_service else learning(schema))):
+    count = STEPS["running"] + STEPS["p"] * has_p + STEPS["learning"] * (not is_service)
+    for index, step in enumerate(chain(running(schema, has_p), () if is_service else learning(schema))):
         if report is not None:
-            report(index / (STEPS["running"] if is_service else sum(STEPS.values())), step)
+            report(index / count, step)
     if is_service:
         let_compiler_go()
     return time.monotonic() - start
@@ -158,7 +162,7 @@ def main() -> None:
             if not is_terminal:
                 print(f"Compiling, {share:.0%}: {step}", flush=True)
 
-        duration = warm(show)
+        duration = warm(show, has_p="--without-p" not in sys.argv[1:])
     print(f"Compiled code is ready after {duration:.1f} s, {f'saved in {FOLDER}' if FOLDER else 'not saved'}.")
 
 

@@ -77,11 +77,11 @@ def determine(
     alive, notes = _alive(dataset)
     judge = Judge(alive.layout.names, (), thresholds)
     first, most = (FIRST_SPLITS, MOST_SPLITS) if splits is None else (splits, splits)
-    judge.add(*train_masks(alive, config, first, _share(progress, 0, most, first), drafts))
+    judge.add(*train_masks(alive, config, first, _share(progress, 0, first), drafts))
     for split in range(first, most):
         if _is_decided(judge):
             break
-        judge.add(train_split(alive, config, split, _share(progress, split, most), drafts))
+        judge.add(train_split(alive, config, split, _share(progress, split, 1), drafts))
     if progress is not None:
         progress(1.0, "structure")
     if len(alive.layout.names) <= LISTED:
@@ -196,9 +196,12 @@ def _alive(dataset: Dataset) -> tuple[Dataset, list[str]]:
     return dataset if len(alive) == len(layout.names) else dataset.with_layout(layout.subset(alive)), notes
 
 
-def _share(progress: Progress | None, split: int, most: int, count: int = 1) -> Progress | None:
-    """Return the progress of `count` splits from `split` as a share of all."""
-    return None if progress is None else lambda done, text: progress((split + count * done) / most, text)
+def _share(progress: Progress | None, split: int, count: int) -> Progress | None:
+    """Return the progress of `count` splits from `split`, as a share of all if one more split may follow."""
+    if progress is None:
+        return None
+    begin, end = (done / (done + 1.0) for done in (split, split + count))
+    return lambda done, text: progress(begin + (end - begin) * done, text)
 
 
 def _is_decided(judge: Judge) -> bool:

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 
 from rich.console import Console
@@ -37,6 +38,8 @@ from services.process.supervisor import Supervisor, gemuco_command
 from services.runtime import services_here
 from services.show import progress
 
+AFTER_SIMULATOR = {"hal", "vision"}
+"""These processes look for the simulator's buses when they start."""
 READY_WITHIN = 180.0
 """A process must be ready within this time [s], also on a busy machine."""
 
@@ -62,7 +65,7 @@ def play(robot: RobotConfig, path: Path, seed: int, out: Path, with_page: bool =
             console.print(f"Page: {link}  It shows the robot as soon as its processes run.", soft_wrap=True)
         make_model(robot, console)
         with progress("compiling") as show:  # otherwise each process would wait for it
-            warm(show)
+            warm(show, has_p=trainer.has_p(robot))
         with Supervisor(out, at_checks=True) as supervisor:
             with running(robot, path, seed, target, out, supervisor, console) as cast:
                 perform(cast, seed, picture, list(supervisor.children), link)
@@ -243,7 +246,7 @@ def make_model(robot: RobotConfig, console: Console) -> None:
         console.print(f"Using the model in {folder}.")
         return
     console.print("No model yet: the body schema is learned from random motion of the designer's model.")
-    with compiling() as compiler:
+    with compiling(trainer.has_p(robot)) as compiler:
         with progress("collecting") as show:
             collection = collector.collect_direct(robot, None, 0, progress=show)
         console.print(f"{len(collection.dataset)} samples, {collection.speed:.0f} times faster than real time.")
@@ -256,13 +259,15 @@ def make_model(robot: RobotConfig, console: Console) -> None:
 
 
 @contextmanager
-def compiling() -> Iterator[subprocess.Popen[bytes]]:
-    """Compile, on a new machine for a minute, in a process beside the block; it ends with the block.
+def compiling(has_p: bool) -> Iterator[subprocess.Popen[bytes]]:
+    """Compile, on a new machine for up to a minute, in a process beside the block; it ends with the block.
 
     What it cannot compile is compiled later, so its output is not shown, nor how it ends after Ctrl-C.
     """
     process = subprocess.Popen(
-        [sys.executable, "-m", "gemuco.warm"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        [sys.executable, "-m", "gemuco.warm", *([] if has_p else ["--without-p"])],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
     )
     try:
         yield process
@@ -281,7 +286,9 @@ def start(
     client: Client,
     console: Console,
 ) -> None:
-    """Start the simulator, then the others at once; the last one, when all are ready, prints estimates of `target`.
+    """Start the processes at once, but those that need its buses after the simulator; then a client.
+
+    The client prints estimates of `target`.
 
     Raises:
         ChildDied: A process ended.
@@ -294,10 +301,13 @@ def start(
         "model": ("serve", str(path)),
         "recorder": ("record", str(path), str(recording)),
     }
-    for name, command in commands.items():
-        supervisor.start(name, gemuco_command(*command))
-        if name == "simulator":  # the others look for its buses
-            await_ready(name, supervisor, client, console)
+    for name in commands:
+        if name not in AFTER_SIMULATOR:
+            supervisor.start(name, gemuco_command(*commands[name]))
+    import_module("services.learning.plots")  # matplotlib takes two seconds, in which the processes start
+    await_ready("simulator", supervisor, client, console)
+    for name in AFTER_SIMULATOR & commands.keys():
+        supervisor.start(name, gemuco_command(*commands[name]))
     for name in commands:
         await_ready(name, supervisor, client, console)
     supervisor.start("client", gemuco_command("query", robot.robot, "estimate", target, "--watch"))

@@ -26,6 +26,9 @@ MARGIN = 0.05
 """A sample may exceed its limits by this share of their range."""
 STARVED = 30.0
 """Collecting stops after this robot time [s] without a usable sample."""
+CYCLES = 10
+"""Without a bus the robot has at most this number of cycles per sample: more of them change the samples by their noise
+only, and cost time."""
 BUS = "bus"
 """Data recorded on a bus have this condition if neither the robot file nor the request names a condition."""
 
@@ -104,13 +107,18 @@ def collect_direct(
         def report(share: float, text: str, index: int = index, condition: str | None = condition) -> None:
             progress((index + share) / len(conditions), text if condition is None else f"{condition}: {text}")
 
-        with simulator.direct(robot, variant, seed, condition) as body:
+        with simulator.direct(_slowed(robot, CYCLES * config.rate), variant, seed, condition) as body:
             place = DirectPlayground(body, config.rate)
             parts.append(_gather(robot, place, motions[index], config, request, condition or variant, report))
     whole = _joined(parts)
     if config.states is None or variant != simulator.variants[0] or request.postures is not None:
         return whole
     return _with_states(robot, config, whole, seed)
+
+
+def _slowed(robot: RobotConfig, rate: float) -> RobotConfig:
+    """Return the robot with at most this number of cycles per second [Hz]."""
+    return robot.model_copy(update={"rates": robot.rates.model_copy(update={"hal": min(robot.rates.hal, rate)})})
 
 
 def collect_bus(

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 FINE_TUNING_RATE = 1.0 / 3.0
 """The peak learning rate of fine-tuning is this share of the rate in the robot file."""
-LIKELY_SPLITS = 3
+LIKELY_SPLITS = 2
 """The progress assumes this many splits if their number is not given."""
 
 
@@ -228,6 +228,11 @@ def remarks(history: History) -> list[str]:
             "of their samples contradict them. If there are many, look for a loose sensor."
         )
     return sentences
+
+
+def has_p(robot: RobotConfig) -> bool:
+    """Whether a model that is learned from the robot file's conditions has a parametric bias."""
+    return train_config(model_config(robot), None, 0).bias_for(max(1, len(robot.conditions))) > 0
 
 
 def train_config(config: ModelConfig, epochs: int | None, seed: int) -> TrainConfig:

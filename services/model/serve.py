@@ -38,15 +38,15 @@ def serve(robot: RobotConfig, folder: Path, connect: Iterable[str] = (), stop: t
     items = tuple(connect)
     with starting():
         schema = load_model(robot, folder, items)
-        make_ready()
+        make_ready(bool(len(schema.bias)))
     with until_stopped(stop) as stopped, Service(robot.robot, "model", items) as service:
         model = GemucoService(robot, schema, service)
         ModelVerbs(model).serve(service)
         model.run(stopped)
 
 
-def make_ready() -> None:
-    """Load all compiled code before the first tick; report progress while the compiler runs."""
+def make_ready(has_p: bool) -> None:
+    """Load all compiled code before the first tick, for a model with p or without; report a compilation's progress."""
     reported = time.monotonic()
 
     def report(done: float, part: str) -> None:
@@ -59,4 +59,4 @@ def make_ready() -> None:
                 part,
             )
 
-    warm(report, is_service=True)
+    warm(report, is_service=True, has_p=has_p)

@@ -53,6 +53,10 @@ def frames(tmp_path: Path) -> Frames:
     return Frames(tmp_path / "two.urdf")
 
 
+REFUSED = "Unknown channel ID: "
+"""foxglove-sdk 0.30 advertises a new channel before it accepts subscriptions to it, and reports one that is earlier."""
+
+
 class Viewer:
     """A client of the WebSocket protocol `foxglove.sdk.v1`: JSON for control, binary opcode 1 for message data."""
 
@@ -89,13 +93,19 @@ class Viewer:
 
     def _take(self, control: dict[str, Any]) -> None:
         if control["op"] == "advertise":
-            wanted = []
-            for channel in control["channels"]:
-                self.channels[channel["topic"]] = channel
-                number = len(self._subscribed) + 1
-                self._subscribed[number] = channel["topic"]
-                wanted.append({"id": number, "channelId": channel["id"]})
-            self._socket.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
+            self.channels.update({channel["topic"]: channel for channel in control["channels"]})
+            self._subscribe(control["channels"])
+        elif control["op"] == "status" and control["message"].startswith(REFUSED):
+            number = int(control["message"].removeprefix(REFUSED))
+            self._subscribe([channel for channel in self.channels.values() if channel["id"] == number])
+
+    def _subscribe(self, channels: list[dict[str, Any]]) -> None:
+        wanted = []
+        for channel in channels:
+            number = len(self._subscribed) + 1
+            self._subscribed[number] = channel["topic"]
+            wanted.append({"id": number, "channelId": channel["id"]})
+        self._socket.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
 
     def json(self, topic: str) -> dict[str, Any]:
         return json.loads(self.newest[topic]) if topic in self.newest else {}
