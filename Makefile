@@ -2,6 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 VMCAN ?= ../shared/tools/vmcan.sh
+PLAYS := .venv/plays
 PACKAGES := .venv/packages
 STAMP := .venv/installed
 CLOCKLESS := tests/gemuco tests/house tests/hal/test_campaign.py tests/hal/test_fuzz.py tests/simulators/test_physics.py tests/system/test_kills.py \
@@ -22,9 +23,13 @@ endef
 help:            ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 18
 
+$(PLAYS): pyproject.toml constraints.txt requirements.lock deploy/setup.sh
+	deploy/setup.sh $(PYTHON) train sim view
+	@touch $(PLAYS)
+
 $(PACKAGES): pyproject.toml constraints.txt requirements.lock deploy/setup.sh
 	deploy/setup.sh $(PYTHON) dev
-	@touch $(PACKAGES)
+	@touch $(PACKAGES) $(PLAYS)
 
 $(STAMP): $(PACKAGES)
 	$(BIN)/python -m gemuco.warm
@@ -32,7 +37,7 @@ $(STAMP): $(PACKAGES)
 
 setup: $(STAMP)  ## make .venv with the exact versions of constraints.txt
 
-demo: $(PACKAGES)  ## two minutes with a muscle-driven arm that loses a sensor and a muscle
+demo: $(PLAYS)  ## two minutes with a muscle-driven arm that loses a sensor and a muscle
 	$(BIN)/gemuco demo
 
 reproduce: $(STAMP)  ## the paper's experiments on three simulated robots, its figures beside ours

@@ -29,11 +29,15 @@ cert=$(pip config list | sed -n "s/^.*\.cert='\(.*\)'$/\1/p" | tail -n 1) # of a
 
 list +dev =uv >build/uv.txt
 list $(printf '+%s ' "$@") +build >build/wanted.txt
+torch= # with --no-deps it is installed beside the others, and needs nothing of them
+if $bin/python deploy/requirements.py $(printf '+%s ' "$@") | grep -q '^torch'; then
+    torch="pip install $compile --constraint constraints.txt torch"
+    $torch --no-deps &
+fi
 if ! { pip install --quiet $how --requirement build/uv.txt && $bin/uv pip install $kept --python $bin/python $how --requirement build/wanted.txt; }; then
     echo "uv did not install; pip does it, which takes longer."
     pip install $how --requirement build/wanted.txt
 fi
-if $bin/python deploy/requirements.py $(printf '+%s ' "$@") | grep -q '^torch'; then
-    pip install $compile --constraint constraints.txt torch
-fi
+wait
+[ -z "$torch" ] || $torch # now with what it needs, if that is not there yet
 pip install --quiet --no-deps --no-build-isolation --editable .
