@@ -1,5 +1,6 @@
 import os
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -40,6 +41,16 @@ def test_measure_and_outputs_are_options(data, structure):
     for name, value in structure.L_i.items():
         assert wide.L_i[name] == pytest.approx(np.sqrt(value), rel=1e-5)
     assert "root mean square error" in wide.report()
+
+
+@pytest.mark.parametrize(("splits", "trained"), [(None, 0.6), (3, 0.7)])
+def test_progress_grows_with_the_trainings_and_not_at_the_end_at_once(data, splits, trained):
+    shares = []
+    determine(data, TINY, progress=lambda done, text: shares.append((done, text)), splits=splits)
+    values = [done for done, _ in shares]
+    assert values[-1] == 1.0
+    assert all(before <= after for before, after in pairwise(values))
+    assert max(done for done, text in shares if "loss" in text) > trained
 
 
 def test_says_what_is_wrong_with_thresholds(data):

@@ -38,6 +38,20 @@ def test_every_condition_is_recorded_and_told_in_its_episodes() -> None:
         np.testing.assert_allclose(episode.values["center_of_gravity"], gravity, atol=1e-9)
 
 
+def test_a_fast_robot_is_recorded_in_fewer_cycles_and_a_slow_one_in_its_own(monkeypatch) -> None:
+    rates = []
+    direct = small_hand.simulator.direct
+    monkeypatch.setattr(
+        small_hand.simulator, "direct", lambda robot, *rest: rates.append(robot.rates.hal) or direct(robot, *rest)
+    )
+    for hal in (500.0, 50.0):
+        robot = config()
+        robot = robot.model_copy(update={"rates": robot.rates.model_copy(update={"hal": hal})})
+        dataset = collected(robot, "long", samples=20)
+        assert len(dataset) == 20
+    assert rates == [100.0, 50.0], "ten cycles per sample are enough"
+
+
 def test_a_condition_named_twice_is_recorded_once() -> None:
     dataset = collect_direct(config(), None, 0, Request(("long", "short", "long"), 20)).dataset
     assert dataset.conditions == ("long", "short")

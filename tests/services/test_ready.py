@@ -13,8 +13,10 @@ import numpy as np
 import gemuco.compiled
 from gemuco.normal import Normal
 from gemuco.warm import warm
-warm(is_service=True)
+warm(is_service=True, has_p=False)
 from arm_model import arm, fresh, small_model
+from gemuco.adaption.config import UpdateConfig
+from gemuco.warm import follow
 from hal.clock import ManualClock
 from services.model.anomaly_loop import AnomalyWatch
 from services.model.estimation import Estimation, Freshness
@@ -28,6 +30,7 @@ before = {one: list(one.signatures) for one in kernels}
 schema, clock, published = small_model(), ManualClock(), []
 normal = Normal(np.zeros(schema.out_layout.size), np.eye(schema.out_layout.size), 1.0, 1e-3)
 schema = schema.with_normal(normal)
+assert not len(schema.bias)
 newest = None
 freshness = Freshness(arm(), lambda: newest, clock)
 estimation = Estimation(freshness, lambda: schema, published.append, clock)
@@ -40,6 +43,7 @@ for number, silent in enumerate(silences):
     anomaly.tick()
 clock.advance(0.015)
 estimation.tick()
+follow(schema, schema.layout.split(np.zeros(schema.layout.size)), UpdateConfig(minimum=1))
 assert any(one.estimated.flat.any() for one in published if hasattr(one, "estimated"))
 new = {one.__name__: one.signatures[len(before[one]):] for one in kernels if len(one.signatures) > len(before[one])}
 assert not new, new
