@@ -23,6 +23,8 @@ AGES_TRIED = 4
 """With at most this number of ages near that of the alarm."""
 APART = 2.0
 """The values of both differ by this much [healthy errors]; else any lie of one would do as the other's value."""
+OTHER_TOOL = 0.2
+"""Another tool or load is one whose p differs by this share of the range of the trained ones."""
 
 
 class Alternatives:
@@ -92,3 +94,10 @@ class Alternatives:
         z = np.concatenate([self._now.z[:-since], other.z[-since:]])
         z[-since - 1] = np.nan  # the change was within this block
         return self._judge(replace(self._now, z=z, noises=np.full((1, z.shape[1]), np.nan)))
+
+
+def is_another(schema: BodySchema, bias: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Return whether p is that of another tool or load than each of some others, shape (n,)."""
+    trained = np.array(list(schema.biases.values()))
+    span = np.ptp(trained, axis=0).max() if trained.size else 0.0
+    return np.asarray(np.abs(others - bias).max(axis=1, initial=0.0) > OTHER_TOOL * span)

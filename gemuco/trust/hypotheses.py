@@ -57,6 +57,7 @@ def explain(
     environment: Hidden,
     conditions: Callable[[], Iterable[tuple[str, Evidence, bool]]] = lambda: (),
     exchanges: Iterable[tuple[Hidden, Evidence]] = (),
+    beyond: Hidden = frozenset(),
 ) -> Cause:
     """Return the most likely cause of an alarm.
 
@@ -70,6 +71,8 @@ def explain(
             under it are known; if not, a doubt is in favour
             of the sensors.
         exchanges: Pairs of elements, and the evidence if they are exchanged back.
+        beyond: Columns outside of what was learned. There the relations are not known, so if one of them explains the
+            alarm, it contradicts no other: the tension of a cut wire makes a right encoder look wrong.
     """
     order = np.argsort(-evidence.strength)
     lead = int(order[0])
@@ -92,6 +95,7 @@ def explain(
                 yield frozenset({column, int(without(frozenset({column})).strength.argmax())})
 
     single = [column for column in singles if solves(frozenset({column}))]
+    single = [column for column in single if column in beyond] or single
     best = float(evidence.strength[single[0]]) if single else 0.0
     rest = min((left(frozenset({column})) for column in single), default=1.0)
     if not evidence.is_noise.any():  # which an exchange does not explain

@@ -8,7 +8,7 @@ import numpy as np
 
 from gemuco.anomaly.blame import parts
 from gemuco.schema import BodySchema
-from gemuco.trust.alternatives import Alternatives
+from gemuco.trust.alternatives import Alternatives, is_another
 from gemuco.trust.changes import LONGEST, LastingTest
 from gemuco.trust.config import BLOCK, Finding, Hidden, TrustConfig
 from gemuco.trust.evidence import Evidence, Judge
@@ -49,8 +49,6 @@ GROSS, LONG, LIKE = 3.0, 50.0, 1.3
 explains the second number of blocks of motion, and leaves errors below the third multiple of those learned."""
 MOVED = 30.0
 """A body is not known before it has moved for this number of blocks, with this tool: at rest it shows one posture."""
-OTHER_TOOL = 0.2
-"""Another tool or load is one whose p differs by this share of the range of the trained ones."""
 AT_ONCE, ONCE = 3, 15
 """At most this number of elements are wrong at once, which is within this number of blocks; otherwise the body is."""
 SURE = 2.0
@@ -115,7 +113,7 @@ class TrustMonitor:
         """Judge by another model; what is known of the body is kept unless the normal errors were learned anew."""
         before, self._schema = self._schema, schema
         if before is not None and before.normal is schema.normal:
-            if _is_another(schema, schema.bias, self._met[None])[0]:
+            if is_another(schema, schema.bias, self._met[None])[0]:
                 self._met, self._met_at = schema.bias, self._healthy.moved
             return
         self._met, self._met_at = schema.bias, 0.0
@@ -155,7 +153,7 @@ class TrustMonitor:
         if any(case.is_hidden and case.cause.cause == "environment" for case in self._cases):
             return False
         has_moved = self._healthy.moved - self._met_at >= MOVED
-        return self.is_known and has_moved and not _is_another(self._schema, self._schema.bias, self._biases).all()
+        return self.is_known and has_moved and not is_another(self._schema, self._schema.bias, self._biases).all()
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -225,7 +223,7 @@ class TrustMonitor:
             cause = explain(
                 evidence, self._without(hidden), self._joined, self._parts, self._environment - hidden,
                 lambda: self._conditions(hidden, int(evidence.age.flat[evidence.strength.argmax()])),
-                self._alternatives(hidden).exchanges(evidence) if self._may_be_exchange() else (),
+                self._alternatives(hidden).exchanges(evidence) if self._may_be_exchange() else (), self._beyond(),
             )  # fmt: skip
             self._suspect(cause, evidence, hidden)
         else:
@@ -243,7 +241,7 @@ class TrustMonitor:
         assert schema is not None
         for name, bias in schema.biases.items():
             if not np.array_equal(bias, schema.bias):
-                yield name, alternatives.condition(name, age), not _is_another(schema, bias, self._biases).all()
+                yield name, alternatives.condition(name, age), not is_another(schema, bias, self._biases).all()
 
     def _may_be_exchange(self) -> bool:
         """Whether exchanges are looked for in this block: of a new alarm, of one that is one, and now and then."""
@@ -361,7 +359,7 @@ class TrustMonitor:
         self._describe(case, self._hidden_columns(), case.kind == "noise")
         if case.cause.cause not in ("element", "either"):
             return
-        again = explain(evidence, self._without(rest), self._joined, self._parts, frozenset())
+        again = explain(evidence, self._without(rest), self._joined, self._parts, frozenset(), beyond=self._beyond())
         if again.cause == "element" and again.columns != case.cause.columns and not again.columns & self._environment:
             inside = again.columns < case.cause.columns
             rival, own = again.lead, max(case.cause.columns - again.columns, key=lambda c: evidence.strength[c])
@@ -418,6 +416,11 @@ class TrustMonitor:
     def _fresh_judge(self) -> Judge:
         return Judge(self._healthy, self._config.false_alarms, self._least)
 
+    def _beyond(self) -> Hidden:
+        """Return the columns whose newest values are outside of what was learned."""
+        assert self._relations is not None
+        return self._relations.beyond(self._recent.values()[-1])
+
     def _without(self, hidden: Hidden) -> Callable[[Hidden], Evidence]:
         relations, judge = self._relations, self._judge
         assert relations is not None
@@ -441,10 +444,3 @@ class TrustMonitor:
             tuple(at), case.cause.cause, case.kind, since, case.size, case.is_hidden,
             reason=case.reason, condition=case.cause.condition,
         )  # fmt: skip
-
-
-def _is_another(schema: BodySchema, bias: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return whether p is that of another tool or load than each of some others, shape (n,)."""
-    trained = np.array(list(schema.biases.values()))
-    span = np.ptp(trained, axis=0).max() if trained.size else 0.0
-    return np.asarray(np.abs(others - bias).max(axis=1, initial=0.0) > OTHER_TOOL * span)

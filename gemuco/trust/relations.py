@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gemuco.anomaly.prediction import with_bias
+from gemuco.intervals.sureness import MARGIN
 from gemuco.schema import BodySchema
 from gemuco.trust.config import Hidden, TrustConfig
 from gemuco.trust.sensitivity import Sensed, Sensitivity
@@ -105,6 +106,7 @@ class Relations:
         self.sensitivity = Sensitivity(schema, self.columns)
         self._sensed = self.sensitivity.sense(schema, rows)
         self._coarse = FLOOR * _signal_spreads(schema, rows, self.columns, watch.signal)
+        self._low, self._high = _learned(schema, self.columns)
         self._least = np.maximum(FLOOR * np.maximum(rows[:, self.columns].std(axis=0), 1e-3), self._coarse)
         self._kept: dict[Hidden, Relation] = {}
         self._inflation = np.ones(inputs)
@@ -131,6 +133,10 @@ class Relations:
     def features(self, rows: np.ndarray) -> np.ndarray:
         """Return the features of samples and their p, zero where an element is not finite: (n, features)."""
         return np.asarray(np.nan_to_num(self._watch.reading(None, maps=False).features(rows)))
+
+    def beyond(self, values: np.ndarray) -> Hidden:
+        """Return the columns with values [standard deviations], shape (columns,), outside of what was learned."""
+        return frozenset(np.flatnonzero((values < self._low) | (values > self._high)).tolist())
 
     def sizes(self, schema: BodySchema, config: TrustConfig) -> np.ndarray:
         """Return from which size on a lie of each column matters [errors of a healthy prediction], shape (columns,)."""
@@ -258,3 +264,10 @@ def _removal(spread: np.ndarray, own: np.ndarray, outside: np.ndarray) -> np.nda
     if kept.any():
         result[np.ix_(kept, kept)] = np.linalg.inv(spread[np.ix_(own[kept], own[kept])])
     return result
+
+
+def _learned(schema: BodySchema, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the ends of the learned ranges of judged columns, with a margin, shapes (columns,); infinite for p."""
+    low, high = schema.scaler.normalise(np.stack([schema.scaler.low, schema.scaler.high]))
+    room, none = MARGIN * (high - low), np.full(len(schema.bias), np.inf)
+    return np.concatenate([low - room, -none])[columns], np.concatenate([high + room, none])[columns]
