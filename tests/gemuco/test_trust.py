@@ -13,8 +13,9 @@ from gemuco.learning.train import fit
 from gemuco.normal.watch import Watch
 from gemuco.trust.changes import AGES, LONGEST, Likeness, StepTest
 from gemuco.trust.config import BLOCK, TrustConfig
-from gemuco.trust.evidence import Judge
+from gemuco.trust.evidence import Evidence, Judge
 from gemuco.trust.healthy import NOISE_KNOWN, Healthy
+from gemuco.trust.hypotheses import explain
 from gemuco.trust.monitor import TrustMonitor
 from gemuco.trust.recent import View
 from gemuco.trust.relations import Relations, rows_of
@@ -329,6 +330,31 @@ def test_an_element_that_reads_another_is_not_taken_for_two_swapped(model, arm, 
     monitor, hidden = watch(model, samples)
     assert element in hidden[-1]
     assert all(finding.kind != "swapped" for finding in monitor.findings)
+
+
+@pytest.mark.parametrize(("beyond", "accused"), [((), JOINT), ((TENSION,), TENSION), ((LENGTH,), JOINT)])
+def test_what_is_outside_of_the_learned_range_contradicts_no_other(beyond, accused):
+    """The wire of a muscle is cut: joint and tension explain it alone, the joint better, and the length does not."""
+    strength = np.zeros(12)
+    strength[[JOINT, TENSION, LENGTH]] = 98.0, 37.0, 42.0
+    ratio = np.where(strength > 0.0, 0.6, 0.0)
+    ratio[JOINT] = 1.0
+    whole = Evidence(ratio, strength, np.full(12, 5), np.zeros(12), np.zeros(12, bool), np.zeros(12, bool), 1.0)
+
+    def without(columns):
+        return whole if columns.isdisjoint({JOINT, TENSION}) else replace(whole, ratio=0.3 * ratio)
+
+    cause = explain(whole, without, (), (), frozenset(), beyond=frozenset(beyond))
+    assert (cause.cause, cause.columns) == ("element", frozenset({accused}))
+
+
+def test_a_column_is_beyond_what_was_learned_by_its_own_range(model, arm):
+    relations, x = Relations.of(model), model.scaler.normalise(move(arm, 40, 1)[0, 0])
+    assert not relations.beyond(x)
+    low, high = model.scaler.normalise(np.stack([model.scaler.low, model.scaler.high]))
+    x[TENSION], x[JOINT] = low[TENSION] - 0.1 * (high - low)[TENSION], high[JOINT] + 0.01 * (high - low)[JOINT]
+    x[LENGTH] = np.nan
+    assert relations.beyond(x) == {TENSION}, "at the end of its range, and missing, is not beyond it"
 
 
 def test_never_more_than_the_model_can_replace(model, arm):
