@@ -91,7 +91,7 @@ def _shifts(moved: np.ndarray) -> np.ndarray:
     shifts = []
     for part in np.array_split(np.arange(len(moved)), PARTS):
         others = np.delete(moved, part, axis=0)
-        center, spread = others.mean(axis=0), others.var(axis=0) + 1e-9
+        center, spread = others.mean(axis=0), np.maximum(others.var(axis=0), SYSTEMATIC)
         shifts.append(((moved[part] - center) ** 2 / spread).mean(axis=1))
     return np.concatenate(shifts)
 
