@@ -272,6 +272,9 @@ def test_torques_come_from_the_inertia_where_the_file_states_too_little(tmp_path
     assert survey(choose_arm(read_tree(written(tmp_path)))).effort.tolist() == [60.0, 60.0, 60.0]
     assert (found.high - found.low <= 1.2 + 1e-9).all()
     assert found.low[2] >= 0.0  # the wrist's own limits
+    strong = survey(choose_arm(read_tree(written(tmp_path, ARM.replace('effort="60"', 'effort="9000"')))))
+    assert strong.effort == pytest.approx(50.0 * found.effort), "a drive of 9 kN m would not feel this arm"
+    assert any(note.startswith("Torque of shoulder_pan, elbow, wrist is 50 times what") for note in strong.notes)
 
 
 def test_the_robot_file_is_complete(robot):

@@ -27,6 +27,8 @@ MARGIN = 1.5
 """A motor has this multiple of the largest torque that is needed."""
 SMALLEST = 0.02
 """A motor has at least this torque [N m]."""
+STRONGEST = 50.0
+"""A motor has at most this multiple of the torque that its joint needs: URDFs state 100 N m for a finger."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +84,14 @@ def survey(arm: Arm) -> Survey:
         notes.append(
             f"Torque of {', '.join(weak)} is from the inertia; the file states none, or less than gravity needs."
         )
+    most = STRONGEST * needed
+    strong = [name for name, own, limit in zip(arm.names, stated, most, strict=True) if own > limit]
+    if strong:
+        notes.append(
+            f"Torque of {', '.join(strong)} is {STRONGEST:g} times what gravity and motion need; the file states more. A "
+            "drive reports thousandths of its rated torque, and one of that size would not feel its load. If yours is "
+            "that large, change its rated_torque."
+        )
     velocity = np.array([joint.velocity or FASTEST for joint in arm.joints])
     narrow = [
         name for name, joint, a, b in zip(arm.names, arm.joints, low, high, strict=True) if _is_narrower(joint, a, b)
@@ -91,7 +101,7 @@ def survey(arm: Arm) -> Survey:
             f"The range of {', '.join(narrow)} is narrower than in the URDF: a model knows what it has seen, and a "
             "wider range needs more samples."
         )
-    return Survey(low, high, np.minimum(velocity, FASTEST), np.where(stated < needed, needed, stated), tuple(notes))
+    return Survey(low, high, np.minimum(velocity, FASTEST), np.clip(stated, needed, most), tuple(notes))
 
 
 def _is_narrower(joint: Joint, low: float, high: float) -> bool:
