@@ -14,7 +14,7 @@ from services.client import Client
 from services.errors import ServiceError
 from services.wire.messages import Status
 
-LOOK = 3.0
+LOOK = 2.0
 """The cycles are counted for this long [s]; the HAL reports its counts once a second."""
 MOST_SKIPPED, MOST_INCOMPLETE = 0.02, 0.05
 """A machine keeps a rate if at most these shares of the cycles are skipped or lack an answer. Drives and sensors

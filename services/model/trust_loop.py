@@ -280,8 +280,8 @@ class Trust:
     def _changed_part(self, finding: Finding) -> str:
         """Return the element that shows that not a sensor but a part of the body may have changed; empty if none does.
 
-        It belongs to the same part, as tension and length of a muscle do, and has left its learned range: that of a
-        wire that is cut, or slack.
+        It belongs to a part with several elements, as tension and length of a muscle, and has left its learned range:
+        that of a wire that is cut, or slack.
         """
         schema, last = self._schema(), self._last
         if finding.cause != "element" or finding.by_hand or schema.certainty is None or last is None:
@@ -291,7 +291,7 @@ class Trust:
         outside = (x < low - room) | (x > high + room)
         lying = finding.elements[0]
         part = next((part for part in parts(schema, list(range(len(x)))) if lying in part), ())
-        return next((self._names[other] for other in part if other != lying and outside[other]), "")
+        return next((self._names[other] for other in part if len(part) > 1 and outside[other]), "")
 
     def _sentence(self, finding: Finding) -> str:
         since, names = self._wall_time(finding.since), [self._names[index] for index in finding.elements]
@@ -310,7 +310,7 @@ class Trust:
         device, other = self._device.get(finding.elements[0]), self._changed_part(finding)
         if other:
             text += f", or {_part_of(other)} itself has changed: {other} is outside of what was learned"
-        elif finding.kind in CALIBRATED and device is not None and len(names) == 1:
+        if other in ("", names[0]) and finding.kind in CALIBRATED and device is not None and len(names) == 1:
             text += f"; `gemuco calibrate` measures {device} anew"
         return f"{text} (still used: {finding.reason})." if finding.reason else f"{text}."
 
