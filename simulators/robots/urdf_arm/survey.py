@@ -88,9 +88,9 @@ def survey(arm: Arm) -> Survey:
     strong = [name for name, own, limit in zip(arm.names, stated, most, strict=True) if own > limit]
     if strong:
         notes.append(
-            f"Torque of {', '.join(strong)} is {STRONGEST:g} times what gravity and motion need; the file states more. A "
-            "drive reports thousandths of its rated torque, and one of that size would not feel its load. If yours is "
-            "that large, change its rated_torque."
+            f"Torque of {', '.join(strong)} is {STRONGEST:g} times what gravity and motion need; the file states more. "
+            "A drive reports thousandths of its rated torque, and one of that size would not feel its load. If yours "
+            "is that large, change its rated_torque."
         )
     velocity = np.array([joint.velocity or FASTEST for joint in arm.joints])
     narrow = [
