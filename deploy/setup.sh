@@ -31,8 +31,11 @@ list +dev =uv >build/uv.txt
 list $(printf '+%s ' "$@") +build >build/wanted.txt
 torch= # with --no-deps it is installed beside the others, and needs nothing of them
 if $bin/python deploy/requirements.py $(printf '+%s ' "$@") | grep -q '^torch'; then
-    torch="pip install $compile --constraint constraints.txt torch"
+    torch="$bin/python -m pip --disable-pip-version-check install $compile --constraint constraints.txt torch"
     $torch --no-deps &
+    beside=$!
+    trap 'kill $beside 2>/dev/null || :' EXIT # a process in the background does not see Ctrl-C
+    trap 'exit 130' INT TERM
 fi
 if ! { pip install --quiet $how --requirement build/uv.txt && $bin/uv pip install $kept --python $bin/python $how --requirement build/wanted.txt; }; then
     echo "uv did not install; pip does it, which takes longer."

@@ -20,7 +20,7 @@ import numpy as np
 
 from hal.clock import SystemClock
 from hal.config import load_robot
-from hal.robot import Robot
+from hal.robot import Robot, open_robot
 
 REAL_NS = time.time_ns
 
@@ -62,9 +62,7 @@ class HalWitness:
 def run_hal(file: Path, record: BinaryIO, connect: list[str]) -> int:
     from services.hardware import hal_service
 
-    open_robot = hal_service.open_robot
-    hal_service.open_robot = lambda config, *rest: HalWitness(open_robot(config, *rest), record)  # type: ignore
-    return hal_service.run_hal(load_robot(file), connect)
+    return hal_service.run_hal(load_robot(file), connect, make=lambda config: HalWitness(open_robot(config), record))  # type: ignore
 
 
 def run_model(file: Path, record: BinaryIO, folder: Path, connect: list[str]) -> int:
