@@ -13,13 +13,21 @@ import secrets
 import threading
 import zlib
 from collections.abc import Iterable
+from datetime import UTC, datetime
 from typing import Any
 
 import zenoh
 
 from services.errors import NotAllowed, ServiceError, ServiceUnavailable
 from services.wire import keys
-from services.wire.connect import expiry_warning, host_and_port, split_connect, with_password_file, with_role_files
+from services.wire.connect import (
+    certificate_end,
+    expiry_warning,
+    host_and_port,
+    split_connect,
+    with_password_file,
+    with_role_files,
+)
 from services.wire.member import member_in
 from services.wire.messages import MAX_BYTES
 from services.wire.probe import is_listening
@@ -210,14 +218,16 @@ def _no_link(configuration: dict[str, Any], who: str) -> ServiceError:
         return ServiceUnavailable(
             f"No zenoh session for {who}: no process listens at {', '.join(places)}. Is `gemuco router` running?"
         )
-    role = member_in(configuration).role
-    hint = (
-        expiry_warning(configuration)
-        or f"Is the role file ('{role}') of the same `gemuco security init` as the router's, and not renewed since? "
-        "The router may also be full, or its certificate may not name this address."
-        if role
-        else "It may want a role file (`--connect ROLE.json`), as `gemuco security init` makes them."
-    )
+    role, until = member_in(configuration).role, certificate_end(configuration)
+    if until is not None and until <= datetime.now(UTC):
+        hint = expiry_warning(configuration)
+    elif role:
+        hint = (
+            f"Is the role file ('{role}') of the same `gemuco security init` as the router's, and not renewed since? "
+            "The router, or this person's share of it, may also be full, or its certificate may not name this address."
+        )
+    else:
+        hint = "It may want a role file (`--connect ROLE.json`), as `gemuco security init` makes them."
     return NotAllowed(
         f"No zenoh session for {who}: {', '.join(listening)} refused it. {hint} "
         f"If the router is only starting, or busy, it took longer than {ANSWER_MS / 1e3:g} s: try again."

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from link import inside
-from stack import HERE, ROUTER, Stack
+from stack import HERE, ROUTER, VIEWERS, Stack
 
 AGAIN = 30.0
 """How long [s] a killed process may take to come up on a loaded machine."""
@@ -135,8 +135,8 @@ def watched(how_many: int, slow: float = 0.0, is_stopped: bool = False) -> Calla
 
     def do(stack: Stack) -> Times:
         command = inside(
-            stack.link.first, sys.executable, str(HERE / "viewers.py"), stack.robot, str(stack.roles["viewer"]),
-            str(how_many), str(slow),
+            stack.link.first, sys.executable, str(HERE / "viewers.py"), stack.robot,
+            ",".join(str(stack.roles[name]) for name in VIEWERS), str(how_many), str(slow),
         )  # fmt: skip
         process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=stack.env, start_new_session=True

@@ -18,13 +18,15 @@ from link import Link, inside
 from hal.config import load_robot
 from services.process.supervisor import Supervisor, gemuco_command
 from services.security.init import init, placed
-from services.security.plan import InstallationPlan
+from services.security.plan import InstallationPlan, Person
 from services.security.signing import sign_model
 from services.wire.session import ROUTER_PORT, port
 
 HERE = Path(__file__).parent
 PATIENCE = 40.0
 ROUTER = f"{Link.ADDRESS['first']}:{ROUTER_PORT}"
+VIEWERS = ("viewer", "guest")
+"""One person has 32 sessions at the router."""
 
 
 class Records:
@@ -215,7 +217,7 @@ class Stack:
                 "connect": {"endpoints": [f"{self.protocol}/{hal}", *router]},
             },
             "operator": {"mode": "client", "connect": {"endpoints": router}},
-            "viewer": {"mode": "client", "connect": {"endpoints": router}},
+            **{name: {"mode": "client", "connect": {"endpoints": router}} for name in VIEWERS},
         }
         paths = {}
         for name, configuration in made.items():
@@ -226,7 +228,11 @@ class Stack:
     def _secured(self) -> dict[str, Path]:
         folder = self.folder / "security"
         hosts = placed(Link.ADDRESS["first"], Link.ADDRESS["second"])
-        init(folder, InstallationPlan(protocol=self.protocol, routers=[ROUTER], robots={self.robot: hosts}, days=2))
+        people = {"operator": Person(role="operator"), **{name: Person(role="viewer") for name in VIEWERS}}
+        plan = InstallationPlan(
+            protocol=self.protocol, routers=[ROUTER], robots={self.robot: hosts}, people=people, days=2
+        )
+        init(folder, plan)
         sign_model(folder, self.model)
         services = {name: folder / f"{name}.{self.robot}.json" for name in ("simulator", "hal", "model")}
-        return services | {name: folder / f"{name}.json" for name in ("router", "operator", "viewer")}
+        return services | {name: folder / f"{name}.json" for name in ("router", "operator", *VIEWERS)}

@@ -1,9 +1,10 @@
 """Viewers of a robot through the router, all in one process: each a session of its own that wants everything.
 
-    python viewers.py ROBOT CONNECT HOW_MANY SECONDS
+    python viewers.py ROBOT CONNECT[,CONNECT...] HOW_MANY SECONDS
 
-SECONDS is how long each takes over a message. Prints `ready`, and ends with stdin. Viewers stand for other computers,
-whose work takes no processor from the robot's: this one yields to everything else.
+They share the endpoints or role files, because one person has a limited number of sessions. SECONDS is how long each
+takes over a message. Prints `ready`, and ends with stdin. Viewers stand for other computers, whose work takes no
+processor from the robot's: this one yields to everything else.
 """
 
 import contextlib
@@ -23,9 +24,9 @@ def main(robot: str, connect: str, how_many: str, seconds: str) -> None:
         time.sleep(float(seconds))
 
     with contextlib.ExitStack() as stack:
-        kept = []
+        kept, places = [], connect.split(",")
         for number in range(int(how_many)):
-            client = stack.enter_context(Client(robot, [connect], name=f"viewer {number}"))
+            client = stack.enter_context(Client(robot, [places[number % len(places)]], name=f"viewer {number}"))
             kept.append(client.session.declare_subscriber(f"gemuco/{robot}/**", slowly))
         print("ready", flush=True)
         sys.stdin.read()
