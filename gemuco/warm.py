@@ -6,7 +6,7 @@ On a new machine this takes a minute. The compiled code is saved (`gemuco.compil
 seconds. To compile everything, all functions that a service uses are called once with a small body.
 """
 
-import sys
+import argparse
 import time
 from collections.abc import Callable, Iterator, Mapping
 from itertools import chain, pairwise
@@ -154,6 +154,9 @@ def main() -> None:
     """Compile everything and show a progress bar; lines if the output is no terminal."""
     from rich.progress import BarColumn, Progress, TextColumn
 
+    parser = argparse.ArgumentParser(prog="python -m gemuco.warm", description="Compile everything.")
+    parser.add_argument("--without-p", action="store_true", help="leave out the recognition of p")
+    has_p = not parser.parse_args().without_p
     with Progress(TextColumn("compiling"), BarColumn(), TextColumn("{task.description}"), transient=True) as bar:
         task, is_terminal = bar.add_task("", total=1.0), bar.console.is_terminal
 
@@ -162,7 +165,7 @@ def main() -> None:
             if not is_terminal:
                 print(f"Compiling, {share:.0%}: {step}", flush=True)
 
-        duration = warm(show, has_p="--without-p" not in sys.argv[1:])
+        duration = warm(show, has_p=has_p)
     print(f"Compiled code is ready after {duration:.1f} s, {f'saved in {FOLDER}' if FOLDER else 'not saved'}.")
 
 

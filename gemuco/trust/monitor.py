@@ -16,7 +16,7 @@ from gemuco.trust.healthy import Healthy
 from gemuco.trust.hypotheses import SEARCHED, Cause, explain
 from gemuco.trust.kinds import kind_of
 from gemuco.trust.recent import Recent, View
-from gemuco.trust.relations import Relations
+from gemuco.trust.relations import Relations, learned_range
 
 CONFIRMED = 2
 """The same cause must explain this number of successive blocks before it is hidden."""
@@ -417,9 +417,11 @@ class TrustMonitor:
         return Judge(self._healthy, self._config.false_alarms, self._least)
 
     def _beyond(self) -> Hidden:
-        """Return the columns whose newest values are outside of what was learned."""
-        assert self._relations is not None
-        return self._relations.beyond(self._recent.values()[-1])
+        """Return the judged elements whose newest values are outside of what was learned."""
+        assert self._relations is not None and self._schema is not None
+        judged, (low, high) = self._relations.columns[: self._relations.count], learned_range(self._schema)
+        values = self._recent.values()[-1, : len(judged)]
+        return frozenset(np.flatnonzero((values < low[judged]) | (values > high[judged])).tolist())
 
     def _without(self, hidden: Hidden) -> Callable[[Hidden], Evidence]:
         relations, judge = self._relations, self._judge

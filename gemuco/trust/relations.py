@@ -106,7 +106,6 @@ class Relations:
         self.sensitivity = Sensitivity(schema, self.columns)
         self._sensed = self.sensitivity.sense(schema, rows)
         self._coarse = FLOOR * _signal_spreads(schema, rows, self.columns, watch.signal)
-        self._low, self._high = _learned(schema, self.columns)
         self._least = np.maximum(FLOOR * np.maximum(rows[:, self.columns].std(axis=0), 1e-3), self._coarse)
         self._kept: dict[Hidden, Relation] = {}
         self._inflation = np.ones(inputs)
@@ -133,10 +132,6 @@ class Relations:
     def features(self, rows: np.ndarray) -> np.ndarray:
         """Return the features of samples and their p, zero where an element is not finite: (n, features)."""
         return np.asarray(np.nan_to_num(self._watch.reading(None, maps=False).features(rows)))
-
-    def beyond(self, values: np.ndarray) -> Hidden:
-        """Return the columns with values [standard deviations], shape (columns,), outside of what was learned."""
-        return frozenset(np.flatnonzero((values < self._low) | (values > self._high)).tolist())
 
     def sizes(self, schema: BodySchema, config: TrustConfig) -> np.ndarray:
         """Return from which size on a lie of each column matters [errors of a healthy prediction], shape (columns,)."""
@@ -266,8 +261,18 @@ def _removal(spread: np.ndarray, own: np.ndarray, outside: np.ndarray) -> np.nda
     return result
 
 
-def _learned(schema: BodySchema, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the ends of the learned ranges of judged columns, with a margin, shapes (columns,); infinite for p."""
+def learned_range(schema: BodySchema) -> tuple[np.ndarray, np.ndarray]:
+    """Return lowest and highest value of every element up to which its relations are known, shapes (size,).
+
+    They are [standard deviations] those of the training data and of the update, with a margin, or those of the normal
+    samples, whichever reach further.
+    """
     low, high = schema.scaler.normalise(np.stack([schema.scaler.low, schema.scaler.high]))
-    room, none = MARGIN * (high - low), np.full(len(schema.bias), np.inf)
-    return np.concatenate([low - room, -none])[columns], np.concatenate([high + room, none])[columns]
+    if schema.certainty is not None:
+        low, high = schema.certainty.low, schema.certainty.high
+    room = MARGIN * (high - low)
+    low, high = low - room, high + room
+    if schema.normal is not None and len(schema.normal.rows):
+        rows = schema.normal.rows[:, : schema.layout.size]
+        low, high = np.fmin(low, np.fmin.reduce(rows)), np.fmax(high, np.fmax.reduce(rows))
+    return low, high

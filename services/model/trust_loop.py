@@ -11,12 +11,12 @@ import numpy as np
 
 from gemuco.anomaly.blame import parts
 from gemuco.estimation import fill, recipes
-from gemuco.intervals.sureness import MARGIN
 from gemuco.normal import Normal
 from gemuco.schema import BodySchema
 from gemuco.trust.aligned import Aligned
 from gemuco.trust.config import BLOCK, Finding, TrustConfig
 from gemuco.trust.monitor import TrustMonitor
+from gemuco.trust.relations import learned_range
 from hal.by_signal import Numbers
 from hal.clock import Clock
 from hal.config import RobotConfig
@@ -284,11 +284,10 @@ class Trust:
         that of a wire that is cut, or slack.
         """
         schema, last = self._schema(), self._last
-        if finding.cause != "element" or finding.by_hand or schema.certainty is None or last is None:
+        if finding.cause != "element" or finding.by_hand or last is None:
             return ""
-        low, high = schema.certainty.low, schema.certainty.high
-        x, room = schema.scaler.normalise(in_order(schema, last).flat), MARGIN * (high - low)
-        outside = (x < low - room) | (x > high + room)
+        x, (low, high) = schema.scaler.normalise(in_order(schema, last).flat), learned_range(schema)
+        outside = (x < low) | (x > high)
         lying = finding.elements[0]
         part = next((part for part in parts(schema, list(range(len(x)))) if lying in part), ())
         return next((self._names[other] for other in part if len(part) > 1 and outside[other]), "")

@@ -18,7 +18,7 @@ from gemuco.trust.healthy import NOISE_KNOWN, Healthy
 from gemuco.trust.hypotheses import explain
 from gemuco.trust.monitor import TrustMonitor
 from gemuco.trust.recent import View
-from gemuco.trust.relations import Relations, rows_of
+from gemuco.trust.relations import Relations, learned_range, rows_of
 from gemuco.trust.sensitivity import Sensitivity
 
 SAMPLES = 5
@@ -348,13 +348,19 @@ def test_what_is_outside_of_the_learned_range_contradicts_no_other(beyond, accus
     assert (cause.cause, cause.columns) == ("element", frozenset({accused}))
 
 
-def test_a_column_is_beyond_what_was_learned_by_its_own_range(model, arm):
-    relations, x = Relations.of(model), model.scaler.normalise(move(arm, 40, 1)[0, 0])
-    assert not relations.beyond(x)
-    low, high = model.scaler.normalise(np.stack([model.scaler.low, model.scaler.high]))
-    x[TENSION], x[JOINT] = low[TENSION] - 0.1 * (high - low)[TENSION], high[JOINT] + 0.01 * (high - low)[JOINT]
-    x[LENGTH] = np.nan
-    assert relations.beyond(x) == {TENSION}, "at the end of its range, and missing, is not beyond it"
+def test_the_learned_range_is_that_of_the_training_or_of_normal_samples_beyond_it(model, arm):
+    x = model.scaler.normalise(move(arm, 40, 1)[:, 0])
+    low, high = learned_range(model)
+    assert ((low < x) & (x < high)).all()
+    assert (low[TENSION], high[TENSION]) == pytest.approx(
+        (model.certainty.low[TENSION] - 0.03 * np.ptp([model.certainty.low, model.certainty.high], axis=0)[TENSION],
+         model.certainty.high[TENSION] + 0.03 * np.ptp([model.certainty.low, model.certainty.high], axis=0)[TENSION])
+    )  # fmt: skip
+    rows = model.normal.rows.copy()
+    rows[0, TENSION], rows[1, TENSION] = high[TENSION] + 1.0, np.nan
+    wider = learned_range(model.with_normal(replace(model.normal, rows=rows)))
+    assert wider[1][TENSION] == pytest.approx(high[TENSION] + 1.0), "the body itself was there, and was normal"
+    assert np.array_equal(wider[0], low)
 
 
 def test_never_more_than_the_model_can_replace(model, arm):

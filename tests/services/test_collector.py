@@ -38,18 +38,21 @@ def test_every_condition_is_recorded_and_told_in_its_episodes() -> None:
         np.testing.assert_allclose(episode.values["center_of_gravity"], gravity, atol=1e-9)
 
 
-def test_a_fast_robot_is_recorded_in_fewer_cycles_and_a_slow_one_in_its_own(monkeypatch) -> None:
+@pytest.mark.parametrize(
+    ("hal", "lives", "cycles"), [(500.0, 0.1, 100.0), (50.0, 0.1, 50.0), (100.0, 0.1, 100.0), (500.0, 0.02, 500.0)]
+)
+def test_a_fast_robot_is_recorded_in_fewer_cycles_than_it_has(monkeypatch, hal, lives, cycles) -> None:
+    """But not in so few that its commands expire."""
     rates = []
     direct = small_hand.simulator.direct
     monkeypatch.setattr(
         small_hand.simulator, "direct", lambda robot, *rest: rates.append(robot.rates.hal) or direct(robot, *rest)
     )
-    for hal in (500.0, 50.0):
-        robot = config()
-        robot = robot.model_copy(update={"rates": robot.rates.model_copy(update={"hal": hal})})
-        dataset = collected(robot, "long", samples=20)
-        assert len(dataset) == 20
-    assert rates == [100.0, 50.0], "ten cycles per sample are enough"
+    robot = config()
+    command = robot.command.model_copy(update={"time_to_live": lives})
+    robot = robot.model_copy(update={"rates": robot.rates.model_copy(update={"hal": hal}), "command": command})
+    assert len(collected(robot, "long", samples=20)) == 20
+    assert rates == [cycles]
 
 
 def test_a_condition_named_twice_is_recorded_once() -> None:
