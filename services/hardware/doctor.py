@@ -1,4 +1,4 @@
-"""`gemuco doctor`: check everything that a robot needs, and print one line per check with its remedy."""
+"""`gemuco doctor`: check everything that a robot, or this machine, needs; one line per check with its remedy."""
 
 import socket
 import struct
@@ -41,17 +41,18 @@ More = Callable[[RobotConfig], Iterable[Finding]]
 """A function of this type yields further findings on a robot."""
 
 
-def run_doctor(robot: str, connect: Iterable[str] = (), more: More = lambda _: ()) -> int:
+def run_doctor(robot: str | None, connect: Iterable[str] = (), more: More = lambda _: ()) -> int:
     """Print all findings and return the exit code: 1 if anything is bad.
 
     Args:
-        robot: Name or file.
+        robot: Name or file; None for this machine alone.
         connect: Endpoints, such as a router's, and role files.
         more: Checks of what this room does not know, such as topics of ROS 2.
     """
     counts = dict.fromkeys(Severity, 0)
     console = show.console()
-    for finding in _findings(robot, tuple(connect), more):
+    connect = tuple(connect)
+    for finding in _of_machine(connect) if robot is None else _findings(robot, connect, more):
         counts[finding.verdict] += 1
         if console.is_terminal:
             row = Table.grid(padding=(0, 2))
@@ -62,7 +63,22 @@ def run_doctor(robot: str, connect: Iterable[str] = (), more: More = lambda _: (
         else:  # a table would wrap lines in a file or pipe
             print(f"{finding.verdict:<8} {finding.what:<24} {finding.text}")
     console.print(f"{counts[Severity.OK]} ok, {counts[Severity.WARNING]} warnings, {counts[Severity.BAD]} bad.")
+    if robot is None:
+        console.print("Name a robot to check its buses and nodes too: gemuco doctor ROBOT.")
     return 1 if counts[Severity.BAD] else 0
+
+
+def _of_machine(connect: tuple[str, ...]) -> Iterator[Finding]:
+    yield from host_checks.installation()
+    yield from host_checks.can_interfaces()
+    yield from _of_host(connect)
+
+
+def _of_host(connect: tuple[str, ...]) -> Iterator[Finding]:
+    yield from host_checks.clocks()
+    yield from host_checks.real_time()
+    yield from host_checks.other_users(bool(split_connect(connect)[1]))
+    yield from role_files(connect)
 
 
 def _findings(robot: str, connect: tuple[str, ...], more: More) -> Iterator[Finding]:
@@ -79,10 +95,7 @@ def _findings(robot: str, connect: tuple[str, ...], more: More) -> Iterator[Find
         if not config.has_topics:
             yield from _devices(config, connect)
         yield from more(config)
-    yield from host_checks.clocks()
-    yield from host_checks.real_time()
-    yield from host_checks.other_users(bool(split_connect(connect)[1]))
-    yield from role_files(connect)
+    yield from _of_host(connect)
     yield from _network(config, connect)
 
 

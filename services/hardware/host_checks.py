@@ -1,7 +1,8 @@
-"""Checks of this machine: clocks, real-time scheduling, memory, processor."""
+"""Checks of this machine: installation, CAN interfaces, clocks, real-time scheduling, memory, processor."""
 
 import ctypes
 import os
+import platform
 import pwd
 import resource
 import threading
@@ -10,6 +11,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from hal.finding.doctor import Finding, ok, warning
+from hal.finding.link import known_links, look_up
+from services.extras import EXTRAS, is_missing
 from services.hardware.hal_service import CYCLE_PRIORITY
 
 STEADY = 1e-3
@@ -25,6 +28,42 @@ _TIME_ERROR = 5
 """adjtimex(2) returns this value while the clock is not synchronised."""
 _FAST_SOURCES = ("tsc", "arch_sys_counter", "kvm-clock", "hyperv_clocksource_tsc_page", "riscv_clocksource")
 _SYSTEM = Path("/sys/devices/system")
+
+
+def installation() -> Iterator[Finding]:
+    """Report versions, optional packages and compiled code."""
+    from gemuco.compiled.jit import FOLDER  # numba takes half a second
+
+    yield ok("python", f"{platform.python_version()} on {platform.machine()}, gemuco in {Path(__file__).parents[2]}.")
+    absent = [package for package in EXTRAS if is_missing(package)]
+    present = [package for package in EXTRAS if package not in absent]
+    lacking = f" Not installed: {', '.join(f'{package} ({EXTRAS[package]})' for package in absent)}." if absent else ""
+    yield ok("extras", f"{', '.join(present) or 'None'}.{lacking}")
+    if FOLDER is None:
+        yield warning(
+            "compiled code",
+            "No folder for it is writable, so every start compiles for a minute. Set NUMBA_CACHE_DIR to one that is.",
+        )
+    elif not any(FOLDER.rglob("*.nbc")):
+        yield ok("compiled code", f"None yet: the first start takes a minute. `python -m gemuco.warm` fills {FOLDER}.")
+    else:
+        yield ok("compiled code", f"In {FOLDER}.")
+
+
+def can_interfaces() -> Iterator[Finding]:
+    """Report the CAN interfaces of this machine."""
+    links = [link for name in known_links() if (link := look_up(name)) is not None]
+    for link in links:
+        rate = f", {link.bitrate / 1e6:g} Mbit/s" if link.bitrate else ""
+        if link.is_up:
+            yield ok(
+                f"interface {link.name}", f"{link.kind or 'can'}, up{rate}{', ' + link.state if link.state else ''}."
+            )
+        else:
+            command = f"sudo ip link set {link.name} up type can bitrate 1000000 restart-ms 100"
+            yield warning(f"interface {link.name}", f"{link.kind or 'can'}, down. Bring it up: `{command}`.")
+    if not links:
+        yield ok("interfaces", "No CAN interface. Simulated robots need none.")
 
 
 def clocks() -> Iterator[Finding]:

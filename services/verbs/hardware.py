@@ -18,6 +18,9 @@ MaybeRobot = Annotated[
         metavar="[ROBOT]", help="A robot file or the name of one; or a channel, such as can0 or hub:CHANNEL."
     ),
 ]
+DoctorRobot = Annotated[
+    str | None, typer.Argument(metavar="[ROBOT]", help="A robot file, or the name of one in robots/.")
+]
 CHANNEL = re.compile(r"(?:sl|v)?can\d+|[a-z][a-z0-9_]*:[^\\].*")
 """A channel in place of a robot, as `gemuco init --scan` has it; `C:\\` begins a path."""
 Interface = Annotated[
@@ -65,11 +68,11 @@ def scan(
 
 
 @report_errors
-def doctor(robot: RobotFile, connect: Connect = None) -> int:
+def doctor(robot: DoctorRobot = None, connect: Connect = None) -> int:
     """Check buses, nodes, topics, clocks, role files and network of a robot: one line per check, with its remedy.
 
-    Reads the status of the HAL if it runs, otherwise opens the buses with the motors off. Exit code 1 if anything is
-    bad.
+    Reads the status of the HAL if it runs, otherwise opens the buses with the motors off. Without a robot: this
+    machine's packages, CAN interfaces, clocks and scheduling. Exit code 1 if anything is bad.
     """
     from services.hardware.doctor import run_doctor
     from services.ros2.hardware import check_topics

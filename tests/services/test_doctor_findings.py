@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from hal.finding import link
 from hal.finding.doctor import Severity
 from services.hardware import doctor, host_checks
 from services.security.init import init, placed
@@ -110,3 +111,32 @@ def test_role_files_are_checked_for_their_expiry(tmp_path: Path) -> None:
     assert found.verdict is Severity.BAD
     assert "cannot be read" in found.text
     assert not list(doctor.role_files(["tcp/127.0.0.1:7447"]))
+
+
+def test_without_a_robot_the_machine_is_checked(capsys: pytest.CaptureFixture[str]) -> None:
+    assert doctor.run_doctor(None) == 0
+    lines = capsys.readouterr().out.splitlines()
+    for subject in ("python", "extras", "compiled code", "interface", "wall clock", "scheduling", "users"):
+        assert any(line.split(maxsplit=1)[1].startswith(subject) for line in lines), subject
+    assert lines[-1] == "Name a robot to check its buses and nodes too: gemuco doctor ROBOT."
+
+
+def test_the_installation_names_what_is_missing_and_what_brings_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(host_checks, "is_missing", lambda package: package == "viser")
+    extras = {found.what: found.text for found in host_checks.installation()}["extras"]
+    assert extras.startswith("torch, ")
+    assert extras.endswith(" Not installed: viser (view).")
+
+
+@pytest.mark.parametrize(
+    ("is_up", "verdict", "said"), [(True, Severity.OK, "0.5 Mbit/s"), (False, Severity.WARNING, "ip link set can0 up")]
+)
+def test_the_can_interfaces_of_the_machine(
+    monkeypatch: pytest.MonkeyPatch, is_up: bool, verdict: Severity, said: str
+) -> None:
+    monkeypatch.setattr(host_checks, "known_links", lambda: ["can0"])
+    monkeypatch.setattr(host_checks, "look_up", lambda name: link.Interface(name, True, is_up, "can", 500_000))
+    (finding,) = host_checks.can_interfaces()
+    assert finding.what == "interface can0"
+    assert finding.verdict is verdict
+    assert said in finding.text
