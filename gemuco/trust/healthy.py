@@ -20,6 +20,8 @@ PRIOR = 100.0
 """What is assumed at the start counts as this number of blocks."""
 COMMON, EXCEEDS = 3.0, 0.015
 """A healthy body's step test exceeds `COMMON` standard deviations in at most about this share of the blocks."""
+DOUBTED = 0.2
+"""Beyond it errors teach the scale by this share only, because a drift would pass as healthy before it is noticed."""
 TOGETHER = 4.0
 """Blocks with a large step come in groups of about this number, each of which would be one false alarm."""
 TAIL, EXCESSES = 0.4, 20.0
@@ -54,7 +56,8 @@ class Healthy:
         """
         self.count += 1
         self.moved += motion
-        share = motion / min(PRIOR + self.moved, MEMORY)
+        doubted = np.where((steps > COMMON) & (self.count > PRIOR), DOUBTED, 1.0)
+        share = doubted * motion / min(PRIOR + self.moved, MEMORY)
         now = z[-1]
         is_new = np.isfinite(now)
         square = np.clip(np.where(is_new, now**2, self._square), 0.0, 9.0 * self._square)

@@ -58,6 +58,7 @@ def explain(
     conditions: Callable[[], Iterable[tuple[str, Evidence, bool]]] = lambda: (),
     exchanges: Iterable[tuple[Hidden, Evidence]] = (),
     beyond: Hidden = frozenset(),
+    sudden: Hidden = frozenset(),
 ) -> Cause:
     """Return the most likely cause of an alarm.
 
@@ -73,10 +74,12 @@ def explain(
         exchanges: Pairs of elements, and the evidence if they are exchanged back.
         beyond: Columns outside of what was learned. There the relations are not known, so if one of them explains the
             alarm, it contradicts no other: the tension of a cut wire makes a right encoder look wrong.
+        sudden: Columns that jumped when the alarm began, while all others moved as usual.
     """
     order = np.argsort(-evidence.strength)
     lead = int(order[0])
     singles = [int(c) for c in order[:CANDIDATES] if evidence.ratio[c] >= PLAUSIBLE and int(c) not in environment]
+    singles += sorted(sudden - environment - set(singles))
     known: dict[Hidden, float] = {}
 
     def left(columns: Hidden) -> float:
@@ -95,24 +98,25 @@ def explain(
                 yield frozenset({column, int(without(frozenset({column})).strength.argmax())})
 
     single = [column for column in singles if solves(frozenset({column}))]
-    single = [column for column in single if column in beyond] or single
+    for known_wrong in (sudden, beyond):
+        single = [column for column in single if column in known_wrong] or single
     best = float(evidence.strength[single[0]]) if single else 0.0
     rest = min((left(frozenset({column})) for column in single), default=1.0)
-    if not evidence.is_noise.any():  # which an exchange does not explain
-        calmer = ((pair, other) for pair, other in exchanges if other.level <= evidence.level)
-        ratio, pair = min(((float(o.ratio.max(initial=0.0)), sorted(p)) for p, o in calmer), default=(1.0, []))
-        if ratio < min(AGREES, rest):
-            return Cause(frozenset(pair), "all", max(pair, key=lambda c: evidence.strength[c]), is_exchange=True)
+    pair: Hidden = frozenset() if evidence.is_noise.any() else _exchanged(evidence, exchanges, rest, sudden)
+    if pair:
+        return Cause(pair, "all", max(pair, key=lambda c: evidence.strength[c]), is_exchange=True)
     if evidence.is_slow[lead]:  # another tool is there at once
         environment = frozenset()
     if environment and not evidence.is_noise[lead]:
         for name, other, is_known in conditions():
             if float(other.ratio.max(initial=0.0)) < (min(AGREES, rest + RIVALS) if is_known else EXPLAINED):
                 return Cause(environment, "environment", lead, name)
-    if environment:
+    if environment and not sudden.intersection(single):  # another tool moves the whole tip
         own = float(evidence.strength[list(environment)].max())
         if own >= CLOSE * best - ALIKE and solves(environment):
             return Cause(environment, "environment", lead)
+    if len(sudden) > 1 and not any(sudden <= part for part in parts) and solves(sudden):
+        return Cause(sudden, "all", max(sudden, key=lambda c: evidence.strength[c]))
     if single:
         alike = [c for c in single if _is_alike(best, float(evidence.strength[c]))]
         if len(alike) == 1:
@@ -122,6 +126,18 @@ def explain(
         if solves(columns):
             return Cause(columns, cause, max(columns, key=lambda c: evidence.strength[c]))
     return Cause(frozenset(), "body", lead)
+
+
+def _exchanged(evidence: Evidence, exchanges: Iterable[tuple[Hidden, Evidence]], rest: float, sudden: Hidden) -> Hidden:
+    """Return the pair that agrees best in each other's place, and better than `rest` or if both jumped; empty if none.
+
+    Noise is not explained by an exchange.
+    """
+    calmer = [(float(o.ratio.max(initial=0.0)), sorted(p)) for p, o in exchanges if o.level <= evidence.level]
+    agreeing = [
+        (not sudden.issuperset(p), r, p) for r, p in calmer if r < AGREES and (r < rest or sudden.issuperset(p))
+    ]
+    return frozenset(min(agreeing)[2]) if agreeing else frozenset()
 
 
 def _is_alike(best: float, other: float) -> bool:

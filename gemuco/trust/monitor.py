@@ -1,22 +1,22 @@
 """The monitor: it judges every element block by block, and hides those that lie until they have agreed again."""
 
-import math
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from gemuco.anomaly.blame import parts
 from gemuco.schema import BodySchema
 from gemuco.trust.alternatives import Alternatives, is_another
+from gemuco.trust.cases import Case, describe, has_moved
 from gemuco.trust.changes import LONGEST, LastingTest
 from gemuco.trust.config import BLOCK, Finding, Hidden, TrustConfig
 from gemuco.trust.evidence import Evidence, Judge
 from gemuco.trust.healthy import Healthy
 from gemuco.trust.hypotheses import SEARCHED, Cause, explain
-from gemuco.trust.kinds import kind_of
+from gemuco.trust.jumps import EARLIER
 from gemuco.trust.recent import Recent, View
-from gemuco.trust.relations import Relations, learned_range
+from gemuco.trust.relations import Relations
 
 CONFIRMED = 2
 """The same cause must explain this number of successive blocks before it is hidden."""
@@ -42,8 +42,6 @@ DOUBTFUL, PLAIN = 0.4, 1.5
 second multiple of an alarm."""
 UNEXPLAINED, ONCE_MORE = 3, 100
 """If this number of searches found no cause, those hidden in this number of blocks were no cause either."""
-CLEAR = 2.0
-"""A lie begins with the first error of this size [errors of a healthy prediction]."""
 GROSS, LONG, LIKE = 3.0, 50.0, 1.3
 """On a body that is not known to be as the model says, a lie is hidden if it is the first multiple of an alarm,
 explains the second number of blocks of motion, and leaves errors below the third multiple of those learned."""
@@ -51,29 +49,16 @@ MOVED = 30.0
 """A body is not known before it has moved for this number of blocks, with this tool: at rest it shows one posture."""
 AT_ONCE, ONCE = 3, 15
 """At most this number of elements are wrong at once, which is within this number of blocks; otherwise the body is."""
+LATELY, SUSPECT = 10, 0.6
+"""Of an element that jumped within the first number of blocks, the second share of an alarm is one: with limits for one
+wrong verdict a week, so much less evidence is enough if the jump itself comes once in a quarter of an hour at most."""
+PATIENCE = 100
+"""An element that jumped away returns after this number of blocks, or after it has jumped back."""
 SURE = 2.0
 """Another cause replaces one if its evidence is this multiple."""
-MOVES = 3.0
-"""Before a frozen element returns, it and its prediction move by this much [errors of a healthy prediction]."""
 
 Replaces = Callable[[frozenset[int]], bool]
 """Whether all elements of a set can be estimated while none of them is measured."""
-
-
-@dataclass(slots=True)
-class _Case:
-    """A cause under suspicion, or hidden."""
-
-    cause: Cause
-    began: int
-    first: int
-    last: int
-    seen: int = 1
-    moved: float = 0.0
-    is_hidden: bool = False
-    kind: str = "unknown"
-    size: float = math.nan
-    reason: str = ""
 
 
 class TrustMonitor:
@@ -103,7 +88,7 @@ class TrustMonitor:
         self._recent, self._count, self._now = Recent(), 0, 0.0
         self._by_hand: dict[int, float] = {}
         self._immune: set[int] = set()
-        self._cases: list[_Case] = []
+        self._cases: list[Case] = []
         self._relations: Relations | None = None
         self._schema: BodySchema | None = None
         self._healthy, self._met, self._met_at = Healthy(0), schema.bias, 0.0
@@ -198,6 +183,7 @@ class TrustMonitor:
         view = self._view = self._recent.view(self._relations, hidden, before)
         if before is None or before.hidden != hidden:
             self._lasting = LastingTest(len(self._relations.columns))
+            view = self._view = self._compared(view, before)
         if self._count % REFRESH == 0:
             self._judge = self._fresh_judge()
         self._lasting.add(view.z[-1] / self._judge.scale, self._judge.least, motion / self._judge.time)
@@ -210,9 +196,20 @@ class TrustMonitor:
         if not self._healthy.is_known or is_quiet or self._other > OTHER:
             self._learn(view, evidence, motion)
 
+    def _compared(self, view: View, before: View | None) -> View:
+        """Return a view with newly hidden columns, in which errors are usual that were there before they lied."""
+        if before is None or not before.hidden < view.hidden:
+            self._recent.usual.clear()
+            return view
+        began = max((case.began for case in self._cases if case.is_hidden), default=self._count)
+        usual = view.usual(self._judge.scale, self._count - began + 1 + EARLIER)
+        self._recent.usual[view.hidden] = usual * self._recent.usual.get(view.hidden, 1.0)
+        return view.scaled(usual)
+
     def _decide(self, evidence: Evidence, hidden: Hidden) -> None:
         immune = [self._place[p] for p in self._immune if p in self._place]
         ratio = self._left(evidence, hidden)
+        ratio[list(self._sudden(LATELY))] /= SUSPECT
         ratio[immune] = 0.0
         highest = float(ratio.max(initial=0.0))
         self._alarmed = self._alarmed + 1 if highest >= 1.0 else 0
@@ -220,12 +217,7 @@ class TrustMonitor:
         if highest >= 1.0 and body is not None and self._count % AGAIN:
             body.last = self._count  # a search without a result costs as much as 50 blocks
         elif highest >= 1.0 or (highest >= DOUBTFUL and self._count % AGAIN == 0 and self._hides_others(ratio, hidden)):
-            cause = explain(
-                evidence, self._without(hidden), self._joined, self._parts, self._environment - hidden,
-                lambda: self._conditions(hidden, int(evidence.age.flat[evidence.strength.argmax()])),
-                self._alternatives(hidden).exchanges(evidence) if self._may_be_exchange() else (), self._beyond(),
-            )  # fmt: skip
-            self._suspect(cause, evidence, hidden)
+            self._suspect(self._explain(evidence, hidden), evidence, hidden)
         else:
             highest = float(evidence.ratio.max(initial=0.0))
             self._cases = [case for case in self._cases if case.is_hidden or not self._has_lapsed(case, highest)]
@@ -256,11 +248,11 @@ class TrustMonitor:
                 ratio = np.minimum(ratio, self._rest(case, hidden - case.cause.columns).ratio)
         return ratio
 
-    def _rest(self, case: _Case, hidden: Hidden) -> Evidence:
+    def _rest(self, case: Case, hidden: Hidden) -> Evidence:
         """Return the evidence without the elements of a case, or with exchanged ones in each other's place."""
         if case.cause.is_exchange:
             return self._alternatives(hidden).exchanged(case.cause.columns, self._count - case.began + 1)
-        return self._without(hidden)(case.cause.columns)
+        return self._without(hidden, self._count - case.began + 1)(case.cause.columns)
 
     def _alternatives(self, hidden: Hidden) -> Alternatives:
         assert self._schema is not None and self._relations is not None
@@ -275,8 +267,9 @@ class TrustMonitor:
         else:
             self._cases = [case for case in self._cases if case.is_hidden]
             began = self._count - int(evidence.age[cause.lead]) + 1
-            known = _Case(cause, began, self._count, self._count)
+            known = Case(cause, began, self._count, self._count)
             self._cases.append(known)
+        known.has_jumped |= bool(cause.columns & self._sudden(LATELY))
         self._describe(known, hidden | cause.columns, bool(evidence.is_noise[cause.lead]))
         if cause.cause == "body" and known.seen >= UNEXPLAINED:
             self._release_recent()
@@ -293,7 +286,7 @@ class TrustMonitor:
                 self._cases.remove(case)
                 self._immune.update(self._at(case))
 
-    def _has_lapsed(self, case: _Case, highest: float) -> bool:
+    def _has_lapsed(self, case: Case, highest: float) -> bool:
         """Whether nothing speaks for a suspicion any more; `highest` is the evidence against any element."""
         if highest >= 1.0 and case.cause.cause == "body":
             case.last = self._count
@@ -305,7 +298,7 @@ class TrustMonitor:
         alone = (float(without(frozenset({int(column)})).ratio.max()) for column in order if ratio[column] > 0.0)
         return any(highest >= PLAIN for highest in alone)
 
-    def _limit_at_once(self, new: _Case) -> None:
+    def _limit_at_once(self, new: Case) -> None:
         """Take a change of many elements at once as one of the body, which hides none of them."""
         together = [c for c in self._cases if c.is_hidden and abs(c.began - new.began) < ONCE and self._at(c)]
         elements = frozenset().union(*(self._at(case) for case in together))
@@ -313,10 +306,10 @@ class TrustMonitor:
             return
         self._cases = [case for case in self._cases if case not in together]
         body = Cause(frozenset(), "body", new.cause.lead)
-        self._cases.append(_Case(body, min(case.began for case in together), self._count, self._count))
+        self._cases.append(Case(body, min(case.began for case in together), self._count, self._count))
         self._immune.update(elements)
 
-    def _refusal(self, case: _Case, ratio: float) -> str:
+    def _refusal(self, case: Case, ratio: float) -> str:
         """Return why a cause is not hidden; empty if it is. `ratio` is the evidence, as a multiple of an alarm."""
         if case.cause.cause == "environment":
             return ""
@@ -335,7 +328,7 @@ class TrustMonitor:
             return "the model cannot replace it"
         return ""
 
-    def _judge_again(self, case: _Case) -> None:
+    def _judge_again(self, case: Case) -> None:
         """Let a hidden cause return if it agrees, and correct it while that is possible."""
         assert self._relations is not None
         rest = (self._hidden_columns() - case.cause.columns) | self._recent.missing()
@@ -343,6 +336,8 @@ class TrustMonitor:
         if self._recent.resting <= self._count - case.first:  # it lied already when the body settled
             shown = replace(shown, settled=np.full_like(shown.settled, np.nan))
         evidence = self._judge(shown)
+        if self._count - case.first > AGAIN + LATELY and case.cause.columns & self._sudden(AGAIN):
+            case.has_jumped = False
         columns = sorted(case.cause.columns - self._recent.missing())
         if not columns:
             return
@@ -351,94 +346,83 @@ class TrustMonitor:
             is_silent = errors.max() < self._judge.least[columns].max()
             if case.cause.is_exchange and self._count - case.first < LONGEST:
                 return  # where the two cross they seem to agree
-            if is_silent and np.isfinite(shown.z[:, columns]).all() and self._has_moved(case, shown):
+            if case.has_jumped and self._count - case.first < PATIENCE:
+                return  # it jumped away, and has not jumped back
+            if self._recent.jumps.is_restless(case.cause.columns, shown.healthy[-1] * self._judge.scale):
+                return
+            if is_silent and np.isfinite(shown.z[:, columns]).all() and has_moved(case, shown, self._recent):
                 self._cases.remove(case)
             return
         if self._count - case.first > SETTLED or case.cause.cause == "environment":
             return
-        self._describe(case, self._hidden_columns(), case.kind == "noise")
+        self._describe(case, self._hidden_columns())
         if case.cause.cause not in ("element", "either"):
             return
-        again = explain(evidence, self._without(rest), self._joined, self._parts, frozenset(), beyond=self._beyond())
+        again = self._explain(evidence, rest, is_new=False)
         if again.cause == "element" and again.columns != case.cause.columns and not again.columns & self._environment:
             inside = again.columns < case.cause.columns
             rival, own = again.lead, max(case.cause.columns - again.columns, key=lambda c: evidence.strength[c])
             if evidence.strength[rival] > (1.0 if inside else SURE) * evidence.strength[own]:
                 case.cause = again
-                self._describe(case, rest | again.columns, case.kind == "noise")
+                self._describe(case, rest | again.columns)
 
-    def _has_moved(self, case: _Case, shown: View) -> bool:
-        """Whether an element that was frozen has moved with its prediction."""
-        if case.kind not in ("frozen", "clipped"):
-            return True
-        values = self._recent.values()[-LONGEST:]
-        healthy = shown.healthy[-len(values) :]
-        return all(np.ptp(values[:, c]) > MOVES * np.nanmean(healthy[:, c]) for c in case.cause.columns)
-
-    def _describe(self, case: _Case, hidden: Hidden, is_noise: bool) -> None:
+    def _describe(self, case: Case, hidden: Hidden, is_noise: bool = False) -> None:
         """Find kind and size of a lie from its blocks so far, predicted from trusted elements only."""
         assert self._relations is not None and self._schema is not None
-        columns = [column for column in sorted(case.cause.columns) if column < self._relations.count]
-        if not columns:  # p alone
-            return
-        view = self._recent.view(self._relations, hidden | case.cause.columns)
-        count = min(max(1, self._count - case.began + 1), len(self._recent.blocks), LONGEST)
-        lead = case.cause.lead if case.cause.lead in columns else columns[0]
-        values, spans = self._recent.values()[-count:], self._recent.spans()[-count:]
-        error = view.z[-count:] * view.healthy[-count:]
-        known = np.isfinite(error[:, columns]).all(axis=1)
-        if not known.any():
-            return
-        values, error, spans = values[known], error[known], spans[known]
-        healthy = view.healthy[-count:][known][:, lead]
-        clear = np.abs(error[:, lead]) > CLEAR * healthy * self._judge.scale[lead]
-        if case.kind != "noise" and not is_noise and clear.any() and not case.is_hidden:
-            first = int(np.argmax(clear))
-            values, error, spans, healthy = values[first:], error[first:], spans[first:], healthy[first:]
-            case.began = self._count - len(values) + 1
-        position = int(self._relations.columns[lead])
-        std, layout = float(self._schema.scaler.std[position]), self._schema.layout
-        unit = layout.signal(layout.element(position).partition(".")[0]).unit
-        others = [c for c in columns if c != lead]
-        case.kind = "swapped" if case.cause.is_exchange else kind_of(
-            values[:, lead], error[:, lead], float(healthy.mean()), std, unit, is_noise,
-            values[:, others] - error[:, others] if case.cause.cause == "all" else None, float(spans[:, lead].max()),
-        )  # fmt: skip
-        case.size = float(np.sqrt(np.mean(error[:, lead] ** 2))) * std
+        view, scale = self._recent.view(self._relations, hidden | case.cause.columns), self._judge.scale
+        is_noise |= case.kind == "noise" or self._recent.jumps.is_restless(case.cause.columns, view.healthy[-1] * scale)
+        describe(case, view, self._recent, self._relations, self._schema, scale, self._count, is_noise)
 
     def _learn(self, view: View, evidence: Evidence, motion: float) -> None:
-        noise = view.noises[-1].copy()
-        z = view.z.copy()
+        noise, z = view.noises[-1].copy(), view.z.copy()
         z[:, list(view.hidden)], noise[list(view.hidden)] = np.nan, np.nan
+        self._recent.jumps.learn(view.hidden)
         if np.isfinite(z[-1]).any():
             self._healthy.add(z, evidence.step, noise, motion)
 
     def _fresh_judge(self) -> Judge:
         return Judge(self._healthy, self._config.false_alarms, self._least)
 
-    def _beyond(self) -> Hidden:
-        """Return the judged elements whose newest values are outside of what was learned."""
+    def _explain(self, evidence: Evidence, hidden: Hidden, is_new: bool = True) -> Cause:
+        """Return the most likely cause of an alarm; of one that is not new, without other tools and exchanges."""
         assert self._relations is not None and self._schema is not None
-        judged, (low, high) = self._relations.columns[: self._relations.count], learned_range(self._schema)
-        values = self._recent.values()[-1, : len(judged)]
-        return frozenset(np.flatnonzero((values < low[judged]) | (values > high[judged])).tolist())
+        age = int(evidence.age.flat[evidence.strength.argmax()])
+        return explain(
+            evidence, self._without(hidden, age), self._joined, self._parts,
+            self._environment - hidden if is_new else frozenset(),
+            lambda: self._conditions(hidden, age),
+            self._alternatives(hidden).exchanges(evidence) if is_new and self._may_be_exchange() else (),
+            self._relations.beyond(self._schema, self._recent.values()[-1]),
+            self._sudden(age),
+        )  # fmt: skip
 
-    def _without(self, hidden: Hidden) -> Callable[[Hidden], Evidence]:
+    def _sudden(self, age: int) -> Hidden:
+        """Return the columns that jumped within about the newest `age` blocks while all others moved as usual."""
+        assert self._view is not None
+        return self._recent.jumps.sudden(age, self._view.healthy[-1] * self._judge.scale)
+
+    def _without(self, hidden: Hidden, age: int = LONGEST) -> Callable[[Hidden], Evidence]:
+        """Return the evidence with more columns hidden; errors are usual that were there before `age` blocks."""
         relations, judge = self._relations, self._judge
         assert relations is not None
-        return lambda more: judge(self._recent.view(relations, hidden | more))
+
+        def without(more: Hidden) -> Evidence:
+            view = self._recent.view(relations, hidden | more)
+            return judge(view.scaled(view.usual(judge.scale, age + EARLIER)))
+
+        return without
 
     def _hidden_columns(self) -> Hidden:
         by_hand = {self._place[p] for p in self._by_hand if p in self._place}
         return frozenset(by_hand).union(*(case.cause.columns for case in self._cases if case.is_hidden))
 
-    def _at(self, case: _Case) -> frozenset[int]:
+    def _at(self, case: Case) -> frozenset[int]:
         """Return the positions in the layout of a case's elements, without p."""
         assert self._relations is not None
         columns = [c for c in case.cause.columns if c < self._relations.count]
         return frozenset(int(self._relations.columns[c]) for c in columns)
 
-    def _finding(self, case: _Case) -> Finding:
+    def _finding(self, case: Case) -> Finding:
         lead = case.cause.lead
         at = sorted(self._at(case), key=lambda p: (self._place[p] != lead, p))
         since = self._now - (self._count - case.began) * BLOCK

@@ -9,6 +9,7 @@ import numpy as np
 from gemuco.schema import BodySchema
 from gemuco.trust.changes import LONGEST
 from gemuco.trust.config import Hidden
+from gemuco.trust.jumps import Jumps
 from gemuco.trust.relations import Relations, rows_of
 from gemuco.trust.sensitivity import Sensed
 
@@ -16,6 +17,9 @@ JERKS = 0.5
 """Noise of an element exceeds this share of the noise in what the others predict of it."""
 NOISY = 5
 """The noise is the median of this number of the newest blocks."""
+ENOUGH, LARGER = 10, 1.5
+"""Errors that were larger than learned before a change are usual: from the first number of blocks on, and in so far as
+they were larger than the second multiple."""
 SETTLING = 10
 """The errors of a posture are the mean of the first this many blocks at rest."""
 
@@ -52,6 +56,23 @@ class View:
         median = 0.5 * (ordered[middle // 2, columns] + ordered[(middle + 1) // 2, columns])
         return np.where(2 * count > len(ordered), median, np.nan)
 
+    def usual(self, scale: np.ndarray, age: int) -> np.ndarray:
+        """Return which multiple of a healthy body's the errors were before the newest blocks, at least 1, shape (n,).
+
+        Args:
+            scale: A healthy body's errors [unit of `z`], shape (n,).
+            age: Number of the newest blocks.
+        """
+        before = self.z[: max(LONGEST - age, 0)] / (LARGER * scale)
+        known = np.isfinite(before)
+        count = known.sum(axis=0)
+        square = (np.where(known, before, 0.0) ** 2).sum(axis=0) / np.maximum(count, 1)
+        return np.where(count >= ENOUGH, np.sqrt(np.maximum(square, 1.0)), 1.0)
+
+    def scaled(self, usual: np.ndarray) -> "View":
+        """Return the same errors, if these multiples of a healthy body's errors are usual, shape (n,)."""
+        return replace(self, z=self.z / usual, healthy=self.healthy * usual, settled=self.settled / usual)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Block:
@@ -74,12 +95,16 @@ class Recent:
         self._settling: list[_Block] = []
         self._settled: _Block | None = None
         self._away = 0.0
+        self.jumps = Jumps()
+        self.usual: dict[Hidden, np.ndarray] = {}
+        """Multiples of a healthy body's errors that are usual while these columns are hidden, shape (columns,)."""
         self.resting = 0
         """This number of blocks ago the body had settled at its posture; 0 in motion."""
 
     def add(self, schema: BodySchema, relations: Relations, samples: np.ndarray) -> None:
         """Add the samples of one block [standard deviations], shape (n, size), NaN where missing."""
         rows = rows_of(schema, samples)[:, relations.columns]
+        self.jumps.add(rows[:, : relations.count])
         finite = np.isfinite(rows)
         missing = finite.sum(axis=0) * 2 < len(rows)
         whole = rows[finite[:, ~missing].all(axis=1)]
@@ -173,6 +198,7 @@ class Recent:
         features = np.array([block.features for block in blocks])
         sensed = Sensed(*(np.concatenate(parts) for parts in zip(*(block.sensed for block in blocks), strict=True)))
         errors, healthy = relations.judged(hidden, features, sensed)
+        healthy = healthy * self.usual.get(hidden, 1.0)
         z = errors / healthy
         unusable = np.array([(block.missing & used).any() for block in blocks])
         z[unusable] = np.nan
@@ -196,7 +222,7 @@ class Recent:
         if settled is None or (settled.missing & used).any():
             return np.full(len(used), np.nan)
         errors, healthy = relations.judged(hidden, settled.features[None], settled.sensed)
-        return np.where(settled.missing, np.nan, (errors / healthy)[0])
+        return np.where(settled.missing, np.nan, (errors / healthy)[0] / self.usual.get(hidden, 1.0))
 
     def _noises(self, relations: Relations, hidden: Hidden, count: int) -> np.ndarray:
         """Return `View.noises` of a number of the newest blocks."""
@@ -207,6 +233,8 @@ class Recent:
     def clear(self) -> None:
         """Forget all blocks."""
         self.blocks.clear()
+        self.usual.clear()
+        self.jumps = Jumps()
         self.unsettle()
 
 

@@ -211,6 +211,17 @@ class Relations:
             errors, healthy = np.where(better, lies, errors), np.where(better, spread, healthy)
         return errors, healthy
 
+    def beyond(self, schema: BodySchema, values: np.ndarray) -> Hidden:
+        """Return the judged elements whose values are outside of what was learned.
+
+        Args:
+            schema: The schema.
+            values: Values of the judged columns [standard deviations], shape (columns,).
+        """
+        judged, (low, high) = self.columns[: self.count], learned_range(schema)
+        own = values[: self.count]
+        return frozenset(np.flatnonzero((own < low[judged]) | (own > high[judged])).tolist())
+
     def _prediction(self, index: int, outside: np.ndarray, inverse: np.ndarray) -> np.ndarray:
         """Return the map of the error of a hidden column, which the features with hidden columns do not enter."""
         unit = (np.flatnonzero(outside) == 1 + index).astype(float)

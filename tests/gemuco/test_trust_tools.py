@@ -8,9 +8,10 @@ from gemuco.dataset import Dataset, Episode
 from gemuco.learning.config import TrainConfig
 from gemuco.learning.train import fit
 from gemuco.signals import Layout, Signal
+from gemuco.trust.cases import Case
 from gemuco.trust.config import BLOCK
 from gemuco.trust.hypotheses import Cause
-from gemuco.trust.monitor import TrustMonitor, _Case
+from gemuco.trust.monitor import TrustMonitor
 
 TOOLS = {"short": 0.1, "long": 0.25}
 LAYOUT = Layout(
@@ -122,10 +123,10 @@ def test_a_pair_of_an_element_and_p_is_described_by_the_element(model):
     for number, block in enumerate(model.scaler.normalise(rows).reshape(-1, SAMPLES, LAYOUT.size)):
         monitor.add(block, number * BLOCK)
     p = LAYOUT.size
-    case = _Case(Cause(frozenset({0, p}), "all", p), 41, 41, 60)
+    case = Case(Cause(frozenset({0, p}), "all", p), 41, 41, 60)
     monitor._describe(case, case.cause.columns, is_noise=False)
     assert case.kind == "offset"
     assert case.size == pytest.approx(0.5, abs=0.2)
-    alone = _Case(Cause(frozenset({p}), "element", p), 41, 41, 60)
+    alone = Case(Cause(frozenset({p}), "element", p), 41, 41, 60)
     monitor._describe(alone, alone.cause.columns, is_noise=False)
     assert alone.kind == "unknown"

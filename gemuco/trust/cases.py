@@ -1,0 +1,102 @@
+"""Suspected and hidden causes, and what kind of lie each of them is."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from gemuco.schema import BodySchema
+from gemuco.trust.changes import LONGEST
+from gemuco.trust.hypotheses import Cause
+from gemuco.trust.kinds import kind_of
+from gemuco.trust.recent import Recent, View
+from gemuco.trust.relations import Relations
+
+CLEAR = 2.0
+"""A lie begins with the first error of this size [errors of a healthy prediction]."""
+MOVES = 3.0
+"""Before a frozen element returns, it and its prediction move by this much [errors of a healthy prediction]."""
+
+
+@dataclass(slots=True)
+class Case:
+    """A cause under suspicion, or hidden.
+
+    Attributes:
+        cause: The cause.
+        began: Number of the first wrong block.
+        first: Number of the block in which it was suspected first.
+        last: Number of the newest block that speaks for it.
+        seen: Number of blocks that were explained by it.
+        moved: Their motion [blocks at the usual pace].
+        is_hidden: Whether its elements are hidden.
+        has_jumped: Whether an element has jumped away, and not yet back.
+        kind: As in `Finding`.
+        size: As in `Finding`.
+        reason: Why its elements are still used, if a rule forbids to hide them.
+    """
+
+    cause: Cause
+    began: int
+    first: int
+    last: int
+    seen: int = 1
+    moved: float = 0.0
+    is_hidden: bool = False
+    has_jumped: bool = False
+    kind: str = "unknown"
+    size: float = math.nan
+    reason: str = ""
+
+
+def describe(
+    case: Case, view: View, recent: Recent, relations: Relations, schema: BodySchema, scale: np.ndarray, now: int,
+    is_noise: bool,
+) -> None:  # fmt: skip
+    """Find kind and size of a lie from its blocks so far.
+
+    Args:
+        case: The case; its kind, size and first wrong block are set.
+        view: Errors predicted from trusted elements only.
+        recent: The newest blocks.
+        relations: The relations.
+        schema: The model.
+        scale: Errors on this body [unit of the view], shape (columns,).
+        now: Number of the newest block.
+        is_noise: Whether its noise is the strongest evidence.
+    """
+    columns = [column for column in sorted(case.cause.columns) if column < relations.count]
+    if not columns:  # p alone
+        return
+    count = min(max(1, now - case.began + 1), len(recent.blocks), LONGEST)
+    lead = case.cause.lead if case.cause.lead in columns else columns[0]
+    values, spans = recent.values()[-count:], recent.spans()[-count:]
+    error = view.z[-count:] * view.healthy[-count:]
+    known = np.isfinite(error[:, columns]).all(axis=1)
+    if not known.any():
+        return
+    values, error, spans = values[known], error[known], spans[known]
+    healthy = view.healthy[-count:][known][:, lead]
+    clear = np.abs(error[:, lead]) > CLEAR * healthy * scale[lead]
+    if not is_noise and clear.any() and not case.is_hidden:
+        first = int(np.argmax(clear))
+        values, error, spans, healthy = values[first:], error[first:], spans[first:], healthy[first:]
+        case.began = now - len(values) + 1
+    position = int(relations.columns[lead])
+    std, layout = float(schema.scaler.std[position]), schema.layout
+    unit = layout.signal(layout.element(position).partition(".")[0]).unit
+    others = [c for c in columns if c != lead]
+    case.kind = "swapped" if case.cause.is_exchange else kind_of(
+        values[:, lead], error[:, lead], float(healthy.mean()), std, unit, is_noise,
+        values[:, others] - error[:, others] if case.cause.cause == "all" else None, float(spans[:, lead].max()),
+    )  # fmt: skip
+    case.size = float(np.sqrt(np.mean(error[:, lead] ** 2))) * std
+
+
+def has_moved(case: Case, shown: View, recent: Recent) -> bool:
+    """Whether an element that was frozen has moved with its prediction."""
+    if case.kind not in ("frozen", "clipped"):
+        return True
+    values = recent.values()[-LONGEST:]
+    healthy = shown.healthy[-len(values) :]
+    return all(np.ptp(values[:, c]) > MOVES * np.nanmean(healthy[:, c]) for c in case.cause.columns)
