@@ -22,7 +22,7 @@ RESTING, STILL = 0.3, 0.01
 POSES = 6
 """The model's error is measured at this many test poses before and after the update, which does not use them."""
 LEARNING_POSES = 8
-LEARNING_TIME = 2.0
+LEARNING_TIME = 1.6
 MOVING_TIME = 1.2
 """The arm sets off for its next pose before it rests: its samples differ more."""
 LEARNED = 80
