@@ -186,7 +186,8 @@ class TrustMonitor:
             view = self._view = self._compared(view, before)
         if self._count % REFRESH == 0:
             self._judge = self._fresh_judge()
-        self._lasting.add(view.z[-1] / self._judge.scale, self._judge.least, motion / self._judge.time)
+        looks = 0.0 if self._recent.resting else motion  # at rest sensor noise is no motion
+        self._lasting.add(view.z[-1] / self._judge.scale, self._judge.least, looks / self._judge.time)
         evidence = self._judge(view, self._lasting)
         if self._healthy.is_known:
             self._decide(evidence, hidden)

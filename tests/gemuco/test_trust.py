@@ -363,6 +363,16 @@ def test_the_learned_range_is_that_of_the_training_or_of_normal_samples_beyond_i
     assert np.array_equal(wider[0], low)
 
 
+@pytest.mark.long
+def test_at_rest_the_noise_of_the_sensors_is_no_motion(model, arm):
+    """The same error at one posture says the same again and again, for minutes."""
+    samples = np.concatenate([move(arm, 200, 15), np.zeros((900, SAMPLES, 12))])
+    samples[200:] = samples[199, -1] + np.random.default_rng(16).normal(0.0, 1.0, (900, SAMPLES, 12)) * NOISE
+    samples[200:, :, JOINT] += 0.015
+    _, hidden = watch(model, samples)
+    assert not any(hidden)
+
+
 def test_never_more_than_the_model_can_replace(model, arm):
     samples = move(arm, 200, 13)
     samples[150:, :, JOINT] += 0.5
