@@ -373,6 +373,16 @@ def test_at_rest_the_noise_of_the_sensors_is_no_motion(model, arm):
     assert not any(hidden)
 
 
+def test_a_small_offset_is_noticed_by_its_jump_and_hidden_until_it_jumps_back(model, arm):
+    samples = move(arm, 420, 18)
+    samples[200:300, :, TENSION] += 6.0
+    _, hidden = watch(model, samples)
+    wrong = [index for index, elements in enumerate(hidden) if elements == {TENSION}]
+    assert 200 <= wrong[0] < 210
+    assert 300 <= wrong[-1] < 300 + LONGEST
+    assert len(wrong) == wrong[-1] - wrong[0] + 1
+
+
 def test_never_more_than_the_model_can_replace(model, arm):
     samples = move(arm, 200, 13)
     samples[150:, :, JOINT] += 0.5
