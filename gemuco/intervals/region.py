@@ -7,9 +7,9 @@ import numpy as np
 from gemuco.intervals.sureness import MARGIN, SURE, UNKNOWN, Sureness
 from gemuco.schema import BodySchema
 
-FAR = 1.3
-"""A value is outside if it is this many times as far from its nearest anchor as nearly all anchors are from theirs."""
-NEARLY_ALL = 0.995
+RANK, NEARLY_ALL = 10, 0.995
+"""A value is outside if it is further from its nearest anchor than nearly all anchors are from their tenth nearest: the
+nearest ones may be of the same motion, right before and after, and say nothing of the distance between motions."""
 
 
 class Region:
@@ -51,10 +51,11 @@ class Region:
 
 
 def _limit(anchors: np.ndarray) -> float:
-    """Return the largest usual distance of a value from its nearest anchor, times `FAR` [standard deviations]."""
+    """Return the largest usual distance of a value from its nearest anchor [standard deviations]."""
     if len(anchors) < 2:
         return float("inf")
     squared = (anchors**2).sum(axis=1)
     between = squared[:, None] + squared - 2.0 * anchors @ anchors.T
-    np.fill_diagonal(between, np.inf)
-    return FAR * float(np.quantile(np.sqrt(between.min(axis=1).clip(min=0.0)), NEARLY_ALL))
+    rank = min(RANK, len(anchors) - 1)  # each is nearest to itself
+    near = np.partition(between, rank, axis=1)[:, rank].clip(min=0.0)
+    return float(np.quantile(np.sqrt(near), NEARLY_ALL))

@@ -3,6 +3,8 @@
 import json
 import time
 from dataclasses import replace
+from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,6 +23,8 @@ from gemuco.estimation import estimate
 from gemuco.intervals.calibration import fitted
 from gemuco.intervals.region import Region
 from gemuco.learning.train import TrainConfig, fit
+from gemuco.scaler import Scaler
+from gemuco.signals import Layout, Signal
 
 FL = [{"joint_position", "muscle_tension"}, {"muscle_tension", "muscle_length"}]
 
@@ -199,6 +203,25 @@ def test_a_region_knows_its_edges_and_its_holes(schema, arm):
         Region(hollow, "joint_position").judge((LOW + HIGH) / 2).reason
         == "this joint_position is far from all learned ones"
     )
+
+
+def test_a_region_is_not_measured_by_the_samples_right_before_and_after():
+    """An arm of six joints moves between random postures; others of the same range were unknown, and control crept."""
+
+    def motion(seed):
+        postures = np.random.default_rng(seed).uniform(-1.7, 1.7, (100, 6))
+        return np.concatenate([np.linspace(a, b, 20)[:-1] for a, b in pairwise(postures)])
+
+    zeros, ones = np.zeros(6), np.ones(6)
+    arm = SimpleNamespace(
+        layout=Layout((Signal("joint_position", 6, "rad"),)), scaler=Scaler(zeros, ones, -1.8 * ones, 1.8 * ones),
+        certainty=None, anchors=np.random.default_rng(0).permutation(motion(1))[:1000],
+    )  # fmt: skip
+    region = Region(arm, "joint_position")
+    states = [region.judge(posture).state for posture in motion(2)[::5]]
+    assert states.count("unknown") < 0.02 * len(states)
+    corner = np.full(6, 1.75)
+    assert region.judge(corner).reason == "this joint_position is far from all learned ones"
 
 
 def test_growth_is_interpolated_and_rises_with_the_square_behind_its_end():
