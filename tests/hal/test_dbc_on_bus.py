@@ -1,6 +1,7 @@
 """A servo and a load cell by their DBC files against simulated ones: what is measured, commanded, told and refused."""
 
 import math
+import re
 import struct
 import threading
 
@@ -362,7 +363,8 @@ def test_what_the_doctor_sees(bench):
     assert found["message 'Heartbeat'"].is_good
     axis(bench)._periods[axis(bench)._heartbeat] = 0.3
     bench.while_time_passes(lambda: found.update({check.what: check for check in axis_device.inspect()}))
-    assert "every 0.3 s, but `periods` has 0.1 s" in found["message 'Heartbeat'"].text
+    every = re.fullmatch(r"It comes every ([\d.]+) s, but `periods` has 0.1 s\..*", found["message 'Heartbeat'"].text)
+    assert every and float(every[1]) == pytest.approx(0.3, abs=0.01), "its period within a cycle of the HAL"
 
 
 @pytest.mark.parametrize(
