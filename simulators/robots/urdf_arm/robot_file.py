@@ -20,8 +20,8 @@ GEAR = 100
 """Drives have this many turns of the motor per turn of the joint."""
 ON_ONE_BUS = 8
 """A bus has the drives and encoders of at most this many joints."""
-SAMPLES = 3000
-"""This many samples are collected."""
+SAMPLES, MANY, MORE = 3000, 6, 5000
+"""The first number of samples is collected, and the last one of an arm with at least the second number of joints."""
 FIRST_ENCODER = 31
 """The encoders have node ids from this one on; the drives from 1 on."""
 TEXT = """\
@@ -143,7 +143,7 @@ def _draft(tree: Tree, urdf: str, tip: str | None, name: str | None, more: Seque
         gear=GEAR,
         devices=_devices(arm, ranges),
         tip=_quoted(arm.tip),
-        samples=SAMPLES,
+        samples=MORE if len(arm.joints) >= MANY else SAMPLES,
         speed=0.4 * float(ranges.rate.min()),
     )
     sheets = tuple(EDS_FOLDER / f"{kind}.eds" for kind in ("servo_drive", "joint_encoder"))
