@@ -70,6 +70,8 @@ class Jumps:
 
     def is_restless(self, columns: Hidden, error: np.ndarray) -> bool:
         """Whether one of some columns jumped more than once lately, as one with noise does; `error` as in `sudden`."""
+        if self._count < KNOWN:
+            return False
         own = [column for column in columns if column < len(self._usual)]
         jumped = [self._ratio(newest, error)[1][own].any() for newest in list(self._recent)[-LONGEST:]]
         return bool(sum(jumped) > ONE_JUMP)

@@ -71,8 +71,9 @@ def test_an_old_jump_is_not_named_and_a_usual_one_is_none() -> None:
 
 def test_the_first_blocks_name_nothing_because_no_jump_is_known_to_be_unusual() -> None:
     samples = motion(LEARNED - 2)
-    samples[-2:, :, JOINT] += 0.5
+    samples[-6::2, :, JOINT] += 0.5
     assert not after(samples).sudden(3, ERROR)
+    assert not after(samples).is_restless(frozenset({JOINT}), ERROR)
 
 
 def test_a_missing_element_does_not_jump_when_it_returns() -> None:
