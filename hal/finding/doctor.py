@@ -329,7 +329,7 @@ def check_serial(what: str, bus: BusConfig) -> Iterator[Finding]:
 def check_socketcan(what: str, bus: BusConfig, state: link.Interface | None, commands: int) -> Iterator[Finding]:
     """Check a Linux CAN interface; `commands` frames are sent at once, in addition to the SYNC."""
     name = what.split()[-1]
-    up = f"sudo ip link set {bus.channel} up type can bitrate {bus.bitrate} restart-ms 100"
+    up = link.up_command(bus.channel, "can" if state is None else state.kind, bus.bitrate)
     if state is None:
         known = ", ".join(link.known_links()) or "none"
         yield bad(
@@ -342,8 +342,7 @@ def check_socketcan(what: str, bus: BusConfig, state: link.Interface | None, com
         )
         return
     if not state.is_up:
-        command = up if state.kind in ("can", "") else f"sudo ip link set {bus.channel} up"
-        yield bad(what, f"'{bus.channel}' is down. Set it up with `{command}`.")
+        yield bad(what, f"'{bus.channel}' is down. Set it up with `{up}`.")
         return
     yield ok(what, f"'{bus.channel}' ({state.kind or 'CAN'}) is up.")
     if state.kind == "can":
@@ -355,18 +354,19 @@ def check_socketcan(what: str, bus: BusConfig, state: link.Interface | None, com
             )
         else:
             yield ok(f"bit rate {name}", f"{bus.bitrate / 1e3:g} kbit/s.")
-        yield from _controller(name, bus, state)
+        yield from check_controller(name, state)
     if state.queue is not None and state.queue < commands + 2:
         more = f"sudo ip link set {bus.channel} txqueuelen {4 * (commands + 2)}"
         yield warning(f"queue {name}", f"{state.queue} frames, and {commands + 2} are sent at once. `{more}`")
 
 
-def _controller(name: str, bus: BusConfig, state: link.Interface) -> Iterator[Finding]:
+def check_controller(name: str, state: link.Interface) -> Iterator[Finding]:
+    """Check the restart and the state of the controller of a CAN interface that is up."""
     if not state.restart:
         yield warning(
             f"restart {name}",
             "The controller stays off after bus-off. "
-            f"`sudo ip link set {bus.channel} down; sudo ip link set {bus.channel} type can restart-ms 100`",
+            f"`sudo ip link set {state.name} down; sudo ip link set {state.name} type can restart-ms 100`",
         )
     else:
         yield ok(f"restart {name}", f"{state.restart * 1e3:g} ms after bus-off.")

@@ -75,6 +75,12 @@ def parse(output: list[dict[str, Any]]) -> Interface:
     )
 
 
+def up_command(name: str, kind: str, bitrate: int) -> str:
+    """Return the command that brings an interface up; only a controller has a bit rate [bit/s] and a restart."""
+    settings = f" type can bitrate {bitrate} restart-ms 100" if kind in ("can", "") else ""
+    return f"sudo ip link set {name} up{settings}"
+
+
 def known_links() -> list[str]:
     """Return the names of this machine's CAN interfaces."""
     return sorted(folder.name for folder in NET.iterdir() if _number(folder / "type") == _ARPHRD_CAN)

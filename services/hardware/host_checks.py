@@ -10,8 +10,8 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from hal.finding.doctor import Finding, ok, warning
-from hal.finding.link import known_links, look_up
+from hal.finding.doctor import Finding, check_controller, ok, warning
+from hal.finding.link import known_links, look_up, up_command
 from services.extras import EXTRAS, is_missing
 from services.hardware.hal_service import CYCLE_PRIORITY
 
@@ -21,6 +21,8 @@ OBSERVED = 0.3
 """The two clocks are compared over this time [s]."""
 FIRST_PERSON = 1000
 """Users of services have lower numbers."""
+USUAL_BITRATE = 1_000_000
+"""Without a robot file the bit rate of a bus is not known [bit/s]."""
 _TIMEX_BYTES = 256
 _MAX_ERROR_AT = 24
 """`maxerror` [us] has this offset in `struct timex` (64 bit)."""
@@ -54,14 +56,14 @@ def can_interfaces() -> Iterator[Finding]:
     """Report the CAN interfaces of this machine."""
     links = [link for name in known_links() if (link := look_up(name)) is not None]
     for link in links:
-        rate = f", {link.bitrate / 1e6:g} Mbit/s" if link.bitrate else ""
-        if link.is_up:
-            yield ok(
-                f"interface {link.name}", f"{link.kind or 'can'}, up{rate}{', ' + link.state if link.state else ''}."
-            )
-        else:
-            command = f"sudo ip link set {link.name} up type can bitrate 1000000 restart-ms 100"
+        if not link.is_up:
+            command = up_command(link.name, link.kind, USUAL_BITRATE)
             yield warning(f"interface {link.name}", f"{link.kind or 'can'}, down. Bring it up: `{command}`.")
+            continue
+        rate = f", {link.bitrate / 1e6:g} Mbit/s" if link.bitrate else ""
+        yield ok(f"interface {link.name}", f"{link.kind or 'can'}, up{rate}.")
+        if link.kind == "can":
+            yield from check_controller(link.name, link)
     if not links:
         yield ok("interfaces", "No CAN interface. Simulated robots need none.")
 

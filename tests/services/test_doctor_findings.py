@@ -2,7 +2,9 @@
 
 import pwd
 import socket
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -129,14 +131,23 @@ def test_the_installation_names_what_is_missing_and_what_brings_it(monkeypatch: 
 
 
 @pytest.mark.parametrize(
-    ("is_up", "verdict", "said"), [(True, Severity.OK, "0.5 Mbit/s"), (False, Severity.WARNING, "ip link set can0 up")]
+    ("changes", "what", "verdict", "said"),
+    [
+        ({}, "interface can0", Severity.OK, "up, 0.5 Mbit/s"),
+        ({}, "restart can0", Severity.OK, "100 ms"),
+        ({"state": "BUS-OFF"}, "controller can0", Severity.BAD, "BUS-OFF"),
+        ({"is_up": False}, "interface can0", Severity.WARNING, "ip link set can0 up type can bitrate 1000000"),
+        ({"is_up": False, "kind": "vcan"}, "interface can0", Severity.WARNING, "`sudo ip link set can0 up`"),
+        ({"kind": "vcan", "bitrate": None}, "interface can0", Severity.OK, "vcan, up."),
+    ],
 )
 def test_the_can_interfaces_of_the_machine(
-    monkeypatch: pytest.MonkeyPatch, is_up: bool, verdict: Severity, said: str
+    monkeypatch: pytest.MonkeyPatch, changes: dict[str, Any], what: str, verdict: Severity, said: str
 ) -> None:
+    sound = link.Interface("can0", True, True, "can", 500_000, 0.1, "ERROR-ACTIVE")
     monkeypatch.setattr(host_checks, "known_links", lambda: ["can0"])
-    monkeypatch.setattr(host_checks, "look_up", lambda name: link.Interface(name, True, is_up, "can", 500_000))
-    (finding,) = host_checks.can_interfaces()
-    assert finding.what == "interface can0"
-    assert finding.verdict is verdict
-    assert said in finding.text
+    monkeypatch.setattr(host_checks, "look_up", lambda name: replace(sound, **changes))
+    found = {finding.what: finding for finding in host_checks.can_interfaces()}
+    assert found[what].verdict is verdict
+    assert said in found[what].text
+    assert len(found) == (1 if "kind" in changes or "is_up" in changes else 3 if "state" in changes else 2)
