@@ -98,8 +98,8 @@ def explain(
                 yield frozenset({column, int(without(frozenset({column})).strength.argmax())})
 
     single = [column for column in singles if solves(frozenset({column}))]
-    for known_wrong in (sudden, beyond):
-        single = [column for column in single if column in known_wrong] or single
+    for preferred in (sudden, beyond):
+        single = [column for column in single if column in preferred] or single
     best = float(evidence.strength[single[0]]) if single else 0.0
     rest = min((left(frozenset({column})) for column in single), default=1.0)
     pair: Hidden = frozenset() if evidence.is_noise.any() else _exchanged(evidence, exchanges, rest, sudden)

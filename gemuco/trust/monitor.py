@@ -51,7 +51,7 @@ AT_ONCE, ONCE = 3, 15
 """At most this number of elements are wrong at once, which is within this number of blocks; otherwise the body is."""
 LATELY, SUSPECT = 10, 0.6
 """Of an element that jumped within the first number of blocks, the second share of an alarm is one: with limits for one
-wrong verdict a week, so much less evidence is enough if the jump itself comes once in a quarter of an hour at most."""
+wrong verdict a week, so much less evidence is enough if a jump of a right element comes once in 20 minutes at most."""
 PATIENCE = 100
 """An element that jumped away returns after this number of blocks, or after it has jumped back."""
 SURE = 2.0
@@ -200,7 +200,8 @@ class TrustMonitor:
     def _compared(self, view: View, before: View | None) -> View:
         """Return a view with newly hidden columns, in which errors are usual that were there before they lied."""
         if before is None or not before.hidden < view.hidden:
-            self._recent.usual.clear()
+            known = self._recent.usual
+            self._recent.usual = {columns: usual for columns, usual in known.items() if columns <= view.hidden}
             return view
         began = max((case.began for case in self._cases if case.is_hidden), default=self._count)
         usual = view.usual(self._judge.scale, self._count - began + 1 + EARLIER)
@@ -394,7 +395,7 @@ class TrustMonitor:
             lambda: self._conditions(hidden, age),
             self._alternatives(hidden).exchanges(evidence) if is_new and self._may_be_exchange() else (),
             self._relations.beyond(self._schema, self._recent.values()[-1]),
-            self._sudden(age),
+            self._sudden(age) - hidden,
         )  # fmt: skip
 
     def _sudden(self, age: int) -> Hidden:
