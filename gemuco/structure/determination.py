@@ -24,7 +24,7 @@ from gemuco.signals import Layout
 from gemuco.structure.mask_errors import LISTED
 from gemuco.structure.mask_judge import Judge, Thresholds
 from gemuco.structure.mask_search import choose, find_border
-from gemuco.structure.mask_training import train_masks, train_split
+from gemuco.structure.mask_training import cores, train_masks
 from gemuco.structure.result import Structure
 
 __all__ = ["Judge", "Structure", "Thresholds", "determine", "learn", "search", "select"]
@@ -78,10 +78,13 @@ def determine(
     judge = Judge(alive.layout.names, (), thresholds)
     first, most = (FIRST_SPLITS, MOST_SPLITS) if splits is None else (splits, splits)
     judge.add(*train_masks(alive, config, first, _share(progress, 0, first), drafts))
-    for split in range(first, most):
-        if _is_decided(judge):
-            break
-        judge.add(train_split(alive, config, split, _share(progress, split, 1), drafts))
+    done = first
+    while done < most and not _is_decided(judge):
+        beside = min(cores(), most - done)
+        for errors in train_masks(alive, config, beside, _share(progress, done, beside), drafts, done):
+            if not _is_decided(judge):  # so that the result does not depend on the number of cores
+                judge.add(errors)
+        done += beside
     if progress is not None:
         progress(1.0, "structure")
     if len(alive.layout.names) <= LISTED:

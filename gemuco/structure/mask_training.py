@@ -24,14 +24,21 @@ class _Stopped(Exception):
     """A training ends because one beside it failed or was interrupted."""
 
 
+def cores() -> int:
+    """Return the number of processor cores that this process may use."""
+    return len(os.sched_getaffinity(0))
+
+
 def train_masks(
     dataset: Dataset,
     config: TrainConfig,
     splits: int = 1,
     progress: Progress | None = None,
     drafts: Path | None = None,
+    first: int = 0,
 ) -> tuple[MaskErrors, ...]:
-    """Train one network under all masks per split of the data, and return each with its held-out rows.
+    """Train one network under all masks per split of the data, `first` and those after it, and return each with its
+    held-out rows.
 
     The trainings run beside each other, one per core. If one fails, or Ctrl-C comes, the others end with their epoch.
 
@@ -44,14 +51,14 @@ def train_masks(
         def report(done: float, text: str) -> None:
             if stop.is_set():
                 raise _Stopped
-            shares[split] = done
+            shares[split - first] = done
             if progress is not None:
                 progress(float(shares.mean()), text)
 
         return train_split(dataset, config, split, report, drafts)
 
-    with one_thread(), ThreadPoolExecutor(min(splits, len(os.sched_getaffinity(0)))) as pool:
-        jobs = [pool.submit(train, split) for split in range(splits)]
+    with one_thread(), ThreadPoolExecutor(min(splits, cores())) as pool:
+        jobs = [pool.submit(train, split) for split in range(first, first + splits)]
         try:
             ended, _ = wait(jobs, return_when=FIRST_EXCEPTION)
             return tuple(job.result() for job in sorted(ended, key=jobs.index))

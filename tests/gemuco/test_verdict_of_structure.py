@@ -77,8 +77,8 @@ def splits(monkeypatch):
             asked.append(split)
             return split_with(errors(split))
 
-        for module in (determination, mask_training):
-            monkeypatch.setattr(module, "train_split", train_split)
+        monkeypatch.setattr(mask_training, "train_split", train_split)
+        monkeypatch.setattr(determination, "cores", lambda: 1)
         return asked
 
     return with_errors
@@ -106,6 +106,23 @@ def test_more_splits_until_the_spread_is_small_against_the_distance(splits):
     assert found.splits == len(asked)
     assert "a" in found.x_out
     assert found.open == ()
+
+
+@pytest.mark.parametrize("cores", [2, 3, 16])
+def test_more_cores_train_more_splits_beside_each_other_and_change_nothing(splits, monkeypatch, cores):
+    wild = [0.02, 0.12, 0.05, 0.08, 0.06, 0.07, 0.06, 0.07, 0.06, 0.07]
+
+    def errors(split):
+        return {"a": wild[split], "b": 0.01, "c": 0.9}
+
+    asked = splits(errors)
+    alone = determine(body(), TINY)
+    asked.clear()
+    monkeypatch.setattr(determination, "cores", lambda: cores)
+    beside = determine(body(), TINY)
+    assert beside == alone
+    assert sorted(asked) == list(range(len(asked)))
+    assert beside.splits <= len(asked) < beside.splits + cores
 
 
 def test_an_error_at_the_threshold_ends_undecided_and_says_so(splits):
