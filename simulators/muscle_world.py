@@ -9,7 +9,7 @@ a forearm is light, so steps are linearly implicit: they use the tensions at the
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from typing_extensions import override
@@ -38,6 +38,8 @@ class MuscleWorld(World):
                 a ten times shorter step by 0.001 rad and 0.5 N (root mean square).
         """
         self.time = 0.0
+        self.push: Callable[[np.ndarray], np.ndarray] | None = None
+        """It returns the joint torques of contacts [N m] at joint positions [rad], both of shape (n,)."""
         self._longest_step = longest_step
         self._body = body
         self._servo = servo or Servo()
@@ -135,6 +137,8 @@ class MuscleWorld(World):
 
     def _substep(self, duration: float) -> None:
         torque = self._pulled(duration, self._wires, self._slid_joint)
+        if self.push is not None:
+            torque = torque + self.push(self._physics.position)
         self._physics.step(self._bias + self._implicit @ (torque - self._bias), duration)
 
     def _pulled(self, duration: float, wires: np.ndarray, slid_joint: np.ndarray) -> np.ndarray:

@@ -1,6 +1,6 @@
 """The trained model of the muscle-driven arm, and random motion of its actual variants."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 from rich.console import Console
@@ -29,13 +29,25 @@ def motion(
             return
 
 
+Contact = Callable[[float, np.ndarray], np.ndarray]
+"""Joint torques [N m] of contacts at a time [s] and at joint positions [rad], shapes (n,)."""
+
+
 def record(
-    robot: RobotConfig, arm: int, seed: int, rate: float, duration: float, part: str = ""
+    robot: RobotConfig,
+    arm: int,
+    seed: int,
+    rate: float,
+    duration: float,
+    part: str = "",
+    contact: Contact | None = None,
 ) -> dict[str, np.ndarray]:
     """Return signal -> samples (count, n) [unit] of one actual arm."""
     world = registry.load_object(robot.simulator or "", "simulator", ("world",)).world("actual", arm)
     if part:
         world.break_part(part)
+    if contact is not None:
+        world.push = lambda position: contact(world.time, position)
     clock = WorldClock(world)
     with Robot(robot, [DirectDevice(robot, world, clock)], clock=clock, source="simulated") as body:
         rows = list(motion(robot, body, seed, rate, duration))
