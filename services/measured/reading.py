@@ -18,8 +18,22 @@ from services.measured.table_files import read_table
 logger = logging.getLogger(__name__)
 
 
+@dataclass(frozen=True, slots=True)
+class Timed:
+    """Episodes, the file or folder of each, and the number of their rows per second [Hz]; None if it is not known."""
+
+    dataset: Dataset
+    names: tuple[str, ...]
+    rate: float | None
+
+
 def read_measured(config: MeasuredConfig, folder: Path, note: Callable[[str], None] = logger.warning) -> Dataset:
-    """Read all episodes that a description names.
+    """Read all episodes that a description names; arguments and errors are those of `read_timed`."""
+    return read_timed(config, folder, note).dataset
+
+
+def read_timed(config: MeasuredConfig, folder: Path, note: Callable[[str], None] = logger.warning) -> Timed:
+    """Read all episodes that a description names, with their names and rate.
 
     Args:
         config: The description.
@@ -34,7 +48,9 @@ def read_measured(config: MeasuredConfig, folder: Path, note: Callable[[str], No
     reader = _Reader(config, note)
     episodes = [(place, episode) for place in places for episode in reader.episodes(place, reader.condition(place))]
     reader.check()
-    return Dataset(config.layout, _together(config, episodes))
+    names, joined = zip(*_together(config, episodes), strict=True)
+    rate = 1.0 / float(np.median(reader.steps)) if reader.steps else None
+    return Timed(Dataset(config.layout, joined), names, rate)
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,9 +93,9 @@ def _unmatched(folder: Path, pattern: str) -> str:
     )
 
 
-def _together(config: MeasuredConfig, episodes: list[tuple[_Place, Episode]]) -> tuple[Episode, ...]:
-    """Return the episodes with every group joined into one."""
-    merged: list[Episode] = []
+def _together(config: MeasuredConfig, episodes: list[tuple[_Place, Episode]]) -> list[tuple[str, Episode]]:
+    """Return the episodes and their names with every group joined into one."""
+    merged: list[tuple[str, Episode]] = []
     remaining = dict(enumerate(episodes))
     for group in config.together:
         chosen = [i for i, (place, _) in remaining.items() if any(place.fits(pattern) for pattern in group)]
@@ -88,8 +104,8 @@ def _together(config: MeasuredConfig, episodes: list[tuple[_Place, Episode]]) ->
             fault = "have several conditions; they must have the same one" if parts else "do not exist"
             raise DatasetError(f"together: the episodes that match {', '.join(group)} {fault}.")
         values = {name: np.concatenate([part.values[name] for part in parts]) for name in config.signals}
-        merged.append(Episode(parts[0].condition, values))
-    return (*merged, *(episode for _, episode in remaining.values()))
+        merged.append((", ".join(group), Episode(parts[0].condition, values)))
+    return [*merged, *((place.name, episode) for place, episode in remaining.values())]
 
 
 @dataclass(slots=True)
@@ -101,6 +117,7 @@ class _Reader:
         note: Called with sentences on rows that were left out.
         used: Patterns of conditions that some file matches.
         seen: Number of rows of data; `kept` is the number after thinning out.
+        steps: Usual time between the rows of each episode [s].
     """
 
     config: MeasuredConfig
@@ -108,6 +125,7 @@ class _Reader:
     used: set[str] = field(default_factory=set)
     seen: int = 0
     kept: int = 0
+    steps: list[float] = field(default_factory=list)
 
     def condition(self, place: _Place) -> str:
         """Return the condition of a file or folder."""
@@ -155,6 +173,8 @@ class _Reader:
         for part in np.split(rows, np.flatnonzero(starts) + 1):
             chosen = part[self._thinned(len(part), None if stamps is None else stamps[part])]
             self.seen, self.kept = self.seen + len(part), self.kept + len(chosen)
+            if stamps is not None and len(chosen) > 1:
+                self.steps.append(float(np.median(np.diff(stamps[chosen]))))
             yield Episode(condition, {name: array[chosen] for name, array in values.items()})
 
     def _thinned(self, count: int, stamps: np.ndarray | None) -> np.ndarray:
