@@ -1,12 +1,13 @@
 """Suspected and hidden causes, and what kind of lie each of them is."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from gemuco.schema import BodySchema
 from gemuco.trust.changes import LONGEST
+from gemuco.trust.evidence import Evidence
 from gemuco.trust.hypotheses import Cause
 from gemuco.trust.kinds import kind_of
 from gemuco.trust.recent import Recent, View
@@ -28,9 +29,12 @@ class Case:
         first: Number of the block in which it was suspected first.
         last: Number of the newest block that speaks for it.
         seen: Number of blocks that were explained by it.
+        weight: Their evidence, the sum of squared shares of an alarm.
+        steps: Their largest results of the step test [standard deviations], shape (columns,).
         moved: Their motion [blocks at the usual pace].
         is_hidden: Whether its elements are hidden.
         has_jumped: Whether an element has jumped away, and not yet back.
+        is_plain: Whether an element jumped or was stuck, so that it certainly lied.
         kind: As in `Finding`.
         size: As in `Finding`.
         reason: Why its elements are still used, if a rule forbids to hide them.
@@ -41,12 +45,22 @@ class Case:
     first: int
     last: int
     seen: int = 1
+    weight: float = 0.0
+    steps: np.ndarray = field(default_factory=lambda: np.zeros(1))
     moved: float = 0.0
     is_hidden: bool = False
     has_jumped: bool = False
+    is_plain: bool = False
     kind: str = "unknown"
     size: float = math.nan
     reason: str = ""
+
+    def weigh(self, evidence: Evidence, has_jumped: bool, is_stuck: bool) -> None:
+        """Add the evidence of one block, in which its elements may have jumped or been stuck."""
+        self.has_jumped |= has_jumped
+        self.is_plain |= has_jumped or is_stuck
+        self.weight += float(evidence.ratio.max()) ** 2
+        self.steps = np.fmax(self.steps, evidence.step)
 
 
 def describe(

@@ -28,6 +28,10 @@ TAIL, EXCESSES = 0.4, 20.0
 """Mean excess above `COMMON` that is assumed at the start, and the number of excesses that this counts as."""
 TAILS = (0.3, 0.7)
 """The mean excess is at least and at most this; 0.28 for normal errors."""
+CAREFUL, MOST_CAREFUL, FORGETS = 3.0, 30.0, 36000.0
+"""Each time that elements were hidden and then agreed again, without a sign that they had lied, this multiple of the
+evidence is needed from then on, up to the second number; it is forgotten in this number of blocks. Contacts contradict
+what was learned too, for a while."""
 NOISE_KNOWN = 20
 """The usual noise of a column is known after this number of blocks in which it was measured."""
 RESTS = 0.2
@@ -39,6 +43,8 @@ class Healthy:
 
     def __init__(self, size: int) -> None:
         self.count, self.moved = 0, 0.0
+        self.caution = 0.0
+        """An element that gives no sign of its own is hidden from this sum of squared shares of an alarm on."""
         self._square = np.ones(size)
         self._near, self._far = np.full(size, 0.85), np.full(size, 0.5)
         self._excess, self._exceeding = np.full(size, TAIL * EXCESSES), np.full(size, EXCESSES)
@@ -56,6 +62,7 @@ class Healthy:
         """
         self.count += 1
         self.moved += motion
+        self.caution *= 1.0 - 1.0 / FORGETS
         doubted = np.where((steps > COMMON) & (self.count > PRIOR), DOUBTED, 1.0)
         share = doubted * motion / min(PRIOR + self.moved, MEMORY)
         now = z[-1]
@@ -74,6 +81,19 @@ class Healthy:
         share = is_noise / np.clip(self._noise_count, 1.0, MEMORY)
         change = np.clip(np.where(is_noise, noise, self._noise), 0.0, 9.0 * self._noise + 1e-4)
         self._noise += share * (change - self._noise)
+
+    def excuse(self, columns: list[int], steps: np.ndarray, was_hidden: bool) -> None:
+        """Learn that an alarm was none, because it ended by itself.
+
+        Args:
+            columns: The columns that were suspected.
+            steps: Their largest steps, shape (n,).
+            was_hidden: Whether they were hidden.
+        """
+        self._excess[columns] += np.maximum(steps[columns] - COMMON, 0.0)
+        self._exceeding[columns] += 1.0
+        if was_hidden:
+            self.caution = min(CAREFUL * max(self.caution, 1.0), MOST_CAREFUL)
 
     def motion(self, moved: float) -> float:
         """Return how much of a look at a new posture a block is, from 0 at rest to 1.

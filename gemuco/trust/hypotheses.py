@@ -9,8 +9,9 @@ import numpy as np
 from gemuco.trust.config import Hidden
 from gemuco.trust.evidence import Evidence
 
-EXPLAINED = 0.85
-"""Without the wrong columns the evidence against all others is below this share of an alarm."""
+TOOL, EXPLAINED = 0.85, 0.6
+"""Without the wrong columns the evidence against all others is below the second share of an alarm; a contact of the
+body changes what is measured by many sensors, and more is left of it. Another tool is believed below the first."""
 CANDIDATES = 5
 """This many columns with the most evidence are held against each other."""
 SEARCHED = 6
@@ -74,7 +75,7 @@ def explain(
         exchanges: Pairs of elements, and the evidence if they are exchanged back.
         beyond: Columns outside of what was learned. There the relations are not known, so if one of them explains the
             alarm, it contradicts no other: the tension of a cut wire makes a right encoder look wrong.
-        sudden: Columns that jumped when the alarm began, while all others moved as usual.
+        sudden: Columns that jumped when the alarm began, while all others moved as usual, or that are stuck.
     """
     order = np.argsort(-evidence.strength)
     lead = int(order[0])
@@ -109,11 +110,11 @@ def explain(
         environment = frozenset()
     if environment and not evidence.is_noise[lead]:
         for name, other, is_known in conditions():
-            if float(other.ratio.max(initial=0.0)) < (min(AGREES, rest + RIVALS) if is_known else EXPLAINED):
+            if float(other.ratio.max(initial=0.0)) < (min(AGREES, rest + RIVALS) if is_known else TOOL):
                 return Cause(environment, "environment", lead, name)
     if environment and not sudden.intersection(single):  # another tool moves the whole tip
         own = float(evidence.strength[list(environment)].max())
-        if own >= CLOSE * best - ALIKE and solves(environment):
+        if own >= CLOSE * best - ALIKE and left(environment) < TOOL:
             return Cause(environment, "environment", lead)
     if len(sudden) > 1 and not any(sudden <= part for part in parts) and solves(sudden):
         return Cause(sudden, "all", max(sudden, key=lambda c: evidence.strength[c]))

@@ -186,6 +186,7 @@ class TrustMonitor:
             view = self._view = self._compared(view, before)
         if self._count % REFRESH == 0:
             self._judge = self._fresh_judge()
+        self._recent.find_repeats(view, self._judge.scale, motion)
         looks = 0.0 if self._recent.resting else motion  # at rest sensor noise is no motion
         self._lasting.add(view.z[-1] / self._judge.scale, self._judge.least, looks / self._judge.time)
         evidence = self._judge(view, self._lasting)
@@ -212,6 +213,8 @@ class TrustMonitor:
         immune = [self._place[p] for p in self._immune if p in self._place]
         ratio = self._left(evidence, hidden)
         ratio[list(self._sudden(LATELY))] /= SUSPECT
+        stuck = list(self._recent.repeats.stuck - hidden)
+        ratio[stuck] = np.maximum(ratio[stuck], 1.0)
         ratio[immune] = 0.0
         highest = float(ratio.max(initial=0.0))
         self._alarmed = self._alarmed + 1 if highest >= 1.0 else 0
@@ -222,7 +225,8 @@ class TrustMonitor:
             self._suspect(self._explain(evidence, hidden), evidence, hidden)
         else:
             highest = float(evidence.ratio.max(initial=0.0))
-            self._cases = [case for case in self._cases if case.is_hidden or not self._has_lapsed(case, highest)]
+            for case in [c for c in self._cases if not c.is_hidden and self._has_lapsed(c, highest)]:
+                self._close(case)
         if self._count % AGAIN == 0:
             for case in [case for case in self._cases if case.is_hidden]:
                 self._judge_again(case)
@@ -271,11 +275,13 @@ class TrustMonitor:
             began = self._count - int(evidence.age[cause.lead]) + 1
             known = Case(cause, began, self._count, self._count)
             self._cases.append(known)
-        known.has_jumped |= bool(cause.columns & self._sudden(LATELY))
+        columns = cause.columns
+        known.weigh(evidence, bool(columns & self._sudden(LATELY)), bool(columns & self._recent.repeats.stuck))
+        is_enough = known.is_plain or known.weight >= self._healthy.caution or cause.cause == "environment"
         self._describe(known, hidden | cause.columns, bool(evidence.is_noise[cause.lead]))
         if cause.cause == "body" and known.seen >= UNEXPLAINED:
             self._release_recent()
-        if known.seen >= CONFIRMED and cause.cause != "body":
+        if known.seen >= CONFIRMED and is_enough and cause.cause != "body":
             known.reason = self._refusal(known, float(evidence.ratio.max()))
             known.is_hidden = not known.reason
             self._limit_at_once(known)
@@ -348,12 +354,14 @@ class TrustMonitor:
             is_silent = errors.max() < self._judge.least[columns].max()
             if case.cause.is_exchange and self._count - case.first < LONGEST:
                 return  # where the two cross they seem to agree
+            if case.cause.columns & self._recent.repeats.stuck:
+                return  # it agrees by chance
             if case.has_jumped and self._count - case.first < PATIENCE:
                 return  # it jumped away, and has not jumped back
             if self._recent.jumps.is_restless(case.cause.columns, shown.healthy[-1] * self._judge.scale):
                 return
             if is_silent and np.isfinite(shown.z[:, columns]).all() and has_moved(case, shown, self._recent):
-                self._cases.remove(case)
+                self._close(case)
             return
         if self._count - case.first > SETTLED or case.cause.cause == "environment":
             return
@@ -367,6 +375,12 @@ class TrustMonitor:
             if evidence.strength[rival] > (1.0 if inside else SURE) * evidence.strength[own]:
                 case.cause = again
                 self._describe(case, rest | again.columns)
+
+    def _close(self, case: Case) -> None:
+        """End a case; one without a plain lie may have been a contact, and such errors are usual from now on."""
+        self._cases.remove(case)
+        if case.cause.cause in ("element", "either", "all") and not case.is_plain:
+            self._healthy.excuse(sorted(case.cause.columns), case.steps, case.is_hidden)
 
     def _describe(self, case: Case, hidden: Hidden, is_noise: bool = False) -> None:
         """Find kind and size of a lie from its blocks so far, predicted from trusted elements only."""
@@ -395,7 +409,7 @@ class TrustMonitor:
             lambda: self._conditions(hidden, age),
             self._alternatives(hidden).exchanges(evidence) if is_new and self._may_be_exchange() else (),
             self._relations.beyond(self._schema, self._recent.values()[-1]),
-            self._sudden(age) - hidden,
+            (self._sudden(age) | self._recent.repeats.stuck) - hidden,
         )  # fmt: skip
 
     def _sudden(self, age: int) -> Hidden:

@@ -12,6 +12,7 @@ from gemuco.trust.config import Hidden
 from gemuco.trust.jumps import Jumps
 from gemuco.trust.relations import Relations, rows_of
 from gemuco.trust.sensitivity import Sensed
+from gemuco.trust.stuck import Repeats
 
 JERKS = 0.5
 """Noise of an element exceeds this share of the noise in what the others predict of it."""
@@ -95,7 +96,10 @@ class Recent:
         self._settling: list[_Block] = []
         self._settled: _Block | None = None
         self._away = 0.0
-        self.jumps = Jumps()
+        self._schema: BodySchema
+        """This is the schema of the newest block."""
+        self._samples = np.zeros((0, 0))
+        self.jumps, self.repeats = Jumps(), Repeats()
         self.usual: dict[Hidden, np.ndarray] = {}
         """Multiples of a healthy body's errors that are usual while these columns are hidden, shape (columns,)."""
         self.resting = 0
@@ -103,8 +107,10 @@ class Recent:
 
     def add(self, schema: BodySchema, relations: Relations, samples: np.ndarray) -> None:
         """Add the samples of one block [standard deviations], shape (n, size), NaN where missing."""
+        self._schema = schema
         rows = rows_of(schema, samples)[:, relations.columns]
-        self.jumps.add(rows[:, : relations.count])
+        self._samples = rows[:, : relations.count]
+        self.jumps.add(self._samples)
         finite = np.isfinite(rows)
         missing = finite.sum(axis=0) * 2 < len(rows)
         whole = rows[finite[:, ~missing].all(axis=1)]
@@ -159,7 +165,7 @@ class Recent:
     def _read_as(self, schema: BodySchema, relations: Relations, values: np.ndarray) -> "Recent":
         """Return the same blocks with other means [standard deviations], shape (blocks, columns), and a schema's p."""
         other = Recent()
-        other._moved = self._moved.copy()
+        other._moved, other._schema = self._moved.copy(), schema
         full = relations.rows(schema, values)
         features, sensed = relations.features(full), relations.sensitivity.sense(schema, full)
         none = np.zeros((0, features.shape[1]))
@@ -197,7 +203,8 @@ class Recent:
         blocks = [self.blocks[-1]] if fresh else list(self.blocks)
         features = np.array([block.features for block in blocks])
         sensed = Sensed(*(np.concatenate(parts) for parts in zip(*(block.sensed for block in blocks), strict=True)))
-        errors, healthy = relations.judged(hidden, features, sensed)
+        means = np.array([block.mean for block in blocks])
+        errors, healthy = relations.judged(self._schema, hidden, features, sensed, means)
         healthy = healthy * self.usual.get(hidden, 1.0)
         z = errors / healthy
         unusable = np.array([(block.missing & used).any() for block in blocks])
@@ -216,12 +223,27 @@ class Recent:
         moved = np.array(self._moved) - self._moved[-1]
         return View(z, healthy, noises, hidden, settled, self._away, moved)
 
+    def find_repeats(self, view: View, scale: np.ndarray, motion: float) -> None:
+        """Find the elements that are stuck after the newest block.
+
+        Args:
+            view: The errors.
+            scale: A healthy body's errors [unit of the view], shape (columns,).
+            motion: Motion in the newest block [looks at a new posture].
+        """
+        used = slice(self._samples.shape[1])
+        healthy = view.healthy[-1][used]
+        predicted = self.blocks[-1].mean[used] - view.z[-1][used] * healthy
+        self.repeats.add(self._samples, motion, predicted, healthy * scale[used])
+
     def _errors_when_settled(self, relations: Relations, hidden: Hidden, used: np.ndarray) -> np.ndarray:
         """Return `View.settled`; `used` are the columns that are not hidden."""
         settled = self._settled
         if settled is None or (settled.missing & used).any():
             return np.full(len(used), np.nan)
-        errors, healthy = relations.judged(hidden, settled.features[None], settled.sensed)
+        errors, healthy = relations.judged(
+            self._schema, hidden, settled.features[None], settled.sensed, settled.mean[None]
+        )
         return np.where(settled.missing, np.nan, (errors / healthy)[0] / self.usual.get(hidden, 1.0))
 
     def _noises(self, relations: Relations, hidden: Hidden, count: int) -> np.ndarray:
@@ -234,7 +256,7 @@ class Recent:
         """Forget all blocks."""
         self.blocks.clear()
         self.usual.clear()
-        self.jumps = Jumps()
+        self.jumps, self.repeats = Jumps(), Repeats()
         self.unsettle()
 
 

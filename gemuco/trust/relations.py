@@ -16,6 +16,8 @@ from gemuco.trust.sensitivity import Sensed, Sensitivity
 
 NEAR = 0.2
 """The variance of a prediction has this constant part; the rest grows with the distance from the known samples."""
+NEARBY = 0.05
+"""The network's errors are computed anew if a hidden element is off by more than this [standard deviations]."""
 KEPT = 64
 """At most this number of relations is kept."""
 FLOOR = 0.002
@@ -197,19 +199,52 @@ class Relations:
         usual = np.median(spread, axis=0) * calibration
         return np.asarray(usual < std), calibration
 
-    def judged(self, hidden: Hidden, features: np.ndarray, sensed: Sensed) -> tuple[np.ndarray, np.ndarray]:
+    def judged(
+        self, schema: BodySchema, hidden: Hidden, features: np.ndarray, sensed: Sensed, values: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return the errors of samples with some columns hidden, and those of a healthy body, shapes (n, columns).
 
         Each error is that of the watch, or the lie that the network's errors suggest, whichever is known better.
+
+        Args:
+            schema: The schema whose p the samples have.
+            hidden: The hidden columns.
+            features: Features of the samples, shape (n, features).
+            sensed: Errors of the network at the samples.
+            values: Values of the judged columns [standard deviations], shape (n, columns).
         """
         relation = self.without(hidden)
         errors, healthy = relation.errors(features), relation.healthy(features)
         if relation.network.any():
+            sensed, off = self._sensed_without(schema, hidden, errors, sensed, values)
             lies, spread = self.sensitivity.lies(sensed, hidden)
+            lies = lies + off
             spread = np.maximum(spread * relation.calibration * np.maximum(1.0, healthy / relation.std), self._coarse)
             better = relation.network & np.isfinite(spread)
             errors, healthy = np.where(better, lies, errors), np.where(better, spread, healthy)
         return errors, healthy
+
+    def _sensed_without(
+        self, schema: BodySchema, hidden: Hidden, errors: np.ndarray, sensed: Sensed, values: np.ndarray
+    ) -> tuple[Sensed, np.ndarray]:
+        """Return the errors of the network with the watch's predictions in place of hidden elements that are far off.
+
+        The network's derivatives hold near the truth only: at a wrong value of a hidden element the errors of all
+        others would be wrong too, the more so the larger its lie is.
+
+        Returns:
+            The errors, and the correction that was taken off every column, shape (n, columns).
+        """
+        elements, off = sorted(column for column in hidden if column < self.count), np.zeros(errors.shape)
+        off[:, elements] = np.nan_to_num(errors[:, elements])
+        far = np.abs(off).max(axis=1, initial=0.0) > NEARBY
+        off[~far] = 0.0
+        if not far.any():
+            return sensed, off
+        again = self.sensitivity.sense(schema, self.rows(schema, (values - off)[far]))
+        result = Sensed(*(part.copy() for part in sensed))
+        result.errors[far], result.slopes[far] = again
+        return result, off
 
     def beyond(self, schema: BodySchema, values: np.ndarray) -> Hidden:
         """Return the judged elements whose values are outside of what was learned.
