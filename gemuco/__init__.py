@@ -42,6 +42,8 @@ _ROOMS = {
     "gemuco.simulation": ("SimulatedState", "Simulator", "simulate"),
     "gemuco.structure.determination": ("Structure", "determine", "learn"),
     "gemuco.structure.mask_judge": ("Thresholds",),
+    "gemuco.trust.config": ("TrustConfig",),
+    "gemuco.trust.inspection": ("Inspection", "Inspector", "Lie", "inspect"),
 }
 _ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
 __all__ = sorted(_ROOM_OF)
@@ -95,6 +97,11 @@ if TYPE_CHECKING:
     from gemuco.structure.determination import determine as determine
     from gemuco.structure.determination import learn as learn
     from gemuco.structure.mask_judge import Thresholds as Thresholds
+    from gemuco.trust.config import TrustConfig as TrustConfig
+    from gemuco.trust.inspection import Inspection as Inspection
+    from gemuco.trust.inspection import Inspector as Inspector
+    from gemuco.trust.inspection import Lie as Lie
+    from gemuco.trust.inspection import inspect as inspect
 else:
 
     def __getattr__(name: str) -> object:
