@@ -11,7 +11,8 @@ from hal.calibration.units import CONVERSIONS, NAMED, PLAIN
 
 BRACKET = re.compile(r"\s*[\[(]([^\])\d][^\])]*)[\])]\s*$")
 TAIL = re.compile(
-    r"[_\s](deg_per_s|rad_per_s|deg_s|rad_s|m_per_s|degrees|radians|deg|rad|nm|nmm|mm|cm|rpm|ma|mv|kpa|mpa|bar|degc|px|ms|us|ns)$",
+    r"[_\s](deg_per_s|rad_per_s|deg_s|rad_s|m_per_s|degrees|radians|degps|radps|dps|mps2|mps|kmh|kph|deg|rad|nm|nmm|mm|cm"
+    r"|rpm|ma|mv|kpa|mpa|bar|degc|px|ms|us|ns)$",
     re.IGNORECASE,
 )
 """An end of a name that is a unit."""

@@ -10,7 +10,8 @@ from hal.calibration.units import CONVERSIONS, PLAIN, check_units, factor
 DEFINED = {
     "deg": ("rad", math.radians(1)), "deg/s": ("rad/s", math.radians(1)), "deg/s^2": ("rad/s^2", math.radians(1)),
     "rpm": ("rad/s", 2 * math.pi / 60), "rev": ("rad", math.tau),
-    "mm": ("m", 0.001), "cm": ("m", 0.01), "um": ("m", 0.000_001), "mm/s": ("m/s", 0.001), "g": ("kg", 0.001),
+    "mm": ("m", 0.001), "cm": ("m", 0.01), "um": ("m", 0.000_001), "mm/s": ("m/s", 0.001), "km/h": ("m/s", 1000 / 3600),
+    "g": ("kg", 0.001),
     "ms": ("s", 0.001), "us": ("s", 0.000_001), "ns": ("s", 0.000_000_001), "min": ("s", 60), "h": ("s", 3600),
     "mN": ("N", 0.001), "kN": ("N", 1000), "kgf": ("N", 9.80665),
     "N mm": ("N m", 0.001), "N cm": ("N m", 0.01), "kN m": ("N m", 1000),
