@@ -93,6 +93,27 @@ def test_a_relation_is_the_prediction_of_the_watch(model, arm):
     assert isinstance(normal.watch, Watch)
 
 
+@pytest.mark.parametrize("off", [0.3, 1.0, 3.0])
+def test_how_wrong_a_hidden_element_is_changes_nothing_of_the_others(model, arm, off):
+    relations = Relations.of(model)
+    rows = rows_of(model, model.scaler.normalise(move(arm, 20, 1)[:, 0]))
+    sees_network = False
+    for element in range(12):
+        hidden, others = frozenset({element}), np.arange(12) != element
+
+        def errors(wrong, hidden=hidden, element=element):
+            own = rows.copy()
+            own[:, element] += wrong
+            values, sensed = own[:, relations.columns], relations.sensitivity.sense(model, own)
+            error, healthy = relations.judged(model, hidden, relations.features(own), sensed, values)
+            return error / healthy
+
+        sees_network |= bool(relations.without(hidden).network[others].any())
+        assert np.abs(errors(off) - errors(0.0))[:, others].max() < 0.5
+        assert (errors(off) - errors(0.0))[:, element].min() > 2.0
+    assert sees_network
+
+
 def test_a_step_is_tested_with_its_likeness():
     """A healthy slow error passes; the deviation of a step is that of the likelihood ratio of normal variables."""
     likeness = Likeness(np.array([0.9]), np.array([0.1]))
