@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from services.verbs import bridges, deployment, describe, endpoint, hardware, init, inspect, page, recording
+from services.verbs import bridges, deployment, describe, endpoint, hardware, init, page, recording
 from services.verbs.verb import CommandLine, Connect, RobotFile, load, report_errors, robot_name, robot_path
 
 app = typer.Typer(
@@ -326,7 +326,7 @@ def reproduce(
     typer.echo(f"Figures and tables are in {out / robot}.")
 
 
-for verbs in (init, describe, inspect, hardware, deployment, endpoint, recording, page, bridges):
+for verbs in (init, describe, hardware, deployment, endpoint, recording, page, bridges):
     verbs.register(app)
 
 

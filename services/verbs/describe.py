@@ -1,4 +1,4 @@
-"""`gemuco describe`: draft a description of measured data, to train from."""
+"""The verbs of measured data: describe them, to train from, and inspect them for sensors that lied."""
 
 import shlex
 from pathlib import Path
@@ -19,6 +19,7 @@ from services.verbs.verb import report_errors
 def register(app: typer.Typer) -> None:
     """Add the verb to the command line."""
     app.command()(describe)
+    app.command()(inspect)
 
 
 @report_errors
@@ -50,6 +51,30 @@ def describe(
         typer.echo(f"Units are not known of {', '.join(result.unknown)}: write them where {path} marks it.")
     data = "" if is_below else f" --data {shlex.quote(str(folder))}"
     typer.echo(f"Next: gemuco train {shlex.quote(str(path))}{data}")
+
+
+@report_errors
+def inspect(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A description of measured tables, or a robot file.")],
+    data: Annotated[
+        list[Path],
+        typer.Option(help="What to inspect: a table, a folder of tables, or recordings (.mcap); repeat for more."),
+    ],
+    model: Annotated[Path | None, typer.Option(help="Folder of the model; runs/<name>/model if not given.")] = None,
+    rate: Annotated[
+        float | None, typer.Option(min=1e-3, metavar="HZ", help="Rows per second, if the tables have no time.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="Write each episode with estimates in place of lies as CSV.")
+    ] = None,
+) -> None:
+    """Find sensors that lied in recorded data: frozen, off, drifting, clipped, swapped.
+
+    The model must be trained from other data, in which all sensors were right.
+    """
+    from services.verbs.inspect import run_inspection
+
+    run_inspection(file, data, model, rate, out)
 
 
 def _show(result: Draft, console: Console) -> None:

@@ -3,7 +3,6 @@
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 import typer
@@ -25,32 +24,14 @@ from services.model import artifacts
 from services.model.living_model import load_model
 from services.model.model_config import CollectConfig, collect_config
 from services.recording.dataset import is_recording, select
-from services.verbs.verb import report_errors
 
 
-def register(app: typer.Typer) -> None:
-    """Add the verb to the command line."""
-    app.command()(inspect)
+def run_inspection(file: Path, data: Sequence[Path], model: Path | None, rate: float | None, out: Path | None) -> None:
+    """Print the lies in recorded data; arguments are those of the verb.
 
-
-@report_errors
-def inspect(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="A description of measured tables, or a robot file.")],
-    data: Annotated[
-        list[Path],
-        typer.Option(help="What to inspect: a table, a folder of tables, or recordings (.mcap); repeat for more."),
-    ],
-    model: Annotated[Path | None, typer.Option(help="Folder of the model; runs/<name>/model if not given.")] = None,
-    rate: Annotated[
-        float | None, typer.Option(min=1e-3, metavar="HZ", help="Rows per second, if the tables have no time.")
-    ] = None,
-    out: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="Write each episode with estimates in place of lies as CSV.")
-    ] = None,
-) -> None:
-    """Find sensors that lied in recorded data: frozen, off, drifting, clipped, swapped.
-
-    The model must be trained from other data, in which all sensors were right.
+    Raises:
+        SchemaError: Data, model or description do not fit.
+        RecordingError: A recording cannot be read.
     """
     if is_table(file):
         raise ConfigError(f"'{file}' holds data. Name the description that `gemuco train` used, and this with --data.")
