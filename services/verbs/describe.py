@@ -55,10 +55,12 @@ def describe(
 
 @report_errors
 def inspect(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="A description of measured tables, or a robot file.")],
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="The description of measured tables that `gemuco train` used.")
+    ],
     data: Annotated[
         list[Path],
-        typer.Option(help="What to inspect: a table, a folder of tables, or recordings (.mcap); repeat for more."),
+        typer.Option(help="What to inspect: a table, or a folder of tables; repeat for more."),
     ],
     model: Annotated[Path | None, typer.Option(help="Folder of the model; runs/<name>/model if not given.")] = None,
     rate: Annotated[
@@ -68,7 +70,7 @@ def inspect(
         Path | None, typer.Option(metavar="FOLDER", help="Write each episode with estimates in place of lies as CSV.")
     ] = None,
 ) -> None:
-    """Find sensors that lied in recorded data: frozen, off, drifting, clipped, swapped.
+    """Find sensors that lied in measured tables: frozen, off, drifting, clipped, swapped.
 
     The model must be trained from other data, in which all sensors were right.
     """

@@ -39,3 +39,9 @@ def test_blocks_run_in_an_empty_folder(tmp_path):
     )  # as the tutorial's arm
     assert np.abs(unloaded - without_load).max() < 1.0
     assert np.abs(np.array(unloaded) - tension).max() > 10.0  # the load is in p
+    lines = [" ".join(line.split()) for line in outputs[7].splitlines()]
+    assert [line.split("│")[4:6] for line in lines if "heavy_4" in line] == [
+        [" cable.cable_2_mm ", " offset "],
+        [" joint.joint_1_deg ", " frozen "],
+    ]
+    assert sorted(path.name for path in (tmp_path / "repaired").iterdir()) == ["000_heavy_4_csv.csv"]
