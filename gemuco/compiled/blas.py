@@ -7,6 +7,7 @@ numpy that is not a wheel of PyPI.
 """
 
 import ctypes
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
@@ -34,6 +35,11 @@ if not HAS_NUMPYS and find_spec("scipy") is None:
         "This numpy has no BLAS that compiled code can call, because it is not a wheel of PyPI. "
         "Install scipy beside it, or numpy by pip."
     )
+
+
+def cores() -> int:
+    """Return the number of processor cores that this process may use."""
+    return len(os.sched_getaffinity(0))
 
 
 @contextmanager

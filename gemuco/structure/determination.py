@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gemuco.compiled.blas import cores
 from gemuco.dataset import Data, Dataset, as_dataset
 from gemuco.errors import NotEnoughData, check_kind
 from gemuco.learning.config import TrainConfig
@@ -24,7 +25,7 @@ from gemuco.signals import Layout
 from gemuco.structure.mask_errors import LISTED
 from gemuco.structure.mask_judge import Judge, Thresholds
 from gemuco.structure.mask_search import choose, find_border
-from gemuco.structure.mask_training import cores, train_masks
+from gemuco.structure.mask_training import train_masks
 from gemuco.structure.result import Structure
 
 __all__ = ["Judge", "Structure", "Thresholds", "determine", "learn", "search", "select"]

@@ -1,12 +1,11 @@
 """Errors of a network that infers every signal from any mask, measured on held-out rows."""
 
-import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gemuco.compiled.blas import one_thread
+from gemuco.compiled.blas import cores, one_thread
 from gemuco.compiled.chain import pack
 from gemuco.compiled.masks import Rows, squared_errors
 from gemuco.dataset import Dataset
@@ -137,7 +136,7 @@ class MaskErrors:
 
         Each core measures a part of the masks; compiled code holds no interpreter lock.
         """
-        chain, cores = pack(self.chain), len(os.sched_getaffinity(0))
+        chain, count = pack(self.chain), min(cores(), len(masks))
         inputs = np.concatenate([self.x, self.p], axis=1, dtype=np.float32)
         rows = Rows(inputs, self.x, self.counts.astype(np.float32), np.ascontiguousarray(self.whole))
 
@@ -146,8 +145,8 @@ class MaskErrors:
             paths = np.stack([self.path.map(gate) for gate in gates])
             return np.asarray(squared_errors(chain, rows, gates, paths, share.astype(np.float32)))
 
-        with one_thread(), ThreadPoolExecutor(cores) as pool:
-            return np.concatenate(list(pool.map(part, np.array_split(masks, min(cores, len(masks))))))
+        with one_thread(), ThreadPoolExecutor(max(1, count)) as pool:
+            return np.concatenate(list(pool.map(part, np.array_split(masks, count))))
 
     def from_others(self) -> np.ndarray:
         """Return the error of every signal inferred from all others, shape (signals,); NaN if no row allows it."""

@@ -1,6 +1,5 @@
 """Training of a network that infers every signal from any mask. `mask_errors` measures it without torch."""
 
-import os
 import threading
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from dataclasses import replace
@@ -8,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gemuco.compiled.blas import one_thread
+from gemuco.compiled.blas import cores, one_thread
 from gemuco.dataset import Dataset
 from gemuco.learning.config import TrainConfig
 from gemuco.learning.learner import Progress
@@ -24,11 +23,6 @@ class _Stopped(Exception):
     """A training ends because one beside it failed or was interrupted."""
 
 
-def cores() -> int:
-    """Return the number of processor cores that this process may use."""
-    return len(os.sched_getaffinity(0))
-
-
 def train_masks(
     dataset: Dataset,
     config: TrainConfig,
@@ -37,8 +31,7 @@ def train_masks(
     drafts: Path | None = None,
     first: int = 0,
 ) -> tuple[MaskErrors, ...]:
-    """Train one network under all masks per split of the data, `first` and those after it, and return each with its
-    held-out rows.
+    """Train one network under all masks per split from `first` on, and return each with its held-out rows.
 
     The trainings run beside each other, one per core. If one fails, or Ctrl-C comes, the others end with their epoch.
 
