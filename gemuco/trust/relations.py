@@ -207,11 +207,11 @@ class Relations:
         Each error is that of the watch, or the lie that the network's errors suggest, whichever is known better.
 
         Args:
-            schema: The schema whose p the samples have.
+            schema: The schema.
             hidden: The hidden columns.
             features: Features of the samples, shape (n, features).
             sensed: Errors of the network at the samples.
-            values: Values of the judged columns [standard deviations], shape (n, columns).
+            values: Values of the judged columns, p included [standard deviations], shape (n, columns).
         """
         relation = self.without(hidden)
         errors, healthy = relation.errors(features), relation.healthy(features)
@@ -236,12 +236,14 @@ class Relations:
             The errors, and the correction that was taken off every column, shape (n, columns).
         """
         elements, off = sorted(column for column in hidden if column < self.count), np.zeros(errors.shape)
-        off[:, elements] = np.nan_to_num(errors[:, elements])
+        off[:, elements] = np.where(np.isfinite(values[:, elements]), errors[:, elements], 0.0)
         far = np.abs(off).max(axis=1, initial=0.0) > NEARBY
         off[~far] = 0.0
         if not far.any():
             return sensed, off
-        again = self.sensitivity.sense(schema, self.rows(schema, (values - off)[far]))
+        rows = self.rows(schema, (values - off)[far])
+        rows[:, self.columns] = (values - off)[far]  # also the p of each sample, if another tool has come since
+        again = self.sensitivity.sense(schema, rows)
         result = Sensed(*(part.copy() for part in sensed))
         result.errors[far], result.slopes[far] = again
         return result, off
