@@ -169,7 +169,7 @@ class Inspector:
             known.end, known.seen, known.was_hidden = end, known.seen + 1, known.was_hidden or finding.is_distrusted
         for one in followed:
             if one.was_hidden and one.end == begin:  # it was used again: it has agreed for the whole window
-                one.end = max(one.start + self._block, begin - LONGEST * self._block)
+                one.end = max(one.start + self._block, begin - (LONGEST - 1) * self._block)
 
     def _lie(self, schema: BodySchema, one: _Open) -> Lie:
         finding = one.finding
