@@ -28,15 +28,14 @@ from studies.accuracy.lying_robots import ARM, RATE
 CACHE = Path("runs/contacts")
 KNOCKS = 0.3
 """Share of the pushes that are knocks."""
-FORCE, RAMP, KNOCK_RAMP, HELD, KNOCK_HELD, BETWEEN = (
-    (5.0, 30.0),
-    (0.05, 1.0),
-    (0.02, 0.1),
-    (0.5, 8.0),
-    0.05,
-    (3.0, 10.0),
-)
-"""Ranges of force [N], and of the times [s] in which it grows, is held, and until the next push."""
+FORCE = (5.0, 30.0)
+"""A push has a force in this range [N]."""
+RAMP, HELD = (0.05, 1.0), (0.5, 8.0)
+"""It grows, and is held, for times in these ranges [s]."""
+KNOCK_RAMP, KNOCK_HELD = (0.02, 0.1), 0.05
+"""The same of a knock."""
+BETWEEN = (3.0, 10.0)
+"""Time without a push [s]."""
 
 
 @dataclass(frozen=True, slots=True)
