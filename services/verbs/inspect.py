@@ -35,6 +35,8 @@ def run_inspection(file: Path, data: Sequence[Path], model: Path | None, rate: f
     Raises:
         SchemaError: Data, model or description do not fit.
     """
+    if not file.is_file():
+        raise ConfigError(f"There is no file '{file}'. Name the description that `gemuco train` used.")
     if not description.is_description(file):
         what = "holds data" if is_table(file) else "is no description of measured tables"
         raise ConfigError(
