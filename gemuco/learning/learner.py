@@ -31,8 +31,12 @@ outliers. This limits the effect of outliers that are not detected yet. With 1 %
 off, the error of the PR2's tip is 14 mm; with squared errors it is 141 mm, and on clean data 8 mm
 (studies/accuracy/imperfect_data.py)."""
 
-SEARCHES = 16
-"""Outliers are searched for about this many times during a training, after the first quarter of the epochs."""
+SEARCHES = 4, 16
+"""Outliers are searched for at least and at most about this many times during a training, after the first quarter of
+the epochs; in between as often as costs no more than the training itself."""
+
+PASSES = 3
+"""An epoch costs as much as this many predictions of all samples."""
 
 DRAFTS = 40
 """A training is saved about this many times."""
@@ -154,10 +158,18 @@ class Learner:
         has_stalled = self.epoch - max(course.best_epoch, 0) > patience
         return has_stalled and not course.train[-1] > course.held_out[-1]
 
+    @property
+    def _searches(self) -> range:
+        """Epochs before which outliers are searched for."""
+        least, most = SEARCHES
+        affordable = PASSES * self.epochs // (outliers.JUDGES * len(self.task.x_out))
+        begin = self.epochs // 4
+        return range(begin, self.epochs, max(1, self.epochs // min(max(affordable, least), most)))
+
     def _epoch(self) -> None:
         """Learn from every sample once, and measure the loss on the held-out samples."""
         course, epoch, epochs = self.course, self.epoch, self.epochs
-        searches = range(epochs // 4, epochs, max(1, epochs // SEARCHES))
+        searches = self._searches
         if epoch in searches:
             self._reject_outliers(spare_rare=epoch < epochs // 2)
         course.train.append(self._pass(epoch, HUBER[epoch > searches.start]))

@@ -60,6 +60,26 @@ def fit(
     """
     check_kind("The settings of a training", config, TrainConfig, "a TrainConfig")
     dataset = as_dataset(data, units)
+    schema, learner, history = fit_weights(dataset, config, masks, progress, x_out, title, resume)
+    conditions = dataset.conditions
+    schema = blended(schema, *judged_rows(schema, learner.held, conditions))
+    return doubted(assessed(schema, learner, conditions), dataset), history
+
+
+def fit_weights(
+    dataset: Dataset,
+    config: TrainConfig,
+    masks: Iterable[Iterable[str]],
+    progress: Progress | None = None,
+    x_out: Iterable[str] | None = None,
+    title: str = "training",
+    resume: str | Path | None = None,
+) -> tuple[BodySchema, Learner, History]:
+    """Train a body schema as `fit` does, without its errors and the statistics of its normal errors.
+
+    Returns:
+        The schema, its training with the samples, and the record of the training.
+    """
     layout = dataset.layout
     checked = tuple(mask(m, layout.names) for m in masks)
     if not checked or frozenset() in checked:
@@ -85,12 +105,10 @@ def fit(
     biases = np.zeros((len(conditions), bias_size), np.float32)
     learner = Learner(config, weights, biases, frozen, material, held)
     learner.run(progress, title, Draft(resume, draft_key(config, task, dataset)))
-    schema = schema_of(learner, scaler, conditions)
     weights = learner.weights
     _mute(weights, task, scaler.dead, unused)
-    schema = blended(schema.with_weights(weights), *judged_rows(schema, learner.held, conditions))
-    schema = doubted(assessed(schema, learner, conditions), dataset)
-    return schema, history_of(learner, scaler, notes)
+    schema = schema_of(learner, scaler, conditions).with_weights(weights)
+    return schema, learner, history_of(learner, scaler, notes)
 
 
 def _task(dataset: Dataset, masks: tuple[Mask, ...], x_out: tuple[str, ...]) -> tuple[Task, list[str]]:

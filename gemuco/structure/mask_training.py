@@ -11,7 +11,7 @@ from gemuco.compiled.blas import cores, one_thread
 from gemuco.dataset import Dataset
 from gemuco.learning.config import TrainConfig
 from gemuco.learning.learner import Progress
-from gemuco.learning.train import fit
+from gemuco.learning.train import fit_weights
 from gemuco.masks import Mask, all_masks
 from gemuco.structure.mask_errors import LISTED, MaskErrors
 
@@ -79,7 +79,7 @@ def train_split(
     train, held = dataset.split(own.held_out, own.seed)
     resume = None if drafts is None else drafts / f"structure_{split}.safetensors"
     masks = _drawn_masks(dataset.layout.names, own.seed)
-    schema, _ = fit(dataset, own, masks, progress, title=f"structure, split {split + 1}", resume=resume)
+    schema, _, _ = fit_weights(dataset, own, masks, progress, title=f"structure, split {split + 1}", resume=resume)
     return MaskErrors.of_schema(schema, train, held, config.outliers)
 
 

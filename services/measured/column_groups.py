@@ -1,6 +1,7 @@
 """Groups of columns that belong to one signal, and their units, guessed from names and numbers."""
 
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -17,7 +18,7 @@ TAIL = re.compile(
 )
 """An end of a name that is a unit."""
 LETTER = re.compile(r"[_\s]([nmsva])$", re.IGNORECASE)
-"""An end of a name that is a unit if the name also has a word of a quantity."""
+"""An end of a name that is a unit if the name also has a word of a quantity or of a source of electricity."""
 INDEX = re.compile(r"\d+(?=\D*$)")
 AXIS = re.compile(r"^(.*?)(x|y|z|w|roll|pitch|yaw)$", re.IGNORECASE)
 
@@ -59,6 +60,8 @@ QUANTITIES = {
     "cmd",
     "ref",
 }
+SOURCES = {"battery", "bus", "motor", "supply"}
+"""Current and voltage of these are often called by the unit alone: `battery_a`, `battery_v`."""
 LARGEST_ANGLE = 6.5
 """An angle beyond this is in degrees [rad]."""
 DERIVED = 0.8
@@ -158,13 +161,19 @@ def _by_name(columns: list[Column]) -> list[Group]:
             if key is not None:
                 keys.setdefault((key, unit), []).append(column)
         for (key, unit), members in keys.items():
-            if len(members) > 1:
+            if len(members) > 1 and not _differ_in_unit(members):
                 groups.append(_group(key, members, unit))
                 remaining = [column for column in remaining if column not in members]
     for column in remaining:
         base, unit = unit_in(column.label)
         groups.append(_group(re.sub(r"_0$", "", base), [column], unit))
     return groups
+
+
+def _differ_in_unit(columns: list[Column]) -> bool:
+    """Whether the ends of the names are different units: `battery_a`, `battery_v`, but not three phases a, b, c."""
+    letters = {match[1].lower() for column in columns if (match := LETTER.search(column.label))}
+    return len(letters) == len(columns) and all((QUANTITIES | SOURCES) & set(_words(c.label)) for c in columns)
 
 
 def _index(name: str) -> str | None:
@@ -200,7 +209,7 @@ def _group(key: str, columns: list[Column], unit: str | None) -> Group:
     base, own = unit_in(re.sub(r"[_\s.]*[#@]", "", key))
     unit, is_guess = unit or own, False
     words = _words(base)
-    if unit is None and (letter := LETTER.search(base)) and QUANTITIES & set(words):
+    if unit is None and (letter := LETTER.search(base)) and (QUANTITIES | SOURCES) & set(words):
         base, unit = base[: letter.start()], proper(letter[1].upper() if letter[1] in "nva" else letter[1])
     if unit is None:
         unit = next((WORDS[word] for word in words if word in WORDS), None) or _of_joint(words)
@@ -267,11 +276,15 @@ def _name(stem: str) -> str:
 
 
 def _distinct(groups: Iterable[Group]) -> list[Group]:
-    """Return the groups with names that differ."""
-    names: dict[str, int] = {}
+    """Return the groups with names that differ: if two are alike without their units, they keep these."""
+    groups = list(groups)
+    shared = Counter(group.name for group in groups)
+    names: Counter[str] = Counter()
     distinct = []
     for group in groups:
-        names[group.name] = count = names.get(group.name, 0) + 1
-        name = group.name if count == 1 else f"{group.name}_{count}"
+        is_shared = shared[group.name] > 1 and len(group.columns) == 1 and not group.columns[0].is_numbered
+        name = _name(group.columns[0].label) if is_shared else group.name
+        names[name] += 1
+        name = name if names[name] == 1 else f"{name}_{names[name]}"
         distinct.append(Group(name, group.columns, group.unit, group.is_guess))
     return distinct

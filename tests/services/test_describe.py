@@ -51,6 +51,10 @@ def groups_of(*labels: str) -> dict[str, tuple[list[str], str | None]]:
         (["hip_torque", "knee_torque"], {"torque": (["hip_torque", "knee_torque"], "N m")}),
         (["voltage_v"], {"voltage": (["voltage_v"], "V")}),
         (["link_a", "link_v"], {"link": (["link_a", "link_v"], None)}),
+        (["battery_a", "battery_v"], {"battery_a": (["battery_a"], "A"), "battery_v": (["battery_v"], "V")}),
+        (["motor_rpm", "motor_a"], {"motor_rpm": (["motor_rpm"], "rpm"), "motor_a": (["motor_a"], "A")}),
+        (["bus_a", "bus_b"], {"bus": (["bus_a", "bus_b"], None)}),
+        (["current_a", "current_b", "current_c"], {"current": (["current_a", "current_b", "current_c"], "A")}),
     ],
 )
 def test_columns_are_grouped_by_their_names(labels, signals):
