@@ -58,6 +58,8 @@ def learn_normal(
     """
     x = with_bias(schema, schema.scaler.normalise(np.asarray(rows, float)), bias)
     signal = _columns(schema, x)
+    if not (signal >= 0).any():
+        raise NotEnoughData("No signal is measured in most samples, so normal errors cannot be learned.")
     whole = np.isfinite(x[:, signal >= -1]).all(axis=1)
     complete = x[whole]
     _check(complete)

@@ -202,6 +202,7 @@ def _first(name: str) -> str | None:
 
 
 def _words(name: str) -> list[str]:
+    name = re.sub(r"\d[A-Za-z]+\d\w*", "", name)  # a hexadecimal ID: the f in 4F1 is no force
     return [word for word in re.split(r"[^a-z]+", re.sub(r"([a-z])([A-Z])", r"\1_\2", name).lower()) if word]
 
 

@@ -134,6 +134,9 @@ class MeasuredConfig(Section):
     """Whether the first line names the columns."""
     cut_to_shortest: bool = False
     """Whether the files of a folder may have different numbers of rows; only rows that all files have are used."""
+    names: Text = ""
+    """Column with the name of the message that a row holds; its value `speed` is then the column `message.speed`, or
+    `message` if a row has only one value. Needs `interpolate`."""
     signals: dict[str, MeasuredSignalConfig] = Field(min_length=1)
     time: TimeConfig | None = None
     """Time column; without it a file is one episode."""
@@ -143,6 +146,9 @@ class MeasuredConfig(Section):
     """Of this many rows one is used."""
     rate: Positive | None = None
     """Rows are used at most at this rate [Hz]; needs `time`."""
+    interpolate: Positive | None = None
+    """For rows that hold some of the signals only, and files with stamps of their own: every signal is interpolated at
+    `rate` between its samples, where these are at most this far apart [s]. Each file has the column of `time`."""
     conditions: dict[str, Text] = Field(default_factory=dict)
     """Condition of the body by pattern of an episode's file or folder; if empty, all have the same condition."""
     together: tuple[tuple[str, ...], ...] = ()
@@ -175,6 +181,12 @@ class MeasuredConfig(Section):
             raise ValueError("rate needs the column of the time, such as time: {columns: t}; or write every: 10")
         if self.rate is not None and self.every != 1:
             raise ValueError("every and rate both leave rows out; write one of them")
+        if self.interpolate is not None and (self.rate is None or self.time is None):
+            raise ValueError("interpolate needs time and rate, such as time: {columns: t} and rate: 50")
+        if self.names and self.interpolate is None:
+            raise ValueError("names needs interpolate, such as interpolate: 0.5, because a row has one message only")
+        if self.interpolate is not None and self.episode is not None:
+            raise ValueError("episode and interpolate cannot be used together; write each episode to a file of its own")
         owners: dict[tuple[str | None, str], str] = {}
         for name, part in self.signals.items():
             for column in part.expanded():
@@ -186,7 +198,7 @@ class MeasuredConfig(Section):
     @property
     def style(self) -> TextStyle:
         """Form of the text files."""
-        return TextStyle(self.separator, self.header, self.decimal)
+        return TextStyle(self.separator, self.header, self.decimal, self.names)
 
     @property
     def layout(self) -> Layout:

@@ -2,7 +2,7 @@
 
 import json
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -10,11 +10,14 @@ import numpy as np
 
 from gemuco.errors import DatasetError
 from hal.calibration.units import CONVERSIONS, factor
+from services.measured.alignment import are_apart, usual_steps
 from services.measured.column_groups import Column, Group, grouped, unit_in
 from services.measured.episode_files import Recording, read_recording
 
 ENOUGH = 20_000
 """A draft thins a recording of more rows out to about this many."""
+BRIDGED = 3.0
+"""Samples of a signal are interpolated if they are at most this many steps of the slowest signal apart."""
 PAUSE = 10.0
 """A pause longer than this many usual steps begins another episode."""
 TIMES = {"time", "timestamp", "stamp", "t", "sec", "secs", "seconds", "ts", "date", "datetime", "clock", "received"}
@@ -56,6 +59,21 @@ class Clock:
 
 
 @dataclass(frozen=True, slots=True)
+class Alignment:
+    """Interpolation of rows that hold some of the signals only.
+
+    Attributes:
+        rate: Rows per second after it [Hz].
+        pause: Samples further apart than this are not interpolated [s].
+        reason: Words on the rows.
+    """
+
+    rate: float
+    pause: float
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
 class Draft:
     """Everything that was guessed of a recording.
 
@@ -66,6 +84,7 @@ class Draft:
         clock: Time; None if no column is the time.
         episode: Column with the number of the episode; None if no column is.
         unused: Column -> reason for leaving it out.
+        alignment: How the rows are interpolated; None if every row has all signals.
     """
 
     name: str
@@ -74,6 +93,7 @@ class Draft:
     clock: Clock | None
     episode: Column | None
     unused: dict[str, str]
+    alignment: Alignment | None = None
 
     @property
     def unknown(self) -> list[str]:
@@ -90,7 +110,7 @@ class Draft:
     @property
     def every(self) -> int:
         """Of this many rows the draft uses one."""
-        return max(1, round(self.recording.rows / ENOUGH))
+        return 1 if self.alignment is not None else max(1, round(self.recording.rows / ENOUGH))
 
     def text(self, base: Path | None = None) -> str:
         """Return the description as YAML.
@@ -105,15 +125,17 @@ class Draft:
         lines += [f"separator: {json.dumps(style.separator)}"] if style.separator != "," else []
         lines += [f"decimal: {json.dumps(style.decimal)}"] if style.decimal != "." else []
         lines += ["header: false   # columns are numbered from 0"] if not style.header else []
-        if self.recording.is_ragged:
+        if self.recording.is_ragged and self.alignment is None:
             lines.append("cut_to_shortest: true   # the files of an episode have different numbers of rows")
+        if style.names:
+            lines.append(f"names: {_quoted(style.names)}   # the message of each row")
         lines += [
             "",
             "# A signal is what is lost, estimated or commanded together. Divide or join them as your robot is built.",
         ]
         lines += ["signals:", *(self._signal(group) for group in self.groups), ""]
         if self.clock is not None:
-            place = _place(self.clock.column)
+            place = _place(self.clock.column, self.alignment is not None)
             unit = "" if self.clock.unit == "s" else f", written_in: {self.clock.unit}"
             lines.append(
                 f"time: {{{place}{unit}, gap: {self.clock.gap:g}}}   # a longer pause [s] begins another episode"
@@ -138,6 +160,11 @@ class Draft:
         )
 
     def _thinning(self) -> list[str]:
+        if self.alignment is not None:
+            return [
+                f"rate: {self.alignment.rate:g}   # [Hz] {self.alignment.reason}, so all are interpolated at it",
+                f"interpolate: {self.alignment.pause:g}   # [s] longer pauses of a signal are not bridged",
+            ]
         if self.every == 1:
             return []
         if self.clock is None:
@@ -160,7 +187,18 @@ def draft(paths: list[Path]) -> Draft:
     recording = read_recording(paths)
     unused: dict[str, str] = dict.fromkeys(recording.texts, "holds text")
     columns = [column for column in recording.columns if column.label not in unused]
-    clock, others = _clock(recording, columns)
+    names = recording.messages
+    clock, others = _clock(recording, columns, is_bus=names is not None)
+    if names is not None and clock is not None:
+        recording = read_recording(paths, names, (clock.column.label,))
+        clock = replace(clock, column=next(c for c in recording.columns if c.label == clock.column.label))
+        columns, others = [column for column in recording.columns if not column.is_dead], []
+        unused = {column.label: "never varies" for column in recording.columns if column.is_dead}
+    alignment = _alignment(recording, clock, columns)
+    if clock is not None and alignment is not None:
+        clock = replace(clock, gap=max(clock.gap, BRIDGED * alignment.pause))
+        columns = [column for column in columns if column.label != clock.column.label or column is clock.column]
+        others = [column for column in others if column.label != clock.column.label]
     unused |= {_label(column): "another time" for column in others}
     columns = [column for column in columns if column is not (clock and clock.column) and column not in others]
     episode = next((column for column in columns if _is_episode(column)), None)
@@ -177,7 +215,35 @@ def draft(paths: list[Path]) -> Draft:
         raise DatasetError(
             f"No column of '{paths[0]}' is a signal: {', '.join(f'{n} {r}' for n, r in unused.items())}."
         )
-    return Draft(name, recording, tuple(groups), clock, episode, unused)
+    return Draft(name, recording, tuple(groups), clock, episode, unused, alignment)
+
+
+def _alignment(recording: Recording, clock: Clock | None, columns: list[Column]) -> Alignment | None:
+    """Return how rows that hold some of the signals only are interpolated; None if every row has most signals."""
+    if clock is None:
+        return None
+    own = recording.episodes[0]
+    if len(own) > 1:
+        has_clocks = all(clock.column.label in table.columns for table in own.values())
+        if not recording.is_ragged or not has_clocks or clock.column.is_numbered:
+            return None
+        reason = "each file has stamps of its own"
+    else:
+        if not are_apart(np.stack([column.values for column in columns], axis=1)):
+            return None
+        reason = "a row has some of the signals only"
+    scale = factor("s", clock.unit)
+    between, length = [], 0.0
+    for tables in recording.episodes:
+        for table in tables.values():
+            stamps = table.columns[clock.column.label] * scale
+            values = np.stack([part for label, part in table.columns.items() if label != clock.column.label], axis=1)
+            between.append(usual_steps(stamps, values))
+        length += float(np.ptp(stamps[np.isfinite(stamps)]))
+    steps = np.concatenate(between)
+    steps = steps[np.isfinite(steps)]
+    rate = min(1.0 / float(np.median(steps)), ENOUGH / max(length, 1e-9))
+    return Alignment(float(f"{rate:.2g}"), float(f"{BRIDGED * steps.max():.2g}"), reason)
 
 
 def _stem(recording: Recording, paths: list[Path]) -> str:
@@ -189,8 +255,8 @@ def _label(column: Column) -> str:
     return label if column.file is None else f"{column.file} {label}"
 
 
-def _clock(recording: Recording, columns: list[Column]) -> tuple[Clock | None, list[Column]]:
-    """Return the time, and the other columns that could be."""
+def _clock(recording: Recording, columns: list[Column], is_bus: bool) -> tuple[Clock | None, list[Column]]:
+    """Return the time, and the other columns that could be; on a bus every row is another message."""
     candidates = [column for column in columns if _is_time(recording, column)]
     if not candidates:
         return None, []
@@ -198,7 +264,7 @@ def _clock(recording: Recording, columns: list[Column]) -> tuple[Clock | None, l
     best = (plain or candidates)[0]
     parts = recording.parts(best)
     steps = np.concatenate([np.diff(part[np.isfinite(part)]) for part in parts])
-    unit = _time_unit(best, steps)
+    unit = _time_unit(best, steps, is_bus)
     steps = steps * factor("s", unit)
     step = float(np.median(steps[steps > 0.0]))
     gap = float(f"{PAUSE * step:.2g}")
@@ -221,8 +287,11 @@ def _is_time(recording: Recording, column: Column) -> bool:
     return False
 
 
-def _time_unit(column: Column, steps: np.ndarray) -> str:
-    """Return the unit of stamps: that of the name, or the one for which they are a date or a usual step."""
+def _time_unit(column: Column, steps: np.ndarray, is_bus: bool) -> str:
+    """Return the unit of stamps: that of the name, or the one for which they are a date or a usual step.
+
+    The messages of a bus follow each other faster than every half second.
+    """
     _, unit = unit_in(column.label)
     if unit in ("s", "ms", "us", "ns", "min"):
         return unit
@@ -231,7 +300,7 @@ def _time_unit(column: Column, steps: np.ndarray) -> str:
         if first > limit:
             return dated
     usual = float(np.median(steps[steps > 0.0]))
-    return "ms" if usual >= 2.0 and np.all(steps == np.round(steps)) else "s"
+    return "ms" if (usual >= 2.0 and np.all(steps == np.round(steps))) or (is_bus and usual > 0.5) else "s"
 
 
 def _is_episode(column: Column) -> bool:
@@ -246,8 +315,8 @@ def _is_counter(recording: Recording, column: Column) -> bool:
     return all(len(part) > 1 and bool(np.all(part == 1.0)) for part in parts)
 
 
-def _place(column: Column) -> str:
-    file = "" if column.file is None else f"file: {_quoted(column.file)}, "
+def _place(column: Column, of_every_file: bool = False) -> str:
+    file = "" if column.file is None or of_every_file else f"file: {_quoted(column.file)}, "
     return f"{file}columns: {_quoted(column.label)}"
 
 

@@ -1,6 +1,6 @@
 """Files of a recording that has no description yet: which are episodes of their own, and which belong to one."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fnmatch import fnmatch
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from services.measured.column_groups import Column
 from services.measured.lerobot_files import data_files
 from services.measured.table import Table
 from services.measured.table_files import TABLES, read_table
-from services.measured.text_style import guess_style
+from services.measured.text_style import guess_style, message_column
 from services.measured.text_table import TextStyle
 
 TEXTS = TABLES - {".npz", ".npy", ".parquet"}
@@ -53,6 +53,12 @@ class Recording:
         return sum(min(table.rows for table in tables.values()) for tables in self.episodes)
 
     @property
+    def messages(self) -> str | None:
+        """Column that names the message of each row; None if every row has all values, or the files are no text."""
+        path = next(iter(self.episodes[0].values())).path
+        return message_column(path, self.style) if path.suffix.lower() in TEXTS else None
+
+    @property
     def is_ragged(self) -> bool:
         """Whether files of one folder have different numbers of rows."""
         return any(len({table.rows for table in tables.values()}) > 1 for tables in self.episodes)
@@ -62,17 +68,24 @@ class Recording:
         return [tables[column.file].columns[column.label] for tables in self.episodes]
 
 
-def read_recording(paths: list[Path]) -> Recording:
+def read_recording(paths: list[Path], names: str = "", stamps: tuple[str, ...] = ()) -> Recording:
     """Read all columns of files or folders.
 
     A folder of files with the same columns holds episodes; a folder of files with other columns each is an episode.
+
+    Args:
+        paths: Files or folders.
+        names: Column that names the message of each row; see `MeasuredConfig.names`.
+        stamps: Columns that may hold dates.
 
     Raises:
         DatasetError: A file cannot be read, or has other columns than the first.
     """
     places = [place for path in paths for place in _places(path)]
-    style = _common_style(places[0])
-    episodes = tuple({file: read_table(path, style, None) for file, path in _files(place).items()} for place in places)
+    style = replace(_common_style(places[0]), names=names)
+    episodes = tuple(
+        {file: read_table(path, style, None, stamps) for file, path in _files(place).items()} for place in places
+    )
     head = {file: table.columns.keys() for file, table in episodes[0].items()}
     for place, tables in zip(places[1:], episodes[1:], strict=True):
         if {file: table.columns.keys() for file, table in tables.items()} != head:

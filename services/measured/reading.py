@@ -11,7 +11,8 @@ import numpy as np
 
 from gemuco.dataset import Dataset, Episode
 from gemuco.errors import DatasetError
-from services.measured.description import ColumnsConfig, MeasuredConfig
+from services.measured.alignment import aligned, by_signal, merged
+from services.measured.description import ColumnsConfig, MeasuredConfig, TimeConfig
 from services.measured.table import Table, counted
 from services.measured.table_files import read_table
 
@@ -145,7 +146,9 @@ class _Reader:
         for pattern in self.config.conditions:
             if pattern not in self.used:
                 self.note(f"conditions: '{pattern}' is of no episode, or an earlier pattern has them all.")
-        if self.kept < self.seen:
+        if self.config.interpolate is not None:
+            self.note(f"Interpolated: {self.kept} rows at {self.config.rate:g} Hz from {self.seen}.")
+        elif self.kept < self.seen:
             self.note(f"Thinned out: {self.kept} of {self.seen} rows are used.")
         elif self.config.rate is not None:
             self.note(f"rate: {self.config.rate:g} Hz is not below the rate of the data; every row is used.")
@@ -167,15 +170,29 @@ class _Reader:
         starts = np.zeros(len(rows) - 1, bool)
         if stamps is not None and self.config.time is not None:
             steps = np.diff(stamps[rows])
-            starts |= (steps > self.config.time.pause(steps)) | (steps < 0.0)
+            back = 0.0 if self.config.interpolate is None else -self.config.interpolate
+            starts |= (steps > self.config.time.pause(steps)) | (steps < back)
         if numbers is not None:
             starts |= np.diff(numbers[rows]) != 0.0
         for part in np.split(rows, np.flatnonzero(starts) + 1):
+            if stamps is not None and self.config.interpolate is not None:
+                yield self._interpolated(condition, stamps[part], {name: array[part] for name, array in values.items()})
+                continue
             chosen = part[self._thinned(len(part), None if stamps is None else stamps[part])]
             self.seen, self.kept = self.seen + len(part), self.kept + len(chosen)
             if stamps is not None and len(chosen) > 1:
                 self.steps.append(float(np.median(np.diff(stamps[chosen]))))
             yield Episode(condition, {name: array[chosen] for name, array in values.items()})
+
+    def _interpolated(self, condition: str, stamps: np.ndarray, values: dict[str, np.ndarray]) -> Episode:
+        """Return an episode of rows that hold some of the signals only, interpolated at the rate of the description."""
+        rate, pause = self.config.rate, self.config.interpolate
+        assert rate is not None and pause is not None  # the description demands both
+        rows = aligned(stamps, np.concatenate(list(values.values()), axis=1), rate, pause)
+        rows = rows[np.isfinite(rows).any(axis=1)]
+        self.seen, self.kept = self.seen + len(stamps), self.kept + len(rows)
+        self.steps.append(1.0 / rate)
+        return Episode(condition, by_signal(rows, {name: part.shape[1] for name, part in values.items()}))
 
     def _thinned(self, count: int, stamps: np.ndarray | None) -> np.ndarray:
         """Return the indices of the rows of an episode that are used."""
@@ -187,6 +204,8 @@ class _Reader:
     def _columns(self, place: _Place) -> tuple[dict[str, np.ndarray], np.ndarray | None, np.ndarray | None]:
         """Return values of every signal [its unit], shape (rows, n), stamps [s], shape (rows,), and episode numbers."""
         config, tables = self.config, self._tables(place)
+        if config.interpolate is not None:
+            return *self._merged(tables), None
         arrays = {name: self._of(tables, part) for name, part in config.signals.items()}
         stamps = None if config.time is None else self._of(tables, config.time)[0]
         numbers = None if config.episode is None else self._of(tables, config.episode)[0]
@@ -207,18 +226,42 @@ class _Reader:
             stamps = config.time.seconds(stamps[:rows])
         return values, stamps, None if numbers is None else numbers[:rows]
 
+    def _merged(self, tables: Mapping[str | None, Table]) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        """Return values of every signal and stamps of the rows of all files, NaN where a row is of another file."""
+        parts: list[tuple[np.ndarray, np.ndarray]] = []
+        sizes: dict[str, int] = {}
+        for clock in self._clocks:
+            own = {name: signal for name, signal in self.config.signals.items() if signal.file == clock.file}
+            sizes |= {name: len(signal.expanded()) for name, signal in own.items()}
+            columns = [c * signal.scale for signal in own.values() for c in self._of(tables, signal)]
+            stamps = clock.seconds(self._of(tables, clock)[0])
+            stamped = np.isfinite(stamps)
+            parts.append((stamps[stamped], np.stack(columns, axis=1)[stamped]))
+        stamps, values = merged(parts)
+        arrays = by_signal(values, sizes)
+        return {name: arrays[name] for name in self.config.signals}, stamps
+
+    @property
+    def _clocks(self) -> list[TimeConfig]:
+        """Places of the time: in every file if each has stamps of its own."""
+        config = self.config
+        if config.time is None or config.interpolate is None:
+            return [] if config.time is None else [config.time]
+        files = dict.fromkeys(signal.file for signal in config.signals.values())
+        return [config.time.model_copy(update={"file": file}) for file in files]
+
     def _tables(self, place: _Place) -> dict[str | None, Table]:
         """Return the tables of a file or folder with the columns that the description names."""
         config = self.config
-        extra = [part for part in (config.time, config.episode) if part is not None]
+        clocks = {clock.file: clock.expanded() for clock in self._clocks}
+        episode = () if config.episode is None else (config.episode,)
         wanted: dict[str | None, dict[str, None]] = {}
-        for part in (*config.signals.values(), *extra):
+        for part in (*config.signals.values(), *self._clocks, *episode):
             wanted.setdefault(part.file, {}).update(dict.fromkeys(part.expanded()))
         tables: dict[str | None, Table] = {}
         for file, columns in wanted.items():
-            stamps = config.time.expanded() if config.time and config.time.file == file else ()
             path = place.path / file if file else place.path
-            tables[file] = read_table(path, config.style, tuple(columns), stamps)
+            tables[file] = read_table(path, config.style, tuple(columns), clocks.get(file, ()))
             for sentence in tables[file].notes:
                 self.note(sentence)
         return tables

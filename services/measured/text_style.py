@@ -1,12 +1,18 @@
 """Guess of the form of a text file: separator, decimal character, header."""
 
-from itertools import islice
+import re
+from itertools import islice, pairwise
 from pathlib import Path
 
-from services.measured.text_table import TextStyle, decoded, lines_of, stamp_of
+from services.measured.text_table import SAMPLE, TextStyle, TextTable, decoded, lines_of, stamp_of
 
 LINES = 200
 """The form is guessed from this many lines."""
+
+ID = {"id", "canid", "arbitration", "topic", "message", "signal"}
+"""A column whose name has one of these words may name the message of a row by a number."""
+LEAST, OFTEN, FEW = 20, 0.2, 0.5
+"""A name of messages needs at least this many rows, changes in this share of them, and has values for this share."""
 
 
 def guess_style(path: Path) -> TextStyle:
@@ -32,6 +38,26 @@ def guess_style(path: Path) -> TextStyle:
             if score > most:
                 best, most = TextStyle(separator, _is_header(lines[0], usual, decimal), decimal), score
     return best
+
+
+def message_column(path: Path, style: TextStyle) -> str | None:
+    """Return the column that names the message of each row; None if every row has all values.
+
+    It has text or is called an ID, it has few values, and neighbouring rows often differ in it: a remark such as the
+    name of a tool stays the same for many rows.
+    """
+    table = TextTable(path, style)
+    lines = [cells for _, cells in islice(lines_of(decoded(path), style.separator), SAMPLE)]
+    rows = [cells for cells in lines[1:] if len(cells) >= len(table.names)]
+    for place, label in enumerate(table.labels):
+        keys = [cells[place].strip() for cells in rows]
+        changes = sum(key != after for key, after in pairwise(keys))
+        is_name = bool(ID & set(re.split(r"[^a-z]+", label.lower()))) or not any(
+            _is_number(key, style.decimal) for key in keys
+        )
+        if is_name and len(keys) > LEAST and changes > OFTEN * len(keys) and 1 < len(set(keys)) < FEW * len(keys):
+            return label
+    return None
 
 
 def _is_header(cells: list[str], usual: int, decimal: str) -> bool:

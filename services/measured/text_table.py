@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from gemuco.errors import DatasetError
+from services.measured.long_table import widened
 from services.measured.table import Table, counted, place_of, shown
 
 SAMPLE = 1000
@@ -40,11 +41,13 @@ class TextStyle:
         separator: Character between cells; a space stands for any number of spaces and tabs.
         header: Whether the first line names the columns.
         decimal: Character before the decimals.
+        names: Column with the name of the message of each row; empty if every row has all values.
     """
 
     separator: str = ","
     header: bool = True
     decimal: str = "."
+    names: str = ""
 
 
 class TextTable:
@@ -107,6 +110,13 @@ class TextTable:
 
     def table(self, wanted: Sequence[str] | None, stamps: frozenset[str]) -> Table:
         """Return columns as numbers; a broken row is NaN, so that rows of several files stay side by side."""
+        if not self.style.names:
+            return self._read(wanted, stamps)
+        place = self._place(self.style.names)
+        keys = [cells[place].strip() if place < len(cells) else "" for _, cells in self._lines()]
+        return widened(self._read(None, stamps), keys, self.labels[place], stamps, wanted)
+
+    def _read(self, wanted: Sequence[str] | None, stamps: frozenset[str]) -> Table:
         chosen = self.labels if wanted is None else tuple(wanted)
         places = range(len(self.names)) if wanted is None else [self._place(name) for name in chosen]
         readers = [stamp_of if name in stamps or wanted is None else number_of for name in chosen]

@@ -110,6 +110,8 @@ def _show(result: Draft, console: Console) -> None:
         )
     if result.episode is not None:
         lines.append(f"Episodes by {result.episode.label}.")
+    if (alignment := result.alignment) is not None:
+        lines.append(f"As {alignment.reason}, all are interpolated at {alignment.rate:g} Hz.")
     if result.every > 1:
         lines.append(
             f"One of {result.every} rows is used, so that the first training is short; the draft says how to use all."

@@ -136,6 +136,15 @@ def test_a_signal_that_was_never_measured_is_left_out(arm):
         fit(episodes(arm, change=silent), SMALL, [{"joint_position"}])
 
 
+def test_rows_that_hold_one_signal_each_are_trained_without_what_is_normal(arm):
+    def one_each(values, _random):
+        for index, name in enumerate(LAYOUT.names):
+            values[name][np.arange(len(values[name])) % 3 != index] = np.nan
+
+    schema, _ = fit(episodes(arm, change=one_each), replace(SMALL, epochs=3), [{name} for name in LAYOUT.names])
+    assert schema.normal is None
+
+
 def test_a_signal_that_never_varies_is_named(arm):
     def still(values, _random):
         values["joint_position"][:] = [0.4, 1.1]
