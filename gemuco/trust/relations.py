@@ -10,6 +10,7 @@ import numpy as np
 
 from gemuco.anomaly.prediction import with_bias
 from gemuco.intervals.sureness import MARGIN
+from gemuco.normal.local import LocalSize
 from gemuco.schema import BodySchema
 from gemuco.trust.config import Hidden, TrustConfig
 from gemuco.trust.sensitivity import Sensed, Sensitivity
@@ -41,6 +42,8 @@ class Relation:
         distance: Mean distance of the known samples.
         network: Whether the network's errors say more of each column than the watch does, shape (columns,).
         calibration: Healthy errors of the lies that these suggest, in their own standard deviations, shape (columns,).
+        by_watch: Size of the watch's healthy errors at each sample.
+        by_network: Size of the healthy errors of these lies.
     """
 
     maps: np.ndarray
@@ -52,6 +55,8 @@ class Relation:
     distance: np.ndarray
     network: np.ndarray
     calibration: np.ndarray
+    by_watch: LocalSize
+    by_network: LocalSize
 
     def errors(self, features: np.ndarray) -> np.ndarray:
         """Return measured minus predicted [standard deviations], shape (n, columns).
@@ -104,16 +109,19 @@ class Relations:
         self._penalty = np.concatenate([penalties, np.full(inputs - self.count, np.median(penalties))])
         self._inverse = {float(penalty): watch.inverse(float(penalty)) for penalty in set(self._penalty)}
         rows = schema.normal.rows.astype(float)
-        self._rows = self.features(rows)
+        self._rows, self._known = self.features(rows), rows
         self.sensitivity = Sensitivity(schema, self.columns)
         self._sensed = self.sensitivity.sense(schema, rows)
         self._coarse = FLOOR * _signal_spreads(schema, rows, self.columns, watch.signal)
         self._least = np.maximum(FLOOR * np.maximum(rows[:, self.columns].std(axis=0), 1e-3), self._coarse)
         self._kept: dict[Hidden, Relation] = {}
         self._inflation = np.ones(inputs)
+        self._uneven: tuple[np.ndarray | None, np.ndarray | None] = None, None
         outputs = schema.out_layout.size
         promised = np.sqrt(np.diag(schema.normal.covariance))[outputs : outputs + self.count]
-        ratio = promised / self.without(frozenset()).std[: self.count]
+        whole = self.without(frozenset())
+        self._uneven = whole.by_watch.uneven, whole.by_network.uneven
+        ratio = promised / whole.std[: self.count]
         self._inflation = np.maximum(1.0, np.concatenate([ratio, np.full(inputs - self.count, np.median(ratio))]))
         self._kept.clear()
 
@@ -173,17 +181,31 @@ class Relations:
         places = np.array([np.flatnonzero(self._holds[:, index]) for index in range(inputs)])
         removal = np.array([_removal(spread, own, outside) for own in places])
         zero, one = np.zeros(inputs), np.ones(inputs)
-        draft = Relation(maps, zero, one, spread, places, removal, one, zero > 0.0, one)
+        even = LocalSize(np.zeros((2 * inputs, inputs)), zero)
+        draft = Relation(maps, zero, one, spread, places, removal, one, zero > 0.0, one, even, even)
         far = draft.far(self._rows)
         draft = replace(draft, distance=np.maximum(far.mean(axis=0), 1e-9))
         growth, errors = draft.growth(far), draft.errors(self._rows)
         mean = errors.mean(axis=0)
         std = np.sqrt(np.mean(((errors - mean) / growth) ** 2, axis=0)) * self._inflation
         std = np.maximum(std, self._least)
-        network, calibration = self._by_network(hidden, std, np.maximum(1.0, growth))
-        return replace(draft, mean=mean, std=std, network=network, calibration=calibration)
+        network, calibration, ratio = self._by_network(hidden, std, np.maximum(1.0, growth))
+        values = np.nan_to_num(self._known[:, self.columns])
+        by_watch = LocalSize.fit(values, (errors - mean) / (growth * std), hidden, self._uneven[0])
+        by_network = LocalSize.fit(values, ratio / calibration, hidden, self._uneven[1])
+        return replace(
+            draft,
+            mean=mean,
+            std=std,
+            network=network,
+            calibration=calibration,
+            by_watch=by_watch,
+            by_network=by_network,
+        )
 
-    def _by_network(self, hidden: Hidden, std: np.ndarray, factor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _by_network(
+        self, hidden: Hidden, std: np.ndarray, factor: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return whether the network says more of each column than the watch, and its calibration.
 
         Args:
@@ -197,7 +219,7 @@ class Relations:
         ratio = np.where(known, lies, 0.0) / np.where(known, spread, 1.0)
         calibration = np.maximum(1.0, np.sqrt((ratio**2).sum(axis=0) / np.maximum(known.sum(axis=0), 1)))
         usual = np.median(spread, axis=0) * calibration
-        return np.asarray(usual < std), calibration
+        return np.asarray(usual < std), calibration, np.where(known, ratio, np.nan)
 
     def judged(
         self, schema: BodySchema, hidden: Hidden, features: np.ndarray, sensed: Sensed, values: np.ndarray
@@ -215,11 +237,14 @@ class Relations:
         """
         relation = self.without(hidden)
         errors, healthy = relation.errors(features), relation.healthy(features)
+        growth = healthy / relation.std
+        healthy = healthy * relation.by_watch(values)
         if relation.network.any():
             sensed, off = self._sensed_without(schema, hidden, errors, sensed, values)
             lies, spread = self.sensitivity.lies(sensed, hidden)
             lies = lies + off
-            spread = np.maximum(spread * relation.calibration * np.maximum(1.0, healthy / relation.std), self._coarse)
+            spread = spread * relation.calibration * np.maximum(1.0, growth) * relation.by_network(values)
+            spread = np.maximum(spread, self._coarse)
             better = relation.network & np.isfinite(spread)
             errors, healthy = np.where(better, lies, errors), np.where(better, spread, healthy)
         return errors, healthy
