@@ -229,7 +229,8 @@ def _alignment(recording: Recording, clock: Clock | None, columns: list[Column])
             return None
         reason = "each file has stamps of its own"
     else:
-        if not are_apart(np.stack([column.values for column in columns], axis=1)):
+        is_bus = bool(recording.style.names)
+        if not is_bus and not are_apart(np.stack([column.values for column in columns], axis=1)):
             return None
         reason = "a row has some of the signals only"
     scale = factor("s", clock.unit)

@@ -13,6 +13,10 @@ from services.measured.lerobot_files import without_estimates
 from services.measured.table import Table, place_of
 from services.measured.text_table import TextStyle, TextTable
 
+DECODE = (
+    "It holds frames of a bus: decode them with the DBC file of the bus (with asammdf, for example), and save the "
+    "signals as CSV, with one column of times"
+)
 ELSEWHERE = {
     ".xlsx": "Save the sheet as CSV",
     ".xls": "Save the sheet as CSV",
@@ -25,6 +29,10 @@ ELSEWHERE = {
     ".db3": "Export its topics as CSV",
     ".zip": "Unpack it first",
     ".gz": "Unpack it first",
+    ".blf": DECODE,
+    ".asc": DECODE,
+    ".trc": DECODE,
+    ".mf4": DECODE,
     ".mcap": "Train from a recording of gemuco with `gemuco train ROBOT --data FILE`, or write tables with `gemuco "
     "export FILE`",
 }
@@ -53,6 +61,8 @@ def read_table(path: Path, style: TextStyle, wanted: Sequence[str] | None, stamp
     kind = path.suffix.lower()
     if kind in ELSEWHERE:
         raise DatasetError(f"'{path}' cannot be read as a table. {ELSEWHERE[kind]}.")
+    if style.names and kind in (".npz", ".npy", ".parquet"):
+        raise DatasetError(f"'{path}': names is for text files; save the table as CSV.")
     try:
         if kind in (".npz", ".npy"):
             return _chosen(path, _archive(path), wanted)

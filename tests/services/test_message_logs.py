@@ -156,3 +156,24 @@ def test_an_unknown_message_is_one_sentence(tmp_path):
     (tmp_path / "bus.yaml").write_text(text + "interpolate: 1\nsignals: {left: {unit: m/s, columns: Left_mps}}\n")
     with pytest.raises(DatasetError, match=r"has no column 'Left_mps'.*Is 'left_mps' meant"):
         read_measured(load_measured(tmp_path / "bus.yaml"), tmp_path)
+
+
+def test_a_log_of_frames_is_refused_with_what_to_do(tmp_path):
+    (tmp_path / "drive.blf").write_bytes(b"LOGG\x90\x00")
+    with pytest.raises(DatasetError, match=r"decode them with the DBC file of the bus"):
+        draft([tmp_path / "drive.blf"])
+
+
+def test_names_of_messages_are_of_text_files(tmp_path):
+    np.savez(tmp_path / "run.npz", t=np.arange(9.0), value=np.arange(9.0))
+    text = "recording: bus\nepisodes: run.npz\nnames: signal\ntime: {columns: t}\nrate: 1\ninterpolate: 3\n"
+    (tmp_path / "bus.yaml").write_text(text + "signals: {left: {unit: m/s, columns: left}}\n")
+    with pytest.raises(DatasetError, match="names is for text files; save the table as CSV"):
+        read_measured(load_measured(tmp_path / "bus.yaml"), tmp_path)
+
+
+def test_a_bus_with_one_message_of_numbers_is_drafted_and_read(tmp_path):
+    lines = [f"{0.01 * k:.2f},{'ab'[k % 2]},{np.sin(k) if k % 2 else 'ON'}" for k in range(400)]
+    (tmp_path / "run.csv").write_text("\n".join(("time,signal,value", *lines)))
+    (tmp_path / "run.yaml").write_text(draft([tmp_path / "run.csv"]).text())
+    assert len(read_measured(load_measured(tmp_path / "run.yaml"), tmp_path)) > 100
