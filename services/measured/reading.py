@@ -170,8 +170,10 @@ class _Reader:
         starts = np.zeros(len(rows) - 1, bool)
         if stamps is not None and self.config.time is not None:
             steps = np.diff(stamps[rows])
-            back = 0.0 if self.config.interpolate is None else -self.config.interpolate
-            starts |= (steps > self.config.time.pause(steps)) | (steps < back)
+            pause, back = self.config.time.pause(steps), 0.0
+            if self.config.interpolate is not None:  # the usual step is that between two messages
+                pause, back = self.config.time.gap or max(pause, self.config.interpolate), -self.config.interpolate
+            starts |= (steps > pause) | (steps < back)
         if numbers is not None:
             starts |= np.diff(numbers[rows]) != 0.0
         for part in np.split(rows, np.flatnonzero(starts) + 1):

@@ -124,6 +124,16 @@ def test_rows_out_of_order_are_sorted_and_a_clock_that_begins_anew_is_another_ep
         assert np.abs(left - value(0, t)).max() < 0.03
 
 
+def test_a_pause_between_bursts_of_messages_does_not_end_an_episode(tmp_path):
+    stamps = [0.1 * burst + 0.0005 * k for burst in range(100) for k in range(5)]
+    lines = [f"{t:.4f},{'abcde'[k % 5]},{value(0, np.array(t)):.5f}" for k, t in enumerate(stamps)]
+    (tmp_path / "run.csv").write_text("\n".join(("t,id,value", *lines)))
+    text = "recording: bus\nepisodes: run.csv\nnames: id\ntime: {columns: t}\nrate: 10\ninterpolate: 0.5\n"
+    (tmp_path / "bus.yaml").write_text(text + "signals: {all: {unit: m, columns: [a, b, c, d, e]}}\n")
+    data = read_measured(load_measured(tmp_path / "bus.yaml"), tmp_path)
+    assert [len(episode.values["all"]) for episode in data.episodes] == [100]
+
+
 def test_a_remark_in_words_does_not_make_a_log_of_messages(tmp_path):
     lines = ["t,tool,q0,q1"]
     for row in range(300):
