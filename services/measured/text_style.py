@@ -9,8 +9,10 @@ from services.measured.text_table import SAMPLE, TextStyle, TextTable, decoded, 
 LINES = 200
 """The form is guessed from this many lines."""
 
-ID = {"id", "canid", "arbitration", "topic", "message", "signal"}
+ID = {"id", "canid", "arbitration"}
 """A column whose name has one of these words may name the message of a row by a number."""
+NAME = ID | {"topic", "message", "msg", "signal", "name", "channel", "frame", "key", "variable", "sensor", "tag"}
+"""A text in a column without one of these words names messages only if there are three or more: `red`, `green` do not."""
 LEAST, OFTEN, FEW = 20, 0.2, 0.5
 """A name of messages needs at least this many rows, changes in this share of them, and has values for this share."""
 
@@ -52,9 +54,9 @@ def message_column(path: Path, style: TextStyle) -> str | None:
     for place, label in enumerate(table.labels):
         keys = [cells[place].strip() for cells in rows]
         changes = sum(key != after for key, after in pairwise(keys))
-        is_name = bool(ID & set(re.split(r"[^a-z]+", label.lower()))) or not any(
-            _is_number(key, style.decimal) for key in keys
-        )
+        words = set(re.split(r"[^a-z]+", label.lower()))
+        is_text = not any(_is_number(key, style.decimal) for key in keys)
+        is_name = bool(ID & words) or (is_text and (bool(NAME & words) or len(set(keys)) > 2))
         if is_name and len(keys) > LEAST and changes > OFTEN * len(keys) and 1 < len(set(keys)) < FEW * len(keys):
             return label
     return None
