@@ -12,7 +12,7 @@ LINES = 200
 ID = {"id", "canid", "arbitration"}
 """A column whose name has one of these words may name the message of a row by a number."""
 NAME = ID | {"topic", "message", "msg", "signal", "name", "channel", "frame", "key", "variable", "sensor", "tag"}
-"""A text in a column without one of these words names messages only if there are three or more: `red`, `green` do not."""
+"""Texts of a column without one of these words name messages only if there are three or more: red and green do not."""
 LEAST, OFTEN, FEW = 20, 0.2, 0.5
 """A name of messages needs at least this many rows, changes in this share of them, and has values for this share."""
 
