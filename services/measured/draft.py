@@ -222,27 +222,33 @@ def _alignment(recording: Recording, clock: Clock | None, columns: list[Column])
     """Return how rows that hold some of the signals only are interpolated; None if every row has most signals."""
     if clock is None:
         return None
-    own = recording.episodes[0]
-    if len(own) > 1:
-        has_clocks = all(clock.column.label in table.columns for table in own.values())
+    label = clock.column.label
+    if any(len(tables) > 1 for tables in recording.episodes):
+        has_clocks = all(label in table.columns for tables in recording.episodes for table in tables.values())
         if not recording.is_ragged or not has_clocks or clock.column.is_numbered:
             return None
         reason = "each file has stamps of its own"
     else:
-        is_bus = bool(recording.style.names)
-        if not is_bus and not are_apart(np.stack([column.values for column in columns], axis=1)):
+        labels = [column.label for column in columns]
+        tables = [table for own in recording.episodes for table in own.values()]
+        if not recording.style.names and not any(
+            are_apart(np.stack([table.columns[name] for name in labels], axis=1)) for table in tables
+        ):
             return None
         reason = "a row has some of the signals only"
-    scale = factor("s", clock.unit)
-    between, length = [], 0.0
-    for tables in recording.episodes:
-        for table in tables.values():
-            stamps = table.columns[clock.column.label] * scale
-            values = np.stack([part for label, part in table.columns.items() if label != clock.column.label], axis=1)
-            between.append(usual_steps(stamps, values))
-        length += float(np.ptp(stamps[np.isfinite(stamps)]))
+    scale, between, length = factor("s", clock.unit), [np.zeros(0)], 0.0
+    for own in recording.episodes:
+        stamps = [table.columns[label] * scale for table in own.values()]
+        for table, times in zip(own.values(), stamps, strict=True):
+            values = [part for name, part in table.columns.items() if name != label]
+            between += [usual_steps(times, np.stack(values, axis=1))] if values else []
+        known = np.concatenate(stamps)
+        known = known[np.isfinite(known)]
+        length += float(np.ptp(known)) if len(known) else 0.0
     steps = np.concatenate(between)
     steps = steps[np.isfinite(steps)]
+    if not len(steps):
+        return None
     rate = min(1.0 / float(np.median(steps)), ENOUGH / max(length, 1e-9))
     return Alignment(float(f"{rate:.2g}"), float(f"{BRIDGED * steps.max():.2g}"), reason)
 

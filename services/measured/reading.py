@@ -191,7 +191,6 @@ class _Reader:
         rate, pause = self.config.rate, self.config.interpolate
         assert rate is not None and pause is not None  # the description demands both
         rows = aligned(stamps, np.concatenate(list(values.values()), axis=1), rate, pause)
-        rows = rows[np.isfinite(rows).any(axis=1)]
         self.seen, self.kept = self.seen + len(stamps), self.kept + len(rows)
         self.steps.append(1.0 / rate)
         return Episode(condition, by_signal(rows, {name: part.shape[1] for name, part in values.items()}))

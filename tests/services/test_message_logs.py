@@ -134,6 +134,43 @@ def test_a_pause_between_bursts_of_messages_does_not_end_an_episode(tmp_path):
     assert [len(episode.values["all"]) for episode in data.episodes] == [100]
 
 
+def test_the_time_of_a_row_is_right_after_a_pause_that_is_not_bridged(tmp_path):
+    t = np.arange(0.0, 20.0, 0.05)
+    t = t[(t < 5.0) | (t > 8.0)]
+    lines = [f"{x:.2f},{'abc'[k % 3]},{x:.4f}" for k, x in enumerate(t)]
+    (tmp_path / "run.csv").write_text("\n".join(("t,id,value", *lines)))
+    text = "recording: bus\nepisodes: run.csv\nnames: id\ntime: {columns: t, gap: 5}\nrate: 10\ninterpolate: 0.5\n"
+    (tmp_path / "bus.yaml").write_text(text + "signals: {all: {unit: s, columns: [a, b, c]}}\n")
+    (episode,) = read_measured(load_measured(tmp_path / "bus.yaml"), tmp_path).episodes
+    values = episode.values["all"]
+    assert np.isnan(values[55:75]).all()
+    number, known = np.arange(len(values)) / 10.0, np.isfinite(values)
+    np.testing.assert_allclose(values[known], np.repeat(number[:, None], 3, axis=1)[known], atol=1e-6)
+
+
+def test_sensors_of_different_runs_do_not_make_a_log_of_messages(tmp_path):
+    random = np.random.default_rng(0)
+    for run in range(2):
+        rows = [f"{0.02 * k:.2f},{random.normal()},{','.join((['x', ''], ['', 'x'])[run])}" for k in range(200)]
+        rows = [row.replace("x", f"{random.normal():.4f}") for row in rows]
+        (tmp_path / f"run_{run}.csv").write_text("\n".join(("t,joint,left,right", *rows)))
+    assert draft([tmp_path]).alignment is None
+
+
+def test_a_folder_with_a_file_that_has_only_the_time_is_drafted(tmp_path):
+    for run in range(2):
+        (tmp_path / f"run_{run}").mkdir()
+        by_time = "\n".join(f"{0.01 * k:.2f}" for k in range(300))
+        (tmp_path / f"run_{run}" / "time.csv").write_text("t\n" + by_time)
+        for name, step in (("arm", 0.02), ("hand", 0.05)):
+            rows = [f"{step * k:.2f},{np.sin(k)}" for k in range(int(3.0 / step))]
+            (tmp_path / f"run_{run}" / f"{name}.csv").write_text("\n".join((f"t,{name}", *rows)))
+    result = draft([tmp_path])
+    assert result.alignment is not None
+    (tmp_path / "log.yaml").write_text(result.text())
+    assert len(read_measured(load_measured(tmp_path / "log.yaml"), tmp_path).episodes) == 2
+
+
 @pytest.mark.parametrize(
     ("head", "of"),
     [
