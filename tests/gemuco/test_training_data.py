@@ -136,6 +136,20 @@ def test_a_signal_that_was_never_measured_is_left_out(arm):
         fit(episodes(arm, change=silent), SMALL, [{"joint_position"}])
 
 
+@pytest.mark.parametrize(("epochs", "searches"), [(12, 4), (96, 16)])
+def test_outliers_are_searched_for_as_often_as_the_training_can_afford(arm, monkeypatch, epochs, searches):
+    count, find = [0], outliers.find
+
+    def counted(*given):
+        count[0] += 1
+        return find(*given)
+
+    monkeypatch.setattr(outliers, "find", counted)
+    fit(episodes(arm), replace(SMALL, epochs=epochs, patience=1000), [{name} for name in LAYOUT.names])
+    judged = count[0] // 2 - 1  # training and held-out samples; once more at the end
+    assert 0.7 * searches <= judged <= searches  # after a quarter of the epochs
+
+
 def test_rows_that_hold_one_signal_each_are_trained_without_what_is_normal(arm):
     def one_each(values, _random):
         for index, name in enumerate(LAYOUT.names):
