@@ -73,6 +73,8 @@ def run_inspection(file: Path, data: Sequence[Path], model: Path | None, rate: f
 
 def _read(config: MeasuredConfig, place: Path) -> Timed:
     """Return the episodes of one table, or of all tables in a folder if none has a name of the description."""
+    if not place.exists():
+        raise DatasetError(f"There is no file or folder '{place}'. Name the tables to inspect with --data.")
     if is_recording(place):
         raise DatasetError(f"'{place}' is a recording of a robot; `gemuco export` writes it as a table.")
     patterns = (place.name,) if place.is_file() else config.episodes

@@ -103,10 +103,11 @@ def test_a_folder_is_inspected_table_by_table(trained, tmp_path):
     ("file", "data", "exit_code", "sentence"),
     [
         ("later_1.csv", "later_1.csv", 2, "holds data. Name the description that `gemuco train` used"),
-        ("none.yaml", "later_1.csv", 2, "There is no file"),
+        ("none.yaml", "later_1.csv", 2, "Name the description that `gemuco train` used."),
         ("robot.yaml", "later_1.csv", 2, "is no description of measured tables"),
         ("timed.yaml", "walk.mcap", 1, "is a recording of a robot; `gemuco export` writes it as a table."),
-        ("timed.yaml", "nowhere", 1, "There is no folder"),
+        ("timed.yaml", "nowhere", 1, "There is no file or folder"),
+        ("timed.yaml", "nowhere.csv", 1, "Name the tables to inspect with --data."),
     ],
 )
 def test_a_wrong_file_is_refused_in_a_sentence(trained, file, data, exit_code, sentence):
