@@ -8,7 +8,7 @@ import numpy as np
 
 from hal.errors import CommandRefused
 from services.client import Client
-from services.errors import NoAnswer, NotEngaged, ServiceError
+from services.errors import NoAnswer, NotEngaged, ServiceError, TooLate
 
 NOTICED_WITHIN = 3.0
 """An event must be reported within this time [s]."""
@@ -19,6 +19,8 @@ FOLLOWS_WITHIN = 15.0
 """The robot must follow within this time [s], in which nodes restart and refused requests are repeated."""
 STEADY = 0.3
 """An event is noticed when it is reported for this long [s]: on a busy machine one late message looks like it."""
+AGAIN = 0.05
+"""Before a request is repeated the client receives samples for this time [s]."""
 TRIES = 3
 """A target is sent at most this often if the HAL stops the robot before the end."""
 
@@ -69,7 +71,7 @@ class Actor:
                     self._client.reset()
                     self.wait(lambda: self._mode() == "off" and self._is_healthy(), ENGAGED_WITHIN)
                 self._client.engage()
-            except (NotEngaged, CommandRefused) as error:
+            except (NotEngaged, CommandRefused, NoAnswer) as error:
                 refusal = str(error)
             self.wait(self._follows, ENGAGED_WITHIN)
 
@@ -157,15 +159,19 @@ class Actor:
         self.engage()
 
     def _insist(self, ask: Callable[[], object]) -> None:
-        """Ask again while the service does not answer, at most `REACHED_WITHIN`; `idle` notices if it has ended."""
+        """Ask again while the service does not answer, or refuses because this machine was too slow to ask in time.
+
+        It ends after `REACHED_WITHIN`; `idle` notices if the service has ended.
+        """
         deadline = time.monotonic() + REACHED_WITHIN
         while True:
             try:
                 ask()
-            except NoAnswer:
+            except (NoAnswer, TooLate):
                 if time.monotonic() > deadline:
                     raise
                 self._idle()
+                time.sleep(AGAIN)
             else:
                 return
 

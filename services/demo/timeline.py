@@ -121,8 +121,13 @@ class Timeline:
 
 
 def hidden_error(client: Client, signal: str, hide: Sequence[str]) -> np.ndarray:
-    """Return a signal's estimate with some signals hidden, minus the truth [unit], shape (n,); NaN if unknown."""
+    """Return a signal's estimate with some signals hidden, minus the truth [unit], shape (n,).
+
+    All are NaN if the truth is not known, or if the estimate has no expected error: while other sensors are late, it is
+    made from single elements and shows what they lack, not what the model knows.
+    """
     answer = client.infer(signal, hide=hide)
     truth = client.truth()
     value = np.asarray(answer["values"], float)
-    return value - truth.values[signal] if truth is not None else np.full(len(value), np.nan)
+    is_expected = np.isfinite(np.asarray(answer["std"], float)).all()
+    return value - truth.values[signal] if truth is not None and is_expected else np.full(len(value), np.nan)

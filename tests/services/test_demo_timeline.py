@@ -4,8 +4,9 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pytest
 
-from services.demo.timeline import Timeline
+from services.demo.timeline import Timeline, hidden_error
 
 
 class Arm:
@@ -56,3 +57,24 @@ def test_one_value_without_a_mark_is_seen() -> None:
 def test_nothing_is_marked_where_no_value_was_made() -> None:
     timeline = recorded((9.0, 1.0, True), (10.5, float("nan"), True), (12.0, 1.0, True))
     assert timeline.marked(10.0, 11.0) == 0.0
+
+
+class LateArm:
+    """Client of an arm at rest whose model's estimate is far off, without an expected error, while sensors are late."""
+
+    def __init__(self, late: int) -> None:
+        self.late = late
+
+    def infer(self, signal: str, hide: Any) -> dict[str, Any]:
+        self.late -= 1
+        is_late = self.late >= 0
+        return {"values": [2.0, 0.5] if is_late else [1.1, 0.5], "std": [float("nan"), 0.1] if is_late else [0.1, 0.1]}
+
+    def truth(self) -> Any:
+        return SimpleNamespace(values={"tip": np.array([1.0, 0.5])})
+
+
+def test_an_estimate_from_what_is_left_of_late_sensors_does_not_judge_the_model() -> None:
+    arm: Any = LateArm(late=1)
+    assert np.isnan(hidden_error(arm, "tip", ["tip"])).all()
+    assert hidden_error(arm, "tip", ["tip"]) == pytest.approx([0.1, 0.0])
