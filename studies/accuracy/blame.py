@@ -23,7 +23,7 @@ from gemuco.anomaly.window import scores
 from gemuco.schema import BodySchema
 from hal.config import RobotConfig, load_robot
 from services.model.model_config import model_config
-from studies.accuracy.actual_arms import model, record
+from studies.bodies.actual_arms import model, record
 
 JOINTS, TENSIONS = "joint_position", "muscle_tension"
 OFF = 0.3

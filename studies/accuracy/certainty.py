@@ -35,7 +35,7 @@ from gemuco.learning.train import fit
 from gemuco.masks import Mask
 from gemuco.schema import BodySchema
 from gemuco.signals import Layout, Signal
-from studies.accuracy.actual_arms import record
+from studies.bodies.actual_arms import record
 from studies.peers import recordings, robots
 from studies.peers.question import MissingData, Trial
 

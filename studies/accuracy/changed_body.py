@@ -21,7 +21,7 @@ from gemuco.anomaly.verdict import window_score
 from gemuco.anomaly.window import scores
 from gemuco.schema import BodySchema
 from hal.config import RobotConfig, load_robot
-from studies.accuracy.actual_arms import model, record
+from studies.bodies.actual_arms import model, record
 
 RATE = 10.0
 ADAPTED, NORMAL, HEALTHY, CUT, SETTLED = 20.0, 100.0, 200.0, 60.0, 2.0

@@ -21,9 +21,9 @@ from rich.table import Table
 from gemuco.trust.monitor import TrustMonitor
 from hal.config import load_robot
 from simulators.robots.musashi_arm import force_torque
-from studies.accuracy.actual_arms import record
 from studies.accuracy.lies import PART, body_of
-from studies.accuracy.lying_robots import ARM, RATE
+from studies.bodies.actual_arms import record
+from studies.bodies.lying_robots import ARM, RATE
 
 CACHE = Path("runs/contacts")
 KNOCKS = 0.3

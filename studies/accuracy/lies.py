@@ -28,7 +28,7 @@ from gemuco.anomaly.healthy import learn_normal
 from gemuco.estimation import fill
 from gemuco.trust.monitor import TrustMonitor
 from gemuco.trust.relations import Relations, rows_of
-from studies.accuracy.lying_robots import BODIES, Motion
+from studies.bodies.lying_robots import BODIES, Motion
 
 RATE, BEFORE, AFTER = 50, 20, 8
 """Samples per second, and seconds before and after a lie begins."""
@@ -39,6 +39,8 @@ VISIBLE = 5.0
 """A lie without a size begins when its error first has this number of standard errors."""
 LATE = 2.0
 """After this time [s] a value that is wrong by more than three standard errors must not be passed on as measured."""
+ANGLES = ("joint", "motor_position", "second", "steering")
+"""Signals whose names begin so wrap at a whole turn."""
 CACHE = Path("runs/lies")
 Random = np.random.Generator
 Normalised = dict[str, np.ndarray]
@@ -159,13 +161,14 @@ def play(body: Body, kind: str, size: int, seed: int) -> Outcome | None:
     schema, whole = under(body.schema, condition), body.motion[condition]
     start = int(draw.integers(0, len(whole) - (BEFORE + AFTER) * RATE))
     rows = whole[start : start + (BEFORE + AFTER) * RATE]
-    angles = [
-        i for i, c in enumerate(body.columns) if schema.layout.element(int(c)).startswith(("joint", "motor", "second"))
-    ]
+    angles = [i for i, c in enumerate(body.columns) if schema.layout.element(int(c)).startswith(ANGLES)]
     index = int(draw.choice(angles)) if kind == "wrap" else int(draw.integers(len(body.columns)))
     element = int(body.columns[index])
     span = next(span for span in schema.layout.slices.values() if span.start <= element < span.stop)
-    other = int(draw.choice([i for i in range(span.start, span.stop) if i != element and i in body.columns]))
+    others = [i for i in range(span.start, span.stop) if i != element and i in body.columns]
+    if kind == "swapped" and not others:
+        return None
+    other = int(draw.choice(others)) if others else element
     wrong = lie(kind, rows, element, other, size * body.error[index], schema, draw)
     lying = {element, other} if kind == "swapped" else {element}
     error = np.abs(wrong - rows)[:, element] / body.error[index]

@@ -18,7 +18,7 @@ from rich.table import Table
 from gemuco.trust.config import BLOCK
 from gemuco.trust.monitor import TrustMonitor
 from studies.accuracy.lies import BEFORE, PART, RATE, Body, body_of, ridge_errors, under
-from studies.accuracy.lying_robots import BODIES
+from studies.bodies.lying_robots import BODIES
 
 PACES = (0.3, 1.0)
 """Paces of a drift [standard errors of the healthy prediction per second]."""

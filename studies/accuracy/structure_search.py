@@ -2,7 +2,7 @@
 
     python -m studies.accuracy.structure_search [--signals 12] [--seeds 3] [--samples 10000]
 
-The bodies are synthetic (`synthetic_body.py`). One network is trained. All 2^n - 1 masks are measured with it (up to 12
+The bodies are synthetic (`studies.bodies`). One network is trained. All 2^n - 1 masks are measured with it (up to 12
 signals), and the search uses the same network. A feasible mask of the exhaustive result counts as found if the search
 returned it or a feasible part of it. It counts as served if one of the masks of the schema (at most 64) is part of it.
 The last line has the result of a perfect model of the body. Times are CPU times, summed over all cores.
@@ -17,7 +17,7 @@ from gemuco.learning.train import TrainConfig
 from gemuco.masks import bits
 from gemuco.structure.determination import Judge, Thresholds, search, select
 from gemuco.structure.mask_training import train_masks
-from studies.accuracy.synthetic_body import SyntheticBody
+from studies.bodies.synthetic_body import SyntheticBody
 
 CONFIG = TrainConfig(hidden=(200, 100), latent=40, activation="relu", epochs=100, batch=500, rate=3e-3)
 EXHAUSTIVE = 12

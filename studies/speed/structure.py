@@ -15,7 +15,7 @@ from gemuco.learning.train import TrainConfig
 from gemuco.masks import all_masks, bits
 from gemuco.structure.determination import Judge, Thresholds
 from gemuco.structure.mask_training import train_masks
-from studies.accuracy.synthetic_body import SyntheticBody
+from studies.bodies.synthetic_body import SyntheticBody
 from studies.speed.bodies import module
 from studies.speed.table import Row, faster, show
 

@@ -21,7 +21,7 @@ from services.client import Client
 from services.process.supervisor import Supervisor
 from services.wire import keys
 from services.wire.messages import Estimates, Sample, decode
-from studies.accuracy.actual_arms import model
+from studies.bodies.actual_arms import model
 from studies.speed.table import Row, show
 from studies.stack.driving import measures
 from studies.stack.loops import stack, with_rates

@@ -30,7 +30,7 @@ from services.hardware.hal_service import CYCLE_PRIORITY
 from services.model.gemuco_service import PRIORITIES
 from services.process.supervisor import Supervisor, gemuco_command
 from services.wire.messages import Status
-from studies.accuracy.actual_arms import model
+from studies.bodies.actual_arms import model
 from studies.stack.driving import Mover, engage, measures
 from studies.stack.processes import BareLoops, cpu
 

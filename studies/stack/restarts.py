@@ -18,7 +18,7 @@ from rich.table import Table
 from hal.config import load_robot
 from services.client import Client
 from services.process.supervisor import Supervisor
-from studies.accuracy.actual_arms import model
+from studies.bodies.actual_arms import model
 from studies.stack.driving import engage, measures
 from studies.stack.loops import stack
 

@@ -14,7 +14,8 @@ from services.learning.motion import Forecast, random_postures
 from services.learning.trainer import train_config
 from services.model.living_model import layout_of
 from services.model.model_config import collect_config, model_config
-from studies.accuracy.actual_arms import record
+from studies.bodies import vehicle
+from studies.bodies.actual_arms import record
 
 Rows = dict[str, np.ndarray]
 Motion = dict[str, Rows]
@@ -35,6 +36,8 @@ MASKS = {
 MUSCLES = [(JOINTS, TENSION), (TENSION, LENGTH), (JOINTS, LENGTH), (JOINTS, TENSION, LENGTH)]
 SECONDS, RATE = 240, 50
 """Length [s] and rate [Hz] of the motion of each condition."""
+DRIVEN, DRIVES = 1200.0, 5.0
+"""Length [s] and rate [Hz] of the drive that a model of the car is learned from."""
 ARM, LIVED, JUDGED = 921, 400.0, 300.0
 """Number of the muscle-driven arm, and the lengths [s] of the motion to learn from and of that to judge."""
 
@@ -113,10 +116,16 @@ def _kuka(fit: Callable, config: Callable, learn: Callable) -> tuple[BodySchema,
     return schema, {"": judged}
 
 
+def _car(fit: Callable, config: Callable, learn: Callable) -> tuple[BodySchema, Motion]:
+    schema, _ = fit([vehicle.drive(1, DRIVEN, DRIVES)], config(seed=0), vehicle.MASKS, units=vehicle.UNITS)
+    return schema, {"": vehicle.drive(2, DRIVEN, float(RATE))}
+
+
 BODIES: dict[str, Callable[..., tuple[BodySchema, Motion]]] = {
     "kxr_humanoid": partial(_with_tools, "kxr_humanoid"),
     "pr2_duster": partial(_with_tools, "pr2_duster"),
     "musashi_arm": _arm,
     "kuka": _kuka,
+    "car": _car,
 }
 """Robot -> function of `fit`, `TrainConfig` and `learn_normal` that returns model and healthy motion by condition."""

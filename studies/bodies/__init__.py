@@ -1,0 +1,1 @@
+"""Bodies, real and simulated, that several studies judge."""
