@@ -1,4 +1,8 @@
-"""Estimation of missing values (paper, II-G): by a feasible mask, by descent on z, or by descent on x_in."""
+"""Estimation of missing values (paper, II-G): by a feasible mask, by descent on z, or by descent on x_in.
+
+A signal of which only some elements are missing may be estimated better from the others: by regression on all measured
+elements. Which way is best is known after both were tried on normal samples.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,6 +14,7 @@ import numpy as np
 from gemuco.compiled.inference import infer
 from gemuco.derived import ByPattern
 from gemuco.intervals.beyond import Line, line_of
+from gemuco.intervals.regression import METHOD, Regression
 from gemuco.intervals.sureness import KNOWN, SURE, UNKNOWN, Judge, Judgement, RangeJudge, Sureness, since_change
 from gemuco.layers import run
 from gemuco.masks import Mask, covered_by, label
@@ -19,7 +24,10 @@ from gemuco.search.fold import fitting, input_lines, latent_lines
 from gemuco.search.routes import STARTS, latent_starts
 
 SEARCH = NewtonConfig()
-
+BETTER = 0.8
+"""Regression is used if its expected error is below this share of that of the other way."""
+TRIED = 16
+"""A search is tried on this many normal samples."""
 
 _OF_NOTHING = Judgement(Sureness(UNKNOWN, "nothing that it could be estimated from was measured"), 1.0)
 
@@ -33,7 +41,8 @@ class Estimate:
         std: Expected error of this estimate [unit], shape (n,): 90 % of the errors of held-out data are within
             `gemuco.certainty.NINETY` std; 0 where measured, NaN where unknown.
         estimated: Whether each element is an estimate, shape (n,).
-        method: `measured`, `mask` (usages a and b), `latent` (e), `input` (f) or `none`.
+        method: `measured`, `mask` (usages a and b), `latent` (e), `input` (f), `regression` on all measured elements,
+            or `none`.
         mask: The signals from which it was estimated; empty where measured.
         residual: Root mean square of the given values minus the model's [standard deviations of the training data];
             0 where measured, NaN without estimate. For `latent` the network also predicts the given values from the
@@ -71,7 +80,7 @@ class Recipe:
     """
 
     steps: tuple[tuple[str, Mask, np.ndarray, tuple[str, ...]], ...]
-    judges: tuple[Judge | RangeJudge | None, ...]
+    judges: tuple[Judge | RangeJudge | Regression | None, ...]
     lines: tuple[Line | None, ...]
     unseen: Sureness
     std: np.ndarray
@@ -81,40 +90,105 @@ class Recipe:
     label: Mapping[str, str]
 
     @classmethod
-    def of(cls, schema: BodySchema, finite: np.ndarray) -> "Recipe":
-        """Make the recipe for samples with these finite elements, truth values, shape (size,)."""
-        slices, whole = schema.layout.slices, schema.layout.whole(finite)
-        signals: dict[tuple[str, Mask], list[str]] = {}
-        for name in slices:
-            source = ("measured", frozenset()) if name in whole else _route(schema, name, whole, finite)
-            signals.setdefault(source, []).append(name)
-        std, estimated = np.zeros(len(finite)), np.zeros(len(finite), bool)
-        steps = []
-        for (method, mask), names in signals.items():
-            missing = np.zeros(len(finite), bool)
+    def of(cls, schema: BodySchema, finite: np.ndarray, is_tried: bool = False) -> "Recipe":
+        """Make the recipe for samples with these finite elements, truth values, shape (size,).
+
+        Args:
+            schema: The body schema.
+            finite: Whether each element is finite, shape (size,).
+            is_tried: Whether the ways to estimate the missing elements of a signal that is partly measured are tried.
+        """
+        slices, ways = schema.layout.slices, _ways(schema, finite, is_tried)
+        std, estimated, steps, judges = np.zeros(len(finite)), np.zeros(len(finite), bool), [], []
+        for way in dict.fromkeys(ways.values()):
+            names, missing = tuple(name for name in slices if ways[name] is way), np.zeros(len(finite), bool)
             for name in names:
                 missing[slices[name]] = ~finite[slices[name]]
-            std[missing] = _std(schema, method, mask)[missing]
-            estimated |= missing & (method != "none")
-            if method != "measured":
-                steps.append((method, mask, missing, tuple(names)))
-        sources = {name: source for source, names in signals.items() for name in names}
+            std[missing] = way.std[missing]
+            estimated |= missing & (way.method != "none")
+            if way.method != "measured":
+                steps.append((way.method, way.given, missing, names))
+                judges.append(way.regression or _judge(schema, way, finite))
         std.setflags(write=False)
         estimated.setflags(write=False)
-        masks = {name: sources[name][1] for name in slices}
-        labels = {name: label(mask, schema.layout.names) for name, mask in masks.items()}
-        judges = tuple(_judge(schema, (method, mask), finite) for method, mask, _, _ in steps)
         return cls(
             tuple(steps),
-            judges,
+            tuple(judges),
             tuple(line_of(schema, mask) if method == "mask" else None for method, mask, _, _ in steps),
             since_change(schema, ~finite),
             std,
             estimated,
-            {name: sources[name][0] for name in slices},
-            masks,
-            labels,
+            {name: way.method for name, way in ways.items()},
+            {name: way.given for name, way in ways.items()},
+            {name: label(way.given, schema.layout.names) for name, way in ways.items()},
         )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Way:
+    """A way to estimate missing elements.
+
+    Attributes:
+        method: See `Estimate`.
+        given: Signals that it is given.
+        std: Expected errors [unit], shape (size,); NaN where unknown.
+        is_tried: Whether they are those of a trial.
+        regression: The estimates by regression.
+    """
+
+    method: str
+    given: Mask
+    std: np.ndarray
+    is_tried: bool = False
+    regression: Regression | None = None
+
+
+def _ways(schema: BodySchema, finite: np.ndarray, is_tried: bool) -> dict[str, _Way]:
+    """Return the way by which each signal is estimated; signals with the same way share it. See `Recipe.of`."""
+    whole, known, ways = schema.layout.whole(finite), dict[tuple[str, Mask], _Way](), {}
+    for name, span in schema.layout.slices.items():
+        method, mask = ("measured", Mask()) if name in whole else _route(schema, name, whole, finite)
+        way = known.get((method, mask))
+        if way is None:
+            std = _std(schema, method, mask)
+            is_new = is_tried and method in ("latent", "input") and _is_other(schema, std, whole, finite)
+            way = _Way(method, mask, _tried(schema, method, mask, finite) if is_new else std, is_new)
+            known[method, mask] = way
+        if is_tried and name not in whole and finite[span].any():
+            missing = span.start + np.flatnonzero(~finite[span])
+            regression = Regression.of(schema, name, finite)
+            if regression is not None and _is_better(regression.std[missing], way.std[missing]):
+                way = _Way(METHOD, regression.given, regression.std, regression=regression)
+        ways[name] = way
+    return ways
+
+
+def _is_other(schema: BodySchema, std: np.ndarray, whole: Mask, finite: np.ndarray) -> bool:
+    """Whether a search has other errors than learned ones [unit], shape (size,): it is given parts of signals."""
+    return bool(np.isnan(std).all() or (finite & ~np.isin(np.arange(len(finite)), schema.layout.indices(whole))).any())
+
+
+def _is_better(std: np.ndarray, other: np.ndarray) -> bool:
+    """Whether expected errors [unit] are clearly smaller than others, shape (n,), which may be unknown."""
+    ratio = std / np.where(np.isfinite(other), other, np.inf)
+    return bool(np.exp(np.mean(np.log(np.maximum(ratio, 1e-9)))) < BETTER)
+
+
+def _tried(schema: BodySchema, method: str, mask: Mask, finite: np.ndarray) -> np.ndarray:
+    """Return the root mean square errors of a search on normal samples [unit], shape (size,); NaN without samples."""
+    size = schema.layout.size
+    rows = np.zeros((0, size)) if schema.normal is None else schema.normal.rows.astype(float)
+    if len(schema.bias) and len(rows):
+        away = ((rows[:, size:] - schema.bias) ** 2).sum(axis=1)
+        rows = rows[away <= away.min() + 1e-9]
+    if not len(rows):
+        return _std(schema, method, mask)
+    rows = rows[np.linspace(0, len(rows) - 1, min(TRIED, len(rows))).astype(int), :size]
+    squares = []
+    for row in schema.scaler.restore(rows):
+        prediction, _ = _search(schema, method, mask, np.where(finite, row, np.nan))
+        squares.append((prediction - row) ** 2)
+    return np.asarray(np.sqrt(np.mean(squares, axis=0)))
 
 
 class Completion(NamedTuple):
@@ -136,8 +210,13 @@ class Completion(NamedTuple):
 
 
 def recipes(schema: BodySchema) -> ByPattern[Recipe]:
-    """Return the recipes of a schema by the finite elements of a sample."""
+    """Return the recipes of a schema by the finite elements of a sample, of which none was tried."""
     return ByPattern(partial(Recipe.of, schema))
+
+
+def tried_recipes(schema: BodySchema) -> ByPattern[Recipe]:
+    """Return the recipes of a schema by the finite elements of a sample; see `Recipe.of`."""
+    return ByPattern(partial(Recipe.of, schema, is_tried=True))
 
 
 def estimate(schema: BodySchema, values: Mapping[str, np.ndarray]) -> dict[str, Estimate]:
@@ -190,9 +269,9 @@ def fill(schema: BodySchema, joined: np.ndarray, recipe: Recipe | None = None) -
     """Complete a sample in one array [unit of each element], shape (size,), NaN where missing; see `estimate`.
 
     The array must be read-only, as in a service: the code is compiled for read-only arrays. The recipe is that of its
-    finite elements; the schema's if not given.
+    finite elements; the schema's, tried on normal samples, if not given.
     """
-    recipe = recipe or schema.derived(recipes)(np.isfinite(joined))
+    recipe = recipe or schema.derived(tried_recipes)(np.isfinite(joined))
     value, residual, std = joined.copy(), dict.fromkeys(recipe.method, 0.0), recipe.std
     sureness = dict.fromkeys(recipe.method, SURE)
     if recipe.steps:
@@ -201,6 +280,9 @@ def fill(schema: BodySchema, joined: np.ndarray, recipe: Recipe | None = None) -
         own = float("nan")
         if method == "mask":
             error, own = infer(*schema.parts, joined, *schema.gate(mask), missing, value)
+        elif isinstance(judge, Regression):
+            judge.predict(joined, value)
+            error = float("nan")
         else:
             prediction, error = _search(schema, method, mask, joined)
             np.copyto(value, prediction, where=missing)
@@ -214,12 +296,12 @@ def fill(schema: BodySchema, joined: np.ndarray, recipe: Recipe | None = None) -
     return Completion(value, std, residual, sureness, recipe)
 
 
-def _judge(schema: BodySchema, way: tuple[str, Mask], finite: np.ndarray) -> Judge | RangeJudge | None:
-    if way[0] == "none":
+def _judge(schema: BodySchema, way: _Way, finite: np.ndarray) -> Judge | RangeJudge | None:
+    if way.method == "none":
         return None
     if schema.certainty is None:
-        return RangeJudge(schema, way[1], finite)
-    return Judge(schema, way, finite, _std(schema, *way))
+        return RangeJudge(schema, way.given, finite)
+    return Judge(schema, (way.method, way.given), finite, way.std, TRIED if way.is_tried else 0)
 
 
 def _route(schema: BodySchema, name: str, whole: Mask, finite: np.ndarray) -> tuple[str, Mask]:

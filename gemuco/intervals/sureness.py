@@ -86,13 +86,14 @@ class Judge:
         way: Method and given signals.
         finite: Whether each element of the layout is given, shape (size,).
         expected: Expected error of every element [unit], shape (size,).
+        tried: Number of samples on which a way that was not calibrated was tried.
     """
 
-    def __init__(self, schema: BodySchema, way: Way, finite: np.ndarray, expected: np.ndarray) -> None:
+    def __init__(self, schema: BodySchema, way: Way, finite: np.ndarray, expected: np.ndarray, tried: int = 0) -> None:
         certainty, std = schema.certainty, schema.scaler.std
         assert certainty is not None
         place = certainty.place(way)
-        self._layout, self._way = schema.layout, way
+        self._layout, self._way, self._tried = schema.layout, way, tried
         self.is_calibrated = place is not None
         self.about_p = about_p(schema)
         elements = given_elements(schema, way[1], finite)
@@ -137,8 +138,9 @@ class Judge:
             state = UNKNOWN if length > self._limits[1] else DOUBTFUL
             return worse(Sureness(state, WORDS[measures.index(max(measures))]), self.about_p)
         if not self.is_calibrated:
-            text = f"how exact an estimate by {self._way[0]} from these signals is was never measured"
-            return worse(self.about_p, Sureness(UNKNOWN, text))
+            way = f"how exact an estimate by {self._way[0]} from these signals is was"
+            tried = Sureness(DOUBTFUL, f"{way} measured on {self._tried} samples only")
+            return worse(self.about_p, tried if self._tried else Sureness(UNKNOWN, f"{way} never measured"))
         return self.about_p
 
 

@@ -214,7 +214,7 @@ class Watch:
         place = np.cumsum(measured) - 1
         first, second = _pairs(len(self.inputs))
         usable = measured[first] & measured[second]
-        kept = np.concatenate([[True], measured, usable])
+        kept = self.kept(measured)
         parts, target, kind, start = [np.zeros((int(kept.sum()), 0))], [], [], 0
         chosen = []
         for entry, penalty in zip(self.targets(), self.penalties, strict=True) if maps else ():
@@ -237,9 +237,23 @@ class Watch:
             np.concatenate([np.zeros(0, int), *kind]),
         )
 
-    def inverse(self, penalty: float) -> np.ndarray:
-        """Return the inverse of the moments with a ridge penalty of the products, shape (features, features)."""
-        return np.asarray(np.linalg.inv(self.moments + self._ridge(penalty)))
+    def kept(self, measured: np.ndarray) -> np.ndarray:
+        """Return the features that only measured inputs enter, truth values: shape (inputs,) -> (features,)."""
+        first, second = _pairs(len(self.inputs))
+        return np.concatenate([[True], measured, measured[first] & measured[second]])
+
+    def inverse(self, penalty: float, kept: np.ndarray | None = None) -> np.ndarray:
+        """Return the inverse of the moments with a ridge penalty of the products.
+
+        Args:
+            penalty: The penalty.
+            kept: The features to use, truth values, shape (features,); None: all.
+
+        Returns:
+            Shape (k, k) for k features.
+        """
+        used = np.ones(len(self.moments), bool) if kept is None else kept
+        return np.asarray(np.linalg.inv((self.moments + self._ridge(penalty))[np.ix_(used, used)]))
 
     def _ridge(self, penalty: float) -> np.ndarray:
         ridge = np.full(len(self.moments), penalty)

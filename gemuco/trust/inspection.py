@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gemuco.errors import NotEnoughData, SchemaError, WrongSize
-from gemuco.estimation import estimate, recipes
+from gemuco.estimation import estimate, tried_recipes
 from gemuco.schema import BodySchema, check_schema
 from gemuco.trust.changes import LONGEST
 from gemuco.trust.config import BLOCK, Finding, TrustConfig
@@ -183,7 +183,7 @@ class Inspector:
         """Whether the model can estimate some elements while all others are as in the newest sample."""
         finite = np.isfinite(self._row)
         finite[list(elements)] = False
-        return bool(self._schema.derived(recipes)(finite).estimated[list(elements)].all())
+        return bool(self._schema.derived(tried_recipes)(finite).estimated[list(elements)].all())
 
 
 def _repaired(

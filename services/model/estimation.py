@@ -18,6 +18,7 @@ from hal.clock import Clock
 from hal.config import RobotConfig
 from services.model.fusion import Fusion
 from services.model.living_model import layout_of
+from services.model.ways import Ways
 from services.wire.messages import Estimates, Sample
 from services.wire.streams import Arrival
 
@@ -232,6 +233,7 @@ class Estimation:
         clock: Clock,
         factor: Callable[[], np.ndarray | None] = lambda: None,
         fusion: Fusion | None = None,
+        is_known: Callable[[BodySchema], bool] = lambda schema: True,
     ) -> None:
         """Prepare.
 
@@ -242,9 +244,10 @@ class Estimation:
             clock: Source of time.
             factor: Returns the factors on the std of the schema's elements, shape (size,), if there are any.
             fusion: Combines measurements with estimates; without it they are published as measured.
+            is_known: Whether the normal errors of a schema are known to be those of this body.
         """
         self._freshness, self._schema, self._publish, self._clock = freshness, schema, publish, clock
-        self._factor, self._fusion = factor, fusion
+        self._factor, self._fusion, self.ways = factor, fusion, Ways(is_known)
         self._source: tuple[BodySchema, Numbers, np.ndarray | None] | None = None
         """This holds the schema, the values and the factors of `latest`."""
         self._newest: Sample | None = None
@@ -265,7 +268,14 @@ class Estimation:
             self.latest = replace(self.latest, stamp_ns=stamp_ns, cycle=cycle)
         else:
             self.latest = _estimates(
-                schema, in_order(schema, values), factor, self._fusion, stamp_ns, cycle, self._freshness.distrust
+                schema,
+                self.ways,
+                in_order(schema, values),
+                factor,
+                self._fusion,
+                stamp_ns,
+                cycle,
+                self._freshness.distrust,
             )
             self._source = schema, values, factor
         self._publish(self.latest)
@@ -283,6 +293,7 @@ class Estimation:
 
 def _estimates(
     schema: BodySchema,
+    ways: Ways,
     values: Numbers,
     factor: np.ndarray | None,
     fusion: Fusion | None,
@@ -290,7 +301,8 @@ def _estimates(
     cycle: int,
     distrust: Distrust,
 ) -> Estimates:
-    value, std, residual, sureness, recipe = fill(schema, values.flat)
+    recipe = ways.at_hand(schema, np.isfinite(values.flat))
+    value, std, residual, sureness, _ = fill(schema, values.flat, recipe)
     if factor is not None and recipe.steps:
         std, sureness = std * factor, widened(schema, sureness, recipe.estimated, factor)
     method = dict(recipe.method)

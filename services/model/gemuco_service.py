@@ -141,11 +141,11 @@ class GemucoService:
         self.history = HistoryRing({s.name: s.size for s in schema.layout.signals}, robot.rates.estimation)
         self._estimates = service.publisher(keys.estimate(robot.robot), Estimates)
         self.hindsight = Hindsight(self.freshness, self._schema, self.clock)
+        self.acquaintance = Acquaintance()
         self.estimation = Estimation(
             self.freshness, self._schema, self._publish, self.clock, lambda: self.hindsight.factor,
-            Fusion(schema.layout.size) if self.config.fuse else None,
+            Fusion(schema.layout.size) if self.config.fuse else None, self.acquaintance.is_known,
         )  # fmt: skip
-        self.acquaintance = Acquaintance()
         self.trust = self._make_trust()
         self.anomaly = AnomalyWatch(
             self.freshness,
@@ -346,7 +346,8 @@ class GemucoService:
         return {name: sum(counters[name] for counters in orders) for name in ("repeated", "late")}
 
     def _look_back(self) -> None:
-        """Judge the last samples, and measure the errors of the model on them."""
+        """Judge the last samples, measure the errors of the model on them, and try ways to estimate what is missing."""
+        self.estimation.ways.prepare()
         self.anomaly.judge()
         self.hindsight.look()
 

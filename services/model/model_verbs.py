@@ -15,6 +15,7 @@ from services.model.control_config import controller_of, simulator_of
 from services.model.control_loop import Control
 from services.model.estimation import widened
 from services.model.gemuco_service import PRIORITIES, GemucoService
+from services.model.ways import Ways
 from services.process.realtime import at_most
 from services.process.service import Service
 from services.wire.caller import Caller
@@ -104,11 +105,11 @@ class ModelVerbs:
         values, cycle = self._values(arguments)
         reasons = {} if arguments.get("values") is not None else dict(self._service.freshness.distrust.reasons)
         facts = {"cycle": cycle, "model_version": self._service.living.version, "distrusted": reasons}
-        factor = self._service.hindsight.factor
+        factor, ways = self._service.hindsight.factor, self._service.estimation.ways
         if "signal" in arguments:
             signal = schema.layout.signal(arguments["signal"])
-            return _estimates(schema, values, factor)[signal.name] | facts
-        return {"signals": _estimates(schema, values, factor)} | facts
+            return _estimates(schema, ways, values, factor)[signal.name] | facts
+        return {"signals": _estimates(schema, ways, values, factor)} | facts
 
     def solve(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Return the command for a target by the robot file's loss; the robot does not move."""
@@ -256,10 +257,13 @@ class ModelVerbs:
         return values, cycle
 
 
-def _estimates(schema: BodySchema, values: Mapping[str, np.ndarray], factor: np.ndarray) -> dict[str, dict[str, Any]]:
+def _estimates(
+    schema: BodySchema, ways: Ways, values: Mapping[str, np.ndarray], factor: np.ndarray
+) -> dict[str, dict[str, Any]]:
     joined = schema.layout.join_one(values)
     joined.setflags(write=False)
-    completion, expected, residual, sureness, recipe = fill(schema, joined)
+    recipe = ways.best(schema, np.isfinite(joined))
+    completion, expected, residual, sureness, _ = fill(schema, joined, recipe)
     expected, sureness = expected * factor, widened(schema, sureness, recipe.estimated, factor)
     value, std, estimated = completion.tolist(), expected.tolist(), recipe.estimated.tolist()
     return {

@@ -153,7 +153,7 @@ class Trust:
         values = in_order(schema, self._last).flat
         hidden = np.where(self._returns.back, np.nan, values)
         hidden.setflags(write=False)
-        completion = fill(schema, hidden)
+        completion = fill(schema, hidden, schema.derived(recipes)(np.isfinite(hidden)))
         std = completion.std * np.maximum(1.0, self._factor())
         with np.errstate(invalid="ignore"):
             return np.asarray(np.abs(values - completion.value) > FAR * std)

@@ -222,8 +222,8 @@ class Estimates(OfSignals, frozen=True, kw_only=True):
         estimated: Signal -> whether each element was estimated, shape (n,).
         std: Signal -> expected error of an estimate (1 sigma) [unit], shape (n,): 1.645 of them contain the truth in 90
             of 100 samples that are like the learned ones; 0 where measured, NaN where unknown.
-        method: Signal -> `measured`, `fused` (a measurement combined with its estimate), `mask`, `latent`, `input` or
-            `none`.
+        method: Signal -> `measured`, `fused` (a measurement combined with its estimate), `mask`, `latent`, `input`,
+            `regression` or `none`.
         mask: Signal -> the signals it was estimated from, joined by `+`.
         residual: Signal -> error of the model on its own input (root mean square), in standard deviations of the
             training data; 0 where measured.

@@ -98,7 +98,7 @@ def test_estimates_a_batch_as_sample_by_sample(schema, arm):
             for attribute in ("value", "std", "estimated", "residual"):
                 np.testing.assert_array_equal(getattr(together[name], attribute)[row], getattr(known, attribute))
             assert (together[name].method[row], together[name].mask[row]) == (known.method, known.mask)
-    assert set(together["joint_position"].method) == {"mask", "latent"}
+    assert set(together["joint_position"].method) == {"mask", "latent", "regression"}
 
 
 def test_a_schema_shows_itself(schema):

@@ -1,0 +1,102 @@
+"""Ways to estimate missing elements: a tick never tries one, and normal samples of another body decide nothing."""
+
+import numpy as np
+import pytest
+from arm_model import small_model, states
+
+from gemuco.estimation import Recipe, fill
+from gemuco.schema import BodySchema
+from services.model.ways import Ways
+
+ELEMENT = 5
+
+
+class Known:
+    """The body of which normal errors are known, or another one."""
+
+    def __init__(self, is_known: bool = True) -> None:
+        self.is_known = is_known
+
+    def __call__(self, schema: BodySchema) -> bool:
+        return self.is_known
+
+
+@pytest.fixture(scope="module")
+def finite() -> np.ndarray:
+    """One element is missing."""
+    elements = np.ones(small_model().layout.size, bool)
+    elements[ELEMENT] = False
+    return elements
+
+
+@pytest.fixture
+def tried(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
+    """Every recipe that is made, as whether its ways are tried."""
+    made, make = [], Recipe.of
+
+    def of(schema: BodySchema, finite: np.ndarray, is_tried: bool = False) -> Recipe:
+        made.append(is_tried)
+        return make(schema, finite, is_tried)
+
+    monkeypatch.setattr(Recipe, "of", of)
+    return made
+
+
+def test_a_tick_tries_nothing_and_uses_what_was_tried_before(finite: np.ndarray, tried: list[bool]) -> None:
+    schema, ways = small_model(), Ways(Known())
+    first = ways.at_hand(schema, finite)
+    assert not any(tried)
+    ways.prepare()
+    assert tried[-1]
+    count, best = len(tried), ways.at_hand(schema, finite)
+    assert len(tried) == count
+    assert best is ways.best(schema, finite)
+    assert best is not first
+
+
+def test_nothing_is_tried_twice_or_for_a_whole_sample(finite: np.ndarray, tried: list[bool]) -> None:
+    schema, ways = small_model(), Ways(Known())
+    ways.at_hand(schema, np.ones(len(finite), bool))
+    ways.prepare()
+    assert not any(tried)
+    for _ in range(3):
+        ways.at_hand(schema, finite)
+        ways.prepare()
+    assert sum(tried) == 1
+
+
+def test_another_body_is_not_judged_by_these_normal_samples(finite: np.ndarray, tried: list[bool]) -> None:
+    schema, known = small_model(), Known()
+    ways = Ways(known)
+    ways.at_hand(schema, finite)
+    ways.prepare()
+    best = ways.at_hand(schema, finite)
+    known.is_known = False
+    assert ways.at_hand(schema, finite) is not best
+    assert ways.best(schema, finite) is not best
+    ways.prepare()
+    assert sum(tried) == 1
+    known.is_known = True
+    assert ways.at_hand(schema, finite) is best
+
+
+def test_another_schema_is_tried_anew(finite: np.ndarray) -> None:
+    schema, ways = small_model(), Ways(Known())
+    other = schema.with_weights(schema.weights)
+    before = ways.best(schema, finite)
+    assert ways.at_hand(other, finite) is not before
+    ways.prepare()
+    assert ways.at_hand(other, finite) is ways.best(other, finite)
+
+
+def test_the_tried_way_is_at_least_as_good(finite: np.ndarray) -> None:
+    schema, ways = small_model(), Ways(Known())
+    rows = schema.layout.join(states(seed=3))[:200]
+    quick, best = ways.at_hand(schema, finite), ways.best(schema, finite)
+    errors = []
+    for recipe in (quick, best):
+        hidden = np.where(finite, rows, np.nan)
+        hidden.setflags(write=False)
+        estimates = np.array([fill(schema, row, recipe).value[ELEMENT] for row in hidden])
+        errors.append(np.sqrt(np.mean((estimates - rows[:, ELEMENT]) ** 2)))
+    assert errors[1] < 1.2 * errors[0]
