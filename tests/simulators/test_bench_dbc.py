@@ -226,7 +226,7 @@ def test_a_broken_servo_is_off_until_it_is_reset(tmp_path: Path) -> None:
     with running(virtual(servo(tmp_path, "position"))) as (robot, rig):
         cycle_until(robot, arrives("joint_position", np.array([0.2])), np.array([0.2]))
         rig.fault("emcy axis")
-        cycle_until(robot, lambda one: states(robot) == {"axis": "fault"})
+        cycle_until(robot, lambda one: states(robot) == {"axis": "fault"} and robot.mode == "fault")
         robot.reset()
         cycle_until(robot, lambda one: states(robot) == {"axis": "ready"})
         cycle_until(robot, arrives("joint_position", np.array([0.3])), np.array([0.3]))
