@@ -22,10 +22,9 @@ ALIKE = 6.0
 """Two columns look alike if their logarithms of the likelihood ratio differ by less than this."""
 CLOSE = 0.8
 """Nor if the smaller is more than this share of the larger."""
-ONE_SIDED, LITTLE = 1.5, 0.3
+ONE_SIDED = 1.5
 """Without B the prediction of A is worse by a factor, and as much is that of B without A, if each is predicted as well
-as it can be. B is not if the first factor is this multiple of the second; then its own evidence says little, if it is
-below the second share of that against A."""
+as it can be. B is not if the first factor is this multiple of the second; then its own evidence says little."""
 MOST = 3
 """At most this number of columns is named as alternatives."""
 AGREES = 0.6
@@ -185,8 +184,6 @@ def _blind(
     of_columns = without(frozenset({lead})).healthy / evidence.healthy
 
     def is_blind(column: int) -> bool:
-        if evidence.strength[column] > LITTLE * evidence.strength[lead]:
-            return False
         of_lead = without(frozenset({column})).healthy[lead] / evidence.healthy[lead]
         return bool(of_lead > ONE_SIDED * of_columns[column])
 

@@ -22,20 +22,19 @@ def evidence(strength: dict[int, float], healthy: dict[int, float] | None = None
     return Evidence(np.sqrt(strengths / 50.0), strengths, np.full(SIZE, 5), np.zeros(SIZE), no, no, 1.0, errors)
 
 
-def cause(without_yaw: float, without_acceleration: float, of_yaw: float = 1.0, own: float = 4.0) -> Cause:
+def cause(without_yaw: float, without_acceleration: float, of_yaw: float = 1.0) -> Cause:
     """Explain a contradiction in the acceleration, which is predicted from the yaw rate.
 
     Args:
         without_yaw: What is left of the evidence without the yaw rate.
         without_acceleration: The same without the acceleration.
         of_yaw: How much worse the yaw rate is predicted without the acceleration; the reverse is four times.
-        own: Evidence against the yaw rate itself; that against the acceleration is 80.
     """
     left = {
         frozenset({YAW}): evidence({ACCELERATION: without_yaw}, {ACCELERATION: 4.0}),
         frozenset({ACCELERATION}): evidence({YAW: without_acceleration}, {YAW: of_yaw}),
     }
-    whole = evidence({ACCELERATION: 80.0, YAW: own})
+    whole = evidence({ACCELERATION: 80.0, YAW: 4.0})
 
     def without(columns: Hidden) -> Evidence:
         return left.get(columns, whole)
@@ -55,10 +54,6 @@ def test_what_is_left_decides_where_a_relation_has_one_direction(without_yaw, wi
 
 def test_own_evidence_decides_where_both_predict_each_other():
     assert cause(1.0, 12.0, of_yaw=4.0).columns == {ACCELERATION}
-
-
-def test_own_evidence_decides_where_it_is_not_little():
-    assert cause(1.0, 12.0, own=40.0).columns == {ACCELERATION}
 
 
 def blocks(case: Case, count: int, yaw: float, acceleration: float, seed: int, look: float = 0.2) -> list[Case]:
