@@ -1,14 +1,12 @@
 """Suspected and hidden causes, and what kind of lie each of them is."""
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from gemuco.schema import BodySchema
 from gemuco.trust.changes import LONGEST
-from gemuco.trust.config import Hidden
 from gemuco.trust.evidence import Evidence
 from gemuco.trust.hypotheses import Cause
 from gemuco.trust.kinds import kind_of
@@ -17,11 +15,6 @@ from gemuco.trust.relations import Relations
 
 CLEAR = 2.0
 """A lie begins with the first error of this size [errors of a healthy prediction]."""
-WRONG, RIGHT = 3.0, 1.5
-"""Of hidden elements that look alike, those with a mean square error of at least the first number lied, if the errors
-of the others are below the second [squared errors of a healthy prediction]."""
-LOOKS, FORGETS = 4.0, 10.0
-"""This is judged from this number of independent looks on, and looks before the second number are forgotten."""
 MOVES = 3.0
 """Before a frozen element returns, it and its prediction move by this much [errors of a healthy prediction]."""
 
@@ -45,8 +38,6 @@ class Case:
         kind: As in `Finding`.
         size: As in `Finding`.
         reason: Why its elements are still used, if a rule forbids to hide them.
-        looks: Independent looks at its elements while all of them were hidden, shape (columns,).
-        squares: Their mean squared errors [squared errors of a healthy prediction], shape (columns,).
     """
 
     cause: Cause
@@ -63,8 +54,6 @@ class Case:
     kind: str = "unknown"
     size: float = math.nan
     reason: str = ""
-    looks: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    squares: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     def weigh(self, evidence: Evidence, has_jumped: bool, is_stuck: bool) -> None:
         """Add the evidence of one block, in which its elements may have jumped or been stuck."""
@@ -72,42 +61,6 @@ class Case:
         self.is_plain |= has_jumped or is_stuck
         self.weight += float(evidence.ratio.max()) ** 2
         self.steps = np.fmax(self.steps, evidence.step)
-
-    def tell_apart(self, z: np.ndarray, looks: np.ndarray) -> list[int]:
-        """Add a block in which all elements were hidden; return those that lied, empty while that is not clear.
-
-        Args:
-            z: Errors of all columns [errors of a healthy prediction], shape (n,); NaN where missing.
-            looks: Number of independent looks that the block is worth, shape (n,).
-        """
-        columns = sorted(self.cause.columns)
-        if len(self.looks) != len(columns):
-            self.looks, self.squares = np.zeros(len(columns)), np.ones(len(columns))
-        own = np.where(np.isfinite(z[columns]), looks[columns], 0.0)
-        self.looks = np.minimum(self.looks + own, FORGETS)
-        share = own / np.maximum(self.looks, 1e-9)
-        self.squares += share * (np.nan_to_num(z[columns]) ** 2 - self.squares)
-        wrong, right = self.squares >= WRONG, self.squares <= RIGHT
-        is_clear = self.looks.min() >= LOOKS and wrong.any() and (wrong | right).all() and not wrong.all()
-        return [column for column, lied in zip(columns, wrong.tolist(), strict=True) if lied] if is_clear else []
-
-
-def told_apart(cases: Iterable[Case], hidden: Hidden, z: np.ndarray, looks: np.ndarray) -> list[Case]:
-    """Return the hidden cases of elements that look alike of which this block says which lied; their cause is changed.
-
-    Args:
-        cases: All cases.
-        hidden: The hidden columns.
-        z: Errors of all columns [errors of a healthy prediction], shape (n,); NaN where missing.
-        looks: Number of independent looks that the block is worth, shape (n,).
-    """
-    changed = []
-    for case in cases:
-        alike = case.is_hidden and case.cause.cause == "either" and case.cause.columns <= hidden
-        if alike and (lied := case.tell_apart(z, looks)):
-            case.cause = Cause(frozenset(lied), "element" if len(lied) == 1 else "either", lied[0])
-            changed.append(case)
-    return changed
 
 
 def describe(

@@ -34,7 +34,6 @@ class Evidence:
         is_noise: Whether noise is the strongest evidence.
         is_slow: Whether the body rests and the error has changed so slowly since that no other tool explains it.
         level: Usual error of the columns that are not hidden [that of this body while it was healthy], a scalar.
-        healthy: Errors of a healthy body at the newest block [standard deviations of the signal].
     """
 
     ratio: np.ndarray
@@ -44,7 +43,6 @@ class Evidence:
     is_noise: np.ndarray
     is_slow: np.ndarray
     level: float
-    healthy: np.ndarray
 
 
 class Judge:
@@ -86,8 +84,7 @@ class Judge:
         strength = np.where(is_noise, 10.0 * noise, strength)
         hidden = list(view.hidden)
         ratio[hidden] = strength[hidden] = 0.0
-        healthy = view.healthy[-1] * self.scale
-        return Evidence(ratio, strength, age, step, is_noise, is_rest & is_slow, _level(view, self.scale), healthy)
+        return Evidence(ratio, strength, age, step, is_noise, is_rest & is_slow, _level(view, self.scale))
 
     def _at_rest(self, view: View) -> tuple[np.ndarray, np.ndarray]:
         """Return the evidence in errors that change while the body rests, 0 in motion; and whether they change slowly.

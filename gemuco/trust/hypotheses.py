@@ -22,9 +22,6 @@ ALIKE = 6.0
 """Two columns look alike if their logarithms of the likelihood ratio differ by less than this."""
 CLOSE = 0.8
 """Nor if the smaller is more than this share of the larger."""
-ONE_SIDED = 1.5
-"""Without B the prediction of A is worse by a factor, and as much is that of B without A, if each is predicted as well
-as it can be. B is not if the first factor is this multiple of the second; then its own evidence says little."""
 MOST = 3
 """At most this number of columns is named as alternatives."""
 AGREES = 0.6
@@ -44,7 +41,6 @@ class Cause:
         lead: The column with the most evidence.
         condition: The trained condition whose p explains the alarm; empty if none does.
         is_exchange: Whether they are two elements that agree with all others in each other's place.
-        is_one_sided: Whether the evidence against one of them says little; see `ONE_SIDED`.
     """
 
     columns: Hidden
@@ -52,7 +48,6 @@ class Cause:
     lead: int
     condition: str = ""
     is_exchange: bool = False
-    is_one_sided: bool = False
 
 
 def explain(
@@ -104,9 +99,6 @@ def explain(
                 yield frozenset({column, int(without(frozenset({column})).strength.argmax())})
 
     single = [column for column in singles if solves(frozenset({column}))]
-    blind = _blind(evidence, without, order[:CANDIDATES].tolist(), single, environment)
-    blind = [column for column in blind if solves(frozenset({column}))]
-    single += [column for column in blind if column not in single]
     for preferred in (sudden, beyond):
         single = [column for column in single if column in preferred] or single
     best = float(evidence.strength[single[0]]) if single else 0.0
@@ -127,7 +119,10 @@ def explain(
     if len(sudden) > 1 and not any(sudden <= part for part in parts) and solves(sudden):
         return Cause(sudden, "all", max(sudden, key=lambda c: evidence.strength[c]))
     if single:
-        return _of_single(evidence, without, single, blind, best)
+        alike = [c for c in single if _is_alike(best, float(evidence.strength[c]))]
+        if len(alike) == 1:
+            return Cause(frozenset(alike), "element", alike[0])
+        return Cause(frozenset(alike[:MOST]), "either", alike[0])
     for columns, cause in _sets(singles, devices, parts, partners):
         if solves(columns):
             return Cause(columns, cause, max(columns, key=lambda c: evidence.strength[c]))
@@ -144,50 +139,6 @@ def _exchanged(evidence: Evidence, exchanges: Iterable[tuple[Hidden, Evidence]],
         (not sudden.issuperset(p), r, p) for r, p in calmer if r < AGREES and (r < rest or sudden.issuperset(p))
     ]
     return frozenset(min(agreeing)[2]) if agreeing else frozenset()
-
-
-def _of_single(
-    evidence: Evidence, without: Callable[[Hidden], Evidence], single: list[int], blind: list[int], best: float
-) -> Cause:
-    """Return the most likely of single columns that explain an alarm, or those that look alike.
-
-    Args:
-        evidence: See `explain`.
-        without: See `explain`.
-        single: The columns.
-        blind: Columns whose own evidence says little. What is left without a column decides about these.
-        best: The evidence against the first column.
-    """
-    alike = [c for c in single if c not in blind and _is_alike(best, float(evidence.strength[c]))]
-    rivals = [c for c in single if c in blind]
-    if rivals:
-        left = {c: float(without(frozenset({c})).strength.max(initial=0.0)) for c in alike[:1] + rivals}
-        limit = min(left.values()) + ALIKE
-        alike = [c for c in alike if left[alike[0]] <= limit] + [c for c in rivals if left[c] <= limit]
-    if len(alike) == 1:
-        return Cause(frozenset(alike), "element", alike[0])
-    alike = alike[:MOST]
-    return Cause(frozenset(alike), "either", alike[0], is_one_sided=bool(set(rivals) & set(alike)))
-
-
-def _blind(
-    evidence: Evidence,
-    without: Callable[[Hidden], Evidence],
-    columns: list[int],
-    single: list[int],
-    environment: Hidden,
-) -> list[int]:
-    """Return the columns from which the first single cause is predicted, but which are hardly predicted from it."""
-    if not single:
-        return []
-    lead = single[0]
-    of_columns = without(frozenset({lead})).healthy / evidence.healthy
-
-    def is_blind(column: int) -> bool:
-        of_lead = without(frozenset({column})).healthy[lead] / evidence.healthy[lead]
-        return bool(of_lead > ONE_SIDED * of_columns[column])
-
-    return [column for column in columns if column != lead and column not in environment and is_blind(column)]
 
 
 def _is_alike(best: float, other: float) -> bool:

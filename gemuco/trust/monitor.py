@@ -8,7 +8,7 @@ import numpy as np
 from gemuco.anomaly.blame import parts
 from gemuco.schema import BodySchema
 from gemuco.trust.alternatives import Alternatives, is_another
-from gemuco.trust.cases import Case, describe, has_moved, told_apart
+from gemuco.trust.cases import Case, describe, has_moved
 from gemuco.trust.changes import LONGEST, LastingTest
 from gemuco.trust.config import BLOCK, Finding, Hidden, TrustConfig
 from gemuco.trust.evidence import Evidence, Judge
@@ -190,8 +190,6 @@ class TrustMonitor:
         looks = 0.0 if self._recent.resting else motion  # at rest sensor noise is no motion
         self._lasting.add(view.z[-1] / self._judge.scale, self._judge.least, looks / self._judge.time)
         evidence = self._judge(view, self._lasting)
-        for case in told_apart(self._cases, view.hidden, view.z[-1] / self._judge.scale, looks / self._judge.time):
-            self._describe(case, view.hidden)
         if self._healthy.is_known:
             self._decide(evidence, hidden)
         is_other = any(case.cause.cause == "body" for case in self._cases)
@@ -368,7 +366,7 @@ class TrustMonitor:
         if self._count - case.first > SETTLED or case.cause.cause == "environment":
             return
         self._describe(case, self._hidden_columns())
-        if case.cause.cause not in ("element", "either") or case.cause.is_one_sided:  # `told_apart` decides
+        if case.cause.cause not in ("element", "either"):
             return
         again = self._explain(evidence, rest, is_new=False)
         if again.cause == "element" and again.columns != case.cause.columns and not again.columns & self._environment:

@@ -360,9 +360,7 @@ def test_what_is_outside_of_the_learned_range_contradicts_no_other(beyond, accus
     strength[[JOINT, TENSION, LENGTH]] = 98.0, 37.0, 42.0
     ratio = np.where(strength > 0.0, 0.6, 0.0)
     ratio[JOINT] = 1.0
-    whole = Evidence(
-        ratio, strength, np.full(12, 5), np.zeros(12), np.zeros(12, bool), np.zeros(12, bool), 1.0, np.ones(12)
-    )
+    whole = Evidence(ratio, strength, np.full(12, 5), np.zeros(12), np.zeros(12, bool), np.zeros(12, bool), 1.0)
 
     def without(columns):
         return whole if columns.isdisjoint({JOINT, TENSION}) else replace(whole, ratio=0.3 * ratio)

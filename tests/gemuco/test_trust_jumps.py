@@ -103,7 +103,7 @@ def evidence(*accused: int) -> Evidence:
     """Return evidence against some columns, the strongest first."""
     strength, zero = np.zeros(SIZE), np.zeros(SIZE, bool)
     strength[list(accused)] = 60.0 - 20.0 * np.arange(len(accused))
-    return Evidence(strength / 20.0, strength, np.full(SIZE, 3), np.zeros(SIZE), zero, zero, 1.0, np.ones(SIZE))
+    return Evidence(strength / 20.0, strength, np.full(SIZE, 3), np.zeros(SIZE), zero, zero, 1.0)
 
 
 @pytest.mark.parametrize(

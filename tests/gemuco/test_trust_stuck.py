@@ -88,7 +88,7 @@ def test_missing_values_repeat_nothing() -> None:
 def evidence(ratio: list[float]) -> Evidence:
     """Return evidence of these shares of an alarm."""
     shares, zero = np.array(ratio), np.zeros(len(ratio))
-    return Evidence(shares, 50.0 * shares, zero + 5.0, 9.0 * shares, zero > 1.0, zero > 1.0, 1.0, zero + 1.0)
+    return Evidence(shares, 50.0 * shares, zero + 5.0, 9.0 * shares, zero > 1.0, zero > 1.0, 1.0)
 
 
 @pytest.mark.parametrize(("rest", "cause"), [(0.4, "element"), (0.7, "body")])
