@@ -123,11 +123,11 @@ class Timeline:
 def hidden_error(client: Client, signal: str, hide: Sequence[str]) -> np.ndarray:
     """Return a signal's estimate with some signals hidden, minus the truth [unit], shape (n,).
 
-    All are NaN if the truth is not known, or if the estimate has no expected error: while other sensors are late, it is
-    made from single elements and shows what they lack, not what the model knows.
+    All are NaN if the truth is not known, or if anything else is missing: while other sensors are late, the estimate
+    shows what they lack, not what the model knows.
     """
-    answer = client.infer(signal, hide=hide)
-    truth = client.truth()
-    value = np.asarray(answer["values"], float)
-    is_expected = np.isfinite(np.asarray(answer["std"], float)).all()
-    return value - truth.values[signal] if truth is not None and is_expected else np.full(len(value), np.nan)
+    estimate, truth = client.estimate(hide=hide), client.truth()
+    assert estimate is not None  # without some signals the model estimates anew
+    value = np.asarray(estimate.values[signal], float)
+    is_whole = not any(part.any() for name, part in estimate.estimated.items() if name not in hide)
+    return value - truth.values[signal] if truth is not None and is_whole else np.full(len(value), np.nan)

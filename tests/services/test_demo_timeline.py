@@ -60,15 +60,19 @@ def test_nothing_is_marked_where_no_value_was_made() -> None:
 
 
 class LateArm:
-    """Client of an arm at rest whose model's estimate is far off, without an expected error, while sensors are late."""
+    """Client of an arm at rest whose model is far off, and promises little error, while an encoder is late."""
 
     def __init__(self, late: int) -> None:
         self.late = late
 
-    def infer(self, signal: str, hide: Any) -> dict[str, Any]:
+    def estimate(self, hide: Any) -> Any:
+        assert hide == ["tip"]
         self.late -= 1
         is_late = self.late >= 0
-        return {"values": [2.0, 0.5] if is_late else [1.1, 0.5], "std": [float("nan"), 0.1] if is_late else [0.1, 0.1]}
+        return SimpleNamespace(
+            values={"tip": np.array([2.0, 0.5] if is_late else [1.1, 0.5]), "joints": np.array([0.0, 1.0])},
+            estimated={"tip": np.array([True, True]), "joints": np.array([False, is_late])},
+        )
 
     def truth(self) -> Any:
         return SimpleNamespace(values={"tip": np.array([1.0, 0.5])})
