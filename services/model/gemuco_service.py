@@ -347,9 +347,9 @@ class GemucoService:
 
     def _look_back(self) -> None:
         """Judge the last samples, measure the errors of the model on them, and try ways to estimate what is missing."""
-        self.estimation.ways.prepare()
         self.anomaly.judge()
         self.hindsight.look()
+        self.estimation.ways.prepare()
 
     def _readers(self) -> list[Reader[Any]]:
         readers: list[Reader[Any] | None] = [self._samples, self._seen, self._applied]

@@ -14,7 +14,8 @@ class Ways:
     """The recipes of the schema in use.
 
     A trial takes as long as several ticks, and normal samples of another body say nothing of this one. So a tick uses a
-    recipe that needs no trial until the better way is known.
+    recipe that needs no trial until the better way is known. On a busy machine other sensors are late in every sample:
+    only what lasts is tried, because trials would make it busier.
 
     Args:
         is_known: Whether the normal errors of a schema are known to be those of this body.
@@ -24,6 +25,8 @@ class Ways:
         self._is_known = is_known
         self._tried: tuple[BodySchema, ByPattern[Recipe]] | None = None
         self._wanted: tuple[BodySchema, np.ndarray] | None = None
+        self._lasts = b""
+        """These are the finite elements that the last tick before `prepare` lacked a recipe for."""
 
     def at_hand(self, schema: BodySchema, finite: np.ndarray) -> Recipe:
         """Return a recipe for samples with these finite elements, truth values, shape (size,), without a trial."""
@@ -44,7 +47,8 @@ class Ways:
         return tried[1](finite)
 
     def prepare(self) -> None:
-        """Try the ways that the last tick lacked."""
+        """Try the ways that the last tick lacked, if they lacked at the call before too."""
         wanted, self._wanted = self._wanted, None
-        if wanted is not None:
+        lasted, self._lasts = self._lasts, b"" if wanted is None else wanted[1].tobytes()
+        if wanted is not None and self._lasts == lasted:
             self.best(*wanted)
