@@ -17,6 +17,8 @@ MASS, DRAG, ROLLING, ROLLS, GRAVITY = 1500.0, 0.4, 150.0, 0.2, 9.81
 SLIP = 0.004
 """Slip of the driven wheels by acceleration [s2/m]."""
 VOLTAGE, IDLE = 370.0, 3.0
+STEP = 100.0
+"""Steps of the simulation per second, a multiple of every rate: with steps of 0.2 s the tyres would be others."""
 SPEEDS = (0.0, 5.0, 10.0, 15.0, 20.0, 28.0)
 NOISE = {
     "wheel_speed": 0.03, "yaw_rate": 0.004, "steering_angle": 0.003, "acceleration": 0.08, "motor_torque": 1.0,
@@ -32,11 +34,11 @@ MASKS = [tuple(s for s in UNITS if s not in lost) for n in (1, 2) for lost in co
 
 
 def drive(seed: int, seconds: float, rate: float) -> dict[str, np.ndarray]:
-    """Return what the sensors measure, signal -> shape (n, size)."""
-    draw, step, count = np.random.default_rng(seed), 1.0 / rate, round(seconds * rate)
+    """Return what the sensors measure at a rate [Hz] for some seconds, signal -> shape (n, size) [`UNITS`]."""
+    draw, step, every = np.random.default_rng(seed), 1.0 / STEP, round(STEP / rate)
     speed, aim, gain, steering, turn, yaw, slope, climb = 0.0, 10.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     rows = []
-    for _ in range(count):
+    for number in range(round(seconds * STEP)):
         if draw.random() < step / 8.0:
             aim = float(draw.choice(SPEEDS))
         if draw.random() < step / 4.0:
@@ -46,14 +48,16 @@ def drive(seed: int, seconds: float, rate: float) -> dict[str, np.ndarray]:
         slope += (climb - slope) * step / 5.0
         steering += np.clip(turn - steering, -0.5 * step, 0.5 * step)
         gain += (np.clip(0.5 * (aim - speed), -3.5, 2.5) - gain) * step / ENGINE
-        speed = max(0.0, speed + gain * step)
+        before, speed = speed, max(0.0, speed + gain * step)
         yaw += (speed * steering / (BASE * (1.0 + UNDERSTEER * speed**2)) - yaw) * step / TYRES
-        felt = gain + GRAVITY * slope
+        real = (speed - before) / step  # a car that stands does not slow down
+        felt = real + GRAVITY * slope
         force = MASS * felt + DRAG * speed**2 + ROLLING * np.tanh(speed / ROLLS)
-        rows.append([speed, yaw, steering, gain, felt, force])
-    speed, yaw, steering, gain, felt, force = np.array(rows).T
+        if number % every == 0:
+            rows.append([speed, yaw, steering, real, felt, force])
+    speed, yaw, steering, real, felt, force = np.array(rows).T
     front, half = np.hypot(speed, FRONT * yaw), 0.5 * TRACK * yaw
-    driven = 1.0 + SLIP * gain
+    driven = 1.0 + SLIP * real
     wheels = [
         driven * (front - half * np.cos(steering)), driven * (front + half * np.cos(steering)), speed - half,
         speed + half,
