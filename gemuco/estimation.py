@@ -146,26 +146,20 @@ class _Way:
 def _ways(schema: BodySchema, finite: np.ndarray, is_tried: bool) -> dict[str, _Way]:
     """Return the way by which each signal is estimated; signals with the same way share it. See `Recipe.of`."""
     whole, known, ways = schema.layout.whole(finite), dict[tuple[str, Mask], _Way](), {}
+    partly = [n for n, span in schema.layout.slices.items() if n not in whole and finite[span].any()]
+    regression = Regression.of(schema, finite) if is_tried and partly else None
+    other = None if regression is None else _Way(METHOD, regression.given, regression.std, regression=regression)
     for name, span in schema.layout.slices.items():
         method, mask = ("measured", Mask()) if name in whole else _route(schema, name, whole, finite)
         way = known.get((method, mask))
         if way is None:
-            std = _std(schema, method, mask)
-            is_new = is_tried and method in ("latent", "input") and _is_other(schema, std, whole, finite)
-            way = _Way(method, mask, _tried(schema, method, mask, finite) if is_new else std, is_new)
-            known[method, mask] = way
-        if is_tried and name not in whole and finite[span].any():
-            missing = span.start + np.flatnonzero(~finite[span])
-            regression = Regression.of(schema, name, finite)
-            if regression is not None and _is_better(regression.std[missing], way.std[missing]):
-                way = _Way(METHOD, regression.given, regression.std, regression=regression)
-        ways[name] = way
+            is_new = bool(is_tried and partly and method in ("latent", "input"))
+            std = _tried(schema, method, mask, finite) if is_new else _std(schema, method, mask)
+            way = known[method, mask] = _Way(method, mask, std, is_new)
+        missing = span.start + np.flatnonzero(~finite[span])
+        is_other = other is not None and name in partly and _is_better(other.std[missing], way.std[missing])
+        ways[name] = other if other is not None and is_other else way
     return ways
-
-
-def _is_other(schema: BodySchema, std: np.ndarray, whole: Mask, finite: np.ndarray) -> bool:
-    """Whether a search has other errors than learned ones [unit], shape (size,): it is given parts of signals."""
-    return bool(np.isnan(std).all() or (finite & ~np.isin(np.arange(len(finite)), schema.layout.indices(whole))).any())
 
 
 def _is_better(std: np.ndarray, other: np.ndarray) -> bool:
@@ -175,7 +169,10 @@ def _is_better(std: np.ndarray, other: np.ndarray) -> bool:
 
 
 def _tried(schema: BodySchema, method: str, mask: Mask, finite: np.ndarray) -> np.ndarray:
-    """Return the root mean square errors of a search on normal samples [unit], shape (size,); NaN without samples."""
+    """Return the root mean square errors of a search on normal samples [unit], shape (size,).
+
+    They differ from the learned errors where it is given parts of signals. Without samples they are the learned ones.
+    """
     size = schema.layout.size
     rows = np.zeros((0, size)) if schema.normal is None else schema.normal.rows.astype(float)
     if len(schema.bias) and len(rows):
@@ -281,7 +278,7 @@ def fill(schema: BodySchema, joined: np.ndarray, recipe: Recipe | None = None) -
         if method == "mask":
             error, own = infer(*schema.parts, joined, *schema.gate(mask), missing, value)
         elif isinstance(judge, Regression):
-            judge.predict(joined, value)
+            judge.predict(joined, missing, value)
             error = float("nan")
         else:
             prediction, error = _search(schema, method, mask, joined)

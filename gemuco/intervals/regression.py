@@ -5,7 +5,7 @@ do. The second moments of the watch give a ridge regression for any set of measu
 on normal samples, and grows with the distance from them.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,27 +13,25 @@ from gemuco.certainty.certainty import NINETY
 from gemuco.intervals.sureness import Judgement, RangeJudge, about_p, worse
 from gemuco.masks import Mask
 from gemuco.normal.statistics import Normal
-from gemuco.normal.watch import Reading
+from gemuco.normal.watch import Reading, error_growth, without_features
 from gemuco.schema import BodySchema
 
 METHOD = "regression"
 """The name of this way to estimate."""
-LEAST = 30
-"""The expected error is known from at least this number of normal samples."""
-NEAR = 0.2
-"""The variance of a prediction has this constant part; the rest grows with the distance from the normal samples."""
+LEAST, MOST = 30, 150
+"""The expected error is that on at least and at most this number of normal samples."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """Ridge regression of some elements on the measured ones.
+    """Ridge regression of missing elements on the measured ones.
 
     Attributes:
-        elements: Positions of the predicted elements, shape (k,).
+        elements: Positions of the missing elements, ascending, shape (k,).
         reading: Features of a sample.
         maps: Elements [standard deviations] by features, shape (features, k).
         spread: Inverse of the moments of the features, shape (features, features).
-        distance: Mean distance of the normal samples.
+        distance: Mean distance of the normal samples, by this inverse.
         std: Expected error at this distance [standard deviations], shape (k,); see `gemuco.certainty.Certainty`.
     """
 
@@ -44,104 +42,107 @@ class Fit:
     distance: float
     std: np.ndarray
 
+    @classmethod
+    def of(cls, schema: BodySchema, finite: np.ndarray) -> "Fit | None":
+        """Return the regression of all missing elements that a body's watch predicts; None if there are none.
+
+        Args:
+            schema: The body schema.
+            finite: Whether each element of the layout is measured, shape (size,).
+        """
+        normal = schema.normal
+        if normal is None or normal.watch is None or len(normal.rows) < LEAST:
+            return None
+        watch, measured = normal.watch, np.concatenate([finite, np.ones(len(schema.bias), bool)])
+        singles = watch.inputs[watch.signal >= 0]
+        elements = singles[~finite[singles]]
+        if not len(elements):
+            return None
+        places, kept = np.searchsorted(watch.inputs, elements), watch.kept(measured[watch.inputs])
+        penalties = watch.penalties[np.searchsorted(singles, elements)]
+        maps, spread = np.zeros((int(kept.sum()), len(elements))), np.zeros((0, 0))
+        for penalty in np.unique(penalties):
+            own = penalties == penalty
+            spread = without_features(watch.inverse(float(penalty)), ~kept)[np.ix_(kept, kept)]
+            maps[:, own] = spread @ watch.moments[np.ix_(kept, 1 + places[own])]
+        reading, distance, std = watch.reading(measured, maps=False), 1.0, np.ones(len(elements))
+        return cls(elements, reading, maps, spread, distance, std)._judged(normal)
+
+    def _judged(self, normal: Normal) -> "Fit":
+        """Return the same with the errors on normal samples."""
+        rows = normal.rows[np.linspace(0, len(normal.rows) - 1, min(MOST, len(normal.rows))).astype(int)].astype(float)
+        features = self.reading.features(rows)
+        far = self._far(features)
+        distance = max(float(far.mean()), 1e-9)
+        errors = np.abs(rows[:, self.elements] - features @ self.maps) / error_growth(far, distance)[:, None]
+        std = np.maximum(np.sqrt(np.mean(errors**2, axis=0)), np.quantile(errors, 0.9, axis=0) / NINETY)
+        return replace(self, distance=distance, std=std * _optimism(normal, self.elements, rows))
+
     def growth(self, features: np.ndarray) -> np.ndarray:
         """Return how much larger the errors are at samples, shape (n, features) -> (n,)."""
-        far = np.einsum("ij,ij->i", features @ self.spread, features)
-        return np.asarray(np.sqrt((NEAR * self.distance + far) / ((1.0 + NEAR) * self.distance)))
+        return error_growth(self._far(features), self.distance)
 
-
-def fit_of(normal: Normal, finite: np.ndarray, elements: np.ndarray) -> Fit | None:
-    """Return the regression of missing elements on the measured ones; None if it is not possible.
-
-    Args:
-        normal: What is normal for the body.
-        finite: Whether each element, and each element of p, is measured, shape (size + bias_size,).
-        elements: Positions of the missing elements, shape (k,).
-    """
-    watch = normal.watch
-    if watch is None or len(normal.rows) < LEAST or not np.isin(elements, watch.inputs[watch.signal >= 0]).all():
-        return None
-    reading = watch.reading(finite, maps=False)
-    places = np.searchsorted(watch.inputs, elements)
-    kept, singles = watch.kept(finite[watch.inputs]), np.flatnonzero(watch.signal >= 0)
-    maps = np.zeros((int(kept.sum()), len(elements)))
-    penalties = watch.penalties[np.searchsorted(singles, places)]
-    inverse = np.zeros((0, 0))
-    for penalty in np.unique(penalties):
-        own = penalties == penalty
-        inverse = watch.inverse(float(penalty), kept)
-        maps[:, own] = inverse @ watch.moments[np.ix_(kept, 1 + places[own])]
-    rows = normal.rows.astype(float)
-    features = reading.features(rows)
-    far = np.einsum("ij,ij->i", features @ inverse, features)
-    draft = Fit(elements, reading, maps, inverse, max(float(far.mean()), 1e-9), np.zeros(len(elements)))
-    errors = np.abs(rows[:, elements] - features @ maps) / draft.growth(features)[:, None]
-    ninety = np.quantile(errors, 0.9, axis=0) / NINETY
-    std = np.maximum(np.sqrt(np.mean(errors**2, axis=0)), ninety) * _optimism(normal, elements, rows)
-    return Fit(elements, reading, maps, inverse, draft.distance, std)
+    def _far(self, features: np.ndarray) -> np.ndarray:
+        return np.asarray(np.einsum("ij,ij->i", features @ self.spread, features))
 
 
 def _optimism(normal: Normal, elements: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Return how much larger errors are than those on the normal samples, which may have been learned from: (k,)."""
+    """Return how much larger errors are than those on the normal samples, which may have been learned from: (k,).
+
+    Args:
+        normal: What is normal for the body.
+        elements: Positions of the elements, ascending, shape (k,).
+        rows: Normal samples with their p [standard deviations], shape (n, size + bias_size).
+    """
     assert normal.watch is not None
     whole = normal.watch.reading(None)
-    single = np.flatnonzero(np.isin(whole.target, elements))
-    _, first = np.unique(whole.target[single], return_index=True)
-    single = single[first]
+    known, first = np.unique(whole.target, return_index=True)  # elements alone come before those of whole signals
+    single = first[np.searchsorted(known, elements)]
     within = np.sqrt(np.mean(whole.residuals(rows)[:, single] ** 2, axis=0))
-    residuals = len(whole.target)
-    promised = np.sqrt(np.diag(normal.covariance))[-residuals:][single]
+    promised = np.sqrt(np.diag(normal.covariance))[-len(whole.target) :][single]
     ratio = promised / np.maximum(within, 1e-9)
     return np.asarray(np.where(np.isfinite(ratio), np.maximum(1.0, ratio), 1.0))
 
 
 class Regression:
-    """Estimates of the missing elements of one signal, with their std and state, for samples with the same elements.
+    """Estimates of missing elements, with their std and state, for samples with the same elements.
 
     Attributes:
         std: Expected error of every element [unit], shape (size,); NaN for those that are not estimated.
         given: Signals of which some elements are measured.
     """
 
-    def __init__(self, schema: BodySchema, fit: Fit, mask: Mask, finite: np.ndarray) -> None:
-        """Prepare for a fit on these measured elements, shape (size,), which are of these signals."""
-        self._schema, self._fit, self.given = schema, fit, mask
-        self._range, self._about_p = RangeJudge(schema, mask, finite), about_p(schema)
+    def __init__(self, schema: BodySchema, fit: Fit, finite: np.ndarray) -> None:
+        """Prepare for a fit on these measured elements, shape (size,)."""
+        self.given: Mask = frozenset(name for name, span in schema.layout.slices.items() if finite[span].any())
+        self._schema, self._fit = schema, fit
+        self._range, self._about_p = RangeJudge(schema, self.given, finite), about_p(schema)
         excess = 1.0 if schema.certainty is None else max(1.0, schema.certainty.excess)
         self.std = np.full(schema.layout.size, np.nan)
         self.std[fit.elements] = fit.std * excess * schema.scaler.std[fit.elements]
 
     @classmethod
-    def of(cls, schema: BodySchema, name: str, finite: np.ndarray) -> "Regression | None":
-        """Return the estimates of the missing elements of a signal; None if they are not possible.
+    def of(cls, schema: BodySchema, finite: np.ndarray) -> "Regression | None":
+        """Return the estimates of the missing elements, shape (size,); None if they are not possible."""
+        fit = Fit.of(schema, finite)
+        return None if fit is None else cls(schema, fit, finite)
 
-        Args:
-            schema: The body schema.
-            name: The signal, of which some elements are measured.
-            finite: Whether each element of the layout is measured, shape (size,).
-        """
-        span = schema.layout.slices[name]
-        elements = span.start + np.flatnonzero(~finite[span])
-        if schema.normal is None or len(elements) == span.stop - span.start:
-            return None
-        fit = fit_of(schema.normal, np.concatenate([finite, np.ones(len(schema.bias), bool)]), elements)
-        given = frozenset(s for s, part in schema.layout.slices.items() if finite[part].any())
-        return None if fit is None else cls(schema, fit, given, finite)
-
-    def predict(self, joined: np.ndarray, value: np.ndarray) -> None:
-        """Write the estimates of the missing elements into a completed sample [unit], shape (size,).
+    def predict(self, joined: np.ndarray, requested: np.ndarray, value: np.ndarray) -> None:
+        """Write estimates into a completed sample [unit], shape (size,).
 
         Args:
             joined: Every element of the layout [unit], shape (size,), NaN where missing.
+            requested: Whether each element is requested, truth values, shape (size,).
             value: Result, shape (size,).
         """
         elements, scaler = self._fit.elements, self._schema.scaler
-        value[elements] = (self._features(joined) @ self._fit.maps)[0] * scaler.std[elements] + scaler.mean[elements]
+        own = requested[elements]
+        values = (self._features(joined) @ self._fit.maps[:, own])[0]
+        value[elements[own]] = values * scaler.std[elements[own]] + scaler.mean[elements[own]]
 
     def judge(self, joined: np.ndarray, residual: float, requested: np.ndarray, std: np.ndarray) -> Judgement:
-        """Write the std of the estimates, and return their judgement; the arguments are those of `Judge.judge`."""
-        elements = self._fit.elements
-        std[elements] = self._fit.growth(self._features(joined))[0] * self.std[elements]
+        """Write the std of the requested elements, and return their judgement; see `Judge.judge`."""
+        std[requested] = self._fit.growth(self._features(joined))[0] * self.std[requested]
         judgement = self._range.judge(joined, residual, requested, std)
         return Judgement(worse(judgement.sureness, self._about_p), judgement.inside)
 

@@ -33,6 +33,9 @@ BLOCKS = 5
 PRIORS = (0.0, 100.0, 1000.0)
 """Earlier samples count as at most this many samples when the watch learns a body anew; held-out blocks choose."""
 
+NEAR = 0.2
+"""The variance of a prediction has this constant part; the rest grows with the distance from the known samples."""
+
 PATTERNS = 16
 """At most this many sets of measured elements are kept."""
 
@@ -123,6 +126,7 @@ class Watch:
     penalties: np.ndarray
     count: float
     _readings: dict[bytes, Reading] = field(default_factory=dict, init=False, repr=False)
+    _inverses: dict[float, np.ndarray] = field(default_factory=dict, init=False, repr=False)
 
     @classmethod
     def fit(
@@ -242,18 +246,12 @@ class Watch:
         first, second = _pairs(len(self.inputs))
         return np.concatenate([[True], measured, measured[first] & measured[second]])
 
-    def inverse(self, penalty: float, kept: np.ndarray | None = None) -> np.ndarray:
-        """Return the inverse of the moments with a ridge penalty of the products.
-
-        Args:
-            penalty: The penalty.
-            kept: The features to use, truth values, shape (features,); None: all.
-
-        Returns:
-            Shape (k, k) for k features.
-        """
-        used = np.ones(len(self.moments), bool) if kept is None else kept
-        return np.asarray(np.linalg.inv((self.moments + self._ridge(penalty))[np.ix_(used, used)]))
+    def inverse(self, penalty: float) -> np.ndarray:
+        """Return the inverse of the moments with a ridge penalty of the products, shape (features, features)."""
+        known = self._inverses.get(penalty)
+        if known is None:
+            known = self._inverses[penalty] = np.asarray(np.linalg.inv(self.moments + self._ridge(penalty)))
+        return known
 
     def _ridge(self, penalty: float) -> np.ndarray:
         ridge = np.full(len(self.moments), penalty)
@@ -285,6 +283,26 @@ class Watch:
                 residual = np.linalg.solve(inverse[np.ix_(block, block)], inverse[block])
                 result[index] = residual[np.searchsorted(block, position[1 + target.elements])].T
         return [maps for maps in result if maps is not None]
+
+
+def without_features(inverse: np.ndarray, outside: np.ndarray) -> np.ndarray:
+    """Return the inverse of the moments of the features that remain, zero for the others, shape (features, features).
+
+    Args:
+        inverse: Inverse of the moments of all features, shape (features, features).
+        outside: The features to leave out, truth values, shape (features,).
+    """
+    if not outside.any():
+        return inverse
+    block = inverse[outside]
+    result = inverse - block.T @ np.linalg.solve(block[:, outside], block)
+    result[outside] = result[:, outside] = 0.0
+    return result
+
+
+def error_growth(far: np.ndarray, distance: np.ndarray | float) -> np.ndarray:
+    """Return how much larger errors are at distances from the known samples than at their mean distance."""
+    return np.asarray(np.sqrt((NEAR * distance + far) / ((1.0 + NEAR) * distance)))
 
 
 def _pairs(count: int) -> tuple[np.ndarray, np.ndarray]:

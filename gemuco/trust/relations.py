@@ -11,12 +11,11 @@ import numpy as np
 from gemuco.anomaly.prediction import with_bias
 from gemuco.intervals.sureness import MARGIN
 from gemuco.normal.local import LocalSize
+from gemuco.normal.watch import error_growth, without_features
 from gemuco.schema import BodySchema
 from gemuco.trust.config import Hidden, TrustConfig
 from gemuco.trust.sensitivity import Sensed, Sensitivity
 
-NEAR = 0.2
-"""The variance of a prediction has this constant part; the rest grows with the distance from the known samples."""
 NEARBY = 0.05
 """The network's errors are computed anew if a hidden element is off by more than this [standard deviations]."""
 KEPT = 64
@@ -75,7 +74,7 @@ class Relation:
 
     def growth(self, far: np.ndarray) -> np.ndarray:
         """Return how much larger the errors are at a distance from the known samples, shape (n, columns)."""
-        return np.asarray(np.sqrt((NEAR * self.distance + far) / ((1.0 + NEAR) * self.distance)))
+        return error_growth(far, self.distance)
 
     def far(self, features: np.ndarray) -> np.ndarray:
         """Return the distance of the other columns from the known samples, shape (n, columns)."""
@@ -164,7 +163,7 @@ class Relations:
         inputs, away = len(self.columns), np.zeros(len(self.columns), bool)
         away[list(hidden)] = True
         outside = np.asarray(self._holds[:, away].any(axis=1))
-        kept = {penalty: _without(inverse, outside) for penalty, inverse in self._inverse.items()}
+        kept = {penalty: without_features(inverse, outside) for penalty, inverse in self._inverse.items()}
         maps = np.zeros((len(self._holds), inputs))
         for index in range(inputs):
             inverse = kept[float(self._penalty[index])]
@@ -313,16 +312,6 @@ def _signal_spreads(schema: BodySchema, rows: np.ndarray, columns: np.ndarray, s
         std = schema.scaler.std[columns[own]]
         spread = rows[:, columns[own]].std(axis=0) * std
         result[own] = np.where(spread < HARDLY * spread.max(), spread.max() / std, 0.0)
-    return result
-
-
-def _without(inverse: np.ndarray, outside: np.ndarray) -> np.ndarray:
-    """Return the inverse of the moments of the features that remain, zero for the others."""
-    if not outside.any():
-        return inverse
-    block = inverse[outside]
-    result = inverse - block.T @ np.linalg.solve(block[:, outside], block)
-    result[outside] = result[:, outside] = 0.0
     return result
 
 
