@@ -1,12 +1,14 @@
 """Suspected and hidden causes, and what kind of lie each of them is."""
 
 import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from gemuco.schema import BodySchema
 from gemuco.trust.changes import LONGEST
+from gemuco.trust.config import Finding, Hidden
 from gemuco.trust.evidence import Evidence
 from gemuco.trust.hypotheses import Cause
 from gemuco.trust.kinds import kind_of
@@ -61,6 +63,43 @@ class Case:
         self.is_plain |= has_jumped or is_stuck
         self.weight += float(evidence.ratio.max()) ** 2
         self.steps = np.fmax(self.steps, evidence.step)
+
+    def finding(self, elements: Sequence[int], since: float) -> Finding:
+        """Return what others see of it: positions of its elements in the layout, wrong since this time [s]."""
+        return Finding(
+            tuple(elements), self.cause.cause, self.kind, since, self.size, self.is_hidden,
+            reason=self.reason, condition=self.cause.condition,
+        )  # fmt: skip
+
+
+@dataclass(slots=True)
+class LastSearch:
+    """The last search for a cause, which costs as much as 50 blocks.
+
+    Attributes:
+        alarming: The columns that had the evidence of an alarm.
+    """
+
+    alarming: Hidden = frozenset()
+
+    def answer(self, cases: Iterable[Case], ratio: np.ndarray, is_due: bool) -> Case | None:
+        """Return the case that answers for this block too; None if there is no alarm, or a search is to be made.
+
+        The last search answers if it found no cause at all, or one that cannot be hidden and no other column alarms.
+
+        Args:
+            cases: All cases.
+            ratio: Evidence against each column [multiples of an alarm], shape (columns,).
+            is_due: Whether it is time for another search in any case.
+        """
+        alarming = frozenset(np.flatnonzero(ratio >= 1.0).tolist())
+        if not alarming:
+            return None
+        case = next((c for c in cases if not c.is_hidden and (c.cause.cause == "body" or c.reason)), None)
+        if case is None or is_due or not (case.cause.cause == "body" or alarming <= self.alarming):
+            self.alarming = alarming
+            return None
+        return case
 
 
 def describe(

@@ -8,7 +8,7 @@ import numpy as np
 from gemuco.anomaly.blame import parts
 from gemuco.schema import BodySchema
 from gemuco.trust.alternatives import Alternatives, is_another
-from gemuco.trust.cases import Case, describe, has_moved
+from gemuco.trust.cases import Case, LastSearch, describe, has_moved
 from gemuco.trust.changes import LONGEST, LastingTest
 from gemuco.trust.config import BLOCK, Finding, Hidden, TrustConfig
 from gemuco.trust.evidence import Evidence, Judge
@@ -27,7 +27,7 @@ LEARNING = 0.8
 REFRESH = 10
 """Limits follow the healthy errors once in this number of blocks."""
 AGAIN = 5
-"""Hidden elements are judged anew once in this number of blocks."""
+"""Hidden elements are judged anew, and a cause that cannot be hidden is searched for, once in this number of blocks."""
 SETTLED = 25
 """A cause and its kind may be corrected for this number of blocks."""
 OTHER = 100.0
@@ -111,6 +111,7 @@ class TrustMonitor:
         size = len(self._relations.columns)
         self._recent.clear()
         self._other = self._motion = self._alarmed = 0.0
+        self._search = LastSearch()
         self._healthy, self._lasting = Healthy(size), LastingTest(size)
         self._least = self._relations.sizes(schema, self._config)
         self._judge = self._fresh_judge()
@@ -218,9 +219,9 @@ class TrustMonitor:
         ratio[immune] = 0.0
         highest = float(ratio.max(initial=0.0))
         self._alarmed = self._alarmed + 1 if highest >= 1.0 else 0
-        body = next((case for case in self._cases if case.cause.cause == "body"), None)
-        if highest >= 1.0 and body is not None and self._count % AGAIN:
-            body.last = self._count  # a search without a result costs as much as 50 blocks
+        known = self._search.answer(self._cases, ratio, self._count % AGAIN == 0)
+        if known is not None:
+            known.last, known.moved = self._count, known.moved + self._motion
         elif highest >= 1.0 or (highest >= DOUBTFUL and self._count % AGAIN == 0 and self._hides_others(ratio, hidden)):
             self._suspect(self._explain(evidence, hidden), evidence, hidden)
         else:
@@ -439,10 +440,5 @@ class TrustMonitor:
         return frozenset(int(self._relations.columns[c]) for c in columns)
 
     def _finding(self, case: Case) -> Finding:
-        lead = case.cause.lead
-        at = sorted(self._at(case), key=lambda p: (self._place[p] != lead, p))
-        since = self._now - (self._count - case.began) * BLOCK
-        return Finding(
-            tuple(at), case.cause.cause, case.kind, since, case.size, case.is_hidden,
-            reason=case.reason, condition=case.cause.condition,
-        )  # fmt: skip
+        at = sorted(self._at(case), key=lambda p: (self._place[p] != case.cause.lead, p))
+        return case.finding(at, since=self._now - (self._count - case.began) * BLOCK)
