@@ -162,6 +162,7 @@ def test_both_at_once(grips):
     assert not np.array_equal(updater.schema.weights.encoder[0].matrix, grips.weights.encoder[0].matrix)
 
 
+@pytest.mark.long
 def test_w_goes_back_when_it_does_harm(grips):
     """With a step that is far too large, an update that is checked and taken back ends nearer than one that is not."""
     shares = []
@@ -179,6 +180,7 @@ def test_w_goes_back_when_it_does_harm(grips):
     assert np.median(shares) < 0.5
 
 
+@pytest.mark.long
 def test_constraints_count_as_samples(grips):
     arm = TOOLS["0.2/0.8/0.8"]
     known = {name: array for name, array in arm.sample(50, 8).items() if name != "center_of_gravity"}

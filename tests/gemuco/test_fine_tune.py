@@ -55,6 +55,7 @@ def test_few_samples_are_enough(simulated, tuned):
     assert history.held_out[history.best_epoch] < history.held_out[0]
 
 
+@pytest.mark.long
 def test_what_was_known_is_kept(simulated, tuned):
     schema = tuned[0]
     np.testing.assert_array_equal(schema.biases["light"], simulated.biases["light"])
@@ -70,6 +71,7 @@ def test_what_was_known_is_kept(simulated, tuned):
     assert schema.scaler is simulated.scaler
 
 
+@pytest.mark.long
 def test_anchors_are_of_the_body_as_it_is(simulated, tuned):
     schema = tuned[0]
     names = list(schema.biases)

@@ -43,8 +43,8 @@ def test_healthy_samples_hold_no_lie_and_stay_as_they_are(schema):
         assert not result.std[name].any()
 
 
-@pytest.mark.parametrize("seed", [11, 12])
-@pytest.mark.parametrize("size", [3.0, 6.0, 20.0, 60.0])
+@pytest.mark.parametrize("seed", [11, pytest.param(12, marks=pytest.mark.long)])
+@pytest.mark.parametrize("size", [3.0, *(pytest.param(size, marks=pytest.mark.long) for size in (6.0, 20.0, 60.0))])
 def test_an_offset_is_dated_named_and_repaired_however_large_it_is(schema, seed, size):
     rows = motion(seed, SECONDS)
     true = rows["cable"].copy()
@@ -75,6 +75,7 @@ def test_a_frozen_joint_is_found_and_what_is_usual_is_remembered(schema):
     assert BEGIN - 0.2 <= lies[0].start < BEGIN + 2.0
 
 
+@pytest.mark.long
 def test_a_signal_that_was_not_measured_is_no_lie(schema):
     rows = motion(15, SECONDS)
     del rows["tension"]

@@ -77,6 +77,7 @@ def test_goes_on_after_a_kill(whole, tmp_path):
     assert (again[1].resumed, whole[1].resumed) == (11, 0)
 
 
+@pytest.mark.long
 def test_a_finished_training_is_not_done_again(whole, tmp_path):
     path = tmp_path / "draft"
     same(fit(two_bodies(), CONFIG, MASKS, resume=path), whole)
@@ -94,6 +95,7 @@ def test_goes_on_after_many_interruptions(whole, tmp_path):
     same(fit(two_bodies(), CONFIG, MASKS, resume=path), whole)
 
 
+@pytest.mark.long
 def test_a_draft_of_another_training_is_left_alone(whole, tmp_path):
     path = tmp_path / "draft"
     with pytest.raises(Stopped):
@@ -118,6 +120,7 @@ def test_a_damaged_draft_is_begun_anew(whole, tmp_path):
     same(fit(two_bodies(), CONFIG, MASKS, resume=path), whole)
 
 
+@pytest.mark.long
 def test_fine_tuning_goes_on_too(whole, tmp_path):
     real = Dataset(LAYOUT, (Episode("real", MuscleArm(softness=3.0).sample(60, 9)),))
     config = replace(CONFIG, rate=1e-3)

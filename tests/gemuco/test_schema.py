@@ -1,10 +1,11 @@
 """The body schema as the face of it all, on plain arrays."""
 
 import pickle
+from dataclasses import replace
 
 import numpy as np
 
-from gemuco.adaption.adapt import adapt
+from gemuco.adaption.adapt import LIST, adapt
 from gemuco.anomaly.score import score
 from gemuco.checkpoint import load, save
 from gemuco.controller import control
@@ -32,7 +33,7 @@ def test_every_verb_from_arrays_to_a_stored_body(arm, data, tmp_path):
     assert not score(body, sample).is_anomaly
 
     lived = arm.sample(40, 11)
-    wiser = adapt(body, ({name: rows[i] for name, rows in lived.items()} for i in range(40)))
+    wiser = adapt(body, ({name: rows[i] for name, rows in lived.items()} for i in range(40)), replace(LIST, batch=10))
     assert wiser is not body
     save(wiser, tmp_path)
     again = load(tmp_path)

@@ -165,7 +165,10 @@ def many_signals(seed: int, gaps: float = 0.0) -> Dataset:
     return Dataset(layout, tuple(episodes))
 
 
-@pytest.fixture(scope="module", params=["seed 0", "seed 1", "seed 2", "gaps", "arm"])
+@pytest.fixture(
+    scope="module",
+    params=["seed 0", *(pytest.param(f"seed {seed}", marks=pytest.mark.long) for seed in (1, 2)), "gaps", "arm"],
+)
 def measured(request, data) -> tuple[Layout, tuple[MaskErrors, ...]]:
     """Networks that were trained for structure determination, and what they say of masks."""
     kind, _, seed = request.param.partition(" ")

@@ -43,6 +43,7 @@ def wild(values, random):
         values[name] = array
 
 
+@pytest.mark.long
 def test_outliers_cost_little_and_are_counted(arm):
     clean = joint_error(fit(episodes(arm), SMALL, MASKS)[0], arm)
     dirty = episodes(arm, change=wild)
@@ -58,6 +59,7 @@ def test_outliers_cost_little_and_are_counted(arm):
     assert np.all(promised < 0.2)  # [rad]: the promise is not about the wild values
 
 
+@pytest.mark.long
 def test_clean_data_are_not_rejected(arm):
     _, history = fit(episodes(arm), SMALL, MASKS)
     assert (history.rejected, history.skipped, history.dead, history.notes) == (0, 0, (), ())
@@ -136,7 +138,7 @@ def test_a_signal_that_was_never_measured_is_left_out(arm):
         fit(episodes(arm, change=silent), SMALL, [{"joint_position"}])
 
 
-@pytest.mark.parametrize(("epochs", "searches"), [(12, 4), (96, 16)])
+@pytest.mark.parametrize(("epochs", "searches"), [(12, 4), pytest.param(96, 16, marks=pytest.mark.long)])
 def test_outliers_are_searched_for_as_often_as_the_training_can_afford(arm, monkeypatch, epochs, searches):
     count, find = [0], outliers.find
 

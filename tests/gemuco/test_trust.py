@@ -142,6 +142,7 @@ def test_an_error_after_a_gap_is_no_step(first, last):
     assert np.quantile(test(healthy, MOVING)[0], 0.999) < 1.05 * usual
 
 
+@pytest.mark.long
 def test_errors_at_one_posture_say_the_same_again_and_again():
     """At rest a healthy error stays; the step test must not take 30 equal errors for 30 witnesses."""
     random, count = np.random.default_rng(2), 20_000
@@ -249,8 +250,10 @@ def resting(arm, model, seed, blocks):
     return samples[350:], monitor
 
 
-@pytest.mark.parametrize("element", [JOINT, TENSION, LENGTH])
-@pytest.mark.parametrize("rate", [0.3, 1.0])
+@pytest.mark.parametrize(
+    "element", [JOINT, *(pytest.param(element, marks=pytest.mark.long) for element in (TENSION, LENGTH))]
+)
+@pytest.mark.parametrize("rate", [0.3, pytest.param(1.0, marks=pytest.mark.long)])
 def test_a_slow_drift_at_rest_is_hidden_and_an_end_of_it_is_seen(model, arm, element, rate):
     """At rest the errors of one posture do not change; a drift of 0.3 healthy errors per second was never found."""
     samples, monitor = resting(arm, model, 51, 450)
@@ -266,6 +269,7 @@ def test_a_slow_drift_at_rest_is_hidden_and_an_end_of_it_is_seen(model, arm, ele
     assert not monitor.hidden
 
 
+@pytest.mark.long
 def test_a_body_at_rest_is_trusted_also_if_it_creeps(model, arm):
     samples = move(arm, 600, 61)
     moving = samples[290:590].reshape(-1, 12).T
@@ -277,6 +281,7 @@ def test_a_body_at_rest_is_trusted_also_if_it_creeps(model, arm):
     assert not any(hidden)
 
 
+@pytest.mark.long
 def test_an_encoder_whose_lie_ends_at_rest_is_used_again(model, arm):
     """It lied when the body settled, so its return to the truth is no change to accuse it of."""
     samples, random = move(arm, 500, 71), np.random.default_rng(71)
@@ -329,7 +334,9 @@ def test_elements_that_look_alike_are_both_named(model, arm):
         assert "alike" in used.findings[0].reason
 
 
-@pytest.mark.parametrize("pair", [(0, 1), (2, 4), (7, 8), (9, 11)])
+@pytest.mark.parametrize(
+    "pair", [(0, 1), *(pytest.param(pair, marks=pytest.mark.long) for pair in ((2, 4), (7, 8), (9, 11)))]
+)
 def test_two_swapped_elements_are_both_hidden_until_they_are_put_back(model, arm, pair):
     """Two that are wrong would not agree with all others in each other's place.
 
@@ -344,7 +351,10 @@ def test_two_swapped_elements_are_both_hidden_until_they_are_put_back(model, arm
     assert not hidden[-1]
 
 
-@pytest.mark.parametrize(("element", "other"), [(0, 1), (1, 0), (8, 10), (10, 8), (11, 7)])
+@pytest.mark.parametrize(
+    ("element", "other"),
+    [(8, 10), *(pytest.param(*pair, marks=pytest.mark.long) for pair in ((0, 1), (1, 0), (10, 8), (11, 7)))],
+)
 def test_an_element_that_reads_another_is_not_taken_for_two_swapped(model, arm, element, other):
     samples = move(arm, 240, 41)
     samples[150:, :, element] = samples[150:, :, other]
@@ -394,6 +404,7 @@ def test_at_rest_the_noise_of_the_sensors_is_no_motion(model, arm):
     assert not any(hidden)
 
 
+@pytest.mark.long
 def test_a_small_offset_is_noticed_by_its_jump_and_hidden_until_it_jumps_back(model, arm):
     samples = move(arm, 420, 18)
     samples[200:300, :, TENSION] += 6.0

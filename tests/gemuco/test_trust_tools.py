@@ -108,7 +108,7 @@ def test_no_sensor_is_hidden_for_another_tool_at_rest(model, seed):
     assert not hidden
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in (1, 2))])
 def test_an_encoder_that_drifts_at_rest_is_not_taken_for_a_tool(model, seed):
     rows, begin = body(at_rest(60 + seed), TOOLS["short"]), (CHANGE + 30) * SAMPLES
     rows[begin:, 0] += 0.01 * BLOCK / SAMPLES * np.arange(len(rows) - begin)

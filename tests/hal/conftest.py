@@ -2,6 +2,14 @@ import pytest
 from hal_bench import Bench
 from mit_bench import mit_bench
 
+from hal.wire import bus
+
+
+@pytest.fixture(autouse=True)
+def buses_close_at_once(monkeypatch):
+    """A bus is closed when its thread has waited for a frame once more; hundreds of tests close some."""
+    monkeypatch.setattr(bus, "RECEIVE_TIMEOUT", 0.01)
+
 
 @pytest.fixture
 def bench():

@@ -43,7 +43,7 @@ class Puppet:
 
     def _run(self):
         while not self._closing.is_set():
-            frame = self._wire.recv(0.05)
+            frame = self._wire.recv(0.005)
             if frame is None:
                 continue
             data = bytes(frame.data)

@@ -32,6 +32,7 @@ def test_every_page_is_in_the_navigation() -> None:
     assert pages(nav) == {path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").rglob("*.md")}
 
 
+@pytest.mark.long
 def test_site_builds_without_a_warning() -> None:
     """Broken links, anchors and references to Python names are errors of a strict build."""
     build = [sys.executable, "-m", "zensical", "build", "--strict", "--clean"]

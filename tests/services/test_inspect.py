@@ -84,6 +84,7 @@ def test_a_lie_is_printed_and_the_table_is_written_without_it(trained, tmp_path)
     assert not any(row["estimated"] for row in rows[: (LIES_FROM - 1) * RATE])
 
 
+@pytest.mark.long
 def test_tables_without_a_time_need_their_rate(trained):
     words = (str(trained / "arm.yaml"), "--data", str(trained / "plain.csv"))
     code, text = run(trained, *words)
@@ -91,6 +92,7 @@ def test_tables_without_a_time_need_their_rate(trained):
     assert run(trained, *words, "--rate", "10")[0] == 0
 
 
+@pytest.mark.long
 def test_a_folder_is_inspected_table_by_table(trained, tmp_path):
     for name in ("a.csv", "b.csv"):
         shutil.copy(trained / "later_1.csv", tmp_path / name)

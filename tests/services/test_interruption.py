@@ -49,6 +49,7 @@ def test_an_interrupted_training_of_other_data_is_not_continued(tmp_path):
     assert not run(tmp_path, key_of_training(DATA, 1))
 
 
+@pytest.mark.long
 def test_the_command_line_reports_only_an_interruption(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     q, f = np.random.default_rng(0).normal(size=(2, 200))

@@ -149,6 +149,7 @@ def test_a_dataset_that_cannot_be_read_is_refused_in_a_sentence(tmp_path: Path, 
         read_recording([tmp_path])
 
 
+@pytest.mark.long
 def test_the_verbs_export_and_describe(tmp_path: Path) -> None:
     with_estimates(tmp_path / "walk.mcap", 300, range(0))
     answer = gemuco(tmp_path, "export", "walk.mcap", "--out", "set", "--format", "lerobot", "--fps", "25")

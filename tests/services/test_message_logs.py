@@ -65,7 +65,10 @@ def by_files(folder: Path, run: int) -> None:
         (folder / f"run_{run}" / f"{name}.csv").write_text("\n".join((f"t,{','.join(SIGNALS[name])}", *rows)))
 
 
-@pytest.mark.parametrize("write", [by_columns, by_signal_names, by_message_ids, by_files])
+@pytest.mark.parametrize(
+    "write",
+    [by_columns, *(pytest.param(form, marks=pytest.mark.long) for form in (by_signal_names, by_message_ids, by_files))],
+)
 def test_a_draft_of_messages_gives_rows_of_all_signals(tmp_path, write: Callable[[Path, int], None]):
     for run in range(2):
         write(tmp_path, run)

@@ -210,6 +210,7 @@ def test_a_link_is_cut_when_its_certificate_ends(secured: Secured, tmp_path: Pat
         Client(secured.robot, str(path)).__enter__()
 
 
+@pytest.mark.long
 def test_no_secret_in_a_log_a_recording_or_a_process_list(secured: Secured) -> None:
     secrets = secured.secrets()
     assert len(secrets) >= 20

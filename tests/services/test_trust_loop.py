@@ -100,7 +100,7 @@ def test_a_lying_encoder_is_estimated_and_marked_until_it_agrees() -> None:
     assert not estimates.estimated.flat.any()
 
 
-@pytest.mark.parametrize(("tension", "is_cut"), [(None, False), (0.0, True)])
+@pytest.mark.parametrize(("tension", "is_cut"), [(0.0, True), pytest.param(None, False, marks=pytest.mark.long)])
 def test_a_wire_that_is_cut_is_not_taken_for_a_lying_sensor_alone(tension: float | None, is_cut: bool) -> None:
     bench, samples = Bench(), motion(500, 2)
     place = arm().signals["muscle_length"].elements.index("deltoid_side")
@@ -121,7 +121,10 @@ def test_a_wire_that_is_cut_is_not_taken_for_a_lying_sensor_alone(tension: float
     assert f"`gemuco calibrate` measures deltoid_side_{'cell' if is_cut else 'drive'} anew" in text
 
 
-@pytest.mark.parametrize(("is_wrong", "is_known"), [(False, True), (True, True), (True, False)])
+@pytest.mark.parametrize(
+    ("is_wrong", "is_known"),
+    [(False, True), *(pytest.param(True, known, marks=pytest.mark.long) for known in (True, False))],
+)
 def test_an_element_that_returns_is_used_when_it_agrees(is_wrong: bool, is_known: bool) -> None:
     """The HAL takes a value that has jumped by a radian, and stays there, for five seconds only."""
     bench, samples = Bench(is_known=is_known), motion(800, 3)

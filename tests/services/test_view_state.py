@@ -159,6 +159,7 @@ def test_a_paused_replay_is_shown_as_present():
     assert held(playing) is playing
 
 
+@pytest.mark.long
 def test_the_drawn_wires_are_those_of_the_simulator():
     robot = load_robot(ROBOTS / "musashi_arm.yaml")
     body = Body(robot.folder / robot.urdf)

@@ -162,6 +162,7 @@ def test_without_its_hal_the_camera_alone_is_told_for_what_it_is(stack: Stack) -
     eventually(lambda: stack.method("joint_position") == "measured")
 
 
+@pytest.mark.long
 def test_another_tool_moves_what_the_camera_sees(stack: Stack) -> None:
     before = stack.true_tip()
     joints = stack.estimate().values["joint_position"]

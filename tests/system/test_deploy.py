@@ -102,6 +102,7 @@ def test_the_lock_has_a_hash_for_every_version_that_is_pinned() -> None:
     assert set(locked) <= set(pins)
 
 
+@pytest.mark.long
 def test_every_pinned_package_runs_on_the_oldest_python_that_is_promised() -> None:
     oldest = "3.11.2"  # Debian 12's; the tests may run on a newer one, on which pip would take anything
     installed = [metadata.distribution(name) for name in PINS if _installed(name)]

@@ -82,6 +82,7 @@ def test_what_cannot_move_is_refused_before_the_drives_are_enabled(robot: str) -
         assert now.mode == "off"
 
 
+@pytest.mark.long
 def test_another_client_that_commands_is_named(robot: str) -> None:
     with Client(robot, name="anna") as anna, anna.lease():
         answer = ask(robot, "move", "joint_position", "0.1")
