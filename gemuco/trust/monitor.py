@@ -28,6 +28,8 @@ REFRESH = 10
 """Limits follow the healthy errors once in this number of blocks."""
 AGAIN = 5
 """Hidden elements are judged anew, and a cause that cannot be hidden is searched for, once in this number of blocks."""
+RARELY = 20
+"""A body that is not known to be as the model says is searched once in this number of blocks."""
 SETTLED = 25
 """A cause and its kind may be corrected for this number of blocks."""
 OTHER = 100.0
@@ -111,7 +113,7 @@ class TrustMonitor:
         size = len(self._relations.columns)
         self._recent.clear()
         self._other = self._motion = self._alarmed = 0.0
-        self._search = LastSearch()
+        self._search, self._missing = LastSearch(), Hidden()
         self._healthy, self._lasting = Healthy(size), LastingTest(size)
         self._least = self._relations.sizes(schema, self._config)
         self._judge = self._fresh_judge()
@@ -177,7 +179,8 @@ class TrustMonitor:
         self._recent.add(self._schema, self._relations, samples)
         motion = self._motion = self._healthy.motion(self._recent.moved())
         self._recent.rest(motion, self._healthy.looks)
-        hidden = self._hidden_columns() | self._recent.missing()
+        is_steady, self._missing = self._missing == self._recent.missing(), self._recent.missing()
+        hidden = self._hidden_columns() | self._missing
         before = self._view
         if before is not None and before.hidden - hidden:
             self._recent.unsettle()  # one that returns may have lied when the body settled
@@ -192,7 +195,7 @@ class TrustMonitor:
         self._lasting.add(view.z[-1] / self._judge.scale, self._judge.least, looks / self._judge.time)
         evidence = self._judge(view, self._lasting)
         if self._healthy.is_known:
-            self._decide(evidence, hidden)
+            self._decide(evidence, hidden, is_steady)
         is_other = any(case.cause.cause == "body" for case in self._cases)
         self._other = self._other + motion if is_other else 0.0
         is_quiet = float(evidence.ratio.max(initial=0.0)) < LEARNING
@@ -210,7 +213,8 @@ class TrustMonitor:
         self._recent.usual[view.hidden] = usual * self._recent.usual.get(view.hidden, 1.0)
         return view.scaled(usual)
 
-    def _decide(self, evidence: Evidence, hidden: Hidden) -> None:
+    def _decide(self, evidence: Evidence, hidden: Hidden, is_steady: bool) -> None:
+        """Suspect, hide and show elements; `is_steady` says whether the same were missing in the block before."""
         immune = [self._place[p] for p in self._immune if p in self._place]
         ratio = self._left(evidence, hidden)
         ratio[list(self._sudden(LATELY))] /= SUSPECT
@@ -219,19 +223,21 @@ class TrustMonitor:
         ratio[immune] = 0.0
         highest = float(ratio.max(initial=0.0))
         self._alarmed = self._alarmed + 1 if highest >= 1.0 else 0
-        known = self._search.answer(self._cases, ratio, self._count % AGAIN == 0)
+        is_due = self._count % AGAIN == 0
+        again = self._count % (AGAIN if self._is_known_body else RARELY) == 0
+        known, is_alarm = self._search.answer(self._cases, ratio, again), highest >= 1.0 and (is_steady or is_due)
         if known is not None:
             known.last, known.moved = self._count, known.moved + self._motion
-        elif highest >= 1.0 or (highest >= DOUBTFUL and self._count % AGAIN == 0 and self._hides_others(ratio, hidden)):
+        elif is_alarm or (highest >= DOUBTFUL and is_due and self._hides_others(ratio, hidden)):
             self._suspect(self._explain(evidence, hidden), evidence, hidden)
         else:
             highest = float(evidence.ratio.max(initial=0.0))
             for case in [c for c in self._cases if not c.is_hidden and self._has_lapsed(c, highest)]:
                 self._close(case)
-        if self._count % AGAIN == 0:
+        if is_due:
             for case in [case for case in self._cases if case.is_hidden]:
                 self._judge_again(case)
-        if immune and self._count % AGAIN == 0 and float(evidence.ratio[immune].max()) < CALM:
+        if immune and is_due and float(evidence.ratio[immune].max()) < CALM:
             self._immune.clear()
 
     def _conditions(self, hidden: Hidden, age: int) -> Iterator[tuple[str, Evidence, bool]]:

@@ -202,7 +202,7 @@ class Recent:
         fresh = before is not None and before.hidden == hidden
         blocks = [self.blocks[-1]] if fresh else list(self.blocks)
         features = np.array([block.features for block in blocks])
-        sensed = Sensed(*(np.concatenate(parts) for parts in zip(*(block.sensed for block in blocks), strict=True)))
+        sensed = Sensed.joined(block.sensed for block in blocks)
         means = np.array([block.mean for block in blocks])
         errors, healthy = relations.judged(self._schema, hidden, features, sensed, means)
         healthy = healthy * self.usual.get(hidden, 1.0)

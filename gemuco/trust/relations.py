@@ -269,7 +269,8 @@ class Relations:
         rows[:, self.columns] = (values - off)[far]  # also the p of each sample, if another tool has come since
         again = self.sensitivity.sense(schema, rows)
         result = Sensed(*(part.copy() for part in sensed))
-        result.errors[far], result.slopes[far] = again
+        for part, new in zip(result, again, strict=True):
+            part[far] = new
         return result, off
 
     def beyond(self, schema: BodySchema, values: np.ndarray) -> Hidden:

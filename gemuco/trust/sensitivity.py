@@ -5,6 +5,8 @@ of the tip of an arm may come from the camera or from any joint; its derivatives
 explain it. Hidden columns may be wrong by any amount, so the directions in which they move the errors do not count.
 """
 
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -20,19 +22,39 @@ LINEAR = 0.5
 LEAST = 1e-4
 """The errors say nothing of a column with less information than this."""
 FREE = 1e-9
-"""This keeps inverses finite in directions without information."""
+"""This share of the largest information keeps inverses finite in directions without any."""
 
 
-class Sensed(NamedTuple):
-    """Errors of the network and their derivatives.
+@dataclass(frozen=True, slots=True, eq=False)
+class Sensed:
+    """Errors of the network, and what they say of every column.
 
     Attributes:
         errors: Measured minus predicted [standard deviations], shape (n, errors).
         slopes: Their derivatives by every judged column, shape (n, errors, columns).
+        information: Slopes by precision by slopes: how much the errors say of every two columns, shape (n, columns,
+            columns).
+        evidence: Slopes by precision by errors, shape (n, columns).
     """
 
     errors: np.ndarray
     slopes: np.ndarray
+    information: np.ndarray
+    evidence: np.ndarray
+
+    @classmethod
+    def of(cls, errors: np.ndarray, slopes: np.ndarray, precision: np.ndarray) -> "Sensed":
+        """Make it from errors and slopes, and the precision of healthy errors, shape (errors, errors)."""
+        turned = slopes.transpose(0, 2, 1) @ precision
+        return cls(errors, slopes, turned @ slopes, (turned @ errors[:, :, None])[:, :, 0])
+
+    def __iter__(self) -> Iterator[np.ndarray]:
+        yield from (self.errors, self.slopes, self.information, self.evidence)
+
+    @classmethod
+    def joined(cls, parts: Iterable["Sensed"]) -> "Sensed":
+        """Return parts one after the other."""
+        return cls(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 
 class _Judging(NamedTuple):
@@ -85,17 +107,20 @@ class Sensitivity:
         biases, owner = np.unique(rows[:, size:], axis=0, return_inverse=True)
         if len(biases) <= 1:
             is_own = not len(biases) or np.array_equal(biases[0], schema.bias)
-            return self._sense(schema if is_own else schema.with_bias(biases[0]), rows[:, :size])
+            return Sensed.of(
+                *self._sense(schema if is_own else schema.with_bias(biases[0]), rows[:, :size]), self._precision
+            )
         errors = np.zeros((len(rows), len(self._index)))
         slopes = np.zeros((len(rows), len(self._index), len(self._columns)))
         for number, bias in enumerate(biases):
             of = owner.reshape(-1) == number
             errors[of], slopes[of] = self._sense(schema.with_bias(bias), rows[of, :size])
-        return Sensed(errors, slopes)
+        return Sensed.of(errors, slopes, self._precision)
 
-    def _sense(self, schema: BodySchema, x: np.ndarray) -> Sensed:
+    def _sense(self, schema: BodySchema, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return errors and slopes of samples under the p of a schema."""
         if not len(self._index):
-            return Sensed(np.zeros((len(x), 0)), np.zeros((len(x), 0, len(self._columns))))
+            return np.zeros((len(x), 0)), np.zeros((len(x), 0, len(self._columns)))
         errors = prediction_errors(schema, x)[:, self._index] / self._std[self._index] - self._mean
         slopes = np.zeros((len(x), schema.out_layout.size, len(self._columns)))
         for judging in self._judgings_of(schema):
@@ -106,7 +131,7 @@ class Sensitivity:
             slopes[np.ix_(np.arange(len(x)), judging.outputs, judging.columns)] = -pushed.transpose(1, 2, 0)
         for number, own in enumerate(self._own):
             slopes[:, own, number] += 1.0
-        return Sensed(np.nan_to_num(errors), slopes[:, self._index])
+        return np.nan_to_num(errors), slopes[:, self._index]
 
     def _judgings_of(self, schema: BodySchema) -> list[_Judging]:
         """Return what each mask judges; an update of W may choose other masks."""
@@ -122,37 +147,27 @@ class Sensitivity:
         Both have the shape (n, columns) [standard deviations of the signal]; the second is infinite where the errors
         say nothing of a column, or where hidden columns are too far off for the derivatives.
         """
-        count, columns = len(sensed.errors), len(self._columns)
-        value, spread = np.zeros((count, columns)), np.full((count, columns), np.inf)
+        value, spread = np.zeros(sensed.evidence.shape), np.full(sensed.evidence.shape, np.inf)
         if not len(self._index):
             return value, spread
-        whole = np.broadcast_to(self._precision, (count, *self._precision.shape))
-        shared = self._without(whole, sensed.slopes[:, :, sorted(hidden)]) if hidden else whole
-        value, spread = self._ratios(shared, sensed, list(range(columns)))
-        for column in sorted(hidden):
-            others = sorted(hidden - {column})
-            precision = self._without(whole, sensed.slopes[:, :, others]) if others else whole
-            own = self._ratios(precision, sensed, [column])
-            value[:, column], spread[:, column] = own[0][:, 0], own[1][:, 0]
+        away = sorted(hidden)
+        information, evidence, free = np.einsum("ncc->nc", sensed.information), sensed.evidence, np.zeros((1, 1))
         if hidden:
-            far = (np.abs(value[:, sorted(hidden)]) > LINEAR).any(axis=1)
+            # what is left of the other columns where the hidden ones may be wrong by any amount
+            across = sensed.information[:, :, away]
+            free = FREE * (1.0 + information[:, away].max(axis=1))[:, None]
+            inverse = np.linalg.inv(across[:, away] + free[:, :, None] * np.eye(len(away)))
+            taken = across @ inverse
+            information = information - np.einsum("nch,nch->nc", taken, across)
+            evidence = evidence - (taken @ evidence[:, away, None])[:, :, 0]
+            # a hidden column may be wrong by any amount where the other hidden ones are too
+            own = 1.0 / np.einsum("nhh->nh", inverse)
+            information[:, away] = own - free
+            evidence[:, away] = (inverse @ sensed.evidence[:, away, None])[:, :, 0] * own
+        known = information > LEAST + 2.0 * free
+        divisor = np.where(known, information, 1.0)
+        value, spread = np.where(known, evidence, 0.0) / divisor, np.where(known, divisor**-0.5, np.inf)
+        if hidden:
+            far = (np.abs(value[:, away]) > LINEAR).any(axis=1)
             spread[far] = np.inf
         return value, spread
-
-    @staticmethod
-    def _ratios(precision: np.ndarray, sensed: Sensed, columns: list[int]) -> tuple[np.ndarray, np.ndarray]:
-        """Return the lies of some columns and their standard deviations under precisions of the errors."""
-        slopes = sensed.slopes[:, :, columns]
-        scaled = precision @ slopes
-        information = np.einsum("nec,nec->nc", scaled, slopes)
-        known = information > LEAST
-        divisor = np.where(known, information, 1.0)
-        value = np.where(known, np.einsum("nec,ne->nc", scaled, sensed.errors), 0.0) / divisor
-        return value, np.where(known, divisor**-0.5, np.inf)
-
-    @staticmethod
-    def _without(precision: np.ndarray, slopes: np.ndarray) -> np.ndarray:
-        """Return precisions without the directions of some columns, shape (n, errors, errors)."""
-        scaled = precision @ slopes
-        inner = np.swapaxes(slopes, 1, 2) @ scaled + FREE * np.eye(slopes.shape[2])
-        return np.asarray(precision - scaled @ np.linalg.pinv(inner, rcond=1e-9) @ np.swapaxes(scaled, 1, 2))

@@ -56,9 +56,9 @@ then stays until the reference or the model changes."""
 NETWORK_PRIORITY = 45
 STATUS_PRIORITY = 10
 """The status is less urgent than any loop that keeps time: it takes 1 ms, once a second."""
-PRIORITIES = {"estimation": 40, "control": 35, "anomaly": 30, "trust": 20, "update": 10, "verdict": 10}
-"""These are SCHED_FIFO priorities, where the system allows it. Learning and verdicts have the lowest ones, but not
-none: they would hold the interpreter lock while other processes run."""
+PRIORITIES = {"estimation": 40, "control": 35, "anomaly": 30, "trust": 10, "update": 10, "verdict": 10}
+"""These are SCHED_FIFO priorities, where the system allows it. What may compute for long has the lowest ones, below
+simulated nodes, but not none: it would hold the interpreter lock while other processes run."""
 OFFSETS = {
     "estimation": 0.8e-3, "anomaly": 1.4e-3, "control": 1.9e-3, "trust": 3.4e-3, "update": 7.4e-3, "verdict": 29.4e-3
 }  # fmt: skip
