@@ -138,7 +138,7 @@ class CheckSessions:
 
     def another_endpoint(self) -> str:
         """Return a free endpoint of this machine."""
-        return f"{self.plan.protocol}/127.0.0.1:{_free_port(self.plan.protocol)}"
+        return f"{self.plan.protocol}/127.0.0.1:{_free_port()}"
 
     def of(self, name: str) -> dict[str, Any]:
         """Return a fresh copy of a member's role file."""
@@ -231,8 +231,13 @@ def answered(session: zenoh.Session, selector: str, payload: bytes = b"true", ti
     return any(reply.ok is not None and reply.ok.payload.to_bytes() == payload for reply in replies)
 
 
-def _free_port(protocol: str) -> int:
-    kind = socket.SOCK_DGRAM if protocol == "quic" else socket.SOCK_STREAM
-    with socket.socket(type=kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+def _free_port() -> int:
+    """Return a port of this machine that is free for TCP and for UDP."""
+    while True:
+        with socket.socket(type=socket.SOCK_DGRAM) as datagrams, socket.socket() as stream:
+            datagrams.bind(("127.0.0.1", 0))
+            try:
+                stream.bind(datagrams.getsockname())
+            except OSError:
+                continue  # another program has it for TCP
+            return int(datagrams.getsockname()[1])
