@@ -26,6 +26,8 @@ LISTEN = (f"tcp/127.0.0.1:{ROUTER_PORT}",)
 WHO = "the router"
 PROBE_RATE = 1.0
 """The router probes its own endpoints at this rate [Hz], so that a health check notices if it does not answer."""
+PROBE_ENDS = 0.5
+"""Before it ends, a router waits for a probe in progress for at most this time [s], which would report closed ports."""
 
 
 def router_settings(listen: Iterable[str] = (), connect: Iterable[str] = ()) -> dict[str, Any]:
@@ -75,7 +77,7 @@ def run_router(listen: Iterable[str] = (), connect: Iterable[str] = (), stop: th
             with Heartbeat(ROUTER, "", [probe]):
                 stopped.wait()
         finally:
-            probe.stop(0.0)
+            probe.stop(PROBE_ENDS)
 
 
 @contextmanager

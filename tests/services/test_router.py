@@ -19,6 +19,7 @@ from services.errors import ServiceError, ServiceUnavailable
 from services.process.router import LISTEN, router_settings, run_router
 from services.wire import keys
 from services.wire.messages import Estimates, Sample
+from services.wire.probe import is_listening
 from services.wire.query import serve_verb
 from services.wire.session import close_session, open_session
 from services.wire.streams import Publisher
@@ -152,6 +153,23 @@ def test_a_router_ends_when_told(number: signal.Signals) -> None:
     process = start_router("--listen", f"tcp/127.0.0.1:{free_port()}")
     process.send_signal(number)
     assert process.communicate(timeout=10) == ("", "") and process.returncode == 0
+
+
+def test_a_probe_in_progress_ends_before_the_ports_are_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    begun, stop, reports = threading.Event(), threading.Event(), []
+
+    def probe(endpoints: list[str]) -> None:
+        begun.set()
+        time.sleep(0.2)
+        reports.append(is_listening(endpoints[0]))
+
+    monkeypatch.setattr("services.process.router.check_answers", probe)
+    router = threading.Thread(target=run_router, args=([f"tcp/127.0.0.1:{free_port()}"], (), stop))
+    router.start()
+    assert begun.wait(10.0)
+    stop.set()
+    router.join(10.0)
+    assert reports == [True]
 
 
 @pytest.mark.parametrize(
