@@ -11,7 +11,7 @@ from gemuco.schema import BodySchema
 from gemuco.trust import monitor as trust
 from gemuco.trust.cases import Case, LastSearch
 from gemuco.trust.hypotheses import Cause
-from gemuco.trust.monitor import AGAIN, TrustMonitor
+from gemuco.trust.monitor import AGAIN, RARELY, TrustMonitor
 
 BEGIN, COUNT, SAMPLES, JOINT, OTHER = 120, 320, 5, 0, 8
 
@@ -55,6 +55,31 @@ def test_a_lie_that_cannot_be_hidden_is_searched_for_now_and_then_and_a_second_o
     assert any(BEGIN + 102 < count <= BEGIN + 106 for count in made)
     assert not monitor.hidden
     assert {JOINT, OTHER} <= {element for finding in monitor.findings for element in finding.elements}
+
+
+@pytest.mark.long
+def test_a_body_that_is_not_known_is_searched_rarely(model, arm, monkeypatch):
+    samples = motion(arm, COUNT, 4)
+    samples[BEGIN:, :, JOINT] += 0.3  # rad
+    monitor = TrustMonitor(model, replaces=lambda elements: False)
+    monitor.is_known = False
+    made = [count for count in searches(monkeypatch, monitor, model.scaler.normalise(samples)) if count > BEGIN]
+    alone = [count for count in made if count > BEGIN + 20]
+    assert any(count <= BEGIN + 6 for count in made)
+    assert 1 <= len(alone) <= (COUNT - BEGIN - 20) / RARELY + 2
+
+
+@pytest.mark.long
+def test_while_elements_come_and_go_a_cause_is_searched_for_now_and_then(model, arm, monkeypatch):
+    samples, draw = motion(arm, COUNT, 5), np.random.default_rng(0)
+    samples[BEGIN:, :, 7:] *= 1.0 + np.array([0.03, -0.04, 0.05, -0.03, 0.04])  # of no single element
+    for block in samples[BEGIN - 10 : BEGIN + 100]:
+        block[:, draw.choice(12, draw.integers(1, 6), replace=False)] = np.nan
+    monitor = TrustMonitor(model)
+    monitor.is_known = False
+    made = searches(monkeypatch, monitor, model.scaler.normalise(samples))
+    within = [count for count in made if BEGIN < count <= BEGIN + 100]
+    assert 0 < len(within) <= 100 / AGAIN
 
 
 def test_the_last_search_answers_for_what_it_was_asked() -> None:
