@@ -224,7 +224,7 @@ class TrustMonitor:
         highest = float(ratio.max(initial=0.0))
         self._alarmed = self._alarmed + 1 if highest >= 1.0 else 0
         is_due = self._count % AGAIN == 0
-        again = self._count % (AGAIN if self._is_known_body else RARELY) == 0
+        again = highest >= 1.0 and self._count % (AGAIN if self._is_known_body else RARELY) == 0
         known, is_alarm = self._search.answer(self._cases, ratio, again), highest >= 1.0 and (is_steady or is_due)
         if known is not None:
             known.last, known.moved = self._count, known.moved + self._motion

@@ -5,8 +5,7 @@ of the tip of an arm may come from the camera or from any joint; its derivatives
 explain it. Hidden columns may be wrong by any amount, so the directions in which they move the errors do not count.
 """
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -25,31 +24,29 @@ FREE = 1e-9
 """This share of the largest information keeps inverses finite in directions without any."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Sensed:
-    """Errors of the network, and what they say of every column.
+class Sensed(NamedTuple):
+    """What the errors of the network say of every column.
 
     Attributes:
-        errors: Measured minus predicted [standard deviations], shape (n, errors).
-        slopes: Their derivatives by every judged column, shape (n, errors, columns).
-        information: Slopes by precision by slopes: how much the errors say of every two columns, shape (n, columns,
-            columns).
-        evidence: Slopes by precision by errors, shape (n, columns).
+        information: How much they say of every two columns: the errors' derivatives by both, weighted by the precision
+            of healthy errors [1 / standard deviations squared], shape (n, columns, columns).
+        evidence: The errors' derivatives by every column, times the errors, weighted so, shape (n, columns).
     """
 
-    errors: np.ndarray
-    slopes: np.ndarray
     information: np.ndarray
     evidence: np.ndarray
 
     @classmethod
     def of(cls, errors: np.ndarray, slopes: np.ndarray, precision: np.ndarray) -> "Sensed":
-        """Make it from errors and slopes, and the precision of healthy errors, shape (errors, errors)."""
-        turned = slopes.transpose(0, 2, 1) @ precision
-        return cls(errors, slopes, turned @ slopes, (turned @ errors[:, :, None])[:, :, 0])
+        """Weigh errors.
 
-    def __iter__(self) -> Iterator[np.ndarray]:
-        yield from (self.errors, self.slopes, self.information, self.evidence)
+        Args:
+            errors: Measured minus predicted [standard deviations], shape (n, errors).
+            slopes: Their derivatives by every judged column, shape (n, errors, columns).
+            precision: Inverse of the covariance of healthy errors, shape (errors, errors).
+        """
+        turned = slopes.transpose(0, 2, 1) @ precision
+        return cls(turned @ slopes, (turned @ errors[:, :, None])[:, :, 0])
 
     @classmethod
     def joined(cls, parts: Iterable["Sensed"]) -> "Sensed":
@@ -102,23 +99,30 @@ class Sensitivity:
         self._precision = np.linalg.inv(covariance[place]) if len(self._index) else np.zeros((0, 0))
 
     def sense(self, schema: BodySchema, rows: np.ndarray) -> Sensed:
-        """Return the errors of samples followed by p, shape (n, size + bias_size); zero where a value is missing."""
+        """Return what the errors of samples followed by p say, shape (n, size + bias_size)."""
+        return Sensed.of(*self.errors(schema, rows), self._precision)
+
+    def errors(self, schema: BodySchema, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the errors of samples followed by p, shape (n, size + bias_size), and their derivatives.
+
+        Returns:
+            Measured minus predicted [standard deviations], zero where a value is missing, shape (n, errors), and their
+            derivatives by every judged column, shape (n, errors, columns).
+        """
         size = schema.layout.size
         biases, owner = np.unique(rows[:, size:], axis=0, return_inverse=True)
         if len(biases) <= 1:
             is_own = not len(biases) or np.array_equal(biases[0], schema.bias)
-            return Sensed.of(
-                *self._sense(schema if is_own else schema.with_bias(biases[0]), rows[:, :size]), self._precision
-            )
+            return self._of_bias(schema if is_own else schema.with_bias(biases[0]), rows[:, :size])
         errors = np.zeros((len(rows), len(self._index)))
         slopes = np.zeros((len(rows), len(self._index), len(self._columns)))
         for number, bias in enumerate(biases):
             of = owner.reshape(-1) == number
-            errors[of], slopes[of] = self._sense(schema.with_bias(bias), rows[of, :size])
-        return Sensed.of(errors, slopes, self._precision)
+            errors[of], slopes[of] = self._of_bias(schema.with_bias(bias), rows[of, :size])
+        return errors, slopes
 
-    def _sense(self, schema: BodySchema, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return errors and slopes of samples under the p of a schema."""
+    def _of_bias(self, schema: BodySchema, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the errors of samples, shape (n, size), under the p of a schema, and their derivatives."""
         if not len(self._index):
             return np.zeros((len(x), 0)), np.zeros((len(x), 0, len(self._columns)))
         errors = prediction_errors(schema, x)[:, self._index] / self._std[self._index] - self._mean
