@@ -15,7 +15,7 @@ CLOCKLESS := $(addprefix tests/hal/test_,campaign.py fuzz.py object_tables.py sa
 SOCKETCAN := $(addprefix tests/system/test_socketcan,.py _bus.py _drivers.py _states.py)
 
 # Tests that need no clock run beside the others, at the lowest priority and so with more time, and are printed at the end. Each program computes
-# in one thread: threads of linear algebra that wait for each other on two busy cores make it three times slower.
+# in one thread: threads of linear algebra wait for each other on two busy cores (the model's tests: 341 s in place of 215).
 BESIDE := nice -n 19 $(BIN)/python -m pytest -p no:cacheprovider --timeout=600
 define RUN_TESTS
 @mkdir -p build; export OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1; \

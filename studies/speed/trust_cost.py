@@ -68,8 +68,9 @@ def share(schema: BodySchema, motion: np.ndarray, change: Change, is_known: bool
     monitor.is_known = is_known
     whole = len(motion) // SAMPLES
     for number in range(BLOCKS):
-        first = number % whole * SAMPLES
-        block = motion[first : first + SAMPLES].copy()
+        turn, place = divmod(number, whole)  # motion that ends goes on backwards, without a jump
+        first = (place if turn % 2 == 0 else whole - 1 - place) * SAMPLES
+        block = motion[first : first + SAMPLES][:: 1 if turn % 2 == 0 else -1].copy()
         if number >= BEFORE:
             change(block, schema, draw)
         begin = time.thread_time()
