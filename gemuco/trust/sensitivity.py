@@ -25,7 +25,7 @@ FREE = 1e-9
 
 
 class Sensed(NamedTuple):
-    """What the errors of the network say of every column.
+    """Evidence of the network's errors against every column.
 
     Attributes:
         information: How much they say of every two columns: the errors' derivatives by both, weighted by the precision
