@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gemuco.anomaly.prediction import judging_masks, prediction_errors
-from gemuco.layers import push, trace
+from gemuco.anomaly.prediction import judging_masks
+from gemuco.layers import pull, trace
 from gemuco.masks import Mask
 from gemuco.schema import BodySchema
 from gemuco.trust.config import Hidden
@@ -55,30 +55,40 @@ class Sensed(NamedTuple):
 
 
 class _Judging(NamedTuple):
-    """Outputs that are judged by one mask.
+    """Errors of outputs that are judged by one mask.
 
     Attributes:
         mask: The mask.
-        outputs: Positions of the outputs, shape (n,).
-        columns: Judged columns that the mask contains, by their number, shape (k,).
-        places: Their positions in the network's input, shape (k,).
+        errors: Their numbers, shape (k,).
+        outputs: Positions of the outputs in x_out, shape (k,).
+        columns: Judged columns that the mask contains, by their number, shape (m,).
+        places: Their positions in the network's input, shape (m,).
     """
 
     mask: Mask
+    errors: np.ndarray
     outputs: np.ndarray
     columns: np.ndarray
     places: np.ndarray
 
     @classmethod
-    def of(cls, schema: BodySchema, mask: Mask, columns: np.ndarray) -> "_Judging":
-        """Return what is judged by a mask; the columns are positions in the layout, then p."""
+    def of(cls, schema: BodySchema, mask: Mask, columns: np.ndarray, index: np.ndarray) -> "_Judging":
+        """Return what is judged by a mask.
+
+        Args:
+            schema: The body schema.
+            mask: The mask.
+            columns: Positions of the judged columns in the layout, then p.
+            index: Positions in x_out of all errors.
+        """
         size, through = schema.layout.size, schema.gate(mask).through
         place = {int(at): number for number, at in enumerate(schema.in_index) if through[number] > 0}
         place |= {size + number: number - len(schema.bias) for number in range(len(schema.bias))}
         known = [number for number, column in enumerate(columns) if int(column) in place]
         names = [name for name, own in schema.derived(judging_masks).items() if own == mask]
+        errors = np.flatnonzero(np.isin(index, schema.out_layout.indices(names)))
         places = np.array([place[int(columns[number])] for number in known], int)
-        return cls(mask, schema.out_layout.indices(names), np.array(known, int), places)
+        return cls(mask, errors, index[errors], np.array(known, int), places)
 
 
 class Sensitivity:
@@ -89,13 +99,13 @@ class Sensitivity:
         assert schema.normal is not None
         outputs, std = schema.out_layout.size, schema.scaler.std[schema.out_index]
         self._index = np.flatnonzero(np.isfinite(schema.normal.mean[:outputs]))
-        self._columns, self._std = columns, std
+        self._columns = columns
         place = np.ix_(self._index, self._index)
         covariance = schema.normal.covariance[:outputs, :outputs] / np.outer(std, std)
         self._mean = schema.normal.mean[:outputs][self._index] / std[self._index]
         self._judging: dict[str, Mask] = {}
         self._judgings: list[_Judging] = []
-        self._own = [np.flatnonzero(schema.out_index == column) for column in columns]
+        self._own = [np.flatnonzero(schema.out_index[self._index] == column) for column in columns]
         self._precision = np.linalg.inv(covariance[place]) if len(self._index) else np.zeros((0, 0))
 
     def sense(self, schema: BodySchema, rows: np.ndarray) -> Sensed:
@@ -123,26 +133,27 @@ class Sensitivity:
 
     def _of_bias(self, schema: BodySchema, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the errors of samples, shape (n, size), under the p of a schema, and their derivatives."""
-        if not len(self._index):
-            return np.zeros((len(x), 0)), np.zeros((len(x), 0, len(self._columns)))
-        errors = prediction_errors(schema, x)[:, self._index] / self._std[self._index] - self._mean
-        slopes = np.zeros((len(x), schema.out_layout.size, len(self._columns)))
+        errors = np.zeros((len(x), len(self._index)))
+        slopes = np.zeros((*errors.shape, len(self._columns)))
         for judging in self._judgings_of(schema):
+            predicted = schema.infer(x, judging.mask)[:, judging.outputs].astype(float)
+            predicted[~np.isfinite(x[:, schema.layout.indices(judging.mask)]).all(axis=1)] = np.nan
+            errors[:, judging.errors] = x[:, schema.out_index[judging.outputs]] - predicted
             chain, inputs = schema.chain(judging.mask), schema.network_input(np.nan_to_num(x), judging.mask)
-            tangents = np.zeros((len(judging.places), *inputs.shape), inputs.dtype)
-            tangents[np.arange(len(judging.places)), :, judging.places] = 1.0
-            pushed = push(chain, trace(chain, inputs), tangents)[:, :, judging.outputs]
-            slopes[np.ix_(np.arange(len(x)), judging.outputs, judging.columns)] = -pushed.transpose(1, 2, 0)
+            gradients = np.zeros((len(judging.outputs), len(x), schema.out_layout.size), inputs.dtype)
+            gradients[np.arange(len(judging.outputs)), :, judging.outputs] = 1.0
+            pulled = pull(chain, trace(chain, inputs), gradients)[:, :, judging.places]
+            slopes[np.ix_(np.arange(len(x)), judging.errors, judging.columns)] = -pulled.transpose(1, 0, 2)
         for number, own in enumerate(self._own):
             slopes[:, own, number] += 1.0
-        return np.nan_to_num(errors), slopes[:, self._index]
+        return np.nan_to_num(errors - self._mean), slopes
 
     def _judgings_of(self, schema: BodySchema) -> list[_Judging]:
         """Return what each mask judges; an update of W may choose other masks."""
         judging = schema.derived(judging_masks)
         if judging != self._judging:
-            self._judging = judging
-            self._judgings = [_Judging.of(schema, mask, self._columns) for mask in set(judging.values())]
+            all_of = [_Judging.of(schema, mask, self._columns, self._index) for mask in set(judging.values())]
+            self._judging, self._judgings = judging, [one for one in all_of if len(one.errors)]
         return self._judgings
 
     def lies(self, sensed: Sensed, hidden: Hidden) -> tuple[np.ndarray, np.ndarray]:
