@@ -184,7 +184,7 @@ class TrustMonitor:
         before = self._view
         if before is not None and before.hidden - hidden:
             self._recent.unsettle()  # one that returns may have lied when the body settled
-        view = self._view = self._recent.view(self._relations, hidden, before)
+        view = self._view = self._recent.view(self._relations, hidden)
         if before is None or before.hidden != hidden:
             self._lasting = LastingTest(len(self._relations.columns))
             view = self._view = self._compared(view, before)

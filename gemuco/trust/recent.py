@@ -3,6 +3,7 @@
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,6 +22,8 @@ NOISY = 5
 ENOUGH, LARGER = 10, 1.5
 """Errors that were larger than learned before a change are usual: from the first number of blocks on, and in so far as
 they were larger than the second multiple."""
+KEPT = 64
+"""The errors under this number of hypotheses are kept, those that were asked for last."""
 SETTLING = 10
 """The errors of a posture are the mean of the first this many blocks at rest."""
 
@@ -87,11 +90,29 @@ class _Block:
     sensed: Sensed
 
 
+class _Errors(NamedTuple):
+    """Errors of the newest blocks while some columns are hidden, oldest first.
+
+    Attributes:
+        newest: Number of the newest of them.
+        errors: Errors [standard deviations of the signal], shape (blocks, columns).
+        healthy: Those of a healthy body, shape (blocks, columns).
+        noises: As in `View`.
+    """
+
+    newest: int
+    errors: np.ndarray
+    healthy: np.ndarray
+    noises: np.ndarray
+
+
 class Recent:
     """The newest blocks."""
 
     def __init__(self) -> None:
         self.blocks: deque[_Block] = deque(maxlen=LONGEST)
+        self._count = 0
+        self._errors: dict[Hidden, _Errors] = {}
         self._moved: deque[float] = deque([0.0] * LONGEST, maxlen=LONGEST)
         self._settling: list[_Block] = []
         self._settled: _Block | None = None
@@ -123,6 +144,7 @@ class Recent:
         features = relations.features(full)
         sensed = relations.sensitivity.sense(schema, full[:1])
         self.blocks.append(_Block(mean, features[0], features[1:], span, missing, sensed))
+        self._count += 1
 
     def rest(self, motion: float, looks: Callable[[float], float]) -> None:
         """Notice whether the body rests at one posture since the newest block was added.
@@ -195,33 +217,49 @@ class Recent:
         """Return the range of every column within each of the newest blocks, shape (blocks, columns)."""
         return np.array([block.span for block in self.blocks])
 
-    def view(self, relations: Relations, hidden: Hidden, before: View | None = None) -> View:
-        """Return the errors with some columns hidden; `before` is the same view without the newest block."""
+    def view(self, relations: Relations, hidden: Hidden) -> View:
+        """Return the errors with some columns hidden."""
         used = np.ones(len(relations.columns), bool)
         used[list(hidden)] = False
-        fresh = before is not None and before.hidden == hidden
-        blocks = [self.blocks[-1]] if fresh else list(self.blocks)
+        known, missing = self._errors_without(relations, hidden), np.array([block.missing for block in self.blocks])
+        healthy = known.healthy * self.usual.get(hidden, 1.0)
+        z = known.errors / healthy
+        z[np.any(missing & used, axis=1)] = np.nan
+        z[missing] = np.nan
+        if len(z) < LONGEST:
+            lacking = np.full((LONGEST - len(z), z.shape[1]), np.nan)
+            z, healthy = np.concatenate([lacking, z]), np.concatenate([lacking, healthy])
+        settled, moved = self._errors_when_settled(relations, hidden, used), np.array(self._moved) - self._moved[-1]
+        return View(z, healthy, known.noises, hidden, settled, self._away, moved)
+
+    def _errors_without(self, relations: Relations, hidden: Hidden) -> _Errors:
+        """Return the errors with some columns hidden; only those of blocks that are new are computed."""
+        before = self._errors.pop(hidden, None)
+        fresh = len(self.blocks) if before is None else min(self._count - before.newest, len(self.blocks))
+        if before is None or fresh == len(self.blocks):
+            known = _Errors(self._count, *self._judged(relations, hidden, list(self.blocks)))
+        elif fresh:
+            own = self._judged(relations, hidden, list(self.blocks)[-fresh:])
+            kept = zip(before[1:], own, (LONGEST, LONGEST, NOISY), strict=True)
+            known = _Errors(self._count, *(np.concatenate([old, new])[-most:] for old, new, most in kept))
+        else:
+            known = before
+        while len(self._errors) >= KEPT:
+            del self._errors[next(iter(self._errors))]
+        self._errors[hidden] = known
+        return known
+
+    def _judged(
+        self, relations: Relations, hidden: Hidden, blocks: Sequence[_Block]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return errors, those of a healthy body, and noises of some blocks; see `_Errors`."""
         features = np.array([block.features for block in blocks])
         sensed = Sensed.joined(block.sensed for block in blocks)
         means = np.array([block.mean for block in blocks])
         errors, healthy = relations.judged(self._schema, hidden, features, sensed, means)
-        healthy = healthy * self.usual.get(hidden, 1.0)
-        z = errors / healthy
-        unusable = np.array([(block.missing & used).any() for block in blocks])
-        z[unusable] = np.nan
-        z[np.array([block.missing for block in blocks])] = np.nan
-        if before is not None and fresh:
-            z, healthy = np.concatenate([before.z[1:], z]), np.concatenate([before.healthy[1:], healthy])
-        elif len(z) < LONGEST:
-            lacking = np.full((LONGEST - len(z), z.shape[1]), np.nan)
-            z, healthy = np.concatenate([lacking, z]), np.concatenate([lacking, healthy])
-        noises = self._noises(relations, hidden, 1 if fresh else NOISY)
-        if before is not None and fresh:
-            noises = np.concatenate([before.noises, noises])[-NOISY:]
-        is_same = fresh and before is not None and self.resting > 0
-        settled = before.settled if is_same and before else self._errors_when_settled(relations, hidden, used)
-        moved = np.array(self._moved) - self._moved[-1]
-        return View(z, healthy, noises, hidden, settled, self._away, moved)
+        relation, newest = relations.without(hidden), blocks[-NOISY:]
+        noises = np.array([_noise(block.each, relation.maps) for block in newest])
+        return errors, healthy, noises / relation.healthy(features[-NOISY:]) ** 2
 
     def find_repeats(self, view: View, scale: np.ndarray, motion: float) -> None:
         """Find the elements that are stuck after the newest block.
@@ -246,15 +284,10 @@ class Recent:
         )
         return np.where(settled.missing, np.nan, (errors / healthy)[0] / self.usual.get(hidden, 1.0))
 
-    def _noises(self, relations: Relations, hidden: Hidden, count: int) -> np.ndarray:
-        """Return `View.noises` of a number of the newest blocks."""
-        relation, newest = relations.without(hidden), list(self.blocks)[-count:]
-        usual = relation.healthy(np.array([block.features for block in newest]))
-        return np.array([_noise(block.each, relation.maps) for block in newest]) / usual**2
-
     def clear(self) -> None:
         """Forget all blocks."""
         self.blocks.clear()
+        self._errors.clear()
         self.usual.clear()
         self.jumps, self.repeats = Jumps(), Repeats()
         self.unsettle()

@@ -152,11 +152,10 @@ class Relations:
 
     def without(self, hidden: Hidden) -> Relation:
         """Return the relation that uses none of the hidden columns."""
-        known = self._kept.get(hidden)
-        if known is None:
-            if len(self._kept) >= KEPT:
-                self._kept.clear()
-            known = self._kept[hidden] = self._relation(hidden)
+        known = self._kept.pop(hidden, None) or self._relation(hidden)
+        while len(self._kept) >= KEPT:
+            del self._kept[next(iter(self._kept))]
+        self._kept[hidden] = known
         return known
 
     def _relation(self, hidden: Hidden) -> Relation:
