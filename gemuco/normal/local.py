@@ -1,7 +1,8 @@
 """Size of a healthy error at each sample: a steering angle is not known from the motion of a car that stands.
 
-The logarithm of the squared errors is regressed on the values and their squares, without the value itself and without
-hidden ones, so that no lie excuses itself. A column keeps one size where held-out errors are not described better.
+Errors have steps: where another value is above a limit, they are larger or smaller by a factor. Neither the value
+itself nor a hidden one decides, so that no lie excuses itself. A column keeps one size where steps do not describe
+held-out errors better.
 """
 
 from dataclasses import dataclass
@@ -10,18 +11,24 @@ import numpy as np
 
 BLOCKS = 5
 """Each of this many blocks of the samples is judged by the others."""
-PENALTY = 0.05
-"""Ridge penalty, as a share of the number of samples."""
 BETTER = 0.05
 """The mean log likelihood of held-out errors must rise by this much per error."""
 LEAST = 4
 """At least this many known errors per used column are needed."""
-SMALL = 0.05
-"""Squared errors below this share of the usual ones are not distinguished."""
-RANGE = 0.7, 4.0
+STEPS = 4
+"""A column has at most this number of steps."""
+LIMITS, LEAF = 32, 10
+"""Limits of steps are in the middle between successive quantiles of a value, this number of them; at least the second
+number of errors is on either side."""
+SURE = 3.0
+"""Errors on one side of a step that are few, or all alike, may be larger next time: a factor makes this number of
+standard deviations as unlikely as those of Student's t."""
+SMALLEST = 1e-3
+"""Squared errors on one side of a step are at least this share of the usual ones."""
+SMALLER = 0.5
+"""That errors are smaller than usual is believed less: the logarithm of the factor is multiplied by this."""
+RANGE = 0.2, 30.0
 """Errors are at least and at most this many times the usual ones."""
-FAR = 3.0
-"""Values are clipped here [standard deviations]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,12 +36,22 @@ class LocalSize:
     """Healthy errors as a function of the sample.
 
     Attributes:
-        weights: Basis -> logarithm of the size, shape (2 * columns, columns).
-        offset: Its constant, shape (columns,).
+        place: The value that decides each step of each column, shape (columns, STEPS).
+        limit: Its limit [standard deviations], shape (columns, STEPS).
+        below: Logarithm of the factor below the limit, shape (columns, STEPS); 0 without a step.
+        above: The same from the limit on.
     """
 
-    weights: np.ndarray
-    offset: np.ndarray
+    place: np.ndarray
+    limit: np.ndarray
+    below: np.ndarray
+    above: np.ndarray
+
+    @classmethod
+    def even(cls, columns: int) -> "LocalSize":
+        """Return one size for each of some columns."""
+        shape = columns, STEPS
+        return cls(np.zeros(shape, int), np.zeros(shape), np.zeros(shape), np.zeros(shape))
 
     @classmethod
     def fit(
@@ -43,68 +60,115 @@ class LocalSize:
         """Learn the sizes of healthy errors.
 
         Args:
-            values: Known samples [standard deviations], shape (n, columns).
+            values: Known samples [standard deviations], in order of time, shape (n, columns).
             ratios: Their errors [usual errors], shape (n, columns), NaN where not known.
             hidden: Columns that are not used.
-            uneven: Columns whose errors differ from sample to sample, shape (columns,); held-out errors decide if None.
+            uneven: Columns that may have steps, shape (columns,); all if None.
         """
         columns = values.shape[1]
-        weights, offset = np.zeros((2 * columns, columns)), np.zeros(columns)
-        basis = _basis(values)
+        size, knots = cls.even(columns), np.quantile(values, np.linspace(0.0, 1.0, LIMITS + 1), axis=0)
+        limits = 0.5 * (knots[:-1] + knots[1:])
+        bins = (values[:, :, None] >= limits.T).sum(axis=2)
         for column in range(columns) if uneven is None else np.flatnonzero(uneven).tolist():
             known = np.isfinite(ratios[:, column])
-            used = [c for c in range(columns) if c != column and c not in hidden]
-            if known.sum() < LEAST * len(used) or not used:
+            used = np.array([c for c in range(columns) if c != column and c not in hidden], int)
+            ratio = ratios[known, column]
+            if known.sum() < LEAST * len(used) or not len(used) or not ratio.any():
                 continue
-            own = np.array([*used, *(columns + c for c in used)])
-            x, ratio = basis[np.ix_(known, own)], ratios[known, column]
-            if uneven is not None or _gain(x, ratio) > BETTER:
-                weights[own, column], offset[column] = _fitted(x, ratio)
-                offset[column] -= 0.5 * np.log(_usual(ratio))
-        return cls(weights, offset)
+            ratio = ratio / np.sqrt(np.mean(ratio**2))
+            for number in range(STEPS):
+                step = _step(bins[np.ix_(known, used)], ratio)
+                if step is None:
+                    break
+                place, at, *factors = used[step[0]], *step[1:]
+                size.place[column, number], size.limit[column, number] = place, limits[at, place]
+                size.below[column, number], size.above[column, number] = factors
+                ratio = ratio / np.exp(np.where(bins[known, place] <= at, *factors))
+        return size
 
     @property
     def uneven(self) -> np.ndarray:
         """Columns whose errors differ from sample to sample, truth values, shape (columns,)."""
-        return np.asarray(self.weights.any(axis=0))
+        return np.asarray(((self.below != 0.0) | (self.above != 0.0)).any(axis=1))
 
     def __call__(self, values: np.ndarray) -> np.ndarray:
         """Return the size of a healthy error at samples [usual errors], shape (n, columns) -> (n, columns)."""
-        return _limited(_basis(np.nan_to_num(values)) @ self.weights + self.offset)
+        is_below = np.nan_to_num(values)[:, self.place] < self.limit
+        factor = np.where(is_below, self.below, self.above).sum(axis=2)
+        return np.asarray(np.clip(np.exp(np.where(factor < 0.0, SMALLER * factor, factor)), *RANGE))
 
 
-def _gain(x: np.ndarray, ratio: np.ndarray) -> float:
-    """Return by how much local sizes raise the mean log likelihood of held-out errors."""
-    part, gain = np.arange(len(ratio)) * BLOCKS // len(ratio), 0.0
+def _step(bins: np.ndarray, ratio: np.ndarray) -> tuple[int, int, float, float] | None:
+    """Return the step that describes errors best, or None if it does not describe held-out ones better than none.
+
+    Args:
+        bins: Number of limits that each value has reached, shape (n, columns).
+        ratio: Errors [usual errors], shape (n,).
+
+    Returns:
+        Column, number of the limit, and the logarithms of the factors below it and from it on.
+    """
+    count, columns = bins.shape
+    part = np.arange(count) * BLOCKS // count
+    code = ((part[:, None] * columns + np.arange(columns)) * (LIMITS + 1) + bins).ravel()
+    shape, size = (BLOCKS, columns, LIMITS + 1), BLOCKS * columns * (LIMITS + 1)
+    numbers = np.bincount(code, minlength=size).reshape(shape).cumsum(axis=2)
+    squares = np.bincount(code, np.repeat(ratio**2, columns), size).reshape(shape).cumsum(axis=2)
+    gain = 0.0
     for block in range(BLOCKS):
-        others = part != block
-        weights, constant = _fitted(x[others], ratio[others])
-        size, usual = _limited(x[~others] @ weights + constant), _usual(ratio[others])
-        now = ratio[~others] ** 2
-        gain += 0.5 * float(np.sum(np.log(usual) + now / usual - 2.0 * np.log(size) - now / size**2))
-    return gain / len(ratio)
+        others = numbers.sum(axis=0) - numbers[block], squares.sum(axis=0) - squares[block]
+        step = _best_step(*others)
+        if step is None:
+            return None
+        column, at, *factors = step
+        held, usual = part == block, np.sqrt(max(others[1][0, -1] / others[0][0, -1], 1e-12))
+        size = np.exp(np.where(bins[held, column] <= at, *factors))
+        gain += _likelihood(ratio[held], size) - _likelihood(ratio[held], usual)
+    if gain <= BETTER * count or (step := _best_step(numbers.sum(axis=0), squares.sum(axis=0))) is None:
+        return None
+    column, at, below, above = step
+    is_below = bins[:, column] <= at
+    return column, at, below + _doubt(ratio, is_below), above + _doubt(ratio, ~is_below)
 
 
-def _usual(ratio: np.ndarray) -> float:
-    """Return the mean square of errors."""
-    return max(float(np.mean(ratio**2)), 1e-12)
+def _likelihood(errors: np.ndarray, size: np.ndarray) -> float:
+    """Return the logarithm of the likelihood of errors, but for a constant, if they have these sizes, shapes (n,)."""
+    return -float(np.sum(np.log(size) + 0.5 * (errors / size) ** 2))
 
 
-def _basis(values: np.ndarray) -> np.ndarray:
-    x = np.clip(values, -FAR, FAR)
-    return np.concatenate([x, x * x - 1.0], axis=1)
+def _doubt(ratio: np.ndarray, member: np.ndarray) -> float:
+    """Return the logarithm of the factor on the size of some errors in order of time, truth values, shape (n,).
+
+    Errors that hardly change from one sample to the next count as one per stretch of time.
+    """
+    own, both = ratio[member], member[1:] & member[:-1]
+    stretches = int(member[0]) + int((member[1:] & ~member[:-1]).sum())
+    alike = float((ratio[1:] * ratio[:-1])[both].mean() / np.mean(own**2)) if both.any() else 0.0
+    alike = min(max(alike, 0.0), 1.0)
+    freedom = max(stretches, len(own) * (1.0 - alike) / (1.0 + alike), 2.0) - 1.0
+    return 0.5 * float(np.log(freedom * np.expm1(SURE**2 / freedom) / SURE**2))
 
 
-def _fitted(x: np.ndarray, ratio: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return weights and constant of the logarithm of the size, so that errors by size have a mean square of one."""
-    target = 0.5 * np.log(ratio**2 / _usual(ratio) + SMALL)
-    mean = x.mean(axis=0)
-    centred = x - mean
-    gram = centred.T @ centred + PENALTY * len(x) * np.eye(x.shape[1])
-    weights = np.linalg.solve(gram, centred.T @ (target - target.mean()))
-    size = np.exp(np.clip(x @ weights, -5.0, 5.0))
-    return weights, 0.5 * float(np.log(_usual(ratio / size)))
+def _side(cumulated: np.ndarray, side: int) -> np.ndarray:
+    """Return what is below each limit (0), or from it on (1), of cumulated numbers, shape (columns, LIMITS)."""
+    below = cumulated[:, :-1]
+    return below if side == 0 else cumulated[:, -1:] - below
 
 
-def _limited(logarithm: np.ndarray) -> np.ndarray:
-    return np.asarray(np.clip(np.exp(np.clip(logarithm, -5.0, 5.0)), *RANGE))
+def _best_step(numbers: np.ndarray, squares: np.ndarray) -> tuple[int, int, float, float] | None:
+    """Return the most likely step; None if no limit has enough errors on both sides.
+
+    Args:
+        numbers: Number of errors up to each limit of each column, and of all, shape (columns, LIMITS + 1).
+        squares: Their sums of squares.
+    """
+    sides = [(_side(numbers, side), _side(squares, side)) for side in (0, 1)]
+    least = max(SMALLEST * squares[0, -1] / numbers[0, -1], 1e-12)
+    means = [np.maximum(square / np.maximum(number, 1), least) for number, square in sides]
+    likelihood = -sum(number * np.log(mean) for (number, _), mean in zip(sides, means, strict=True))
+    enough = np.minimum(sides[0][0], sides[1][0]) >= LEAF
+    if not enough.any():
+        return None
+    column, at = np.unravel_index(int(np.argmax(np.where(enough, likelihood, -np.inf))), enough.shape)
+    below, above = (0.5 * float(np.log(mean[column, at])) for mean in means)
+    return int(column), int(at), below, above

@@ -2,16 +2,20 @@
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
+from statistics import NormalDist
 
 import numpy as np
 
 from gemuco.trust.changes import AGES, LastingTest, StepTest
 from gemuco.trust.config import BLOCK
 from gemuco.trust.healthy import Healthy
-from gemuco.trust.recent import SETTLING, View
+from gemuco.trust.recent import JERKS, NOISY, SETTLING, View
 
 NOISE = 8.0
-"""A burst of noise has at least this multiple of the healthy variance."""
+"""A burst of noise has at least this multiple of the healthy variance, more if it is known from few samples."""
+BENDS = 1.94
+"""This number of second differences of white noise says as much of its variance as one independent value."""
 RECENT = 20
 """The usual error is that of this number of blocks."""
 NEWEST = 5
@@ -63,6 +67,7 @@ class Judge:
         self._steps, self._limit = StepTest(likeness), np.maximum(healthy.limit(chance), least)
         self._sum, self._likeness, self._size = -math.log(chance), likeness, least
         self._noise = np.maximum(NOISE * healthy.noise, (QUIET * least * self.scale) ** 2)
+        self._chance = chance
 
     def __call__(self, view: View, lasting: LastingTest | None = None) -> Evidence:
         """Return the evidence in a view; without `lasting` from its blocks alone."""
@@ -78,7 +83,7 @@ class Judge:
         is_rest = rest > ratio
         ratio, age = np.where(is_rest, rest, ratio), np.where(is_rest, AGES[-1], age)
         strength = np.maximum(strength, 0.5 * (rest * self._limit) ** 2)
-        noise = np.nan_to_num(view.noise) / self._noise
+        noise = np.nan_to_num(view.noise) / self._noise * min(1.0, NOISE / burst(view.samples, self._chance))
         is_noise = (noise >= 1.0) & (np.sqrt(noise) > ratio)
         ratio = np.where(is_noise, np.sqrt(noise), ratio)
         strength = np.where(is_noise, 10.0 * noise, strength)
@@ -98,6 +103,20 @@ class Judge:
         posture = self._limit**2 * 2.0 * (1.0 - white) * (1.0 - slow**view.away)
         noise = 2.0 * self._sum * white * (1.0 / SETTLING + 1.0 / NEWEST)  # normal, so without a tail
         return change / np.maximum(np.sqrt(posture + noise), self._size), lately < SLOWLY * change
+
+
+@lru_cache
+def burst(samples: int, chance: float) -> float:
+    """Return the multiple of the healthy variance that healthy noise reaches with this chance.
+
+    Noise is the median of `NOISY` blocks with this number of samples, so most of them reach it. A share `JERKS` of the
+    noise of the prediction, which is half of all where both are alike, has been taken off. By the approximation of
+    Wilson and Hilferty for chi squared.
+    """
+    freedom, most = max(samples - 2, 1) / BENDS, NOISY // 2 + 1
+    one = NormalDist().inv_cdf(1.0 - (chance / math.comb(NOISY, most)) ** (1.0 / most))
+    part = 2.0 / (9.0 * freedom)
+    return (1.0 - part + one * math.sqrt(part)) ** 3 / (1.0 - 0.5 * JERKS)
 
 
 def _level(view: View, scale: np.ndarray) -> float:

@@ -22,6 +22,8 @@ NOISY = 5
 ENOUGH, LARGER = 10, 1.5
 """Errors that were larger than learned before a change are usual: from the first number of blocks on, and in so far as
 they were larger than the second multiple."""
+FREE = 1.5
+"""Where the errors are more than this multiple of the usual ones, a value changes while the others rest."""
 KEPT = 64
 """The errors under this number of hypotheses are kept, those that were asked for last."""
 SETTLING = 10
@@ -39,9 +41,10 @@ class View:
             (blocks, n); NaN where unknown.
         hidden: The hidden columns.
         settled: Errors when the body had come to the posture in which it rests, in the unit of `z`, shape (n,); NaN
-            where unknown, and in motion.
-        away: Distance from that posture [looks at a new posture].
+            where unknown, where a value does not follow from the posture, and in motion.
+        away: Distance of all other columns from that posture [looks at a new posture], shape (n,).
         moved: Motion up to each block [looks at a new posture], shape (LONGEST,).
+        samples: Number of samples in the newest block.
     """
 
     z: np.ndarray
@@ -49,8 +52,9 @@ class View:
     noises: np.ndarray
     hidden: Hidden
     settled: np.ndarray
-    away: float
+    away: np.ndarray
     moved: np.ndarray
+    samples: int
 
     @property
     def noise(self) -> np.ndarray:
@@ -116,7 +120,7 @@ class Recent:
         self._moved: deque[float] = deque([0.0] * LONGEST, maxlen=LONGEST)
         self._settling: list[_Block] = []
         self._settled: _Block | None = None
-        self._away = 0.0
+        self._away = np.zeros(1)
         self._schema: BodySchema
         """This is the schema of the newest block."""
         self._samples = np.zeros((0, 0))
@@ -149,7 +153,8 @@ class Recent:
     def rest(self, motion: float, looks: Callable[[float], float]) -> None:
         """Notice whether the body rests at one posture since the newest block was added.
 
-        The column that changed most does not count: it may be a sensor that drifts.
+        The column that changed most does not count: it may be a sensor that drifts. The others are held against it,
+        and not against each other: it may as well be a value that changes while they rest.
 
         Args:
             motion: Motion in the newest block [looks at a new posture].
@@ -158,10 +163,12 @@ class Recent:
         newest = self.blocks[-1]
         self._moved.append(self._moved[-1] + motion)
         if self._settling:
-            change = np.sort(np.abs(newest.mean - self._settling[0].mean))  # NaN is the last
-            known = change[np.isfinite(change)][:-1]
-            self._away = looks(float(np.sqrt(np.mean(known**2)))) if len(known) else 1.0
-            if self._away >= 1.0:
+            square = np.nan_to_num((newest.mean - self._settling[0].mean) ** 2)
+            count, first = np.count_nonzero(np.isfinite(newest.mean)), int(square.argmax())
+            others = (square.sum() - square[first]) / max(count - 1, 1)
+            self._away = np.full(len(square), looks(float(np.sqrt(square.sum() / max(count, 1)))))
+            self._away[first] = looks(float(np.sqrt(others)))
+            if count < 2 or self._away[first] >= 1.0:
                 self.unsettle()
         if self._settled is not None:
             self.resting += 1
@@ -174,7 +181,7 @@ class Recent:
 
     def unsettle(self) -> None:
         """Forget the posture in which the body rests."""
-        self._settling, self._settled, self._away, self.resting = [], None, 0.0, 0
+        self._settling, self._settled, self._away, self.resting = [], None, np.zeros(1), 0
 
     def under(self, schema: BodySchema, relations: Relations) -> "Recent":
         """Return the same blocks with the p of another schema; their noise is unknown."""
@@ -230,7 +237,8 @@ class Recent:
             lacking = np.full((LONGEST - len(z), z.shape[1]), np.nan)
             z, healthy = np.concatenate([lacking, z]), np.concatenate([lacking, healthy])
         settled, moved = self._errors_when_settled(relations, hidden, used), np.array(self._moved) - self._moved[-1]
-        return View(z, healthy, known.noises, hidden, settled, self._away, moved)
+        settled = np.where(self._away < 1.0, settled, np.nan)
+        return View(z, healthy, known.noises, hidden, settled, self._away, moved, len(self.blocks[-1].each))
 
     def _errors_without(self, relations: Relations, hidden: Hidden) -> _Errors:
         """Return the errors with some columns hidden; only those of blocks that are new are computed."""
@@ -256,7 +264,7 @@ class Recent:
         features = np.array([block.features for block in blocks])
         sensed = Sensed.joined(block.sensed for block in blocks)
         means = np.array([block.mean for block in blocks])
-        errors, healthy = relations.judged(self._schema, hidden, features, sensed, means)
+        errors, healthy, _ = relations.judged(self._schema, hidden, features, sensed, means)
         relation, newest = relations.without(hidden), blocks[-NOISY:]
         noises = np.array([_noise(block.each, relation.maps) for block in newest])
         return errors, healthy, noises / relation.healthy(features[-NOISY:]) ** 2
@@ -279,10 +287,11 @@ class Recent:
         settled = self._settled
         if settled is None or (settled.missing & used).any():
             return np.full(len(used), np.nan)
-        errors, healthy = relations.judged(
+        errors, healthy, size = relations.judged(
             self._schema, hidden, settled.features[None], settled.sensed, settled.mean[None]
         )
-        return np.where(settled.missing, np.nan, (errors / healthy)[0] / self.usual.get(hidden, 1.0))
+        is_unknown = settled.missing | (size[0] > FREE)
+        return np.where(is_unknown, np.nan, (errors / healthy)[0] / self.usual.get(hidden, 1.0))
 
     def clear(self) -> None:
         """Forget all blocks."""

@@ -114,6 +114,7 @@ class Relations:
         self._coarse = FLOOR * _signal_spreads(schema, rows, self.columns, watch.signal)
         self._least = np.maximum(FLOOR * np.maximum(rows[:, self.columns].std(axis=0), 1e-3), self._coarse)
         self._kept: dict[Hidden, Relation] = {}
+        self._schema = schema
         self._inflation = np.ones(inputs)
         self._uneven: tuple[np.ndarray | None, np.ndarray | None] = None, None
         outputs = schema.out_layout.size
@@ -179,7 +180,7 @@ class Relations:
         places = np.array([np.flatnonzero(self._holds[:, index]) for index in range(inputs)])
         removal = np.array([_removal(spread, own, outside) for own in places])
         zero, one = np.zeros(inputs), np.ones(inputs)
-        even = LocalSize(np.zeros((2 * inputs, inputs)), zero)
+        even = LocalSize.even(inputs)
         draft = Relation(maps, zero, one, spread, places, removal, one, zero > 0.0, one, even, even)
         far = draft.far(self._rows)
         draft = replace(draft, distance=np.maximum(far.mean(axis=0), 1e-9))
@@ -187,44 +188,56 @@ class Relations:
         mean = errors.mean(axis=0)
         std = np.sqrt(np.mean(((errors - mean) / growth) ** 2, axis=0)) * self._inflation
         std = np.maximum(std, self._least)
-        network, calibration, ratio = self._by_network(hidden, std, np.maximum(1.0, growth))
+        spread, calibration, ratio = self._by_network(hidden, np.maximum(1.0, growth), errors - mean)
         values = np.nan_to_num(self._known[:, self.columns])
         by_watch = LocalSize.fit(values, (errors - mean) / (growth * std), hidden, self._uneven[0])
         by_network = LocalSize.fit(values, ratio / calibration, hidden, self._uneven[1])
+        sizes = growth * std * by_watch(values), spread * calibration * by_network(values)
         return replace(
             draft,
             mean=mean,
             std=std,
-            network=network,
+            network=np.median(sizes[1], axis=0) < np.median(sizes[0], axis=0),
             calibration=calibration,
             by_watch=by_watch,
             by_network=by_network,
         )
 
     def _by_network(
-        self, hidden: Hidden, std: np.ndarray, factor: np.ndarray
+        self, hidden: Hidden, factor: np.ndarray, errors: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return whether the network says more of each column than the watch, and its calibration.
+        """Return what the network says of each column at the known samples.
 
         Args:
             hidden: The hidden columns.
-            std: Healthy errors of the watch, shape (columns,).
             factor: Growth of errors with the distance from the known samples, shape (samples, columns).
+            errors: Errors of the watch at the known samples, shape (samples, columns).
+
+        Returns:
+            Standard deviations of the lies that its errors suggest [standard deviations], shape (samples, columns),
+            infinite where they say nothing, their calibration, shape (columns,), and the lies of the healthy body
+            [their standard deviations], shape (samples, columns), NaN where unknown.
         """
         lies, spread = self.sensitivity.lies(self._sensed, hidden)
+        far = np.isinf(spread[:, sorted(hidden)]).any(axis=1)
+        if far.any():  # these are the largest errors: without them all others would be expected too small
+            values, kept = self._known[far][:, self.columns], Sensed(*(part[far] for part in self._sensed))
+            sensed, off = self._sensed_without(self._schema, hidden, errors[far], kept, values)
+            lies[far], spread[far] = self.sensitivity.lies(sensed, hidden)
+            lies[far] += off
         spread = spread * factor
         known = np.isfinite(spread)
         ratio = np.where(known, lies, 0.0) / np.where(known, spread, 1.0)
         calibration = np.maximum(1.0, np.sqrt((ratio**2).sum(axis=0) / np.maximum(known.sum(axis=0), 1)))
-        usual = np.median(spread, axis=0) * calibration
-        return np.asarray(usual < std), calibration, np.where(known, ratio, np.nan)
+        return spread, calibration, np.where(known, ratio, np.nan)
 
     def judged(
         self, schema: BodySchema, hidden: Hidden, features: np.ndarray, sensed: Sensed, values: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the errors of samples with some columns hidden, and those of a healthy body, shapes (n, columns).
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the errors of samples with some columns hidden, those of a healthy body, and the size of these.
 
-        Each error is that of the watch, or the lie that the network's errors suggest, whichever is known better.
+        Each error is that of the watch, or the lie that the network's errors suggest, whichever is known better. The
+        size is a multiple of the usual one: of what the others say less at some samples. Shapes (n, columns).
 
         Args:
             schema: The schema.
@@ -235,17 +248,19 @@ class Relations:
         """
         relation = self.without(hidden)
         errors, healthy = relation.errors(features), relation.healthy(features)
-        growth = healthy / relation.std
-        healthy = healthy * relation.by_watch(values)
+        growth, size = healthy / relation.std, relation.by_watch(values)
+        healthy = np.maximum(healthy * size, self._least)
         if relation.network.any():
             sensed, off = self._sensed_without(schema, hidden, errors, sensed, values)
             lies, spread = self.sensitivity.lies(sensed, hidden)
             lies = lies + off
-            spread = spread * relation.calibration * np.maximum(1.0, growth) * relation.by_network(values)
+            by_network = relation.by_network(values)
+            spread = spread * relation.calibration * np.maximum(1.0, growth) * by_network
             spread = np.maximum(spread, self._coarse)
             better = relation.network & np.isfinite(spread)
             errors, healthy = np.where(better, lies, errors), np.where(better, spread, healthy)
-        return errors, healthy
+            size = np.where(better, by_network, size)
+        return errors, healthy, size
 
     def _sensed_without(
         self, schema: BodySchema, hidden: Hidden, errors: np.ndarray, sensed: Sensed, values: np.ndarray

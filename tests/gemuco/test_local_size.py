@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gemuco.normal.local import RANGE, LocalSize
+from gemuco.normal.local import RANGE, SMALLER, LocalSize
 
 COUNT = 500
 
@@ -26,8 +26,10 @@ def test_errors_are_large_where_they_were(seed):
     scale = size(fresh)
     assert (scale[:, 1:] == 1.0).all()
     low, high = fresh[:, 1] < -1.0, fresh[:, 1] > 0.5
-    assert np.median(scale[low, 0]) > 1.1  # 1.7 is the truth, in a step, which a square of the value describes poorly
-    assert np.median(scale[low, 0]) > 1.5 * np.median(scale[high, 0])
+    usual = np.sqrt(0.31 * 25.0 + 0.69)  # the share of the samples below -0.5 is 0.31
+    assert np.median(scale[low, 0]) == pytest.approx(5.0 / usual, rel=0.3)
+    smaller = np.median(scale[high, 0])
+    assert smaller == pytest.approx(usual**-SMALLER, rel=0.3), "smaller errors are half believed"
     within = np.abs(errors[:, 0] / scale[:, 0]) < 2.0
     assert abs(within[low].mean() - within[high].mean()) < abs(
         (np.abs(errors[low, 0]) < 2.0).mean() - (np.abs(errors[high, 0]) < 2.0).mean()
@@ -66,3 +68,20 @@ def test_few_or_unknown_errors_leave_one_size():
     assert not LocalSize.fit(values[:10], ratios[:10], frozenset()).uneven.any()
     ratios[:, 0] = np.nan
     assert not LocalSize.fit(values, ratios, frozenset()).uneven.any()
+
+
+def test_errors_from_few_stretches_of_time_may_be_larger_next_time():
+    """Six stands of a car with one error each are no 60 errors."""
+    random, values = np.random.default_rng(3), np.random.default_rng(4).normal(size=(COUNT, 2))
+    stands = np.arange(COUNT) % 80 < 10
+    values[:, 1] = np.where(stands, -2.0, 1.0) + 0.1 * random.normal(size=COUNT)
+    sizes = {}
+    for name, errors in {
+        "independent": random.normal(size=COUNT),
+        "alike": np.repeat(random.normal(size=COUNT // 10), 10),
+    }.items():
+        ratios = np.stack([np.where(stands, 10.0 * errors, random.normal(size=COUNT)), random.normal(size=COUNT)], 1)
+        own = np.sqrt(np.mean(ratios[stands, 0] ** 2) / np.mean(ratios[:, 0] ** 2))
+        sizes[name] = np.median(LocalSize.fit(values, ratios, frozenset())(values)[stands, 0]) / own
+    assert sizes["independent"] == pytest.approx(1.0, abs=0.15)
+    assert 1.3 < sizes["alike"] < 2.0

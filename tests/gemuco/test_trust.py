@@ -101,7 +101,7 @@ def test_how_wrong_a_hidden_element_is_changes_nothing_of_the_others(model, arm,
             own = rows.copy()
             own[:, element] += wrong
             values, sensed = own[:, relations.columns], relations.sensitivity.sense(model, own)
-            error, healthy = relations.judged(model, hidden, relations.features(own), sensed, values)
+            error, healthy, _ = relations.judged(model, hidden, relations.features(own), sensed, values)
             return error / healthy
 
         sees_network |= bool(relations.without(hidden).network[others].any())

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from gemuco.trust.changes import AGES, LONGEST, Likeness, StepTest
-from gemuco.trust.evidence import Judge
+from gemuco.trust.evidence import Judge, burst
 from gemuco.trust.healthy import NOISE_KNOWN, Healthy
-from gemuco.trust.recent import View
+from gemuco.trust.recent import NOISY, View, _noise
 
 MOVING = np.arange(LONGEST, dtype=float)
 """Motion up to each block of a body that moves at its usual pace."""
@@ -88,6 +88,21 @@ def test_noise_matters_from_a_share_of_the_size_on(share, is_noise):
     judge = Judge(healthy, 0.006, np.full(2, size))
     noises = np.array([[(share * size) ** 2, 1e-3]] * 5) * judge.scale**2
     unknown = np.full(2, np.nan)
-    evidence = judge(View(np.zeros((LONGEST, 2)), np.ones((LONGEST, 2)), noises, frozenset(), unknown, 0.0, MOVING))
+    evidence = judge(
+        View(np.zeros((LONGEST, 2)), np.ones((LONGEST, 2)), noises, frozenset(), unknown, np.zeros(2), MOVING, 20)
+    )
     assert evidence.is_noise.tolist() == [is_noise, False]
     assert (evidence.ratio[0] >= 1.0) == is_noise
+
+
+@pytest.mark.parametrize("samples", [5, 20])
+def test_healthy_noise_is_a_burst_as_rarely_as_was_asked_for(samples):
+    """Of few samples the variance is less sure, and healthy noise reached a fixed multiple of it once in a minute."""
+    random, chance = np.random.default_rng(samples), 1e-3
+    features = random.normal(size=(4000, NOISY, samples, 3))
+    features[..., 0] = 1.0
+    maps = np.array([[0.0], [1.0], [-1.0]])  # measured minus predicted, which have the same noise
+    noises = np.array([[_noise(block, maps)[0] for block in window] for window in features])
+    usual, median = noises.mean(), np.median(noises, axis=1)
+    assert (median > burst(samples, chance) * usual).mean() < 3.0 * chance
+    assert (median > 0.5 * burst(samples, chance) * usual).mean() > chance
