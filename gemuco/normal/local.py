@@ -6,6 +6,7 @@ held-out errors better.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,6 +30,25 @@ SMALLER = 0.5
 """That errors are smaller than usual is believed less: the logarithm of the factor is multiplied by this."""
 RANGE = 0.2, 30.0
 """Errors are at least and at most this many times the usual ones."""
+
+
+class Grid(NamedTuple):
+    """The limits at which steps may be, and the known samples.
+
+    Attributes:
+        limits: Shape (LIMITS, columns) [standard deviations], ascending.
+        bins: Number of limits that each value of each sample has reached, in order of time, shape (n, columns).
+    """
+
+    limits: np.ndarray
+    bins: np.ndarray
+
+    @classmethod
+    def of(cls, values: np.ndarray) -> "Grid":
+        """Return the grid of known samples [standard deviations], in order of time, shape (n, columns)."""
+        knots = np.quantile(values, np.linspace(0.0, 1.0, LIMITS + 1), axis=0)
+        limits = 0.5 * (knots[:-1] + knots[1:])
+        return cls(limits, (values[:, :, None] >= limits.T).sum(axis=2))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,41 +75,45 @@ class LocalSize:
 
     @classmethod
     def fit(
-        cls, values: np.ndarray, ratios: np.ndarray, hidden: frozenset[int], uneven: np.ndarray | None = None
+        cls, grid: "Grid", ratios: np.ndarray, hidden: frozenset[int], like: "LocalSize | None" = None
     ) -> "LocalSize":
         """Learn the sizes of healthy errors.
 
         Args:
-            values: Known samples [standard deviations], in order of time, shape (n, columns).
+            grid: The known samples.
             ratios: Their errors [usual errors], shape (n, columns), NaN where not known.
             hidden: Columns that are not used.
-            uneven: Columns that may have steps, shape (columns,); all if None.
+            like: Sizes without hidden columns; their steps are used where they need no hidden one.
         """
-        columns = values.shape[1]
-        size, knots = cls.even(columns), np.quantile(values, np.linspace(0.0, 1.0, LIMITS + 1), axis=0)
-        limits = 0.5 * (knots[:-1] + knots[1:])
-        bins = (values[:, :, None] >= limits.T).sum(axis=2)
-        for column in range(columns) if uneven is None else np.flatnonzero(uneven).tolist():
+        columns = ratios.shape[1]
+        size, steps = cls.even(columns), np.full(columns, STEPS) if like is None else like.steps
+        for column in np.flatnonzero(steps).tolist():
             known = np.isfinite(ratios[:, column])
             used = np.array([c for c in range(columns) if c != column and c not in hidden], int)
             ratio = ratios[known, column]
             if known.sum() < LEAST * len(used) or not len(used) or not ratio.any():
                 continue
-            ratio = ratio / np.sqrt(np.mean(ratio**2))
-            for number in range(STEPS):
-                step = _step(bins[np.ix_(known, used)], ratio)
-                if step is None:
+            ratio, bins = ratio / np.sqrt(np.mean(ratio**2)), grid.bins[known]
+            for number in range(steps[column]):
+                if like is not None and like.place[column, number] in used:
+                    place, limit = like.place[column, number], like.limit[column, number]
+                elif (step := _step(bins[:, used], ratio)) is not None:
+                    place, limit = used[step[0]], grid.limits[step[1], used[step[0]]]
+                else:
                     break
-                place, at, *factors = used[step[0]], *step[1:]
-                size.place[column, number], size.limit[column, number] = place, limits[at, place]
+                is_below = bins[:, place] <= np.searchsorted(grid.limits[:, place], limit)
+                if is_below.all() or not is_below.any():
+                    break
+                factors = _factor(ratio, is_below), _factor(ratio, ~is_below)
+                size.place[column, number], size.limit[column, number] = place, limit
                 size.below[column, number], size.above[column, number] = factors
-                ratio = ratio / np.exp(np.where(bins[known, place] <= at, *factors))
+                ratio = ratio / np.exp(np.where(is_below, *factors))
         return size
 
     @property
-    def uneven(self) -> np.ndarray:
-        """Columns whose errors differ from sample to sample, truth values, shape (columns,)."""
-        return np.asarray(((self.below != 0.0) | (self.above != 0.0)).any(axis=1))
+    def steps(self) -> np.ndarray:
+        """Number of steps of each column, shape (columns,)."""
+        return np.asarray(((self.below != 0.0) | (self.above != 0.0)).sum(axis=1))
 
     def __call__(self, values: np.ndarray) -> np.ndarray:
         """Return the size of a healthy error at samples [usual errors], shape (n, columns) -> (n, columns)."""
@@ -98,15 +122,12 @@ class LocalSize:
         return np.asarray(np.clip(np.exp(np.where(factor < 0.0, SMALLER * factor, factor)), *RANGE))
 
 
-def _step(bins: np.ndarray, ratio: np.ndarray) -> tuple[int, int, float, float] | None:
-    """Return the step that describes errors best, or None if it does not describe held-out ones better than none.
+def _step(bins: np.ndarray, ratio: np.ndarray) -> tuple[int, int] | None:
+    """Return column and limit of the step that describes errors best; None if held-out ones are better without.
 
     Args:
         bins: Number of limits that each value has reached, shape (n, columns).
         ratio: Errors [usual errors], shape (n,).
-
-    Returns:
-        Column, number of the limit, and the logarithms of the factors below it and from it on.
     """
     count, columns = bins.shape
     part = np.arange(count) * BLOCKS // count
@@ -122,13 +143,10 @@ def _step(bins: np.ndarray, ratio: np.ndarray) -> tuple[int, int, float, float] 
             return None
         column, at, *factors = step
         held, usual = part == block, np.sqrt(max(others[1][0, -1] / others[0][0, -1], 1e-12))
-        size = np.exp(np.where(bins[held, column] <= at, *factors))
-        gain += _likelihood(ratio[held], size) - _likelihood(ratio[held], usual)
-    if gain <= BETTER * count or (step := _best_step(numbers.sum(axis=0), squares.sum(axis=0))) is None:
-        return None
-    column, at, below, above = step
-    is_below = bins[:, column] <= at
-    return column, at, below + _doubt(ratio, is_below), above + _doubt(ratio, ~is_below)
+        size_of = np.exp(np.where(bins[held, column] <= at, *factors))
+        gain += _likelihood(ratio[held], size_of) - _likelihood(ratio[held], usual)
+    step = _best_step(numbers.sum(axis=0), squares.sum(axis=0))
+    return None if gain <= BETTER * count or step is None else step[:2]
 
 
 def _likelihood(errors: np.ndarray, size: np.ndarray) -> float:
@@ -136,17 +154,18 @@ def _likelihood(errors: np.ndarray, size: np.ndarray) -> float:
     return -float(np.sum(np.log(size) + 0.5 * (errors / size) ** 2))
 
 
-def _doubt(ratio: np.ndarray, member: np.ndarray) -> float:
-    """Return the logarithm of the factor on the size of some errors in order of time, truth values, shape (n,).
+def _factor(ratio: np.ndarray, member: np.ndarray) -> float:
+    """Return the logarithm of the size of some errors, larger if they are few; both in order of time, shape (n,).
 
     Errors that hardly change from one sample to the next count as one per stretch of time.
     """
     own, both = ratio[member], member[1:] & member[:-1]
+    square = max(float(np.mean(own**2)), SMALLEST)
     stretches = int(member[0]) + int((member[1:] & ~member[:-1]).sum())
-    alike = float((ratio[1:] * ratio[:-1])[both].mean() / np.mean(own**2)) if both.any() else 0.0
+    alike = float((ratio[1:] * ratio[:-1])[both].mean()) / square if both.any() else 0.0
     alike = min(max(alike, 0.0), 1.0)
     freedom = max(stretches, len(own) * (1.0 - alike) / (1.0 + alike), 2.0) - 1.0
-    return 0.5 * float(np.log(freedom * np.expm1(SURE**2 / freedom) / SURE**2))
+    return 0.5 * float(np.log(square * freedom * np.expm1(SURE**2 / freedom) / SURE**2))
 
 
 def _side(cumulated: np.ndarray, side: int) -> np.ndarray:

@@ -10,11 +10,11 @@ import numpy as np
 
 from gemuco.anomaly.prediction import with_bias
 from gemuco.intervals.sureness import MARGIN
-from gemuco.normal.local import LocalSize
+from gemuco.normal.local import Grid, LocalSize
 from gemuco.normal.watch import error_growth, without_features
 from gemuco.schema import BodySchema
 from gemuco.trust.config import Hidden, TrustConfig
-from gemuco.trust.sensitivity import Sensed, Sensitivity
+from gemuco.trust.sensitivity import LINEAR, Sensed, Sensitivity
 
 NEARBY = 0.05
 """The network's errors are computed anew if a hidden element is off by more than this [standard deviations]."""
@@ -114,13 +114,13 @@ class Relations:
         self._coarse = FLOOR * _signal_spreads(schema, rows, self.columns, watch.signal)
         self._least = np.maximum(FLOOR * np.maximum(rows[:, self.columns].std(axis=0), 1e-3), self._coarse)
         self._kept: dict[Hidden, Relation] = {}
-        self._schema = schema
         self._inflation = np.ones(inputs)
-        self._uneven: tuple[np.ndarray | None, np.ndarray | None] = None, None
+        self._grid = Grid.of(np.nan_to_num(rows[:, self.columns]))
+        self._sizes: tuple[LocalSize | None, LocalSize | None] = None, None
         outputs = schema.out_layout.size
         promised = np.sqrt(np.diag(schema.normal.covariance))[outputs : outputs + self.count]
         whole = self.without(frozenset())
-        self._uneven = whole.by_watch.uneven, whole.by_network.uneven
+        self._sizes = whole.by_watch, whole.by_network
         ratio = promised / whole.std[: self.count]
         self._inflation = np.maximum(1.0, np.concatenate([ratio, np.full(inputs - self.count, np.median(ratio))]))
         self._kept.clear()
@@ -188,10 +188,10 @@ class Relations:
         mean = errors.mean(axis=0)
         std = np.sqrt(np.mean(((errors - mean) / growth) ** 2, axis=0)) * self._inflation
         std = np.maximum(std, self._least)
-        spread, calibration, ratio = self._by_network(hidden, np.maximum(1.0, growth), errors - mean)
-        values = np.nan_to_num(self._known[:, self.columns])
-        by_watch = LocalSize.fit(values, (errors - mean) / (growth * std), hidden, self._uneven[0])
-        by_network = LocalSize.fit(values, ratio / calibration, hidden, self._uneven[1])
+        spread, calibration, ratio = self._by_network(hidden, np.maximum(1.0, growth))
+        by_watch = LocalSize.fit(self._grid, (errors - mean) / (growth * std), hidden, self._sizes[0])
+        by_network = LocalSize.fit(self._grid, ratio / calibration, hidden, self._sizes[1])
+        values = self._known[:, self.columns]
         sizes = growth * std * by_watch(values), spread * calibration * by_network(values)
         return replace(
             draft,
@@ -203,28 +203,23 @@ class Relations:
             by_network=by_network,
         )
 
-    def _by_network(
-        self, hidden: Hidden, factor: np.ndarray, errors: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _by_network(self, hidden: Hidden, factor: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return what the network says of each column at the known samples.
 
         Args:
             hidden: The hidden columns.
             factor: Growth of errors with the distance from the known samples, shape (samples, columns).
-            errors: Errors of the watch at the known samples, shape (samples, columns).
 
         Returns:
             Standard deviations of the lies that its errors suggest [standard deviations], shape (samples, columns),
             infinite where they say nothing, their calibration, shape (columns,), and the lies of the healthy body
             [their standard deviations], shape (samples, columns), NaN where unknown.
         """
-        lies, spread = self.sensitivity.lies(self._sensed, hidden)
-        far = np.isinf(spread[:, sorted(hidden)]).any(axis=1)
-        if far.any():  # these are the largest errors: without them all others would be expected too small
-            values, kept = self._known[far][:, self.columns], Sensed(*(part[far] for part in self._sensed))
-            sensed, off = self._sensed_without(self._schema, hidden, errors[far], kept, values)
-            lies[far], spread[far] = self.sensitivity.lies(sensed, hidden)
-            lies[far] += off
+        lies, spread = self.sensitivity.lies(self._sensed, hidden, limit=np.inf)
+        away = sorted(hidden)
+        far = (np.abs(lies[:, away]) > LINEAR).any(axis=1)
+        # the largest errors of the hidden columns count: without them all others would be expected too small
+        spread[np.ix_(far, np.delete(np.arange(spread.shape[1]), away))] = np.inf
         spread = spread * factor
         known = np.isfinite(spread)
         ratio = np.where(known, lies, 0.0) / np.where(known, spread, 1.0)

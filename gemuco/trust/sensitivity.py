@@ -156,11 +156,11 @@ class Sensitivity:
             self._judging, self._judgings = judging, [one for one in all_of if len(one.errors)]
         return self._judgings
 
-    def lies(self, sensed: Sensed, hidden: Hidden) -> tuple[np.ndarray, np.ndarray]:
+    def lies(self, sensed: Sensed, hidden: Hidden, limit: float = LINEAR) -> tuple[np.ndarray, np.ndarray]:
         """Return the lie of every column that alone would explain the errors, and its standard deviation.
 
         Both have the shape (n, columns) [standard deviations of the signal]; the second is infinite where the errors
-        say nothing of a column, or where hidden columns are too far off for the derivatives.
+        say nothing of a column, or where a hidden column is off by more than the limit, so that no derivative holds.
         """
         value, spread = np.zeros(sensed.evidence.shape), np.full(sensed.evidence.shape, np.inf)
         if not len(self._index):
@@ -183,6 +183,6 @@ class Sensitivity:
         divisor = np.where(known, information, 1.0)
         value, spread = np.where(known, evidence, 0.0) / divisor, np.where(known, divisor**-0.5, np.inf)
         if hidden:
-            far = (np.abs(value[:, away]) > LINEAR).any(axis=1)
+            far = (np.abs(value[:, away]) > limit).any(axis=1)
             spread[far] = np.inf
         return value, spread

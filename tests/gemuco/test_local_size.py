@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gemuco.normal.local import RANGE, SMALLER, LocalSize
+from gemuco.normal.local import RANGE, SMALLER, Grid, LocalSize
 
 COUNT = 500
 
@@ -20,8 +20,8 @@ def samples(seed: int, columns: int = 4) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("seed", range(5))
 def test_errors_are_large_where_they_were(seed):
     values, ratios = samples(seed)
-    size = LocalSize.fit(values, ratios, frozenset())
-    assert size.uneven.tolist() == [True, False, False, False]
+    size = LocalSize.fit(Grid.of(values), ratios, frozenset())
+    assert (size.steps > 0).tolist() == [True, False, False, False]
     fresh, errors = samples(seed + 100)
     scale = size(fresh)
     assert (scale[:, 1:] == 1.0).all()
@@ -39,11 +39,11 @@ def test_errors_are_large_where_they_were(seed):
 def test_no_lie_excuses_itself_and_no_hidden_value_does():
     values, ratios = samples(0)
     ratios[:, 1] = ratios[:, 0]  # the errors of column 1 depend on its own value only
-    size = LocalSize.fit(values, ratios, frozenset())
-    assert not size.uneven[1]
+    size = LocalSize.fit(Grid.of(values), ratios, frozenset())
+    assert not size.steps[1]
     whole, hidden = (
-        LocalSize.fit(values, ratios, frozenset()),
-        LocalSize.fit(values, ratios, frozenset({1}), size.uneven),
+        LocalSize.fit(Grid.of(values), ratios, frozenset()),
+        LocalSize.fit(Grid.of(values), ratios, frozenset({1}), size),
     )
     wrong = values.copy()
     wrong[:, 1] += 10.0
@@ -56,7 +56,7 @@ def test_no_lie_excuses_itself_and_no_hidden_value_does():
 
 def test_sizes_stay_within_their_range_also_far_outside_and_with_missing_values():
     values, ratios = samples(1)
-    size = LocalSize.fit(values, ratios, frozenset())
+    size = LocalSize.fit(Grid.of(values), ratios, frozenset())
     far = np.full((3, 4), 1e6)
     far[1] = np.nan
     far[2] = -1e6
@@ -65,9 +65,9 @@ def test_sizes_stay_within_their_range_also_far_outside_and_with_missing_values(
 
 def test_few_or_unknown_errors_leave_one_size():
     values, ratios = samples(2)
-    assert not LocalSize.fit(values[:10], ratios[:10], frozenset()).uneven.any()
+    assert not LocalSize.fit(Grid.of(values[:10]), ratios[:10], frozenset()).steps.any()
     ratios[:, 0] = np.nan
-    assert not LocalSize.fit(values, ratios, frozenset()).uneven.any()
+    assert not LocalSize.fit(Grid.of(values), ratios, frozenset()).steps.any()
 
 
 def test_errors_from_few_stretches_of_time_may_be_larger_next_time():
@@ -82,6 +82,6 @@ def test_errors_from_few_stretches_of_time_may_be_larger_next_time():
     }.items():
         ratios = np.stack([np.where(stands, 10.0 * errors, random.normal(size=COUNT)), random.normal(size=COUNT)], 1)
         own = np.sqrt(np.mean(ratios[stands, 0] ** 2) / np.mean(ratios[:, 0] ** 2))
-        sizes[name] = np.median(LocalSize.fit(values, ratios, frozenset())(values)[stands, 0]) / own
+        sizes[name] = np.median(LocalSize.fit(Grid.of(values), ratios, frozenset())(values)[stands, 0]) / own
     assert sizes["independent"] == pytest.approx(1.0, abs=0.15)
     assert 1.3 < sizes["alike"] < 2.0
