@@ -33,7 +33,7 @@ def share_heaps() -> None:
     """Let all threads allocate from at most `MOST_HEAPS` heaps of the C library, where it knows this setting.
 
     By default it makes up to eight heaps per core, and each keeps the most that its threads ever needed: in a flood of
-    messages a recorder grew for several floods (docs/results.md).
+    messages a recorder grew for several floods (docs/results_running.md).
     """
     with contextlib.suppress(AttributeError):  # not the GNU library
         ctypes.CDLL(None).mallopt(_M_ARENA_MAX, MOST_HEAPS)

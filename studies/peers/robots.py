@@ -121,7 +121,7 @@ KXR = Questions(
     ],
     bars={},
 )
-"""The masks are the paper's eight, which structure determination finds on this robot (docs/results.md)."""
+"""The masks are the paper's eight, which structure determination finds on this robot (docs/results_experiments.md)."""
 PR2 = Questions([(JOINTS,)], (TIP,), [(TIP, (JOINTS,), "mm", 1e3)], {})
 MUSASHI = Questions(
     masks=[(JOINTS, TENSION), (TENSION, LENGTH), (JOINTS, LENGTH), (JOINTS, TENSION, LENGTH)],

@@ -229,7 +229,7 @@ def _break(
 
 
 def show(result: dict[str, Any], console: Console) -> None:
-    """Print the tables of docs/results.md."""
+    """Print the tables of docs/results_running.md."""
     table = Table(
         "robots", "Hz each (least)", "lost", "gaps", "p50 ms", "p99 ms", "% core/robot", "own MB/robot", "router %",
         "router MB", "client %", "kB/s/robot", "bare skipped", "load",

@@ -102,7 +102,7 @@ def statuses(client: Client) -> dict[str, Status]:
 
 
 def show(result: dict[str, Any], console: Console) -> None:
-    """Print the table of docs/results.md; times in ms."""
+    """Print the table of docs/results_running.md; times in ms."""
     table = Table(
         "loop", "rate [Hz]", "p50", "p99", "max", "skipped", "bare p50", "bare p99", "bare max", "bare skipped"
     )

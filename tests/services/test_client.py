@@ -47,7 +47,7 @@ def cpu_time(statement: str, compiled: Path) -> float:
 
 @pytest.mark.long
 def test_importing_the_client_costs_little_more_than_what_it_stands_on(tmp_path: Path) -> None:
-    """How long it takes [s] is in docs/results.md; here is only what it is made of, compiled as at its second start."""
+    """docs/results_running.md has its duration; here is what it is made of, compiled as at its second start."""
     bare, ours = [], []
     for _ in range(4):
         bare.append(cpu_time("import numpy, zenoh, msgpack", tmp_path))
