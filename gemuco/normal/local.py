@@ -33,13 +33,15 @@ RANGE = 0.2, 30.0
 
 
 class Grid(NamedTuple):
-    """The limits at which steps may be, and the known samples.
+    """The known samples, and the limits at which steps may be.
 
     Attributes:
-        limits: Shape (LIMITS, columns) [standard deviations], ascending.
-        bins: Number of limits that each value of each sample has reached, in order of time, shape (n, columns).
+        values: The samples [standard deviations], in order of time, shape (n, columns).
+        limits: The limits, ascending, shape (LIMITS, columns).
+        bins: Number of limits that each value has reached, shape (n, columns).
     """
 
+    values: np.ndarray
     limits: np.ndarray
     bins: np.ndarray
 
@@ -48,7 +50,7 @@ class Grid(NamedTuple):
         """Return the grid of known samples [standard deviations], in order of time, shape (n, columns)."""
         knots = np.quantile(values, np.linspace(0.0, 1.0, LIMITS + 1), axis=0)
         limits = 0.5 * (knots[:-1] + knots[1:])
-        return cls(limits, (values[:, :, None] >= limits.T).sum(axis=2))
+        return cls(values, limits, (values[:, :, None] >= limits.T).sum(axis=2))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,7 +77,7 @@ class LocalSize:
 
     @classmethod
     def fit(
-        cls, grid: "Grid", ratios: np.ndarray, hidden: frozenset[int], like: "LocalSize | None" = None
+        cls, grid: Grid, ratios: np.ndarray, hidden: frozenset[int], like: "LocalSize | None" = None
     ) -> "LocalSize":
         """Learn the sizes of healthy errors.
 
@@ -93,15 +95,15 @@ class LocalSize:
             ratio = ratios[known, column]
             if known.sum() < LEAST * len(used) or not len(used) or not ratio.any():
                 continue
-            ratio, bins = ratio / np.sqrt(np.mean(ratio**2)), grid.bins[known]
+            ratio = ratio / np.sqrt(np.mean(ratio**2))
             for number in range(steps[column]):
                 if like is not None and like.place[column, number] in used:
                     place, limit = like.place[column, number], like.limit[column, number]
-                elif (step := _step(bins[:, used], ratio)) is not None:
+                elif (step := _step(grid.bins[np.ix_(known, used)], ratio)) is not None:
                     place, limit = used[step[0]], grid.limits[step[1], used[step[0]]]
                 else:
                     break
-                is_below = bins[:, place] <= np.searchsorted(grid.limits[:, place], limit)
+                is_below = grid.values[known, place] < limit
                 if is_below.all() or not is_below.any():
                     break
                 factors = _factor(ratio, is_below), _factor(ratio, ~is_below)

@@ -114,9 +114,9 @@ def burst(samples: int, chance: float) -> float:
     Wilson and Hilferty for chi squared.
     """
     freedom, most = max(samples - 2, 1) / BENDS, NOISY // 2 + 1
-    one = NormalDist().inv_cdf(1.0 - (chance / math.comb(NOISY, most)) ** (1.0 / most))
-    part = 2.0 / (9.0 * freedom)
-    return (1.0 - part + one * math.sqrt(part)) ** 3 / (1.0 - 0.5 * JERKS)
+    quantile = NormalDist().inv_cdf(1.0 - (chance / math.comb(NOISY, most)) ** (1.0 / most))
+    variance = 2.0 / (9.0 * freedom)
+    return (1.0 - variance + quantile * math.sqrt(variance)) ** 3 / (1.0 - 0.5 * JERKS)
 
 
 def _level(view: View, scale: np.ndarray) -> float:

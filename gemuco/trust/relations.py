@@ -236,7 +236,7 @@ class Relations:
         """Return the errors of samples with some columns hidden, those of a healthy body, and the size of these.
 
         Each error is that of the watch, or the lie that the network's errors suggest, whichever is known better. The
-        size is a multiple of the usual one: of what the others say less at some samples. Shapes (n, columns).
+        size is a multiple of the usual one, larger where a value follows less from the others. Shapes (n, columns).
 
         Args:
             schema: The schema.

@@ -152,8 +152,9 @@ class Sensitivity:
         """Return what each mask judges; an update of W may choose other masks."""
         judging = schema.derived(judging_masks)
         if judging != self._judging:
-            all_of = [_Judging.of(schema, mask, self._columns, self._index) for mask in set(judging.values())]
-            self._judging, self._judgings = judging, [one for one in all_of if len(one.errors)]
+            masks = dict.fromkeys(judging.values())
+            judgings = (_Judging.of(schema, mask, self._columns, self._index) for mask in masks)
+            self._judging, self._judgings = judging, [own for own in judgings if len(own.errors)]
         return self._judgings
 
     def lies(self, sensed: Sensed, hidden: Hidden, limit: float = LINEAR) -> tuple[np.ndarray, np.ndarray]:

@@ -70,7 +70,7 @@ def test_a_driver_who_steers_at_standstill_is_no_lie(model, seed):
     ("element", "lie", "begin"),
     [(STEERING, 0.2, 460), (YAW, 0.1, 425), pytest.param(LEFT, 1.0, 460, marks=pytest.mark.long)],
 )
-def test_lies_are_found_where_the_others_tell(model, element, lie, begin):
+def test_lies_are_found_where_a_value_follows_from_the_others(model, element, lie, begin):
     samples = samples_of(model, begin + 40, 21)
     samples[begin:, :, element] += lie
     hidden = hidden_in(model, samples)
