@@ -8,12 +8,10 @@ from gemuco.anomaly.healthy import learn_normal
 from gemuco.learning.config import TrainConfig
 from gemuco.learning.train import fit
 from gemuco.schema import BodySchema
-from gemuco.trust import cases
 from gemuco.trust import monitor as trust
 from gemuco.trust.cases import Case, LastSearch
 from gemuco.trust.hypotheses import Cause
 from gemuco.trust.monitor import AGAIN, RARELY, TrustMonitor
-from gemuco.trust.relations import Relations
 
 BEGIN, COUNT, SAMPLES, JOINT, OTHER = 120, 320, 5, 0, 8
 
@@ -98,45 +96,3 @@ def test_the_last_search_answers_for_what_it_was_asked() -> None:
     element.is_hidden = True
     assert search.answer([element], alarm, is_due=False) is None
     assert search.answer([element, body], wider, is_due=False) is body
-
-
-def test_a_long_search_continues_in_the_next_blocks_and_ends_with_the_same_cause(model, arm, monkeypatch):
-    """All at once, its new relations would hold up the other loops for as long as several blocks."""
-    samples = model.scaler.normalise(motion(arm, BEGIN + 60, 6))
-    samples[BEGIN:, :, JOINT] += 0.3 / model.scaler.std[JOINT]
-    computed, made = [], Relations._relation
-    monkeypatch.setattr(Relations, "_relation", lambda own, hidden: computed.append(hidden) or made(own, hidden))
-
-    def judged(work: int) -> tuple[int, int]:
-        """Return the block in which the joint was hidden, and the largest number of new relations in a block."""
-        monkeypatch.setattr(cases, "WORK", work)
-        monitor, most, hidden = TrustMonitor(model), 0, []
-        for block in samples:
-            before = len(computed)
-            monitor.add(block, 0.1 * len(hidden))
-            most = max(most, len(computed) - before)
-            hidden.append(JOINT in monitor.hidden)
-        assert monitor.hidden == {JOINT}
-        return hidden.index(True), most
-
-    (at_once, many), (later, few) = judged(10**9), judged(1)
-    assert many > 2 * cases.FEWEST >= few
-    assert at_once < later <= at_once + 10
-
-
-def test_a_search_is_open_until_it_has_done_its_share() -> None:
-    search = LastSearch()
-    with search.part(columns=10**6):
-        for _ in range(cases.FEWEST):
-            search.spend(is_new=True)
-        search.spend(is_new=False)
-        search.spend(is_new=True)
-        pytest.fail("it continues in the next block")
-    assert search.is_open
-    body = Case(Cause(frozenset(), "body", 1), 0, 0, 0)
-    alarm = np.array([0.0, 2.0])
-    search.alarming = frozenset({1})
-    assert search.answer([body], alarm, is_due=False) is None
-    with search.part(columns=10**6):
-        search.spend(is_new=True)
-    assert search.answer([body], alarm, is_due=False) is body
