@@ -1,8 +1,7 @@
 """Suspected and hidden causes, and what kind of lie each of them is."""
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -18,9 +17,6 @@ from gemuco.trust.relations import Relations
 
 CLEAR = 2.0
 """A lie begins with the first error of this size [errors of a healthy prediction]."""
-WORK, FEWEST = 1900, 2
-"""In one block a search computes the first number of new relations, by the square of the number of columns, or the
-second if that is more."""
 MOVES = 3.0
 """Before a frozen element returns, it and its prediction move by this much [errors of a healthy prediction]."""
 
@@ -76,46 +72,15 @@ class Case:
         )  # fmt: skip
 
 
-class _Unfinished(Exception):
-    """A search has done its share of a block."""
-
-
 @dataclass(slots=True)
 class LastSearch:
     """The last search for a cause, which costs as much as 50 blocks.
 
-    A search that needs many relations for the first time continues in the next blocks, because all at once they would
-    hold up the other loops of a busy machine. What was computed is kept.
-
     Attributes:
         alarming: The columns that had the evidence of an alarm.
-        is_open: Whether the search is not finished.
-        left: Number of new relations that it may compute in this block.
     """
 
     alarming: Hidden = frozenset()
-    is_open: bool = False
-    left: int = 0
-
-    @contextmanager
-    def part(self, columns: int) -> Iterator[None]:
-        """Search in one block, for a body with this number of judged columns."""
-        self.left = max(FEWEST, WORK // columns**2)
-        try:
-            yield
-            self.is_open = False
-        except _Unfinished:
-            self.is_open = True
-
-    def spend(self, is_new: bool) -> None:
-        """Count one hypothesis; `is_new`: whether it needs a relation for the first time.
-
-        Raises:
-            _Unfinished: The search continues in the next block; `part` catches it.
-        """
-        self.left -= is_new
-        if self.left < 0:
-            raise _Unfinished
 
     def answer(self, cases: Iterable[Case], ratio: np.ndarray, is_due: bool) -> Case | None:
         """Return the case that answers for this block too; None if there is no alarm, or a search is to be made.
@@ -131,7 +96,7 @@ class LastSearch:
         if not alarming:
             return None
         case = next((c for c in cases if not c.is_hidden and (c.cause.cause == "body" or c.reason)), None)
-        if self.is_open or case is None or is_due or not (case.cause.cause == "body" or alarming <= self.alarming):
+        if case is None or is_due or not (case.cause.cause == "body" or alarming <= self.alarming):
             self.alarming = alarming
             return None
         return case

@@ -160,7 +160,8 @@ class TrustMonitor:
     def trust(self, position: int) -> None:
         """Use an element again; it is not hidden again before it has agreed with the others once."""
         self._by_hand.pop(position, None)
-        for case in [case for case in self._cases if position in self._at(case)]:
+        cases = [case for case in self._cases if position in self._at(case)]
+        for case in cases:
             self._cases.remove(case)
             self._immune.update(self._at(case))
 
@@ -194,8 +195,7 @@ class TrustMonitor:
         self._lasting.add(view.z[-1] / self._judge.scale, self._judge.least, looks / self._judge.time)
         evidence = self._judge(view, self._lasting)
         if self._healthy.is_known:
-            with self._search.part(len(self._relations.columns)):
-                self._decide(evidence, hidden, is_steady)
+            self._decide(evidence, hidden, is_steady)
         is_other = any(case.cause.cause == "body" for case in self._cases)
         self._other = self._other + motion if is_other else 0.0
         is_quiet = float(evidence.ratio.max(initial=0.0)) < LEARNING
@@ -353,7 +353,8 @@ class TrustMonitor:
         evidence = self._judge(shown)
         if self._count - case.first > AGAIN + LATELY and case.cause.columns & self._sudden(AGAIN):
             case.has_jumped = False
-        if not (columns := sorted(case.cause.columns - self._recent.missing())):
+        columns = sorted(case.cause.columns - self._recent.missing())
+        if not columns:
             return
         if float(evidence.ratio.max(initial=0.0)) < CALM:
             errors = np.abs(shown.z[:, columns] / self._judge.scale[columns])
@@ -429,7 +430,6 @@ class TrustMonitor:
         assert relations is not None
 
         def without(more: Hidden) -> Evidence:
-            self._search.spend(is_new=not relations.knows(hidden | more))
             view = self._recent.view(relations, hidden | more)
             return judge(view.scaled(view.usual(judge.scale, age + EARLIER)))
 

@@ -151,10 +151,6 @@ class Relations:
             sizes[(self.columns >= span.start) & (self.columns < span.stop)] = size
         return sizes
 
-    def knows(self, hidden: Hidden) -> bool:
-        """Whether the relation without some columns has been computed."""
-        return hidden in self._kept
-
     def without(self, hidden: Hidden) -> Relation:
         """Return the relation that uses none of the hidden columns."""
         known = self._kept.pop(hidden, None) or self._relation(hidden)
