@@ -37,6 +37,8 @@ class Case:
         is_hidden: Whether its elements are hidden.
         has_jumped: Whether an element has jumped away, and not yet back.
         is_plain: Whether an element jumped or was stuck, so that it certainly lied.
+        may_be_body: Whether not its sensors may be wrong, but the part of the body that they measure has changed: a
+            wire that is cut contradicts the sensors of its neighbours too.
         kind: As in `Finding`.
         size: As in `Finding`.
         reason: Why its elements are still used, if a rule forbids to hide them.
@@ -53,16 +55,34 @@ class Case:
     is_hidden: bool = False
     has_jumped: bool = False
     is_plain: bool = False
+    may_be_body: bool = False
     kind: str = "unknown"
     size: float = math.nan
     reason: str = ""
 
-    def weigh(self, evidence: Evidence, has_jumped: bool, is_stuck: bool) -> None:
-        """Add the evidence of one block, in which its elements may have jumped or been stuck."""
+    def weigh(self, evidence: Evidence, sudden: Hidden, stuck: Hidden, parts: Iterable[Hidden]) -> None:
+        """Add the evidence of one block, in which some columns had jumped lately or were stuck.
+
+        Args:
+            evidence: The evidence.
+            sudden: Columns that had jumped.
+            stuck: Columns that were stuck.
+            parts: Columns of each part of the body with several sensors.
+        """
+        columns, is_noise = self.cause.columns, bool(evidence.is_noise[self.cause.lead])
+        has_jumped, is_stuck = bool(columns & sudden), bool(columns & stuck)
         self.has_jumped |= has_jumped
         self.is_plain |= has_jumped or is_stuck
+        is_sensor = self.cause.is_exchange or is_noise or is_stuck
+        strongest = frozenset(np.argsort(-evidence.strength)[:2].tolist())
+        self.may_be_body |= not is_sensor and any(columns | strongest <= part for part in parts)
         self.weight += float(evidence.ratio.max()) ** 2
         self.steps = np.fmax(self.steps, evidence.step)
+
+    def changes(self, columns: Hidden, parts: Iterable[Hidden]) -> bool:
+        """Whether it may have changed the body that some columns measure, other than those of its own part."""
+        is_body = self.may_be_body and not any(self.cause.columns | columns <= part for part in parts)
+        return is_body or self.cause.cause == "environment"
 
     def finding(self, elements: Sequence[int], since: float) -> Finding:
         """Return what others see of it: positions of its elements in the layout, wrong since this time [s]."""

@@ -99,25 +99,23 @@ def explain(
                 yield frozenset({column, int(without(frozenset({column})).strength.argmax())})
 
     single = [column for column in singles if solves(frozenset({column}))]
-    for preferred in (sudden, beyond):
+    strongest = set(order[:3].tolist())
+    part = _changed_part(evidence, without, left, single, (part for part in parts if part & strongest))
+    for preferred in (sudden, part, beyond):
         single = [column for column in single if column in preferred] or single
     best = float(evidence.strength[single[0]]) if single else 0.0
     rest = min((left(frozenset({column})) for column in single), default=1.0)
     pair: Hidden = frozenset() if evidence.is_noise.any() else _exchanged(evidence, exchanges, rest, sudden)
     if pair:
         return Cause(pair, "all", max(pair, key=lambda c: evidence.strength[c]), is_exchange=True)
-    if evidence.is_slow[lead]:  # another tool is there at once
-        environment = frozenset()
-    if environment and not evidence.is_noise[lead]:
-        for name, other, is_known in conditions():
-            if float(other.ratio.max(initial=0.0)) < (min(AGREES, rest + RIVALS) if is_known else TOOL):
-                return Cause(environment, "environment", lead, name)
-    if environment and not sudden.intersection(single):  # another tool moves the whole tip
-        own = float(evidence.strength[list(environment)].max())
-        if own >= CLOSE * best - ALIKE and left(environment) < TOOL:
-            return Cause(environment, "environment", lead)
+    if environment and not evidence.is_slow[lead]:  # another tool is there at once
+        tool = _another_tool(evidence, left, environment, conditions, single, rest, sudden)
+        if tool is not None:
+            return tool
     if len(sudden) > 1 and not any(sudden <= part for part in parts) and solves(sudden):
         return Cause(sudden, "all", max(sudden, key=lambda c: evidence.strength[c]))
+    if part and not (part | sudden).intersection(single):
+        return Cause(part, "part", max(part, key=lambda c: evidence.strength[c]))
     if single:
         alike = [c for c in single if _is_alike(best, float(evidence.strength[c]))]
         if len(alike) == 1:
@@ -127,6 +125,66 @@ def explain(
         if solves(columns):
             return Cause(columns, cause, max(columns, key=lambda c: evidence.strength[c]))
     return Cause(frozenset(), "body", lead)
+
+
+def _another_tool(
+    evidence: Evidence,
+    left: Callable[[Hidden], float],
+    environment: Hidden,
+    conditions: Callable[[], Iterable[tuple[str, Evidence, bool]]],
+    single: Sequence[int],
+    rest: float,
+    sudden: Hidden,
+) -> Cause | None:
+    """Return another tool or load as the cause; None if none explains the alarm as well as the elements.
+
+    Args:
+        evidence: The evidence.
+        left: Returns the largest evidence without some columns.
+        environment: The columns of p.
+        conditions: As in `explain`.
+        single: Columns that explain the alarm alone, the most likely first.
+        rest: Smallest evidence that is left without one of them.
+        sudden: As in `explain`.
+    """
+    lead = int(evidence.strength.argmax())
+    if not evidence.is_noise[lead]:
+        for name, other, is_known in conditions():
+            if float(other.ratio.max(initial=0.0)) < (min(AGREES, rest + RIVALS) if is_known else TOOL):
+                return Cause(environment, "environment", lead, name)
+    if not sudden.intersection(single):  # another tool moves the whole tip
+        own = float(evidence.strength[list(environment)].max())
+        best = float(evidence.strength[single[0]]) if single else 0.0
+        if own >= CLOSE * best - ALIKE and left(environment) < TOOL:
+            return Cause(environment, "environment", lead)
+    return None
+
+
+def _changed_part(
+    evidence: Evidence,
+    without: Callable[[Hidden], Evidence],
+    left: Callable[[Hidden], float],
+    single: Sequence[int],
+    parts: Iterable[Hidden],
+) -> Hidden:
+    """Return the part that explains an alarm better than all single elements of others; empty if none does.
+
+    Args:
+        evidence: The evidence.
+        without: Returns the evidence with more columns hidden.
+        left: Returns the largest of it.
+        single: Columns that explain the alarm alone.
+        parts: Parts of the body with several sensors.
+    """
+    for part in parts:
+        rivals = [column for column in single if column not in part]
+        if left(part) >= min([EXPLAINED, *(left(frozenset({column})) for column in rivals)]):
+            continue
+        first = max(part, key=lambda c: evidence.strength[c])
+        others = float(without(frozenset({first})).strength[list(part - {first})].sum())
+        if evidence.strength[first] + others > max((evidence.strength[c] for c in rivals), default=0.0) + ALIKE:
+            return part
+    return frozenset()
 
 
 def _exchanged(evidence: Evidence, exchanges: Iterable[tuple[Hidden, Evidence]], rest: float, sudden: Hidden) -> Hidden:

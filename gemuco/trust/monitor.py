@@ -134,11 +134,10 @@ class TrustMonitor:
         """Whether lies can be noticed: what is normal is known, and enough blocks were seen."""
         return self._relations is not None and self._healthy.is_known
 
-    @property
-    def _is_known_body(self) -> bool:
-        """Whether what is healthy is known of this body, with this tool, in motion."""
+    def _is_known_body(self, columns: Hidden = frozenset()) -> bool:
+        """Whether what is healthy is known of this body, with this tool, in motion; of some columns, or of all."""
         assert self._schema is not None
-        if any(case.is_hidden and case.cause.cause == "environment" for case in self._cases):
+        if any(case.is_hidden and case.changes(columns, self._parts) for case in self._cases):
             return False
         has_moved = self._healthy.moved - self._met_at >= MOVED
         return self.is_known and has_moved and not is_another(self._schema, self._schema.bias, self._biases).all()
@@ -224,7 +223,7 @@ class TrustMonitor:
         highest = float(ratio.max(initial=0.0))
         self._alarmed = self._alarmed + 1 if highest >= 1.0 else 0
         is_due = self._count % AGAIN == 0
-        again = highest >= 1.0 and self._count % (AGAIN if self._is_known_body else RARELY) == 0
+        again = highest >= 1.0 and self._count % (AGAIN if self._is_known_body() else RARELY) == 0
         known, is_alarm = self._search.answer(self._cases, ratio, again), highest >= 1.0 and (is_steady or is_due)
         if known is not None:
             known.last, known.moved = self._count, known.moved + self._motion
@@ -282,8 +281,7 @@ class TrustMonitor:
             began = self._count - int(evidence.age[cause.lead]) + 1
             known = Case(cause, began, self._count, self._count)
             self._cases.append(known)
-        columns = cause.columns
-        known.weigh(evidence, bool(columns & self._sudden(LATELY)), bool(columns & self._recent.repeats.stuck))
+        known.weigh(evidence, self._sudden(LATELY), self._recent.repeats.stuck, self._parts)
         is_enough = known.is_plain or known.weight >= self._healthy.caution or cause.cause == "environment"
         self._describe(known, hidden | cause.columns, bool(evidence.is_noise[cause.lead]))
         if cause.cause == "body" and known.seen >= UNEXPLAINED:
@@ -328,14 +326,12 @@ class TrustMonitor:
         """Return why a cause is not hidden; empty if it is. `ratio` is the evidence, as a multiple of an alarm."""
         if case.cause.cause == "environment":
             return ""
-        if case.cause.cause == "part":
-            return "a part of the body has changed, and not its sensors"
         if case.cause.cause == "either" and self._config.pairs == "use":
             return "they look alike, and the settings say to use them"
         elements = self._at(case)
         rest = self._rest(case, self._hidden_columns() | self._recent.missing())
         is_gross = ratio >= GROSS and case.moved >= LONG and rest.level < LIKE
-        if rest.level > STRANGE or not (self._is_known_body or is_gross):
+        if rest.level > STRANGE or not (self._is_known_body(case.cause.columns) or is_gross):
             return "what is normal is not known on this body"
         if self._immune & elements:
             return "it is not hidden again before it has agreed once"
@@ -376,10 +372,13 @@ class TrustMonitor:
         if case.cause.cause not in ("element", "either"):
             return
         again = self._explain(evidence, rest, is_new=False)
-        if again.cause == "element" and again.columns != case.cause.columns and not again.columns & self._environment:
-            inside = again.columns < case.cause.columns
-            rival, own = again.lead, max(case.cause.columns - again.columns, key=lambda c: evidence.strength[c])
-            if evidence.strength[rival] > (1.0 if inside else SURE) * evidence.strength[own]:
+        if again.cause == "part" and case.cause.columns < again.columns:
+            case.cause, case.may_be_body = again, True
+        elif again.cause == "element" and again.columns != case.cause.columns and not again.columns & self._environment:
+            whole = case.cause.columns.union(*(part for part in self._parts if case.cause.columns <= part))
+            rival, own = evidence.strength[again.lead], evidence.strength[list(whole - again.columns)].max()
+            is_certain = case.is_plain and not again.columns <= whole
+            if rival > (1.0 if again.columns < case.cause.columns else SURE) * own and not is_certain:
                 case.cause = again
                 self._describe(case, rest | again.columns)
 
@@ -410,8 +409,9 @@ class TrustMonitor:
         """Return the most likely cause of an alarm; of one that is not new, without other tools and exchanges."""
         assert self._relations is not None and self._schema is not None
         age = int(evidence.age.flat[evidence.strength.argmax()])
+        parts = [part - hidden for part in self._parts if part - hidden]
         return explain(
-            evidence, self._without(hidden, age), self._joined, self._parts,
+            evidence, self._without(hidden, age), self._joined, parts,
             self._environment - hidden if is_new else frozenset(),
             lambda: self._conditions(hidden, age),
             self._alternatives(hidden).exchanges(evidence) if is_new and self._may_be_exchange() else (),

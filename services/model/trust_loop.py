@@ -273,22 +273,28 @@ class Trust:
         others = [self._names[other] for other in finding.elements if other != index]
         if finding.cause == "either" and others:
             return f"it or {' or '.join(others)} is {words}"
-        if self._changed_part(finding):
-            return f"{words}, or {_part_of(self._names[index])} itself has changed"
+        if part := self._changed_part(finding):
+            return f"{words}, or {part} itself has changed"
         return words
 
     def _changed_part(self, finding: Finding) -> str:
-        """Return the element that shows that not a sensor but a part of the body may have changed; empty if none does.
+        """Return the part of the body that may have changed, in place of its sensors; empty if none may.
 
-        It belongs to a part with several elements, as tension and length of a muscle, and has left its learned range:
-        that of a wire that is cut, or slack.
+        It has several elements, as tension and length of a muscle, and all of them are contradicted, or one has left
+        its learned range: that of a wire that is cut, or slack.
         """
+        part = _part_of(self._names[finding.elements[0]]) if finding.elements else ""
+        if finding.cause == "part":
+            return part
+        return part if finding.cause == "element" and not finding.by_hand and self._outside(finding.elements[0]) else ""
+
+    def _outside(self, lying: int) -> str:
+        """Return an element of the same part of the body that has left its learned range; empty if none has."""
         schema, last = self._schema(), self._last
-        if finding.cause != "element" or finding.by_hand or last is None:
+        if last is None:
             return ""
         x, (low, high) = schema.scaler.normalise(in_order(schema, last).flat), learned_range(schema)
         outside = (x < low) | (x > high)
-        lying = finding.elements[0]
         part = next((part for part in parts(schema, list(range(len(x)))) if lying in part), ())
         return next((self._names[other] for other in part if len(part) > 1 and outside[other]), "")
 
@@ -306,10 +312,12 @@ class Trust:
         text += f": {kind}since {since}"
         if finding.kind in SIZED and math.isfinite(finding.size):
             text += f", off by {finding.size:.3g} {self._units[finding.elements[0]]}"
-        device, other = self._device.get(finding.elements[0]), self._changed_part(finding)
-        if other:
-            text += f", or {_part_of(other)} itself has changed: {other} is outside of what was learned"
-        if other in ("", names[0]) and finding.kind in CALIBRATED and device is not None and len(names) == 1:
+        device, part, outside = self._device.get(finding.elements[0]), self._changed_part(finding), ""
+        if part:
+            outside = self._outside(finding.elements[0])
+            text += f", or {part} itself has changed"
+            text += f": {outside} is outside of what was learned" if outside else ""
+        if outside in ("", names[0]) and finding.kind in CALIBRATED and device is not None and len(names) == 1:
             text += f"; `gemuco calibrate` measures {device} anew"
         return f"{text} (still used: {finding.reason})." if finding.reason else f"{text}."
 

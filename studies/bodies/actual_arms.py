@@ -41,16 +41,21 @@ def record(
     duration: float,
     part: str = "",
     contact: Contact | None = None,
+    breaks_at: float = 0.0,
 ) -> dict[str, np.ndarray]:
-    """Return signal -> samples (count, n) [unit] of one actual arm."""
+    """Return signal -> samples (count, n) [unit] of one actual arm, of which a part breaks at a time [s]."""
     world = registry.load_object(robot.simulator or "", "simulator", ("world",)).world("actual", arm)
-    if part:
+    if part and not breaks_at:
         world.break_part(part)
     if contact is not None:
         world.push = lambda position: contact(world.time, position)
     clock = WorldClock(world)
     with Robot(robot, [DirectDevice(robot, world, clock)], clock=clock, source="simulated") as body:
-        rows = list(motion(robot, body, seed, rate, duration))
+        rows = []
+        for row in motion(robot, body, seed, rate, duration):
+            rows.append(row)
+            if part and breaks_at and len(rows) == round(breaks_at * rate):
+                world.break_part(part)
     return {name: np.array([row[name] for row in rows]) for name in robot.signals}
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from gemuco import BodySchema
+from gemuco.dataset import Dataset, Episode
 from hal import registry
 from hal.config import RobotConfig, load_robot
 from services.learning.motion import Forecast, random_postures
@@ -92,7 +93,7 @@ def _with_tools(name: str, fit: Callable, config: Callable, learn: Callable) -> 
 def _arm(fit: Callable, config: Callable, learn: Callable) -> tuple[BodySchema, Motion]:
     robot = _robot("musashi_arm")
     lived, other = record(robot, ARM, 1, 10.0, LIVED), record(robot, ARM, 2, float(RATE), JUDGED)
-    schema, _ = fit([lived], config(seed=0), MUSCLES, units={JOINTS: "rad", TENSION: "N", LENGTH: "m"})
+    schema, _ = fit(Dataset(layout_of(robot), (Episode("default", lived),)), config(seed=0), MUSCLES)
     half = len(other[JOINTS]) // 2
     schema = schema.with_normal(learn(schema, schema.layout.join({s: v[:half:5] for s, v in other.items()})))
     return schema, {"": {s: v[half:] for s, v in other.items()}}

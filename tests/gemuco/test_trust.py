@@ -266,6 +266,21 @@ def test_two_swapped_elements_are_both_hidden_until_they_are_put_back(model, arm
     assert not hidden[-1]
 
 
+def test_while_a_muscle_may_have_changed_other_sensors_are_accused_later(model, arm):
+    """The wire may be cut, which makes sensors of its neighbours look wrong. Those that lie beside a joint are not."""
+    samples = move(arm, 170, 31)
+    samples[100:, :, TENSION] += 30.0
+    samples[150:, :, JOINT] += 0.1
+    monitor, hidden = watch(model, samples)
+    assert hidden[149] == hidden[-1] == {TENSION}
+    assert any(finding.elements == (JOINT,) and finding.reason for finding in monitor.findings)
+    samples = move(arm, 170, 31)
+    samples[100:, :, JOINT] += 0.3
+    samples[150:, :, TENSION] += 15.0
+    _, hidden = watch(model, samples)
+    assert (hidden[149], hidden[-1]) == ({JOINT}, {JOINT, TENSION})
+
+
 @pytest.mark.parametrize(
     ("element", "other"),
     [(8, 10), *(pytest.param(*pair, marks=pytest.mark.long) for pair in ((0, 1), (1, 0), (10, 8), (11, 7)))],

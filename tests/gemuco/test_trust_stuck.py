@@ -132,11 +132,12 @@ def test_an_alarm_that_was_none_is_raised_later_again_and_a_plain_lie_teaches_no
 
 def test_a_case_weighs_its_evidence_and_knows_a_plain_lie() -> None:
     case = Case(Cause(frozenset({1}), "element", 1), 0, 0, 0)
-    case.weigh(evidence([0.2, 1.1, 0.1]), has_jumped=False, is_stuck=False)
-    case.weigh(evidence([0.2, 2.0, 0.1]), has_jumped=False, is_stuck=False)
+    none: frozenset[int] = frozenset()
+    case.weigh(evidence([0.2, 1.1, 0.1]), none, none, [])
+    case.weigh(evidence([0.2, 2.0, 0.1]), none, none, [])
     assert case.weight == pytest.approx(1.1**2 + 2.0**2)
     assert case.steps == pytest.approx([1.8, 18.0, 0.9])
     assert not case.is_plain
-    case.weigh(evidence([0.2, 1.1, 0.1]), has_jumped=False, is_stuck=True)
+    case.weigh(evidence([0.2, 1.1, 0.1]), none, frozenset({0, 1}), [])
     assert case.is_plain
     assert not case.has_jumped

@@ -8,7 +8,7 @@ from arm_model import arm, sample_of, small_model
 
 from gemuco.anomaly.healthy import learn_normal
 from gemuco.schema import BodySchema
-from gemuco.trust.config import TrustConfig
+from gemuco.trust.config import Finding, TrustConfig
 from hal.clock import ManualClock
 from hal.errors import ConfigError
 from services.errors import BadArguments
@@ -119,6 +119,16 @@ def test_a_wire_that_is_cut_is_not_taken_for_a_lying_sensor_alone(tension: float
     assert reason.endswith(", or deltoid_side itself has changed") == is_cut
     assert ("muscle_tension.deltoid_side is outside of what was learned" in text) == is_cut
     assert f"`gemuco calibrate` measures deltoid_side_{'cell' if is_cut else 'drive'} anew" in text
+
+
+def test_a_part_whose_sensors_are_all_contradicted_may_itself_have_changed() -> None:
+    bench = Bench()
+    names = [model().layout.element(index) for index in range(model().layout.size)]
+    lying = tuple(names.index(f"{signal}.biceps") for signal in ("muscle_tension", "muscle_length"))
+    bench.trust.findings = (Finding(lying, "part", "offset", bench.clock.monotonic(), 50.0, is_distrusted=True),)
+    text = bench.trust.text()
+    assert text.startswith("muscle_tension.biceps and muscle_length.biceps are distrusted: offset since ")
+    assert text.endswith(", off by 50 N, or biceps itself has changed.")
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,76 @@
+"""Parts of the body with several sensors: a muscle that is cut is not taken for lying sensors of others."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gemuco.trust.cases import Case
+from gemuco.trust.evidence import Evidence
+from gemuco.trust.hypotheses import Cause, explain
+
+SIZE, JOINT, TENSION, LENGTH, OTHER = 12, 0, 3, 8, 9
+MUSCLE = frozenset({TENSION, LENGTH})
+
+
+def evidence(**strength: float) -> Evidence:
+    """Return evidence against joint, tension and length; the joint alarms."""
+    columns = {"joint": JOINT, "tension": TENSION, "length": LENGTH}
+    against, zero = np.zeros(SIZE), np.zeros(SIZE, bool)
+    against[[columns[name] for name in strength]] = list(strength.values())
+    return Evidence(against / 80.0, against, np.full(SIZE, 5), np.zeros(SIZE), zero, zero, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("rest", "length", "sudden", "cause", "columns"),
+    [
+        (0.3, 90.0, frozenset(), "part", MUSCLE),
+        (0.55, 90.0, frozenset(), "element", {JOINT}),
+        (0.3, 12.0, frozenset(), "element", {JOINT}),
+        (0.3, 90.0, frozenset({JOINT}), "element", {JOINT}),
+    ],
+    ids=["it explains more, and less is left", "more is left", "it explains less", "the joint jumped"],
+)
+def test_a_part_has_changed_if_it_explains_an_alarm_better_than_a_joint(
+    rest: float, length: float, sudden: frozenset[int], cause: str, columns: set[int]
+) -> None:
+    """Without the joint the alarm would be gone as well, and half as much is left as without any."""
+    whole = evidence(joint=90.0, length=length, tension=20.0)
+
+    def without(hidden: frozenset[int]) -> Evidence:
+        share = rest if hidden >= MUSCLE else 0.5 if JOINT in hidden else 0.9
+        return replace(whole, ratio=np.where(np.arange(SIZE) == OTHER, share, 0.0))
+
+    result = explain(whole, without, (), (MUSCLE,), frozenset(), sudden=sudden)
+    assert (result.cause, result.columns) == (cause, columns)
+
+
+def test_its_sensor_alone_is_named_if_that_explains_the_alarm() -> None:
+    whole = evidence(joint=60.0, tension=90.0, length=30.0)
+
+    def without(hidden: frozenset[int]) -> Evidence:
+        share = 0.2 if TENSION in hidden else 0.5 if JOINT in hidden else 0.9
+        return replace(whole, ratio=np.where(np.arange(SIZE) == OTHER, share, 0.0))
+
+    result = explain(whole, without, (), (MUSCLE,), frozenset())
+    assert (result.cause, result.columns) == ("element", {TENSION})
+
+
+@pytest.mark.parametrize(
+    ("cause", "against", "stuck", "may_be_body"),
+    [
+        (Cause(frozenset({TENSION}), "element", TENSION), {"tension": 90.0, "length": 50.0, "joint": 10.0}, (), True),
+        (Cause(frozenset({TENSION}), "element", TENSION), {"tension": 90.0, "length": 5.0, "joint": 10.0}, (), False),
+        (Cause(frozenset({TENSION}), "element", TENSION), {"tension": 90.0, "length": 50.0}, (TENSION,), False),
+        (Cause(frozenset({JOINT}), "element", JOINT), {"joint": 90.0, "length": 50.0}, (), False),
+    ],
+    ids=["both sensors are contradicted", "only one is", "it is stuck", "a joint has no part"],
+)
+def test_a_part_of_which_all_sensors_are_contradicted_leaves_the_body_unknown_for_others(
+    cause: Cause, against: dict[str, float], stuck: tuple[int, ...], may_be_body: bool
+) -> None:
+    case = Case(cause, 1, 1, 1)
+    case.weigh(evidence(**against), frozenset(), frozenset(stuck), [MUSCLE])
+    assert case.may_be_body == may_be_body
+    assert case.changes(frozenset({JOINT}), [MUSCLE]) == may_be_body
+    assert not case.changes(frozenset({LENGTH}), [MUSCLE]), "its own sensors are judged as before"
