@@ -322,9 +322,15 @@ def await_ready(name: str, supervisor: Supervisor, client: Client, console: Cons
 
 
 def _is_running(client: Client, name: str) -> Callable[[], bool]:
+    """Return a function that returns whether a process runs; a model that estimates does, even if it suspects a sensor.
+
+    Before it has learned what is normal on this body it may suspect one for as long as the arm rests.
+    """
+
     def is_running() -> bool:
         status = client.status(name)
-        return status is not None and status.state == "running"
+        is_estimating = name == "model" and client.estimate() is not None
+        return status is not None and (status.state == "running" or is_estimating)
 
     return is_running
 

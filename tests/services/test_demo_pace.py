@@ -175,3 +175,26 @@ def test_a_process_that_ended_is_named_before_what_it_did_not_answer(
         demo.running(load_robot(arm), arm, 1, "joint_position", arm.parent, processes, Console()),  # type: ignore[arg-type]
     ):
         raise ServiceUnavailable("No 'vision' service answered.")
+
+
+@pytest.mark.parametrize(
+    ("name", "state", "estimates", "runs"),
+    [
+        ("model", "running", True, True),
+        ("model", "degraded", True, True),
+        ("model", "degraded", False, False),
+        ("hal", "degraded", True, False),
+        ("model", None, True, False),
+    ],
+)
+def test_a_model_that_suspects_a_sensor_of_an_unknown_body_runs(
+    name: str, state: str | None, estimates: bool, runs: bool
+) -> None:
+    class Publishing:
+        def status(self, service: str) -> Status | None:
+            return None if state is None else Status(service=service, state=state, text="a sensor is suspected")
+
+        def estimate(self) -> object:
+            return object() if estimates else None
+
+    assert demo._is_running(Publishing(), name)() == runs  # type: ignore[arg-type]
