@@ -17,6 +17,8 @@ from gemuco.trust.relations import Relations
 
 CLEAR = 2.0
 """A lie begins with the first error of this size [errors of a healthy prediction]."""
+SURE = 2.0
+"""Another cause replaces one if its evidence is this multiple."""
 MOVES = 3.0
 """Before a frozen element returns, it and its prediction move by this much [errors of a healthy prediction]."""
 
@@ -83,6 +85,28 @@ class Case:
         """Whether it may have changed the body that some columns measure, other than those of its own part."""
         is_body = self.may_be_body and not any(self.cause.columns | columns <= part for part in parts)
         return is_body or self.cause.cause == "environment"
+
+    def yields_to(self, again: Cause, evidence: Evidence, parts: Iterable[Hidden], beyond: Hidden) -> bool:
+        """Whether another element replaces it: one of its own, or one with much more evidence.
+
+        It is held against all sensors of its part of the body. If one of these jumped, or is beyond what was learned,
+        or all are contradicted, another part does not replace it: a cut wire lets the arm go where its neighbours look
+        wrong.
+
+        Args:
+            again: The element that explains best what is seen now.
+            evidence: The evidence now.
+            parts: Columns of each part of the body with several sensors.
+            beyond: Columns outside of what was learned.
+        """
+        columns = self.cause.columns
+        whole = columns.union(*(part for part in parts if columns <= part))
+        if again.columns == columns:
+            return False
+        if not again.columns <= whole and (self.is_plain or self.may_be_body or whole & beyond):
+            return False
+        own = float(evidence.strength[list(whole - again.columns)].max())
+        return float(evidence.strength[again.lead]) > (1.0 if again.columns < columns else SURE) * own
 
     def finding(self, elements: Sequence[int], since: float) -> Finding:
         """Return what others see of it: positions of its elements in the layout, wrong since this time [s]."""

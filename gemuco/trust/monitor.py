@@ -56,9 +56,6 @@ LATELY, SUSPECT = 10, 0.6
 wrong verdict a week, so much less evidence is enough if a jump of a right element comes once in 20 minutes at most."""
 PATIENCE = 100
 """An element that jumped away returns after this number of blocks, or after it has jumped back."""
-SURE = 2.0
-"""Another cause replaces one if its evidence is this multiple."""
-
 Replaces = Callable[[frozenset[int]], bool]
 """Whether all elements of a set can be estimated while none of them is measured."""
 
@@ -341,7 +338,7 @@ class TrustMonitor:
 
     def _judge_again(self, case: Case) -> None:
         """Let a hidden cause return if it agrees, and correct it while that is possible."""
-        assert self._relations is not None
+        assert self._relations is not None and self._schema is not None
         rest = (self._hidden_columns() - case.cause.columns) | self._recent.missing()
         shown = self._recent.view(self._relations, rest)
         if self._recent.resting <= self._count - case.first:  # it lied already when the body settled
@@ -374,11 +371,9 @@ class TrustMonitor:
         again = self._explain(evidence, rest, is_new=False)
         if again.cause == "part" and case.cause.columns < again.columns:
             case.cause, case.may_be_body = again, True
-        elif again.cause == "element" and again.columns != case.cause.columns and not again.columns & self._environment:
-            whole = case.cause.columns.union(*(part for part in self._parts if case.cause.columns <= part))
-            rival, own = evidence.strength[again.lead], evidence.strength[list(whole - again.columns)].max()
-            is_certain = case.is_plain and not again.columns <= whole
-            if rival > (1.0 if again.columns < case.cause.columns else SURE) * own and not is_certain:
+        elif again.cause == "element" and not again.columns & self._environment:
+            beyond = self._relations.beyond(self._schema, self._recent.values()[-1])
+            if case.yields_to(again, evidence, self._parts, beyond):
                 case.cause = again
                 self._describe(case, rest | again.columns)
 

@@ -1,11 +1,12 @@
 """Contacts: how often a right sensor is hidden while a muscle-driven arm is pushed and knocked at the hand.
 
-    python -m studies.accuracy.contacts [--seeds 11 12 13 14 15 16] [--minutes 5] [--free]
+    python -m studies.accuracy.contacts [--seeds 11 12 13 14 15 16] [--minutes 5] [--free] [--learned 31 32]
 
 The model is that of `studies.accuracy.lies`: neither it nor what is normal has seen a contact. Each seed is one
 recording of random motion; one monitor judges all of them one after another, as a robot that goes on working. In 40 %
 of the time a force of 5 to 30 N of any direction acts on the hand; three in ten pushes are knocks of about a tenth of a
-second, the others are held for 0.5 to 8 s. `--free` has no contacts.
+second, the others are held for 0.5 to 8 s. `--free` has no contacts. `--learned` first learns what is normal from other
+recordings without contacts, in place of 150 s.
 """
 
 import argparse
@@ -18,6 +19,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from gemuco.anomaly.healthy import learn_normal
+from gemuco.schema import BodySchema
 from gemuco.trust.monitor import TrustMonitor
 from hal.config import load_robot
 from simulators.robots.musashi_arm import force_torque
@@ -89,9 +92,17 @@ def recording(seed: int, duration: float, is_free: bool) -> dict[str, np.ndarray
     return dict(pickle.loads(file.read_bytes()))
 
 
-def judge(seeds: Sequence[int], duration: float, is_free: bool) -> tuple[Table, str]:
-    """Return a table of the wrong verdicts, and a sentence that counts them."""
+def model_of(learned: Sequence[int], duration: float) -> BodySchema:
+    """Return the model; what is normal is learned from recordings without contacts of these seeds, if there are any."""
     schema = body_of("musashi_arm").schema
+    if not learned:
+        return schema
+    rows = [schema.layout.join(recording(seed, duration, is_free=True))[::PART] for seed in learned]
+    return schema.with_normal(learn_normal(schema, np.concatenate(rows)))
+
+
+def judge(schema: BodySchema, seeds: Sequence[int], duration: float, is_free: bool) -> tuple[Table, str]:
+    """Return a table of the wrong verdicts, and a sentence that counts them."""
     monitor, table = TrustMonitor(schema), Table("time", "seed", "force", "hidden", "kind")
     before: frozenset[int] = frozenset()
     blocks = hidden = verdicts = 0
@@ -119,6 +130,8 @@ if __name__ == "__main__":
     parser.add_argument("--seeds", type=int, nargs="+", default=list(range(11, 17)))
     parser.add_argument("--minutes", type=float, default=5.0, help="Length of each recording.")
     parser.add_argument("--free", action="store_true", help="Without contacts.")
+    parser.add_argument("--learned", type=int, nargs="+", default=[], help="Seeds to learn what is normal from.")
     options = parser.parse_args()
-    for part in judge(options.seeds, 60.0 * options.minutes, options.free):
+    duration = 60.0 * options.minutes
+    for part in judge(model_of(options.learned, duration), options.seeds, duration, options.free):
         Console(width=120).print(part)

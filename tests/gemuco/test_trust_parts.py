@@ -74,3 +74,32 @@ def test_a_part_of_which_all_sensors_are_contradicted_leaves_the_body_unknown_fo
     assert case.may_be_body == may_be_body
     assert case.changes(frozenset({JOINT}), [MUSCLE]) == may_be_body
     assert not case.changes(frozenset({LENGTH}), [MUSCLE]), "its own sensors are judged as before"
+
+
+@pytest.mark.parametrize(
+    ("joint", "beyond", "is_plain", "yields"),
+    [
+        (70.0, (), False, False),
+        (110.0, (), False, True),
+        (110.0, (TENSION,), False, False),
+        (110.0, (LENGTH,), False, False),
+        (110.0, (OTHER,), False, True),
+        (110.0, (), True, False),
+    ],
+)
+def test_a_sensor_of_a_part_yields_to_a_joint_with_much_more_evidence_only(
+    joint: float, beyond: tuple[int, ...], is_plain: bool, yields: bool
+) -> None:
+    """The length has more evidence than the accused tension; both are of the muscle."""
+    case = Case(Cause(frozenset({TENSION}), "element", TENSION), 1, 1, 1, is_plain=is_plain)
+    whole, other = evidence(joint=joint, tension=20.0, length=50.0), Cause(frozenset({JOINT}), "element", JOINT)
+    assert case.yields_to(other, whole, [MUSCLE], frozenset(beyond)) == yields
+    own = Cause(frozenset({LENGTH}), "element", LENGTH)
+    assert case.yields_to(own, whole, [MUSCLE], frozenset(beyond)), "2.5 times its evidence"
+    assert not case.yields_to(case.cause, whole, [MUSCLE], frozenset(beyond))
+
+
+def test_one_of_two_that_look_alike_needs_more_evidence_only() -> None:
+    case = Case(Cause(frozenset({JOINT, OTHER}), "either", JOINT), 1, 1, 1)
+    alone = Cause(frozenset({JOINT}), "element", JOINT)
+    assert case.yields_to(alone, evidence(joint=10.0), [], frozenset())
